@@ -1,0 +1,258 @@
+"""Train a policy with OSR on real MuJoCo transitions, from nothing, with one command.
+
+    python examples/offline_osr.py env=hopper
+    python examples/offline_osr.py env=walker2d data=medium-expert seed=3 preset=paper
+    python examples/offline_osr.py -m env=hopper,walker2d seed=0,1,2 hydra/launcher=pool
+    python examples/offline_osr.py resume=outputs/hopper-medium-replay/seed0-...
+
+The data are rolled out on this machine at the first run and cached. A run leaves
+``curve.png``, ``returns.json``, ``inverse_dynamics.json``, ``config.yaml``,
+``status.json``, CSV files and ``checkpoint/`` in its folder.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import hydra
+import numpy as np
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+from tensordict import TensorDict
+from torchrl.envs import ObservationNorm
+from torchrl.objectives import SoftUpdate
+from torchrl.record.loggers import CSVLogger, Logger, get_logger
+
+from torchrl_osr import InverseDynamicsLoss, OSRLoss, StatePerturbation, config
+from torchrl_osr.data import (
+    load_local_dataset,
+    make_replay_buffer,
+    observation_statistics,
+    split_held_out,
+)
+from torchrl_osr.evaluation import inverse_dynamics_report
+from torchrl_osr.evaluation.episodes import (
+    EpisodeEvaluator,
+    deterministic_policy,
+    summarize,
+)
+from torchrl_osr.evaluation.figures import learning_curve, read_scalars
+from torchrl_osr.modules import (
+    critic_ensemble,
+    tanh_gaussian_actor,
+    tanh_gaussian_inverse_dynamics,
+)
+from torchrl_osr.trainers import OfflineTrainer, run_folder
+
+EVALUATION_SEED = 10_000  # far from the seeds of the data's episodes
+LAST_EVALUATIONS = 5  # neighbouring evaluations swing by tens of points: report a mean
+
+config.register()
+
+
+@hydra.main(version_base="1.3", config_path="../conf", config_name="offline_osr")
+def main(cfg: DictConfig) -> float:
+    """Run or resume one training run; return its last score, for a sweeper."""
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    if cfg.resume is not None:
+        cfg = run_folder.saved_config(folder)
+    run_folder.claim(folder, cfg)
+    with run_folder.status(folder):
+        return run(cfg, folder)
+
+
+def run(cfg: DictConfig, folder: Path) -> float:
+    """Data, inverse dynamics model, policy, report."""
+    torch.set_num_threads(cfg.trainer.num_threads)
+    torch.manual_seed(cfg.seed)
+    np.random.seed(cfg.seed)
+    device = torch.device(cfg.trainer.device)
+
+    # Data: standardised once, the same numbers for every batch and every evaluation.
+    data, manifest = load_local_dataset(
+        cfg.env.name,
+        cfg.data.level,
+        num_transitions=cfg.data.num_transitions,
+        seed=cfg.data.seed,
+        progress=cfg.trainer.progress,
+    )
+    loc, scale = observation_statistics(data)
+    norm = ObservationNorm(
+        loc,
+        scale,
+        in_keys=["observation", ("next", "observation")],
+        standard_normal=True,
+    ).to(device)
+    data = norm(data.to(device))
+    data, held_out = split_held_out(data, cfg.data.held_out, seed=cfg.data.seed)
+    # In units of the standard deviation, since the observations now are.
+    perturbation = StatePerturbation(
+        cfg.perturbation.std, noise=cfg.perturbation.noise, seed=cfg.seed
+    )
+    buffer = make_replay_buffer(
+        data,
+        batch_size=cfg.trainer.batch_size,
+        seed=cfg.seed,
+        transform=perturbation,
+        device=device,
+    )
+
+    # Networks.
+    sizes = (data["observation"].shape[-1], data["action"].shape[-1])
+    cells = list(cfg.network.num_cells)
+    actor = tanh_gaussian_actor(*sizes, num_cells=cells).to(device)
+    critics = critic_ensemble(
+        *sizes, num_qvalue_nets=cfg.network.num_qvalue_nets, num_cells=cells
+    )
+    critics = [critic.to(device) for critic in critics]
+    model = tanh_gaussian_inverse_dynamics(*sizes, num_cells=cells).to(device)
+
+    common: dict[str, Any] = {
+        "replay_buffer": buffer,
+        "components": {"perturbation": perturbation, "observation_norm": norm},
+        "loggers": make_loggers(cfg, folder),
+        "log_interval": cfg.trainer.log_interval,
+        "checkpoint_interval": cfg.trainer.checkpoint_interval,
+        "progress": cfg.trainer.progress,
+    }
+
+    # First phase: which action leads from s~ to s'?
+    if cfg.loss.recovery_weight > 0:
+        train_inverse_dynamics(cfg, folder, model, held_out, common)
+
+    # Second phase: the policy, taught by the critics and by the frozen model.
+    loss = OSRLoss(actor, critics, model, **cfg.loss).to(device)
+    loss.make_value_estimator(gamma=cfg.optim.gamma)
+    optimizer = torch.optim.Adam(
+        [
+            {
+                "params": loss.actor_network_params.parameters(),
+                "lr": cfg.optim.actor_lr,
+            },
+            {
+                "params": loss.qvalue_network_params.parameters(),
+                "lr": cfg.optim.qvalue_lr,
+            },
+            {
+                "params": [] if cfg.loss.fixed_alpha else [loss.log_alpha],
+                "lr": cfg.optim.actor_lr,
+            },
+        ],
+        fused=True,
+    )
+    evaluator = EpisodeEvaluator(
+        cfg.env.id,
+        num_episodes=cfg.trainer.eval_episodes,
+        seed=EVALUATION_SEED,
+        device=device,
+    )
+    policy = deterministic_policy(actor, norm)
+    trainer = OfflineTrainer(
+        loss,
+        optimizer,
+        total_steps=cfg.trainer.steps,
+        folder=folder / "checkpoint" / "policy",
+        seed=cfg.seed + 1,
+        target_net_updater=SoftUpdate(loss, tau=cfg.optim.tau),
+        evaluate=lambda: summarize(evaluator(policy), cfg.env.name),
+        eval_interval=cfg.trainer.eval_interval,
+        description="policy",
+        **common,
+    )
+    trainer.train()
+    evaluator.close()
+    return report(cfg, folder, manifest, trainer)
+
+
+def train_inverse_dynamics(
+    cfg: DictConfig,
+    folder: Path,
+    model: torch.nn.Module,
+    held_out: TensorDict,
+    common: dict[str, Any],
+) -> None:
+    """Fit the model to the mixed data set and say how well it does on held-out rows."""
+    loss = InverseDynamicsLoss(model)
+    trainer = OfflineTrainer(
+        loss,
+        torch.optim.Adam(
+            loss.parameters(), lr=cfg.optim.inverse_dynamics_lr, fused=True
+        ),
+        total_steps=cfg.trainer.inverse_dynamics_steps,
+        folder=folder / "checkpoint" / "inverse_dynamics",
+        seed=cfg.seed,
+        evaluate=lambda: inverse_dynamics_report(model, held_out),
+        metric=("nll", "min"),
+        eval_interval=cfg.trainer.inverse_dynamics_steps,
+        description="inverse_dynamics",
+        **common,
+    )
+    trainer.train()
+    result = trainer.history[-1]
+    run_folder.write_json(folder / "inverse_dynamics.json", result)
+    print(
+        f"inverse dynamics, {result['rows']} held-out rows: "
+        f"NLL {result['nll']:.2f}, "
+        f"R2 {', '.join(f'{value:.2f}' for value in result['r2'])}, "
+        f"90 % interval covers {100 * result['coverage_90']:.0f} %"
+    )
+
+
+def make_loggers(cfg: DictConfig, folder: Path) -> list[Logger]:
+    """Return the CSV logger and, if asked for, TensorBoard's or W&B's."""
+    loggers = [CSVLogger("csv", log_dir=str(folder))]
+    if cfg.logger.kind != "csv":
+        wandb = {"project": cfg.logger.project, "mode": cfg.logger.mode}
+        logger = get_logger(
+            cfg.logger.kind, str(folder), cfg.logger.kind, wandb_kwargs=wandb
+        )
+        loggers.append(logger)
+    return loggers
+
+
+def report(
+    cfg: DictConfig, folder: Path, manifest: dict[str, Any], trainer: OfflineTrainer
+) -> float:
+    """Write raw returns and the figure, print the table."""
+    last, best = trainer.history[-1], trainer.best()
+    recent = [row["score"] for row in trainer.history[-LAST_EVALUATIONS:]]
+    name = f"{cfg.env.name} {cfg.data.level}"
+    run_folder.write_json(
+        folder / "returns.json",
+        {
+            "env": cfg.env.id,
+            "data": {"level": cfg.data.level, "score": manifest["normalized_score"]},
+            "last": last,
+            "best": best,
+            "evaluations": trainer.history,
+        },
+    )
+    learning_curve(
+        trainer.history,
+        read_scalars(folder / "csv" / "scalars" / "policy"),
+        folder / "curve.png",
+        title=f"{name}, seed {cfg.seed}, lambda {cfg.loss.recovery_weight:g}",
+        data_score=manifest["normalized_score"],
+    )
+    rows = [
+        ("data, mean episode", f"{manifest['normalized_score']:6.1f}"),
+        ("policy, last", interval(last)),
+        (f"policy, mean of last {len(recent)}", f"{np.mean(recent):6.1f}"),
+        ("policy, best evaluation", f"{interval(best)}  at step {best['step']}"),
+    ]
+    print(f"\n{name}: normalised score (0 random, 100 expert)")
+    for label, value in rows:
+        print(f"  {label:<26}{value}")
+    print(f"  {'files':<26}{folder}")
+    return float(last["score"])
+
+
+def interval(row: dict[str, Any]) -> str:
+    """Format an evaluation's score with its interval over episodes."""
+    return f"{row['score']:6.1f}  [{row['score_low']:.1f}, {row['score_high']:.1f}]"
+
+
+if __name__ == "__main__":
+    main()

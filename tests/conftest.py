@@ -1,0 +1,127 @@
+"""What several test modules share: a seed, small networks and a transition batch."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torchrl.modules import (
+    MLP,
+    NormalParamExtractor,
+    ProbabilisticActor,
+    TanhNormal,
+    ValueOperator,
+)
+
+torch.set_num_threads(1)
+
+OBSERVATION_DIM, ACTION_DIM = 3, 2
+
+
+@pytest.fixture(autouse=True)
+def _seeded() -> None:
+    torch.manual_seed(0)
+
+
+@pytest.fixture
+def make_batch():
+    """Return a factory of random transitions, float64, any batch size.
+
+    Of every five rows one is terminated and one is cut by a time limit. The numbers
+    come from a generator of their own: equal sizes give equal batches.
+    """
+
+    def make(*size: int, twin: bool = True) -> TensorDict:
+        generator = torch.Generator().manual_seed(7)
+
+        def normal(dim: int) -> torch.Tensor:
+            return torch.randn(*size, dim, generator=generator, dtype=torch.float64)
+
+        row = torch.arange(size.numel() if hasattr(size, "numel") else _prod(size))
+        row = row.reshape(*size, 1) % 5
+        observation = normal(OBSERVATION_DIM)
+        batch = TensorDict(
+            {
+                "observation": observation,
+                "action": 0.9 * torch.tanh(normal(ACTION_DIM)),
+                "next": {
+                    "observation": observation + 0.5 * normal(OBSERVATION_DIM),
+                    "reward": normal(1),
+                    "done": (row == 1) | (row == 2),
+                    "terminated": row == 1,
+                },
+            },
+            size,
+        )
+        if twin:
+            batch["perturbed", "observation"] = observation + 0.1 * normal(
+                OBSERVATION_DIM
+            )
+        return batch
+
+    return make
+
+
+def _prod(size: tuple[int, ...]) -> int:
+    return torch.Size(size).numel()
+
+
+@pytest.fixture
+def make_networks():
+    """Return a factory of a small actor, critics and inverse dynamics model, float64.
+
+    Built from TorchRL alone, with any keys; equal seeds give equal weights.
+    """
+
+    def make(
+        *,
+        observation="observation",
+        action="action",
+        low: float = -1.0,
+        high: float = 1.0,
+        num_critics: int = 2,
+        seed: int = 0,
+        distribution_class: type = TanhNormal,
+    ) -> SimpleNamespace:
+        torch.manual_seed(seed)
+        kwargs = {"low": low, "high": high} if distribution_class is TanhNormal else {}
+
+        def probabilistic(*inputs) -> ProbabilisticActor:
+            network = TensorDictSequential(
+                TensorDictModule(
+                    MLP(len(inputs) * OBSERVATION_DIM, 2 * ACTION_DIM, num_cells=[8]),
+                    list(inputs),
+                    ["param"],
+                ),
+                TensorDictModule(NormalParamExtractor(), ["param"], ["loc", "scale"]),
+            )
+            return ProbabilisticActor(
+                network,
+                in_keys=["loc", "scale"],
+                out_keys=[action],
+                distribution_class=distribution_class,
+                distribution_kwargs=kwargs,
+            ).double()
+
+        return SimpleNamespace(
+            actor=probabilistic(observation),
+            critics=[
+                ValueOperator(
+                    MLP(OBSERVATION_DIM + ACTION_DIM, 1, num_cells=[8]),
+                    in_keys=[observation, action],
+                ).double()
+                for _ in range(num_critics)
+            ],
+            inverse_dynamics=probabilistic(
+                observation, torch_next(observation)
+            ),
+        )
+
+    return make
+
+
+def torch_next(key):
+    return ("next", *((key,) if isinstance(key, str) else key))

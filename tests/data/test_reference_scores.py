@@ -1,0 +1,31 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from torchrl_osr.data import REFERENCE_RETURNS, normalized_score
+
+
+def test_hand_computed_scores() -> None:
+    assert normalized_score("halfcheetah", 12135.0) == 100.0
+    assert normalized_score("halfcheetah", -280.178953) == 0.0
+    assert normalized_score("hopper", 3234.3) == 100.0
+    # 1.629008 + (4592.3 - 1.629008) / 2
+    assert normalized_score("walker2d", 2296.964504) == pytest.approx(50.0)
+
+
+@pytest.mark.parametrize("env_name", REFERENCE_RETURNS)
+def test_arrays_keep_their_shape(env_name: str) -> None:
+    returns = np.array([list(REFERENCE_RETURNS[env_name])], dtype=np.float32)
+    scores = normalized_score(env_name, returns)
+    assert scores.dtype == np.float64
+    np.testing.assert_allclose(scores, [[0.0, 100.0]], atol=1e-4)
+
+
+def test_a_number_gives_a_float() -> None:
+    assert type(normalized_score("hopper", 1.0)) is float
+
+
+def test_unknown_environment_lists_what_exists() -> None:
+    with pytest.raises(ValueError, match=r"'ant'.*halfcheetah, hopper, walker2d"):
+        normalized_score("ant", 1.0)

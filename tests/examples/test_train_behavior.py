@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from torchrl_osr.data import (
+    collect_transitions,
+    load_behavior_card,
+    load_behavior_policy,
+    make_environment,
+)
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("policies")
+    # A process of its own, as a user runs it: torchrl's collectors warn on import.
+    arguments = {
+        "env": "InvertedPendulum-v5",
+        "out": folder,
+        "steps": 192,
+        "random-steps": 96,
+        "eval-every": 96,
+        "eval-steps": 200,
+        "card-steps": 400,
+        "batch-size": 16,
+    }
+    options = [f"--{name}={value}" for name, value in arguments.items()]
+    script = str(ROOT / "examples" / "train_behavior.py")
+    completed = subprocess.run(
+        [sys.executable, script, *options],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert completed.returncode == 0, completed.stderr
+    return folder
+
+
+def test_card_lists_every_file(folder: Path) -> None:
+    card = load_behavior_card(folder)["invertedpendulum"]
+    files = {path.stem for path in (folder / "invertedpendulum").glob("*.npz")}
+    assert card["env"] == "InvertedPendulum-v5"
+    assert set(card["policies"]) == files
+    assert files == {"medium", "expert", *(f"replay_{n}" for n in range(1, 9))}
+    for entry in card["policies"].values():
+        assert entry["steps"] in (96, 192)
+        assert entry["stochastic_return"][0] > 0
+        assert entry["episodes"] > 0
+
+
+def test_saved_policies_load_and_play(folder: Path) -> None:
+    policy = load_behavior_policy("invertedpendulum", "replay_1", folder=folder)
+    with closing(make_environment("InvertedPendulum-v5")) as env:
+        data, returns, _ = collect_transitions(env, [policy.sample], 100)
+    assert data.shape == (100,)
+    assert returns.min() >= 0
+
+
+def test_nothing_else_is_written(folder: Path) -> None:
+    names = {path.name for path in folder.iterdir()}
+    assert names == {"card.json", "invertedpendulum"}

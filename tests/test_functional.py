@@ -1,0 +1,244 @@
+"""The equations against numbers from elsewhere, and the properties they promise."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torch.distributions import Normal, kl_divergence
+from torchrl.modules import TanhNormal
+from torchrl.objectives.value import TD0Estimator
+
+from torchrl_osr import functional
+
+# The pair of the golden numbers: inverse dynamics N(.4, .3), policy N(-.2, .5).
+INVERSE_DYNAMICS = (0.4, 0.3)
+POLICY = (-0.2, 0.5)
+# By hand: log(.5/.3) + (.09 + .36)/.5 - .5, and log(.3/.5) + (.25 + .36)/.18 - .5.
+FORWARD, REVERSE = 0.910826, 2.378063
+
+locations = st.floats(-3, 3)
+scales = st.floats(0.05, 3)
+
+
+def tensors(*numbers: float) -> list[torch.Tensor]:
+    return [torch.tensor([number], dtype=torch.float64) for number in numbers]
+
+
+@pytest.mark.parametrize(
+    ("direction", "expected"), [("forward", FORWARD), ("reverse", REVERSE)]
+)
+def test_state_recovery_matches_hand_computed_numbers(direction, expected) -> None:
+    value = functional.state_recovery(
+        *tensors(*POLICY, *INVERSE_DYNAMICS), direction=direction
+    )
+    assert value.item() == pytest.approx(expected, abs=1e-6)
+
+
+@given(locations, scales, locations, scales)
+@settings(deadline=None)
+def test_gaussian_kl_agrees_with_torch_and_is_not_negative(m_p, s_p, m_q, s_q) -> None:
+    m_p, s_p, m_q, s_q = tensors(m_p, s_p, m_q, s_q)
+    value = functional.gaussian_kl(m_p, s_p, m_q, s_q)
+    witness = kl_divergence(Normal(m_p, s_p), Normal(m_q, s_q))
+    torch.testing.assert_close(value, witness, rtol=1e-9, atol=1e-9)
+    assert value.item() >= -1e-15
+
+
+@given(locations, scales)
+@settings(deadline=None)
+def test_gaussian_kl_of_equals_is_exactly_zero(loc, scale) -> None:
+    loc, scale = tensors(loc, scale)
+    assert functional.gaussian_kl(loc, scale, loc, scale).item() == 0.0
+
+
+def test_gaussian_kl_agrees_with_monte_carlo() -> None:
+    p, q = (Normal(*tensors(*pair)) for pair in (INVERSE_DYNAMICS, POLICY))
+    sample = p.sample((400_000,))
+    ratio = p.log_prob(sample) - q.log_prob(sample)
+    error = 3 * ratio.std() / sample.numel() ** 0.5
+    assert abs(ratio.mean().item() - FORWARD) < error.item() < 0.01
+
+
+@pytest.mark.parametrize(("low", "high"), [(-1.0, 1.0), (-0.4, 2.0)])
+def test_squashing_both_leaves_the_divergence_unchanged(low, high) -> None:
+    # The log-determinants of the tanh-Gaussians are TorchRL's, not ours.
+    p, q = (
+        TanhNormal(*tensors(*pair), low=low, high=high)
+        for pair in (INVERSE_DYNAMICS, POLICY)
+    )
+    action, log_prob = p.sample_and_log_prob((400_000,))
+    ratio = log_prob - q.log_prob(action)
+    error = 3 * ratio.std() / log_prob.numel() ** 0.5
+    assert abs(ratio.mean().item() - FORWARD) < error.item() < 0.01
+
+
+@pytest.mark.parametrize("direction", ["forward", "reverse"])
+def test_state_recovery_adds_or_averages_action_dimensions(direction) -> None:
+    loc, other_loc = torch.randn(2, 5, 4, dtype=torch.float64)
+    scale, other_scale = torch.rand(2, 5, 4, dtype=torch.float64) + 0.1
+    arguments = (loc, scale, other_loc, other_scale)
+    columns = [
+        functional.state_recovery(
+            *(tensor[:, i : i + 1] for tensor in arguments), direction=direction
+        )
+        for i in range(4)
+    ]
+    total = functional.state_recovery(*arguments, direction=direction)
+    mean = functional.state_recovery(
+        *arguments, direction=direction, action_reduction="mean"
+    )
+    torch.testing.assert_close(total, torch.stack(columns).sum(0))
+    torch.testing.assert_close(mean, torch.stack(columns).mean(0))
+
+
+def test_state_recovery_gradients_match_the_closed_form() -> None:
+    loc, scale, other_loc, other_scale = tensors(*POLICY, *INVERSE_DYNAMICS)
+    loc.requires_grad_()
+    scale.requires_grad_()
+    functional.state_recovery(loc, scale, other_loc, other_scale).backward()
+    # d/dmu_pi = (mu_pi - mu_I)/s_pi^2 ; d/ds_pi = 1/s_pi - (s_I^2 + gap^2)/s_pi^3.
+    assert loc.grad.item() == pytest.approx(-0.6 / 0.25, abs=1e-10)
+    assert scale.grad.item() == pytest.approx(1 / 0.5 - 0.45 / 0.125, abs=1e-10)
+
+
+@pytest.mark.parametrize("direction", ["forward", "reverse"])
+def test_state_recovery_passes_gradcheck(direction) -> None:
+    inputs = torch.rand(4, 3, 2, dtype=torch.float64) + 0.2
+    inputs = [tensor.clone().requires_grad_() for tensor in inputs]
+    assert torch.autograd.gradcheck(
+        lambda *args: functional.state_recovery(*args, direction=direction), inputs
+    )
+
+
+# Inverse dynamics N(0, 1), policy N(.5, s): ours by hand is log s + 1.25/(2 s^2) - .5;
+# printed (12) has log(1/s), hence .625, -2.3, -6.91, -13.8, and wins by s -> infinity.
+@pytest.mark.parametrize(
+    ("scale", "expected"), [(1, 0.125), (10, 1.8088), (1e3, 6.40776), (1e6, 13.31551)]
+)
+def test_recovery_grows_with_the_policy_scale_unlike_printed_12(scale, expected) -> None:
+    value = functional.state_recovery(*tensors(0.5, scale, 0.0, 1.0)).item()
+    printed = math.log(1 / scale) + 1.25 / (2 * scale**2)
+    assert value == pytest.approx(expected, abs=1e-4)
+    assert value - printed == pytest.approx(2 * math.log(scale) - 0.5, abs=1e-9)
+
+
+# Three next states: mu_I = (-.5, .2, .9), s_I = (.2, .4, .1). Forward: the moments of
+# the mixture, mean .2 and variance .07 + .98/3. Reverse: precision weighting,
+# (25*-.5 + 6.25*.2 + 100*.9)/131.25 and (131.25/3)^-1/2.
+@pytest.mark.parametrize(
+    ("direction", "loc", "scale"),
+    [("forward", 0.2, 0.629815), ("reverse", 0.6, 0.151186)],
+)
+def test_recovery_alone_has_the_known_fixed_point(direction, loc, scale) -> None:
+    target = torch.tensor([[-0.5, 0.2, 0.9], [0.2, 0.4, 0.1]], dtype=torch.float64)
+    policy = [tensor.requires_grad_() for tensor in tensors(0.0, 0.0)]
+    optimizer = torch.optim.LBFGS(
+        policy, max_iter=200, tolerance_grad=1e-12, tolerance_change=1e-14,
+        line_search_fn="strong_wolfe",
+    )
+
+    def closure() -> torch.Tensor:
+        optimizer.zero_grad()
+        pi = (policy[0].expand(3, 1), policy[1].exp().expand(3, 1))
+        value = functional.state_recovery(*pi, *target[..., None], direction=direction)
+        value.sum().backward()
+        return value.sum()
+
+    optimizer.step(closure)
+    assert policy[0].item() == pytest.approx(loc, abs=1e-5)
+    assert policy[1].exp().item() == pytest.approx(scale, abs=1e-5)
+
+
+def test_equations_7_and_11_differ_by_the_mutual_information() -> None:
+    # a ~ N(-.3, .4^2), s' = .5 a + N(0, .1^2): I(a | s') has gain .08/.05 = 1.6 and
+    # variance .16 * .01/.05 = .032; its mean over s' varies by 1.6^2 * .05 = .128.
+    # Hence I(a; s') = log(.16/.032)/2. Two points at +-1 sd integrate a quadratic.
+    inverse_dynamics_loc = torch.tensor([[-1.0], [1.0]], dtype=torch.float64)
+    inverse_dynamics_loc = -0.3 + 0.128**0.5 * inverse_dynamics_loc
+    inverse_dynamics_scale = torch.full_like(inverse_dynamics_loc, 0.032**0.5)
+    for loc, scale in [(-0.3, 0.4), (0.0, 1.0), (1.3, 0.2), (-2.0, 0.7)]:
+        pi = [tensor.expand(2, 1) for tensor in tensors(loc, scale)]
+        each = functional.state_recovery(
+            *pi, inverse_dynamics_loc, inverse_dynamics_scale
+        ).mean()
+        marginal = functional.gaussian_kl(*tensors(-0.3, 0.4, loc, scale))
+        assert (each - marginal).item() == pytest.approx(math.log(5) / 2, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("direction", "backward"), ("action_reduction", "max")]
+)
+def test_state_recovery_rejects_unknown_options(option, value) -> None:
+    with pytest.raises(ValueError, match=f"{option} must be .* got '{value}'"):
+        functional.state_recovery(*tensors(0, 1, 0, 1), **{option: value})
+
+
+def test_policy_value_takes_the_smallest_critic_and_seeks_high_values() -> None:
+    qvalue = torch.tensor([[1.0, 5.0], [2.0, 3.0]])
+    value = functional.soft_policy_value(torch.tensor([0.5, -1.0]), qvalue, 0.2)
+    # By hand: .2 * .5 - 1 and .2 * -1 - 3.
+    torch.testing.assert_close(value, torch.tensor([-0.9, -3.2]))
+
+
+def test_temperature_rises_when_the_policy_has_too_little_entropy() -> None:
+    log_alpha = torch.tensor(0.3, requires_grad=True)
+    log_prob = torch.tensor([1.0, 4.0], requires_grad=True)
+    value = functional.temperature_objective(log_alpha, log_prob, -2.0)
+    torch.testing.assert_close(value, torch.tensor([0.3, -0.6]))  # -.3 * (-1, 2)
+    value.mean().backward()
+    assert log_alpha.grad.item() == pytest.approx(-0.5)
+    assert log_prob.grad is None
+
+
+@pytest.mark.parametrize("temperature", [0.5, 1.0, 3.0])
+def test_conservative_gap_at_zero_values_is_a_constant(temperature) -> None:
+    # K = 10, A = 3, all 30 densities those of the cube of side 2: tau log(30 8^1/tau).
+    log_prob = torch.full((4, 30), -3 * math.log(2), dtype=torch.float64)
+    zero = torch.zeros_like(log_prob)
+    gap = functional.conservative_gap(
+        zero, log_prob, zero[:, 0], temperature=temperature
+    )
+    expected = temperature * math.log(30) + 3 * math.log(2)
+    torch.testing.assert_close(gap, torch.full_like(gap, expected))
+
+
+def test_conservative_gap_matches_a_plain_sum() -> None:
+    sampled, log_prob = torch.randn(2, 5, 6, dtype=torch.float64)
+    data = torch.randn(5, dtype=torch.float64)
+    gap = functional.conservative_gap(sampled, log_prob, data, temperature=2.0)
+    for i in range(5):
+        total = sum(
+            math.exp((q - p) / 2)
+            for q, p in zip(sampled[i].tolist(), log_prob[i].tolist(), strict=True)
+        )
+        assert gap[i].item() == pytest.approx(2 * math.log(total) - data[i].item())
+
+
+def test_target_ignores_the_value_of_a_terminated_state_even_nan() -> None:
+    reward = torch.tensor([1.0, 2.0], requires_grad=True)
+    next_qvalue = torch.tensor([[10.0, math.nan], [8.0, math.inf]])
+    terminated = torch.tensor([False, True])
+    target = functional.td_target(reward, terminated, next_qvalue, 0.5)
+    torch.testing.assert_close(target, torch.tensor([5.0, 2.0]))
+    target.sum().backward()
+    assert reward.grad.tolist() == [1.0, 1.0]
+
+
+def test_target_equals_torchrls_one_step_estimator(make_batch) -> None:
+    batch = make_batch(10)
+    next_qvalue = torch.randn(3, 10, dtype=torch.float64)
+    flat = batch["next"].apply(lambda tensor: tensor.squeeze(-1))
+    target = functional.td_target(
+        flat["reward"], flat["terminated"], next_qvalue, 0.97
+    )
+    next_value = next_qvalue.min(0).values.unsqueeze(-1)
+    batch["next", "state_value"] = next_value
+    witness = TD0Estimator(gamma=0.97, value_network=None).value_estimate(
+        TensorDict(batch, [10])
+    )
+    torch.testing.assert_close(target, witness.squeeze(-1), rtol=1e-7, atol=1e-7)

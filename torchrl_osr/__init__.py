@@ -1,0 +1,12 @@
+"""Out-of-sample State Recovery for offline reinforcement learning, on TorchRL.
+
+"Recovering from Out-of-sample States via Inverse Dynamics in Offline Reinforcement
+Learning" (Jiang et al., NeurIPS 2023), https://openreview.net/forum?id=4gLWjSaw4o
+"""
+
+from torchrl_osr.objectives import InverseDynamicsLoss, OSRLoss
+from torchrl_osr.transforms import StatePerturbation
+
+__version__ = "0.1.0"
+
+__all__ = ["InverseDynamicsLoss", "OSRLoss", "StatePerturbation", "__version__"]

@@ -1,0 +1,261 @@
+"""Local data sets with a cache: rolled out once, checked and read ever after.
+
+One folder a data set, ``data.npz`` (plain arrays) and ``manifest.json``. The manifest
+says what the data were made from and how well they did; a folder whose manifest or
+checksum does not fit is made anew, never trusted.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from filelock import FileLock
+from tensordict import TensorDict
+from torchrl import torchrl_logger
+
+from torchrl_osr.data.behavior import behavior_policy_path
+from torchrl_osr.data.collection import Collection
+from torchrl_osr.data.environment import environment_id
+from torchrl_osr.data.levels import collect_level, level_policies
+from torchrl_osr.data.reference_scores import normalized_score
+from torchrl_osr.data.validation import DATASET_KEYS, check_dataset
+
+try:
+    import platformdirs
+except ImportError as error:
+    raise ImportError(
+        f"local data sets need {error.name!r}: pip install torchrl-osr[examples]"
+    ) from error
+
+CACHE_VARIABLE = "TORCHRL_OSR_CACHE"
+"""Environment variable that moves the cache folder."""
+
+# Raise it whenever the recipe or the layout changes: older folders are then re-made.
+FORMAT_VERSION = 1
+
+# Other versions of these give other data for the same seed.
+DATA_PACKAGES = ("numpy", "gymnasium", "mujoco")
+
+
+def load_local_dataset(
+    env_name: str,
+    level: str,
+    *,
+    num_transitions: int,
+    seed: int = 0,
+    cache_dir: Path | str | None = None,
+    progress: bool = True,
+) -> tuple[TensorDict, dict[str, Any]]:
+    """Load a data set rolled out on this machine, collecting it on first use.
+
+    About 10,000 transitions a second are collected; a set of a million takes one or
+    two minutes once. Processes that ask for the same set at once wait for one of them
+    to collect it. The same seed gives the same data on one machine and one set of
+    library versions, not across machines: contact dynamics are chaotic.
+
+    Args:
+        env_name: ``"hopper"``, ``"walker2d"`` or ``"halfcheetah"`` (Gymnasium v5).
+        level: ``"random"``, ``"medium"``, ``"medium-replay"``, ``"medium-expert"`` or
+            ``"expert"``.
+
+    Keyword Args:
+        num_transitions: exact number of transitions ``N``.
+        seed: non-negative seed. Default: 0.
+        cache_dir: cache folder. Default: the environment variable
+            ``TORCHRL_OSR_CACHE``, else the user's cache folder for ``torchrl-osr``.
+        progress: show a progress bar when on a terminal. Default: ``True``.
+
+    Returns:
+        The transitions ``[N]``, see :func:`~torchrl_osr.data.check_dataset` for their
+        keys, and the manifest.
+
+    Raises:
+        ValueError: unknown environment or level.
+        OSError: the cache folder cannot be written.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_osr.data import load_local_dataset
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     data, manifest = load_local_dataset(
+        ...         "hopper", "random", num_transitions=500, cache_dir=folder
+        ...     )
+        >>> len(data), manifest["env_id"]
+        (500, 'Hopper-v5')
+    """
+    request = _request(env_name, level, num_transitions, seed)
+    folder = _cache_root(cache_dir) / (
+        f"{env_name}-{level}-{num_transitions}-seed{seed}"
+    )
+    # Without the lock first: a whole set can be read from a folder that is read-only.
+    with suppress(OSError, ValueError):
+        return _read(folder, request)
+    with _locked(folder):
+        try:
+            # Another process may have made it while this one waited for the lock.
+            return _read(folder, request)
+        except (OSError, ValueError) as flaw:
+            if folder.exists():
+                torchrl_logger.warning(f"Collecting {folder} anew: {flaw}.")
+        collection = collect_level(
+            env_name, level, num_transitions, seed=seed, progress=progress
+        )
+        check_dataset(collection.data)
+        with _explained_write_errors(folder):
+            _write(folder, request, collection)
+        return _read(folder, request)
+
+
+def _cache_root(cache_dir: Path | str | None) -> Path:
+    root = cache_dir or os.environ.get(CACHE_VARIABLE)
+    return Path(root or platformdirs.user_cache_dir("torchrl-osr")) / "local"
+
+
+def _request(
+    env_name: str, level: str, num_transitions: int, seed: int
+) -> dict[str, Any]:
+    """Return the part of the manifest that decides what the data are."""
+    try:
+        versions = {package: version(package) for package in DATA_PACKAGES}
+    except PackageNotFoundError as error:
+        raise ImportError(
+            f"collecting data needs {error.name!r}: pip install torchrl-osr[examples]"
+        ) from error
+    return {
+        "format_version": FORMAT_VERSION,
+        "env_name": env_name,
+        "env_id": environment_id(env_name),
+        "level": level,
+        "num_transitions": num_transitions,
+        "seed": seed,
+        "behavior_sha256": {
+            name: _sha256(behavior_policy_path(env_name, name))
+            for name in level_policies(level)
+        },
+        "versions": versions,
+    }
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    lock = FileLock(f"{folder}.lock")
+    with _explained_write_errors(folder):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        lock.acquire()
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _read(folder: Path, request: dict[str, Any]) -> tuple[TensorDict, dict[str, Any]]:
+    """Return a cached set; raise OSError or ValueError, with the reason, if unfit."""
+    manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+    if not isinstance(manifest, dict):
+        raise ValueError("its manifest.json is not an object")
+    for key, wanted in request.items():
+        if manifest.get(key) != wanted:
+            raise ValueError(f"its {key} is {manifest.get(key)!r}, wanted {wanted!r}")
+    # Hash and parse the same bytes: the folder may be replaced at any moment.
+    content = (folder / "data.npz").read_bytes()
+    if hashlib.sha256(content).hexdigest() != manifest.get("data_sha256"):
+        raise ValueError("the checksum of its data.npz is wrong")
+    data = TensorDict({}, batch_size=[manifest["num_transitions"]])
+    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+        for key in DATASET_KEYS:
+            data.set(key, torch.from_numpy(arrays[_array_name(key)]))
+    return data, manifest
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _array_name(key: str | tuple[str, ...]) -> str:
+    return key if isinstance(key, str) else "/".join(key)
+
+
+def _write(folder: Path, request: dict[str, Any], collection: Collection) -> None:
+    """Write beside the target and rename: a reader sees a whole folder or none."""
+    fresh = folder.with_name(f".{folder.name}.new")
+    stale = folder.with_name(f".{folder.name}.old")
+    try:
+        # Left by a process that was killed; the lock is held, so nobody uses them.
+        for leftover in (fresh, stale):
+            shutil.rmtree(leftover, ignore_errors=True)
+        fresh.mkdir()
+        arrays = {_array_name(key): collection.data[key] for key in DATASET_KEYS}
+        with (fresh / "data.npz").open("wb") as file:
+            np.savez(file, **{name: array.numpy() for name, array in arrays.items()})
+            _sync(file)
+        manifest = request | _statistics(request["env_name"], collection)
+        manifest["data_sha256"] = _sha256(fresh / "data.npz")
+        with (fresh / "manifest.json").open("w", encoding="utf-8") as file:
+            json.dump(manifest, file, indent=1)
+            _sync(file)
+        if folder.exists():
+            os.replace(folder, stale)
+        os.replace(fresh, folder)
+    finally:
+        for leftover in (fresh, stale):
+            shutil.rmtree(leftover, ignore_errors=True)
+
+
+def _sync(file: Any) -> None:
+    file.flush()
+    os.fsync(file.fileno())
+
+
+def _statistics(env_name: str, collection: Collection) -> dict[str, Any]:
+    returns, lengths = collection.episode_returns, collection.episode_lengths
+    return {
+        "torchrl_osr_version": _own_version(),
+        "num_complete_episodes": len(returns),
+        "return": _summary(returns),
+        "episode_length": _summary(lengths),
+        "normalized_score": (
+            normalized_score(env_name, float(returns.mean())) if len(returns) else None
+        ),
+        "episode_returns": returns.tolist(),
+        "episode_lengths": lengths.tolist(),
+    }
+
+
+def _own_version() -> str:
+    try:
+        return version("torchrl-osr")
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def _summary(values: np.ndarray[Any, Any]) -> dict[str, float] | None:
+    """Return mean, std, min and max; ``None`` if no episode was completed."""
+    if not len(values):
+        return None
+    names = ("mean", "std", "min", "max")
+    return {name: float(getattr(values, name)()) for name in names}
+
+
+@contextmanager
+def _explained_write_errors(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        # errno picks the subclass, so that PermissionError stays one.
+        raise OSError(
+            error.errno,
+            f"cannot write the data set ({error.strerror}); free space, or choose "
+            f"another folder with {CACHE_VARIABLE}=/path or cache_dir=",
+            str(folder),
+        ) from error

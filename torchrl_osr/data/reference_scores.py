@@ -1,0 +1,75 @@
+"""D4RL reference returns, and scores normalised by them.
+
+A normalised score is 0 for the return of D4RL's uniformly random policy and 100 for
+the return of its expert. The constants are those of ``d4rl/infos.py`` in
+https://github.com/Farama-Foundation/D4RL.
+
+They were measured on the v2 tasks of the old ``mujoco-py``. On Gymnasium's v5 tasks
+they are a common scale, not the same task: do not put the two in one column.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class ReferenceReturns(NamedTuple):
+    """Mean undiscounted episode returns of D4RL's random and expert policies."""
+
+    random: float
+    expert: float
+
+
+REFERENCE_RETURNS: dict[str, ReferenceReturns] = {
+    "hopper": ReferenceReturns(random=-20.272305, expert=3234.3),
+    "halfcheetah": ReferenceReturns(random=-280.178953, expert=12135.0),
+    "walker2d": ReferenceReturns(random=1.629008, expert=4592.3),
+}
+"""Reference returns by short environment name."""
+
+
+@overload
+def normalized_score(env_name: str, episode_return: float) -> float: ...
+
+
+@overload
+def normalized_score(
+    env_name: str, episode_return: NDArray[np.floating]
+) -> NDArray[np.float64]: ...
+
+
+def normalized_score(
+    env_name: str, episode_return: float | NDArray[np.floating]
+) -> float | NDArray[np.float64]:
+    r"""Express episode returns as D4RL-normalised scores, in percent.
+
+    .. math::
+        100 \cdot \frac{R - R_{random}}{R_{expert} - R_{random}}
+
+    Args:
+        env_name: short environment name, such as ``"hopper"``.
+        episode_return: undiscounted return(s) of complete episodes, a number or an
+            array of any shape.
+
+    Returns:
+        A float for a number, a float64 array of the same shape for an array.
+
+    Raises:
+        ValueError: there are no reference returns for the environment.
+
+    Examples:
+        >>> from torchrl_osr.data import normalized_score
+        >>> normalized_score("halfcheetah", 12135.0)
+        100.0
+    """
+    if env_name not in REFERENCE_RETURNS:
+        raise ValueError(
+            f"no reference returns for environment {env_name!r}; there are for: "
+            f"{', '.join(sorted(REFERENCE_RETURNS))}."
+        )
+    low, high = REFERENCE_RETURNS[env_name]
+    score = 100.0 * (np.asarray(episode_return, dtype=np.float64) - low) / (high - low)
+    return float(score) if np.ndim(episode_return) == 0 else score

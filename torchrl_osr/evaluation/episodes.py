@@ -1,0 +1,158 @@
+"""Complete episodes of a policy, many at once, and the raw return of each.
+
+Shapes: ``E`` episodes, ``S`` observation, ``A`` action.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict
+from tensordict.nn import ProbabilisticTensorDictSequential
+from torch import Tensor
+from torchrl.envs import ObservationNorm
+
+from torchrl_osr.data import make_environment, normalized_score
+from torchrl_osr.evaluation.statistics import mean_interval
+
+Policy = Callable[[Tensor], Tensor]
+"""Maps observations ``[E, S]`` as the environment gives them to actions ``[E, A]``."""
+
+
+@dataclass(frozen=True)
+class EpisodeResults:
+    """What came out of an evaluation, one entry an episode, in the order of the seeds.
+
+    Attributes:
+        returns: undiscounted sum of rewards, ``[E]``.
+        lengths: steps until the end, ``[E]``.
+        seeds: what ``env.reset`` was seeded with, ``[E]``.
+    """
+
+    returns: NDArray[np.float64]
+    lengths: NDArray[np.int64]
+    seeds: NDArray[np.int64]
+
+
+def deterministic_policy(
+    actor_network: ProbabilisticTensorDictSequential,
+    observation_norm: ObservationNorm | None = None,
+) -> Policy:
+    """Return the actor's deterministic action as a function of raw observations.
+
+    Args:
+        actor_network: reads ``"observation"``, ends in a
+            :class:`~torchrl.modules.TanhNormal`.
+        observation_norm: how the training data were standardised
+            (``standard_normal=True``). Default: not at all.
+    """
+
+    @torch.no_grad()
+    def policy(observation: Tensor) -> Tensor:
+        if observation_norm is not None:
+            observation = (observation - observation_norm.loc) / observation_norm.scale
+        batch = TensorDict({"observation": observation}, [len(observation)])
+        action: Tensor = actor_network.get_dist(batch).deterministic_sample
+        return action
+
+    return policy
+
+
+class EpisodeEvaluator:
+    """Runs one episode for each of a fixed list of seeds, to its end.
+
+    The environments step together, so that the policy is called once a step for all
+    unfinished episodes; they are kept from one evaluation to the next. Neither torch's
+    nor NumPy's global generator is touched.
+
+    Args:
+        env_id: a Gymnasium id, ``"Hopper-v5"`` for instance.
+
+    Keyword Args:
+        num_episodes: ``E``. Default 10.
+        seed: the episodes are seeded ``seed, seed + 1, ...``. Default 0.
+        device: where the policy is. Default CPU.
+
+    Examples:
+        >>> import torch
+        >>> evaluator = EpisodeEvaluator("Hopper-v5", num_episodes=2)
+        >>> results = evaluator(lambda observation: torch.zeros(len(observation), 3))
+        >>> results.lengths.shape
+        (2,)
+    """
+
+    def __init__(
+        self,
+        env_id: str,
+        *,
+        num_episodes: int = 10,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        if num_episodes < 1:
+            raise ValueError(f"num_episodes must be at least 1, got {num_episodes}.")
+        self.environments = [make_environment(env_id) for _ in range(num_episodes)]
+        self.seeds = seed + np.arange(num_episodes)
+        self.device = device
+
+    def __call__(self, policy: Policy) -> EpisodeResults:
+        """Return the raw results of one episode a seed."""
+        episodes = len(self.environments)
+        returns = np.zeros(episodes)
+        lengths = np.zeros(episodes, dtype=np.int64)
+        observations = np.stack(
+            [
+                environment.reset(seed=int(seed))[0]
+                for environment, seed in zip(self.environments, self.seeds, strict=True)
+            ]
+        ).astype(np.float32)
+        running = np.arange(episodes)
+        while running.size:
+            batch = torch.from_numpy(observations[running]).to(self.device)
+            actions = policy(batch).cpu().numpy()
+            unfinished = np.ones(running.size, dtype=bool)
+            for row, episode in enumerate(running):
+                observation, reward, terminated, truncated, _ = self.environments[
+                    episode
+                ].step(actions[row])
+                observations[episode] = observation
+                returns[episode] += float(reward)
+                lengths[episode] += 1
+                unfinished[row] = not (terminated or truncated)
+            running = running[unfinished]
+        return EpisodeResults(returns, lengths, self.seeds)
+
+    def close(self) -> None:
+        """Close the environments."""
+        for environment in self.environments:
+            environment.close()
+
+
+def summarize(results: EpisodeResults, env_name: str) -> dict[str, Any]:
+    """Return normalised score, its interval and the raw results, JSON-compatible.
+
+    Args:
+        results: raw results of ``E`` episodes.
+        env_name: short name with reference returns, ``"hopper"`` for instance.
+
+    Returns:
+        ``"score"`` with its 95 % bootstrap interval ``"score_low"``, ``"score_high"``
+        over the episodes, ``"return"`` (mean), ``"length"`` (mean), and the lists
+        ``"returns"``, ``"lengths"`` and ``"seeds"``.
+    """
+    score, low, high = mean_interval(normalized_score(env_name, results.returns))
+    return {
+        "score": score,
+        "score_low": low,
+        "score_high": high,
+        "return": float(results.returns.mean()),
+        "length": float(results.lengths.mean()),
+        "returns": results.returns.tolist(),
+        "lengths": results.lengths.tolist(),
+        "seeds": results.seeds.tolist(),
+    }

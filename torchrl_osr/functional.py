@@ -1,0 +1,207 @@
+"""The paper's equations as pure tensor functions.
+
+"Recovering from Out-of-sample States via Inverse Dynamics in Offline Reinforcement
+Learning" (Jiang et al., NeurIPS 2023), https://openreview.net/forum?id=4gLWjSaw4o
+
+Shapes: ``B`` batch (any leading dimensions), ``A`` action, ``N`` critics, ``M``
+sampled actions of one state. Every function returns one number a sample; the
+loss modules weigh and reduce. Where the printed paper and this file differ, the
+line says so and why.
+
+Symbols: ``pi`` policy, ``I`` inverse dynamics model, ``s`` clean state, ``s^``
+perturbed state, ``s~`` a state of the mixed data set (clean and perturbed).
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+
+def gaussian_kl(
+    loc_p: Tensor, scale_p: Tensor, loc_q: Tensor, scale_q: Tensor
+) -> Tensor:
+    r"""Return :math:`KL(p \,\|\, q)` of diagonal Gaussians, one number a dimension.
+
+    .. math::
+        \log\frac{\sigma_q}{\sigma_p}
+        + \frac{\sigma_p^2 + (\mu_p - \mu_q)^2}{2\sigma_q^2} - \frac12
+
+    It is also the divergence of the two *tanh*-Gaussians with these pre-tanh
+    parameters and equal bounds, because a bijection leaves the KL unchanged.
+
+    Args:
+        loc_p, scale_p: mean and standard deviation of ``p``, ``[B, A]``.
+        loc_q, scale_q: mean and standard deviation of ``q``, ``[B, A]``.
+
+    Returns:
+        ``[B, A]``, each entry at least 0.
+
+    Examples:
+        >>> p, q = torch.tensor([0.4]), torch.tensor([-0.2])
+        >>> kl = gaussian_kl(p, torch.tensor([0.3]), q, torch.tensor([0.5]))
+        >>> round(kl.item(), 6)
+        0.910826
+    """
+    variance_ratio = (scale_p / scale_q).square()
+    # log(x) / 2 of the squared ratio: one logarithm, and exactly 0 for p == q.
+    return 0.5 * (
+        variance_ratio + ((loc_p - loc_q) / scale_q).square() - 1 - variance_ratio.log()
+    )
+
+
+def state_recovery(
+    policy_loc: Tensor,
+    policy_scale: Tensor,
+    inverse_dynamics_loc: Tensor,
+    inverse_dynamics_scale: Tensor,
+    *,
+    direction: Literal["forward", "reverse"] = "forward",
+    action_reduction: Literal["sum", "mean"] = "sum",
+) -> Tensor:
+    r"""Return the state-recovery term :math:`L_{sr}`, equations (11) and (12).
+
+    .. math::
+        KL\big(I(a \mid \tilde s, s') \,\|\, \pi(a \mid \tilde s)\big)
+
+    The paper prints (12) with :math:`\log(\sigma_I / \sigma_\pi)`, which falls
+    without bound as :math:`\sigma_\pi` grows, and without the constant -1/2.
+    Implemented is the divergence of (11), with :math:`\log(\sigma_\pi / \sigma_I)`.
+
+    Args:
+        policy_loc, policy_scale: pre-tanh policy at ``s~``, ``[B, A]``.
+        inverse_dynamics_loc, inverse_dynamics_scale: pre-tanh inverse dynamics
+            model at ``(s~, s')``, ``[B, A]``.
+        direction: ``"forward"`` is the paper's ``KL(I || pi)``, ``"reverse"`` the
+            ``KL(pi || I)`` of the authors' released code.
+        action_reduction: ``"sum"`` over action dimensions as in (12), ``"mean"`` as
+            in the released code.
+
+    Returns:
+        ``[B]``.
+    """
+    policy = (policy_loc, policy_scale)
+    inverse_dynamics = (inverse_dynamics_loc, inverse_dynamics_scale)
+    if direction == "forward":
+        divergence = gaussian_kl(*inverse_dynamics, *policy)
+    elif direction == "reverse":
+        divergence = gaussian_kl(*policy, *inverse_dynamics)
+    else:
+        raise ValueError(
+            f"direction must be 'forward' or 'reverse', got {direction!r}."
+        )
+    if action_reduction == "sum":
+        return divergence.sum(-1)
+    if action_reduction == "mean":
+        return divergence.mean(-1)
+    raise ValueError(
+        f"action_reduction must be 'sum' or 'mean', got {action_reduction!r}."
+    )
+
+
+def soft_policy_value(
+    log_prob: Tensor, qvalue: Tensor, alpha: Tensor | float
+) -> Tensor:
+    r"""Return the policy's objective to be minimised, section 4.4.
+
+    .. math::
+        \alpha_e \log\pi(\hat a \mid \tilde s) - \min_i Q_i(\tilde s, \hat a)
+
+    The paper prints :math:`+Q` in an objective to be minimised, which would seek
+    the worst action; the entropy term is not printed but is in the authors' code
+    (and in CQL, on which the method stands).
+
+    Args:
+        log_prob: log-density of the sampled action, ``[B]``.
+        qvalue: values of that action, ``[N, B]``.
+        alpha: entropy temperature, a scalar.
+
+    Returns:
+        ``[B]``.
+    """
+    return alpha * log_prob - qvalue.min(0).values
+
+
+def temperature_objective(
+    log_alpha: Tensor, log_prob: Tensor, target_entropy: float
+) -> Tensor:
+    r"""Return SAC's objective for the entropy temperature, linear in its logarithm.
+
+    .. math::
+        -\log\alpha_e \, \big(\log\pi(\hat a \mid \tilde s) + \bar{\mathcal H}\big)
+
+    Args:
+        log_alpha: logarithm of the temperature, a scalar.
+        log_prob: log-density of the policy's own action, ``[B]``; treated as constant.
+        target_entropy: the entropy the policy should keep, in nats.
+
+    Returns:
+        ``[B]``.
+    """
+    return -log_alpha * (log_prob.detach() + target_entropy)
+
+
+def conservative_gap(
+    sampled_qvalue: Tensor,
+    sampled_log_prob: Tensor,
+    data_qvalue: Tensor,
+    *,
+    temperature: float = 1.0,
+) -> Tensor:
+    r"""Return the CQL(H) regulariser with importance-weighted actions.
+
+    .. math::
+        \tau \log \sum_{j=1}^{M} \exp\!\big((Q(s, a_j) - \log p(a_j)) / \tau\big)
+        - Q(s, a)
+
+    with ``M = 3K`` actions: uniform, from ``pi(s)`` and from ``pi(s')``, *all scored
+    at* ``s`` and all in one log-sum-exp ("Conservative Q-Learning", Kumar et al.
+    2020, appendix F, https://arxiv.org/abs/2006.04779). The paper prints the simpler
+    (3); its authors' code, like the reference CQL code, computes this. As there, the
+    sum is not divided by ``M``: a constant, without effect on the gradient.
+
+    TorchRL 0.14.1 ``CQLLoss`` differs: it takes the log-sum-exp over three actions at
+    a time and scores the actions of ``pi(s')`` at ``s'``.
+
+    Args:
+        sampled_qvalue: values of the sampled actions at ``s``, ``[B, M]``.
+        sampled_log_prob: log-density of each action under what drew it, ``[B, M]``.
+        data_qvalue: value of the data's action, ``[B]``.
+        temperature: :math:`\tau`, in units of the value.
+
+    Returns:
+        ``[B]``.
+    """
+    logits = (sampled_qvalue - sampled_log_prob) / temperature
+    return temperature * torch.logsumexp(logits, -1) - data_qvalue
+
+
+def td_target(
+    reward: Tensor, terminated: Tensor, next_qvalue: Tensor, gamma: float | Tensor
+) -> Tensor:
+    r"""Return the one-step target of equation (2) with the pessimistic ensemble value.
+
+    .. math::
+        r + \gamma\,(1 - \text{terminated})\,\min_i \bar Q_i(s', a'),
+        \quad a' \sim \pi(s')
+
+    ``terminated``, not ``done``: a time-out cuts the recording, not the task. A value
+    at a terminated ``s'`` is ignored even when it is not finite.
+
+    ``OSRLoss`` reaches the same number through the value estimator that its user
+    chose with ``make_value_estimator``; this is its default, TD(0), spelled out.
+
+    Args:
+        reward: ``[B]``.
+        terminated: bool, ``[B]``.
+        next_qvalue: target networks' values of the policy's action at ``s'``,
+            ``[N, B]``.
+        gamma: discount factor.
+
+    Returns:
+        ``[B]``.
+    """
+    next_value = next_qvalue.min(0).values
+    return reward + gamma * torch.where(terminated, 0.0, next_value)

@@ -1,0 +1,64 @@
+"""The policy: a tanh-Gaussian actor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal
+
+MIN_SCALE = 1e-2
+"""Smallest standard deviation before the tanh, of policy and inverse dynamics alike.
+
+The forward KL divides by the policy's variance: without a floor one confident,
+wrong state owns the whole gradient.
+"""
+
+
+def tanh_gaussian_actor(
+    observation_dim: int,
+    action_dim: int,
+    *,
+    num_cells: Sequence[int] = (256, 256),
+    activation_class: type[nn.Module] = nn.ReLU,
+    low: float | Tensor = -1.0,
+    high: float | Tensor = 1.0,
+) -> ProbabilisticActor:
+    """Return a tanh-Gaussian actor that reads ``"observation"``.
+
+    Args:
+        observation_dim: size of the observation, ``S``.
+        action_dim: size of the action, ``A``.
+        num_cells: width of each hidden layer.
+        activation_class: activation between the layers.
+        low, high: action bounds, a number or ``[A]``.
+
+    Returns:
+        An actor that writes ``"loc"``, ``"scale"`` (before the tanh) and ``"action"``,
+        each ``[B, A]``, and ``"action_log_prob"``, ``[B]``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> actor = tanh_gaussian_actor(11, 3, num_cells=[32])
+        >>> actor(TensorDict({"observation": torch.zeros(4, 11)}, [4]))["action"].shape
+        torch.Size([4, 3])
+    """
+    network = nn.Sequential(
+        MLP(
+            in_features=observation_dim,
+            out_features=2 * action_dim,
+            num_cells=list(num_cells),
+            activation_class=activation_class,
+        ),
+        NormalParamExtractor(scale_lb=MIN_SCALE),
+    )
+    return ProbabilisticActor(
+        TensorDictModule(network, ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        out_keys=["action"],
+        distribution_class=TanhNormal,
+        distribution_kwargs={"low": low, "high": high},
+        return_log_prob=True,
+    )

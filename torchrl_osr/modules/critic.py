@@ -1,0 +1,54 @@
+"""The critics: an ensemble of Q networks, each with its own initialisation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import nn
+from torchrl.modules import MLP, ValueOperator
+
+
+def critic_ensemble(
+    observation_dim: int,
+    action_dim: int,
+    *,
+    num_qvalue_nets: int = 2,
+    num_cells: Sequence[int] = (256, 256),
+    activation_class: type[nn.Module] = nn.ReLU,
+) -> list[ValueOperator]:
+    """Return Q networks that read ``"observation"`` and ``"action"``.
+
+    A list, not one network to be copied by the loss: TorchRL 0.14.1 re-draws copies
+    uniformly between the smallest and the largest weight, which is another
+    distribution than the one the layers were initialised from.
+
+    Args:
+        observation_dim: size of the observation, ``S``.
+        action_dim: size of the action, ``A``.
+        num_qvalue_nets: number of critics, ``N``.
+        num_cells: width of each hidden layer.
+        activation_class: activation between the layers.
+
+    Returns:
+        ``N`` modules that write ``"state_action_value"``, ``[B, 1]``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> batch = {"observation": torch.zeros(4, 11), "action": torch.zeros(4, 3)}
+        >>> critic, _ = critic_ensemble(11, 3, num_cells=[32])
+        >>> critic(TensorDict(batch, [4]))["state_action_value"].shape
+        torch.Size([4, 1])
+    """
+    return [
+        ValueOperator(
+            MLP(
+                in_features=observation_dim + action_dim,
+                out_features=1,
+                num_cells=list(num_cells),
+                activation_class=activation_class,
+            ),
+            in_keys=["observation", "action"],
+        )
+        for _ in range(num_qvalue_nets)
+    ]

@@ -1,0 +1,312 @@
+"""What the recovery losses share: an actor, an ensemble of critics, a temperature.
+
+Shapes: ``B`` batch (any leading dimensions), ``A`` action, ``N`` critics, ``D`` state
+sets of D_tot (2: clean and perturbed; 1 where nothing recovers). The state sets are
+always stacked as ``[s, s', s^]``: rows ``[:2]`` are the true states, ``[::2]`` D_tot.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictParams,
+)
+from torch import Tensor
+from torchrl.modules import TanhNormal
+from torchrl.modules.distributions.utils import rsample_and_log_prob
+from torchrl.objectives import LossModule, ValueEstimators, distance_loss
+from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
+
+from torchrl_osr import functional
+from torchrl_osr.objectives.distributions import action_bounds, check_same_bounds
+from torchrl_osr.objectives.mixed_states import (
+    nested,
+    perturbed_twin,
+    replace_next,
+    state_keys,
+)
+
+
+class RecoveryActorCriticLoss(LossModule):
+    """Abstract base of :class:`~torchrl_osr.OSRLoss`: networks, keys, shared terms."""
+
+    @dataclass
+    class _AcceptedKeys:
+        """The tensordict entries that :meth:`set_keys` can rename.
+
+        Attributes:
+            action: the data's action. Defaults to ``"action"``.
+            state_action_value: what a critic writes. Defaults to
+                ``"state_action_value"``.
+            value: what the value estimator reads. Defaults to ``"state_value"``.
+            reward, done, terminated: below ``"next"``. Default to their own names.
+            priority: written to the batch, ``[B]``. Defaults to ``"td_error"``.
+            priority_weight: importance weight of a row. Defaults to
+                ``"priority_weight"``.
+            perturbed: where the perturbed twins are. Defaults to ``"perturbed"``.
+        """
+
+        action: NestedKey = "action"
+        state_action_value: NestedKey = "state_action_value"
+        value: NestedKey = "state_value"
+        reward: NestedKey = "reward"
+        done: NestedKey = "done"
+        terminated: NestedKey = "terminated"
+        priority: NestedKey = "td_error"
+        priority_weight: NestedKey = "priority_weight"
+        perturbed: NestedKey = "perturbed"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    default_value_estimator = ValueEstimators.TD0
+
+    actor_network: ProbabilisticTensorDictSequential
+    actor_network_params: TensorDictParams
+    target_actor_network_params: TensorDictParams
+    qvalue_network: TensorDictModule
+    qvalue_network_params: TensorDictParams
+    target_qvalue_network_params: TensorDictParams
+    inverse_dynamics_network: ProbabilisticTensorDictSequential
+    inverse_dynamics_network_params: TensorDictParams
+    target_inverse_dynamics_network_params: TensorDictParams
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+        inverse_dynamics_network: ProbabilisticTensorDictSequential | None,
+        *,
+        num_qvalue_nets: int,
+        loss_function: str,
+        alpha_init: float,
+        fixed_alpha: bool,
+        target_entropy: float | Literal["auto"],
+        delay_qvalue: bool,
+        reduction: Literal["none", "mean", "sum"] | None,
+        deactivate_vmap: bool,
+        use_prioritized_weights: bool | Literal["auto"],
+        scalar_output_mode: Literal["exclude", "non_tensor"] | None,
+    ) -> None:
+        self._in_keys: list[NestedKey] | None = None
+        self._out_keys: list[NestedKey] | None = None
+        super().__init__()
+        self.deactivate_vmap = deactivate_vmap
+        self.use_prioritized_weights = use_prioritized_weights
+        self.recovers = inverse_dynamics_network is not None
+        low, high = bounds = action_bounds(actor_network, "actor_network")
+        self.register_buffer("action_low", low, persistent=False)
+        self.register_buffer("action_high", high, persistent=False)
+        self.convert_to_functional(actor_network, "actor_network")
+        if isinstance(qvalue_network, Sequence):
+            num_qvalue_nets = len(qvalue_network)
+        self.convert_to_functional(
+            qvalue_network,
+            "qvalue_network",
+            num_qvalue_nets,
+            create_target_params=delay_qvalue,
+        )
+        if inverse_dynamics_network is not None:
+            name = "inverse_dynamics_network"
+            check_same_bounds(bounds, action_bounds(inverse_dynamics_network, name))
+            self.convert_to_functional(inverse_dynamics_network, name)
+            # Buffers instead of parameters: part of the state, moved by .to(), but no
+            # optimizer that takes loss.parameters() can move the model.
+            frozen = self.inverse_dynamics_network_params.apply(
+                lambda tensor: tensor.data, filter_empty=False
+            )
+            self.inverse_dynamics_network_params = TensorDictParams(
+                frozen, no_convert=True
+            )
+        log_alpha = torch.tensor(math.log(alpha_init))
+        if fixed_alpha:
+            self.register_buffer("log_alpha", log_alpha)
+        else:
+            self.log_alpha = torch.nn.Parameter(log_alpha)
+        self.target_entropy = target_entropy
+        self.loss_function = loss_function
+        self.reduction = reduction or "mean"
+        if self.reduction == "none" and scalar_output_mode is None:
+            warnings.warn(
+                f"{type(self).__name__} with reduction='none' leaves its scalar "
+                "metrics out; pass scalar_output_mode='exclude' to say so, or "
+                "'non_tensor' to keep them.",
+                stacklevel=3,
+            )
+            scalar_output_mode = "exclude"
+        self.scalar_output_mode = scalar_output_mode
+        self._make_vmap()
+
+    def _make_vmap(self) -> None:
+        self._vmap_qvalue = _vmap_func(
+            self.qvalue_network,
+            (None, 0),
+            randomness=self.vmap_randomness,
+            pseudo_vmap=self.deactivate_vmap,
+        )
+
+    def make_value_estimator(
+        self, value_type: ValueEstimators | str | None = None, **hyperparams: Any
+    ) -> RecoveryActorCriticLoss:
+        """Choose the TD target: TD(0) with ``gamma=0.99`` unless told otherwise."""
+        value_type, kwargs = self._prepare_value_estimator_kwargs(
+            value_type, **hyperparams
+        )
+        if value_type is not None:
+            names = ("value", "reward", "done", "terminated")
+            dispatch_value_estimator(
+                self,
+                value_type,
+                supported=(
+                    ValueEstimators.TD0,
+                    ValueEstimators.TD1,
+                    ValueEstimators.TDLambda,
+                ),
+                tensor_keys={name: getattr(self.tensor_keys, name) for name in names},
+                value_network=None,
+                deactivate_vmap=self.deactivate_vmap,
+                **kwargs,
+            )
+        return self
+
+    def _observation_keys(self) -> list[NestedKey]:
+        """The state entries that actor and critics read."""
+        network_keys = [*self.actor_network.in_keys, *self.qvalue_network.in_keys]
+        return state_keys(network_keys, self.tensor_keys.action)
+
+    def _set_in_keys(self) -> None:
+        """Forget the keys: TorchRL calls this when one was renamed."""
+        self._in_keys = None
+
+    def _input_keys(self) -> list[NestedKey]:
+        keys = self.tensor_keys
+        states = self._observation_keys()
+        in_keys = [*states, keys.action]
+        in_keys += [nested("next", key) for key in states]
+        in_keys += [
+            nested("next", key) for key in (keys.reward, keys.done, keys.terminated)
+        ]
+        if self.recovers:
+            network_keys = self.inverse_dynamics_network.in_keys
+            in_keys += network_keys
+            states += state_keys(network_keys)
+            in_keys += [nested(keys.perturbed, key) for key in states]
+        return list(dict.fromkeys(in_keys))
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """The entries that the loss reads, in a stable order."""
+        if self._in_keys is None:
+            self._in_keys = self._input_keys()
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, values: list[NestedKey]) -> None:
+        self._in_keys = values
+
+    def _flag(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+        """Return a boolean entry below ``"next"``, ``[B]``."""
+        flag: Tensor = tensordict.get(nested("next", key))
+        return flag.squeeze(-1)
+
+    def _states(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return ``[s, s']`` or ``[s, s', s^]``, stacked in front: ``[2 or 3, B]``."""
+        keys = self._observation_keys()
+        clean = tensordict.select(*keys)
+        following = clean.copy()
+        terminated = self._flag(tensordict, self.tensor_keys.terminated)
+        for key in keys:
+            following.set(key, replace_next(tensordict, key, terminated))
+        stack = [clean, following]
+        if self.recovers:
+            stack.append(perturbed_twin(tensordict, keys, self.tensor_keys.perturbed))
+        return torch.stack(stack)
+
+    def _policy(self, states: TensorDictBase) -> TensorDictBase:
+        """Run the actor once on all states; distributions are built from slices."""
+        with self.actor_network_params.to_module(
+            self.actor_network, preserve_module_state=False
+        ):
+            return self.actor_network.get_dist_params(states.copy())
+
+    def _distribution(self, policy: TensorDictBase) -> TanhNormal:
+        return self.actor_network.build_dist_from_params(policy)
+
+    def _qvalue(
+        self, states: TensorDictBase, action: Tensor, params: TensorDictParams
+    ) -> Tensor:
+        """Return the values of all critics, ``[N, B]``, at states and actions."""
+        batch = states.select(*state_keys(self.qvalue_network.in_keys), strict=False)
+        batch.set(self.tensor_keys.action, action)
+        batch = self._vmap_qvalue(batch, params)
+        value: Tensor = batch.get(self.tensor_keys.state_action_value)
+        return value.squeeze(-1)
+
+    def _actor_term(
+        self, states: TensorDictBase, policy: TensorDictBase
+    ) -> tuple[Tensor, Tensor]:
+        """Return the policy's objective and log-density on D_tot, each ``[D, B]``."""
+        action, log_prob = rsample_and_log_prob(self._distribution(policy))
+        qvalue = self._qvalue(states, action, self.qvalue_network_params.detach())
+        alpha = self.log_alpha.detach().exp()
+        return functional.soft_policy_value(log_prob, qvalue, alpha), log_prob
+
+    def _alpha_term(self, log_prob: Tensor, action_dim: int) -> Tensor:
+        """Return the temperature's objective, ``[D, B]``."""
+        target_entropy = self.target_entropy
+        if target_entropy == "auto":
+            target_entropy = -float(action_dim)
+        return functional.temperature_objective(
+            self.log_alpha, log_prob, target_entropy
+        )
+
+    @torch.no_grad()
+    def _target_value(
+        self, tensordict: TensorDictBase, states: TensorDictBase, policy: TensorDictBase
+    ) -> Tensor:
+        """Return the TD target ``[B]`` from the states ``s'`` and the policy there."""
+        action, _ = rsample_and_log_prob(self._distribution(policy))
+        next_qvalue = self._qvalue(states, action, self.target_qvalue_network_params)
+        batch = tensordict.copy()
+        value_key = nested("next", self.value_estimator.tensor_keys.value)
+        batch.set(value_key, next_qvalue.min(0).values.unsqueeze(-1))
+        target_value: Tensor = self.value_estimator.value_estimate(batch)
+        return target_value.squeeze(-1)
+
+    def _td_term(self, qvalue: Tensor, target_value: Tensor) -> Tensor:
+        """Return the sum over critics of the TD distance, ``[B]``.
+
+        The paper prints OSR-v's TD error without the square; it is meant (equation 2).
+        """
+        target_value = target_value.expand_as(qvalue)
+        distance: Tensor = distance_loss(qvalue, target_value, self.loss_function)
+        return distance.sum(0)
+
+    def _output(
+        self,
+        tensordict: TensorDictBase,
+        losses: dict[str, Tensor],
+        metrics: dict[str, Tensor],
+    ) -> TensorDictBase:
+        """Assemble what the loss returns, in the order of :attr:`out_keys`."""
+        if self.reduction == "none":
+            out = TensorDict(losses, batch_size=tensordict.batch_size)
+            if self.scalar_output_mode == "non_tensor":
+                for name, value in metrics.items():
+                    out.set_non_tensor(name, value)
+        else:
+            out = TensorDict(losses | metrics, batch_size=[])
+        names = ("actor_network", "qvalue_network", "target_qvalue_network")
+        params = [f"{name}_params" for name in names]
+        if self.recovers:
+            params.append("inverse_dynamics_network_params")
+        self._clear_weakrefs(tensordict, out, *params)
+        return out

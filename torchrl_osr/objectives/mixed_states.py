@@ -1,0 +1,144 @@
+"""The mixed data set D_tot: every clean state together with its perturbed twin.
+
+The twin lies beside the clean state under ``("perturbed", key)``, as the next state
+lies under ``("next", key)``, so the batch size never changes; the losses stack the
+two where an expectation over D_tot is meant (section 4.1). Shapes: ``B`` batch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+
+def nested(prefix: NestedKey, key: NestedKey) -> NestedKey:
+    """Return ``key`` below ``prefix``: ``("next", "observation")``, for instance."""
+    return unravel_key((prefix, key))
+
+
+def is_next(key: NestedKey) -> bool:
+    """Return whether ``key`` lies below ``"next"``."""
+    return isinstance(key, tuple) and key[0] == "next"
+
+
+def state_keys(in_keys: Iterable[NestedKey], *exclude: NestedKey) -> list[NestedKey]:
+    """Return the current-state entries of ``in_keys``, once each and in order."""
+    keys = dict.fromkeys(unravel_key(key) for key in in_keys)
+    return [key for key in keys if not is_next(key) and key not in exclude]
+
+
+def perturbed_twin(
+    tensordict: TensorDictBase, keys: Sequence[NestedKey], perturbed: NestedKey
+) -> TensorDictBase:
+    """Return the entries ``keys`` with every perturbed one in place of the clean.
+
+    Args:
+        tensordict: a batch ``[B]``.
+        keys: the state entries that a network reads.
+        perturbed: where :class:`~torchrl_osr.StatePerturbation` wrote the twins.
+
+    Raises:
+        KeyError: if no entry has a twin.
+        ValueError: if a twin has another shape than its clean state.
+    """
+    twin = tensordict.select(*keys)
+    twins = {key: tensordict.get(nested(perturbed, key), None) for key in keys}
+    if all(value is None for value in twins.values()):
+        wanted = [nested(perturbed, key) for key in keys]
+        raise KeyError(
+            f"No perturbed state in the batch: expected one of {wanted}, the batch has "
+            f"{sorted(map(str, tensordict.keys(True, True)))}. Append "
+            "StatePerturbation(std=...) to the replay buffer, or set "
+            "recovery_weight=0 (CQL) if no state recovery is wanted."
+        )
+    for key, value in twins.items():
+        if value is None:
+            continue
+        if value.shape != tensordict.get(key).shape:
+            raise ValueError(
+                f"{nested(perturbed, key)!r} has shape {tuple(value.shape)}, but "
+                f"{key!r} has {tuple(tensordict.get(key).shape)}."
+            )
+        twin.set(key, value)
+    return twin
+
+
+def replace_next(tensordict: TensorDictBase, key: NestedKey, flag: Tensor) -> Tensor:
+    """Return ``("next", key)`` with the current state wherever ``flag`` is set.
+
+    What a loader left as the next state of an ended trajectory may be zeros, the first
+    state of the next episode or NaN. Selecting before the networks run, rather than
+    masking after, keeps such values out of the gradient too (``0 * nan`` is ``nan``).
+
+    Args:
+        tensordict: a batch ``[B]`` with ``key`` and ``("next", key)``, ``[B, ...]``.
+        key: a state entry.
+        flag: bool ``[B]``.
+    """
+    state, next_state = tensordict.get(key), tensordict.get(("next", key))
+    if state.shape != next_state.shape:
+        raise ValueError(
+            f"{nested('next', key)!r} has shape {tuple(next_state.shape)}, but "
+            f"{key!r} has {tuple(state.shape)}."
+        )
+    flag = flag.reshape(flag.shape + (1,) * (state.ndim - flag.ndim))
+    return torch.where(flag, state, next_state)
+
+
+def transitions(
+    tensordict: TensorDictBase,
+    in_keys: Sequence[NestedKey],
+    *,
+    done: Tensor,
+    perturbed: NestedKey | None,
+) -> TensorDictBase:
+    """Return what an inverse dynamics model reads, on D_tot or on clean states only.
+
+    Args:
+        tensordict: a batch ``[B]``.
+        in_keys: the model's inputs, some of them below ``"next"``.
+        done: bool ``[B]``; such rows get their own state as the next one.
+        perturbed: where the twins are; ``None`` for clean states only.
+
+    Returns:
+        ``[2, B]``, clean then perturbed, or ``[1, B]``. The next state is never
+        perturbed: it is where the agent shall return to.
+    """
+    keys = state_keys(in_keys)
+    clean = tensordict.select(*keys)
+    stack = [clean]
+    if perturbed is not None:
+        stack.append(perturbed_twin(tensordict, keys, perturbed))
+    for key in in_keys:
+        if is_next(key):
+            next_state = replace_next(tensordict, unravel_key(key[1:]), done)
+            for states in stack:
+                states.set(key, next_state)
+    return torch.stack(stack)
+
+
+def reduce_transitions(
+    loss: LossModule,
+    value: Tensor,
+    done: Tensor,
+    tensordict: TensorDictBase,
+    weights: Tensor | None = None,
+) -> Tensor:
+    """Reduce ``value`` over the rows that are true transitions.
+
+    Args:
+        loss: the module whose ``reduction`` and masks apply.
+        value: one number a row, ``[B]``.
+        done: bool ``[B]``; such rows do not count, and are 0 under ``"none"``.
+        tensordict: the batch ``[B]``, for the masks in it.
+        weights: importance weights of the rows, ``[B]``.
+    """
+    value = torch.where(done, torch.zeros_like(value), value)
+    # A mask handed to _reduce_loss would compact the result under "none".
+    mask = None if loss.reduction == "none" else ~done
+    reduced: Tensor = loss._reduce_loss(value, tensordict, mask=mask, weights=weights)
+    return reduced

@@ -1,0 +1,281 @@
+r"""OSR: conservative Q-learning whose policy learns to come back to the data.
+
+Shapes: ``B`` batch (any leading dimensions), ``A`` action, ``N`` critics, ``K``
+sampled actions of a kind, ``D`` state sets of D_tot (2: clean and perturbed; 1 where
+nothing recovers). The equations are in :mod:`torchrl_osr.functional`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    dispatch,
+)
+from torch import Tensor
+from torchrl.modules.distributions.utils import sample_and_log_prob
+
+from torchrl_osr import functional
+from torchrl_osr.objectives.actor_critic import RecoveryActorCriticLoss
+from torchrl_osr.objectives.mixed_states import reduce_transitions, transitions
+
+
+class OSRLoss(RecoveryActorCriticLoss):
+    r"""Out-of-sample State Recovery by a constraint on the policy (OSR).
+
+    .. math::
+        L_\pi &= \mathbb E_{\tilde s \sim D_{tot}}
+            [\alpha_e \log\pi(\hat a \mid \tilde s) - \min_i Q_i(\tilde s, \hat a)]
+            + \lambda\, \mathbb E_{D_{tot}}
+            KL(I(a \mid \tilde s, s') \,\|\, \pi(a \mid \tilde s)) \\
+        L_Q &= \sum_i \mathbb E_D (Q_i - T)^2 + \alpha \sum_i \mathbb E_D \Big[
+            \log \sum_{j=1}^{3K} e^{Q_i(s, a_j)} / p(a_j) - Q_i(s, a) \Big]
+
+    Presented in "Recovering from Out-of-sample States via Inverse Dynamics in Offline
+    Reinforcement Learning", https://openreview.net/forum?id=4gLWjSaw4o. With
+    ``recovery_weight=0`` it is CQL(H) ("Conservative Q-Learning",
+    https://arxiv.org/abs/2006.04779): no inverse dynamics model is called and no
+    perturbed state is read.
+
+    Every ``loss_*`` entry is weighted already and sends gradient into its own group of
+    parameters only, so their sum, one backward and one optimizer step is right, and so
+    are separate optimizers.
+
+    Args:
+        actor_network: ends in a :class:`~torchrl.modules.TanhNormal`.
+        qvalue_network: one critic, copied by TorchRL, or a list of critics that keep
+            their own weights (:func:`~torchrl_osr.modules.critic_ensemble`).
+        inverse_dynamics_network: a *trained* model of ``I(a | s, s')`` with the
+            actor's bounds (see :class:`~torchrl_osr.InverseDynamicsLoss`). It is frozen
+            here: in the state dict, moved by ``.to()``, without gradient. Needed unless
+            ``recovery_weight=0``.
+
+    Keyword Args:
+        recovery_weight: :math:`\lambda`. Default 0.5. A number assigned later makes a
+            schedule; 0 *here* makes the loss CQL(H) for good.
+        min_q_weight: :math:`\alpha`, weight of the conservative term. Default 5.0. May
+            be assigned later.
+        num_random: ``K``, actions drawn of each kind (uniform, at ``s``, at ``s'``).
+            Default 10.
+        temperature: of the log-sum-exp. Default 1.0.
+        num_qvalue_nets: ``N``, for a single critic; a list has its own length.
+            Default 2.
+        loss_function: distance of the TD error: ``"l2"`` (default), ``"l1"`` or
+            ``"smooth_l1"``.
+        alpha_init: initial entropy temperature :math:`\alpha_e`. Default 1.0.
+        fixed_alpha: keep the temperature. Default ``False``.
+        target_entropy: in nats; ``"auto"`` (default) is minus the action's size.
+        delay_qvalue: use target critics, to be moved by
+            :class:`~torchrl.objectives.SoftUpdate`. Default ``True``.
+        reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
+        deactivate_vmap: run the critics one by one. Default ``False``.
+        use_prioritized_weights: weigh rows by ``"priority_weight"``; ``"auto"``
+            (default) does when the entry is there.
+        scalar_output_mode: with ``reduction="none"``, ``"exclude"`` (with a warning by
+            default) or ``"non_tensor"`` for the scalar metrics.
+
+    Raises:
+        TypeError: if a distribution is not a ``TanhNormal``.
+        ValueError: if bounds differ, a weight is negative or the model is missing.
+        KeyError: in the call, if the batch has no perturbed entry.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.objectives import SoftUpdate
+        >>> from torchrl_osr import OSRLoss, StatePerturbation
+        >>> from torchrl_osr.modules import (
+        ...     critic_ensemble, tanh_gaussian_actor, tanh_gaussian_inverse_dynamics)
+        >>> loss = OSRLoss(tanh_gaussian_actor(11, 3), critic_ensemble(11, 3),
+        ...                tanh_gaussian_inverse_dynamics(11, 3))
+        >>> updater = SoftUpdate(loss, tau=5e-3)
+        >>> no = torch.zeros(4, 1, dtype=torch.bool)
+        >>> batch = TensorDict({
+        ...     "observation": torch.randn(4, 11), "action": torch.rand(4, 3),
+        ...     "next": {"observation": torch.randn(4, 11), "reward": torch.ones(4, 1),
+        ...              "done": no, "terminated": no}}, [4])
+        >>> losses = loss(StatePerturbation(std=1e-3)(batch))
+        >>> sorted(key for key in losses.keys() if key.startswith("loss_"))
+        ['loss_actor', 'loss_alpha', 'loss_cql', 'loss_qvalue', 'loss_recovery']
+    """
+
+    _schedulable_buffers = frozenset({"recovery_weight", "min_q_weight"})
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+        inverse_dynamics_network: ProbabilisticTensorDictSequential | None = None,
+        *,
+        recovery_weight: float = 0.5,
+        min_q_weight: float = 5.0,
+        num_random: int = 10,
+        temperature: float = 1.0,
+        num_qvalue_nets: int = 2,
+        loss_function: str = "l2",
+        alpha_init: float = 1.0,
+        fixed_alpha: bool = False,
+        target_entropy: float | Literal["auto"] = "auto",
+        delay_qvalue: bool = True,
+        reduction: Literal["none", "mean", "sum"] | None = None,
+        deactivate_vmap: bool = False,
+        use_prioritized_weights: bool | Literal["auto"] = "auto",
+        scalar_output_mode: Literal["exclude", "non_tensor"] | None = None,
+    ) -> None:
+        weights = {"recovery_weight": recovery_weight, "min_q_weight": min_q_weight}
+        for name, weight in weights.items():
+            if weight < 0:
+                raise ValueError(f"{name} must be at least 0, got {weight}.")
+        if recovery_weight and inverse_dynamics_network is None:
+            raise ValueError(
+                f"recovery_weight={recovery_weight} needs an inverse_dynamics_network; "
+                "pass one, or recovery_weight=0 for CQL."
+            )
+        super().__init__(
+            actor_network,
+            qvalue_network,
+            inverse_dynamics_network if recovery_weight else None,
+            num_qvalue_nets=num_qvalue_nets,
+            loss_function=loss_function,
+            alpha_init=alpha_init,
+            fixed_alpha=fixed_alpha,
+            target_entropy=target_entropy,
+            delay_qvalue=delay_qvalue,
+            reduction=reduction,
+            deactivate_vmap=deactivate_vmap,
+            use_prioritized_weights=use_prioritized_weights,
+            scalar_output_mode=scalar_output_mode,
+        )
+        for name, weight in weights.items():
+            self.register_coeff_buffer(name, float(weight))
+        self.num_random = num_random
+        self.temperature = temperature
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """The entries that the loss writes, in their order."""
+        if self._out_keys is None:
+            losses = ["loss_actor", "loss_alpha", "loss_qvalue", "loss_cql"]
+            metrics = ["alpha", "entropy", "pred_value", "target_value"]
+            if self.recovers:
+                losses.append("loss_recovery")
+                metrics.append("recovery_kl")
+            kept = self.reduction != "none" or self.scalar_output_mode == "non_tensor"
+            self._out_keys = losses + metrics if kept else losses
+        return self._out_keys
+
+    @out_keys.setter
+    def out_keys(self, values: list[NestedKey]) -> None:
+        self._out_keys = values
+
+    def _recovery_term(
+        self, tensordict: TensorDictBase, policy: TensorDictBase, done: Tensor
+    ) -> Tensor:
+        """Return KL(I || pi) on D_tot, ``[D, B]``."""
+        batch = transitions(
+            tensordict,
+            self.inverse_dynamics_network.in_keys,
+            done=done,
+            perturbed=self.tensor_keys.perturbed,
+        )
+        with (
+            torch.no_grad(),
+            self.inverse_dynamics_network_params.to_module(
+                self.inverse_dynamics_network, preserve_module_state=False
+            ),
+        ):
+            inverse_dynamics = self.inverse_dynamics_network.get_dist(batch)
+        pi = self._distribution(policy)
+        return functional.state_recovery(
+            pi.loc, pi.scale, inverse_dynamics.loc, inverse_dynamics.scale
+        )
+
+    @torch.no_grad()
+    def _proposals(self, policy: TensorDictBase, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Draw K actions each: uniform, from pi(s) and from pi(s').
+
+        Args:
+            policy: the policy at ``s`` and ``s'``, ``[2, B]``.
+            like: an action, ``[B, A]``.
+
+        Returns:
+            Actions ``[3K, B, A]`` and their log-densities ``[3K, B]``.
+        """
+        width = (self.action_high - self.action_low).expand(like.shape[-1])
+        uniform = torch.rand(
+            (self.num_random, *like.shape), dtype=like.dtype, device=like.device
+        )
+        uniform = uniform * width + self.action_low
+        log_density = -width.log().sum().expand(uniform.shape[:-1])
+        action, log_prob = sample_and_log_prob(
+            self._distribution(policy), (self.num_random,)
+        )
+        return (
+            torch.cat([uniform, action.flatten(0, 1)]),
+            torch.cat([log_density, log_prob.flatten(0, 1)]),
+        )
+
+    def _critic_terms(
+        self, tensordict: TensorDictBase, states: TensorDictBase, policy: TensorDictBase
+    ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+        """Return TD and conservative terms, each ``[B]``, and the values ``[N, B]``."""
+        data_action = tensordict.get(self.tensor_keys.action)
+        action, log_prob = self._proposals(policy, data_action)
+        action = torch.cat([data_action.unsqueeze(0), action])
+        clean = states[0].expand(action.shape[:-1])
+        qvalue = self._qvalue(clean, action, self.qvalue_network_params)
+        pred_value, sampled = qvalue[:, 0], qvalue[:, 1:].movedim(1, -1)
+        target_value = self._target_value(tensordict, states[1], policy[1])
+        gap = functional.conservative_gap(
+            sampled, log_prob.movedim(0, -1), pred_value, temperature=self.temperature
+        ).sum(0)
+        values = {"pred_value": pred_value.detach(), "target_value": target_value}
+        return self._td_term(pred_value, target_value), gap, values
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return the losses and metrics of a batch, see :attr:`out_keys`.
+
+        Writes the largest absolute TD error of the critics under the ``priority`` key,
+        ``[B]``, and nothing else, into ``tensordict``.
+
+        Args:
+            tensordict: a batch ``[B]`` with the entries of :attr:`in_keys`.
+        """
+        done = self._flag(tensordict, self.tensor_keys.done)
+        weights = self._maybe_get_priority_weight(tensordict)
+
+        def reduce(value: Tensor) -> Tensor:
+            reduced: Tensor = self._reduce_loss(value, tensordict, weights=weights)
+            return reduced
+
+        states = self._states(tensordict)
+        policy = self._policy(states)
+        action_dim = tensordict.get(self.tensor_keys.action).shape[-1]
+        actor, log_prob = self._actor_term(states[::2], policy[::2])
+        td, gap, values = self._critic_terms(tensordict, states, policy[:2].detach())
+        losses = {
+            "loss_actor": reduce(actor.mean(0)),
+            "loss_alpha": reduce(self._alpha_term(log_prob, action_dim).mean(0)),
+            "loss_qvalue": reduce(td),
+            "loss_cql": self.min_q_weight * reduce(gap),
+        }
+        metrics = {
+            "alpha": self.log_alpha.detach().exp(),
+            "entropy": -log_prob.detach().mean(),
+            "pred_value": values["pred_value"].mean(),
+            "target_value": values["target_value"].mean(),
+        }
+        if self.recovers:
+            kl = self._recovery_term(tensordict, policy[::2], done).mean(0)
+            kl = reduce_transitions(self, kl, done, tensordict, weights)
+            losses["loss_recovery"] = self.recovery_weight * kl
+            metrics["recovery_kl"] = kl.detach().mean()
+        td_error = (values["pred_value"] - values["target_value"]).abs().amax(0)
+        tensordict.set(self.tensor_keys.priority, td_error)
+        return self._output(tensordict, losses, metrics)

@@ -1,0 +1,138 @@
+"""Checkpoints that are whole, that rotate, and that cannot run code when loaded.
+
+They are :mod:`torchrl.checkpoint` archives: one ZIP file each, written beside its place
+and renamed, every member with a checksum. Two things are added: a payload that is only
+ever read with ``weights_only=True`` (TorchRL 0.14.1 unpickles what it finds beside a
+memory-mapped tensordict), and a way back from a damaged newest file.
+"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torchrl import torchrl_logger
+from torchrl.checkpoint import (
+    Checkpoint,
+    CheckpointAdapter,
+    CheckpointError,
+    CheckpointRotation,
+)
+
+
+class WeightsOnlyAdapter(CheckpointAdapter):
+    """Saves ``state_dict()`` with :func:`torch.save`, loads it weights only."""
+
+    adapter_id = "torchrl_osr.weights_only"
+    filename = "state.pt"
+
+    def save(
+        self,
+        component: Any,
+        path: Path,
+        *,
+        args: tuple[Any, ...],
+        kwargs: Mapping[str, Any],
+    ) -> None:
+        """Write the component's state below the folder ``path``."""
+        path.mkdir(parents=True, exist_ok=True)
+        torch.save(component.state_dict(*args, **kwargs), path / self.filename)
+
+    def load(
+        self,
+        component: Any,
+        path: Path,
+        *,
+        map_location: Any,
+        tensor_load_kwargs: Mapping[str, Any],
+        args: tuple[Any, ...],
+        kwargs: Mapping[str, Any],
+    ) -> None:
+        """Restore the component's state from the folder ``path``."""
+        del tensor_load_kwargs
+        state = torch.load(
+            path / self.filename, map_location=map_location, weights_only=True
+        )
+        component.load_state_dict(state, *args, **kwargs)
+
+
+class GeneratorState:
+    """Makes a :class:`torch.Generator` checkpointable.
+
+    Args:
+        generator: whose state to save and restore.
+    """
+
+    def __init__(self, generator: torch.Generator) -> None:
+        self.generator = generator
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """Return the generator's state."""
+        return {"state": self.generator.get_state()}
+
+    def load_state_dict(self, state_dict: Mapping[str, torch.Tensor]) -> None:
+        """Continue from a saved state."""
+        self.generator.set_state(state_dict["state"].cpu())
+
+
+def safe_checkpoint(**components: Any) -> Checkpoint:
+    """Return a checkpoint of ``components`` in one archive without pickled objects.
+
+    Args:
+        **components: whatever has ``state_dict`` and ``load_state_dict``, or is
+            JSON-compatible (lists and mappings are restored in place).
+    """
+    checkpoint = Checkpoint(format="archive")
+    for name, component in components.items():
+        stateful = hasattr(component, "state_dict")
+        adapter = WeightsOnlyAdapter() if stateful else None
+        checkpoint.register(name, component, adapter=adapter)
+    return checkpoint
+
+
+def load_latest(checkpoint: Checkpoint, rotation: CheckpointRotation) -> Path | None:
+    """Restore the newest undamaged checkpoint of a folder.
+
+    Args:
+        checkpoint: the live components.
+        rotation: the folder.
+
+    Returns:
+        What was loaded, or ``None`` if the folder holds no checkpoint.
+
+    Raises:
+        CheckpointError: if a checkpoint does not fit the components, or every one in
+            the folder is damaged.
+    """
+    pattern = f"{rotation.prefix}-*.torchrl"
+    found: list[Path] = sorted(rotation.directory.glob(pattern), reverse=True)
+    for path in found:
+        try:
+            with zipfile.ZipFile(path) as archive:
+                damaged = archive.testzip()
+            if damaged is not None:
+                raise zipfile.BadZipFile(f"wrong checksum of {damaged}")
+        except (zipfile.BadZipFile, zlib.error, EOFError, OSError) as error:
+            torchrl_logger.warning(
+                f"Checkpoint {path} is damaged ({error}); trying the one before."
+            )
+            continue
+        try:
+            checkpoint.load(path, map_location="cpu")
+        except CheckpointError as error:
+            raise CheckpointError(
+                f"{path} does not fit this run: {error} Resume with the configuration "
+                "that it was written with, or start in another folder.",
+                error.result,
+            ) from error
+        return path
+    if found:
+        raise CheckpointError(
+            f"All {len(found)} checkpoints in {rotation.directory} are damaged; move "
+            "them away to start anew."
+        )
+    return None

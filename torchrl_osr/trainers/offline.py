@@ -1,0 +1,291 @@
+"""TorchRL's :class:`~torchrl.trainers.Trainer`, driven by a data set.
+
+TorchRL 0.14.1 has no offline trainer: every trainer asks a collector for frames. Here
+the collector is a clock (:class:`_GradientSteps`), so that frames count gradient steps
+and the trainer's own loop, hooks and optimization stepper are used as they are.
+"""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.checkpoint import CheckpointRotation, GlobalRNGState
+from torchrl.data import ReplayBuffer
+from torchrl.objectives import LossModule, TargetNetUpdater
+from torchrl.record.loggers import Logger
+from torchrl.trainers import OptimizationStepper, Trainer
+
+from torchrl_osr.trainers.checkpointing import (
+    GeneratorState,
+    load_latest,
+    safe_checkpoint,
+)
+
+try:
+    from tqdm.auto import tqdm
+except ImportError as error:
+    raise ImportError(
+        f"the trainer needs {error.name!r}: pip install torchrl-osr[examples]"
+    ) from error
+
+CHECKPOINTS_KEPT = 2
+
+
+class _GradientSteps:
+    """The clock that stands in for a collector: an empty batch of n rows is n steps.
+
+    A tick ends wherever something is due (a log entry, an evaluation, a checkpoint).
+    """
+
+    init_random_frames = 0
+
+    def __init__(self, total: int, intervals: Sequence[int]) -> None:
+        self.total = total
+        self.intervals = intervals
+        self.step = 0
+
+    def __iter__(self) -> Iterator[TensorDictBase]:
+        while self.step < self.total:
+            due = min(
+                (self.step // interval + 1) * interval for interval in self.intervals
+            )
+            steps = min(due, self.total) - self.step
+            self.step += steps
+            yield TensorDict({}, [steps])
+
+    def shutdown(self) -> None:
+        """Do nothing: the trainer calls this on its collector."""
+
+
+class _SumOfLosses(OptimizationStepper):
+    """One backward and one step on the sum of the ``loss_*`` entries.
+
+    TorchRL's default stepper hands back losses with their graph attached and reads the
+    gradient norm back to the host at every step; this one does neither.
+    """
+
+    def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
+        """Run one update and return the detached losses and metrics."""
+        losses = trainer.compute_loss(sub_batch)
+        total = sum(value for key, value in losses.items() if key.startswith("loss_"))
+        total.backward()
+        trainer.optimizer.step()
+        trainer.optimizer.zero_grad(set_to_none=True)
+        return losses.detach()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return nothing: the stepper has no state."""
+        return {}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Do nothing: the stepper has no state."""
+
+
+class OfflineTrainer(Trainer):
+    """Train a loss module on a replay buffer, with evaluation, checkpoints and resume.
+
+    It knows no algorithm: any :class:`~torchrl.objectives.LossModule` whose ``loss_*``
+    entries may be summed. A killed run continues from its newest whole checkpoint and
+    ends with the same bits as one that was never killed: networks, optimizer, targets,
+    the sampler's and the process's random generators and every entry of ``components``
+    are restored. (Bit equality is for one machine, one set of libraries and CPU.)
+
+    Args:
+        loss_module: what to train.
+        optimizer: over the loss module's parameters.
+        replay_buffer: sampled once a step, with a generator that the trainer puts in.
+        total_steps: gradient steps of the whole run.
+        folder: where checkpoints go; created if need be.
+
+    Keyword Args:
+        seed: of the sampling. Default 0.
+        target_net_updater: stepped after each update. Default: none.
+        evaluate: called every ``eval_interval`` steps and at the end; returns
+            JSON-compatible results, of which numbers are logged. All are kept in
+            ``history``, with their ``"step"``. Default: no evaluation.
+        metric: which result decides the best checkpoint, and whether it shall be
+            ``"max"`` or ``"min"``. Default ``("score", "max")``.
+        components: more state to checkpoint, by name: a transform with a generator,
+            observation statistics.
+        loggers: TorchRL loggers; all get every number. Default: none.
+        log_interval: steps between log entries, which are means over them. Default 200.
+        eval_interval: steps between evaluations. Default 5000.
+        checkpoint_interval: steps between checkpoints. Default: ``eval_interval``.
+        description: names the phase in the progress bar and the logs. Default "train".
+        progress: show a progress bar when on a terminal. Default ``True``.
+
+    Raises:
+        FloatingPointError: while training, if a loss is not finite.
+        CheckpointError: if a checkpoint in ``folder`` does not fit.
+    """
+
+    def __init__(
+        self,
+        loss_module: LossModule,
+        optimizer: torch.optim.Optimizer,
+        replay_buffer: ReplayBuffer,
+        total_steps: int,
+        folder: Path | str,
+        *,
+        seed: int = 0,
+        target_net_updater: TargetNetUpdater | None = None,
+        evaluate: Callable[[], dict[str, Any]] | None = None,
+        metric: tuple[str, Literal["min", "max"]] = ("score", "max"),
+        components: Mapping[str, Any] | None = None,
+        loggers: Sequence[Logger] = (),
+        log_interval: int = 200,
+        eval_interval: int = 5000,
+        checkpoint_interval: int | None = None,
+        description: str = "train",
+        progress: bool = True,
+    ) -> None:
+        intervals = (log_interval, eval_interval, checkpoint_interval or eval_interval)
+        if total_steps < 1 or min(intervals) < 1:
+            raise ValueError(
+                f"steps and intervals must be at least 1, got total_steps={total_steps} "
+                f"and log, eval and checkpoint intervals {intervals}."
+            )
+        super().__init__(
+            collector=_GradientSteps(total_steps, intervals),
+            total_frames=total_steps,
+            frame_skip=1,
+            optim_steps_per_batch=1,
+            loss_module=loss_module,
+            optimizer=optimizer,
+            optimization_stepper=_SumOfLosses(),
+            progress_bar=False,
+            auto_log_optim_steps=False,
+        )
+        self.eval_interval, self.checkpoint_interval = intervals[1:]
+        self.evaluate, self.metric = evaluate, metric
+        self.loggers, self.description = loggers, description
+        self.history: list[dict[str, Any]] = []
+        self._progress = {"step": 0}
+        # Not handed to Trainer: it would put the whole data set into checkpoints.
+        generator = torch.Generator(next(loss_module.parameters()).device)
+        replay_buffer.set_rng(generator.manual_seed(seed))
+        self.register_op("process_optim_batch", lambda _: replay_buffer.sample())
+        if target_net_updater is not None:
+            self.register_op("post_optim", target_net_updater.step)
+        self.register_op("post_optim_complete_log", self._log_losses)
+        self.register_op("post_steps_log", self._evaluate)
+        self.register_op("post_steps", self._update_bar)
+        self.progress = progress
+
+        self.rotation = CheckpointRotation(folder, keep_last=CHECKPOINTS_KEPT)
+        self._model_components = ("loss_module", *(components or {}))
+        self.checkpoint_of_run = safe_checkpoint(
+            loss_module=loss_module,
+            optimizer=optimizer,
+            sampler=GeneratorState(generator),
+            global_rng=GlobalRNGState(),
+            history=self.history,
+            progress=self._progress,
+            **(components or {}),
+        )
+
+    @property
+    def best_path(self) -> Path:
+        """Where the checkpoint with the best evaluation is."""
+        return Path(self.rotation.directory) / "best.torchrl"
+
+    def best(self) -> dict[str, Any] | None:
+        """Return the best evaluation so far, the first of equals."""
+        if not self.history:
+            return None
+        name, mode = self.metric
+        return (max if mode == "max" else min)(self.history, key=lambda row: row[name])
+
+    def train(self) -> None:
+        """Run, or continue, to the last step; a finished run returns at once."""
+        self.resume()
+        self._bar = tqdm(
+            total=self.total_frames,
+            initial=self.collected_frames,
+            desc=self.description,
+            unit="step",
+            # None: silent where the output is not a terminal.
+            disable=None if self.progress else True,
+        )
+        with self._bar:
+            super().train()
+
+    def resume(self) -> Path | None:
+        """Restore the newest whole checkpoint of the folder, if there is one."""
+        self.rotation.directory.mkdir(parents=True, exist_ok=True)
+        for leftover in self.rotation.directory.glob(".*.torchrl.*"):
+            # Unfinished writes of a killed run; only this run uses the folder.
+            if leftover.is_dir():
+                shutil.rmtree(leftover)
+            else:
+                leftover.unlink()
+        path = load_latest(self.checkpoint_of_run, self.rotation)
+        step = self._progress["step"]
+        self.collected_frames = self._optim_count = self.collector.step = step
+        return path
+
+    def optim_steps(self, batch: TensorDictBase) -> None:
+        """Run as many updates as the tick has rows."""
+        self.optim_steps_per_batch = batch.numel()
+        super().optim_steps(batch)
+
+    def save_trainer(self, force_save: bool = False) -> None:
+        """Write a checkpoint where one is due, and at the end."""
+        step = self.collected_frames
+        if force_save or step % self.checkpoint_interval == 0:
+            self._progress["step"] = step
+            self.rotation.save(self.checkpoint_of_run, step=step)
+
+    def _log_losses(self, _: int, losses: TensorDictBase) -> None:
+        """Log the means over a tick; one copy to the host for all of them."""
+        names = list(losses.keys())
+        values = torch.stack([losses[name].float() for name in names]).tolist()
+        self._send(dict(zip(names, values, strict=True)))
+        bad = [
+            name for name, value in zip(names, values, strict=True)
+            if not math.isfinite(value)
+        ]  # fmt: skip
+        if bad:
+            raise FloatingPointError(
+                f"{self.description}: {', '.join(bad)} not finite in the "
+                f"{self.optim_steps_per_batch} updates up to step "
+                f"{self.collected_frames}. Lower the learning rates or look at the "
+                f"data; the last checkpoint is {self.rotation.latest()}."
+            )
+
+    def _evaluate(self, _: TensorDictBase) -> None:
+        step = self.collected_frames
+        due = step % self.eval_interval == 0 or step == self.total_frames
+        if self.evaluate is None or not due:
+            return
+        results = {"step": step, **self.evaluate()}
+        self.history.append(results)
+        numbers = {
+            name: value for name, value in results.items()
+            if isinstance(value, (int, float)) and name != "step"
+        }  # fmt: skip
+        self._send(numbers)
+        name, _mode = self.metric
+        self._bar.set_postfix_str(f"{name} {results[name]:.4g}")
+        if self.best() is results:
+            self.checkpoint_of_run.save(
+                self.best_path,
+                components=self._model_components,
+                metadata={"step": step, name: results[name]},
+            )
+
+    def _update_bar(self) -> None:
+        self._bar.update(self.collected_frames - self._bar.n)
+
+    def _send(self, numbers: Mapping[str, float]) -> None:
+        for logger in self.loggers:
+            for name, value in numbers.items():
+                logger.log_scalar(
+                    f"{self.description}/{name}", value, step=self.collected_frames
+                )

@@ -1,0 +1,113 @@
+"""The folder of a run: which configuration it is, how it stands, its small files."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+CONFIG, STATUS = "config.yaml", "status.json"
+
+# May differ when a run is continued: they do not touch a single number.
+FREE_KEYS = ("resume", "trainer.progress")
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Write ``text`` so that a reader finds the old file or the new one, never a part.
+
+    Raises:
+        OSError: naming ``path``, if it cannot be written.
+    """
+    beside = path.with_name(f".{path.name}.new")
+    try:
+        with beside.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(beside, path)
+    except OSError as error:
+        beside.unlink(missing_ok=True)
+        raise OSError(
+            error.errno, f"cannot write the run's file ({error.strerror})", str(path)
+        ) from error
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write ``value`` as JSON, atomically; refuse NaN, which is not JSON."""
+    write_atomically(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
+
+
+def claim(folder: Path, config: DictConfig) -> None:
+    """Write the run's configuration into its folder, or check the one that is there.
+
+    Args:
+        folder: made if need be.
+        config: the composed configuration.
+
+    Raises:
+        ValueError: if the folder holds a run of another configuration, naming what
+            differs.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / CONFIG
+    if not path.exists():
+        write_atomically(path, OmegaConf.to_yaml(config, resolve=True))
+        return
+    here, there = (_flat(OmegaConf.to_container(each, resolve=True)) for each in (
+        config, OmegaConf.load(path)
+    ))  # fmt: skip
+    differences = [
+        f"{key}: {there.get(key)!r} there, {here.get(key)!r} now"
+        for key in sorted(here.keys() | there.keys())
+        if here.get(key) != there.get(key) and key not in FREE_KEYS
+    ]
+    if differences:
+        raise ValueError(
+            f"{folder} holds a run of another configuration: "
+            f"{'; '.join(differences)}. Continue that run with resume={folder} and "
+            "nothing else, or choose another folder."
+        )
+
+
+def saved_config(folder: Path | str) -> DictConfig:
+    """Read the configuration of a run that shall be continued.
+
+    Raises:
+        FileNotFoundError: if there is no run in ``folder``.
+    """
+    path = Path(folder) / CONFIG
+    if not path.exists():
+        raise FileNotFoundError(
+            f"resume={folder}: there is no {CONFIG} in it; give the folder of a run."
+        )
+    config = OmegaConf.load(path)
+    assert isinstance(config, DictConfig)
+    return config
+
+
+@contextmanager
+def status(folder: Path) -> Iterator[None]:
+    """Keep ``status.json`` true: running, then done, or failed and why."""
+    write_json(folder / STATUS, {"status": "running", "pid": os.getpid()})
+    try:
+        yield
+    except BaseException as error:
+        reason = f"{type(error).__name__}: {error}"
+        write_json(folder / STATUS, {"status": "failed", "error": reason})
+        raise
+    write_json(folder / STATUS, {"status": "done"})
+
+
+def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
+    """Return nested mappings as one, with dotted keys."""
+    if not isinstance(value, Mapping):
+        return {prefix: value}
+    flat: dict[str, Any] = {}
+    for key, item in value.items():
+        flat |= _flat(item, f"{prefix}.{key}" if prefix else str(key))
+    return flat

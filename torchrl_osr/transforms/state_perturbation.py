@@ -1,0 +1,160 @@
+r"""The noise of equation (5): :math:`\hat s = s + \beta\,\epsilon`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.envs import Transform
+
+from torchrl_osr.objectives.mixed_states import nested
+
+
+class StatePerturbation(Transform):
+    r"""Give every state a perturbed twin, ``("perturbed", key)`` beside ``key``.
+
+    Appended to a replay buffer it makes the mixed data set D_tot of section 4.1: one
+    freshly perturbed twin for each clean state, the next state untouched. It works out
+    of place, needs no train mode, leaves the batch size alone and draws from a
+    generator of its own, so that the rest of a run stays the same bits with and without
+    it. In an environment it adds the same entry to observations and specs.
+
+    Args:
+        std: :math:`\beta`, the noise's standard deviation per dimension; in units of
+            the observation, or of ``relative_to`` where that is given.
+
+    Keyword Args:
+        in_keys: the states to perturb. Default ``["observation"]``.
+        relative_to: the data's standard deviation, one tensor ``[S]`` for each key (a
+            single tensor for a single key). Default: none, ``std`` is absolute.
+        noise: ``"gaussian"`` (default), or ``"uniform"`` with the same standard
+            deviation (half-width :math:`\sqrt 3\,\beta`).
+        perturbed: where to write the twins. Default ``"perturbed"``.
+        seed: of the generator. Default: torch's initial seed.
+
+    Raises:
+        ValueError: if ``std`` is negative or ``noise`` unknown.
+        KeyError: in the call, if a state is missing.
+        TypeError: in the call, if a state is not floating point.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+        >>> from torchrl_osr import StatePerturbation
+        >>> buffer = TensorDictReplayBuffer(
+        ...     storage=LazyTensorStorage(100), batch_size=16,
+        ...     transform=StatePerturbation(std=1e-3))
+        >>> data = TensorDict({"observation": torch.randn(100, 11)}, [100])
+        >>> indices = buffer.extend(data)
+        >>> buffer.sample()["perturbed", "observation"].shape
+        torch.Size([16, 11])
+    """
+
+    def __init__(
+        self,
+        std: float,
+        *,
+        in_keys: Sequence[NestedKey] = ("observation",),
+        relative_to: Tensor | Sequence[Tensor] | None = None,
+        noise: Literal["gaussian", "uniform"] = "gaussian",
+        perturbed: NestedKey = "perturbed",
+        seed: int | None = None,
+    ) -> None:
+        if not std >= 0:
+            raise ValueError(f"std must be at least 0, got {std}.")
+        if noise not in ("gaussian", "uniform"):
+            raise ValueError(f"noise must be 'gaussian' or 'uniform', got {noise!r}.")
+        in_keys = list(in_keys)
+        super().__init__(
+            in_keys=in_keys, out_keys=[nested(perturbed, key) for key in in_keys]
+        )
+        self.std = std
+        self.noise = noise
+        self.seed = torch.initial_seed() if seed is None else seed
+        if isinstance(relative_to, Tensor):
+            relative_to = [relative_to]
+        if relative_to is not None and len(relative_to) != len(in_keys):
+            raise ValueError(
+                f"relative_to needs one tensor for each of {in_keys}, got "
+                f"{len(relative_to)}."
+            )
+        for i in range(len(in_keys)):
+            scale = 1.0 if relative_to is None else relative_to[i]
+            self.register_buffer(f"_scale_{i}", std * torch.as_tensor(scale))
+        self._generator: torch.Generator | None = None
+
+    def _generator_on(self, device: torch.device) -> torch.Generator:
+        """Return the noise's generator, made on the device of the first batch."""
+        if self._generator is None or self._generator.device != device:
+            self._generator = torch.Generator(device).manual_seed(self.seed)
+        return self._generator
+
+    def _perturb(self, state: Tensor, key: NestedKey, scale: Tensor) -> Tensor:
+        if not state.is_floating_point():
+            raise TypeError(
+                f"{key!r} must be floating point to be perturbed, got {state.dtype}; "
+                "append DoubleToFloat or ToTensorImage first."
+            )
+        generator = self._generator_on(state.device)
+        if self.noise == "gaussian":
+            noise = torch.randn(
+                state.shape, generator=generator, dtype=state.dtype, device=state.device
+            )
+        else:
+            noise = torch.rand(
+                state.shape, generator=generator, dtype=state.dtype, device=state.device
+            )
+            noise = (2 * noise - 1) * 3**0.5
+        return torch.addcmul(state, noise, scale.to(state))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Add the perturbed twins to a batch of any shape."""
+        for i, (key, twin) in enumerate(zip(self.in_keys, self.out_keys, strict=True)):
+            state = tensordict.get(key, None)
+            if state is None:
+                raise KeyError(
+                    f"StatePerturbation reads {key!r}, but the batch has "
+                    f"{sorted(map(str, tensordict.keys(True, True)))}."
+                )
+            tensordict.set(
+                twin, self._perturb(state, key, getattr(self, f"_scale_{i}"))
+            )
+        return tensordict
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self.forward(next_tensordict)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self.forward(tensordict_reset)
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Add the twins' entries: unbounded, of the states' shape and dtype."""
+        if not isinstance(observation_spec, Composite):
+            raise TypeError(
+                f"StatePerturbation needs a Composite spec, got {observation_spec}."
+            )
+        for key, twin in zip(self.in_keys, self.out_keys, strict=True):
+            spec = observation_spec[key]
+            observation_spec[twin] = Unbounded(
+                shape=spec.shape, dtype=spec.dtype, device=spec.device
+            )
+        return observation_spec
+
+    def get_extra_state(self) -> Tensor:
+        """Return the generator's state, for the state dict."""
+        generator = self._generator or torch.Generator().manual_seed(self.seed)
+        return generator.get_state()
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Continue the noise from a saved state."""
+        # A CUDA generator's state is 16 bytes, a CPU one's 5056: the size tells.
+        device = "cpu" if state.numel() > 16 else "cuda"
+        self._generator = torch.Generator(device)
+        self._generator.set_state(state.cpu())
