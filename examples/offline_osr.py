@@ -16,14 +16,13 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from tensordict import TensorDict
+from torchrl import torchrl_logger
 from torchrl.envs import ObservationNorm
 from torchrl.objectives import SoftUpdate
-from torchrl.record.loggers import CSVLogger, Logger, get_logger
 
 from torchrl_osr import InverseDynamicsLoss, OSRLoss, StatePerturbation, config
 from torchrl_osr.data import (
@@ -39,15 +38,16 @@ from torchrl_osr.evaluation.episodes import (
     summarize,
 )
 from torchrl_osr.evaluation.figures import learning_curve, read_scalars
+from torchrl_osr.evaluation.summary import score_table
 from torchrl_osr.modules import (
     critic_ensemble,
     tanh_gaussian_actor,
     tanh_gaussian_inverse_dynamics,
 )
 from torchrl_osr.trainers import OfflineTrainer, run_folder
+from torchrl_osr.trainers.loggers import make_loggers
 
 EVALUATION_SEED = 10_000  # far from the seeds of the data's episodes
-LAST_EVALUATIONS = 5  # neighbouring evaluations swing by tens of points: report a mean
 
 config.register()
 
@@ -65,9 +65,9 @@ def main(cfg: DictConfig) -> float:
 
 def run(cfg: DictConfig, folder: Path) -> float:
     """Data, inverse dynamics model, policy, report."""
+    torchrl_logger.setLevel("WARNING")
     torch.set_num_threads(cfg.trainer.num_threads)
     torch.manual_seed(cfg.seed)
-    np.random.seed(cfg.seed)
     device = torch.device(cfg.trainer.device)
 
     # Data: standardised once, the same numbers for every batch and every evaluation.
@@ -112,7 +112,9 @@ def run(cfg: DictConfig, folder: Path) -> float:
     common: dict[str, Any] = {
         "replay_buffer": buffer,
         "components": {"perturbation": perturbation, "observation_norm": norm},
-        "loggers": make_loggers(cfg, folder),
+        "loggers": make_loggers(
+            cfg.logger.kind, folder, project=cfg.logger.project, mode=cfg.logger.mode
+        ),
         "log_interval": cfg.trainer.log_interval,
         "checkpoint_interval": cfg.trainer.checkpoint_interval,
         "progress": cfg.trainer.progress,
@@ -200,58 +202,30 @@ def train_inverse_dynamics(
     )
 
 
-def make_loggers(cfg: DictConfig, folder: Path) -> list[Logger]:
-    """Return the CSV logger and, if asked for, TensorBoard's or W&B's."""
-    loggers = [CSVLogger("csv", log_dir=str(folder))]
-    if cfg.logger.kind != "csv":
-        wandb = {"project": cfg.logger.project, "mode": cfg.logger.mode}
-        logger = get_logger(
-            cfg.logger.kind, str(folder), cfg.logger.kind, wandb_kwargs=wandb
-        )
-        loggers.append(logger)
-    return loggers
-
-
 def report(
     cfg: DictConfig, folder: Path, manifest: dict[str, Any], trainer: OfflineTrainer
 ) -> float:
     """Write raw returns and the figure, print the table."""
     last, best = trainer.history[-1], trainer.best()
-    recent = [row["score"] for row in trainer.history[-LAST_EVALUATIONS:]]
+    data_score = manifest["normalized_score"]
     name = f"{cfg.env.name} {cfg.data.level}"
-    run_folder.write_json(
-        folder / "returns.json",
-        {
-            "env": cfg.env.id,
-            "data": {"level": cfg.data.level, "score": manifest["normalized_score"]},
-            "last": last,
-            "best": best,
-            "evaluations": trainer.history,
-        },
-    )
+    results = {
+        "env": cfg.env.id,
+        "data": {"level": cfg.data.level, "score": data_score},
+        "last": last,
+        "best": best,
+        "evaluations": trainer.history,
+    }
+    run_folder.write_json(folder / "returns.json", results)
     learning_curve(
         trainer.history,
         read_scalars(folder / "csv" / "scalars" / "policy"),
         folder / "curve.png",
-        title=f"{name}, seed {cfg.seed}, lambda {cfg.loss.recovery_weight:g}",
-        data_score=manifest["normalized_score"],
+        title=f"{name}, seed {cfg.seed}, recovery weight {cfg.loss.recovery_weight:g}",
+        data_score=data_score,
     )
-    rows = [
-        ("data, mean episode", f"{manifest['normalized_score']:6.1f}"),
-        ("policy, last", interval(last)),
-        (f"policy, mean of last {len(recent)}", f"{np.mean(recent):6.1f}"),
-        ("policy, best evaluation", f"{interval(best)}  at step {best['step']}"),
-    ]
-    print(f"\n{name}: normalised score (0 random, 100 expert)")
-    for label, value in rows:
-        print(f"  {label:<26}{value}")
-    print(f"  {'files':<26}{folder}")
+    print("\n" + score_table(name, trainer.history, best, data_score, folder))
     return float(last["score"])
-
-
-def interval(row: dict[str, Any]) -> str:
-    """Format an evaluation's score with its interval over episodes."""
-    return f"{row['score']:6.1f}  [{row['score_low']:.1f}, {row['score_high']:.1f}]"
 
 
 if __name__ == "__main__":

@@ -79,10 +79,8 @@ class Actor(nn.Module):
 
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     """Read the command line."""
-    parser = argparse.ArgumentParser(
-        description="Train behaviour policies with SAC.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
+    formatter = argparse.ArgumentDefaultsHelpFormatter
+    parser = argparse.ArgumentParser(formatter_class=formatter)
     add = parser.add_argument
     add("--env", default="Hopper-v5", help="Gymnasium MuJoCo task id")
     add("--name", help="name in the card; None: the id without its version")
@@ -94,7 +92,6 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     add("--card-steps", type=int, default=20_000, help="steps behind a card entry")
     add("--medium-share", type=float, default=0.4, help="medium return / best return")
     add("--batch-size", type=int, default=128, help="rows per gradient step")
-    add("--learning-rate", type=float, default=3e-4, help="of all networks")
     add("--seed", type=int, default=0, help="seed of everything")
     add("--threads", type=int, default=1, help="torch threads; small nets like one")
     args = parser.parse_args(arguments)
@@ -126,7 +123,7 @@ def train(args: argparse.Namespace, eval_env: Any) -> list[Snapshot]:
     network, policy, loss = make_agent(env)
     targets = SoftUpdate(loss, tau=0.005)
     # Each loss sends gradients into its own networks only: one optimizer will do.
-    optimizer = torch.optim.Adam(loss.parameters(), lr=args.learning_rate)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=3e-4)
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(args.steps + FRAMES), batch_size=args.batch_size
     )
@@ -154,9 +151,8 @@ def train(args: argparse.Namespace, eval_env: Any) -> list[Snapshot]:
             if step >= min(args.steps, args.eval_every * (len(snapshots) + 1)):
                 actor = network.as_arrays()
                 entry = measure_policy(eval_env, actor, args.eval_steps, seed=args.seed)
-                mean_return = entry["stochastic_return"][0]
-                snapshots.append(Snapshot(step, actor, mean_return))
-                bar.set_postfix(mean_return=f"{mean_return:.0f}")
+                snapshots.append(Snapshot(step, actor, entry["stochastic_return"][0]))
+                bar.set_postfix(mean_return=f"{snapshots[-1].mean_return:.0f}")
     collector.shutdown()
     return snapshots
 
@@ -180,23 +176,23 @@ def main(arguments: list[str] | None = None) -> None:
     torch.set_num_threads(args.threads)
     torch.manual_seed(args.seed)
     entries = {}
-    with closing(make_environment(args.env)) as env:
-        snapshots = train(args, env)
-        if not snapshots:
-            raise SystemExit("stopped before the first evaluation: nothing to keep.")
-        for name, kept in choose(snapshots, args.medium_share).items():
-            # Half precision is enough for the eight that only add variety.
-            half = name.startswith("replay")
-            path = args.out / args.name / f"{name}.npz"
-            save_behavior_policy(path, kept.actor, half=half)
-            # Fresh episodes: those that a snapshot was chosen by flatter it.
-            entry = measure_policy(env, kept.actor, args.card_steps, seed=args.seed + 1)
-            if args.name in REFERENCE_RETURNS:
-                mean_return = entry["stochastic_return"][0]
-                entry["normalized"] = normalized_score(args.name, mean_return)
-            entry |= {"steps": kept.step, "dtype": "float16" if half else "float32"}
-            entries[name] = entry
-            torchrl_logger.info(f"{args.name} {name}: {entry}")
+    env = make_environment(args.env)
+    snapshots = train(args, env)
+    if not snapshots:
+        raise SystemExit("stopped before the first evaluation: nothing to keep.")
+    for name, kept in choose(snapshots, args.medium_share).items():
+        # Half precision is enough for the eight that only add variety.
+        half = name.startswith("replay")
+        file = args.out / args.name / f"{name}.npz"
+        save_behavior_policy(file, kept.actor, half=half)
+        # Fresh episodes: those that a snapshot was chosen by flatter it.
+        entry = measure_policy(env, kept.actor, args.card_steps, seed=args.seed + 1)
+        if args.name in REFERENCE_RETURNS:
+            score = normalized_score(args.name, entry["stochastic_return"][0])
+            entry["normalized"] = score
+        entry |= {"steps": kept.step, "dtype": "float16" if half else "float32"}
+        entries[name] = entry
+        torchrl_logger.info(f"{args.name} {name}: {entry}")
     update_behavior_card(args.out, args.name, args.env, entries)
 
 

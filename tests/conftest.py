@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, unravel_key
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.modules import (
     MLP,
@@ -40,8 +40,7 @@ def make_batch():
         def normal(dim: int) -> torch.Tensor:
             return torch.randn(*size, dim, generator=generator, dtype=torch.float64)
 
-        row = torch.arange(size.numel() if hasattr(size, "numel") else _prod(size))
-        row = row.reshape(*size, 1) % 5
+        row = torch.arange(torch.Size(size).numel()).reshape(*size, 1) % 5
         observation = normal(OBSERVATION_DIM)
         batch = TensorDict(
             {
@@ -65,10 +64,6 @@ def make_batch():
     return make
 
 
-def _prod(size: tuple[int, ...]) -> int:
-    return torch.Size(size).numel()
-
-
 @pytest.fixture
 def make_networks():
     """Return a factory of a small actor, critics and inverse dynamics model, float64.
@@ -80,8 +75,8 @@ def make_networks():
         *,
         observation="observation",
         action="action",
-        low: float = -1.0,
-        high: float = 1.0,
+        low: float | torch.Tensor = -1.0,
+        high: float | torch.Tensor = 1.0,
         num_critics: int = 2,
         seed: int = 0,
         distribution_class: type = TanhNormal,
@@ -112,16 +107,13 @@ def make_networks():
                 ValueOperator(
                     MLP(OBSERVATION_DIM + ACTION_DIM, 1, num_cells=[8]),
                     in_keys=[observation, action],
+                    out_keys=["state_action_value"],
                 ).double()
                 for _ in range(num_critics)
             ],
             inverse_dynamics=probabilistic(
-                observation, torch_next(observation)
+                observation, unravel_key(("next", observation))
             ),
         )
 
     return make
-
-
-def torch_next(key):
-    return ("next", *((key,) if isinstance(key, str) else key))

@@ -120,7 +120,7 @@ def test_state_recovery_passes_gradcheck(direction) -> None:
 @pytest.mark.parametrize(
     ("scale", "expected"), [(1, 0.125), (10, 1.8088), (1e3, 6.40776), (1e6, 13.31551)]
 )
-def test_recovery_grows_with_the_policy_scale_unlike_printed_12(scale, expected) -> None:
+def test_recovery_grows_with_policy_scale_unlike_printed_12(scale, expected) -> None:
     value = functional.state_recovery(*tensors(0.5, scale, 0.0, 1.0)).item()
     printed = math.log(1 / scale) + 1.25 / (2 * scale**2)
     assert value == pytest.approx(expected, abs=1e-4)
@@ -138,7 +138,10 @@ def test_recovery_alone_has_the_known_fixed_point(direction, loc, scale) -> None
     target = torch.tensor([[-0.5, 0.2, 0.9], [0.2, 0.4, 0.1]], dtype=torch.float64)
     policy = [tensor.requires_grad_() for tensor in tensors(0.0, 0.0)]
     optimizer = torch.optim.LBFGS(
-        policy, max_iter=200, tolerance_grad=1e-12, tolerance_change=1e-14,
+        policy,
+        max_iter=200,
+        tolerance_grad=1e-12,
+        tolerance_change=1e-14,
         line_search_fn="strong_wolfe",
     )
 
@@ -233,9 +236,7 @@ def test_target_equals_torchrls_one_step_estimator(make_batch) -> None:
     batch = make_batch(10)
     next_qvalue = torch.randn(3, 10, dtype=torch.float64)
     flat = batch["next"].apply(lambda tensor: tensor.squeeze(-1))
-    target = functional.td_target(
-        flat["reward"], flat["terminated"], next_qvalue, 0.97
-    )
+    target = functional.td_target(flat["reward"], flat["terminated"], next_qvalue, 0.97)
     next_value = next_qvalue.min(0).values.unsqueeze(-1)
     batch["next", "state_value"] = next_value
     witness = TD0Estimator(gamma=0.97, value_network=None).value_estimate(

@@ -50,8 +50,9 @@ class Collection(NamedTuple):
     episode_lengths: NDArray[np.int64]
 
 
-def uniform_sampler(action_size: int) -> ActionSampler:
+def uniform_sampler(env: gymnasium.Env[Any, Any]) -> ActionSampler:
     """Return a sampler of uniform actions in ``[-ACTION_LIMIT, ACTION_LIMIT]``."""
+    action_size = gymnasium.spaces.flatdim(env.action_space)
 
     def sample(_: NDArray[Any], rng: np.random.Generator) -> NDArray[np.float32]:
         draws = rng.uniform(-ACTION_LIMIT, ACTION_LIMIT, action_size)
@@ -111,10 +112,7 @@ def collect_transitions(
             f"num_transitions={num_transitions} for {len(samplers)} policies; "
             "expected at least one transition each."
         )
-    sizes = [
-        (space.shape or (0,))[0] for space in (env.observation_space, env.action_space)
-    ]
-    columns = _allocate(num_transitions, *sizes)
+    columns = _allocate(num_transitions, env)
     bounds = [num_transitions * i // len(samplers) for i in range(len(samplers) + 1)]
     seeds = np.random.SeedSequence(seed).spawn(len(samplers))
     returns: list[float] = []

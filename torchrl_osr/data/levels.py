@@ -10,8 +10,6 @@ from __future__ import annotations
 import zlib
 from contextlib import closing
 
-import gymnasium
-
 from torchrl_osr.data.behavior import load_behavior_policy
 from torchrl_osr.data.collection import (
     ActionSampler,
@@ -75,7 +73,7 @@ def collect_level(
     ]
     with closing(make_environment(env_id)) as env:
         if not samplers:
-            samplers = [uniform_sampler(gymnasium.spaces.flatdim(env.action_space))]
+            samplers = [uniform_sampler(env)]
         return collect_transitions(
             env, samplers, num_transitions, seed=entropy, progress=progress
         )

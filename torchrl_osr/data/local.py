@@ -119,7 +119,8 @@ def load_local_dataset(
 
 def _cache_root(cache_dir: Path | str | None) -> Path:
     root = cache_dir or os.environ.get(CACHE_VARIABLE)
-    return Path(root or platformdirs.user_cache_dir("torchrl-osr")) / "local"
+    default = platformdirs.user_cache_dir("torchrl-osr")
+    return Path(root or default).expanduser() / "local"
 
 
 def _request(

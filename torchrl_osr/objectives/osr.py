@@ -18,7 +18,7 @@ from tensordict.nn import (
     dispatch,
 )
 from torch import Tensor
-from torchrl.modules.distributions.utils import sample_and_log_prob
+from torchrl.modules.distributions.utils import rsample_and_log_prob
 
 from torchrl_osr import functional
 from torchrl_osr.objectives.actor_critic import RecoveryActorCriticLoss
@@ -212,7 +212,9 @@ class OSRLoss(RecoveryActorCriticLoss):
         )
         uniform = uniform * width + self.action_low
         log_density = -width.log().sum().expand(uniform.shape[:-1])
-        action, log_prob = sample_and_log_prob(
+        # rsample also without gradient: torch's sample reads the scale back to the host
+        # to check its sign.
+        action, log_prob = rsample_and_log_prob(
             self._distribution(policy), (self.num_random,)
         )
         return (

@@ -57,7 +57,26 @@ class WeightsOnlyAdapter(CheckpointAdapter):
         state = torch.load(
             path / self.filename, map_location=map_location, weights_only=True
         )
+        if isinstance(component, torch.nn.Module):
+            _check_fits(component.state_dict(), state)
         component.load_state_dict(state, *args, **kwargs)
+
+
+def _check_fits(here: Mapping[str, Any], there: Mapping[str, Any]) -> None:
+    """Raise before anything is overwritten; tensordict's own error names no shapes."""
+
+    def shape(state: Mapping[str, Any], key: str) -> str:
+        value = state.get(key, "nothing")
+        return str(tuple(value.shape)) if isinstance(value, torch.Tensor) else "nothing"
+
+    differences = [
+        f"{key} is {shape(there, key)} in the file, {shape(here, key)} here"
+        for key in sorted(here.keys() | there.keys())
+        if shape(here, key) != shape(there, key)
+    ]
+    if differences:
+        shown = "; ".join(differences[:3])
+        raise ValueError(f"{len(differences)} tensors differ: {shown}.")
 
 
 class GeneratorState:

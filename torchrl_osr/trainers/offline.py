@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
@@ -148,8 +149,9 @@ class OfflineTrainer(Trainer):
         intervals = (log_interval, eval_interval, checkpoint_interval or eval_interval)
         if total_steps < 1 or min(intervals) < 1:
             raise ValueError(
-                f"steps and intervals must be at least 1, got total_steps={total_steps} "
-                f"and log, eval and checkpoint intervals {intervals}."
+                "steps and intervals must be at least 1, got "
+                f"total_steps={total_steps} and log, eval and checkpoint intervals "
+                f"{intervals}."
             )
         super().__init__(
             collector=_GradientSteps(total_steps, intervals),
@@ -240,7 +242,8 @@ class OfflineTrainer(Trainer):
         step = self.collected_frames
         if force_save or step % self.checkpoint_interval == 0:
             self._progress["step"] = step
-            self.rotation.save(self.checkpoint_of_run, step=step)
+            with self._explained_write_errors():
+                self.rotation.save(self.checkpoint_of_run, step=step)
 
     def _log_losses(self, _: int, losses: TensorDictBase) -> None:
         """Log the means over a tick; one copy to the host for all of them."""
@@ -274,11 +277,24 @@ class OfflineTrainer(Trainer):
         name, _mode = self.metric
         self._bar.set_postfix_str(f"{name} {results[name]:.4g}")
         if self.best() is results:
-            self.checkpoint_of_run.save(
-                self.best_path,
-                components=self._model_components,
-                metadata={"step": step, name: results[name]},
-            )
+            with self._explained_write_errors():
+                self.checkpoint_of_run.save(
+                    self.best_path,
+                    components=self._model_components,
+                    metadata={"step": step, name: results[name]},
+                )
+
+    @contextmanager
+    def _explained_write_errors(self) -> Iterator[None]:
+        try:
+            yield
+        # torch.save turns a full disk into a RuntimeError.
+        except (OSError, RuntimeError) as error:
+            raise OSError(
+                f"Cannot write a checkpoint to {self.rotation.directory}: {error}. "
+                "Free space or mend the folder's rights and run again: the last whole "
+                f"checkpoint is {self.rotation.latest()}."
+            ) from error
 
     def _update_bar(self) -> None:
         self._bar.update(self.collected_frames - self._bar.n)

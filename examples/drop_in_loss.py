@@ -1,0 +1,61 @@
+"""OSRLoss where CQLLoss stood, in a TorchRL user's own pipeline."""
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.modules import (
+    MLP,
+    NormalParamExtractor,
+    ProbabilisticActor,
+    TanhNormal,
+    ValueOperator,
+)
+from torchrl.objectives import SoftUpdate
+
+from torchrl_osr import InverseDynamicsLoss, OSRLoss, StatePerturbation
+from torchrl_osr.modules import tanh_gaussian_inverse_dynamics
+
+# Your transitions: here 1,000 steps of s' = 0.9 s + a, rewarded near the origin.
+state, action = torch.randn(1000, 3), torch.rand(1000, 3) * 1.8 - 0.9
+following, no = 0.9 * state + action, torch.zeros(1000, 1, dtype=torch.bool)
+reward = -following.norm(dim=-1, keepdim=True)
+data = TensorDict({"observation": state, "action": action}, [1000])
+data["next"] = {"observation": following, "reward": reward, "done": no}
+data["next", "terminated"] = no.clone()
+
+# Your buffer, with one line more: the perturbed twin of every state.
+buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1000), batch_size=64)
+buffer.append_transform(StatePerturbation(std=1e-2))
+buffer.extend(data)
+
+# Your networks, and a model of which action led from a state to the next.
+head = nn.Sequential(MLP(in_features=3, out_features=6), NormalParamExtractor())
+actor = ProbabilisticActor(
+    TensorDictModule(head, ["observation"], ["loc", "scale"]),
+    in_keys=["loc", "scale"],
+    distribution_class=TanhNormal,
+    return_log_prob=True,
+)
+qvalue = ValueOperator(MLP(in_features=6, out_features=1), ["observation", "action"])
+model = tanh_gaussian_inverse_dynamics(3, 3, num_cells=[64, 64])
+
+model_loss = InverseDynamicsLoss(model)
+model_optimizer = torch.optim.Adam(model_loss.parameters(), lr=3e-3)
+for _ in range(200):
+    model_loss(buffer.sample())["loss_inverse_dynamics"].backward()
+    model_optimizer.step()
+    model_optimizer.zero_grad()
+
+loss = OSRLoss(actor, qvalue, model, recovery_weight=0.5)  # was: CQLLoss(actor, qvalue)
+loss.make_value_estimator(gamma=0.99)
+updater = SoftUpdate(loss, tau=5e-3)
+optimizer = torch.optim.Adam(loss.parameters(), lr=3e-4)
+for _ in range(100):
+    losses = loss(buffer.sample())
+    sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+    optimizer.step()
+    optimizer.zero_grad()
+    updater.step()
+print({key: round(value.item(), 3) for key, value in losses.items()})

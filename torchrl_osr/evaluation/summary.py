@@ -1,0 +1,55 @@
+"""What a run says at its end: the table of its scores."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+NUM_RECENT = 5
+"""Evaluations in the mean of the last ones.
+
+Scores of neighbouring evaluations swing by tens of points, so one of them says little.
+"""
+
+
+def recent_score(history: Sequence[Mapping[str, Any]]) -> float:
+    """Return the mean score of the last :data:`NUM_RECENT` evaluations."""
+    return float(np.mean([row["score"] for row in history[-NUM_RECENT:]]))
+
+
+def score_table(
+    title: str,
+    history: Sequence[Mapping[str, Any]],
+    best: Mapping[str, Any],
+    data_score: float,
+    folder: Path,
+) -> str:
+    """Return the table of data's and policy's scores.
+
+    Args:
+        title: what was trained on what.
+        history: all evaluations with their ``"step"``, see
+            :func:`~torchrl_osr.evaluation.episodes.summarize`.
+        best: the best of them; chosen by its own episodes, hence optimistic.
+        data_score: mean normalised score of the data's episodes.
+        folder: where the run's files are.
+    """
+
+    def with_interval(row: Mapping[str, Any]) -> str:
+        return f"{row['score']:6.1f}  [{row['score_low']:.1f}, {row['score_high']:.1f}]"
+
+    rows = [
+        ("data, mean episode", f"{data_score:6.1f}"),
+        ("policy, last", with_interval(history[-1])),
+        (
+            f"policy, mean of last {min(NUM_RECENT, len(history))}",
+            f"{recent_score(history):6.1f}",
+        ),
+        ("policy, best evaluation", f"{with_interval(best)}  at step {best['step']}"),
+    ]
+    lines = [f"{title}: normalised score, 0 random and 100 expert [95 % interval]"]
+    lines += [f"  {label:<25}{value}" for label, value in rows]
+    return "\n".join([*lines, f"  {'files':<26}{folder}"])
