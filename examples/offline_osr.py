@@ -55,9 +55,10 @@ config.register()
 @hydra.main(version_base="1.3", config_path="../conf", config_name="offline_osr")
 def main(cfg: DictConfig) -> float:
     """Run or resume one training run; return its last score, for a sweeper."""
-    folder = Path(HydraConfig.get().runtime.output_dir)
+    job = HydraConfig.get()
+    folder = Path(job.runtime.output_dir)
     if cfg.resume is not None:
-        cfg = run_folder.saved_config(folder)
+        cfg = run_folder.saved_config(folder, job.overrides.task)
     run_folder.claim(folder, cfg)
     with run_folder.status(folder):
         return run(cfg, folder)

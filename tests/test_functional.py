@@ -157,20 +157,29 @@ def test_recovery_alone_has_the_known_fixed_point(direction, loc, scale) -> None
     assert policy[1].exp().item() == pytest.approx(scale, abs=1e-5)
 
 
+# a ~ N(-.3, .4^2), s' = .5 a + N(0, .1^2): I(a | s') has gain .08/.05 = 1.6 and variance
+# .16 * .01/.05 = .032; its mean over s' has variance 1.6^2 * .05 = .128. The recovery
+# term is quadratic in that mean: two points, one deviation off, integrate it exactly.
+NEXT_STATES = torch.tensor([[-1.0], [1.0]], dtype=torch.float64)
+MODEL = (-0.3 + 0.128**0.5 * NEXT_STATES, torch.full_like(NEXT_STATES, 0.032**0.5))
+
+
 def test_equations_7_and_11_differ_by_the_mutual_information() -> None:
-    # a ~ N(-.3, .4^2), s' = .5 a + N(0, .1^2): I(a | s') has gain .08/.05 = 1.6 and
-    # variance .16 * .01/.05 = .032; its mean over s' varies by 1.6^2 * .05 = .128.
-    # Hence I(a; s') = log(.16/.032)/2. Two points at +-1 sd integrate a quadratic.
-    inverse_dynamics_loc = torch.tensor([[-1.0], [1.0]], dtype=torch.float64)
-    inverse_dynamics_loc = -0.3 + 0.128**0.5 * inverse_dynamics_loc
-    inverse_dynamics_scale = torch.full_like(inverse_dynamics_loc, 0.032**0.5)
     for loc, scale in [(-0.3, 0.4), (0.0, 1.0), (1.3, 0.2), (-2.0, 0.7)]:
-        pi = [tensor.expand(2, 1) for tensor in tensors(loc, scale)]
-        each = functional.state_recovery(
-            *pi, inverse_dynamics_loc, inverse_dynamics_scale
-        ).mean()
+        policy = [tensor.expand(2, 1) for tensor in tensors(loc, scale)]
+        each = functional.state_recovery(*policy, *MODEL).mean()
         marginal = functional.gaussian_kl(*tensors(-0.3, 0.4, loc, scale))
+        # I(a; s') = log(.16/.032)/2.
         assert (each - marginal).item() == pytest.approx(math.log(5) / 2, abs=1e-12)
+
+
+def test_recovery_at_clean_states_asks_for_the_behaviour_policy() -> None:
+    # Proposition 2: at s^ = s the model's mean over s' is the behaviour policy.
+    behaviour = [tensor.requires_grad_() for tensor in tensors(-0.3, 0.4)]
+    policy = [tensor.expand(2, 1) for tensor in behaviour]
+    value = functional.state_recovery(*policy, *MODEL).mean()
+    for gradient in torch.autograd.grad(value, behaviour):
+        assert gradient.item() == pytest.approx(0, abs=1e-12)
 
 
 @pytest.mark.parametrize(

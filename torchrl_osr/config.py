@@ -13,6 +13,10 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, OmegaConf
 
 
+# File systems allow 255 bytes, and temporary names beside it need some of them.
+MAX_FOLDER_NAME = 200
+
+
 @dataclass
 class EnvConfig:
     """Which task.
@@ -181,9 +185,15 @@ class OfflineOSRConfig:
 def register() -> None:
     """Make the schema known to Hydra as ``offline_osr_schema``.
 
-    And the resolver ``run_dir``, by which ``resume=folder`` becomes the run's folder.
+    And two resolvers: ``run_dir``, by which ``resume=folder`` becomes the run's folder,
+    and ``job_dir``, which names a sweep's folders by number and overrides.
     """
     ConfigStore.instance().store(name="offline_osr_schema", node=OfflineOSRConfig)
     OmegaConf.register_new_resolver(
         "run_dir", lambda resume, fresh: resume or fresh, replace=True
+    )
+    OmegaConf.register_new_resolver(
+        "job_dir",
+        lambda number, overrides: f"{number}_{overrides}"[:MAX_FOLDER_NAME],
+        replace=True,
     )

@@ -108,16 +108,18 @@ def test_rows_weigh_as_much_as_their_priority_weight(
     torch.manual_seed(2)
     rows = each(batch)
     batch["priority_weight"] = weight
+    weighing = build(mode, make_networks())
     torch.manual_seed(2)
-    out = build(mode, make_networks())(batch)
+    out = weighing(batch)
     done = batch["next", "done"].squeeze(-1)
     for key in rows.keys():  # noqa: SIM118
         counted = weight * ~done if key == "loss_recovery" else weight
         expected = (rows[key] * counted).sum() / counted.sum()
         torch.testing.assert_close(out[key], expected)
+    ignoring = build(mode, make_networks(), use_prioritized_weights=False)
     torch.manual_seed(2)
-    ignoring = build(mode, make_networks(), use_prioritized_weights=False)(batch)
-    torch.testing.assert_close(ignoring["loss_qvalue"], rows["loss_qvalue"].mean())
+    out = ignoring(batch)
+    torch.testing.assert_close(out["loss_qvalue"], rows["loss_qvalue"].mean())
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -74,12 +74,23 @@ def claim(folder: Path, config: DictConfig) -> None:
         )
 
 
-def saved_config(folder: Path | str) -> DictConfig:
+def saved_config(folder: Path | str, overrides: Sequence[str]) -> DictConfig:
     """Read the configuration of a run that shall be continued.
+
+    Args:
+        folder: of the run.
+        overrides: what stood on the command line; only ``resume=`` may.
 
     Raises:
         FileNotFoundError: if there is no run in ``folder``.
+        ValueError: if the command line asks for more than to resume.
     """
+    more = [override for override in overrides if not override.startswith("resume=")]
+    if more:
+        raise ValueError(
+            f"resume={folder} continues that run as it is; leave out {' '.join(more)}, "
+            "or start a new run without resume=."
+        )
     path = Path(folder) / CONFIG
     if not path.exists():
         raise FileNotFoundError(

@@ -1,0 +1,91 @@
+"""Batched episodes are the episodes that one environment would have played."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from torchrl.envs import ObservationNorm
+
+from torchrl_osr.evaluation.episodes import (
+    EpisodeEvaluator,
+    EpisodeResults,
+    deterministic_policy,
+    summarize,
+)
+from torchrl_osr.modules import tanh_gaussian_actor
+
+
+def linear_policy(observation: torch.Tensor) -> torch.Tensor:
+    """A policy under which episodes end at different times; rows do not mix."""
+    return torch.tanh(observation[:, :3] * 3)
+
+
+def play_alone(seed: int) -> tuple[float, int]:
+    environment = gymnasium.make("Hopper-v5")
+    observation, _ = environment.reset(seed=seed)
+    total, steps, over = 0.0, 0, False
+    while not over:
+        row = torch.from_numpy(observation[None].astype(np.float32))
+        action = linear_policy(row)[0].numpy()
+        observation, reward, terminated, truncated, _ = environment.step(action)
+        total, steps, over = total + reward, steps + 1, terminated or truncated
+    return total, steps
+
+
+def test_each_episode_is_what_it_would_be_alone():
+    evaluator = EpisodeEvaluator("Hopper-v5", num_episodes=4, seed=5)
+    results = evaluator(linear_policy)
+    alone = [play_alone(seed) for seed in (5, 6, 7, 8)]
+    np.testing.assert_allclose(
+        results.returns, [total for total, _ in alone], rtol=1e-6
+    )
+    assert results.lengths.tolist() == [steps for _, steps in alone]
+    assert len(set(results.lengths)) > 1, "episodes shall end at different times here"
+    again = evaluator(linear_policy)
+    np.testing.assert_array_equal(results.returns, again.returns)
+
+
+def test_time_limit_ends_an_episode():
+    evaluator = EpisodeEvaluator("HalfCheetah-v5", num_episodes=1)
+    results = evaluator(lambda observation: torch.zeros(len(observation), 6))
+    assert results.lengths.tolist() == [1000]
+
+
+def test_global_generators_are_left_alone():
+    torch_state, numpy_state = torch.get_rng_state(), np.random.get_state()
+    EpisodeEvaluator("Hopper-v5", num_episodes=2)(linear_policy)
+    assert torch.equal(torch_state, torch.get_rng_state())
+    assert all(map(np.array_equal, numpy_state, np.random.get_state()))
+
+
+def test_policy_sees_standardised_observations():
+    actor = tanh_gaussian_actor(2, 1, num_cells=[4])
+    loc, scale = torch.tensor([1.0, 2.0]), torch.tensor([3.0, 4.0])
+    norm = ObservationNorm(loc, scale, in_keys=["observation"], standard_normal=True)
+    raw = torch.tensor([[4.0, -2.0]])
+    # By hand: (4 - 1) / 3 = 1 and (-2 - 2) / 4 = -1.
+    standard = torch.tensor([[1.0, -1.0]])
+    torch.testing.assert_close(
+        deterministic_policy(actor, norm)(raw), deterministic_policy(actor)(standard)
+    )
+    head = actor[0].module(standard)[0]
+    torch.testing.assert_close(deterministic_policy(actor)(standard), head.tanh())
+
+
+def test_summary_is_json_and_normalised():
+    results = EpisodeResults(
+        np.array([3234.3, -20.272305]), np.array([1000, 20]), np.array([0, 1])
+    )
+    summary = summarize(results, "hopper")
+    assert summary["score"] == pytest.approx(50)
+    assert summary["score_low"] == pytest.approx(0)
+    assert summary["score_high"] == pytest.approx(100)
+    assert summary["returns"] == [3234.3, -20.272305]
+    assert summary["length"] == 510
+
+
+def test_no_episodes_is_an_error():
+    with pytest.raises(ValueError, match="at least 1"):
+        EpisodeEvaluator("Hopper-v5", num_episodes=0)

@@ -1,0 +1,173 @@
+"""The main example, run as a user runs it: in processes of its own, a few steps each."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import pytest
+import torch
+
+SCRIPT = Path(__file__).parents[2] / "examples" / "offline_osr.py"
+TINY = [
+    "data=random",
+    "data.num_transitions=600",
+    "data.held_out=0.1",
+    "network.num_cells=[8]",
+    "trainer.batch_size=8",
+    "trainer.inverse_dynamics_steps=30",
+    "trainer.steps=40",
+    "trainer.log_interval=10",
+    "trainer.eval_interval=20",
+    "trainer.eval_episodes=2",
+    "trainer.checkpoint_interval=5",
+]
+LAST = "checkpoint/policy/checkpoint-000000000040.torchrl"
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory) -> dict[str, str]:
+    cache = str(tmp_path_factory.mktemp("cache"))
+    return os.environ | {"TORCHRL_OSR_CACHE": cache, "OMP_NUM_THREADS": "1"}
+
+
+def start(cwd: Path, environment: dict[str, str], *arguments: str) -> subprocess.Popen:
+    return subprocess.Popen(
+        [sys.executable, str(SCRIPT), *arguments],
+        cwd=cwd,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def run(cwd: Path, environment: dict[str, str], *arguments: str) -> tuple[int, str]:
+    process = start(cwd, environment, *arguments)
+    output, _ = process.communicate(timeout=240)
+    return process.returncode, output
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory, environment) -> tuple[Path, str]:
+    cwd = tmp_path_factory.mktemp("finished")
+    code, output = run(cwd, environment, *TINY, "hydra.run.dir=run")
+    assert code == 0, output
+    return cwd / "run", output
+
+
+def final_state(folder: Path) -> dict[str, object]:
+    state: dict[str, object] = {}
+    with zipfile.ZipFile(folder / LAST) as archive:
+        for name in archive.namelist():
+            if name.endswith("state.pt") and "global_rng" not in name:
+                content = io.BytesIO(archive.read(name))
+                state |= _flat(name, torch.load(content, weights_only=True))
+    return state
+
+
+def _flat(prefix: str, value: object) -> dict[str, object]:
+    if isinstance(value, dict):
+        pairs = value.items()
+    elif isinstance(value, (list, tuple)):
+        pairs = enumerate(value)
+    else:
+        return {prefix: value}
+    return {
+        k: v for key, item in pairs for k, v in _flat(f"{prefix}/{key}", item).items()
+    }
+
+
+def test_run_leaves_table_figure_returns_and_checkpoints(finished):
+    folder, output = finished
+    assert "held-out rows: NLL" in output
+    for label in ("data, mean episode", "policy, last", "policy, best evaluation"):
+        assert label in output
+    assert str(folder) in output
+    assert json.loads((folder / "status.json").read_text()) == {"status": "done"}
+    returns = json.loads((folder / "returns.json").read_text())
+    assert [row["step"] for row in returns["evaluations"]] == [20, 40]
+    assert len(returns["last"]["returns"]) == 2
+    assert returns["last"] == returns["evaluations"][-1]
+    assert (folder / "curve.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "csv" / "scalars" / "policy" / "loss_recovery.csv").exists()
+    assert (folder / "checkpoint" / "policy" / "best.torchrl").exists()
+    assert "Warning" not in output
+    assert "Traceback" not in output
+
+
+def test_killed_three_times_ends_with_the_same_bits(tmp_path, environment, finished):
+    phases = [
+        "inverse_dynamics/checkpoint-000000000010",
+        "policy/checkpoint-000000000005",
+    ]
+    phases.append("policy/checkpoint-000000000025")
+    arguments = [*TINY, "hydra.run.dir=run"]
+    for checkpoint in phases:
+        process = start(tmp_path, environment, *arguments)
+        wanted = tmp_path / "run" / "checkpoint" / f"{checkpoint}.torchrl"
+        while not wanted.exists():
+            assert process.poll() is None, process.stdout.read()
+            time.sleep(0.001)
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        arguments = ["resume=run"]
+    assert not (tmp_path / "run" / LAST).exists(), "killed too late to show anything"
+    status = json.loads((tmp_path / "run" / "status.json").read_text())
+    assert status["status"] == "running"
+
+    code, output = run(tmp_path, environment, "resume=run")
+    assert code == 0, output
+    folder, _ = finished
+    mine, theirs = final_state(tmp_path / "run"), final_state(folder)
+    assert mine.keys() == theirs.keys()
+    for key, value in theirs.items():
+        same = torch.equal(mine[key], value) if torch.is_tensor(value) else None
+        assert same or mine[key] == value, key
+    for name in ("returns.json", "inverse_dynamics.json"):
+        assert json.loads((tmp_path / "run" / name).read_text()) == json.loads(
+            (folder / name).read_text()
+        )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["env=swimmer"], ["halfcheetah", "hopper", "walker2d"]),
+        (["trainer.stepz=3"], ["stepz", "TrainerConfig"]),
+        (["resume=nowhere"], ["nowhere", "folder of a run"]),
+        (["resume=run", "seed=3"], ["leave out seed=3"]),
+        (["hydra.run.dir=run", *TINY, "seed=3"], ["another configuration", "seed: 0"]),
+    ],
+)
+def test_bad_input_is_named(finished, environment, arguments, named):
+    folder, _ = finished
+    code, output = run(folder.parent, environment, *arguments)
+    assert code != 0
+    for word in named:
+        assert word in output
+    # A finished run is never touched by a mistake.
+    assert json.loads((folder / "status.json").read_text()) == {"status": "done"}
+
+
+def test_multirun_names_the_failed_job(tmp_path, environment):
+    tiny = [each for each in TINY if not each.startswith("trainer.steps")]
+    arguments = [*tiny, "loss=cql", "trainer.steps=0,20", "hydra.sweep.dir=sweep"]
+    code, output = run(tmp_path, environment, "-m", *arguments)
+    assert code != 0, output
+    status = {
+        path.parent.name: json.loads(path.read_text())
+        for path in (tmp_path / "sweep").glob("*/status.json")
+    }
+    (failed,) = (name for name, each in status.items() if each["status"] == "failed")
+    (done,) = (name for name, each in status.items() if each["status"] == "done")
+    assert failed.startswith("0_data.held_out=0.1")
+    assert "at least 1" in status[failed]["error"]
+    assert done.startswith("1_")

@@ -1,0 +1,81 @@
+"""The same numbers with and without vmap, and with and without torch.compile."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torchrl.objectives import SoftUpdate
+
+from torchrl_osr import InverseDynamicsLoss, OSRLoss
+
+MODES = ["osr", "cql"]
+
+
+def build(mode: str, networks, **kwargs) -> OSRLoss:
+    loss = OSRLoss(
+        networks.actor,
+        networks.critics,
+        networks.inverse_dynamics,
+        recovery_weight=0.5 if mode == "osr" else 0.0,
+        num_random=3,
+        **kwargs,
+    ).double()
+    loss.make_value_estimator(gamma=0.99)
+    SoftUpdate(loss, tau=0.1)
+    return loss
+
+
+def losses_and_gradients(loss, parameters, batch) -> list[torch.Tensor]:
+    torch.manual_seed(2)
+    losses = [v for k, v in loss(batch).items() if k.startswith("loss_")]
+    return [*losses, *torch.autograd.grad(sum(losses), list(parameters))]
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_loop_over_critics_equals_vmap(
+    make_networks, make_batch, mode, count
+) -> None:
+    results = []
+    for deactivate in (False, True):
+        loss = build(mode, make_networks(num_critics=count), deactivate_vmap=deactivate)
+        results.append(losses_and_gradients(loss, loss.parameters(), make_batch(10)))
+    for looped, mapped in zip(*results, strict=True):
+        torch.testing.assert_close(looped, mapped, rtol=1e-12, atol=1e-12)
+
+
+# Raised inside tensordict 0.14.3 and TorchRL 0.14.1 while torch 2.13 traces them.
+@pytest.mark.filterwarnings("ignore:.*autograd.function.Function:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore:.*inline_inbuilt_nn_modules:FutureWarning")
+@pytest.mark.filterwarnings("ignore:Using lock_.. inside a compiled:UserWarning")
+@pytest.mark.parametrize("name", [*MODES, "idm"])
+def test_compiled_loss_equals_eager_without_graph_breaks(
+    make_networks, make_batch, name
+) -> None:
+    networks, batch = make_networks(), make_batch(10)
+    if name == "idm":
+        loss = InverseDynamicsLoss(networks.inverse_dynamics)
+    else:
+        loss = build(name, networks)
+    eager = losses_and_gradients(loss, loss.parameters(), batch)
+    torch.compiler.reset()
+    compiled = torch.compile(loss, backend="eager", fullgraph=True)
+    found = losses_and_gradients(compiled, loss.parameters(), batch)
+    for ours, theirs in zip(found, eager, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-12, atol=1e-12)
+
+
+# For each critic: the data's action and 3K = 9 proposals, the policy's own action at
+# every state of D_tot, and the next action.
+@pytest.mark.parametrize(("mode", "rows"), [("cql", 10 + 1 + 1), ("osr", 10 + 2 + 1)])
+@pytest.mark.parametrize("count", [1, 2])
+def test_critics_score_no_more_rows_than_the_equations_ask(
+    make_networks, make_batch, mode, rows, count
+) -> None:
+    networks, scored = make_networks(num_critics=count), []
+    for critic in networks.critics:
+        critic.module.register_forward_pre_hook(
+            lambda _, inputs: scored.append(inputs[0].shape[:-1].numel())
+        )
+    build(mode, networks, deactivate_vmap=True)(make_batch(10))
+    assert sum(scored) == count * rows * 10
