@@ -31,13 +31,13 @@ from torchrl_osr.data import (
     observation_statistics,
     split_held_out,
 )
-from torchrl_osr.evaluation import inverse_dynamics_report
 from torchrl_osr.evaluation.episodes import (
     EpisodeEvaluator,
     deterministic_policy,
     summarize,
 )
 from torchrl_osr.evaluation.figures import learning_curve, read_scalars
+from torchrl_osr.evaluation.inverse_dynamics import describe, inverse_dynamics_report
 from torchrl_osr.evaluation.summary import score_table
 from torchrl_osr.modules import (
     critic_ensemble,
@@ -79,69 +79,50 @@ def run(cfg: DictConfig, folder: Path) -> float:
         seed=cfg.data.seed,
         progress=cfg.trainer.progress,
     )
-    loc, scale = observation_statistics(data)
     norm = ObservationNorm(
-        loc,
-        scale,
+        *observation_statistics(data),
         in_keys=["observation", ("next", "observation")],
         standard_normal=True,
     ).to(device)
     data = norm(data.to(device))
     data, held_out = split_held_out(data, cfg.data.held_out, seed=cfg.data.seed)
     # In units of the standard deviation, since the observations now are.
-    perturbation = StatePerturbation(
-        cfg.perturbation.std, noise=cfg.perturbation.noise, seed=cfg.seed
-    )
+    perturbation = StatePerturbation(**cfg.perturbation, seed=cfg.seed)
     buffer = make_replay_buffer(
-        data,
-        batch_size=cfg.trainer.batch_size,
-        seed=cfg.seed,
-        transform=perturbation,
-        device=device,
+        data, batch_size=cfg.trainer.batch_size, seed=cfg.seed, transform=perturbation
     )
+    training: dict[str, Any] = {
+        "replay_buffer": buffer,
+        "components": {"perturbation": perturbation, "observation_norm": norm},
+        "loggers": make_loggers(folder=folder, **cfg.logger),
+        "log_interval": cfg.trainer.log_interval,
+        "checkpoint_interval": cfg.trainer.checkpoint_interval,
+        "progress": cfg.trainer.progress,
+    }
 
     # Networks.
     sizes = (data["observation"].shape[-1], data["action"].shape[-1])
     cells = list(cfg.network.num_cells)
     actor = tanh_gaussian_actor(*sizes, num_cells=cells).to(device)
     critics = critic_ensemble(
-        *sizes, num_qvalue_nets=cfg.network.num_qvalue_nets, num_cells=cells
+        *sizes, num_cells=cells, num_qvalue_nets=cfg.network.num_qvalue_nets
     )
-    critics = [critic.to(device) for critic in critics]
     model = tanh_gaussian_inverse_dynamics(*sizes, num_cells=cells).to(device)
-
-    common: dict[str, Any] = {
-        "replay_buffer": buffer,
-        "components": {"perturbation": perturbation, "observation_norm": norm},
-        "loggers": make_loggers(
-            cfg.logger.kind, folder, project=cfg.logger.project, mode=cfg.logger.mode
-        ),
-        "log_interval": cfg.trainer.log_interval,
-        "checkpoint_interval": cfg.trainer.checkpoint_interval,
-        "progress": cfg.trainer.progress,
-    }
 
     # First phase: which action leads from s~ to s'?
     if cfg.loss.recovery_weight > 0:
-        train_inverse_dynamics(cfg, folder, model, held_out, common)
+        train_inverse_dynamics(cfg, folder, model, held_out, training)
 
     # Second phase: the policy, taught by the critics and by the frozen model.
     loss = OSRLoss(actor, critics, model, **cfg.loss).to(device)
     loss.make_value_estimator(gamma=cfg.optim.gamma)
+    critic_params = list(loss.qvalue_network_params.parameters())
+    known = set(critic_params)
+    policy_params = [each for each in loss.parameters() if each not in known]
     optimizer = torch.optim.Adam(
         [
-            {
-                "params": loss.actor_network_params.parameters(),
-                "lr": cfg.optim.actor_lr,
-            },
-            {
-                "params": loss.qvalue_network_params.parameters(),
-                "lr": cfg.optim.qvalue_lr,
-            },
-            {
-                "params": [] if cfg.loss.fixed_alpha else [loss.log_alpha],
-                "lr": cfg.optim.actor_lr,
-            },
+            {"params": critic_params, "lr": cfg.optim.qvalue_lr},
+            {"params": policy_params, "lr": cfg.optim.actor_lr},
         ],
         fused=True,
     )
@@ -162,11 +143,10 @@ def run(cfg: DictConfig, folder: Path) -> float:
         evaluate=lambda: summarize(evaluator(policy), cfg.env.name),
         eval_interval=cfg.trainer.eval_interval,
         description="policy",
-        **common,
+        **training,
     )
     trainer.train()
-    evaluator.close()
-    return report(cfg, folder, manifest, trainer)
+    return report(cfg, folder, manifest["normalized_score"], trainer)
 
 
 def train_inverse_dynamics(
@@ -174,15 +154,14 @@ def train_inverse_dynamics(
     folder: Path,
     model: torch.nn.Module,
     held_out: TensorDict,
-    common: dict[str, Any],
+    training: dict[str, Any],
 ) -> None:
     """Fit the model to the mixed data set and say how well it does on held-out rows."""
     loss = InverseDynamicsLoss(model)
+    rate = cfg.optim.inverse_dynamics_lr
     trainer = OfflineTrainer(
         loss,
-        torch.optim.Adam(
-            loss.parameters(), lr=cfg.optim.inverse_dynamics_lr, fused=True
-        ),
+        torch.optim.Adam(loss.parameters(), lr=rate, fused=True),
         total_steps=cfg.trainer.inverse_dynamics_steps,
         folder=folder / "checkpoint" / "inverse_dynamics",
         seed=cfg.seed,
@@ -190,43 +169,30 @@ def train_inverse_dynamics(
         metric=("nll", "min"),
         eval_interval=cfg.trainer.inverse_dynamics_steps,
         description="inverse_dynamics",
-        **common,
+        **training,
     )
     trainer.train()
-    result = trainer.history[-1]
-    run_folder.write_json(folder / "inverse_dynamics.json", result)
-    print(
-        f"inverse dynamics, {result['rows']} held-out rows: "
-        f"NLL {result['nll']:.2f}, "
-        f"R2 {', '.join(f'{value:.2f}' for value in result['r2'])}, "
-        f"90 % interval covers {100 * result['coverage_90']:.0f} %"
-    )
+    run_folder.write_json(folder / "inverse_dynamics.json", trainer.history[-1])
+    print(describe(trainer.history[-1]))
 
 
 def report(
-    cfg: DictConfig, folder: Path, manifest: dict[str, Any], trainer: OfflineTrainer
+    cfg: DictConfig, folder: Path, data_score: float, trainer: OfflineTrainer
 ) -> float:
     """Write raw returns and the figure, print the table."""
-    last, best = trainer.history[-1], trainer.best()
-    data_score = manifest["normalized_score"]
+    history, best = trainer.history, trainer.best()
+    results = {"data_score": data_score, "last": history[-1], "best": best}
+    run_folder.write_json(folder / "returns.json", results | {"evaluations": history})
     name = f"{cfg.env.name} {cfg.data.level}"
-    results = {
-        "env": cfg.env.id,
-        "data": {"level": cfg.data.level, "score": data_score},
-        "last": last,
-        "best": best,
-        "evaluations": trainer.history,
-    }
-    run_folder.write_json(folder / "returns.json", results)
     learning_curve(
-        trainer.history,
+        history,
         read_scalars(folder / "csv" / "scalars" / "policy"),
         folder / "curve.png",
         title=f"{name}, seed {cfg.seed}, recovery weight {cfg.loss.recovery_weight:g}",
         data_score=data_score,
     )
-    print("\n" + score_table(name, trainer.history, best, data_score, folder))
-    return float(last["score"])
+    print("\n" + score_table(name, history, best, data_score, folder))
+    return float(history[-1]["score"])
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ Shapes: ``N`` rows, ``A`` action.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -59,3 +60,12 @@ def inverse_dynamics_report(
         "coverage_90": inside.float().mean().item(),
         "rows": len(data),
     }
+
+
+def describe(report: Mapping[str, Any]) -> str:
+    """Return a report's line for the screen."""
+    r2 = ", ".join(f"{value:.2f}" for value in report["r2"])
+    return (
+        f"inverse dynamics, {report['rows']} held-out rows: NLL {report['nll']:.2f}, "
+        f"R2 {r2}, 90 % interval covers {100 * report['coverage_90']:.0f} %"
+    )
