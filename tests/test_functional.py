@@ -157,9 +157,9 @@ def test_recovery_alone_has_the_known_fixed_point(direction, loc, scale) -> None
     assert policy[1].exp().item() == pytest.approx(scale, abs=1e-5)
 
 
-# a ~ N(-.3, .4^2), s' = .5 a + N(0, .1^2): I(a | s') has gain .08/.05 = 1.6 and variance
-# .16 * .01/.05 = .032; its mean over s' has variance 1.6^2 * .05 = .128. The recovery
-# term is quadratic in that mean: two points, one deviation off, integrate it exactly.
+# a ~ N(-.3, .4^2), s' = .5 a + N(0, .1^2): I(a | s') has gain .08/.05 = 1.6 and
+# variance .16 * .01/.05 = .032; its mean over s' varies by 1.6^2 * .05 = .128. The
+# recovery term is quadratic in that mean: two points, one deviation off, are exact.
 NEXT_STATES = torch.tensor([[-1.0], [1.0]], dtype=torch.float64)
 MODEL = (-0.3 + 0.128**0.5 * NEXT_STATES, torch.full_like(NEXT_STATES, 0.032**0.5))
 

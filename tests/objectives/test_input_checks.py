@@ -55,7 +55,7 @@ READ = [(name, key) for name in ("osr", "cql", "idm") for key in SHARED]
 READ += [(name, key) for name in ("osr", "cql") for key in CRITIC_ONLY]
 
 
-@pytest.mark.parametrize(("name", "key"), READ)
+@pytest.mark.parametrize(("name", "key"), READ, ids=str)
 def test_missing_entry_is_named(make_networks, make_batch, name, key) -> None:
     loss, batch = build(name, make_networks()), make_batch(10)
     leaf = key if isinstance(key, str) else key[-1]

@@ -209,6 +209,19 @@ def test_priority_is_the_largest_td_error_of_the_critics(
     torch.testing.assert_close(out["loss_qvalue"].detach(), distance.mean())
 
 
+def test_priority_belongs_to_the_worst_critic(make_networks, make_batch) -> None:
+    networks, batch = make_networks(), make_batch(10)
+    loss = make_osr(networks)
+    loss.make_value_estimator(gamma=0.0)
+    loss(batch)
+    errors = [
+        critic(batch.clone())["state_action_value"] - batch["next", "reward"]
+        for critic in make_networks().critics
+    ]
+    wanted = torch.cat(errors, -1).abs().amax(-1)
+    torch.testing.assert_close(batch["td_error"], wanted.detach())
+
+
 def train(loss, batch, steps: int) -> list[Tensor]:
     """Losses, gradients and parameters of a few optimizer steps."""
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)

@@ -1,0 +1,135 @@
+"""How much of a training step is not the update: sampling, noise, hooks, logging.
+
+    python benchmarks/trainer_overhead.py preset=quick
+    python benchmarks/trainer_overhead.py preset=paper bench.steps=50
+
+Two things are timed in turn, in one process and on one thread: the bare update on a
+batch that lies ready, and as many steps of ``OfflineTrainer`` with CSV logging.
+Evaluation is left out: it is counted in minutes, not in steps. Prints
+medians over the rounds, in CPU time, which other processes disturb least.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from hydra import compose, initialize_config_dir
+from tensordict import TensorDict
+from torchrl import torchrl_logger
+from torchrl.objectives import SoftUpdate
+from torchrl.record.loggers import CSVLogger
+
+from torchrl_osr import OSRLoss, StatePerturbation, config
+from torchrl_osr.data import make_replay_buffer
+from torchrl_osr.modules import (
+    critic_ensemble,
+    tanh_gaussian_actor,
+    tanh_gaussian_inverse_dynamics,
+)
+from torchrl_osr.trainers import OfflineTrainer
+
+OBSERVATION, ACTION, ROWS = 11, 3, 100_000  # Hopper's sizes; random numbers do here
+
+
+def random_data() -> TensorDict:
+    """Return transitions of the right shapes."""
+    no = torch.zeros(ROWS, 1, dtype=torch.bool)
+    following = {
+        "observation": torch.randn(ROWS, OBSERVATION),
+        "reward": torch.randn(ROWS, 1),
+        "done": no,
+        "terminated": no.clone(),
+        "truncated": no.clone(),
+    }
+    now = {
+        "observation": torch.randn(ROWS, OBSERVATION),
+        "action": torch.rand(ROWS, ACTION) * 1.8 - 0.9,
+    }
+    return TensorDict(now | {"next": following}, [ROWS])
+
+
+def cpu_seconds(function: Callable[[], None]) -> float:
+    """Return the CPU time of one call."""
+    start = time.process_time()
+    function()
+    return time.process_time() - start
+
+
+def main(rounds: int, steps: int, overrides: list[str]) -> dict[str, float | str]:
+    """Time update and trainer in turn and return the medians."""
+    torchrl_logger.setLevel("WARNING")
+    config.register()
+    conf = Path(__file__).resolve().parents[1] / "conf"
+    with initialize_config_dir(str(conf), version_base="1.3"):
+        cfg = compose("offline_osr", overrides=overrides)
+    torch.set_num_threads(cfg.trainer.num_threads)
+    torch.manual_seed(0)
+    cells = list(cfg.network.num_cells)
+    loss = OSRLoss(
+        tanh_gaussian_actor(OBSERVATION, ACTION, num_cells=cells),
+        critic_ensemble(OBSERVATION, ACTION, num_cells=cells),
+        tanh_gaussian_inverse_dynamics(OBSERVATION, ACTION, num_cells=cells),
+        **cfg.loss,
+    )
+    loss.make_value_estimator(gamma=cfg.optim.gamma)
+    updater = SoftUpdate(loss, tau=cfg.optim.tau)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-4, fused=True)
+    buffer = make_replay_buffer(
+        random_data(),
+        batch_size=cfg.trainer.batch_size,
+        seed=0,
+        transform=StatePerturbation(cfg.perturbation.std, seed=0),
+    )
+    batch = buffer.sample()
+
+    def update() -> None:
+        for _ in range(steps):
+            losses = loss(batch)
+            sum(v for k, v in losses.items() if k.startswith("loss_")).backward()
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+            updater.step()
+
+    def train() -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            OfflineTrainer(
+                loss,
+                optimizer,
+                buffer,
+                total_steps=steps,
+                folder=folder,
+                target_net_updater=updater,
+                loggers=[CSVLogger("csv", log_dir=folder)],
+                log_interval=min(cfg.trainer.log_interval, steps),
+                eval_interval=steps,
+            ).train()
+
+    update(), train()  # warm-up
+    times = [(cpu_seconds(update), cpu_seconds(train)) for _ in range(rounds)]
+    bare, whole = (
+        statistics.median(column) / steps for column in zip(*times, strict=True)
+    )
+    share = statistics.median(1 - pair[0] / pair[1] for pair in times)
+    return {
+        "overrides": " ".join(overrides),
+        "updates_per_cpu_second": 1 / bare,
+        "trainer_steps_per_cpu_second": 1 / whole,
+        "share_not_update": share,
+    }
+
+
+if __name__ == "__main__":
+    options = dict(a.split("=") for a in sys.argv[1:] if a.startswith("bench."))
+    rest = [a for a in sys.argv[1:] if not a.startswith("bench.")]
+    numbers = main(
+        int(options.get("bench.rounds", 7)), int(options.get("bench.steps", 200)), rest
+    )
+    json.dump(numbers, sys.stdout, indent=1)
+    print()

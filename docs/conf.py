@@ -1,0 +1,42 @@
+"""Sphinx configuration: sphinx-build -W -b html docs docs/_build/html."""
+
+import os
+
+import torchrl_osr
+
+project = "torchrl-osr"
+author = "The torchrl-osr authors"
+copyright = "2026, The torchrl-osr authors"
+version = release = torchrl_osr.__version__
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+]
+exclude_patterns = ["_build"]
+html_theme = "furo"
+html_title = "torchrl-osr"
+html_copy_source = False
+
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 2
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented"
+napoleon_numpy_docstring = False
+python_maximum_signature_line_length = 80
+add_module_names = False
+
+# Links into the neighbours' documentation need a network, and the build shall not.
+if os.environ.get("TORCHRL_OSR_DOCS_ONLINE"):
+    extensions.append("sphinx.ext.intersphinx")
+    intersphinx_mapping = {
+        "python": ("https://docs.python.org/3", None),
+        "tensordict": ("https://pytorch.org/tensordict/stable", None),
+        "torch": ("https://docs.pytorch.org/docs/stable", None),
+        "torchrl": ("https://pytorch.org/rl/stable", None),
+    }
