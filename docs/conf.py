@@ -1,6 +1,10 @@
 """Sphinx configuration: sphinx-build -W -b html docs docs/_build/html."""
 
+import inspect
 import os
+
+from sphinx.util.inspect import stringify_signature
+from torchrl.objectives import LossModule
 
 import torchrl_osr
 
@@ -40,3 +44,16 @@ if os.environ.get("TORCHRL_OSR_DOCS_ONLINE"):
         "torch": ("https://docs.pytorch.org/docs/stable", None),
         "torchrl": ("https://pytorch.org/rl/stable", None),
     }
+
+
+def constructor_signature(app, what, name, obj, options, signature, returns):
+    """Show a loss's own arguments; TorchRL's metaclass has them as ``*args``."""
+    if what == "class" and issubclass(obj, LossModule):
+        own = inspect.signature(obj.__init__)
+        own = own.replace(parameters=list(own.parameters.values())[1:])
+        return stringify_signature(own, show_annotation=False), None
+    return None
+
+
+def setup(app):
+    app.connect("autodoc-process-signature", constructor_signature)

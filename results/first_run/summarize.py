@@ -3,7 +3,7 @@
     python results/first_run/summarize.py multirun/*/*/ outputs/*/*/
 
 Writes beside itself ``episodes.csv`` (the raw return of every evaluation episode),
-``scores.csv`` (a line a run) and ``curves.png``; prints means over seeds with intervals.
+``scores.csv`` (a line a run) and ``curves.png``; prints means over seeds.
 """
 
 from __future__ import annotations

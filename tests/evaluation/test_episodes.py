@@ -54,10 +54,11 @@ def test_time_limit_ends_an_episode():
 
 
 def test_global_generators_are_left_alone():
-    torch_state, numpy_state = torch.get_rng_state(), np.random.get_state()
+    before, state = np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
     EpisodeEvaluator("Hopper-v5", num_episodes=2)(linear_policy)
-    assert torch.equal(torch_state, torch.get_rng_state())
-    assert all(map(np.array_equal, numpy_state, np.random.get_state()))
+    assert torch.equal(state, torch.get_rng_state())
+    after = np.random.get_state()  # noqa: NPY002
+    assert all(map(np.array_equal, before, after))
 
 
 def test_policy_sees_standardised_observations():

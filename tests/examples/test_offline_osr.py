@@ -1,4 +1,4 @@
-"""The main example, run as a user runs it: in processes of its own, a few steps each."""
+"""The main example as a user runs it: in processes of its own, a few steps each."""
 
 from __future__ import annotations
 

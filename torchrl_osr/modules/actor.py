@@ -8,8 +8,9 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal
 
-MIN_SCALE = 1e-2
-"""Smallest standard deviation before the tanh, of policy and inverse dynamics alike.
+SCALE_MAPPING = "biased_softplus_1.0_0.01"
+"""Standard deviation before the tanh, of policy and inverse dynamics alike: a softplus
+that is 1 at 0 and never below 0.01.
 
 The forward KL divides by the policy's variance: without a floor one confident,
 wrong state owns the whole gradient.
@@ -52,7 +53,7 @@ def tanh_gaussian_actor(
             num_cells=list(num_cells),
             activation_class=activation_class,
         ),
-        NormalParamExtractor(scale_lb=MIN_SCALE),
+        NormalParamExtractor(SCALE_MAPPING),
     )
     return ProbabilisticActor(
         TensorDictModule(network, ["observation"], ["loc", "scale"]),

@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal
 
-from torchrl_osr.modules.actor import MIN_SCALE
+from torchrl_osr.modules.actor import SCALE_MAPPING
 
 
 def tanh_gaussian_inverse_dynamics(
@@ -58,7 +58,7 @@ def tanh_gaussian_inverse_dynamics(
         ["param"],
     )
     extractor = TensorDictModule(
-        NormalParamExtractor(scale_lb=MIN_SCALE), ["param"], ["loc", "scale"]
+        NormalParamExtractor(SCALE_MAPPING), ["param"], ["loc", "scale"]
     )
     return ProbabilisticActor(
         TensorDictSequential(joint_mlp, extractor),

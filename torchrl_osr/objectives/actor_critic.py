@@ -11,7 +11,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -29,11 +29,18 @@ from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
 from torchrl_osr import functional
 from torchrl_osr.objectives.distributions import action_bounds, check_same_bounds
 from torchrl_osr.objectives.mixed_states import (
+    entry,
     nested,
     perturbed_twin,
     replace_next,
+    select,
     state_keys,
 )
+
+
+def _check_choice(name: str, value: str | None, choices: tuple[Any, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {choices}, got {value!r}.")
 
 
 class RecoveryActorCriticLoss(LossModule):
@@ -96,6 +103,11 @@ class RecoveryActorCriticLoss(LossModule):
         use_prioritized_weights: bool | Literal["auto"],
         scalar_output_mode: Literal["exclude", "non_tensor"] | None,
     ) -> None:
+        _check_choice("loss_function", loss_function, ("l2", "l1", "smooth_l1"))
+        _check_choice("reduction", reduction, (None, "none", "mean", "sum"))
+        _check_choice(
+            "scalar_output_mode", scalar_output_mode, (None, "exclude", "non_tensor")
+        )
         self._in_keys: list[NestedKey] | None = None
         self._out_keys: list[NestedKey] | None = None
         super().__init__()
@@ -108,6 +120,8 @@ class RecoveryActorCriticLoss(LossModule):
         self.convert_to_functional(actor_network, "actor_network")
         if isinstance(qvalue_network, Sequence):
             num_qvalue_nets = len(qvalue_network)
+        if num_qvalue_nets < 1:
+            raise ValueError("There must be at least one critic.")
         self.convert_to_functional(
             qvalue_network,
             "qvalue_network",
@@ -144,6 +158,9 @@ class RecoveryActorCriticLoss(LossModule):
             scalar_output_mode = "exclude"
         self.scalar_output_mode = scalar_output_mode
         self._make_vmap()
+        # Now, not at the first call as TorchRL does: a state dict has the same entries
+        # before and after it.
+        self.make_value_estimator()
 
     def _make_vmap(self) -> None:
         self._vmap_qvalue = _vmap_func(
@@ -152,6 +169,11 @@ class RecoveryActorCriticLoss(LossModule):
             randomness=self.vmap_randomness,
             pseudo_vmap=self.deactivate_vmap,
         )
+
+    def reset_parameters_recursive(self) -> None:
+        """Reset actor and critics; the inverse dynamics model keeps what it learnt."""
+        for name in ("actor_network", "qvalue_network"):
+            self._reset_module_parameters(name, getattr(self, name))
 
     def make_value_estimator(
         self, value_type: ValueEstimators | str | None = None, **hyperparams: Any
@@ -214,13 +236,12 @@ class RecoveryActorCriticLoss(LossModule):
 
     def _flag(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
         """Return a boolean entry below ``"next"``, ``[B]``."""
-        flag: Tensor = tensordict.get(nested("next", key))
-        return flag.squeeze(-1)
+        return entry(tensordict, nested("next", key)).squeeze(-1)
 
     def _states(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return ``[s, s']`` or ``[s, s', s^]``, stacked in front: ``[2 or 3, B]``."""
         keys = self._observation_keys()
-        clean = tensordict.select(*keys)
+        clean = select(tensordict, keys)
         following = clean.copy()
         terminated = self._flag(tensordict, self.tensor_keys.terminated)
         for key in keys:
@@ -247,8 +268,14 @@ class RecoveryActorCriticLoss(LossModule):
         batch = states.select(*state_keys(self.qvalue_network.in_keys), strict=False)
         batch.set(self.tensor_keys.action, action)
         batch = self._vmap_qvalue(batch, params)
-        value: Tensor = batch.get(self.tensor_keys.state_action_value)
-        return value.squeeze(-1)
+        value = batch.get(self.tensor_keys.state_action_value, None)
+        if value is None:
+            raise KeyError(
+                f"The critics write {self.qvalue_network.out_keys}, not "
+                f"{self.tensor_keys.state_action_value!r}: give them that out_key, or "
+                "call set_keys(state_action_value=...)."
+            )
+        return cast(Tensor, value.squeeze(-1))
 
     def _actor_term(
         self, states: TensorDictBase, policy: TensorDictBase
@@ -275,6 +302,7 @@ class RecoveryActorCriticLoss(LossModule):
         """Return the TD target ``[B]`` from the states ``s'`` and the policy there."""
         action, _ = rsample_and_log_prob(self._distribution(policy))
         next_qvalue = self._qvalue(states, action, self.target_qvalue_network_params)
+        entry(tensordict, nested("next", self.tensor_keys.reward))
         batch = tensordict.copy()
         value_key = nested("next", self.value_estimator.tensor_keys.value)
         batch.set(value_key, next_qvalue.min(0).values.unsqueeze(-1))

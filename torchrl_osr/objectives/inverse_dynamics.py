@@ -19,6 +19,7 @@ from torchrl.objectives.common import LossModule
 
 from torchrl_osr.objectives.distributions import action_bounds
 from torchrl_osr.objectives.mixed_states import (
+    entry,
     nested,
     reduce_transitions,
     state_keys,
@@ -156,7 +157,7 @@ class InverseDynamicsLoss(LossModule):
             self.inverse_dynamics_network, preserve_module_state=False
         ):
             distribution = self.inverse_dynamics_network.get_dist(batch)
-        action = tensordict.get(self.tensor_keys.action)
+        action = entry(tensordict, self.tensor_keys.action)
         log_prob: Tensor = distribution.log_prob(action.expand_as(distribution.loc))
         return log_prob
 
@@ -167,7 +168,7 @@ class InverseDynamicsLoss(LossModule):
         Args:
             tensordict: a batch ``[B]`` with the entries of :attr:`in_keys`.
         """
-        done = tensordict.get(nested("next", self.tensor_keys.done)).squeeze(-1)
+        done = entry(tensordict, nested("next", self.tensor_keys.done)).squeeze(-1)
         negative_log_prob = -self._log_prob(tensordict, done).mean(0)
         loss = reduce_transitions(self, negative_log_prob, done, tensordict)
         batch_size = tensordict.batch_size if self.reduction == "none" else []

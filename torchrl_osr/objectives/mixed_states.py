@@ -25,6 +25,26 @@ def is_next(key: NestedKey) -> bool:
     return isinstance(key, tuple) and key[0] == "next"
 
 
+def entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+    """Return an entry that must be there.
+
+    Raises:
+        KeyError: naming the missing entry and those that are there.
+    """
+    value: Tensor | None = tensordict.get(key, None)
+    if value is None:
+        there = sorted(map(str, tensordict.keys(True, True)))
+        raise KeyError(f"The batch has no entry {key!r}; it has {there}.")
+    return value
+
+
+def select(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> TensorDictBase:
+    """Return the entries ``keys``, all of which must be there (see :func:`entry`)."""
+    for key in keys:
+        entry(tensordict, key)
+    return tensordict.select(*keys)
+
+
 def state_keys(in_keys: Iterable[NestedKey], *exclude: NestedKey) -> list[NestedKey]:
     """Return the current-state entries of ``in_keys``, once each and in order."""
     keys = dict.fromkeys(unravel_key(key) for key in in_keys)
@@ -45,15 +65,16 @@ def perturbed_twin(
         KeyError: if no entry has a twin.
         ValueError: if a twin has another shape than its clean state.
     """
-    twin = tensordict.select(*keys)
+    twin = select(tensordict, keys)
     twins = {key: tensordict.get(nested(perturbed, key), None) for key in keys}
     if all(value is None for value in twins.values()):
         wanted = [nested(perturbed, key) for key in keys]
         raise KeyError(
             f"No perturbed state in the batch: expected one of {wanted}, the batch has "
             f"{sorted(map(str, tensordict.keys(True, True)))}. Append "
-            "StatePerturbation(std=...) to the replay buffer, or set "
-            "recovery_weight=0 (CQL) if no state recovery is wanted."
+            "StatePerturbation(std=...) to the replay buffer, or do without the "
+            "perturbed states: recovery_weight=0 makes OSRLoss CQL, states='clean' "
+            "trains InverseDynamicsLoss on the data alone."
         )
     for key, value in twins.items():
         if value is None:
@@ -79,7 +100,7 @@ def replace_next(tensordict: TensorDictBase, key: NestedKey, flag: Tensor) -> Te
         key: a state entry.
         flag: bool ``[B]``.
     """
-    state, next_state = tensordict.get(key), tensordict.get(("next", key))
+    state, next_state = entry(tensordict, key), entry(tensordict, nested("next", key))
     if state.shape != next_state.shape:
         raise ValueError(
             f"{nested('next', key)!r} has shape {tuple(next_state.shape)}, but "
@@ -109,7 +130,7 @@ def transitions(
         perturbed: it is where the agent shall return to.
     """
     keys = state_keys(in_keys)
-    clean = tensordict.select(*keys)
+    clean = select(tensordict, keys)
     stack = [clean]
     if perturbed is not None:
         stack.append(perturbed_twin(tensordict, keys, perturbed))
@@ -127,6 +148,7 @@ def reduce_transitions(
     done: Tensor,
     tensordict: TensorDictBase,
     weights: Tensor | None = None,
+    reduction: str | None = None,
 ) -> Tensor:
     """Reduce ``value`` over the rows that are true transitions.
 
@@ -136,9 +158,13 @@ def reduce_transitions(
         done: bool ``[B]``; such rows do not count, and are 0 under ``"none"``.
         tensordict: the batch ``[B]``, for the masks in it.
         weights: importance weights of the rows, ``[B]``.
+        reduction: in place of the module's.
     """
+    reduction = reduction or loss.reduction
     value = torch.where(done, torch.zeros_like(value), value)
     # A mask handed to _reduce_loss would compact the result under "none".
-    mask = None if loss.reduction == "none" else ~done
-    reduced: Tensor = loss._reduce_loss(value, tensordict, mask=mask, weights=weights)
+    mask = None if reduction == "none" else ~done
+    reduced: Tensor = loss._reduce_loss(
+        value, tensordict, mask=mask, weights=weights, reduction=reduction
+    )
     return reduced

@@ -7,6 +7,7 @@ nothing recovers). The equations are in :mod:`torchrl_osr.functional`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Literal
 
@@ -22,7 +23,11 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 
 from torchrl_osr import functional
 from torchrl_osr.objectives.actor_critic import RecoveryActorCriticLoss
-from torchrl_osr.objectives.mixed_states import reduce_transitions, transitions
+from torchrl_osr.objectives.mixed_states import (
+    entry,
+    reduce_transitions,
+    transitions,
+)
 
 
 class OSRLoss(RecoveryActorCriticLoss):
@@ -129,8 +134,13 @@ class OSRLoss(RecoveryActorCriticLoss):
     ) -> None:
         weights = {"recovery_weight": recovery_weight, "min_q_weight": min_q_weight}
         for name, weight in weights.items():
-            if weight < 0:
+            if not 0 <= weight < math.inf:
                 raise ValueError(f"{name} must be at least 0, got {weight}.")
+        if num_random < 1 or not temperature > 0:
+            raise ValueError(
+                "num_random must be at least 1 and temperature above 0, got "
+                f"{num_random} and {temperature}."
+            )
         if recovery_weight and inverse_dynamics_network is None:
             raise ValueError(
                 f"recovery_weight={recovery_weight} needs an inverse_dynamics_network; "
@@ -226,7 +236,7 @@ class OSRLoss(RecoveryActorCriticLoss):
         self, tensordict: TensorDictBase, states: TensorDictBase, policy: TensorDictBase
     ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
         """Return TD and conservative terms, each ``[B]``, and the values ``[N, B]``."""
-        data_action = tensordict.get(self.tensor_keys.action)
+        data_action = entry(tensordict, self.tensor_keys.action)
         action, log_prob = self._proposals(policy, data_action)
         action = torch.cat([data_action.unsqueeze(0), action])
         clean = states[0].expand(action.shape[:-1])
@@ -256,9 +266,15 @@ class OSRLoss(RecoveryActorCriticLoss):
             reduced: Tensor = self._reduce_loss(value, tensordict, weights=weights)
             return reduced
 
+        def mean(value: Tensor) -> Tensor:
+            metric: Tensor = self._reduce_loss(
+                value.detach().mean(0), tensordict, reduction="mean"
+            )
+            return metric
+
         states = self._states(tensordict)
         policy = self._policy(states)
-        action_dim = tensordict.get(self.tensor_keys.action).shape[-1]
+        action_dim = entry(tensordict, self.tensor_keys.action).shape[-1]
         actor, log_prob = self._actor_term(states[::2], policy[::2])
         td, gap, values = self._critic_terms(tensordict, states, policy[:2].detach())
         losses = {
@@ -269,15 +285,18 @@ class OSRLoss(RecoveryActorCriticLoss):
         }
         metrics = {
             "alpha": self.log_alpha.detach().exp(),
-            "entropy": -log_prob.detach().mean(),
-            "pred_value": values["pred_value"].mean(),
-            "target_value": values["target_value"].mean(),
+            "entropy": -mean(log_prob),
+            "pred_value": mean(values["pred_value"]),
+            "target_value": mean(values["target_value"].unsqueeze(0)),
         }
         if self.recovers:
             kl = self._recovery_term(tensordict, policy[::2], done).mean(0)
-            kl = reduce_transitions(self, kl, done, tensordict, weights)
-            losses["loss_recovery"] = self.recovery_weight * kl
-            metrics["recovery_kl"] = kl.detach().mean()
+            losses["loss_recovery"] = self.recovery_weight * reduce_transitions(
+                self, kl, done, tensordict, weights
+            )
+            metrics["recovery_kl"] = reduce_transitions(
+                self, kl.detach(), done, tensordict, reduction="mean"
+            )
         td_error = (values["pred_value"] - values["target_value"]).abs().amax(0)
         tensordict.set(self.tensor_keys.priority, td_error)
         return self._output(tensordict, losses, metrics)

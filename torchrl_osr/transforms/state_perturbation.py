@@ -69,11 +69,11 @@ class StatePerturbation(Transform):
             raise ValueError(f"std must be at least 0, got {std}.")
         if noise not in ("gaussian", "uniform"):
             raise ValueError(f"noise must be 'gaussian' or 'uniform', got {noise!r}.")
-        in_keys = list(in_keys)
+        in_keys = [in_keys] if isinstance(in_keys, str) else list(in_keys)
         super().__init__(
             in_keys=in_keys, out_keys=[nested(perturbed, key) for key in in_keys]
         )
-        self.std = std
+        self.register_buffer("std", torch.tensor(std, dtype=torch.float64))
         self.noise = noise
         self.seed = torch.initial_seed() if seed is None else seed
         if isinstance(relative_to, Tensor):
@@ -84,8 +84,8 @@ class StatePerturbation(Transform):
                 f"{len(relative_to)}."
             )
         for i in range(len(in_keys)):
-            scale = 1.0 if relative_to is None else relative_to[i]
-            self.register_buffer(f"_scale_{i}", std * torch.as_tensor(scale))
+            unit = 1.0 if relative_to is None else relative_to[i]
+            self.register_buffer(f"_unit_{i}", torch.as_tensor(unit))
         self._generator: torch.Generator | None = None
 
     def _generator_on(self, device: torch.device) -> torch.Generator:
@@ -121,9 +121,8 @@ class StatePerturbation(Transform):
                     f"StatePerturbation reads {key!r}, but the batch has "
                     f"{sorted(map(str, tensordict.keys(True, True)))}."
                 )
-            tensordict.set(
-                twin, self._perturb(state, key, getattr(self, f"_scale_{i}"))
-            )
+            unit: Tensor = getattr(self, f"_unit_{i}")
+            tensordict.set(twin, self._perturb(state, key, self.std * unit))
         return tensordict
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:

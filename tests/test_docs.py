@@ -1,0 +1,147 @@
+"""What the documentation says is true: its code runs, its names and values exist."""
+
+from __future__ import annotations
+
+import re
+from functools import reduce
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from mktestdocs import check_md_file, grab_code_blocks
+from omegaconf import OmegaConf
+
+from torchrl_osr import config
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "torchrl_osr" / "data" / "behavior_policies" / "MODEL_CARD.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+]
+PACKAGES = [
+    f"torchrl_osr{name}"
+    for name in (
+        "",
+        ".data",
+        ".evaluation",
+        ".modules",
+        ".objectives",
+        ".trainers",
+        ".transforms",
+    )
+]
+DESCRIBE_ALL = re.compile(r"\.\. automodule:: ([\w.]+)\n((?:   :.*\n?)*)")
+DESCRIBE_ONE = re.compile(r"\.\. (?:autoclass|autofunction|py:data):: ([\w.]+)")
+
+
+def shell_lines(text: str) -> list[str]:
+    blocks = grab_code_blocks(text, lang="bash")
+    return [line for block in blocks for line in block.splitlines()]
+
+
+def described() -> tuple[set[str], set[int]]:
+    """Names that the reference describes one by one, and ids of all it describes."""
+    text = (ROOT / "docs" / "reference.md").read_text(encoding="utf-8")
+    names = set(DESCRIBE_ONE.findall(text))
+    ids = set()
+    for module, options in DESCRIBE_ALL.findall(text):
+        if ":members:" in options:
+            public = vars(import_module(module)).items()
+            ids |= {id(value) for name, value in public if not name.startswith("_")}
+    for name in names:
+        module, _, attribute = name.rpartition(".")
+        if module:
+            ids.add(id(getattr(import_module(module), attribute)))
+    return names, ids
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_python_blocks_run(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("TORCHRL_OSR_CACHE", str(tmp_path))
+    check_md_file(page, memory=True)
+
+
+def test_readme_shows_the_whole_drop_in_example():
+    block, *_ = grab_code_blocks(README, lang="python")
+    example = ROOT / "examples" / "drop_in_loss.py"
+    assert block.strip() == example.read_text(encoding="utf-8").strip()
+
+
+def test_readme_has_one_test_line_and_one_main_job_line():
+    fresh = [line for line in shell_lines(README) if line.startswith("python3 -m venv")]
+    assert len([line for line in fresh if line.endswith("&& pytest")]) == 1
+    job = "&& python examples/offline_osr.py env=hopper"
+    assert len([line for line in fresh if line.endswith(job)]) == 1
+    assert len(fresh) == 2
+    assert len(re.findall(r"(?m)(?:^|[ &])pytest$", README)) == 1
+
+
+def test_ci_runs_the_readmes_test_line():
+    script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    assert "README.md" in script
+    assert 'bash -euo pipefail -c "$line"' in script
+    assert "pip install -c constraints.txt -e" not in script, "a second copy"
+
+
+def test_readme_is_short():
+    assert len(README.splitlines()) <= 120
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_public_names_are_in_the_reference(package):
+    names, ids = described()
+    module = import_module(package)
+    missing = [
+        name
+        for name in module.__all__
+        if f"{package}.{name}" not in names
+        and name not in names
+        and id(getattr(module, name)) not in ids
+    ]
+    assert not missing
+
+
+def test_public_functions_and_configuration_are_in_the_reference():
+    text = (ROOT / "docs" / "reference.md").read_text(encoding="utf-8")
+    with_members = [
+        name for name, rest in DESCRIBE_ALL.findall(text) if "members" in rest
+    ]
+    assert {"torchrl_osr.functional", "torchrl_osr.config"} <= set(with_members)
+
+
+def test_every_configuration_key_is_documented_with_its_values():
+    page = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
+    row = re.compile(r"(?m)^\| `([\w.]+)` \| `(.+?)` \| `(.+?)` \|")
+    section = page.split("## Every key")[1].split("## Sweeps")[0]
+    rows = {key: values for key, *values in row.findall(section)}
+    config.register()
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        presets = [
+            compose("offline_osr", overrides=[f"preset={name}"])
+            for name in ("quick", "paper")
+        ]
+    for column, cfg in enumerate(presets):
+        tree = OmegaConf.to_container(cfg)
+        keys = {
+            f"{group}.{key}" if isinstance(value, dict) else group
+            for group, value in tree.items()
+            for key in (value if isinstance(value, dict) else [group])
+        }
+        assert keys == rows.keys()
+        for key, values in rows.items():
+            there = reduce(lambda node, part: node[part], key.split("."), tree)
+            (said,) = OmegaConf.create(f"[{values[column]}]")
+            said = OmegaConf.to_container(said) if OmegaConf.is_config(said) else said
+            assert said == there, key
+
+
+def test_options_of_every_group_are_documented():
+    page = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
+    for group in ("env", "data", "loss", "logger", "preset", "hydra/launcher"):
+        (row,) = re.findall(rf"(?m)^\| `{group}` \|.*$", page)
+        for path in (ROOT / "conf" / group).glob("*.yaml"):
+            assert f"`{path.stem}`" in row
