@@ -74,7 +74,7 @@ def main(rounds: int, steps: int, overrides: list[str]) -> dict[str, float | str
     cells = list(cfg.network.num_cells)
     loss = OSRLoss(
         tanh_gaussian_actor(OBSERVATION, ACTION, num_cells=cells),
-        critic_ensemble(OBSERVATION, ACTION, num_cells=cells),
+        critic_ensemble(OBSERVATION, ACTION, **cfg.network),
         tanh_gaussian_inverse_dynamics(OBSERVATION, ACTION, num_cells=cells),
         **cfg.loss,
     )

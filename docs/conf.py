@@ -32,8 +32,13 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"
 napoleon_numpy_docstring = False
+napoleon_use_ivar = True
 python_maximum_signature_line_length = 80
 add_module_names = False
+
+# A link to a name of ours that is not in the reference is an error.
+nitpicky = True
+nitpick_ignore_regex = [("py:.*", r"(?!torchrl_osr\b).*")]
 
 # Links into the neighbours' documentation need a network, and the build shall not.
 if os.environ.get("TORCHRL_OSR_DOCS_ONLINE"):

@@ -104,9 +104,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
     sizes = (data["observation"].shape[-1], data["action"].shape[-1])
     cells = list(cfg.network.num_cells)
     actor = tanh_gaussian_actor(*sizes, num_cells=cells).to(device)
-    critics = critic_ensemble(
-        *sizes, num_cells=cells, num_qvalue_nets=cfg.network.num_qvalue_nets
-    )
+    critics = critic_ensemble(*sizes, **cfg.network)
     model = tanh_gaussian_inverse_dynamics(*sizes, num_cells=cells).to(device)
 
     # First phase: which action leads from s~ to s'?

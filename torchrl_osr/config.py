@@ -53,10 +53,12 @@ class NetworkConfig:
     Attributes:
         num_cells: width of each hidden layer.
         num_qvalue_nets: number of critics.
+        layer_norm: in the critics; steadier, but not in the paper.
     """
 
     num_cells: list[int] = MISSING
     num_qvalue_nets: int = MISSING
+    layer_norm: bool = MISSING
 
 
 @dataclass

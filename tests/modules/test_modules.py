@@ -121,3 +121,24 @@ def test_width_depth_and_activation_are_as_asked(build) -> None:
     layers = [m for m in network.modules() if isinstance(m, torch.nn.Linear)]
     assert [layer.out_features for layer in layers[:2]] == [6, 4]
     assert sum(isinstance(m, torch.nn.Tanh) for m in network.modules()) == 2
+
+
+def test_layer_norm_normalises_each_hidden_layer_before_its_activation() -> None:
+    torch.manual_seed(0)
+    (critic,) = critic_ensemble(
+        3, 2, num_qvalue_nets=1, num_cells=[16, 8], layer_norm=True
+    )
+    state, action = torch.randn(5, 3), torch.randn(5, 2)
+    value = critic(TensorDict({"observation": state, "action": action}, [5]))[
+        "state_action_value"
+    ]
+    # The same network restated layer by layer from its weights.
+    first, second, last = (
+        m for m in critic.modules() if isinstance(m, torch.nn.Linear)
+    )
+    hidden = torch.cat([state, action], -1)
+    for layer in (first, second):
+        hidden = layer(hidden)
+        spread, mean = torch.std_mean(hidden, -1, keepdim=True, correction=0)
+        hidden = ((hidden - mean) / (spread.square() + 1e-5).sqrt()).relu()
+    torch.testing.assert_close(value, last(hidden))

@@ -15,6 +15,7 @@ def critic_ensemble(
     num_qvalue_nets: int = 2,
     num_cells: Sequence[int] = (256, 256),
     activation_class: type[nn.Module] = nn.ReLU,
+    layer_norm: bool = False,
 ) -> list[ValueOperator]:
     """Return Q networks that read ``"observation"`` and ``"action"``.
 
@@ -28,6 +29,10 @@ def critic_ensemble(
         num_qvalue_nets: number of critics, ``N``.
         num_cells: width of each hidden layer.
         activation_class: activation between the layers.
+        layer_norm: normalise each hidden layer before its activation, which bounds
+            the values of actions far from the data ("Efficient Online Reinforcement
+            Learning with Offline Data", https://arxiv.org/abs/2302.02948). Not in the
+            paper; default ``False``.
 
     Returns:
         ``N`` modules that write ``"state_action_value"``, ``[B, 1]``.
@@ -40,6 +45,10 @@ def critic_ensemble(
         >>> critic(TensorDict(batch, [4]))["state_action_value"].shape
         torch.Size([4, 1])
     """
+    norm = {
+        "norm_class": nn.LayerNorm,
+        "norm_kwargs": [{"normalized_shape": width} for width in num_cells],
+    }
     return [
         ValueOperator(
             MLP(
@@ -47,6 +56,7 @@ def critic_ensemble(
                 out_features=1,
                 num_cells=list(num_cells),
                 activation_class=activation_class,
+                **(norm if layer_norm else {}),
             ),
             in_keys=["observation", "action"],
         )
