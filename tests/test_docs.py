@@ -49,8 +49,15 @@ def described() -> tuple[set[str], set[int]]:
     ids = set()
     for module, options in DESCRIBE_ALL.findall(text):
         if ":members:" in options:
-            public = vars(import_module(module)).items()
-            ids |= {id(value) for name, value in public if not name.startswith("_")}
+            ids |= {
+                id(value)
+                for name, value in vars(import_module(module)).items()
+                if not name.startswith("_")
+                and (
+                    ":imported-members:" in options
+                    or getattr(value, "__module__", None) == module
+                )
+            }
     for name in names:
         module, _, attribute = name.rpartition(".")
         if module:
@@ -87,8 +94,11 @@ def test_ci_runs_the_readmes_test_line():
     assert "pip install -c constraints.txt -e" not in script, "a second copy"
 
 
-def test_readme_is_short():
+def test_readme_is_short_and_its_links_exist():
     assert len(README.splitlines()) <= 120
+    targets = re.findall(r"\]\((?!https?:)([^)#]+)", README)
+    assert "docs/method.md" in targets
+    assert all((ROOT / target).exists() for target in targets)
 
 
 @pytest.mark.parametrize("package", PACKAGES)

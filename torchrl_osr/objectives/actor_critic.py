@@ -23,11 +23,12 @@ from tensordict.nn import (
 from torch import Tensor
 from torchrl.modules import TanhNormal
 from torchrl.modules.distributions.utils import rsample_and_log_prob
-from torchrl.objectives import LossModule, ValueEstimators, distance_loss
+from torchrl.objectives import ValueEstimators, distance_loss
 from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
 
 from torchrl_osr import functional
 from torchrl_osr.objectives.distributions import action_bounds, check_same_bounds
+from torchrl_osr.objectives.keyed_loss import KeyedLoss
 from torchrl_osr.objectives.mixed_states import (
     entry,
     nested,
@@ -43,7 +44,7 @@ def _check_choice(name: str, value: str | None, choices: tuple[Any, ...]) -> Non
         raise ValueError(f"{name} must be one of {choices}, got {value!r}.")
 
 
-class RecoveryActorCriticLoss(LossModule):
+class RecoveryActorCriticLoss(KeyedLoss):
     """Abstract base of :class:`~torchrl_osr.OSRLoss`: networks, keys, shared terms."""
 
     @dataclass
@@ -108,8 +109,6 @@ class RecoveryActorCriticLoss(LossModule):
         _check_choice(
             "scalar_output_mode", scalar_output_mode, (None, "exclude", "non_tensor")
         )
-        self._in_keys: list[NestedKey] | None = None
-        self._out_keys: list[NestedKey] | None = None
         super().__init__()
         self.deactivate_vmap = deactivate_vmap
         self.use_prioritized_weights = use_prioritized_weights
@@ -204,10 +203,6 @@ class RecoveryActorCriticLoss(LossModule):
         network_keys = [*self.actor_network.in_keys, *self.qvalue_network.in_keys]
         return state_keys(network_keys, self.tensor_keys.action)
 
-    def _set_in_keys(self) -> None:
-        """Forget the keys: TorchRL calls this when one was renamed."""
-        self._in_keys = None
-
     def _input_keys(self) -> list[NestedKey]:
         keys = self.tensor_keys
         states = self._observation_keys()
@@ -221,18 +216,7 @@ class RecoveryActorCriticLoss(LossModule):
             in_keys += network_keys
             states += state_keys(network_keys)
             in_keys += [nested(keys.perturbed, key) for key in states]
-        return list(dict.fromkeys(in_keys))
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """The entries that the loss reads, in a stable order."""
-        if self._in_keys is None:
-            self._in_keys = self._input_keys()
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
+        return in_keys
 
     def _flag(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
         """Return a boolean entry below ``"next"``, ``[B]``."""

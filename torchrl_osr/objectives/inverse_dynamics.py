@@ -15,9 +15,9 @@ from tensordict.nn import (
     dispatch,
 )
 from torch import Tensor
-from torchrl.objectives.common import LossModule
 
 from torchrl_osr.objectives.distributions import action_bounds
+from torchrl_osr.objectives.keyed_loss import KeyedLoss
 from torchrl_osr.objectives.mixed_states import (
     entry,
     nested,
@@ -27,7 +27,7 @@ from torchrl_osr.objectives.mixed_states import (
 )
 
 
-class InverseDynamicsLoss(LossModule):
+class InverseDynamicsLoss(KeyedLoss):
     r"""Negative log-likelihood of the data's action given both states.
 
     .. math::
@@ -98,17 +98,11 @@ class InverseDynamicsLoss(LossModule):
     ) -> None:
         if states not in ("both", "clean"):
             raise ValueError(f"states must be 'both' or 'clean', got {states!r}.")
-        self._in_keys: list[NestedKey] | None = None
-        self._out_keys = ["loss_inverse_dynamics"]
         super().__init__()
         action_bounds(inverse_dynamics_network, "inverse_dynamics_network")
         self.convert_to_functional(inverse_dynamics_network, "inverse_dynamics_network")
         self.states = states
         self.reduction = reduction or "mean"
-
-    def _set_in_keys(self) -> None:
-        """Forget the keys: TorchRL calls this when one was renamed."""
-        self._in_keys = None
 
     def _input_keys(self) -> list[NestedKey]:
         network_keys = self.inverse_dynamics_network.in_keys
@@ -122,27 +116,10 @@ class InverseDynamicsLoss(LossModule):
                 nested(self.tensor_keys.perturbed, key)
                 for key in state_keys(network_keys)
             ]
-        return list(dict.fromkeys(keys))
+        return keys
 
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """The entries that the loss reads, in a stable order."""
-        if self._in_keys is None:
-            self._in_keys = self._input_keys()
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
-
-    @property
-    def out_keys(self) -> list[NestedKey]:
-        """The entries that the loss writes."""
-        return self._out_keys
-
-    @out_keys.setter
-    def out_keys(self, values: list[NestedKey]) -> None:
-        self._out_keys = values
+    def _output_keys(self) -> list[NestedKey]:
+        return ["loss_inverse_dynamics"]
 
     def _log_prob(self, tensordict: TensorDictBase, done: Tensor) -> Tensor:
         """Return the log-density of the data's action, ``[1 or 2, B]``."""

@@ -166,22 +166,14 @@ class OSRLoss(RecoveryActorCriticLoss):
         self.num_random = num_random
         self.temperature = temperature
 
-    @property
-    def out_keys(self) -> list[NestedKey]:
-        """The entries that the loss writes, in their order."""
-        if self._out_keys is None:
-            losses = ["loss_actor", "loss_alpha", "loss_qvalue", "loss_cql"]
-            metrics = ["alpha", "entropy", "pred_value", "target_value"]
-            if self.recovers:
-                losses.append("loss_recovery")
-                metrics.append("recovery_kl")
-            kept = self.reduction != "none" or self.scalar_output_mode == "non_tensor"
-            self._out_keys = losses + metrics if kept else losses
-        return self._out_keys
-
-    @out_keys.setter
-    def out_keys(self, values: list[NestedKey]) -> None:
-        self._out_keys = values
+    def _output_keys(self) -> list[NestedKey]:
+        losses = ["loss_actor", "loss_alpha", "loss_qvalue", "loss_cql"]
+        metrics = ["alpha", "entropy", "pred_value", "target_value"]
+        if self.recovers:
+            losses.append("loss_recovery")
+            metrics.append("recovery_kl")
+        kept = self.reduction != "none" or self.scalar_output_mode == "non_tensor"
+        return losses + metrics if kept else losses
 
     def _recovery_term(
         self, tensordict: TensorDictBase, policy: TensorDictBase, done: Tensor

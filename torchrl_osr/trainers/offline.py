@@ -1,7 +1,7 @@
 """TorchRL's :class:`~torchrl.trainers.Trainer`, driven by a data set.
 
 TorchRL 0.14.1 has no offline trainer: every trainer asks a collector for frames. Here
-the collector is a clock (:class:`_GradientSteps`), so that frames count gradient steps
+the collector is a clock (:class:`GradientSteps`), so that frames count gradient steps
 and the trainer's own loop, hooks and optimization stepper are used as they are.
 """
 
@@ -15,18 +15,19 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torchrl.checkpoint import CheckpointRotation, GlobalRNGState
 from torchrl.data import ReplayBuffer
 from torchrl.objectives import LossModule, TargetNetUpdater
 from torchrl.record.loggers import Logger
-from torchrl.trainers import OptimizationStepper, Trainer
+from torchrl.trainers import Trainer
 
 from torchrl_osr.trainers.checkpointing import (
     GeneratorState,
     load_latest,
     safe_checkpoint,
 )
+from torchrl_osr.trainers.gradient_steps import GradientSteps, SumOfLosses
 
 try:
     from tqdm.auto import tqdm
@@ -36,56 +37,6 @@ except ImportError as error:
     ) from error
 
 CHECKPOINTS_KEPT = 2
-
-
-class _GradientSteps:
-    """The clock that stands in for a collector: an empty batch of n rows is n steps.
-
-    A tick ends wherever something is due (a log entry, an evaluation, a checkpoint).
-    """
-
-    init_random_frames = 0
-
-    def __init__(self, total: int, intervals: Sequence[int]) -> None:
-        self.total = total
-        self.intervals = intervals
-        self.step = 0
-
-    def __iter__(self) -> Iterator[TensorDictBase]:
-        while self.step < self.total:
-            due = min(
-                (self.step // interval + 1) * interval for interval in self.intervals
-            )
-            steps = min(due, self.total) - self.step
-            self.step += steps
-            yield TensorDict({}, [steps])
-
-    def shutdown(self) -> None:
-        """Do nothing: the trainer calls this on its collector."""
-
-
-class _SumOfLosses(OptimizationStepper):
-    """One backward and one step on the sum of the ``loss_*`` entries.
-
-    TorchRL's default stepper hands back losses with their graph attached and reads the
-    gradient norm back to the host at every step; this one does neither.
-    """
-
-    def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
-        """Run one update and return the detached losses and metrics."""
-        losses = trainer.compute_loss(sub_batch)
-        total = sum(value for key, value in losses.items() if key.startswith("loss_"))
-        total.backward()
-        trainer.optimizer.step()
-        trainer.optimizer.zero_grad(set_to_none=True)
-        return losses.detach()
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return nothing: the stepper has no state."""
-        return {}
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Do nothing: the stepper has no state."""
 
 
 class OfflineTrainer(Trainer):
@@ -154,13 +105,13 @@ class OfflineTrainer(Trainer):
                 f"{intervals}."
             )
         super().__init__(
-            collector=_GradientSteps(total_steps, intervals),
+            collector=GradientSteps(total_steps, intervals),
             total_frames=total_steps,
             frame_skip=1,
             optim_steps_per_batch=1,
             loss_module=loss_module,
             optimizer=optimizer,
-            optimization_stepper=_SumOfLosses(),
+            optimization_stepper=SumOfLosses(),
             progress_bar=False,
             auto_log_optim_steps=False,
         )

@@ -1,0 +1,63 @@
+"""What makes TorchRL's trainer run offline: a clock for a collector, and the update."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from tensordict import TensorDict, TensorDictBase
+from torchrl.trainers import OptimizationStepper, Trainer
+
+
+class GradientSteps:
+    """The clock that stands in for a collector: an empty batch of n rows is n steps.
+
+    A tick ends wherever something is due (a log entry, an evaluation, a checkpoint).
+
+    Args:
+        total: steps of the whole run.
+        intervals: steps between the things that may be due.
+    """
+
+    init_random_frames = 0
+
+    def __init__(self, total: int, intervals: Sequence[int]) -> None:
+        self.total = total
+        self.intervals = intervals
+        self.step = 0
+
+    def __iter__(self) -> Iterator[TensorDictBase]:
+        while self.step < self.total:
+            due = min(
+                (self.step // interval + 1) * interval for interval in self.intervals
+            )
+            steps = min(due, self.total) - self.step
+            self.step += steps
+            yield TensorDict({}, [steps])
+
+    def shutdown(self) -> None:
+        """Do nothing: the trainer calls this on its collector."""
+
+
+class SumOfLosses(OptimizationStepper):
+    """One backward and one step on the sum of the ``loss_*`` entries.
+
+    TorchRL 0.14.1's default stepper hands back losses with their graph attached and
+    reads the gradient norm back to the host at every step; this one does neither.
+    """
+
+    def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
+        """Run one update and return the detached losses and metrics."""
+        losses = trainer.compute_loss(sub_batch)
+        total = sum(value for key, value in losses.items() if key.startswith("loss_"))
+        total.backward()
+        trainer.optimizer.step()
+        trainer.optimizer.zero_grad(set_to_none=True)
+        return losses.detach()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return nothing: the stepper has no state."""
+        return {}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Do nothing: the stepper has no state."""
