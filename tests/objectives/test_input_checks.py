@@ -107,3 +107,21 @@ def test_recovery_without_a_model_is_refused(make_networks) -> None:
     networks.inverse_dynamics = None
     with pytest.raises(ValueError, match="needs an inverse_dynamics_network"):
         build("osr", networks)
+
+
+@pytest.mark.parametrize("name", ["osr", "cql", "idm"])
+def test_action_of_another_size_is_named(make_networks, make_batch, name) -> None:
+    loss, batch = build(name, make_networks()), make_batch(10)
+    batch["action"] = torch.zeros(10, 5, dtype=torch.float64)
+    with pytest.raises(ValueError, match=r"'action' has shape \(10, 5\).* 2 dim"):
+        loss(batch)
+
+
+@pytest.mark.parametrize("key", ["reward", "done", "terminated"])
+def test_flags_and_rewards_need_a_last_dimension_of_one(
+    make_networks, make_batch, key
+) -> None:
+    loss, batch = build("osr", make_networks()), make_batch(10)
+    batch["next", key] = batch["next", key].squeeze(-1)
+    with pytest.raises(ValueError, match=rf"'{key}'\) has shape \(10,\).*\(10, 1\)"):
+        loss(batch)

@@ -119,7 +119,10 @@ def collect_transitions(
     lengths: list[int] = []
     # disable=None: no bar where the output is not a terminal.
     with tqdm(
-        total=num_transitions, unit="step", disable=None if progress else True
+        total=num_transitions,
+        desc="collect",
+        unit="step",
+        disable=None if progress else True,
     ) as bar:
         for sampler, child, (start, stop) in zip(
             samplers, seeds, pairwise(bounds), strict=True

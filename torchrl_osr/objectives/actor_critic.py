@@ -30,7 +30,7 @@ from torchrl_osr import functional
 from torchrl_osr.objectives.distributions import action_bounds, check_same_bounds
 from torchrl_osr.objectives.keyed_loss import KeyedLoss
 from torchrl_osr.objectives.mixed_states import (
-    entry,
+    column,
     nested,
     perturbed_twin,
     replace_next,
@@ -220,7 +220,7 @@ class RecoveryActorCriticLoss(KeyedLoss):
 
     def _flag(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
         """Return a boolean entry below ``"next"``, ``[B]``."""
-        return entry(tensordict, nested("next", key)).squeeze(-1)
+        return column(tensordict, nested("next", key))
 
     def _states(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return ``[s, s']`` or ``[s, s', s^]``, stacked in front: ``[2 or 3, B]``."""
@@ -262,10 +262,10 @@ class RecoveryActorCriticLoss(KeyedLoss):
         return cast(Tensor, value.squeeze(-1))
 
     def _actor_term(
-        self, states: TensorDictBase, policy: TensorDictBase
+        self, states: TensorDictBase, pi: TanhNormal
     ) -> tuple[Tensor, Tensor]:
         """Return the policy's objective and log-density on D_tot, each ``[D, B]``."""
-        action, log_prob = rsample_and_log_prob(self._distribution(policy))
+        action, log_prob = rsample_and_log_prob(pi)
         qvalue = self._qvalue(states, action, self.qvalue_network_params.detach())
         alpha = self.log_alpha.detach().exp()
         return functional.soft_policy_value(log_prob, qvalue, alpha), log_prob
@@ -286,7 +286,7 @@ class RecoveryActorCriticLoss(KeyedLoss):
         """Return the TD target ``[B]`` from the states ``s'`` and the policy there."""
         action, _ = rsample_and_log_prob(self._distribution(policy))
         next_qvalue = self._qvalue(states, action, self.target_qvalue_network_params)
-        entry(tensordict, nested("next", self.tensor_keys.reward))
+        column(tensordict, nested("next", self.tensor_keys.reward))
         batch = tensordict.copy()
         value_key = nested("next", self.value_estimator.tensor_keys.value)
         batch.set(value_key, next_qvalue.min(0).values.unsqueeze(-1))

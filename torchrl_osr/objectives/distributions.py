@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from tensordict import NestedKey
 from tensordict.nn import ProbabilisticTensorDictModule, TensorDictModuleBase
 from torch import Tensor
 from torchrl.modules import TanhNormal
@@ -38,6 +39,19 @@ def action_bounds(network: TensorDictModuleBase, name: str) -> tuple[Tensor, Ten
     low = torch.as_tensor(kwargs.get("low", -1.0), dtype=default)
     high = torch.as_tensor(kwargs.get("high", 1.0), dtype=default)
     return low, high
+
+
+def check_action(action: Tensor, action_dim: int, key: NestedKey) -> None:
+    """Raise unless the batch's actions are of the network's size.
+
+    Raises:
+        ValueError: naming the entry and both sizes.
+    """
+    if action.shape[-1] != action_dim:
+        raise ValueError(
+            f"{key!r} has shape {tuple(action.shape)}, but the network's actions have "
+            f"{action_dim} dimensions."
+        )
 
 
 def check_same_bounds(

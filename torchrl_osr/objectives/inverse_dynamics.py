@@ -16,9 +16,10 @@ from tensordict.nn import (
 )
 from torch import Tensor
 
-from torchrl_osr.objectives.distributions import action_bounds
+from torchrl_osr.objectives.distributions import action_bounds, check_action
 from torchrl_osr.objectives.keyed_loss import KeyedLoss
 from torchrl_osr.objectives.mixed_states import (
+    column,
     entry,
     nested,
     reduce_transitions,
@@ -135,6 +136,7 @@ class InverseDynamicsLoss(KeyedLoss):
         ):
             distribution = self.inverse_dynamics_network.get_dist(batch)
         action = entry(tensordict, self.tensor_keys.action)
+        check_action(action, distribution.loc.shape[-1], self.tensor_keys.action)
         log_prob: Tensor = distribution.log_prob(action.expand_as(distribution.loc))
         return log_prob
 
@@ -145,7 +147,7 @@ class InverseDynamicsLoss(KeyedLoss):
         Args:
             tensordict: a batch ``[B]`` with the entries of :attr:`in_keys`.
         """
-        done = entry(tensordict, nested("next", self.tensor_keys.done)).squeeze(-1)
+        done = column(tensordict, nested("next", self.tensor_keys.done))
         negative_log_prob = -self._log_prob(tensordict, done).mean(0)
         loss = reduce_transitions(self, negative_log_prob, done, tensordict)
         batch_size = tensordict.batch_size if self.reduction == "none" else []

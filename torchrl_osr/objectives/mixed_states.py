@@ -38,6 +38,23 @@ def entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
     return value
 
 
+def column(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+    """Return an entry with one number a row, ``[B, 1]``, as ``[B]``.
+
+    Raises:
+        KeyError: if it is missing.
+        ValueError: if it has another shape.
+    """
+    value = entry(tensordict, key)
+    expected = (*tensordict.batch_size, 1)
+    if value.shape != expected:
+        raise ValueError(
+            f"{key!r} has shape {tuple(value.shape)}, expected {expected}: the batch "
+            "size and a last dimension of 1."
+        )
+    return value.squeeze(-1)
+
+
 def select(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> TensorDictBase:
     """Return the entries ``keys``, all of which must be there (see :func:`entry`)."""
     for key in keys:

@@ -19,10 +19,12 @@ from tensordict.nn import (
     dispatch,
 )
 from torch import Tensor
+from torchrl.modules import TanhNormal
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 
 from torchrl_osr import functional
 from torchrl_osr.objectives.actor_critic import RecoveryActorCriticLoss
+from torchrl_osr.objectives.distributions import check_action
 from torchrl_osr.objectives.mixed_states import (
     entry,
     reduce_transitions,
@@ -176,7 +178,7 @@ class OSRLoss(RecoveryActorCriticLoss):
         return losses + metrics if kept else losses
 
     def _recovery_term(
-        self, tensordict: TensorDictBase, policy: TensorDictBase, done: Tensor
+        self, tensordict: TensorDictBase, pi: TanhNormal, done: Tensor
     ) -> Tensor:
         """Return KL(I || pi) on D_tot, ``[D, B]``."""
         batch = transitions(
@@ -192,7 +194,6 @@ class OSRLoss(RecoveryActorCriticLoss):
             ),
         ):
             inverse_dynamics = self.inverse_dynamics_network.get_dist(batch)
-        pi = self._distribution(policy)
         return functional.state_recovery(
             pi.loc, pi.scale, inverse_dynamics.loc, inverse_dynamics.scale
         )
@@ -266,8 +267,11 @@ class OSRLoss(RecoveryActorCriticLoss):
 
         states = self._states(tensordict)
         policy = self._policy(states)
-        action_dim = entry(tensordict, self.tensor_keys.action).shape[-1]
-        actor, log_prob = self._actor_term(states[::2], policy[::2])
+        action_key = self.tensor_keys.action
+        pi = self._distribution(policy[::2])
+        action_dim = pi.loc.shape[-1]
+        check_action(entry(tensordict, action_key), action_dim, action_key)
+        actor, log_prob = self._actor_term(states[::2], pi)
         td, gap, values = self._critic_terms(tensordict, states, policy[:2].detach())
         losses = {
             "loss_actor": reduce(actor.mean(0)),
@@ -282,7 +286,7 @@ class OSRLoss(RecoveryActorCriticLoss):
             "target_value": mean(values["target_value"].unsqueeze(0)),
         }
         if self.recovers:
-            kl = self._recovery_term(tensordict, policy[::2], done).mean(0)
+            kl = self._recovery_term(tensordict, pi, done).mean(0)
             losses["loss_recovery"] = self.recovery_weight * reduce_transitions(
                 self, kl, done, tensordict, weights
             )
