@@ -1,0 +1,87 @@
+"""A run's folder: never two configurations in one, never half a file."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from omegaconf import OmegaConf
+
+from torchrl_osr.trainers import run_folder
+
+CONFIG = {"seed": 0, "resume": None, "trainer": {"steps": 5, "progress": True}}
+
+
+def configured(**changes):
+    return OmegaConf.merge(OmegaConf.create(CONFIG), changes)
+
+
+def test_configuration_is_written_and_read_back(tmp_path):
+    run_folder.claim(tmp_path / "new" / "run", configured())
+    assert run_folder.saved_config(tmp_path / "new" / "run", ["resume=x"]) == CONFIG
+
+
+def test_same_configuration_may_continue(tmp_path):
+    run_folder.claim(tmp_path, configured())
+    run_folder.claim(tmp_path, configured())
+    # These change no number.
+    run_folder.claim(tmp_path, configured(resume="x", trainer={"progress": False}))
+
+
+def test_another_configuration_is_refused_by_key(tmp_path):
+    run_folder.claim(tmp_path, configured())
+    with pytest.raises(ValueError, match=r"trainer\.steps: 5 there, 6 now") as error:
+        run_folder.claim(tmp_path, configured(trainer={"steps": 6}))
+    assert "seed" not in str(error.value)
+    assert run_folder.saved_config(tmp_path, []) == CONFIG
+
+
+def test_resuming_takes_no_other_override(tmp_path):
+    run_folder.claim(tmp_path, configured())
+    with pytest.raises(ValueError, match="leave out seed=1"):
+        run_folder.saved_config(tmp_path, ["resume=x", "seed=1"])
+
+
+def test_resuming_needs_a_run(tmp_path):
+    with pytest.raises(FileNotFoundError, match="folder of a run"):
+        run_folder.saved_config(tmp_path, ["resume=x"])
+
+
+def read_status(folder) -> dict:
+    return json.loads((folder / "status.json").read_text())
+
+
+def test_status_says_running_then_done(tmp_path):
+    with run_folder.status(tmp_path):
+        assert read_status(tmp_path)["status"] == "running"
+    assert read_status(tmp_path) == {"status": "done"}
+
+
+@pytest.mark.parametrize("error", [ValueError("why"), KeyboardInterrupt("why")])
+def test_status_says_failed_and_why(tmp_path, error):
+    with pytest.raises(type(error)), run_folder.status(tmp_path):
+        raise error
+    assert read_status(tmp_path) == {
+        "status": "failed",
+        "error": f"{type(error).__name__}: why",
+    }
+
+
+def test_failed_write_keeps_the_old_file_and_names_it(tmp_path, monkeypatch):
+    path = tmp_path / "file.json"
+    run_folder.write_json(path, [1])
+
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(run_folder.os, "fsync", full)
+    with pytest.raises(OSError, match=r"No space left.*file\.json"):
+        run_folder.write_json(path, [2])
+    assert json.loads(path.read_text()) == [1]
+    assert [each.name for each in tmp_path.iterdir()] == ["file.json"]
+
+
+def test_nan_is_not_json(tmp_path):
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        run_folder.write_json(tmp_path / "file.json", float("nan"))
+    assert not list(tmp_path.iterdir())
