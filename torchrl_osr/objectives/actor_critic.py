@@ -8,17 +8,18 @@ always stacked as ``[s, s', s^]``: rows ``[:2]`` are the true states, ``[::2]`` 
 from __future__ import annotations
 
 import math
-import warnings
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, cast
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModule,
     TensorDictParams,
+    dispatch,
 )
 from torch import Tensor
 from torchrl.modules import TanhNormal
@@ -27,24 +28,30 @@ from torchrl.objectives import ValueEstimators, distance_loss
 from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
 
 from torchrl_osr import functional
-from torchrl_osr.objectives.distributions import action_bounds, check_same_bounds
-from torchrl_osr.objectives.keyed_loss import KeyedLoss
+from torchrl_osr.objectives.base import (
+    BaseLoss,
+    Reduction,
+    ScalarOutputMode,
+    check_choice,
+)
+from torchrl_osr.objectives.distributions import (
+    action_bounds,
+    check_action,
+    check_same_bounds,
+)
 from torchrl_osr.objectives.mixed_states import (
     column,
+    entry,
     nested,
     perturbed_twin,
+    reduce_transitions,
     replace_next,
     select,
     state_keys,
 )
 
 
-def _check_choice(name: str, value: str | None, choices: tuple[Any, ...]) -> None:
-    if value not in choices:
-        raise ValueError(f"{name} must be one of {choices}, got {value!r}.")
-
-
-class RecoveryActorCriticLoss(KeyedLoss):
+class RecoveryActorCriticLoss(BaseLoss):
     """Abstract base of :class:`~torchrl_osr.OSRLoss`: networks, keys, shared terms."""
 
     @dataclass
@@ -99,19 +106,18 @@ class RecoveryActorCriticLoss(KeyedLoss):
         fixed_alpha: bool,
         target_entropy: float | Literal["auto"],
         delay_qvalue: bool,
-        reduction: Literal["none", "mean", "sum"] | None,
+        reduction: Reduction,
         deactivate_vmap: bool,
         use_prioritized_weights: bool | Literal["auto"],
-        scalar_output_mode: Literal["exclude", "non_tensor"] | None,
+        scalar_output_mode: ScalarOutputMode,
     ) -> None:
-        _check_choice("loss_function", loss_function, ("l2", "l1", "smooth_l1"))
-        _check_choice("reduction", reduction, (None, "none", "mean", "sum"))
-        _check_choice(
-            "scalar_output_mode", scalar_output_mode, (None, "exclude", "non_tensor")
+        check_choice("loss_function", loss_function, ("l2", "l1", "smooth_l1"))
+        super().__init__(
+            reduction,
+            use_prioritized_weights=use_prioritized_weights,
+            scalar_output_mode=scalar_output_mode,
         )
-        super().__init__()
         self.deactivate_vmap = deactivate_vmap
-        self.use_prioritized_weights = use_prioritized_weights
         self.recovers = inverse_dynamics_network is not None
         low, high = bounds = action_bounds(actor_network, "actor_network")
         self.register_buffer("action_low", low, persistent=False)
@@ -146,16 +152,6 @@ class RecoveryActorCriticLoss(KeyedLoss):
             self.log_alpha = torch.nn.Parameter(log_alpha)
         self.target_entropy = target_entropy
         self.loss_function = loss_function
-        self.reduction = reduction or "mean"
-        if self.reduction == "none" and scalar_output_mode is None:
-            warnings.warn(
-                f"{type(self).__name__} with reduction='none' leaves its scalar "
-                "metrics out; pass scalar_output_mode='exclude' to say so, or "
-                "'non_tensor' to keep them.",
-                stacklevel=3,
-            )
-            scalar_output_mode = "exclude"
-        self.scalar_output_mode = scalar_output_mode
         self._make_vmap()
         # Now, not at the first call as TorchRL does: a state dict has the same entries
         # before and after it.
@@ -302,23 +298,76 @@ class RecoveryActorCriticLoss(KeyedLoss):
         distance: Tensor = distance_loss(qvalue, target_value, self.loss_function)
         return distance.sum(0)
 
-    def _output(
+    def _reduce_recovery(
+        self, value: Tensor, done: Tensor, tensordict: TensorDictBase
+    ) -> tuple[Tensor, Tensor]:
+        """Return the recovery term ``[B]``, reduced as asked, and its mean."""
+        weights = self._weights(tensordict)
+        reduced = reduce_transitions(self, value, done, tensordict, weights)
+        mean = reduce_transitions(
+            self, value.detach(), done, tensordict, reduction="mean"
+        )
+        return reduced, mean
+
+    @abstractmethod
+    def _constraints(
         self,
         tensordict: TensorDictBase,
-        losses: dict[str, Tensor],
-        metrics: dict[str, Tensor],
-    ) -> TensorDictBase:
-        """Assemble what the loss returns, in the order of :attr:`out_keys`."""
-        if self.reduction == "none":
-            out = TensorDict(losses, batch_size=tensordict.batch_size)
-            if self.scalar_output_mode == "non_tensor":
-                for name, value in metrics.items():
-                    out.set_non_tensor(name, value)
-        else:
-            out = TensorDict(losses | metrics, batch_size=[])
-        names = ("actor_network", "qvalue_network", "target_qvalue_network")
-        params = [f"{name}_params" for name in names]
-        if self.recovers:
-            params.append("inverse_dynamics_network_params")
-        self._clear_weakrefs(tensordict, out, *params)
-        return out
+        states: TensorDictBase,
+        policy: TensorDictBase,
+        pi: TanhNormal,
+        done: Tensor,
+    ) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
+        """Return what makes one loss differ from another.
+
+        Args:
+            tensordict: the batch, ``[B]``.
+            states: ``[s, s', s^]``, see :meth:`_states`.
+            policy: the policy's parameters there.
+            pi: the policy on D_tot, ``[D, B]``.
+            done: rows whose next state is not to be learnt from, ``[B]``.
+
+        Returns:
+            The critics' values of the data's actions ``[N, B]``, further ``loss_*``
+            entries, weighted and reduced, and further metrics.
+        """
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return the losses and metrics of a batch, see ``out_keys``.
+
+        Writes the largest absolute TD error of the critics under the ``priority`` key,
+        ``[B]``, and nothing else, into ``tensordict``.
+
+        Args:
+            tensordict: a batch ``[B]`` with the entries of ``in_keys``.
+        """
+        states = self._states(tensordict)
+        policy = self._policy(states)
+        pi = self._distribution(policy[::2])
+        action_key, action_dim = self.tensor_keys.action, pi.loc.shape[-1]
+        check_action(entry(tensordict, action_key), action_dim, action_key)
+
+        actor, log_prob = self._actor_term(states[::2], pi)
+        alpha = self._alpha_term(log_prob, action_dim)
+        done = self._flag(tensordict, self.tensor_keys.done)
+        pred_value, losses, metrics = self._constraints(
+            tensordict, states, policy, pi, done
+        )
+        target_value = self._target_value(tensordict, states[1], policy[1].detach())
+        losses = {
+            "loss_actor": self._reduce(actor.mean(0), tensordict),
+            "loss_alpha": self._reduce(alpha.mean(0), tensordict),
+            "loss_qvalue": self._reduce(
+                self._td_term(pred_value, target_value), tensordict
+            ),
+        } | losses
+        metrics = {
+            "alpha": self.log_alpha.detach().exp(),
+            "entropy": -self._mean(log_prob, tensordict),
+            "pred_value": self._mean(pred_value, tensordict),
+            "target_value": self._mean(target_value, tensordict),
+        } | metrics
+        td_error = (pred_value.detach() - target_value).abs().amax(0)
+        tensordict.set(self.tensor_keys.priority, td_error)
+        return self._output(tensordict, losses, metrics)

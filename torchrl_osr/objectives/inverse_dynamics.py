@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictParams,
@@ -16,8 +16,8 @@ from tensordict.nn import (
 )
 from torch import Tensor
 
+from torchrl_osr.objectives.base import BaseLoss, Reduction, check_choice
 from torchrl_osr.objectives.distributions import action_bounds, check_action
-from torchrl_osr.objectives.keyed_loss import KeyedLoss
 from torchrl_osr.objectives.mixed_states import (
     column,
     entry,
@@ -28,7 +28,7 @@ from torchrl_osr.objectives.mixed_states import (
 )
 
 
-class InverseDynamicsLoss(KeyedLoss):
+class InverseDynamicsLoss(BaseLoss):
     r"""Negative log-likelihood of the data's action given both states.
 
     .. math::
@@ -95,15 +95,13 @@ class InverseDynamicsLoss(KeyedLoss):
         inverse_dynamics_network: ProbabilisticTensorDictSequential,
         *,
         states: Literal["both", "clean"] = "both",
-        reduction: Literal["none", "mean", "sum"] | None = None,
+        reduction: Reduction = None,
     ) -> None:
-        if states not in ("both", "clean"):
-            raise ValueError(f"states must be 'both' or 'clean', got {states!r}.")
-        super().__init__()
+        check_choice("states", states, ("both", "clean"))
+        super().__init__(reduction)
         action_bounds(inverse_dynamics_network, "inverse_dynamics_network")
         self.convert_to_functional(inverse_dynamics_network, "inverse_dynamics_network")
         self.states = states
-        self.reduction = reduction or "mean"
 
     def _input_keys(self) -> list[NestedKey]:
         network_keys = self.inverse_dynamics_network.in_keys
@@ -119,8 +117,8 @@ class InverseDynamicsLoss(KeyedLoss):
             ]
         return keys
 
-    def _output_keys(self) -> list[NestedKey]:
-        return ["loss_inverse_dynamics"]
+    def _output_keys(self) -> tuple[list[NestedKey], list[NestedKey]]:
+        return ["loss_inverse_dynamics"], []
 
     def _log_prob(self, tensordict: TensorDictBase, done: Tensor) -> Tensor:
         """Return the log-density of the data's action, ``[1 or 2, B]``."""
@@ -150,7 +148,4 @@ class InverseDynamicsLoss(KeyedLoss):
         done = column(tensordict, nested("next", self.tensor_keys.done))
         negative_log_prob = -self._log_prob(tensordict, done).mean(0)
         loss = reduce_transitions(self, negative_log_prob, done, tensordict)
-        batch_size = tensordict.batch_size if self.reduction == "none" else []
-        out = TensorDict({"loss_inverse_dynamics": loss}, batch_size=batch_size)
-        self._clear_weakrefs(tensordict, out, "inverse_dynamics_network_params")
-        return out
+        return self._output(tensordict, {"loss_inverse_dynamics": loss}, {})

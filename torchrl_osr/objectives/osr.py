@@ -16,7 +16,6 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModule,
-    dispatch,
 )
 from torch import Tensor
 from torchrl.modules import TanhNormal
@@ -24,10 +23,8 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 
 from torchrl_osr import functional
 from torchrl_osr.objectives.actor_critic import RecoveryActorCriticLoss
-from torchrl_osr.objectives.distributions import check_action
+from torchrl_osr.objectives.base import Reduction, ScalarOutputMode
 from torchrl_osr.objectives.mixed_states import (
-    entry,
-    reduce_transitions,
     transitions,
 )
 
@@ -129,10 +126,10 @@ class OSRLoss(RecoveryActorCriticLoss):
         fixed_alpha: bool = False,
         target_entropy: float | Literal["auto"] = "auto",
         delay_qvalue: bool = True,
-        reduction: Literal["none", "mean", "sum"] | None = None,
+        reduction: Reduction = None,
         deactivate_vmap: bool = False,
         use_prioritized_weights: bool | Literal["auto"] = "auto",
-        scalar_output_mode: Literal["exclude", "non_tensor"] | None = None,
+        scalar_output_mode: ScalarOutputMode = None,
     ) -> None:
         weights = {"recovery_weight": recovery_weight, "min_q_weight": min_q_weight}
         for name, weight in weights.items():
@@ -168,14 +165,13 @@ class OSRLoss(RecoveryActorCriticLoss):
         self.num_random = num_random
         self.temperature = temperature
 
-    def _output_keys(self) -> list[NestedKey]:
+    def _output_keys(self) -> tuple[list[NestedKey], list[NestedKey]]:
         losses = ["loss_actor", "loss_alpha", "loss_qvalue", "loss_cql"]
         metrics = ["alpha", "entropy", "pred_value", "target_value"]
         if self.recovers:
             losses.append("loss_recovery")
             metrics.append("recovery_kl")
-        kept = self.reduction != "none" or self.scalar_output_mode == "non_tensor"
-        return losses + metrics if kept else losses
+        return losses, metrics
 
     def _recovery_term(
         self, tensordict: TensorDictBase, pi: TanhNormal, done: Tensor
@@ -225,74 +221,28 @@ class OSRLoss(RecoveryActorCriticLoss):
             torch.cat([log_density, log_prob.flatten(0, 1)]),
         )
 
-    def _critic_terms(
-        self, tensordict: TensorDictBase, states: TensorDictBase, policy: TensorDictBase
-    ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-        """Return TD and conservative terms, each ``[B]``, and the values ``[N, B]``."""
-        data_action = entry(tensordict, self.tensor_keys.action)
-        action, log_prob = self._proposals(policy, data_action)
+    def _constraints(
+        self,
+        tensordict: TensorDictBase,
+        states: TensorDictBase,
+        policy: TensorDictBase,
+        pi: TanhNormal,
+        done: Tensor,
+    ) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
+        data_action = tensordict.get(self.tensor_keys.action)
+        action, log_prob = self._proposals(policy[:2].detach(), data_action)
+        # One pass of the critics for the data's action and all proposals.
         action = torch.cat([data_action.unsqueeze(0), action])
         clean = states[0].expand(action.shape[:-1])
         qvalue = self._qvalue(clean, action, self.qvalue_network_params)
         pred_value, sampled = qvalue[:, 0], qvalue[:, 1:].movedim(1, -1)
-        target_value = self._target_value(tensordict, states[1], policy[1])
         gap = functional.conservative_gap(
             sampled, log_prob.movedim(0, -1), pred_value, temperature=self.temperature
         ).sum(0)
-        values = {"pred_value": pred_value.detach(), "target_value": target_value}
-        return self._td_term(pred_value, target_value), gap, values
-
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the losses and metrics of a batch, see :attr:`out_keys`.
-
-        Writes the largest absolute TD error of the critics under the ``priority`` key,
-        ``[B]``, and nothing else, into ``tensordict``.
-
-        Args:
-            tensordict: a batch ``[B]`` with the entries of :attr:`in_keys`.
-        """
-        done = self._flag(tensordict, self.tensor_keys.done)
-        weights = self._maybe_get_priority_weight(tensordict)
-
-        def reduce(value: Tensor) -> Tensor:
-            reduced: Tensor = self._reduce_loss(value, tensordict, weights=weights)
-            return reduced
-
-        def mean(value: Tensor) -> Tensor:
-            metric: Tensor = self._reduce_loss(
-                value.detach().mean(0), tensordict, reduction="mean"
-            )
-            return metric
-
-        states = self._states(tensordict)
-        policy = self._policy(states)
-        action_key = self.tensor_keys.action
-        pi = self._distribution(policy[::2])
-        action_dim = pi.loc.shape[-1]
-        check_action(entry(tensordict, action_key), action_dim, action_key)
-        actor, log_prob = self._actor_term(states[::2], pi)
-        td, gap, values = self._critic_terms(tensordict, states, policy[:2].detach())
-        losses = {
-            "loss_actor": reduce(actor.mean(0)),
-            "loss_alpha": reduce(self._alpha_term(log_prob, action_dim).mean(0)),
-            "loss_qvalue": reduce(td),
-            "loss_cql": self.min_q_weight * reduce(gap),
-        }
-        metrics = {
-            "alpha": self.log_alpha.detach().exp(),
-            "entropy": -mean(log_prob),
-            "pred_value": mean(values["pred_value"]),
-            "target_value": mean(values["target_value"].unsqueeze(0)),
-        }
-        if self.recovers:
-            kl = self._recovery_term(tensordict, pi, done).mean(0)
-            losses["loss_recovery"] = self.recovery_weight * reduce_transitions(
-                self, kl, done, tensordict, weights
-            )
-            metrics["recovery_kl"] = reduce_transitions(
-                self, kl.detach(), done, tensordict, reduction="mean"
-            )
-        td_error = (values["pred_value"] - values["target_value"]).abs().amax(0)
-        tensordict.set(self.tensor_keys.priority, td_error)
-        return self._output(tensordict, losses, metrics)
+        losses = {"loss_cql": self.min_q_weight * self._reduce(gap, tensordict)}
+        if not self.recovers:
+            return pred_value, losses, {}
+        kl = self._recovery_term(tensordict, pi, done).mean(0)
+        kl, mean_kl = self._reduce_recovery(kl, done, tensordict)
+        losses["loss_recovery"] = self.recovery_weight * kl
+        return pred_value, losses, {"recovery_kl": mean_kl}
