@@ -4,9 +4,15 @@
 Learning" (Jiang et al., NeurIPS 2023), https://openreview.net/forum?id=4gLWjSaw4o
 """
 
-from torchrl_osr.objectives import InverseDynamicsLoss, OSRLoss
+from torchrl_osr.objectives import InverseDynamicsLoss, OSRLoss, OSRVLoss
 from torchrl_osr.transforms import StatePerturbation
 
 __version__ = "0.1.0"
 
-__all__ = ["InverseDynamicsLoss", "OSRLoss", "StatePerturbation", "__version__"]
+__all__ = [
+    "InverseDynamicsLoss",
+    "OSRLoss",
+    "OSRVLoss",
+    "StatePerturbation",
+    "__version__",
+]

@@ -178,6 +178,40 @@ def conservative_gap(
     return temperature * torch.logsumexp(logits, -1) - data_qvalue
 
 
+def value_constraint(
+    policy_qvalue: Tensor,
+    inverse_dynamics_qvalue: Tensor,
+    *,
+    log_prob: Tensor | None = None,
+    temperature: float = 1.0,
+) -> Tensor:
+    r"""Return OSR-v's constraint on the values, equation (8).
+
+    .. math::
+        \mathbb E_{\hat a \sim \pi(\tilde s)} Q(\tilde s, \hat a)
+        - \mathbb E_{a \sim I(\tilde s, s')} Q(\tilde s, a)
+
+    Minimised over Q, it lowers actions with unknown consequences and raises those that
+    lead to ``s'``. With ``log_prob`` the first expectation is a log-sum-exp over
+    importance-weighted actions instead, as in :func:`conservative_gap`: an addition,
+    not in the paper, which puts the weight on the actions that Q overrates.
+
+    Args:
+        policy_qvalue: values of the sampled actions at ``s~``, ``[B, M]``.
+        inverse_dynamics_qvalue: values of the model's actions at ``s~``, ``[B, K]``.
+        log_prob: log-density of each sampled action under what drew it, ``[B, M]``.
+            Default ``None``, the paper's plain mean.
+        temperature: of the log-sum-exp, in units of the value.
+
+    Returns:
+        ``[B]``.
+    """
+    target = inverse_dynamics_qvalue.mean(-1)
+    if log_prob is None:
+        return policy_qvalue.mean(-1) - target
+    return conservative_gap(policy_qvalue, log_prob, target, temperature=temperature)
+
+
 def td_target(
     reward: Tensor, terminated: Tensor, next_qvalue: Tensor, gamma: float | Tensor
 ) -> Tensor:

@@ -2,5 +2,6 @@
 
 from torchrl_osr.objectives.inverse_dynamics import InverseDynamicsLoss
 from torchrl_osr.objectives.osr import OSRLoss
+from torchrl_osr.objectives.osr_v import OSRVLoss
 
-__all__ = ["InverseDynamicsLoss", "OSRLoss"]
+__all__ = ["InverseDynamicsLoss", "OSRLoss", "OSRVLoss"]

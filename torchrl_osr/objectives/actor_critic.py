@@ -48,11 +48,12 @@ from torchrl_osr.objectives.mixed_states import (
     replace_next,
     select,
     state_keys,
+    transitions,
 )
 
 
 class RecoveryActorCriticLoss(BaseLoss):
-    """Abstract base of :class:`~torchrl_osr.OSRLoss`: networks, keys, shared terms."""
+    """Abstract base of OSRLoss and OSRVLoss: networks, keys and shared terms."""
 
     @dataclass
     class _AcceptedKeys:
@@ -256,6 +257,35 @@ class RecoveryActorCriticLoss(BaseLoss):
                 "call set_keys(state_action_value=...)."
             )
         return cast(Tensor, value.squeeze(-1))
+
+    @torch.no_grad()
+    def _inverse_dynamics(self, tensordict: TensorDictBase, done: Tensor) -> TanhNormal:
+        """Return the model's distribution on D_tot, ``[2, B]``."""
+        batch = transitions(
+            tensordict,
+            self.inverse_dynamics_network.in_keys,
+            done=done,
+            perturbed=self.tensor_keys.perturbed,
+        )
+        with self.inverse_dynamics_network_params.to_module(
+            self.inverse_dynamics_network, preserve_module_state=False
+        ):
+            return self.inverse_dynamics_network.get_dist(batch)
+
+    def _uniform(self, number: int, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Draw ``number`` uniform actions for each row.
+
+        Args:
+            number: of actions, ``K``.
+            like: an action, ``[B, A]``.
+
+        Returns:
+            Actions ``[K, B, A]`` and their log-densities ``[K, B]``.
+        """
+        width = (self.action_high - self.action_low).expand(like.shape[-1])
+        action = torch.rand((number, *like.shape), dtype=like.dtype, device=like.device)
+        log_density = -width.log().sum().expand(action.shape[:-1])
+        return action * width + self.action_low, log_density
 
     def _actor_term(
         self, states: TensorDictBase, pi: TanhNormal

@@ -24,9 +24,6 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl_osr import functional
 from torchrl_osr.objectives.actor_critic import RecoveryActorCriticLoss
 from torchrl_osr.objectives.base import Reduction, ScalarOutputMode
-from torchrl_osr.objectives.mixed_states import (
-    transitions,
-)
 
 
 class OSRLoss(RecoveryActorCriticLoss):
@@ -173,27 +170,6 @@ class OSRLoss(RecoveryActorCriticLoss):
             metrics.append("recovery_kl")
         return losses, metrics
 
-    def _recovery_term(
-        self, tensordict: TensorDictBase, pi: TanhNormal, done: Tensor
-    ) -> Tensor:
-        """Return KL(I || pi) on D_tot, ``[D, B]``."""
-        batch = transitions(
-            tensordict,
-            self.inverse_dynamics_network.in_keys,
-            done=done,
-            perturbed=self.tensor_keys.perturbed,
-        )
-        with (
-            torch.no_grad(),
-            self.inverse_dynamics_network_params.to_module(
-                self.inverse_dynamics_network, preserve_module_state=False
-            ),
-        ):
-            inverse_dynamics = self.inverse_dynamics_network.get_dist(batch)
-        return functional.state_recovery(
-            pi.loc, pi.scale, inverse_dynamics.loc, inverse_dynamics.scale
-        )
-
     @torch.no_grad()
     def _proposals(self, policy: TensorDictBase, like: Tensor) -> tuple[Tensor, Tensor]:
         """Draw K actions each: uniform, from pi(s) and from pi(s').
@@ -205,12 +181,7 @@ class OSRLoss(RecoveryActorCriticLoss):
         Returns:
             Actions ``[3K, B, A]`` and their log-densities ``[3K, B]``.
         """
-        width = (self.action_high - self.action_low).expand(like.shape[-1])
-        uniform = torch.rand(
-            (self.num_random, *like.shape), dtype=like.dtype, device=like.device
-        )
-        uniform = uniform * width + self.action_low
-        log_density = -width.log().sum().expand(uniform.shape[:-1])
+        uniform, log_density = self._uniform(self.num_random, like)
         # rsample also without gradient: torch's sample reads the scale back to the host
         # to check its sign.
         action, log_prob = rsample_and_log_prob(
@@ -242,7 +213,8 @@ class OSRLoss(RecoveryActorCriticLoss):
         losses = {"loss_cql": self.min_q_weight * self._reduce(gap, tensordict)}
         if not self.recovers:
             return pred_value, losses, {}
-        kl = self._recovery_term(tensordict, pi, done).mean(0)
-        kl, mean_kl = self._reduce_recovery(kl, done, tensordict)
+        model = self._inverse_dynamics(tensordict, done)
+        kl = functional.state_recovery(pi.loc, pi.scale, model.loc, model.scale)
+        kl, mean_kl = self._reduce_recovery(kl.mean(0), done, tensordict)
         losses["loss_recovery"] = self.recovery_weight * kl
         return pred_value, losses, {"recovery_kl": mean_kl}
