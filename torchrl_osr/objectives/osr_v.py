@@ -194,12 +194,9 @@ class OSRVLoss(RecoveryActorCriticLoss):
         )
         pred_value = qvalue[:, 0]
         compared = qvalue[:, 1:].reshape(-1, *candidates.shape[:-1]).movedim(1, -1)
-        sampled, target = compared.split(
-            [compared.shape[-1] - self.num_random, self.num_random], -1
-        )
         gap = functional.value_constraint(
-            sampled,
-            target,
+            compared[..., : -self.num_random],
+            compared[..., -self.num_random :],
             log_prob=None if log_prob is None else log_prob.movedim(0, -1),
             temperature=self.temperature,
         )
