@@ -60,7 +60,9 @@ class OSRLoss(RecoveryActorCriticLoss):
         recovery_weight: :math:`\lambda`. Default 0.5. A number assigned later makes a
             schedule; 0 *here* makes the loss CQL(H) for good.
         min_q_weight: :math:`\alpha`, weight of the conservative term. Default 5.0. May
-            be assigned later.
+            be assigned later; 0 *here* leaves the term out for good, which with
+            ``num_qvalue_nets=10`` is OSR-10, and with ``recovery_weight=0`` SAC-N
+            (https://arxiv.org/abs/2110.01548).
         num_random: ``K``, actions drawn of each kind (uniform, at ``s``, at ``s'``).
             Default 10.
         temperature: of the log-sum-exp. Default 1.0.
@@ -159,11 +161,14 @@ class OSRLoss(RecoveryActorCriticLoss):
         )
         for name, weight in weights.items():
             self.register_coeff_buffer(name, float(weight))
+        self.conserves = min_q_weight > 0
         self.num_random = num_random
         self.temperature = temperature
 
     def _output_keys(self) -> tuple[list[NestedKey], list[NestedKey]]:
-        losses = ["loss_actor", "loss_alpha", "loss_qvalue", "loss_cql"]
+        losses = ["loss_actor", "loss_alpha", "loss_qvalue"]
+        if self.conserves:
+            losses.append("loss_cql")
         metrics = ["alpha", "entropy", "pred_value", "target_value"]
         if self.recovers:
             losses.append("loss_recovery")
@@ -200,6 +205,26 @@ class OSRLoss(RecoveryActorCriticLoss):
         pi: TanhNormal,
         done: Tensor,
     ) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
+        if self.conserves:
+            pred_value, gap = self._conservative_terms(tensordict, states, policy)
+            gap = self._reduce(gap, tensordict)
+            losses = {"loss_cql": self.min_q_weight * gap}
+        else:
+            action = tensordict.get(self.tensor_keys.action)
+            pred_value = self._qvalue(states[0], action, self.qvalue_network_params)
+            losses = {}
+        if not self.recovers:
+            return pred_value, losses, {}
+        model = self._inverse_dynamics(tensordict, done)
+        kl = functional.state_recovery(pi.loc, pi.scale, model.loc, model.scale)
+        kl, mean_kl = self._reduce_recovery(kl.mean(0), done, tensordict)
+        losses["loss_recovery"] = self.recovery_weight * kl
+        return pred_value, losses, {"recovery_kl": mean_kl}
+
+    def _conservative_terms(
+        self, tensordict: TensorDictBase, states: TensorDictBase, policy: TensorDictBase
+    ) -> tuple[Tensor, Tensor]:
+        """Return the values of the data's actions ``[N, B]`` and CQL's gap ``[B]``."""
         data_action = tensordict.get(self.tensor_keys.action)
         action, log_prob = self._proposals(policy[:2].detach(), data_action)
         # One pass of the critics for the data's action and all proposals.
@@ -209,12 +234,5 @@ class OSRLoss(RecoveryActorCriticLoss):
         pred_value, sampled = qvalue[:, 0], qvalue[:, 1:].movedim(1, -1)
         gap = functional.conservative_gap(
             sampled, log_prob.movedim(0, -1), pred_value, temperature=self.temperature
-        ).sum(0)
-        losses = {"loss_cql": self.min_q_weight * self._reduce(gap, tensordict)}
-        if not self.recovers:
-            return pred_value, losses, {}
-        model = self._inverse_dynamics(tensordict, done)
-        kl = functional.state_recovery(pi.loc, pi.scale, model.loc, model.scale)
-        kl, mean_kl = self._reduce_recovery(kl.mean(0), done, tensordict)
-        losses["loss_recovery"] = self.recovery_weight * kl
-        return pred_value, losses, {"recovery_kl": mean_kl}
+        )
+        return pred_value, gap.sum(0)
