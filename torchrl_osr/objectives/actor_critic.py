@@ -101,6 +101,8 @@ class RecoveryActorCriticLoss(BaseLoss):
         qvalue_network: TensorDictModule | Sequence[TensorDictModule],
         inverse_dynamics_network: ProbabilisticTensorDictSequential | None,
         *,
+        num_random: int,
+        temperature: float,
         num_qvalue_nets: int,
         loss_function: str,
         alpha_init: float,
@@ -112,6 +114,11 @@ class RecoveryActorCriticLoss(BaseLoss):
         use_prioritized_weights: bool | Literal["auto"],
         scalar_output_mode: ScalarOutputMode,
     ) -> None:
+        if num_random < 1 or not temperature > 0:
+            raise ValueError(
+                "num_random must be at least 1 and temperature above 0, got "
+                f"{num_random} and {temperature}."
+            )
         check_choice("loss_function", loss_function, ("l2", "l1", "smooth_l1"))
         super().__init__(
             reduction,
@@ -119,6 +126,8 @@ class RecoveryActorCriticLoss(BaseLoss):
             scalar_output_mode=scalar_output_mode,
         )
         self.deactivate_vmap = deactivate_vmap
+        self.num_random = num_random
+        self.temperature = temperature
         self.recovers = inverse_dynamics_network is not None
         low, high = bounds = action_bounds(actor_network, "actor_network")
         self.register_buffer("action_low", low, persistent=False)

@@ -134,11 +134,6 @@ class OSRLoss(RecoveryActorCriticLoss):
         for name, weight in weights.items():
             if not 0 <= weight < math.inf:
                 raise ValueError(f"{name} must be at least 0, got {weight}.")
-        if num_random < 1 or not temperature > 0:
-            raise ValueError(
-                "num_random must be at least 1 and temperature above 0, got "
-                f"{num_random} and {temperature}."
-            )
         if recovery_weight and inverse_dynamics_network is None:
             raise ValueError(
                 f"recovery_weight={recovery_weight} needs an inverse_dynamics_network; "
@@ -148,6 +143,8 @@ class OSRLoss(RecoveryActorCriticLoss):
             actor_network,
             qvalue_network,
             inverse_dynamics_network if recovery_weight else None,
+            num_random=num_random,
+            temperature=temperature,
             num_qvalue_nets=num_qvalue_nets,
             loss_function=loss_function,
             alpha_init=alpha_init,
@@ -162,8 +159,6 @@ class OSRLoss(RecoveryActorCriticLoss):
         for name, weight in weights.items():
             self.register_coeff_buffer(name, float(weight))
         self.conserves = min_q_weight > 0
-        self.num_random = num_random
-        self.temperature = temperature
 
     def _output_keys(self) -> tuple[list[NestedKey], list[NestedKey]]:
         losses = ["loss_actor", "loss_alpha", "loss_qvalue"]

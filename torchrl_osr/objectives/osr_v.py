@@ -125,15 +125,12 @@ class OSRVLoss(RecoveryActorCriticLoss):
             raise ValueError(
                 f"recovery_weight must be at least 0, got {recovery_weight}."
             )
-        if num_random < 1 or not temperature > 0:
-            raise ValueError(
-                "num_random must be at least 1 and temperature above 0, got "
-                f"{num_random} and {temperature}."
-            )
         super().__init__(
             actor_network,
             qvalue_network,
             inverse_dynamics_network,
+            num_random=num_random,
+            temperature=temperature,
             num_qvalue_nets=num_qvalue_nets,
             loss_function=loss_function,
             alpha_init=alpha_init,
@@ -147,8 +144,6 @@ class OSRVLoss(RecoveryActorCriticLoss):
         )
         self.register_coeff_buffer("recovery_weight", float(recovery_weight))
         self.policy_values = policy_values
-        self.num_random = num_random
-        self.temperature = temperature
 
     def _output_keys(self) -> tuple[list[NestedKey], list[NestedKey]]:
         losses = ["loss_actor", "loss_alpha", "loss_qvalue", "loss_recovery"]
