@@ -231,6 +231,26 @@ def test_conservative_gap_matches_a_plain_sum() -> None:
         assert gap[i].item() == pytest.approx(2 * math.log(total) - data[i].item())
 
 
+def test_value_constraint_is_a_difference_of_means() -> None:
+    policy = torch.tensor([[1.0, 4.0], [-1.0, 3.0]])
+    model = torch.tensor([[2.0, 0.0, 1.0], [3.0, 3.0, 3.0]])
+    # By hand: 2.5 - 1 and 1 - 3. It may be negative.
+    value = functional.value_constraint(policy, model)
+    torch.testing.assert_close(value, torch.tensor([1.5, -2.0]))
+
+
+# Values (log 2, log 6) over densities (1/2, 2) are weights (4, 3), the model's mean is
+# 1: log 7 - 1, and at temperature 2 by square roots 2 log(2 + sqrt 3) - 1.
+@pytest.mark.parametrize(("temperature", "expected"), [(1, 0.945910), (2, 1.633916)])
+def test_value_constraint_weighs_actions_by_density(temperature, expected) -> None:
+    policy, log_prob = torch.tensor([[2.0, 6.0], [0.5, 2.0]]).double().log()
+    model = torch.tensor([2.0, 0.0, 1.0]).double()
+    value = functional.value_constraint(
+        policy, model, log_prob=log_prob, temperature=temperature
+    )
+    assert value.item() == pytest.approx(expected, abs=1e-6)
+
+
 def test_target_ignores_the_value_of_a_terminated_state_even_nan() -> None:
     reward = torch.tensor([1.0, 2.0], requires_grad=True)
     next_qvalue = torch.tensor([[10.0, math.nan], [8.0, math.inf]])

@@ -8,10 +8,10 @@ import pytest
 import torch
 from torchrl.objectives import SoftUpdate
 
-from torchrl_osr import InverseDynamicsLoss, OSRLoss
+from torchrl_osr import InverseDynamicsLoss, OSRLoss, OSRVLoss
 
-NAMES = ["osr", "cql", "idm"]
-MODES = ["osr", "cql"]
+NAMES = ["osr", "cql", "osrv", "idm"]
+MODES = ["osr", "cql", "osrv"]
 
 
 def build(name: str, networks, **kwargs):
@@ -19,8 +19,9 @@ def build(name: str, networks, **kwargs):
         kwargs.pop("scalar_output_mode", None)
         return InverseDynamicsLoss(networks.inverse_dynamics, **kwargs)
     kwargs |= {"num_random": 3, "alpha_init": 0.5}
-    kwargs["recovery_weight"] = 0.5 * (name == "osr")
-    loss = OSRLoss(
+    kwargs["recovery_weight"] = 0.5 * (name != "cql")
+    loss_class = OSRVLoss if name == "osrv" else OSRLoss
+    loss = loss_class(
         networks.actor, networks.critics, networks.inverse_dynamics, **kwargs
     ).double()
     SoftUpdate(loss, tau=0.1)
@@ -151,6 +152,7 @@ def test_order_of_the_rows_does_not_matter_to_the_model_terms(
 ) -> None:
     # The terms without a random draw: recovery, likelihood, and the critics' values.
     loss, batch = build(name, make_networks()), make_batch(10)
-    key = {"osr": "loss_recovery", "cql": "pred_value", "idm": "loss_inverse_dynamics"}
+    drawless = {"osr": "loss_recovery", "idm": "loss_inverse_dynamics"}
+    key = drawless.get(name, "pred_value")
     out, flipped = loss(batch), loss(batch[torch.arange(9, -1, -1)])
-    torch.testing.assert_close(out[key[name]], flipped[key[name]])
+    torch.testing.assert_close(out[key], flipped[key])

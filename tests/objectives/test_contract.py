@@ -7,20 +7,23 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
 
-from torchrl_osr import InverseDynamicsLoss, OSRLoss
+from torchrl_osr import InverseDynamicsLoss, OSRLoss, OSRVLoss
 
-NAMES = ["osr", "cql", "idm"]
+NAMES = ["osr", "cql", "osrv", "idm"]
+MODES = ["osr", "cql", "osrv"]
 REDUCTIONS = ["mean", "sum", "none"]
 CRITIC_LOSSES = ["loss_actor", "loss_alpha", "loss_qvalue", "loss_cql"]
 METRICS = ["alpha", "entropy", "pred_value", "target_value"]
 LOSS_KEYS = {
     "osr": [*CRITIC_LOSSES, "loss_recovery"],
     "cql": CRITIC_LOSSES,
+    "osrv": [*CRITIC_LOSSES[:-1], "loss_recovery"],
     "idm": ["loss_inverse_dynamics"],
 }
 OUT_KEYS = {
     "osr": [*LOSS_KEYS["osr"], *METRICS, "recovery_kl"],
     "cql": [*LOSS_KEYS["cql"], *METRICS],
+    "osrv": [*LOSS_KEYS["osrv"], *METRICS, "recovery_gap"],
     "idm": LOSS_KEYS["idm"],
 }
 NEXT = ("next", "observation")
@@ -30,6 +33,7 @@ TWIN = ("perturbed", "observation")
 IN_KEYS = {
     "osr": [*TRANSITION, TWIN],
     "cql": TRANSITION,
+    "osrv": [*TRANSITION, TWIN],
     "idm": ["observation", NEXT, "action", ("next", "done"), TWIN],
 }
 DEFAULT_KEYS = {
@@ -51,8 +55,9 @@ def build(name: str, networks, **kwargs):
         kwargs.pop("scalar_output_mode", None)
         return InverseDynamicsLoss(networks.inverse_dynamics, **kwargs)
     kwargs |= {"num_random": 3, "alpha_init": 0.5}
-    kwargs["recovery_weight"] = 0.5 * (name == "osr")
-    loss = OSRLoss(
+    kwargs["recovery_weight"] = 0.5 * (name != "cql")
+    loss_class = OSRVLoss if name == "osrv" else OSRLoss
+    loss = loss_class(
         networks.actor, networks.critics, networks.inverse_dynamics, **kwargs
     ).double()
     SoftUpdate(loss, tau=0.1)
@@ -98,7 +103,7 @@ def test_out_keys_are_what_forward_returns(
     assert loss.out_keys == expected[name]
 
 
-@pytest.mark.parametrize("name", ["osr", "cql"])
+@pytest.mark.parametrize("name", MODES)
 def test_reduction_none_warns_about_the_metrics_it_drops(make_networks, name) -> None:
     with pytest.warns(UserWarning, match="leaves its scalar metrics out"):
         loss = build(name, make_networks(), reduction="none")
@@ -186,15 +191,16 @@ def test_keyword_call_equals_tensordict_call(
         torch.testing.assert_close(value, expected[key], rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["osr", "cql"])
+@pytest.mark.parametrize("name", MODES)
 def test_selected_out_keys_are_all_that_comes_back(
     make_networks, make_batch, name
 ) -> None:
     loss, batch = build(name, make_networks()), make_batch(10)
     expected = seeded(loss, batch)
-    loss.select_out_keys("loss_actor", "loss_cql")
+    selected = ["loss_actor", LOSS_KEYS[name][-1]]
+    loss.select_out_keys(*selected)
     out = seeded(loss, batch)
-    assert set(out.keys()) == {"loss_actor", "loss_cql"}
+    assert set(out.keys()) == set(selected)
     assert_same(out, expected, out.keys())
     loss.reset_out_keys()
     assert list(seeded(loss, batch).keys()) == OUT_KEYS[name]

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import inspect
+
 import pytest
 import torch
 from torchrl.objectives import SoftUpdate
 
-from torchrl_osr import InverseDynamicsLoss, OSRLoss
+from torchrl_osr import InverseDynamicsLoss, OSRLoss, OSRVLoss
 
-MODES = ["osr", "cql"]
+MODES = ["osr", "cql", "osrv", "osrv-logsumexp"]
 
 
-def build(mode: str, networks, **kwargs) -> OSRLoss:
-    loss = OSRLoss(
+def build(mode: str, networks, **kwargs) -> OSRLoss | OSRVLoss:
+    loss_class = OSRVLoss if mode.startswith("osrv") else OSRLoss
+    if mode == "osrv-logsumexp":
+        kwargs["policy_values"] = "logsumexp"
+    loss = loss_class(
         networks.actor,
         networks.critics,
         networks.inverse_dynamics,
-        recovery_weight=0.5 if mode == "osr" else 0.0,
-        num_random=3,
-        **kwargs,
+        recovery_weight=0.0 if mode == "cql" else 0.5,
+        **({"num_random": 3} | kwargs),
     ).double()
     loss.make_value_estimator(gamma=0.99)
     SoftUpdate(loss, tau=0.1)
@@ -65,17 +69,43 @@ def test_compiled_loss_equals_eager_without_graph_breaks(
         torch.testing.assert_close(ours, theirs, rtol=1e-12, atol=1e-12)
 
 
-# For each critic: the data's action and 3K = 9 proposals, the policy's own action at
-# every state of D_tot, and the next action.
-@pytest.mark.parametrize(("mode", "rows"), [("cql", 10 + 1 + 1), ("osr", 10 + 2 + 1)])
-@pytest.mark.parametrize("count", [1, 2])
-def test_critics_score_no_more_rows_than_the_equations_ask(
-    make_networks, make_batch, mode, rows, count
-) -> None:
-    networks, scored = make_networks(num_critics=count), []
+def rows_scored(mode: str, networks, batch, **kwargs) -> float:
+    """How many actions all critics together score for one row of the batch."""
+    scored = []
     for critic in networks.critics:
         critic.module.register_forward_pre_hook(
             lambda _, inputs: scored.append(inputs[0].shape[:-1].numel())
         )
-    build(mode, networks, deactivate_vmap=True)(make_batch(10))
-    assert sum(scored) == count * rows * 10
+    build(mode, networks, deactivate_vmap=True, **kwargs)(batch)
+    return sum(scored) / batch.numel()
+
+
+# For each critic: the data's action, the policy's own action at every state of D_tot,
+# the next action, and with K = 3 the proposals: 3K at the state of the data, or those
+# of policy and model (and uniform ones) at both states.
+@pytest.mark.parametrize(
+    ("mode", "rows"),
+    [
+        ("cql", 1 + 1 + 1 + 9),
+        ("osr", 1 + 2 + 1 + 9),
+        ("osrv", 1 + 2 + 1 + 2 * 6),
+        ("osrv-logsumexp", 1 + 2 + 1 + 2 * 9),
+    ],
+)
+@pytest.mark.parametrize("count", [1, 2])
+def test_critics_score_no_more_rows_than_the_equations_ask(
+    make_networks, make_batch, mode, rows, count
+) -> None:
+    networks, batch = make_networks(num_critics=count), make_batch(10)
+    assert rows_scored(mode, networks, batch) == count * rows
+
+
+# What the documentation says that a row costs.
+@pytest.mark.parametrize(("mode", "number", "rows"), [("osr", 10, 68), ("osrv", 1, 16)])
+def test_rows_scored_with_the_defaults(
+    make_networks, make_batch, mode, number, rows
+) -> None:
+    default = inspect.signature(OSRVLoss if mode == "osrv" else OSRLoss)
+    assert default.parameters["num_random"].default == number
+    networks, batch = make_networks(), make_batch(10)
+    assert rows_scored(mode, networks, batch, num_random=number) == rows

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torchrl.modules import TruncatedNormal
 from torchrl.objectives import SoftUpdate
 
-from torchrl_osr import InverseDynamicsLoss, OSRLoss
+from torchrl_osr import InverseDynamicsLoss, OSRLoss, OSRVLoss
+
+NAMES = ["osr", "cql", "osrv", "idm"]
+RECOVERING = ["osr", "osrv"]
 
 
 def build(name: str, networks, **kwargs):
@@ -15,14 +20,15 @@ def build(name: str, networks, **kwargs):
         return InverseDynamicsLoss(networks.inverse_dynamics, **kwargs)
     if name == "cql":
         kwargs["recovery_weight"] = 0.0
-    loss = OSRLoss(
+    loss_class = OSRVLoss if name == "osrv" else OSRLoss
+    loss = loss_class(
         networks.actor, networks.critics, networks.inverse_dynamics, **kwargs
     ).double()
     SoftUpdate(loss, tau=0.1)
     return loss
 
 
-@pytest.mark.parametrize("name", ["osr", "idm"])
+@pytest.mark.parametrize("name", ["osr", "osrv", "idm"])
 @pytest.mark.parametrize("prefix", ["perturbed", "noisy"])
 def test_missing_twin_is_named_with_the_cure(
     make_networks, make_batch, name, prefix
@@ -33,7 +39,7 @@ def test_missing_twin_is_named_with_the_cure(
         loss(make_batch(10, twin=False))
 
 
-@pytest.mark.parametrize("name", ["osr", "idm"])
+@pytest.mark.parametrize("name", ["osr", "osrv", "idm"])
 def test_twin_of_another_shape_is_named(make_networks, make_batch, name) -> None:
     loss, batch = build(name, make_networks()), make_batch(10)
     batch["perturbed", "observation"] = torch.zeros(10, 4)
@@ -41,7 +47,7 @@ def test_twin_of_another_shape_is_named(make_networks, make_batch, name) -> None
         loss(batch)
 
 
-@pytest.mark.parametrize("name", ["osr", "cql", "idm"])
+@pytest.mark.parametrize("name", NAMES)
 def test_next_state_of_another_shape_is_named(make_networks, make_batch, name) -> None:
     loss, batch = build(name, make_networks()), make_batch(10)
     batch["next", "observation"] = torch.zeros(10, 1)
@@ -51,8 +57,8 @@ def test_next_state_of_another_shape_is_named(make_networks, make_batch, name) -
 
 SHARED = ["observation", "action", ("next", "observation"), ("next", "done")]
 CRITIC_ONLY = [("next", "reward"), ("next", "terminated")]
-READ = [(name, key) for name in ("osr", "cql", "idm") for key in SHARED]
-READ += [(name, key) for name in ("osr", "cql") for key in CRITIC_ONLY]
+READ = [(name, key) for name in NAMES for key in SHARED]
+READ += [(name, key) for name in ("osr", "cql", "osrv") for key in CRITIC_ONLY]
 
 
 @pytest.mark.parametrize(("name", "key"), READ, ids=str)
@@ -63,43 +69,75 @@ def test_missing_entry_is_named(make_networks, make_batch, name, key) -> None:
         loss(batch.exclude(key))
 
 
-@pytest.mark.parametrize("name", ["osr", "cql", "idm"])
+@pytest.mark.parametrize("name", NAMES)
 def test_other_distribution_families_are_refused(make_networks, name) -> None:
     networks = make_networks(distribution_class=TruncatedNormal)
     with pytest.raises(TypeError, match=r"network must end in a TanhNormal.*Truncated"):
         build(name, networks)
 
 
-def test_only_the_model_has_another_distribution_family(make_networks) -> None:
+@pytest.mark.parametrize("name", RECOVERING)
+def test_only_the_model_has_another_distribution_family(make_networks, name) -> None:
     networks = make_networks()
     other = make_networks(distribution_class=TruncatedNormal)
     networks.inverse_dynamics = other.inverse_dynamics
     with pytest.raises(TypeError, match="inverse_dynamics_network must end in"):
-        build("osr", networks)
+        build(name, networks)
     build("cql", networks)  # which has no use for the model
 
 
 @pytest.mark.parametrize(
     ("low", "high"), [(-2.0, 1.0), (-1.0, 2.0), (-1.0, torch.tensor([1.0, 2.0]))]
 )
-def test_bounds_that_differ_are_refused(make_networks, low, high) -> None:
+@pytest.mark.parametrize("name", RECOVERING)
+def test_bounds_that_differ_are_refused(make_networks, name, low, high) -> None:
     networks = make_networks()
     networks.inverse_dynamics = make_networks(low=low, high=high).inverse_dynamics
     with pytest.raises(ValueError, match=r"share their action bounds.*2\.0"):
-        build("osr", networks)
+        build(name, networks)
 
 
-def test_bounds_may_be_numbers_or_tensors(make_networks, make_batch) -> None:
+@pytest.mark.parametrize("name", RECOVERING)
+def test_bounds_may_be_numbers_or_tensors(make_networks, make_batch, name) -> None:
     networks = make_networks()
     bounds = {"low": -torch.ones(2), "high": torch.ones(2)}
     networks.inverse_dynamics = make_networks(**bounds).inverse_dynamics
-    assert build("osr", networks)(make_batch(10))["loss_recovery"].isfinite()
+    assert build(name, networks)(make_batch(10))["loss_recovery"].isfinite()
 
 
-@pytest.mark.parametrize("weight", ["recovery_weight", "min_q_weight"])
-def test_negative_weights_are_refused(make_networks, weight) -> None:
-    with pytest.raises(ValueError, match=rf"{weight} must be at least 0, got -0\.5"):
-        build("osr", make_networks(), **{weight: -0.5})
+@pytest.mark.parametrize(
+    ("name", "weight"),
+    [("osr", "recovery_weight"), ("osr", "min_q_weight"), ("osrv", "recovery_weight")],
+)
+@pytest.mark.parametrize("value", [-0.5, math.inf, math.nan])
+def test_weights_that_are_none_are_refused(make_networks, name, weight, value) -> None:
+    with pytest.raises(ValueError, match=rf"{weight} must be at least 0, got {value}"):
+        build(name, make_networks(), **{weight: value})
+
+
+# What every actor-critic loss asks of its options, and what OSR-v asks besides.
+@pytest.mark.parametrize("name", ["osr", "cql", "osrv"])
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("num_random", 0),
+        ("temperature", 0.0),
+        ("temperature", math.nan),
+        ("loss_function", "huber"),
+        ("reduction", "median"),
+        ("scalar_output_mode", "keep"),
+    ],
+)
+def test_options_out_of_range_are_named(make_networks, name, option, value) -> None:
+    with pytest.raises(ValueError, match=f"{option}.*{value}"):
+        build(name, make_networks(), **{option: value})
+
+
+@pytest.mark.parametrize("value", ["max", None])
+def test_unknown_policy_values_are_named(make_networks, value) -> None:
+    expected = rf"policy_values must be one of \('mean', 'logsumexp'\), got {value!r}"
+    with pytest.raises(ValueError, match=expected):
+        build("osrv", make_networks(), policy_values=value)
 
 
 def test_recovery_without_a_model_is_refused(make_networks) -> None:
@@ -109,7 +147,7 @@ def test_recovery_without_a_model_is_refused(make_networks) -> None:
         build("osr", networks)
 
 
-@pytest.mark.parametrize("name", ["osr", "cql", "idm"])
+@pytest.mark.parametrize("name", NAMES)
 def test_action_of_another_size_is_named(make_networks, make_batch, name) -> None:
     loss, batch = build(name, make_networks()), make_batch(10)
     batch["action"] = torch.zeros(10, 5, dtype=torch.float64)
@@ -117,11 +155,19 @@ def test_action_of_another_size_is_named(make_networks, make_batch, name) -> Non
         loss(batch)
 
 
+@pytest.mark.parametrize("name", RECOVERING)
 @pytest.mark.parametrize("key", ["reward", "done", "terminated"])
 def test_flags_and_rewards_need_a_last_dimension_of_one(
-    make_networks, make_batch, key
+    make_networks, make_batch, name, key
 ) -> None:
-    loss, batch = build("osr", make_networks()), make_batch(10)
+    loss, batch = build(name, make_networks()), make_batch(10)
     batch["next", key] = batch["next", key].squeeze(-1)
     with pytest.raises(ValueError, match=rf"'{key}'\) has shape \(10,\).*\(10, 1\)"):
         loss(batch)
+
+
+@pytest.mark.parametrize("loss_class", [OSRLoss, OSRVLoss])
+def test_missing_model_is_named(make_networks, loss_class) -> None:
+    networks = make_networks()
+    with pytest.raises(ValueError, match="needs an inverse_dynamics_network"):
+        loss_class(networks.actor, networks.critics, None)

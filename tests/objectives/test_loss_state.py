@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 import torch
 from torchrl.objectives import HardUpdate, SoftUpdate, ValueEstimators
 from torchrl.objectives.value import TD0Estimator
 
-from torchrl_osr import InverseDynamicsLoss, OSRLoss
+from torchrl_osr import InverseDynamicsLoss, OSRLoss, OSRVLoss
 
-MODES = ["osr", "cql"]
+MODES = ["osr", "cql", "osrv"]
+RECOVERING = ["osr", "osrv"]
 
 
-def build(mode: str, networks, **kwargs) -> OSRLoss:
-    weight = 0.5 if mode == "osr" else 0.0
-    return OSRLoss(
+def build(mode: str, networks, **kwargs) -> OSRLoss | OSRVLoss:
+    loss_class = OSRVLoss if mode == "osrv" else OSRLoss
+    return loss_class(
         networks.actor,
         networks.critics,
         networks.inverse_dynamics,
-        recovery_weight=weight,
+        recovery_weight=0.0 if mode == "cql" else 0.5,
         num_random=3,
         **kwargs,
     ).double()
 
 
-def updated(mode: str, networks, **kwargs) -> OSRLoss:
+def updated(mode: str, networks, **kwargs) -> OSRLoss | OSRVLoss:
     loss = build(mode, networks, **kwargs)
     SoftUpdate(loss, tau=0.1)
     return loss
@@ -50,9 +53,9 @@ def saved_after_a_change(mode: str, networks, batch):
     shift(loss.actor_network_params, 0.1)
     shift(loss.qvalue_network_params, 0.2)
     shift(loss.target_qvalue_network_params, 0.3)
-    if mode == "osr":
+    if mode in RECOVERING:
         shift(loss.inverse_dynamics_network_params, 0.4)
-    loss.min_q_weight = 1.25
+    setattr(loss, "recovery_weight" if mode == "osrv" else "min_q_weight", 1.25)
     loss.log_alpha.data.fill_(-0.5)
     return loss.state_dict(), seeded(loss, batch), loss.state_dict()
 
@@ -82,15 +85,18 @@ def test_state_dict_of_the_model_loss_restores_it(make_networks, make_batch) -> 
     assert torch.equal(fresh(batch)[key], loss(batch)[key])
 
 
-def test_a_trained_model_loss_hands_its_model_over(make_networks, make_batch) -> None:
+@pytest.mark.parametrize("mode", RECOVERING)
+def test_a_trained_model_loss_hands_its_model_over(
+    make_networks, make_batch, mode
+) -> None:
     # The recovery term reads the network that InverseDynamicsLoss trained in place.
     networks = make_networks()
     shift(
         InverseDynamicsLoss(networks.inverse_dynamics).inverse_dynamics_network_params,
         0.3,
     )
-    trained = updated("osr", networks)
-    untrained = updated("osr", make_networks())
+    trained = updated(mode, networks)
+    untrained = updated(mode, make_networks())
     batch = make_batch(10)
     assert (
         seeded(trained, batch)["loss_recovery"]
@@ -180,33 +186,54 @@ def test_weights_can_be_scheduled_in_place(make_networks, make_batch) -> None:
         torch.testing.assert_close(after[key], factor * before[key])
 
 
-def with_estimator(networks, batch, *args, **kwargs) -> torch.Tensor:
-    loss = updated("cql", networks)
+def test_weight_of_the_value_constraint_can_be_scheduled_from_zero(
+    make_networks, make_batch
+) -> None:
+    loss, batch = updated("osrv", make_networks()), make_batch(10)
+    before = seeded(loss, batch)
+    buffer = loss.recovery_weight
+    for weight in (0.0, 2.0):
+        loss.recovery_weight = weight
+        after = seeded(loss, batch)
+        assert loss.recovery_weight is buffer
+        assert loss.state_dict()["recovery_weight"].item() == weight
+        expected = weight / 0.5 * before["loss_recovery"]
+        torch.testing.assert_close(after["loss_recovery"], expected)
+        for key in ("loss_actor", "loss_qvalue", "recovery_gap"):
+            assert torch.equal(after[key], before[key])
+
+
+def with_estimator(networks, batch, *args, mode="cql", **kwargs) -> torch.Tensor:
+    loss = updated(mode, networks)
     loss.make_value_estimator(*args, **kwargs)
     return seeded(loss, batch)["target_value"]
 
 
-def test_the_kinds_of_target_agree_where_they_must(make_networks, make_batch) -> None:
-    networks, batch = make_networks(), make_batch(2, 5)
-    td0 = with_estimator(networks, batch)
-    assert td0 == with_estimator(networks, batch, "td0", gamma=0.99)
-    assert td0 == with_estimator(networks, batch, ValueEstimators.TD0)
-    instance = TD0Estimator(gamma=0.99, value_network=None)
-    assert td0 == with_estimator(networks, batch, instance)
-    td1 = with_estimator(networks, batch, ValueEstimators.TD1)
+@pytest.mark.parametrize("mode", MODES)
+def test_the_kinds_of_target_agree_where_they_must(
+    make_networks, make_batch, mode
+) -> None:
+    target = partial(with_estimator, make_networks(), make_batch(2, 5), mode=mode)
+    td0 = target()
+    assert td0 == target("td0", gamma=0.99)
+    assert td0 == target(ValueEstimators.TD0)
+    assert td0 == target(TD0Estimator(gamma=0.99, value_network=None))
+    td1 = target(ValueEstimators.TD1)
     assert td0 != td1
     # TD(lambda) is TD(0) at lambda = 0 and TD(1) at lambda = 1.
     for lmbda, wanted in {0.0: td0, 1.0: td1}.items():
         # The vectorised estimator of TorchRL 0.14.1 fails at lambda = 0.
-        options = {"lmbda": lmbda, "vectorized": False}
-        found = with_estimator(networks, batch, ValueEstimators.TDLambda, **options)
+        found = target(ValueEstimators.TDLambda, lmbda=lmbda, vectorized=False)
         torch.testing.assert_close(found, wanted)
 
 
+@pytest.mark.parametrize("mode", RECOVERING)
 @pytest.mark.parametrize("kind", ["gae", ValueEstimators.GAE, ValueEstimators.VTrace])
-def test_estimators_without_an_action_value_are_refused(make_networks, kind) -> None:
+def test_estimators_without_an_action_value_are_refused(
+    make_networks, mode, kind
+) -> None:
     with pytest.raises(NotImplementedError):
-        build("osr", make_networks()).make_value_estimator(kind)
+        build(mode, make_networks()).make_value_estimator(kind)
 
 
 def test_gamma_scales_the_bootstrap(make_networks, make_batch) -> None:
@@ -227,11 +254,12 @@ def test_reset_redraws_what_is_trained_and_keeps_the_frozen_model(
     names = ["actor_network", "qvalue_network", "target_qvalue_network"]
     for name in names:
         shift(getattr(loss, f"{name}_params"), 1000.0)
-    model = values(loss.inverse_dynamics_network_params) if mode == "osr" else []
+    recovers = mode in RECOVERING
+    model = values(loss.inverse_dynamics_network_params) if recovers else []
     loss.reset_parameters_recursive()
     for name in names:
         for tensor in values(getattr(loss, f"{name}_params")):
             assert tensor.abs().max() < 100, name
-    if mode == "osr":
+    if recovers:
         kept = values(loss.inverse_dynamics_network_params)
         assert all(map(torch.equal, kept, model))

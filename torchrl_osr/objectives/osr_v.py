@@ -120,6 +120,8 @@ class OSRVLoss(RecoveryActorCriticLoss):
         use_prioritized_weights: bool | Literal["auto"] = "auto",
         scalar_output_mode: ScalarOutputMode = None,
     ) -> None:
+        if inverse_dynamics_network is None:
+            raise ValueError("OSRVLoss needs an inverse_dynamics_network.")
         check_choice("policy_values", policy_values, ("mean", "logsumexp"))
         if not 0 <= recovery_weight < math.inf:
             raise ValueError(

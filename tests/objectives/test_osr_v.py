@@ -1,0 +1,272 @@
+"""OSRVLoss against a plain restatement of its equations, and what (8) means."""
+
+from __future__ import annotations
+
+import copy
+import math
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torch.distributions import Normal
+from torchrl.modules import ProbabilisticActor, TanhNormal
+from torchrl.objectives import SoftUpdate
+
+from torchrl_osr import OSRLoss, OSRVLoss
+
+GAMMA, TEMPERATURE, ALPHA, WEIGHT = 0.875, 1.7, 0.3, 2.5
+TARGET_ENTROPY, TARGET_SCALE = -1.5, 0.8
+LOSSES = ["loss_actor", "loss_alpha", "loss_qvalue", "loss_recovery"]
+
+
+def make_osr_v(networks, **kwargs) -> OSRVLoss:
+    """A loss with every option off its default and target critics of their own."""
+    settings = {
+        "recovery_weight": WEIGHT,
+        "temperature": TEMPERATURE,
+        "alpha_init": ALPHA,
+        "target_entropy": TARGET_ENTROPY,
+    } | kwargs
+    loss = OSRVLoss(
+        networks.actor, networks.critics, networks.inverse_dynamics, **settings
+    ).double()
+    loss.make_value_estimator(gamma=GAMMA)
+    SoftUpdate(loss, tau=0.1)
+    loss.target_qvalue_network_params.apply_(lambda tensor: tensor.mul_(TARGET_SCALE))
+    return loss
+
+
+def seeded(loss, batch, seed: int = 5):
+    torch.manual_seed(seed)
+    return loss(batch)
+
+
+class Restatement:
+    """The equations once more: everything in loops, densities by hand."""
+
+    def __init__(self, networks, *, low: Tensor, high: Tensor) -> None:
+        networks = copy.deepcopy(networks)
+        self.policy_net, self.idm_net = networks.actor[0], networks.inverse_dynamics[0]
+        self.critics = [critic.module for critic in networks.critics]
+        self.targets = copy.deepcopy(self.critics)
+        for target in self.targets:
+            for parameter in target.parameters():
+                parameter.data.mul_(TARGET_SCALE)
+        self.log_alpha = torch.tensor(math.log(ALPHA)).double().requires_grad_()
+        self.low, self.half = low, (high - low) / 2
+
+    def act(self, network, inputs, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """tanh-Gaussian action and log-density, by the change of variables."""
+        _, loc, scale = network(*inputs)
+        x = loc + scale * noise
+        squashed = torch.tanh(x)
+        log_prob = Normal(loc, scale).log_prob(x)
+        log_prob = log_prob - torch.log(self.half * (1 - squashed**2))
+        return self.low + self.half * (1 + squashed), log_prob.sum(-1)
+
+    def gap(self, critic, states, next_state, number, draws, log_sum_exp) -> Tensor:
+        """Equation (8), for a critic: mean over both state sets, ``[B]``."""
+        total = 0.0
+        for i, state in enumerate(states):
+            logits, plain, target = [], 0.0, 0.0
+            for k in range(number):
+                with torch.no_grad():
+                    ours = self.act(self.policy_net, [state], draws["policy"][k, i])
+                    inputs = [state, next_state]
+                    theirs, _ = self.act(self.idm_net, inputs, draws["model"][k, i])
+                value = critic(state, ours[0]).squeeze(-1)
+                plain = plain + value / number
+                target = target + critic(state, theirs).squeeze(-1) / number
+                if log_sum_exp:
+                    logits.append((value - ours[1]) / TEMPERATURE)
+                    uniform = self.low + 2 * self.half * draws["uniform"][k, i]
+                    value = critic(state, uniform).squeeze(-1)
+                    box = -torch.log(2 * self.half).sum()
+                    logits.append((value - box) / TEMPERATURE)
+            if log_sum_exp:
+                plain = TEMPERATURE * sum(logit.exp() for logit in logits).log()
+            total = total + (plain - target) / 2
+        return total
+
+    def losses(
+        self, batch, seed: int, number: int, log_sum_exp: bool
+    ) -> dict[str, Tensor]:
+        s, a = batch["observation"], batch["action"]
+        states = torch.stack([s, batch["perturbed", "observation"]])
+        ended = batch["next", "terminated"]
+        s_next = torch.where(ended, s, batch["next", "observation"])
+        # The draws, in the order in which the loss makes them.
+        torch.manual_seed(seed)
+        shape, like = (number, 2, *a.shape), {"dtype": torch.float64}
+        noise_actor = torch.randn(2, *a.shape, **like)
+        draws = {name: torch.randn(shape, **like) for name in ("policy", "model")}
+        if log_sum_exp:
+            draws["uniform"] = torch.rand(shape, **like)
+        noise_target = torch.randn(*a.shape, **like)
+
+        action, log_prob = self.act(self.policy_net, [states], noise_actor)
+        lowest = torch.stack([q(states, action) for q in self.critics]).amin(0)
+        alpha = self.log_alpha.detach().exp()
+        with torch.no_grad():
+            action, _ = self.act(self.policy_net, [s_next], noise_target)
+            bootstrap = torch.stack([q(s_next, action) for q in self.targets]).amin(0)
+            target = batch["next", "reward"] + GAMMA * bootstrap * ~ended
+        valid = ~batch["next", "done"].squeeze(-1)
+        td, gap = 0.0, 0.0
+        for critic in self.critics:
+            td = td + (critic(s, a) - target).square().mean()
+            rows = self.gap(critic, states, s_next, number, draws, log_sum_exp)
+            gap = gap + rows[valid].mean()
+        entropy_gap = log_prob.detach() + TARGET_ENTROPY
+        return {
+            "loss_actor": (alpha * log_prob - lowest.squeeze(-1)).mean(),
+            "loss_alpha": (-self.log_alpha * entropy_gap).mean(),
+            "loss_qvalue": td,
+            "loss_recovery": WEIGHT * gap,
+        }
+
+
+@pytest.mark.parametrize("policy_values", ["mean", "logsumexp"])
+@pytest.mark.parametrize("number", [1, 3])
+@pytest.mark.parametrize(
+    ("low", "high"), [([-1.0, -1.0], [1.0, 1.0]), ([-1.0, -0.5], [2.0, 1.5])]
+)
+def test_losses_and_gradients_equal_the_restatement(
+    make_networks, make_batch, policy_values, number, low, high
+) -> None:
+    bounds = {"low": torch.tensor(low).double(), "high": torch.tensor(high).double()}
+    networks, batch = make_networks(**bounds), make_batch(10)
+    restated = Restatement(networks, **bounds)
+    loss = make_osr_v(networks, num_random=number, policy_values=policy_values)
+    out = seeded(loss, batch)
+    losses = {key: value for key, value in out.items() if key.startswith("loss_")}
+    expected = restated.losses(batch, 5, number, policy_values == "logsumexp")
+    assert list(losses) == LOSSES
+    for key in LOSSES:
+        torch.testing.assert_close(losses[key], expected[key], rtol=1e-9, atol=1e-9)
+
+    # The sum of ours is correct training; the plain one needs each group by itself.
+    actor = list(restated.policy_net.parameters())
+    each = [list(critic.parameters()) for critic in restated.critics]
+    wanted = list(torch.autograd.grad(expected["loss_actor"], actor))
+    critic_part = expected["loss_qvalue"] + expected["loss_recovery"]
+    for pair in zip(*each, strict=True):
+        wanted.append(
+            torch.stack(torch.autograd.grad(critic_part, pair, retain_graph=True))
+        )
+    wanted += torch.autograd.grad(expected["loss_alpha"], restated.log_alpha)
+    sum(losses.values()).backward()
+    ours = [p.grad for p in loss.actor_network_params.values(True, True)]
+    ours += [p.grad for p in loss.qvalue_network_params.values(True, True)]
+    ours.append(loss.log_alpha.grad)
+    for got, gradient in zip(ours, wanted, strict=True):
+        torch.testing.assert_close(got, gradient, rtol=1e-9, atol=1e-9)
+
+
+def test_metrics_say_what_they_are_called(make_networks, make_batch) -> None:
+    out = seeded(make_osr_v(make_networks()), make_batch(10))
+    assert out["alpha"].item() == pytest.approx(ALPHA)
+    gap = WEIGHT * out["recovery_gap"]
+    assert out["loss_recovery"].item() == pytest.approx(gap.item())
+    assert not out["recovery_gap"].requires_grad
+    entropy = TARGET_ENTROPY + out["loss_alpha"] / math.log(ALPHA)
+    assert out["entropy"].item() == pytest.approx(entropy.item())
+
+
+@pytest.mark.parametrize("policy_values", ["mean", "logsumexp"])
+def test_time_dimension_changes_no_number(
+    make_networks, make_batch, policy_values
+) -> None:
+    options = {"num_random": 3, "policy_values": policy_values}
+    flat, out = make_batch(10), []
+    for batch in (flat, flat.reshape(2, 5)):
+        out.append(seeded(make_osr_v(make_networks(), **options), batch))
+    for key in out[0].keys():  # noqa: SIM118
+        torch.testing.assert_close(out[1][key], out[0][key], rtol=1e-12, atol=1e-12)
+
+
+class Displacement(nn.Module):
+    """Pre-tanh parameters of the action that is the step from a state to the next."""
+
+    def forward(self, state: Tensor, next_state: Tensor) -> tuple[Tensor, Tensor]:
+        action = (next_state - state)[..., :2]
+        return action.atanh(), torch.full_like(action, 1e-12)
+
+
+def known_actions(networks, batch):
+    """A model that knows the data's actions, and twins that are the clean states."""
+    following = batch["observation"].clone()
+    following[..., :2] += batch["action"]
+    batch["next", "observation"] = following
+    batch["perturbed", "observation"] = batch["observation"].clone()
+    networks.inverse_dynamics = ProbabilisticActor(
+        TensorDictModule(
+            Displacement(), ["observation", ("next", "observation")], ["loc", "scale"]
+        ),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+    )
+    return networks, batch
+
+
+def test_without_noise_the_gap_is_cqls_plain_one_and_not_its_log_sum_exp(
+    make_networks, make_batch
+) -> None:
+    """Proposition 2: E_pi Q - E_D Q where s^ = s and the model knows the action.
+
+    That is the conservative term as the paper prints it in (3), and another number
+    than CQL(H), which the authors' code and ``OSRLoss`` compute.
+    """
+    networks, batch = known_actions(make_networks(), make_batch(10))
+    loss = make_osr_v(networks, num_random=4, recovery_weight=1.0)
+    gap = seeded(loss, batch)["loss_recovery"]
+
+    pairs = torch.stack([batch.select("observation")] * 2)
+    torch.manual_seed(5)
+    pi = networks.actor.get_dist(pairs)
+    pi.rsample()  # the actor's own term
+    action = pi.rsample((4,))
+    valid = ~batch["next", "done"].squeeze(-1)
+    wanted = 0.0
+    for critic in make_networks().critics:
+        sampled = critic.module(pairs["observation"].expand(4, 2, 10, 3), action)
+        data = critic.module(batch["observation"], batch["action"])
+        wanted = wanted + sampled.mean((0, 1))[valid].mean() - data[valid].mean()
+    torch.testing.assert_close(gap, wanted, rtol=1e-9, atol=1e-9)
+
+    cql = OSRLoss(
+        networks.actor,
+        networks.critics,
+        recovery_weight=0.0,
+        min_q_weight=1.0,
+        num_random=4,
+    ).double()
+    SoftUpdate(cql, tau=0.1)
+    assert (seeded(cql, batch[valid])["loss_cql"] - gap).abs() > 1.0
+
+
+def test_constant_values_cancel_and_the_critics_output_bias_stays(
+    make_networks, make_batch
+) -> None:
+    # Q -> Q + c(s): the bias is the only c(s) that every critic has.
+    networks, moved = make_networks(), make_networks()
+    for critic in moved.critics:
+        critic.module[-1].bias.data += 10.0
+    before, after = (
+        seeded(make_osr_v(each), make_batch(10))["loss_recovery"]
+        for each in (networks, moved)
+    )
+    torch.testing.assert_close(after, before, rtol=0, atol=1e-10)
+
+
+def test_model_is_called_once_and_twins_matter(make_networks, make_batch) -> None:
+    networks, called = make_networks(), []
+    networks.inverse_dynamics[0][0].register_forward_pre_hook(
+        lambda *_: called.append(1)
+    )
+    loss, batch = make_osr_v(networks), make_batch(10)
+    before = seeded(loss, batch)["loss_recovery"]
+    assert len(called) == 1
+    batch["perturbed", "observation"] += 1.0
+    assert seeded(loss, batch)["loss_recovery"] != before
