@@ -1,300 +1,34 @@
-"""What the recovery losses share: an actor, an ensemble of critics, a temperature.
+"""What OSR and OSR-v share: the terms of a soft actor-critic on D_tot, and the call.
 
 Shapes: ``B`` batch (any leading dimensions), ``A`` action, ``N`` critics, ``D`` state
-sets of D_tot (2: clean and perturbed; 1 where nothing recovers). The state sets are
-always stacked as ``[s, s', s^]``: rows ``[:2]`` are the true states, ``[::2]`` D_tot.
+sets of D_tot (2: clean and perturbed; 1 where nothing recovers).
 """
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, cast
 
 import torch
-from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import (
-    ProbabilisticTensorDictSequential,
-    TensorDictModule,
-    TensorDictParams,
-    dispatch,
-)
+from tensordict import TensorDictBase
+from tensordict.nn import dispatch
 from torch import Tensor
 from torchrl.modules import TanhNormal
 from torchrl.modules.distributions.utils import rsample_and_log_prob
-from torchrl.objectives import ValueEstimators, distance_loss
-from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
+from torchrl.objectives import distance_loss
 
 from torchrl_osr import functional
-from torchrl_osr.objectives.base import (
-    BaseLoss,
-    Reduction,
-    ScalarOutputMode,
-    check_choice,
-)
-from torchrl_osr.objectives.distributions import (
-    action_bounds,
-    check_action,
-    check_same_bounds,
-)
+from torchrl_osr.objectives.distributions import check_action
 from torchrl_osr.objectives.mixed_states import (
     column,
     entry,
     nested,
-    perturbed_twin,
     reduce_transitions,
-    replace_next,
-    select,
-    state_keys,
-    transitions,
 )
+from torchrl_osr.objectives.networks import ActorCriticNetworks
 
 
-class RecoveryActorCriticLoss(BaseLoss):
-    """Abstract base of OSRLoss and OSRVLoss: networks, keys and shared terms."""
-
-    @dataclass
-    class _AcceptedKeys:
-        """The tensordict entries that :meth:`set_keys` can rename.
-
-        Attributes:
-            action: the data's action. Defaults to ``"action"``.
-            state_action_value: what a critic writes. Defaults to
-                ``"state_action_value"``.
-            value: what the value estimator reads. Defaults to ``"state_value"``.
-            reward, done, terminated: below ``"next"``. Default to their own names.
-            priority: written to the batch, ``[B]``. Defaults to ``"td_error"``.
-            priority_weight: importance weight of a row. Defaults to
-                ``"priority_weight"``.
-            perturbed: where the perturbed twins are. Defaults to ``"perturbed"``.
-        """
-
-        action: NestedKey = "action"
-        state_action_value: NestedKey = "state_action_value"
-        value: NestedKey = "state_value"
-        reward: NestedKey = "reward"
-        done: NestedKey = "done"
-        terminated: NestedKey = "terminated"
-        priority: NestedKey = "td_error"
-        priority_weight: NestedKey = "priority_weight"
-        perturbed: NestedKey = "perturbed"
-
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
-    default_value_estimator = ValueEstimators.TD0
-
-    actor_network: ProbabilisticTensorDictSequential
-    actor_network_params: TensorDictParams
-    target_actor_network_params: TensorDictParams
-    qvalue_network: TensorDictModule
-    qvalue_network_params: TensorDictParams
-    target_qvalue_network_params: TensorDictParams
-    inverse_dynamics_network: ProbabilisticTensorDictSequential
-    inverse_dynamics_network_params: TensorDictParams
-    target_inverse_dynamics_network_params: TensorDictParams
-
-    def __init__(
-        self,
-        actor_network: ProbabilisticTensorDictSequential,
-        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
-        inverse_dynamics_network: ProbabilisticTensorDictSequential | None,
-        *,
-        num_random: int,
-        temperature: float,
-        num_qvalue_nets: int,
-        loss_function: str,
-        alpha_init: float,
-        fixed_alpha: bool,
-        target_entropy: float | Literal["auto"],
-        delay_qvalue: bool,
-        reduction: Reduction,
-        deactivate_vmap: bool,
-        use_prioritized_weights: bool | Literal["auto"],
-        scalar_output_mode: ScalarOutputMode,
-    ) -> None:
-        if num_random < 1 or not temperature > 0:
-            raise ValueError(
-                "num_random must be at least 1 and temperature above 0, got "
-                f"{num_random} and {temperature}."
-            )
-        check_choice("loss_function", loss_function, ("l2", "l1", "smooth_l1"))
-        super().__init__(
-            reduction,
-            use_prioritized_weights=use_prioritized_weights,
-            scalar_output_mode=scalar_output_mode,
-        )
-        self.deactivate_vmap = deactivate_vmap
-        self.num_random = num_random
-        self.temperature = temperature
-        self.recovers = inverse_dynamics_network is not None
-        low, high = bounds = action_bounds(actor_network, "actor_network")
-        self.register_buffer("action_low", low, persistent=False)
-        self.register_buffer("action_high", high, persistent=False)
-        self.convert_to_functional(actor_network, "actor_network")
-        if isinstance(qvalue_network, Sequence):
-            num_qvalue_nets = len(qvalue_network)
-        if num_qvalue_nets < 1:
-            raise ValueError("There must be at least one critic.")
-        self.convert_to_functional(
-            qvalue_network,
-            "qvalue_network",
-            num_qvalue_nets,
-            create_target_params=delay_qvalue,
-        )
-        if inverse_dynamics_network is not None:
-            name = "inverse_dynamics_network"
-            check_same_bounds(bounds, action_bounds(inverse_dynamics_network, name))
-            self.convert_to_functional(inverse_dynamics_network, name)
-            # Buffers instead of parameters: part of the state, moved by .to(), but no
-            # optimizer that takes loss.parameters() can move the model.
-            frozen = self.inverse_dynamics_network_params.apply(
-                lambda tensor: tensor.data, filter_empty=False
-            )
-            self.inverse_dynamics_network_params = TensorDictParams(
-                frozen, no_convert=True
-            )
-        log_alpha = torch.tensor(math.log(alpha_init))
-        if fixed_alpha:
-            self.register_buffer("log_alpha", log_alpha)
-        else:
-            self.log_alpha = torch.nn.Parameter(log_alpha)
-        self.target_entropy = target_entropy
-        self.loss_function = loss_function
-        self._make_vmap()
-        # Now, not at the first call as TorchRL does: a state dict has the same entries
-        # before and after it.
-        self.make_value_estimator()
-
-    def _make_vmap(self) -> None:
-        self._vmap_qvalue = _vmap_func(
-            self.qvalue_network,
-            (None, 0),
-            randomness=self.vmap_randomness,
-            pseudo_vmap=self.deactivate_vmap,
-        )
-
-    def reset_parameters_recursive(self) -> None:
-        """Reset actor and critics; the inverse dynamics model keeps what it learnt."""
-        for name in ("actor_network", "qvalue_network"):
-            self._reset_module_parameters(name, getattr(self, name))
-
-    def make_value_estimator(
-        self, value_type: ValueEstimators | str | None = None, **hyperparams: Any
-    ) -> RecoveryActorCriticLoss:
-        """Choose the TD target: TD(0) with ``gamma=0.99`` unless told otherwise."""
-        value_type, kwargs = self._prepare_value_estimator_kwargs(
-            value_type, **hyperparams
-        )
-        if value_type is not None:
-            names = ("value", "reward", "done", "terminated")
-            dispatch_value_estimator(
-                self,
-                value_type,
-                supported=(
-                    ValueEstimators.TD0,
-                    ValueEstimators.TD1,
-                    ValueEstimators.TDLambda,
-                ),
-                tensor_keys={name: getattr(self.tensor_keys, name) for name in names},
-                value_network=None,
-                deactivate_vmap=self.deactivate_vmap,
-                **kwargs,
-            )
-        return self
-
-    def _observation_keys(self) -> list[NestedKey]:
-        """The state entries that actor and critics read."""
-        network_keys = [*self.actor_network.in_keys, *self.qvalue_network.in_keys]
-        return state_keys(network_keys, self.tensor_keys.action)
-
-    def _input_keys(self) -> list[NestedKey]:
-        keys = self.tensor_keys
-        states = self._observation_keys()
-        in_keys = [*states, keys.action]
-        in_keys += [nested("next", key) for key in states]
-        in_keys += [
-            nested("next", key) for key in (keys.reward, keys.done, keys.terminated)
-        ]
-        if self.recovers:
-            network_keys = self.inverse_dynamics_network.in_keys
-            in_keys += network_keys
-            states += state_keys(network_keys)
-            in_keys += [nested(keys.perturbed, key) for key in states]
-        return in_keys
-
-    def _flag(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-        """Return a boolean entry below ``"next"``, ``[B]``."""
-        return column(tensordict, nested("next", key))
-
-    def _states(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return ``[s, s']`` or ``[s, s', s^]``, stacked in front: ``[2 or 3, B]``."""
-        keys = self._observation_keys()
-        clean = select(tensordict, keys)
-        following = clean.copy()
-        terminated = self._flag(tensordict, self.tensor_keys.terminated)
-        for key in keys:
-            following.set(key, replace_next(tensordict, key, terminated))
-        stack = [clean, following]
-        if self.recovers:
-            stack.append(perturbed_twin(tensordict, keys, self.tensor_keys.perturbed))
-        return torch.stack(stack)
-
-    def _policy(self, states: TensorDictBase) -> TensorDictBase:
-        """Run the actor once on all states; distributions are built from slices."""
-        with self.actor_network_params.to_module(
-            self.actor_network, preserve_module_state=False
-        ):
-            return self.actor_network.get_dist_params(states.copy())
-
-    def _distribution(self, policy: TensorDictBase) -> TanhNormal:
-        return self.actor_network.build_dist_from_params(policy)
-
-    def _qvalue(
-        self, states: TensorDictBase, action: Tensor, params: TensorDictParams
-    ) -> Tensor:
-        """Return the values of all critics, ``[N, B]``, at states and actions."""
-        batch = states.select(*state_keys(self.qvalue_network.in_keys), strict=False)
-        batch.set(self.tensor_keys.action, action)
-        batch = self._vmap_qvalue(batch, params)
-        value = batch.get(self.tensor_keys.state_action_value, None)
-        if value is None:
-            raise KeyError(
-                f"The critics write {self.qvalue_network.out_keys}, not "
-                f"{self.tensor_keys.state_action_value!r}: give them that out_key, or "
-                "call set_keys(state_action_value=...)."
-            )
-        return cast(Tensor, value.squeeze(-1))
-
-    @torch.no_grad()
-    def _inverse_dynamics(self, tensordict: TensorDictBase, done: Tensor) -> TanhNormal:
-        """Return the model's distribution on D_tot, ``[2, B]``."""
-        batch = transitions(
-            tensordict,
-            self.inverse_dynamics_network.in_keys,
-            done=done,
-            perturbed=self.tensor_keys.perturbed,
-        )
-        with self.inverse_dynamics_network_params.to_module(
-            self.inverse_dynamics_network, preserve_module_state=False
-        ):
-            return self.inverse_dynamics_network.get_dist(batch)
-
-    def _uniform(self, number: int, like: Tensor) -> tuple[Tensor, Tensor]:
-        """Draw ``number`` uniform actions for each row.
-
-        Args:
-            number: of actions, ``K``.
-            like: an action, ``[B, A]``.
-
-        Returns:
-            Actions ``[K, B, A]`` and their log-densities ``[K, B]``.
-        """
-        width = (self.action_high - self.action_low).expand(like.shape[-1])
-        action = torch.rand((number, *like.shape), dtype=like.dtype, device=like.device)
-        log_density = -width.log().sum().expand(action.shape[:-1])
-        return action * width + self.action_low, log_density
+class RecoveryActorCriticLoss(ActorCriticNetworks):
+    """Abstract base of OSRLoss and OSRVLoss, which add their constraints."""
 
     def _actor_term(
         self, states: TensorDictBase, pi: TanhNormal
