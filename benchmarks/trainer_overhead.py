@@ -3,10 +3,10 @@
     python benchmarks/trainer_overhead.py preset=quick
     python benchmarks/trainer_overhead.py preset=paper bench.steps=50
 
-Two things are timed in turn, in one process and on one thread: the bare update on a
-batch that lies ready, and as many steps of ``OfflineTrainer`` with CSV logging.
-Evaluation is left out: it is counted in minutes, not in steps. Prints
-medians over the rounds, in CPU time, which other processes disturb least.
+``OfflineTrainer`` runs with CSV logging, and a clock inside it adds up the time of the
+updates (loss, backward, optimizer, targets). Evaluation and checkpoints are left out:
+they come by the minute, not by the step. Prints medians over the rounds, in CPU time
+of one thread, which other processes disturb least.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 from hydra import compose, initialize_config_dir
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torchrl import torchrl_logger
 from torchrl.objectives import SoftUpdate
 from torchrl.record.loggers import CSVLogger
@@ -55,15 +55,8 @@ def random_data() -> TensorDict:
     return TensorDict(now | {"next": following}, [ROWS])
 
 
-def cpu_seconds(function: Callable[[], None]) -> float:
-    """Return the CPU time of one call."""
-    start = time.process_time()
-    function()
-    return time.process_time() - start
-
-
 def main(rounds: int, steps: int, overrides: list[str]) -> dict[str, float | str]:
-    """Time update and trainer in turn and return the medians."""
+    """Return the medians over the rounds."""
     torchrl_logger.setLevel("WARNING")
     config.register()
     conf = Path(__file__).resolve().parents[1] / "conf"
@@ -87,41 +80,45 @@ def main(rounds: int, steps: int, overrides: list[str]) -> dict[str, float | str
         seed=0,
         transform=StatePerturbation(cfg.perturbation.std, seed=0),
     )
-    batch = buffer.sample()
 
-    def update() -> None:
-        for _ in range(steps):
-            losses = loss(batch)
-            sum(v for k, v in losses.items() if k.startswith("loss_")).backward()
-            optimizer.step()
-            optimizer.zero_grad(set_to_none=True)
-            updater.step()
-
-    def train() -> None:
+    def train() -> tuple[float, float]:
+        """Return the CPU seconds of the updates and of all of the training."""
         with tempfile.TemporaryDirectory() as folder:
-            OfflineTrainer(
+            trainer = OfflineTrainer(
                 loss,
                 optimizer,
                 buffer,
                 total_steps=steps,
                 folder=folder,
-                target_net_updater=updater,
                 loggers=[CSVLogger("csv", log_dir=folder)],
                 log_interval=min(cfg.trainer.log_interval, steps),
                 eval_interval=steps,
-            ).train()
+            )
+            trainer.save_trainer = lambda force_save=False: None
+            original, updating = trainer.optimization_stepper.step, 0.0
 
-    update(), train()  # warm-up
-    times = [(cpu_seconds(update), cpu_seconds(train)) for _ in range(rounds)]
-    bare, whole = (
-        statistics.median(column) / steps for column in zip(*times, strict=True)
-    )
-    share = statistics.median(1 - pair[0] / pair[1] for pair in times)
+            def step(*arguments: Any) -> TensorDictBase:
+                nonlocal updating
+                start = time.process_time()
+                losses = original(*arguments)
+                updater.step()
+                updating += time.process_time() - start
+                return losses
+
+            trainer.optimization_stepper.step = step
+            start = time.process_time()
+            trainer.train()
+            return updating, time.process_time() - start
+
+    train()  # warm-up
+    times = [train() for _ in range(rounds)]
     return {
         "overrides": " ".join(overrides),
-        "updates_per_cpu_second": 1 / bare,
-        "trainer_steps_per_cpu_second": 1 / whole,
-        "share_not_update": share,
+        "updates_per_cpu_second": steps / statistics.median(part for part, _ in times),
+        "steps_per_cpu_second": steps / statistics.median(whole for _, whole in times),
+        "share_not_update": statistics.median(
+            1 - part / whole for part, whole in times
+        ),
     }
 
 
