@@ -144,6 +144,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
         **training,
     )
     trainer.train()
+    evaluator.close()
     return report(cfg, folder, manifest["normalized_score"], trainer)
 
 

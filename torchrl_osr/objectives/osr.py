@@ -7,7 +7,6 @@ nothing recovers). The equations are in :mod:`torchrl_osr.functional`.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Literal
 
@@ -23,7 +22,7 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 
 from torchrl_osr import functional
 from torchrl_osr.objectives.actor_critic import RecoveryActorCriticLoss
-from torchrl_osr.objectives.base import Reduction, ScalarOutputMode
+from torchrl_osr.objectives.base import Reduction, ScalarOutputMode, check_weight
 
 
 class OSRLoss(RecoveryActorCriticLoss):
@@ -132,8 +131,7 @@ class OSRLoss(RecoveryActorCriticLoss):
     ) -> None:
         weights = {"recovery_weight": recovery_weight, "min_q_weight": min_q_weight}
         for name, weight in weights.items():
-            if not 0 <= weight < math.inf:
-                raise ValueError(f"{name} must be at least 0, got {weight}.")
+            check_weight(name, weight)
         if recovery_weight and inverse_dynamics_network is None:
             raise ValueError(
                 f"recovery_weight={recovery_weight} needs an inverse_dynamics_network; "

@@ -6,7 +6,6 @@ sampled actions of a kind. The equations are in :mod:`torchrl_osr.functional`.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Literal
 
@@ -19,7 +18,12 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 
 from torchrl_osr import functional
 from torchrl_osr.objectives.actor_critic import RecoveryActorCriticLoss
-from torchrl_osr.objectives.base import Reduction, ScalarOutputMode, check_choice
+from torchrl_osr.objectives.base import (
+    Reduction,
+    ScalarOutputMode,
+    check_choice,
+    check_weight,
+)
 
 
 class OSRVLoss(RecoveryActorCriticLoss):
@@ -123,10 +127,7 @@ class OSRVLoss(RecoveryActorCriticLoss):
         if inverse_dynamics_network is None:
             raise ValueError("OSRVLoss needs an inverse_dynamics_network.")
         check_choice("policy_values", policy_values, ("mean", "logsumexp"))
-        if not 0 <= recovery_weight < math.inf:
-            raise ValueError(
-                f"recovery_weight must be at least 0, got {recovery_weight}."
-            )
+        check_weight("recovery_weight", recovery_weight)
         super().__init__(
             actor_network,
             qvalue_network,
