@@ -52,7 +52,8 @@ class InverseDynamicsLoss(BaseLoss):
 
     Raises:
         TypeError: if the network does not end in a ``TanhNormal``.
-        KeyError: in the call, if ``states="both"`` and no perturbed entry is there.
+        KeyError: in the call, if no perturbed entry is there, unless
+            ``states="clean"``.
 
     Examples:
         >>> import torch
@@ -110,7 +111,7 @@ class InverseDynamicsLoss(BaseLoss):
             self.tensor_keys.action,
             nested("next", self.tensor_keys.done),
         ]
-        if self.states == "both":
+        if self.states != "clean":
             keys += [
                 nested(self.tensor_keys.perturbed, key)
                 for key in state_keys(network_keys)
@@ -122,12 +123,12 @@ class InverseDynamicsLoss(BaseLoss):
 
     def _log_prob(self, tensordict: TensorDictBase, done: Tensor) -> Tensor:
         """Return the log-density of the data's action, ``[1 or 2, B]``."""
-        perturbed = self.tensor_keys.perturbed if self.states == "both" else None
         batch = transitions(
             tensordict,
             self.inverse_dynamics_network.in_keys,
             done=done,
-            perturbed=perturbed,
+            perturbed=self.tensor_keys.perturbed,
+            states=self.states,
         )
         with self.inverse_dynamics_network_params.to_module(
             self.inverse_dynamics_network, preserve_module_state=False

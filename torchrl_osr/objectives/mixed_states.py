@@ -8,11 +8,15 @@ two where an expectation over D_tot is meant (section 4.1). Shapes: ``B`` batch.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.objectives import LossModule
+
+States = Literal["both", "clean", "perturbed"]
+"""Which states of D_tot a term is taken on."""
 
 
 def nested(prefix: NestedKey, key: NestedKey) -> NestedKey:
@@ -132,30 +136,33 @@ def transitions(
     in_keys: Sequence[NestedKey],
     *,
     done: Tensor,
-    perturbed: NestedKey | None,
+    perturbed: NestedKey,
+    states: States = "both",
 ) -> TensorDictBase:
-    """Return what an inverse dynamics model reads, on D_tot or on clean states only.
+    """Return what an inverse dynamics model reads, on D_tot or a half of it.
 
     Args:
         tensordict: a batch ``[B]``.
         in_keys: the model's inputs, some of them below ``"next"``.
         done: bool ``[B]``; such rows get their own state as the next one.
-        perturbed: where the twins are; ``None`` for clean states only.
+        perturbed: where the twins are.
+        states: ``"both"`` (default), ``"clean"`` or ``"perturbed"``.
 
     Returns:
         ``[2, B]``, clean then perturbed, or ``[1, B]``. The next state is never
         perturbed: it is where the agent shall return to.
     """
     keys = state_keys(in_keys)
-    clean = select(tensordict, keys)
-    stack = [clean]
-    if perturbed is not None:
+    stack = []
+    if states != "perturbed":
+        stack.append(select(tensordict, keys))
+    if states != "clean":
         stack.append(perturbed_twin(tensordict, keys, perturbed))
     for key in in_keys:
         if is_next(key):
             next_state = replace_next(tensordict, unravel_key(key[1:]), done)
-            for states in stack:
-                states.set(key, next_state)
+            for half in stack:
+                half.set(key, next_state)
     return torch.stack(stack)
 
 

@@ -34,6 +34,7 @@ from torchrl_osr.objectives.distributions import (
     action_bounds,
     check_same_bounds,
 )
+from torchrl_osr.objectives.frozen_model import freeze, frozen_distribution
 from torchrl_osr.objectives.mixed_states import (
     column,
     nested,
@@ -41,7 +42,6 @@ from torchrl_osr.objectives.mixed_states import (
     replace_next,
     select,
     state_keys,
-    transitions,
 )
 
 
@@ -140,13 +140,8 @@ class ActorCriticNetworks(BaseLoss):
             name = "inverse_dynamics_network"
             check_same_bounds(bounds, action_bounds(inverse_dynamics_network, name))
             self.convert_to_functional(inverse_dynamics_network, name)
-            # Buffers instead of parameters: part of the state, moved by .to(), but no
-            # optimizer that takes loss.parameters() can move the model.
-            frozen = self.inverse_dynamics_network_params.apply(
-                lambda tensor: tensor.data, filter_empty=False
-            )
-            self.inverse_dynamics_network_params = TensorDictParams(
-                frozen, no_convert=True
+            self.inverse_dynamics_network_params = freeze(
+                self.inverse_dynamics_network_params
             )
         log_alpha = torch.tensor(math.log(alpha_init))
         if fixed_alpha:
@@ -260,19 +255,15 @@ class ActorCriticNetworks(BaseLoss):
             )
         return cast(Tensor, value.squeeze(-1))
 
-    @torch.no_grad()
     def _inverse_dynamics(self, tensordict: TensorDictBase, done: Tensor) -> TanhNormal:
         """Return the model's distribution on D_tot, ``[2, B]``."""
-        batch = transitions(
+        return frozen_distribution(
+            self.inverse_dynamics_network,
+            self.inverse_dynamics_network_params,
             tensordict,
-            self.inverse_dynamics_network.in_keys,
             done=done,
             perturbed=self.tensor_keys.perturbed,
         )
-        with self.inverse_dynamics_network_params.to_module(
-            self.inverse_dynamics_network, preserve_module_state=False
-        ):
-            return self.inverse_dynamics_network.get_dist(batch)
 
     def _uniform(self, number: int, like: Tensor) -> tuple[Tensor, Tensor]:
         """Draw ``number`` uniform actions for each row.
