@@ -18,13 +18,14 @@ from typing import Any
 import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
 from omegaconf import DictConfig
 from tensordict import TensorDict
 from torchrl import torchrl_logger
 from torchrl.envs import ObservationNorm
 from torchrl.objectives import SoftUpdate
 
-from torchrl_osr import InverseDynamicsLoss, OSRLoss, StatePerturbation, config
+from torchrl_osr import InverseDynamicsLoss, StatePerturbation, config
 from torchrl_osr.data import (
     load_local_dataset,
     make_replay_buffer,
@@ -39,11 +40,7 @@ from torchrl_osr.evaluation.episodes import (
 from torchrl_osr.evaluation.figures import learning_curve, read_scalars
 from torchrl_osr.evaluation.inverse_dynamics import describe, inverse_dynamics_report
 from torchrl_osr.evaluation.summary import score_table
-from torchrl_osr.modules import (
-    critic_ensemble,
-    tanh_gaussian_actor,
-    tanh_gaussian_inverse_dynamics,
-)
+from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
 from torchrl_osr.trainers import OfflineTrainer, run_folder
 from torchrl_osr.trainers.loggers import make_loggers
 
@@ -79,14 +76,14 @@ def run(cfg: DictConfig, folder: Path) -> float:
         seed=cfg.data.seed,
         progress=cfg.trainer.progress,
     )
+    statistics = observation_statistics(data) if cfg.data.standardize else (0.0, 1.0)
     norm = ObservationNorm(
-        *observation_statistics(data),
+        *statistics,
         in_keys=["observation", ("next", "observation")],
         standard_normal=True,
     ).to(device)
     data = norm(data.to(device))
     data, held_out = split_held_out(data, cfg.data.held_out, seed=cfg.data.seed)
-    # In units of the standard deviation, since the observations now are.
     perturbation = StatePerturbation(**cfg.perturbation, seed=cfg.seed)
     buffer = make_replay_buffer(
         data, batch_size=cfg.trainer.batch_size, seed=cfg.seed, transform=perturbation
@@ -104,15 +101,18 @@ def run(cfg: DictConfig, folder: Path) -> float:
     sizes = (data["observation"].shape[-1], data["action"].shape[-1])
     cells = list(cfg.network.num_cells)
     actor = tanh_gaussian_actor(*sizes, num_cells=cells).to(device)
-    critics = critic_ensemble(*sizes, **cfg.network)
-    model = tanh_gaussian_inverse_dynamics(*sizes, num_cells=cells).to(device)
+    critics = critic_ensemble(
+        *sizes, num_qvalue_nets=cfg.loss.num_qvalue_nets, **cfg.network
+    )
+    model = instantiate(cfg.inverse_dynamics.network, *sizes, num_cells=cells)
+    model = model.to(device)
 
     # First phase: which action leads from s~ to s'?
     if cfg.loss.recovery_weight > 0:
         train_inverse_dynamics(cfg, folder, model, held_out, training)
 
     # Second phase: the policy, taught by the critics and by the frozen model.
-    loss = OSRLoss(actor, critics, model, **cfg.loss).to(device)
+    loss = instantiate(cfg.loss, actor, critics, model).to(device)
     loss.make_value_estimator(gamma=cfg.optim.gamma)
     critic_params = list(loss.qvalue_network_params.parameters())
     known = set(critic_params)
@@ -143,6 +143,12 @@ def run(cfg: DictConfig, folder: Path) -> float:
         description="policy",
         **training,
     )
+
+    def warm_start(batch: TensorDict) -> TensorDict:
+        loss.behavior_cloning = trainer.step <= cfg.trainer.bc_steps
+        return batch
+
+    trainer.register_op("process_optim_batch", warm_start)
     trainer.train()
     evaluator.close()
     return report(cfg, folder, manifest["normalized_score"], trainer)
@@ -156,7 +162,7 @@ def train_inverse_dynamics(
     training: dict[str, Any],
 ) -> None:
     """Fit the model to the mixed data set and say how well it does on held-out rows."""
-    loss = InverseDynamicsLoss(model)
+    loss = InverseDynamicsLoss(model, **cfg.inverse_dynamics.loss)
     rate = cfg.optim.inverse_dynamics_lr
     trainer = OfflineTrainer(
         loss,

@@ -117,3 +117,23 @@ def make_networks():
         )
 
     return make
+
+
+@pytest.fixture
+def check(record_property):
+    """Return an assertion of closeness that notes the largest deviation it has seen.
+
+    ``check(what, got, wanted)`` compares two sequences of tensors, deviations relative
+    to the larger of 1 and the wanted number.
+    """
+
+    def compare(what: str, got, wanted, *, tolerance: float) -> None:
+        largest = 0.0
+        for ours, theirs in zip(got, wanted, strict=True):
+            assert ours.shape == theirs.shape
+            deviation = (ours - theirs).abs() / theirs.abs().clamp(min=1.0)
+            largest = max(largest, deviation.max().item())
+        record_property("check", (what, largest))
+        assert largest <= tolerance, f"{what}: {largest}"
+
+    return compare

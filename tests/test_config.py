@@ -8,12 +8,14 @@ from pathlib import Path
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.errors import ConfigCompositionException, MissingConfigException
+from hydra.utils import get_class, instantiate
 from omegaconf import OmegaConf
 
-from torchrl_osr import OSRLoss, config
+from torchrl_osr import Adversary, InverseDynamicsLoss, config, loss_config
 from torchrl_osr.data import LEVELS, load_behavior_card
 
 CONF = Path(__file__).parents[1] / "conf"
+GROUPS = ["env", "data", "inverse_dynamics", "loss", "logger", "preset"]
 
 
 @pytest.fixture(autouse=True)
@@ -33,11 +35,7 @@ def options(group: str) -> list[str]:
 
 @pytest.mark.parametrize(
     "override",
-    [
-        f"{group}={name}"
-        for group in ("env", "data", "loss", "logger", "preset")
-        for name in options(group)
-    ],
+    [f"{group}={name}" for group in GROUPS for name in options(group)],
 )
 def test_every_option_composes_without_a_missing_value(override):
     cfg = composed(override)
@@ -82,7 +80,7 @@ def test_mistyped_key_or_type_stops_by_name(override, named):
     assert named in f"{error.value} {error.value.__cause__}"
 
 
-@pytest.mark.parametrize("group", ["env", "data", "loss", "logger", "preset"])
+@pytest.mark.parametrize("group", GROUPS)
 def test_unknown_option_lists_what_exists(group):
     with pytest.raises(MissingConfigException) as error:
         composed(f"{group}=nothing")
@@ -90,19 +88,59 @@ def test_unknown_option_lists_what_exists(group):
         assert name in str(error.value)
 
 
-def test_loss_config_is_the_loss_modules_vocabulary():
-    keywords = inspect.signature(OSRLoss.__init__).parameters
-    cfg = OmegaConf.to_container(composed("preset=paper").loss)
-    for name, value in cfg.items():
+@pytest.mark.parametrize("name", options("loss"))
+def test_loss_config_is_the_loss_modules_vocabulary(name):
+    cfg = OmegaConf.to_container(composed("preset=paper", f"loss={name}"), resolve=True)
+    loss = cfg["loss"]
+    keywords = inspect.signature(get_class(loss.pop("_target_")).__init__).parameters
+    assert loss.keys() <= keywords.keys()
+    if name in ("osr", "osr_v"):
         # The paper preset is the default of the class too: one set of numbers.
-        assert keywords[name].default == value, name
+        assert loss == {key: keywords[key].default for key in loss}
+
+
+@pytest.mark.parametrize("name", options("inverse_dynamics"))
+def test_model_config_is_the_model_loss_modules_vocabulary(name):
+    cfg = composed(f"inverse_dynamics={name}").inverse_dynamics
+    model = instantiate(cfg.network, 3, 2, num_cells=[4])
+    loss = InverseDynamicsLoss(model, **cfg.loss)
+    assert (loss.states, loss.loss_function) == (
+        cfg.loss.states,
+        cfg.loss.loss_function,
+    )
+
+
+def test_adversary_of_the_configuration_is_the_class_default():
+    assert instantiate(composed("loss=osr_adversarial").loss.adversary) == Adversary()
+
+
+def test_official_preset_reaches_every_group_and_quick_sizes_stay_possible():
+    cfg = composed("preset=official")
+    assert cfg.loss == composed("loss=osr_official", "preset=paper").loss
+    assert cfg.inverse_dynamics == composed("inverse_dynamics=cvae").inverse_dynamics
+    assert (cfg.data.standardize, cfg.trainer.steps) == (False, 4_000_000)
+    quick = composed("loss=osr_official", "inverse_dynamics=cvae")
+    assert quick.loss.recovery_direction == "reverse"
+    assert quick.trainer.steps == composed().trainer.steps
+
+
+def test_number_of_sampled_actions_is_the_presets_where_cqls_term_is():
+    for name in options("loss"):
+        number = composed(f"loss={name}").loss.num_random
+        assert number == (1 if name == "osr_v" else composed().num_random)
 
 
 def test_schema_documents_every_field():
-    for schema in vars(config).values():
-        if inspect.isclass(schema) and schema.__module__ == config.__name__:
-            own = schema.__dataclass_fields__
-            if schema is config.OfflineOSRConfig:
-                own = {"seed", "resume"}
-            for name in own:
-                assert f"{name}:" in schema.__doc__, f"{schema.__name__}.{name}"
+    modules = (config, loss_config)
+    schemas = {
+        schema
+        for module in modules
+        for schema in vars(module).values()
+        if inspect.isclass(schema) and schema.__module__ == module.__name__
+    }
+    for schema in schemas:
+        own = set(schema.__annotations__) - {"_target_"}
+        if schema is config.OfflineOSRConfig:
+            own = {"seed", "num_random", "resume"}
+        for name in own:
+            assert f"{name}:" in schema.__doc__, f"{schema.__name__}.{name}"

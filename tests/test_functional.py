@@ -56,6 +56,27 @@ def test_gaussian_kl_of_equals_is_exactly_zero(loc, scale) -> None:
     assert functional.gaussian_kl(loc, scale, loc, scale).item() == 0.0
 
 
+@given(locations, scales, locations, scales)
+@settings(deadline=None)
+def test_jeffreys_divergence_is_both_divergences_of_torch(m_p, s_p, m_q, s_q) -> None:
+    shift = torch.tensor([0.0, 0.7], dtype=torch.float64)
+    m_p, s_p, m_q, s_q = tensors(m_p, s_p, m_q, s_q)
+    m_p, s_q = m_p + shift, s_q + shift
+    value = functional.jeffreys_divergence(m_p, s_p, m_q, s_q)
+    p, q = Normal(m_p, s_p), Normal(m_q, s_q)
+    witness = (kl_divergence(p, q) + kl_divergence(q, p)).sum(-1)
+    torch.testing.assert_close(value, witness, rtol=1e-9, atol=1e-9)
+    assert value.item() >= 0
+
+
+def test_jeffreys_divergence_keeps_its_digits_where_gaussians_are_close() -> None:
+    # To second order in t it is 2 t^2 for scales 1 and 1 + t; 1.2e-7 is float32's unit.
+    step = torch.tensor([1.0, 3.0, 10.0])[:, None] * 2.0**-16
+    zero, one = torch.zeros(3, 1), torch.ones(3, 1)
+    value = functional.jeffreys_divergence(zero, one, zero, one + step)
+    torch.testing.assert_close(value, 2 * step[:, 0].square(), rtol=1e-3, atol=0.0)
+
+
 def test_gaussian_kl_agrees_with_monte_carlo() -> None:
     p, q = (Normal(*tensors(*pair)) for pair in (INVERSE_DYNAMICS, POLICY))
     sample = p.sample((400_000,))

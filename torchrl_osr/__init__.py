@@ -4,15 +4,27 @@
 Learning" (Jiang et al., NeurIPS 2023), https://openreview.net/forum?id=4gLWjSaw4o
 """
 
-from torchrl_osr.objectives import InverseDynamicsLoss, OSRLoss, OSRVLoss
+from torchrl_osr.objectives import (
+    Adversary,
+    DiscreteInverseDynamicsLoss,
+    DiscreteOSRLoss,
+    InverseDynamicsLoss,
+    OSRLoss,
+    OSRVLoss,
+    StateRecoveryLoss,
+)
 from torchrl_osr.transforms import StatePerturbation
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "Adversary",
+    "DiscreteInverseDynamicsLoss",
+    "DiscreteOSRLoss",
     "InverseDynamicsLoss",
     "OSRLoss",
     "OSRVLoss",
     "StatePerturbation",
+    "StateRecoveryLoss",
     "__version__",
 ]

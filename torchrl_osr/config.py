@@ -8,9 +8,16 @@ value of the wrong type by name.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, OmegaConf
+
+from torchrl_osr.loss_config import (
+    InverseDynamicsConfig,
+    OSRLossConfig,
+    OSRVLossConfig,
+)
 
 # File systems allow 255 bytes, and temporary names beside it need some of them.
 MAX_FOLDER_NAME = 200
@@ -38,12 +45,14 @@ class DataConfig:
         num_transitions: rows of the data set.
         seed: of the rollouts.
         held_out: share of the rows kept from training to judge the inverse dynamics.
+        standardize: observations to mean 0 and standard deviation 1, once.
     """
 
     level: str = MISSING
     num_transitions: int = MISSING
     seed: int = MISSING
     held_out: float = MISSING
+    standardize: bool = MISSING
 
 
 @dataclass
@@ -52,12 +61,10 @@ class NetworkConfig:
 
     Attributes:
         num_cells: width of each hidden layer.
-        num_qvalue_nets: number of critics.
         layer_norm: in the critics; steadier, but not in the paper.
     """
 
     num_cells: list[int] = MISSING
-    num_qvalue_nets: int = MISSING
     layer_norm: bool = MISSING
 
 
@@ -66,37 +73,13 @@ class PerturbationConfig:
     """The noise of the mixed data set, see ``StatePerturbation``.
 
     Attributes:
-        std: in units of each observation entry's standard deviation in the data.
+        std: in units of each observation entry's standard deviation in the data, or
+            of the observation itself where ``data.standardize`` is false.
         noise: gaussian or uniform.
     """
 
     std: float = MISSING
     noise: str = MISSING
-
-
-@dataclass
-class OSRLossConfig:
-    """Keywords of ``OSRLoss``; its docstring has their meaning.
-
-    Attributes:
-        recovery_weight: lambda; 0 is CQL.
-        min_q_weight: alpha.
-        num_random: K, sampled actions of each of the three kinds.
-        temperature: of the log-sum-exp.
-        loss_function: l2, l1 or smooth_l1.
-        alpha_init: initial entropy temperature.
-        fixed_alpha: keep it.
-        deactivate_vmap: critics one by one, which is faster on a CPU.
-    """
-
-    recovery_weight: float = MISSING
-    min_q_weight: float = MISSING
-    num_random: int = MISSING
-    temperature: float = MISSING
-    loss_function: str = MISSING
-    alpha_init: float = MISSING
-    fixed_alpha: bool = MISSING
-    deactivate_vmap: bool = MISSING
 
 
 @dataclass
@@ -126,6 +109,7 @@ class TrainerConfig:
         batch_size: rows of a gradient step.
         inverse_dynamics_steps: gradient steps of the first phase.
         steps: gradient steps of the policy phase.
+        bc_steps: how many of them the policy clones behaviour, for a warm start.
         log_interval: steps between log entries.
         eval_interval: steps between evaluations.
         eval_episodes: complete episodes of an evaluation.
@@ -138,6 +122,7 @@ class TrainerConfig:
     batch_size: int = MISSING
     inverse_dynamics_steps: int = MISSING
     steps: int = MISSING
+    bc_steps: int = MISSING
     log_interval: int = MISSING
     eval_interval: int = MISSING
     eval_episodes: int = MISSING
@@ -168,6 +153,7 @@ class OfflineOSRConfig:
 
     Attributes:
         seed: of networks, sampling, noise and evaluation episodes.
+        num_random: what ``loss.num_random`` is for the losses with CQL's term.
         resume: folder of a killed run to continue.
     """
 
@@ -175,11 +161,15 @@ class OfflineOSRConfig:
     data: DataConfig = field(default_factory=DataConfig)
     network: NetworkConfig = field(default_factory=NetworkConfig)
     perturbation: PerturbationConfig = field(default_factory=PerturbationConfig)
-    loss: OSRLossConfig = field(default_factory=OSRLossConfig)
+    inverse_dynamics: InverseDynamicsConfig = field(
+        default_factory=InverseDynamicsConfig
+    )
+    loss: Any = MISSING  # OSRLossConfig or OSRVLossConfig, as the option says
     optim: OptimConfig = field(default_factory=OptimConfig)
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     seed: int = MISSING
+    num_random: int = MISSING
     resume: str | None = None
 
 
@@ -189,7 +179,10 @@ def register() -> None:
     And two resolvers: ``run_dir``, by which ``resume=folder`` becomes the run's folder,
     and ``job_dir``, which names a sweep's folders by number and overrides.
     """
-    ConfigStore.instance().store(name="offline_osr_schema", node=OfflineOSRConfig)
+    store = ConfigStore.instance()
+    store.store(name="offline_osr_schema", node=OfflineOSRConfig)
+    store.store(group="loss", name="osr_schema", node=OSRLossConfig)
+    store.store(group="loss", name="osr_v_schema", node=OSRVLossConfig)
     OmegaConf.register_new_resolver(
         "run_dir", lambda resume, fresh: resume or fresh, replace=True
     )

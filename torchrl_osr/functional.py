@@ -4,9 +4,9 @@
 Learning" (Jiang et al., NeurIPS 2023), https://openreview.net/forum?id=4gLWjSaw4o
 
 Shapes: ``B`` batch (any leading dimensions), ``A`` action, ``N`` critics, ``M``
-sampled actions of one state. Every function returns one number a sample; the
-loss modules weigh and reduce. Where the printed paper and this file differ, the
-line says so and why.
+sampled actions of one state, ``n`` discrete actions. Every function returns one number
+a sample; the loss modules weigh and reduce. Where the printed paper and this file
+differ, the line says so and why.
 
 Symbols: ``pi`` policy, ``I`` inverse dynamics model, ``s`` clean state, ``s^``
 perturbed state, ``s~`` a state of the mixed data set (clean and perturbed).
@@ -50,6 +50,66 @@ def gaussian_kl(
     return 0.5 * (
         variance_ratio + ((loc_p - loc_q) / scale_q).square() - 1 - variance_ratio.log()
     )
+
+
+def jeffreys_divergence(
+    loc_p: Tensor, scale_p: Tensor, loc_q: Tensor, scale_q: Tensor
+) -> Tensor:
+    r"""Return :math:`KL(p \,\|\, q) + KL(q \,\|\, p)` of diagonal Gaussians.
+
+    .. math::
+        \frac12 \sum_i \Big(\frac{\sigma_p}{\sigma_q} - \frac{\sigma_q}{\sigma_p}\Big)^2
+        + (\mu_p - \mu_q)^2 \Big(\frac1{\sigma_p^2} + \frac1{\sigma_q^2}\Big)
+
+    It is the sum of both :func:`gaussian_kl`, whose logarithms cancel. A sum of squares
+    keeps its digits where ``p`` and ``q`` are close, and there it is used: for a policy
+    at two neighbouring states.
+
+    Args:
+        loc_p, scale_p: mean and standard deviation of ``p``, ``[B, A]``.
+        loc_q, scale_q: mean and standard deviation of ``q``, ``[B, A]``.
+
+    Returns:
+        ``[B]``, each entry at least 0.
+
+    Examples:
+        >>> p, q = torch.tensor([0.4]), torch.tensor([-0.2])
+        >>> both = jeffreys_divergence(p, torch.tensor([0.3]), q, torch.tensor([0.5]))
+        >>> round(both.item(), 6)
+        3.288889
+    """
+    gap = loc_p - loc_q
+    means = (gap / scale_p).square() + (gap / scale_q).square()
+    scales = (scale_p / scale_q - scale_q / scale_p).square()
+    return 0.5 * (means + scales).sum(-1)
+
+
+def categorical_kl(log_prob_p: Tensor, log_prob_q: Tensor) -> Tensor:
+    r"""Return :math:`KL(p \,\|\, q)` of categorical distributions.
+
+    .. math::
+        \sum_a p(a) \, [\log p(a) - \log q(a)]
+
+    An action that ``p`` never takes counts for nothing, whatever ``q`` says of it; one
+    that only ``q`` never takes makes the divergence infinite.
+
+    Args:
+        log_prob_p: normalised log-probabilities of ``p``, ``[B, n]``.
+        log_prob_q: normalised log-probabilities of ``q``, ``[B, n]``.
+
+    Returns:
+        ``[B]``, each entry at least 0.
+
+    Examples:
+        >>> p, q = torch.tensor([0.5, 0.5, 0.0]), torch.tensor([0.25, 0.5, 0.25])
+        >>> round(categorical_kl(p.log(), q.log()).item(), 6)
+        0.346574
+    """
+    prob = log_prob_p.exp()
+    # Selected before the product, not after: the gradient of 0 * inf would be nan.
+    log_prob_p = torch.where(prob > 0, log_prob_p, 0.0)
+    log_prob_q = torch.where(prob > 0, log_prob_q, 0.0)
+    return (prob * (log_prob_p - log_prob_q)).sum(-1)
 
 
 def state_recovery(
@@ -101,6 +161,48 @@ def state_recovery(
     )
 
 
+def deterministic_recovery(
+    policy_loc: Tensor,
+    inverse_dynamics_loc: Tensor,
+    inverse_dynamics_scale: Tensor,
+    *,
+    action_reduction: Literal["sum", "mean"] = "sum",
+) -> Tensor:
+    r"""Return the state-recovery term of a policy without a density.
+
+    .. math::
+        \sum_d \frac{(x_d - \mu_{I,d})^2}{2\sigma_{I,d}^2}
+
+    with :math:`x` the policy's action before the tanh. An addition, not in the paper,
+    whose divergence needs two densities: towards a point :math:`KL(I \,\|\, \pi)` is
+    infinite. This is what of the reverse :math:`KL(\pi \,\|\, I)` depends on where a
+    Gaussian policy of constant width lies.
+
+    Args:
+        policy_loc: pre-tanh action at ``s~``, ``[B, A]``.
+        inverse_dynamics_loc, inverse_dynamics_scale: pre-tanh inverse dynamics
+            model at ``(s~, s')``, ``[B, A]``.
+        action_reduction: ``"sum"`` or ``"mean"`` over action dimensions.
+
+    Returns:
+        ``[B]``, each entry at least 0; 0 where the action is the model's mean.
+
+    Examples:
+        >>> action, loc = torch.tensor([0.4, 1.0]), torch.tensor([-0.2, 0.0])
+        >>> round(deterministic_recovery(action, loc, torch.tensor(0.5)).item(), 6)
+        2.72
+    """
+    # Of equal widths, only the means are left in the divergence.
+    return state_recovery(
+        policy_loc,
+        inverse_dynamics_scale,
+        inverse_dynamics_loc,
+        inverse_dynamics_scale,
+        direction="reverse",
+        action_reduction=action_reduction,
+    )
+
+
 def soft_policy_value(
     log_prob: Tensor, qvalue: Tensor, alpha: Tensor | float
 ) -> Tensor:
@@ -124,6 +226,37 @@ def soft_policy_value(
     return alpha * log_prob - qvalue.min(0).values
 
 
+def discrete_policy_value(
+    log_prob: Tensor, qvalue: Tensor, alpha: Tensor | float
+) -> Tensor:
+    r"""Return :func:`soft_policy_value` in expectation over all ``n`` actions.
+
+    .. math::
+        \sum_{a=1}^{n} \pi(a \mid \tilde s)
+        \, [\alpha_e \log\pi(a \mid \tilde s) - \min_i Q_i(\tilde s, a)]
+
+    "Soft Actor-Critic for Discrete Action Settings", https://arxiv.org/abs/1910.07207:
+    nothing is sampled. With ``alpha=0`` it is minus the value of the state.
+
+    Args:
+        log_prob: normalised log-probabilities of the policy, ``[B, n]``.
+        qvalue: values of every action, ``[N, B, n]``.
+        alpha: entropy temperature, a scalar.
+
+    Returns:
+        ``[B]``.
+
+    Examples:
+        >>> qvalue = torch.tensor([[[2.0, 1.0]], [[3.0, 0.0]]])
+        >>> discrete_policy_value(torch.tensor([[0.25, 0.75]]).log(), qvalue, 0.0)
+        tensor([-0.5000])
+    """
+    prob = log_prob.exp()
+    # 0 log 0 = 0, as in categorical_kl.
+    log_prob = torch.where(prob > 0, log_prob, 0.0)
+    return (prob * (alpha * log_prob - qvalue.min(0).values)).sum(-1)
+
+
 def temperature_objective(
     log_alpha: Tensor, log_prob: Tensor, target_entropy: float
 ) -> Tensor:
@@ -145,7 +278,7 @@ def temperature_objective(
 
 def conservative_gap(
     sampled_qvalue: Tensor,
-    sampled_log_prob: Tensor,
+    sampled_log_prob: Tensor | None,
     data_qvalue: Tensor,
     *,
     temperature: float = 1.0,
@@ -162,20 +295,82 @@ def conservative_gap(
     (3); its authors' code, like the reference CQL code, computes this. As there, the
     sum is not divided by ``M``: a constant, without effect on the gradient.
 
+    Without densities the sum is plain, and the data's action is one of its ``M + 1``
+    terms, as in the reference CQL code (its ``min_q_version=2``) and in CORL with
+    ``cql_importance_sample=False``.
+
     TorchRL 0.14.1 ``CQLLoss`` differs: it takes the log-sum-exp over three actions at
     a time and scores the actions of ``pi(s')`` at ``s'``.
 
     Args:
         sampled_qvalue: values of the sampled actions at ``s``, ``[B, M]``.
-        sampled_log_prob: log-density of each action under what drew it, ``[B, M]``.
+        sampled_log_prob: log-density of each action under what drew it, ``[B, M]``, or
+            ``None`` for a plain sum.
         data_qvalue: value of the data's action, ``[B]``.
         temperature: :math:`\tau`, in units of the value.
 
     Returns:
         ``[B]``.
     """
-    logits = (sampled_qvalue - sampled_log_prob) / temperature
-    return temperature * torch.logsumexp(logits, -1) - data_qvalue
+    if sampled_log_prob is None:
+        logits = torch.cat([sampled_qvalue, data_qvalue.unsqueeze(-1)], -1)
+    else:
+        logits = sampled_qvalue - sampled_log_prob
+    return temperature * torch.logsumexp(logits / temperature, -1) - data_qvalue
+
+
+def lagrange_terms(
+    gap: Tensor, log_multiplier: Tensor, threshold: float
+) -> tuple[Tensor, Tensor]:
+    r"""Return both sides of CQL's Lagrangian, each to be minimised.
+
+    .. math::
+        \max_{\alpha' \ge 0} \min_Q \; \alpha' \, (\text{gap}(Q) - \tau)
+
+    CQL's appendix F (https://arxiv.org/abs/2006.04779). The multiplier is constant in
+    the critics' term and the gap is constant in the multiplier's, so that one backward
+    over the sum of both moves each the right way. TorchRL 0.14.1 ``CQLLoss`` detaches
+    neither: there the multiplier's loss raises the gap.
+
+    Args:
+        gap: the conservative gap, ``[B]``.
+        log_multiplier: :math:`\log\alpha'`, a scalar.
+        threshold: :math:`\tau`, the gap that is tolerated, in units of the value.
+
+    Returns:
+        The critics' term and the multiplier's, each ``[B]``.
+    """
+    # The bound is that of the reference code: a gap that cannot be closed would let
+    # the multiplier overflow.
+    multiplier = log_multiplier.exp().clamp(max=1e6)
+    excess = gap - threshold
+    return multiplier.detach() * excess, -multiplier * excess.detach()
+
+
+def gradient_diversity(action_gradients: Tensor) -> Tensor:
+    r"""Return EDAC's ensemble similarity, to be minimised.
+
+    .. math::
+        \frac{1}{N - 1} \sum_{i \ne j} \Big\langle
+            \frac{\nabla_a Q_i(s, a)}{\|\nabla_a Q_i(s, a)\|},
+            \frac{\nabla_a Q_j(s, a)}{\|\nabla_a Q_j(s, a)\|} \Big\rangle
+
+    "Uncertainty-Based Offline Reinforcement Learning with Diversified Q-Ensemble" (An
+    et al. 2021, equation 4), https://arxiv.org/abs/2110.01548.
+
+    Args:
+        action_gradients: of each critic at the data's action, ``[N, B, A]``,
+            ``N >= 2``.
+
+    Returns:
+        ``[B]``, between -N / (N - 1) and N.
+    """
+    number = action_gradients.shape[0]
+    # Without eps: a dead critic's zero gradient would be 0 / 0.
+    unit = torch.nn.functional.normalize(action_gradients, dim=-1, eps=1e-10)
+    # All pairs at once: |sum_i g_i|^2 - sum_i |g_i|^2, with |g_i| = 1.
+    pairs = unit.sum(0).square().sum(-1) - unit.square().sum((0, -1))
+    return pairs / (number - 1)
 
 
 def value_constraint(

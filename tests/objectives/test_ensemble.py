@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
@@ -27,7 +29,10 @@ def build(networks, **kwargs) -> OSRLoss:
 def test_losses_are_sac_n_restated(make_networks, make_batch, num_critics) -> None:
     """SAC-N (An et al., 2021, equation 2) critic by critic, with the same draws."""
     networks, batch = make_networks(num_critics=num_critics), make_batch(10)
-    loss = build(networks, recovery_weight=0.0, alpha_init=0.3)
+    loss = build(
+        networks, recovery_weight=0.0, alpha_init=0.25, deterministic_backup=False
+    )
+    loss.log_alpha.data.fill_(math.log(0.25))
     torch.manual_seed(5)
     out = loss(batch.clone())
 
@@ -37,7 +42,9 @@ def test_losses_are_sac_n_restated(make_networks, make_batch, num_critics) -> No
     pair = batch.select("observation").clone()
     action, log_prob = networks.actor.get_dist(pair).rsample_and_log_prob()
     next_pair = pair.clone().set("observation", torch.where(ended, state, following))
-    next_action, _ = networks.actor.get_dist(next_pair).rsample_and_log_prob()
+    next_action, next_log_prob = networks.actor.get_dist(
+        next_pair
+    ).rsample_and_log_prob()
 
     def values(observation, action):
         return torch.stack(
@@ -47,12 +54,15 @@ def test_losses_are_sac_n_restated(make_networks, make_batch, num_critics) -> No
             ]
         )
 
-    lowest_next = values(following, next_action).amin(0)
-    target = batch["next", "reward"].squeeze(-1) + 0.9 * lowest_next * ~ended.squeeze(
-        -1
+    soft_next = values(following, next_action).amin(0) - 0.25 * next_log_prob
+    target = batch["next", "reward"] + 0.9 * soft_next.unsqueeze(-1) * ~ended
+    td = (
+        (values(state, batch["action"]) - target.detach().squeeze(-1))
+        .square()
+        .sum(0)
+        .mean()
     )
-    td = (values(state, batch["action"]) - target.detach()).square().sum(0).mean()
-    actor = (0.3 * log_prob - values(state, action).amin(0)).mean()
+    actor = (0.25 * log_prob - values(state, action).amin(0)).mean()
     torch.testing.assert_close(out["loss_qvalue"], td)
     torch.testing.assert_close(out["loss_actor"], actor)
     names = list(out.keys())

@@ -100,12 +100,28 @@ def test_critics_score_no_more_rows_than_the_equations_ask(
     assert rows_scored(mode, networks, batch) == count * rows
 
 
-# What the documentation says that a row costs.
-@pytest.mark.parametrize(("mode", "number", "rows"), [("osr", 10, 68), ("osrv", 1, 16)])
+ENSEMBLE = {"min_q_weight": 0.0, "deterministic_backup": False}
+
+
+# What the documentation says that a row costs; K = 10 of CQL is its default.
+@pytest.mark.parametrize(
+    ("mode", "critics", "options", "rows"),
+    [
+        ("cql", 2, {}, 66),
+        ("osr", 2, {}, 68),
+        ("osr", 2, {"actor_states": "clean"}, 66),
+        ("osr", 2, {"max_q_backup": True}, 86),
+        ("osrv", 2, {}, 16),
+        ("cql", 10, ENSEMBLE, 30),
+        ("cql", 10, ENSEMBLE | {"diversity_weight": 1.0}, 40),
+        ("osr", 10, ENSEMBLE | {"actor_states": "clean"}, 30),
+        ("osr", 10, ENSEMBLE, 40),
+    ],
+)
 def test_rows_scored_with_the_defaults(
-    make_networks, make_batch, mode, number, rows
+    make_networks, make_batch, mode, critics, options, rows
 ) -> None:
     default = inspect.signature(OSRVLoss if mode == "osrv" else OSRLoss)
-    assert default.parameters["num_random"].default == number
-    networks, batch = make_networks(), make_batch(10)
-    assert rows_scored(mode, networks, batch, num_random=number) == rows
+    number = default.parameters["num_random"].default
+    networks, batch = make_networks(num_critics=critics), make_batch(10)
+    assert rows_scored(mode, networks, batch, num_random=number, **options) == rows

@@ -171,3 +171,42 @@ def test_missing_model_is_named(make_networks, loss_class) -> None:
     networks = make_networks()
     with pytest.raises(ValueError, match="needs an inverse_dynamics_network"):
         loss_class(networks.actor, networks.critics, None)
+
+
+def shares(kind: str, networks) -> None:
+    """Give two networks one module, or the critics one critic."""
+    first, second = networks.critics
+    if kind == "critics":
+        networks.critics = [first, first]
+    elif kind == "layer of two critics":
+        second.module[0] = first.module[0]
+    elif kind == "actor and model":
+        networks.inverse_dynamics[0][0].module[2] = networks.actor[0][0].module[2]
+    else:
+        first.module[2].bias = networks.actor[0][0].module[0].bias
+
+
+@pytest.mark.parametrize("name", RECOVERING)
+@pytest.mark.parametrize(
+    "kind", ["critics", "layer of two critics", "actor and model", "actor and critic"]
+)
+def test_networks_with_common_parameters_are_refused(make_networks, name, kind) -> None:
+    networks = make_networks()
+    shares(kind, networks)
+    with pytest.raises(ValueError, match=r"share a parameter of shape .*deepcopy"):
+        build(name, networks)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("recovery_direction", "backward"),
+        ("action_reduction", "max"),
+        ("recovery_states", "clean"),
+        ("actor_states", "perturbed"),
+        ("loss_function", "huber"),
+    ],
+)
+def test_unknown_modes_list_the_known_ones(make_networks, option, value) -> None:
+    with pytest.raises(ValueError, match=rf"{option} must be one of .*, got '{value}'"):
+        build("osr", make_networks(), **{option: value})

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
+import numpy as np
 import pytest
 import torch
-from torch.distributions import Normal
+from tensordict.nn import InteractionType, set_interaction_type
+from torch.distributions import Normal, kl_divergence
 
 from torchrl_osr import InverseDynamicsLoss
 from torchrl_osr.functional import gaussian_kl
+from torchrl_osr.modules import cvae_inverse_dynamics, tanh_gaussian_inverse_dynamics
 
 # float64 tensors, because TorchRL keeps bounds given as numbers in float32.
 BOUNDS = [([-1.0, -1.0], [1.0, 1.0]), ([-1.0, -2.0], [2.0, 1.0])]
@@ -31,6 +35,15 @@ def plain_loss(network, batch, states: str, low, high) -> torch.Tensor:
     return total / len(sets)
 
 
+def assert_same(value, parameters, expected, plain_parameters, rtol=1e-9) -> None:
+    """Compare two losses, and their gradients to within ``rtol``."""
+    torch.testing.assert_close(value, expected, rtol=1e-9, atol=1e-9)
+    found = torch.autograd.grad(value, list(parameters))
+    wanted = torch.autograd.grad(expected, list(plain_parameters))
+    for ours, theirs in zip(found, wanted, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=rtol, atol=1e-9)
+
+
 @pytest.mark.parametrize("states", ["both", "clean"])
 @pytest.mark.parametrize(("low", "high"), BOUNDS)
 def test_loss_and_gradients_equal_the_plain_likelihood(
@@ -42,11 +55,7 @@ def test_loss_and_gradients_equal_the_plain_likelihood(
     batch = make_batch(10)
     value = loss(batch)["loss_inverse_dynamics"]
     expected = plain_loss(plain, batch, states, **bounds)
-    torch.testing.assert_close(value, expected, rtol=1e-9, atol=1e-9)
-    value.backward()
-    expected.backward()
-    for got, wanted in zip(loss.parameters(), plain.parameters(), strict=True):
-        torch.testing.assert_close(got.grad, wanted.grad, rtol=1e-6, atol=1e-9)
+    assert_same(value, loss.parameters(), expected, plain.parameters(), rtol=1e-6)
 
 
 def test_clean_states_need_no_perturbed_entry(make_networks, make_batch) -> None:
@@ -66,12 +75,154 @@ def test_the_users_network_is_the_one_that_learns(make_networks, make_batch) -> 
     assert all(gradient.count_nonzero() > 0 for gradient in gradients)
 
 
-def test_likelihood_recovers_a_linear_gaussian_world(make_networks, make_batch) -> None:
-    # u ~ N(-.3 s, .4^2) drives s' = .9 s + .5 u + N(0, .1^2) in each of two dimensions,
-    # a = tanh(u). By Gaussian conditioning, with gain G = .5 * .16/(.01 + .25 * .16):
-    # I(u | s, s') = N(-.3 s + G (s' - .75 s), .16 * .01/.05).
-    gain, std = 1.6, 0.032**0.5
-    size = 4096
+KEY = "loss_inverse_dynamics"
+
+
+def make_cvae(**kwargs):
+    torch.manual_seed(0)
+    return cvae_inverse_dynamics(3, 2, latent_dim=4, num_cells=[8], **kwargs).double()
+
+
+def seeded(loss, batch) -> torch.Tensor:
+    torch.manual_seed(2)
+    return loss(batch)[KEY]
+
+
+def state_sets(batch, states: str) -> torch.Tensor:
+    """State and next state side by side, ``[1 or 2, B, 6]``: clean, then perturbed."""
+    sets = [batch["observation"]]
+    if states == "both":
+        sets.append(batch["perturbed", "observation"])
+    following = batch["next", "observation"]
+    return torch.stack([torch.cat([state, following], -1) for state in sets])
+
+
+def plain_cvae(network, pairs) -> tuple[torch.Tensor, ...]:
+    """The conditional VAE by hand: loc and scale of action and latent, z drawn."""
+    core = network.module[0].module
+    latent_loc, log_scale = core.encoder(pairs).chunk(2, -1)
+    latent_scale = log_scale.exp()
+    z = latent_loc + latent_scale * torch.randn_like(latent_loc)
+    loc, free = core.decoder(torch.cat([pairs, z], -1)).chunk(2, -1)
+    # A softplus that is 1 at 0, above a floor of .01; its shift is a float32 number.
+    shift = torch.tensor(0.99).expm1().log().item()
+    return loc, torch.nn.functional.softplus(free + shift) + 0.01, latent_loc, log_scale
+
+
+@pytest.mark.parametrize("states", ["both", "clean"])
+@pytest.mark.parametrize(("low", "high"), BOUNDS)
+@pytest.mark.parametrize("latent", [False, True])
+def test_mse_equals_the_plain_squared_error_of_the_same_draws(
+    make_networks, make_batch, states, low, high, latent
+) -> None:
+    low, high = torch.tensor(low).double(), torch.tensor(high).double()
+    bounds = {"low": low, "high": high}
+    if latent:
+        network, plain = make_cvae(**bounds), make_cvae(**bounds)
+    else:
+        network, plain = (make_networks(**bounds).inverse_dynamics for _ in range(2))
+    loss = InverseDynamicsLoss(network, states=states, loss_function="mse")
+    batch = make_batch(10)
+    value = seeded(loss, batch)
+    torch.manual_seed(2)
+    pairs, penalty = state_sets(batch, states), 0.0
+    if latent:
+        loc, scale, latent_loc, log_scale = plain_cvae(plain, pairs)
+        # As the authors write it.
+        penalty = 1 + 2 * log_scale - latent_loc**2 - (2 * log_scale).exp()
+        penalty = -0.5 * penalty.mean(-1)
+    else:
+        _, loc, scale = plain[0](*pairs.split(3, -1))
+    sample = torch.tanh(loc + scale * torch.randn_like(loc))
+    action = (high + low) / 2 + (high - low) / 2 * sample
+    rows = (action - batch["action"]).square().mean(-1) + 0.5 * penalty
+    expected = rows[:, ~batch["next", "done"].squeeze(-1)].mean()
+    assert_same(value, loss.parameters(), expected, plain.parameters())
+
+
+@pytest.mark.parametrize("loss_function", ["nll", "mse"])
+def test_latent_adds_its_divergence_from_the_prior(make_batch, loss_function) -> None:
+    batch = make_batch(10)
+    network, plain = make_cvae(), make_cvae()
+
+    def make(weight: float) -> InverseDynamicsLoss:
+        return InverseDynamicsLoss(
+            network, loss_function=loss_function, latent_weight=weight
+        )
+
+    heavy = make(3.0)
+    value = seeded(heavy, batch) - seeded(make(0.0), batch)
+    _, _, loc, log_scale = plain_cvae(plain, state_sets(batch, "both"))
+    divergence = kl_divergence(Normal(loc, log_scale.exp()), Normal(0.0, 1.0))
+    valid = ~batch["next", "done"].squeeze(-1)
+    expected = 3.0 * divergence[:, valid].mean()
+    encoder, plain_encoder = (net.module[0].module.encoder for net in (network, plain))
+    assert_same(value, encoder.parameters(), expected, plain_encoder.parameters())
+
+
+@pytest.mark.parametrize("reduction", ["mean", "sum", "none"])
+def test_latent_follows_the_reduction(make_batch, reduction) -> None:
+    batch = make_batch(2, 5)
+    out = seeded(InverseDynamicsLoss(make_cvae(), reduction=reduction), batch)
+    rows = seeded(InverseDynamicsLoss(make_cvae(), reduction="none"), batch)
+    done = batch["next", "done"].squeeze(-1)
+    assert rows[done].count_nonzero() == 0
+    reduced = {"mean": rows[~done].mean(), "sum": rows.sum(), "none": rows}
+    torch.testing.assert_close(out, reduced[reduction], rtol=1e-12, atol=1e-12)
+
+
+def test_without_a_latent_nothing_is_drawn_and_no_bit_differs(
+    make_networks, make_batch
+) -> None:
+    network, batch = make_networks().inverse_dynamics, make_batch(10)
+    pairs = batch.select(*network.in_keys)
+    twins = pairs.clone()
+    twins["observation"] = batch["perturbed", "observation"]
+    distribution = network.get_dist(torch.stack([pairs, twins]))
+    rows = -distribution.log_prob(batch["action"].expand(2, 10, 2)).mean(0)
+    expected = rows[~batch["next", "done"].squeeze(-1)].mean()
+    state = torch.get_rng_state()
+    for kwargs in ({}, {"latent_weight": 7.0}, {"loss_function": "nll"}):
+        loss = InverseDynamicsLoss(network, **kwargs)
+        assert torch.equal(loss(batch)[KEY], expected)
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+@pytest.mark.parametrize("ambient", [InteractionType.DETERMINISTIC, None])
+def test_training_draws_the_latent_whatever_the_ambient_type(
+    make_batch, ambient
+) -> None:
+    loss, batch = InverseDynamicsLoss(make_cvae()), make_batch(10)
+    with set_interaction_type(InteractionType.RANDOM):
+        expected = seeded(loss, batch)
+    with set_interaction_type(ambient):
+        assert torch.equal(seeded(loss, batch), expected)
+        assert not torch.equal(loss(batch)[KEY], expected)
+
+
+@pytest.mark.filterwarnings("ignore:.*autograd.function.Function:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore:.*inline_inbuilt_nn_modules:FutureWarning")
+@pytest.mark.filterwarnings("ignore:Using lock_.. inside a compiled:UserWarning")
+@pytest.mark.parametrize("loss_function", ["nll", "mse"])
+def test_compiled_latent_loss_equals_eager(make_batch, loss_function) -> None:
+    loss = InverseDynamicsLoss(make_cvae(), loss_function=loss_function)
+    torch.compiler.reset()
+    compiled = torch.compile(loss, backend="eager", fullgraph=True)
+    results = []
+    for call in (loss, compiled):
+        value = seeded(call, make_batch(2, 5))
+        results.append([value, *torch.autograd.grad(value, list(loss.parameters()))])
+    for found, wanted in zip(*results, strict=True):
+        torch.testing.assert_close(found, wanted, rtol=1e-12, atol=1e-12)
+
+
+def linear_world(make_batch, size: int):
+    """Transitions, and mean and standard deviation of u = atanh(a) given (s, s').
+
+    u ~ N(-.3 s, .4^2) drives s' = .9 s + .5 u + N(0, .1^2) in each of two dimensions.
+    By Gaussian conditioning, with gain G = .5 * .16/(.01 + .25 * .16) = 1.6:
+    I(u | s, s') = N(-.3 s + G (s' - .75 s), .16 * .01/.05).
+    """
     state = torch.randn(size, 3, dtype=torch.float64)
     latent = -0.3 * state[:, :2] + 0.4 * torch.randn(size, 2, dtype=torch.float64)
     following = 0.9 * state
@@ -80,24 +231,66 @@ def test_likelihood_recovers_a_linear_gaussian_world(make_networks, make_batch) 
     batch = make_batch(size, twin=False)
     batch["observation"], batch["action"] = state, torch.tanh(latent)
     batch["next", "observation"] = following
-    network = make_networks().inverse_dynamics
-    loss = InverseDynamicsLoss(network, states="clean")
+    loc = -0.3 * state + 1.6 * (following - 0.75 * state)
+    return batch, loc[:, :2], torch.tensor(0.032**0.5)
+
+
+def fit(network, batch, **kwargs):
+    """Train by Adam; return loc and scale, a latent at its mean."""
+    loss = InverseDynamicsLoss(network, states="clean", **kwargs)
     optimizer = torch.optim.Adam(loss.parameters(), lr=2e-2)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 400)
     for _ in range(400):
         optimizer.zero_grad()
-        loss(batch)["loss_inverse_dynamics"].backward()
+        loss(batch)[KEY].backward()
         optimizer.step()
         schedule.step()
     with torch.no_grad():
-        _, loc, scale = network[0](state, following)
-    wanted = -0.3 * state + gain * (following - 0.75 * state)
-    divergence = gaussian_kl(wanted[:, :2], torch.tensor(std), loc, scale)
+        distribution = network.get_dist(batch.select(*network.in_keys))
+    return distribution.loc, distribution.scale
+
+
+BUILDERS = [
+    tanh_gaussian_inverse_dynamics,
+    partial(cvae_inverse_dynamics, latent_dim=4),
+]
+MODELS = pytest.mark.parametrize("build", BUILDERS, ids=["plain", "latent"])
+
+
+@MODELS
+def test_likelihood_recovers_a_linear_gaussian_world(make_batch, build) -> None:
+    batch, *wanted = linear_world(make_batch, 2048)
+    network = build(3, 2, num_cells=[8]).double()
+    divergence = gaussian_kl(*wanted, *fit(network, batch))
     # A model that ignores s' would be at half the mutual information, log(5)/2.
     assert divergence.mean().item() < 0.03 < math.log(5) / 2
 
 
-@pytest.mark.parametrize("states", ["perturbed", None])
-def test_unknown_state_sets_are_rejected(make_networks, states) -> None:
-    with pytest.raises(ValueError, match="states must be one of"):
-        InverseDynamicsLoss(make_networks().inverse_dynamics, states=states)
+@MODELS
+def test_mse_recovers_the_mean_action_but_not_its_spread(make_batch, build) -> None:
+    batch, loc, std = linear_world(make_batch, 2048)
+    network = build(3, 2, num_cells=[8]).double()
+    found, scale = fit(network, batch, loss_function="mse")
+    # E[tanh(u) | s, s'] by Gauss-Hermite quadrature: the least squares' answer.
+    nodes, weights = map(torch.from_numpy, np.polynomial.hermite_e.hermegauss(20))
+    mean = (torch.tanh(loc[..., None] + std * nodes) * weights).sum(-1) / weights.sum()
+    error = (torch.tanh(found) - mean).square().mean().item()
+    assert error < 0.01 * mean.var().item()
+    # As the documentation warns: the noise of the data is .18, the floor is .01.
+    assert scale.mean().item() < 0.05 < std.item()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("states", "perturbed", r"one of \('both', 'clean'\), got 'perturbed'"),
+        ("states", None, r"one of \('both', 'clean'\), got None"),
+        ("loss_function", "l2", r"one of \('nll', 'mse'\), got 'l2'"),
+        ("loss_function", None, r"one of \('nll', 'mse'\), got None"),
+        ("latent_weight", -0.1, "at least 0, got -0.1"),
+        ("latent_weight", math.nan, "at least 0, got nan"),
+    ],
+)
+def test_unknown_options_are_rejected(make_networks, name, value, message) -> None:
+    with pytest.raises(ValueError, match=f"{name} must be {message}"):
+        InverseDynamicsLoss(make_networks().inverse_dynamics, **{name: value})

@@ -47,7 +47,9 @@ def network_losses(loss, batch) -> dict[str, Tensor]:
 class Restatement:
     """The equations once more: critics in a loop, densities by hand, no torchrl_osr."""
 
-    def __init__(self, networks, *, low: Tensor, high: Tensor, weight: float) -> None:
+    def __init__(
+        self, networks, *, low: Tensor, high: Tensor, weight: float, official: bool
+    ) -> None:
         networks = copy.deepcopy(networks)
         self.policy_net, self.idm_net = networks.actor[0], networks.inverse_dynamics[0]
         self.critics = [critic.module for critic in networks.critics]
@@ -57,7 +59,7 @@ class Restatement:
                 parameter.data.mul_(TARGET_SCALE)
         self.log_alpha = torch.tensor(math.log(ALPHA)).double().requires_grad_()
         self.center, self.half = (high + low) / 2, (high - low) / 2
-        self.weight = weight
+        self.weight, self.official = weight, official
 
     def policy(self, state: Tensor) -> Normal:
         _, loc, scale = self.policy_net(state)
@@ -78,18 +80,20 @@ class Restatement:
         # Rows without a next state never reach a network; any finite stand-in will do.
         s_next = torch.where(terminated, s, batch["next", "observation"])
         s_tot = torch.stack([s, batch["perturbed", "observation"]])
-        if not self.weight:
-            s_tot = s_tot[:1]
+        # Where values are sought, and where the policy recovers: the paper's D_tot, or
+        # what the authors' released code has.
+        s_actor = s_tot[:1] if self.official or not self.weight else s_tot
+        s_recover = s_tot[1:] if self.official else s_tot
         # The draws, in the order in which the loss makes them.
         torch.manual_seed(seed)
         like = {"dtype": torch.float64}
-        noise_actor = torch.randn(*s_tot.shape[:-1], a.shape[-1], **like)
+        noise_actor = torch.randn(*s_actor.shape[:-1], a.shape[-1], **like)
         uniform = 2 * torch.rand(NUM_RANDOM, *a.shape, **like) - 1
         noise_proposals = torch.randn(NUM_RANDOM, 2, *a.shape, **like)
         noise_target = torch.randn(*a.shape, **like)
 
-        action, log_prob = self.act(self.policy(s_tot), noise_actor)
-        values = torch.stack([q(s_tot, action).squeeze(-1) for q in self.critics])
+        action, log_prob = self.act(self.policy(s_actor), noise_actor)
+        values = torch.stack([q(s_actor, action).squeeze(-1) for q in self.critics])
         alpha = self.log_alpha.detach().exp()
         losses = {
             "loss_actor": (alpha * log_prob - values.amin(0)).mean(),
@@ -122,32 +126,49 @@ class Restatement:
         losses |= {"loss_qvalue": td.mean(), "loss_cql": MIN_Q_WEIGHT * gap.mean()}
         if self.weight:
             with torch.no_grad():
-                s_next = s_next.expand_as(s_tot)
-                _, loc, scale = self.idm_net(s_tot, s_next)
-            kl = kl_divergence(Normal(loc, scale), self.policy(s_tot)).sum(-1)
+                s_next = s_next.expand_as(s_recover)
+                _, loc, scale = self.idm_net(s_recover, s_next)
+            model, policy = Normal(loc, scale), self.policy(s_recover)
+            kl = (
+                kl_divergence(policy, model).mean(-1)
+                if self.official
+                else kl_divergence(model, policy).sum(-1)
+            )
             valid = ~done.squeeze(-1)
             losses["loss_recovery"] = self.weight * kl.mean(0)[valid].mean()
         return losses
 
 
-@pytest.mark.parametrize("weight", [0.75, 0.0], ids=["osr", "cql"])
+OFFICIAL = {
+    "recovery_direction": "reverse",
+    "action_reduction": "mean",
+    "recovery_states": "perturbed",
+    "actor_states": "clean",
+}
+
+
+@pytest.mark.parametrize(
+    ("weight", "options"),
+    [(0.75, {}), (0.0, {}), (0.75, OFFICIAL)],
+    ids=["osr", "cql", "official"],
+)
 # Bounds are float64 tensors: TorchRL would keep numbers in float32, to 1e-8 only.
 @pytest.mark.parametrize(
     ("low", "high"), [([-1.0, -1.0], [1.0, 1.0]), ([-1.0, -0.5], [2.0, 1.5])]
 )
 def test_losses_and_gradients_equal_the_restatement(
-    make_networks, make_batch, weight, low, high
+    make_networks, make_batch, check, weight, options, low, high
 ) -> None:
     bounds = {"low": torch.tensor(low).double(), "high": torch.tensor(high).double()}
     networks, batch = make_networks(**bounds), make_batch(10)
-    restatement = Restatement(networks, **bounds, weight=weight)
-    loss = make_osr(networks, weight=weight)
+    restatement = Restatement(networks, **bounds, weight=weight, official=bool(options))
+    loss = make_osr(networks, weight=weight, **options)
     torch.manual_seed(5)
     losses = network_losses(loss, batch)
     expected = restatement.losses(batch, seed=5)
     assert set(losses) == set(expected) == set(LOSSES[: 5 if weight else 4])
-    for key in expected:
-        torch.testing.assert_close(losses[key], expected[key], rtol=1e-9, atol=1e-9)
+    values = [losses[key] for key in expected]
+    check("losses", values, expected.values(), tolerance=1e-8)
 
     # The sum of ours is correct training; the plain one needs each group by itself.
     actor = list(restatement.policy_net.parameters())
@@ -168,10 +189,34 @@ def test_losses_and_gradients_equal_the_restatement(
     stacked = [torch.stack(pair) for pair in zip(first, second, strict=True)]
     ours += [p.grad for p in loss.qvalue_network_params.values(True, True)]
     ours.append(loss.log_alpha.grad)
-    for got, wanted in zip(
-        ours, [*expected_actor, *stacked, expected_alpha], strict=True
-    ):
-        torch.testing.assert_close(got, wanted, rtol=1e-6, atol=1e-9)
+    wanted = [*expected_actor, *stacked, expected_alpha]
+    check("gradients", ours, wanted, tolerance=1e-7)
+
+
+@pytest.mark.parametrize("recovery_weight", [0.75, 0.0])
+def test_behavior_cloning_puts_the_data_in_the_place_of_the_values(
+    make_networks, make_batch, recovery_weight
+) -> None:
+    networks, batch = make_networks(), make_batch(10)
+    loss = make_osr(networks, weight=recovery_weight, behavior_cloning=True)
+    torch.manual_seed(5)
+    out = loss(batch)
+    # -log alpha (mean log pi + target) tells the entropy that was drawn.
+    entropy = out["entropy"]
+    cloned = networks.actor.get_dist(batch).log_prob(batch["action"]).mean()
+    expected = -math.exp(loss.log_alpha.item()) * entropy - cloned
+    torch.testing.assert_close(out["loss_actor"], expected)
+    out["loss_actor"].backward()
+    assert all(p.grad is None for p in loss.qvalue_network_params.values(True, True))
+    # The other terms are what they are without it, and so is this one afterwards.
+    reference = make_osr(make_networks(), weight=recovery_weight)
+    loss.behavior_cloning = False
+    for each in (loss, reference):
+        torch.manual_seed(5)
+        each.record = network_losses(each, make_batch(10))
+    assert loss.record == reference.record
+    for key in set(reference.record) - {"loss_actor"}:
+        assert torch.equal(out[key], reference.record[key])
 
 
 def test_metrics_say_what_they_are_called(make_networks, make_batch) -> None:

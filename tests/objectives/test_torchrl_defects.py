@@ -78,3 +78,36 @@ def test_cql_loss_of_torchrl_scores_next_actions_at_the_next_state(
     )
     assert steep["ours"] == pytest.approx(flat["ours"], abs=1e-9)
     assert abs(steep["torchrl"] - flat["torchrl"]) > 1.0
+
+
+# TorchRL is wrong: the multiplier is to rise while the critics lower the gap. Its
+# multiplier's loss is not detached from the critics, and with one backward over the sum
+# of the losses, as in its own example, it raises the gap.
+def test_cql_loss_of_torchrl_lets_the_multiplier_train_the_critics(
+    make_networks, make_batch
+) -> None:
+    gradients = {}
+    for name, loss_class in {"ours": OSRLoss, "torchrl": CQLLoss}.items():
+        networks = make_networks()
+        loss = loss_class(
+            networks.actor,
+            networks.critics,
+            min_q_weight=1.0,
+            with_lagrange=True,
+            target_entropy=-2.0,
+            **({"recovery_weight": 0.0} if name == "ours" else {}),
+        ).double()
+        SoftUpdate(loss, tau=0.1)
+        out = loss(make_batch(64))
+        critics = list(loss.qvalue_network_params.parameters())
+        gradients[name] = [
+            torch.autograd.grad(out[key], critics, retain_graph=True, allow_unused=True)
+            for key in ("loss_cql", "loss_alpha_prime")
+        ]
+    assert all(gradient is None for gradient in gradients["ours"][1])
+    conservative, multiplier = (
+        torch.cat([gradient.flatten() for gradient in group])
+        for group in gradients["torchrl"]
+    )
+    cosine = torch.cosine_similarity(conservative, multiplier, dim=0)
+    assert cosine.item() == pytest.approx(-1.0, abs=1e-6)

@@ -10,7 +10,11 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential
+from tensordict.nn import (
+    InteractionType,
+    ProbabilisticTensorDictSequential,
+    set_interaction_type,
+)
 
 NORMAL_QUANTILE_95 = 1.6448536269514722
 """A normal variable is within this many standard deviations with probability 0.9."""
@@ -40,9 +44,11 @@ def inverse_dynamics_report(
     data = data[~data.get(("next", "done")).squeeze(-1)]
     if not len(data):
         raise ValueError("No held-out row is a true transition: all are done.")
-    distribution = inverse_dynamics_network.get_dist(
-        data.select(*inverse_dynamics_network.in_keys)
-    )
+    # A latent variable at its mean: as the policy's losses read the model.
+    with set_interaction_type(InteractionType.DETERMINISTIC):
+        distribution = inverse_dynamics_network.get_dist(
+            data.select(*inverse_dynamics_network.in_keys)
+        )
     action = data.get("action")
     error = (action - distribution.deterministic_sample).square().sum(0)
     spread = (action - action.mean(0)).square().sum(0)

@@ -1,7 +1,21 @@
-"""Networks: the actor, the critics and the inverse dynamics model."""
+"""Networks: the actor, the critics and the inverse dynamics models."""
 
 from torchrl_osr.modules.actor import tanh_gaussian_actor
 from torchrl_osr.modules.critic import critic_ensemble
+from torchrl_osr.modules.cvae_inverse_dynamics import cvae_inverse_dynamics
+from torchrl_osr.modules.discrete import (
+    categorical_actor,
+    categorical_inverse_dynamics,
+    discrete_critic_ensemble,
+)
 from torchrl_osr.modules.inverse_dynamics import tanh_gaussian_inverse_dynamics
 
-__all__ = ["critic_ensemble", "tanh_gaussian_actor", "tanh_gaussian_inverse_dynamics"]
+__all__ = [
+    "categorical_actor",
+    "categorical_inverse_dynamics",
+    "critic_ensemble",
+    "cvae_inverse_dynamics",
+    "discrete_critic_ensemble",
+    "tanh_gaussian_actor",
+    "tanh_gaussian_inverse_dynamics",
+]

@@ -1,13 +1,14 @@
 """The networks of the recovery losses: how they are held, and how they are run.
 
-Shapes: ``B`` batch (any leading dimensions), ``A`` action, ``N`` critics, ``D`` state
-sets of D_tot (2: clean and perturbed; 1 where nothing recovers). The state sets are
-always stacked as ``[s, s', s^]``: rows ``[:2]`` are the true states, ``[::2]`` D_tot.
+Shapes: ``B`` batch (any leading dimensions), ``N`` critics, ``D`` state sets of D_tot
+(2: clean and perturbed; 1 where nothing recovers). The state sets are always stacked
+as ``[s, s', s^]``: rows ``[:2]`` are the true states, ``[::2]`` D_tot.
 """
 
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, cast
@@ -20,7 +21,6 @@ from tensordict.nn import (
     TensorDictParams,
 )
 from torch import Tensor
-from torchrl.modules import TanhNormal
 from torchrl.objectives import ValueEstimators
 from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
 
@@ -30,12 +30,10 @@ from torchrl_osr.objectives.base import (
     ScalarOutputMode,
     check_choice,
 )
-from torchrl_osr.objectives.distributions import (
-    action_bounds,
-    check_same_bounds,
-)
+from torchrl_osr.objectives.distributions import check_apart
 from torchrl_osr.objectives.frozen_model import freeze, frozen_distribution
 from torchrl_osr.objectives.mixed_states import (
+    States,
     column,
     nested,
     perturbed_twin,
@@ -46,7 +44,11 @@ from torchrl_osr.objectives.mixed_states import (
 
 
 class ActorCriticNetworks(BaseLoss):
-    """Abstract base that holds an actor, critics and an inverse dynamics model."""
+    """Abstract base that holds an actor, critics and an inverse dynamics model.
+
+    Continuous (:class:`~torchrl_osr.objectives.actor_critic.RecoveryActorCriticLoss`)
+    and discrete actions (:class:`~torchrl_osr.DiscreteOSRLoss`) stand on it.
+    """
 
     @dataclass
     class _AcceptedKeys:
@@ -54,8 +56,6 @@ class ActorCriticNetworks(BaseLoss):
 
         Attributes:
             action: the data's action. Defaults to ``"action"``.
-            state_action_value: what a critic writes. Defaults to
-                ``"state_action_value"``.
             value: what the value estimator reads. Defaults to ``"state_value"``.
             reward, done, terminated: below ``"next"``. Default to their own names.
             priority: written to the batch, ``[B]``. Defaults to ``"td_error"``.
@@ -65,7 +65,6 @@ class ActorCriticNetworks(BaseLoss):
         """
 
         action: NestedKey = "action"
-        state_action_value: NestedKey = "state_action_value"
         value: NestedKey = "state_value"
         reward: NestedKey = "reward"
         done: NestedKey = "done"
@@ -94,8 +93,7 @@ class ActorCriticNetworks(BaseLoss):
         qvalue_network: TensorDictModule | Sequence[TensorDictModule],
         inverse_dynamics_network: ProbabilisticTensorDictSequential | None,
         *,
-        num_random: int,
-        temperature: float,
+        recovery_states: States = "both",
         num_qvalue_nets: int,
         loss_function: str,
         alpha_init: float,
@@ -107,11 +105,7 @@ class ActorCriticNetworks(BaseLoss):
         use_prioritized_weights: bool | Literal["auto"],
         scalar_output_mode: ScalarOutputMode,
     ) -> None:
-        if num_random < 1 or not temperature > 0:
-            raise ValueError(
-                "num_random must be at least 1 and temperature above 0, got "
-                f"{num_random} and {temperature}."
-            )
+        check_choice("recovery_states", recovery_states, ("both", "perturbed"))
         check_choice("loss_function", loss_function, ("l2", "l1", "smooth_l1"))
         super().__init__(
             reduction,
@@ -119,17 +113,20 @@ class ActorCriticNetworks(BaseLoss):
             scalar_output_mode=scalar_output_mode,
         )
         self.deactivate_vmap = deactivate_vmap
-        self.num_random = num_random
-        self.temperature = temperature
         self.recovers = inverse_dynamics_network is not None
-        low, high = bounds = action_bounds(actor_network, "actor_network")
-        self.register_buffer("action_low", low, persistent=False)
-        self.register_buffer("action_high", high, persistent=False)
+        self.recovery_states = recovery_states
+        self._check_distributions(actor_network, inverse_dynamics_network)
+        check_apart(
+            actor_network=actor_network,
+            qvalue_network=qvalue_network,
+            inverse_dynamics_network=inverse_dynamics_network,
+        )
         self.convert_to_functional(actor_network, "actor_network")
         if isinstance(qvalue_network, Sequence):
             num_qvalue_nets = len(qvalue_network)
         if num_qvalue_nets < 1:
             raise ValueError("There must be at least one critic.")
+        self.num_qvalue_nets = num_qvalue_nets
         self.convert_to_functional(
             qvalue_network,
             "qvalue_network",
@@ -137,9 +134,9 @@ class ActorCriticNetworks(BaseLoss):
             create_target_params=delay_qvalue,
         )
         if inverse_dynamics_network is not None:
-            name = "inverse_dynamics_network"
-            check_same_bounds(bounds, action_bounds(inverse_dynamics_network, name))
-            self.convert_to_functional(inverse_dynamics_network, name)
+            self.convert_to_functional(
+                inverse_dynamics_network, "inverse_dynamics_network"
+            )
             self.inverse_dynamics_network_params = freeze(
                 self.inverse_dynamics_network_params
             )
@@ -154,6 +151,14 @@ class ActorCriticNetworks(BaseLoss):
         # Now, not at the first call as TorchRL does: a state dict has the same entries
         # before and after it.
         self.make_value_estimator()
+
+    @abstractmethod
+    def _check_distributions(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        inverse_dynamics_network: ProbabilisticTensorDictSequential | None,
+    ) -> None:
+        """Raise unless the networks' distributions are what the loss computes with."""
 
     def _make_vmap(self) -> None:
         self._vmap_qvalue = _vmap_func(
@@ -208,9 +213,13 @@ class ActorCriticNetworks(BaseLoss):
         if self.recovers:
             network_keys = self.inverse_dynamics_network.in_keys
             in_keys += network_keys
-            states += state_keys(network_keys)
-            in_keys += [nested(keys.perturbed, key) for key in states]
+            in_keys += [nested(keys.perturbed, key) for key in self._perturbed_keys()]
         return in_keys
+
+    def _perturbed_keys(self) -> list[NestedKey]:
+        """The state entries whose perturbed twins are read from the batch."""
+        network_keys = self.inverse_dynamics_network.in_keys
+        return [*self._observation_keys(), *state_keys(network_keys)]
 
     def _flag(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
         """Return a boolean entry below ``"next"``, ``[B]``."""
@@ -236,46 +245,31 @@ class ActorCriticNetworks(BaseLoss):
         ):
             return self.actor_network.get_dist_params(states.copy())
 
-    def _distribution(self, policy: TensorDictBase) -> TanhNormal:
+    def _distribution(self, policy: TensorDictBase) -> Any:
         return self.actor_network.build_dist_from_params(policy)
 
-    def _qvalue(
-        self, states: TensorDictBase, action: Tensor, params: TensorDictParams
+    def _critics(
+        self, batch: TensorDictBase, params: TensorDictParams, key: NestedKey
     ) -> Tensor:
-        """Return the values of all critics, ``[N, B]``, at states and actions."""
-        batch = states.select(*state_keys(self.qvalue_network.in_keys), strict=False)
-        batch.set(self.tensor_keys.action, action)
-        batch = self._vmap_qvalue(batch, params)
-        value = batch.get(self.tensor_keys.state_action_value, None)
+        """Return what all critics write under ``key``, ``[N, B, ...]``."""
+        value = self._vmap_qvalue(batch, params).get(key, None)
         if value is None:
             raise KeyError(
-                f"The critics write {self.qvalue_network.out_keys}, not "
-                f"{self.tensor_keys.state_action_value!r}: give them that out_key, or "
-                "call set_keys(state_action_value=...)."
+                f"The critics write {self.qvalue_network.out_keys}, not {key!r}: give "
+                "them that out_key, or name theirs with set_keys()."
             )
-        return cast(Tensor, value.squeeze(-1))
+        return cast(Tensor, value)
 
-    def _inverse_dynamics(self, tensordict: TensorDictBase, done: Tensor) -> TanhNormal:
-        """Return the model's distribution on D_tot, ``[2, B]``."""
+    def _critic_inputs(self, states: TensorDictBase) -> TensorDictBase:
+        return states.select(*state_keys(self.qvalue_network.in_keys), strict=False)
+
+    def _inverse_dynamics(self, tensordict: TensorDictBase, done: Tensor) -> Any:
+        """Return the model's distribution on D_tot, or its half, ``[2 or 1, B]``."""
         return frozen_distribution(
             self.inverse_dynamics_network,
             self.inverse_dynamics_network_params,
             tensordict,
             done=done,
             perturbed=self.tensor_keys.perturbed,
+            states=self.recovery_states,
         )
-
-    def _uniform(self, number: int, like: Tensor) -> tuple[Tensor, Tensor]:
-        """Draw ``number`` uniform actions for each row.
-
-        Args:
-            number: of actions, ``K``.
-            like: an action, ``[B, A]``.
-
-        Returns:
-            Actions ``[K, B, A]`` and their log-densities ``[K, B]``.
-        """
-        width = (self.action_high - self.action_low).expand(like.shape[-1])
-        action = torch.rand((number, *like.shape), dtype=like.dtype, device=like.device)
-        log_density = -width.log().sum().expand(action.shape[:-1])
-        return action * width + self.action_low, log_density

@@ -7,10 +7,10 @@ nothing recovers). The equations are in :mod:`torchrl_osr.functional`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Literal
 
-import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
@@ -18,14 +18,19 @@ from tensordict.nn import (
 )
 from torch import Tensor
 from torchrl.modules import TanhNormal
-from torchrl.modules.distributions.utils import rsample_and_log_prob
 
 from torchrl_osr import functional
-from torchrl_osr.objectives.actor_critic import RecoveryActorCriticLoss
-from torchrl_osr.objectives.base import Reduction, ScalarOutputMode, check_weight
+from torchrl_osr.objectives.adversary import Adversary
+from torchrl_osr.objectives.base import (
+    Reduction,
+    ScalarOutputMode,
+    check_choice,
+    check_weight,
+)
+from torchrl_osr.objectives.conservative import ConservativeCritics
 
 
-class OSRLoss(RecoveryActorCriticLoss):
+class OSRLoss(ConservativeCritics):
     r"""Out-of-sample State Recovery by a constraint on the policy (OSR).
 
     .. math::
@@ -58,6 +63,17 @@ class OSRLoss(RecoveryActorCriticLoss):
     Keyword Args:
         recovery_weight: :math:`\lambda`. Default 0.5. A number assigned later makes a
             schedule; 0 *here* makes the loss CQL(H) for good.
+        recovery_direction: ``"forward"`` (default, the paper's ``KL(I || pi)``) or
+            ``"reverse"`` (``KL(pi || I)``, the released code's).
+        action_reduction: of the divergence over action dimensions: ``"sum"`` (default,
+            the paper's) or ``"mean"`` (the released code's).
+        recovery_states: ``"both"`` (default) for D_tot, or ``"perturbed"`` alone.
+        actor_states: where the policy seeks values: ``"both"`` (default) or ``"clean"``
+            states alone.
+        adversary: finds the perturbed states in the place of the batch's, see
+            :class:`~torchrl_osr.Adversary`. Default ``None``.
+        behavior_cloning: train the policy on the data's actions in the place of the
+            values, for a warm start: assign ``False`` to end it. Default ``False``.
         min_q_weight: :math:`\alpha`, weight of the conservative term. Default 5.0. May
             be assigned later; 0 *here* leaves the term out for good, which with
             ``num_qvalue_nets=10`` is OSR-10, and with ``recovery_weight=0`` SAC-N
@@ -65,6 +81,18 @@ class OSRLoss(RecoveryActorCriticLoss):
         num_random: ``K``, actions drawn of each kind (uniform, at ``s``, at ``s'``).
             Default 10.
         temperature: of the log-sum-exp. Default 1.0.
+        importance_sample: weigh the drawn actions by their densities. Default ``True``.
+        clip_diff_min, clip_diff_max: bounds of the conservative gap, per critic and
+            row, in units of the value. Default: none.
+        max_q_backup: the target's value is the largest of ``num_random`` actions'.
+            Default ``False``.
+        deterministic_backup: leave the entropy out of the target, as CQL does and
+            SAC-N does not. Default ``True``.
+        with_lagrange: learn a multiplier of the conservative term that holds the gap
+            at ``lagrange_thresh``. Default ``False``.
+        lagrange_thresh: the tolerated gap, in units of the value. Default 0.0.
+        diversity_weight: EDAC's :math:`\eta`, weight of the similarity of the critics'
+            gradients by the action. Default 0.0, which leaves it out for good.
         num_qvalue_nets: ``N``, for a single critic; a list has its own length.
             Default 2.
         loss_function: distance of the TD error: ``"l2"`` (default), ``"l1"`` or
@@ -106,7 +134,9 @@ class OSRLoss(RecoveryActorCriticLoss):
         ['loss_actor', 'loss_alpha', 'loss_cql', 'loss_qvalue', 'loss_recovery']
     """
 
-    _schedulable_buffers = frozenset({"recovery_weight", "min_q_weight"})
+    _schedulable_buffers = frozenset(
+        {"recovery_weight", "min_q_weight", "diversity_weight"}
+    )
 
     def __init__(
         self,
@@ -115,9 +145,23 @@ class OSRLoss(RecoveryActorCriticLoss):
         inverse_dynamics_network: ProbabilisticTensorDictSequential | None = None,
         *,
         recovery_weight: float = 0.5,
+        recovery_direction: Literal["forward", "reverse"] = "forward",
+        action_reduction: Literal["sum", "mean"] = "sum",
+        recovery_states: Literal["both", "perturbed"] = "both",
+        actor_states: Literal["both", "clean"] = "both",
+        adversary: Adversary | None = None,
+        behavior_cloning: bool = False,
         min_q_weight: float = 5.0,
         num_random: int = 10,
         temperature: float = 1.0,
+        importance_sample: bool = True,
+        clip_diff_min: float = -math.inf,
+        clip_diff_max: float = math.inf,
+        max_q_backup: bool = False,
+        deterministic_backup: bool = True,
+        with_lagrange: bool = False,
+        lagrange_thresh: float = 0.0,
+        diversity_weight: float = 0.0,
         num_qvalue_nets: int = 2,
         loss_function: str = "l2",
         alpha_init: float = 1.0,
@@ -129,9 +173,10 @@ class OSRLoss(RecoveryActorCriticLoss):
         use_prioritized_weights: bool | Literal["auto"] = "auto",
         scalar_output_mode: ScalarOutputMode = None,
     ) -> None:
-        weights = {"recovery_weight": recovery_weight, "min_q_weight": min_q_weight}
-        for name, weight in weights.items():
-            check_weight(name, weight)
+        check_weight("recovery_weight", recovery_weight)
+        check_choice("recovery_direction", recovery_direction, ("forward", "reverse"))
+        check_choice("action_reduction", action_reduction, ("sum", "mean"))
+        check_choice("actor_states", actor_states, ("both", "clean"))
         if recovery_weight and inverse_dynamics_network is None:
             raise ValueError(
                 f"recovery_weight={recovery_weight} needs an inverse_dynamics_network; "
@@ -141,8 +186,19 @@ class OSRLoss(RecoveryActorCriticLoss):
             actor_network,
             qvalue_network,
             inverse_dynamics_network if recovery_weight else None,
+            recovery_states=recovery_states,
+            adversary=adversary,
+            behavior_cloning=behavior_cloning,
+            min_q_weight=min_q_weight,
             num_random=num_random,
             temperature=temperature,
+            importance_sample=importance_sample,
+            clip_diff=(clip_diff_min, clip_diff_max),
+            max_q_backup=max_q_backup,
+            deterministic_backup=deterministic_backup,
+            with_lagrange=with_lagrange,
+            lagrange_thresh=lagrange_thresh,
+            diversity_weight=diversity_weight,
             num_qvalue_nets=num_qvalue_nets,
             loss_function=loss_function,
             alpha_init=alpha_init,
@@ -154,41 +210,19 @@ class OSRLoss(RecoveryActorCriticLoss):
             use_prioritized_weights=use_prioritized_weights,
             scalar_output_mode=scalar_output_mode,
         )
-        for name, weight in weights.items():
-            self.register_coeff_buffer(name, float(weight))
-        self.conserves = min_q_weight > 0
+        self.register_coeff_buffer("recovery_weight", float(recovery_weight))
+        self.recovery_direction = recovery_direction
+        self.action_reduction = action_reduction
+        if actor_states == "clean":
+            self._actor_rows = slice(0, 1)
 
     def _output_keys(self) -> tuple[list[NestedKey], list[NestedKey]]:
-        losses = ["loss_actor", "loss_alpha", "loss_qvalue"]
-        if self.conserves:
-            losses.append("loss_cql")
-        metrics = ["alpha", "entropy", "pred_value", "target_value"]
-        if self.recovers:
-            losses.append("loss_recovery")
-            metrics.append("recovery_kl")
+        losses: list[NestedKey] = ["loss_actor", "loss_alpha", "loss_qvalue"]
+        metrics: list[NestedKey] = ["alpha", "entropy", "pred_value", "target_value"]
+        critic_losses, critic_metrics = self._critic_keys()
+        losses += critic_losses + ["loss_recovery"] * self.recovers
+        metrics += critic_metrics + ["recovery_kl"] * self.recovers
         return losses, metrics
-
-    @torch.no_grad()
-    def _proposals(self, policy: TensorDictBase, like: Tensor) -> tuple[Tensor, Tensor]:
-        """Draw K actions each: uniform, from pi(s) and from pi(s').
-
-        Args:
-            policy: the policy at ``s`` and ``s'``, ``[2, B]``.
-            like: an action, ``[B, A]``.
-
-        Returns:
-            Actions ``[3K, B, A]`` and their log-densities ``[3K, B]``.
-        """
-        uniform, log_density = self._uniform(self.num_random, like)
-        # rsample also without gradient: torch's sample reads the scale back to the host
-        # to check its sign.
-        action, log_prob = rsample_and_log_prob(
-            self._distribution(policy), (self.num_random,)
-        )
-        return (
-            torch.cat([uniform, action.flatten(0, 1)]),
-            torch.cat([log_density, log_prob.flatten(0, 1)]),
-        )
 
     def _constraints(
         self,
@@ -196,36 +230,24 @@ class OSRLoss(RecoveryActorCriticLoss):
         states: TensorDictBase,
         policy: TensorDictBase,
         pi: TanhNormal,
-        done: Tensor,
+        data_action: Tensor,
     ) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
-        if self.conserves:
-            pred_value, gap = self._conservative_terms(tensordict, states, policy)
-            gap = self._reduce(gap, tensordict)
-            losses = {"loss_cql": self.min_q_weight * gap}
-        else:
-            action = tensordict.get(self.tensor_keys.action)
-            pred_value = self._qvalue(states[0], action, self.qvalue_network_params)
-            losses = {}
-        if not self.recovers:
-            return pred_value, losses, {}
-        model = self._inverse_dynamics(tensordict, done)
-        kl = functional.state_recovery(pi.loc, pi.scale, model.loc, model.scale)
-        kl, mean_kl = self._reduce_recovery(kl.mean(0), done, tensordict)
-        losses["loss_recovery"] = self.recovery_weight * kl
-        return pred_value, losses, {"recovery_kl": mean_kl}
-
-    def _conservative_terms(
-        self, tensordict: TensorDictBase, states: TensorDictBase, policy: TensorDictBase
-    ) -> tuple[Tensor, Tensor]:
-        """Return the values of the data's actions ``[N, B]`` and CQL's gap ``[B]``."""
-        data_action = tensordict.get(self.tensor_keys.action)
-        action, log_prob = self._proposals(policy[:2].detach(), data_action)
-        # One pass of the critics for the data's action and all proposals.
-        action = torch.cat([data_action.unsqueeze(0), action])
-        clean = states[0].expand(action.shape[:-1])
-        qvalue = self._qvalue(clean, action, self.qvalue_network_params)
-        pred_value, sampled = qvalue[:, 0], qvalue[:, 1:].movedim(1, -1)
-        gap = functional.conservative_gap(
-            sampled, log_prob.movedim(0, -1), pred_value, temperature=self.temperature
+        pred_value, losses, metrics = self._critic_terms(
+            tensordict, states, policy, data_action
         )
-        return pred_value, gap.sum(0)
+        if not self.recovers:
+            return pred_value, losses, metrics
+        done = self._flag(tensordict, self.tensor_keys.done)
+        model = self._inverse_dynamics(tensordict, done)
+        pi = self._recovery_policy(policy, pi)
+        kl = functional.state_recovery(
+            pi.loc,
+            pi.scale,
+            model.loc,
+            model.scale,
+            direction=self.recovery_direction,
+            action_reduction=self.action_reduction,
+        )
+        kl, mean_kl = self._reduce_recovery(kl, tensordict)
+        losses["loss_recovery"] = self.recovery_weight * kl
+        return pred_value, losses, metrics | {"recovery_kl": mean_kl}

@@ -17,16 +17,17 @@ from torchrl.modules import TanhNormal
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 
 from torchrl_osr import functional
-from torchrl_osr.objectives.actor_critic import RecoveryActorCriticLoss
+from torchrl_osr.objectives.adversary import Adversary
 from torchrl_osr.objectives.base import (
     Reduction,
     ScalarOutputMode,
     check_choice,
     check_weight,
 )
+from torchrl_osr.objectives.tanh_gaussian import TanhGaussianActorCritic
 
 
-class OSRVLoss(RecoveryActorCriticLoss):
+class OSRVLoss(TanhGaussianActorCritic):
     r"""Out-of-sample State Recovery by a constraint on the values (OSR-v).
 
     .. math::
@@ -61,6 +62,10 @@ class OSRVLoss(RecoveryActorCriticLoss):
             the policy and ``K`` uniform ones, weighted by their densities.
         num_random: ``K``, actions drawn of each kind. Default 1.
         temperature: of the log-sum-exp. Default 1.0.
+        adversary: finds the perturbed states in the place of the batch's, see
+            :class:`~torchrl_osr.Adversary`. Default ``None``.
+        behavior_cloning: train the policy on the data's actions in the place of the
+            values, for a warm start: assign ``False`` to end it. Default ``False``.
         num_qvalue_nets: ``N``, for a single critic; a list has its own length.
             Default 2.
         loss_function: distance of the TD error: ``"l2"`` (default), ``"l1"`` or
@@ -113,6 +118,8 @@ class OSRVLoss(RecoveryActorCriticLoss):
         policy_values: Literal["mean", "logsumexp"] = "mean",
         num_random: int = 1,
         temperature: float = 1.0,
+        adversary: Adversary | None = None,
+        behavior_cloning: bool = False,
         num_qvalue_nets: int = 2,
         loss_function: str = "l2",
         alpha_init: float = 1.0,
@@ -134,6 +141,8 @@ class OSRVLoss(RecoveryActorCriticLoss):
             inverse_dynamics_network,
             num_random=num_random,
             temperature=temperature,
+            adversary=adversary,
+            behavior_cloning=behavior_cloning,
             num_qvalue_nets=num_qvalue_nets,
             loss_function=loss_function,
             alpha_init=alpha_init,
@@ -155,7 +164,7 @@ class OSRVLoss(RecoveryActorCriticLoss):
 
     @torch.no_grad()
     def _candidates(
-        self, tensordict: TensorDictBase, pi: TanhNormal, done: Tensor
+        self, tensordict: TensorDictBase, pi: TanhNormal
     ) -> tuple[Tensor, Tensor | None]:
         """Draw the actions whose values are compared, all on D_tot.
 
@@ -163,6 +172,7 @@ class OSRVLoss(RecoveryActorCriticLoss):
             Actions ``[M, 2, B, A]``, the last ``K`` of them the model's, and the
             log-densities of the others, ``[M - K, 2, B]``, where they are needed.
         """
+        done = self._flag(tensordict, self.tensor_keys.done)
         model = self._inverse_dynamics(tensordict, done)
         number = (self.num_random,)
         action, log_prob = rsample_and_log_prob(pi, number)
@@ -179,10 +189,9 @@ class OSRVLoss(RecoveryActorCriticLoss):
         states: TensorDictBase,
         policy: TensorDictBase,
         pi: TanhNormal,
-        done: Tensor,
+        data_action: Tensor,
     ) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
-        candidates, log_prob = self._candidates(tensordict, pi, done)
-        data_action = tensordict.get(self.tensor_keys.action)
+        candidates, log_prob = self._candidates(tensordict, pi)
         mixed = states[::2].expand(candidates.shape[:-1])
         # One pass of the critics for the data's action and all candidates.
         qvalue = self._qvalue(
@@ -198,8 +207,6 @@ class OSRVLoss(RecoveryActorCriticLoss):
             log_prob=None if log_prob is None else log_prob.movedim(0, -1),
             temperature=self.temperature,
         )
-        # Sum over critics, mean over D_tot.
-        gap = gap.sum(0).mean(0)
-        gap, mean_gap = self._reduce_recovery(gap, done, tensordict)
+        gap, mean_gap = self._reduce_recovery(gap.sum(0), tensordict)
         losses = {"loss_recovery": self.recovery_weight * gap}
         return pred_value, losses, {"recovery_gap": mean_gap}

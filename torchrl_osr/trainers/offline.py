@@ -144,6 +144,11 @@ class OfflineTrainer(Trainer):
         )
 
     @property
+    def step(self) -> int:
+        """Gradient steps so far, from the run's beginning; the running one counts."""
+        return int(self._optim_count)
+
+    @property
     def best_path(self) -> Path:
         """Where the checkpoint with the best evaluation is."""
         return Path(self.rotation.directory) / "best.torchrl"

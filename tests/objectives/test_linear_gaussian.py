@@ -1,0 +1,126 @@
+"""Recovery where the answer is known: a linear-Gaussian world, end to end.
+
+``s' = A s + B a + w`` with ``w ~ N(0, w^2)`` and behaviour ``a ~ N(k s, b^2)``. Given
+``(s, s')`` the action is Gaussian with mean ``k s + G (s' - (A + B k) s)``, gain
+``G = B b^2 / (w^2 + B^2 b^2)``. At a pushed state the recovering policy undoes a share
+``B G`` of the push: what is left of the deviation is ``w^2 / (w^2 + B^2 b^2)``.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torchrl.modules import (
+    MLP,
+    NormalParamExtractor,
+    ProbabilisticActor,
+    TanhNormal,
+    ValueOperator,
+)
+
+from torchrl_osr import InverseDynamicsLoss, OSRLoss
+
+A, B, GAIN, BEHAVIOR_STD, NOISE_STD = 0.9, 0.5, -0.3, 0.4, 0.1
+VARIANCE = NOISE_STD**2 + B**2 * BEHAVIOR_STD**2
+MODEL_GAIN = B * BEHAVIOR_STD**2 / VARIANCE
+# So wide that the tanh is a straight line where the actions are, to 1 %.
+BOUND = 20.0
+STATE, PUSHED = 1.0, 1.4
+
+
+def linear_gaussian(*inputs) -> ProbabilisticActor:
+    """A tanh-Gaussian with linear mean and one free standard deviation."""
+    network = TensorDictSequential(
+        TensorDictModule(MLP(len(inputs), 2, depth=0), list(inputs), ["param"]),
+        TensorDictModule(NormalParamExtractor("exp"), ["param"], ["loc", "scale"]),
+    )
+    return ProbabilisticActor(
+        network,
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        distribution_kwargs={
+            "low": torch.tensor(-BOUND).double(),
+            "high": torch.tensor(BOUND).double(),
+        },
+    ).double()
+
+
+def transitions(state: torch.Tensor, behavior_std: float) -> TensorDict:
+    """Behaviour and dynamics at the given states, ``[B, 1]``."""
+    action = GAIN * state + behavior_std * torch.randn_like(state)
+    following = A * state + B * action + NOISE_STD * torch.randn_like(state)
+    no = torch.zeros_like(state, dtype=torch.bool)
+    return TensorDict(
+        {
+            "observation": state,
+            "action": action,
+            "next": {
+                "observation": following,
+                "reward": torch.zeros_like(state),
+                "done": no,
+                "terminated": no,
+            },
+        },
+        [len(state)],
+    )
+
+
+def minimize(loss, key: str, parameters, batch: TensorDict) -> None:
+    optimizer = torch.optim.LBFGS(
+        list(parameters), max_iter=60, line_search_fn="strong_wolfe"
+    )
+
+    def closure() -> torch.Tensor:
+        optimizer.zero_grad()
+        value = loss(batch)[key]
+        value.backward()
+        return value
+
+    optimizer.step(closure)
+
+
+@pytest.mark.filterwarnings("ignore:No target network updater")
+@pytest.mark.parametrize("behavior_std", [BEHAVIOR_STD, 0.04])
+def test_what_is_left_of_a_push_is_the_closed_form(behavior_std) -> None:
+    variance = NOISE_STD**2 + B**2 * behavior_std**2
+    networks = SimpleNamespace(
+        actor=linear_gaussian("observation"),
+        model=linear_gaussian("observation", ("next", "observation")),
+        critic=ValueOperator(
+            MLP(2, 1, num_cells=[4]), in_keys=["observation", "action"]
+        ).double(),
+    )
+    data = transitions(torch.randn(100_000, 1).double(), behavior_std)
+    model_loss = InverseDynamicsLoss(networks.model, states="clean")
+    minimize(model_loss, "loss_inverse_dynamics", model_loss.parameters(), data)
+    by_state, by_next = BOUND * networks.model[0][0].module[0].weight[0]
+    gain = B * behavior_std**2 / variance
+    assert by_next.item() == pytest.approx(gain, rel=0.02)
+    assert by_state.item() == pytest.approx(GAIN - gain * (A + B * GAIN), abs=0.02)
+
+    # One state and one push, so that the policy can know where it came from.
+    batch = transitions(torch.full((50_000, 1), STATE).double(), behavior_std)
+    batch["perturbed", "observation"] = torch.full_like(batch["observation"], PUSHED)
+    loss = OSRLoss(
+        networks.actor,
+        networks.critic,
+        networks.model,
+        recovery_weight=1.0,
+        recovery_states="perturbed",
+        num_random=1,
+    ).double()
+    actor = loss.actor_network_params.values(True, True)
+    minimize(loss, "loss_recovery", actor, batch)
+    policy = networks.actor.get_dist(batch["perturbed"].auto_batch_size_(1))
+    action, std = BOUND * policy.loc[0].item(), BOUND * policy.scale[0].item()
+    pushed = A * PUSHED + B * action
+    undisturbed = (A + B * GAIN) * STATE
+    left = (pushed - undisturbed) / ((A + B * GAIN) * (PUSHED - STATE))
+    # 0.2 for the wide behaviour; hardly any recovery (0.96) where it is nearly
+    # deterministic: there the data do not show how to come back.
+    assert left == pytest.approx(NOISE_STD**2 / variance, abs=0.02)
+    assert std == pytest.approx(behavior_std, abs=0.01)

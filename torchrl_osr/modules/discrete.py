@@ -1,0 +1,141 @@
+"""Networks for discrete actions: actor, critics and inverse dynamics model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.modules import MLP, OneHotCategorical, ProbabilisticActor
+
+
+def categorical_actor(
+    observation_dim: int,
+    num_actions: int,
+    *,
+    num_cells: Sequence[int] = (256, 256),
+    activation_class: type[nn.Module] = nn.ReLU,
+) -> ProbabilisticActor:
+    """Return an actor that reads ``"observation"`` and chooses one of ``n`` actions.
+
+    Its actions are one-hot, as :class:`~torchrl.envs.GymEnv` gives and takes them
+    unless it was made with ``categorical_action_encoding=True``.
+
+    Args:
+        observation_dim: size of the observation, ``S``.
+        num_actions: number of actions, ``n``.
+        num_cells: width of each hidden layer.
+        activation_class: activation between the layers.
+
+    Returns:
+        An actor that writes ``"logits"`` and ``"action"``, each ``[B, n]``, and
+        ``"action_log_prob"``, ``[B]``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> actor = categorical_actor(4, 2, num_cells=[32])
+        >>> actor(TensorDict({"observation": torch.zeros(3, 4)}, [3]))["action"].shape
+        torch.Size([3, 2])
+    """
+    network = MLP(
+        in_features=observation_dim,
+        out_features=num_actions,
+        num_cells=list(num_cells),
+        activation_class=activation_class,
+    )
+    return _categorical(TensorDictModule(network, ["observation"], ["logits"]))
+
+
+def categorical_inverse_dynamics(
+    observation_dim: int,
+    num_actions: int,
+    *,
+    num_cells: Sequence[int] = (256, 256),
+    activation_class: type[nn.Module] = nn.ReLU,
+) -> ProbabilisticActor:
+    r"""Return a categorical model of :math:`I(a \mid s, s')`.
+
+    Args:
+        observation_dim: size of the observation, ``S``.
+        num_actions: number of actions, ``n``.
+        num_cells: width of each hidden layer.
+        activation_class: activation between the layers.
+
+    Returns:
+        A module that reads ``"observation"`` and ``("next", "observation")`` and
+        writes ``"logits"`` and one-hot ``"action"``, each ``[B, n]``, and
+        ``"action_log_prob"``, ``[B]``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> model = categorical_inverse_dynamics(4, 2, num_cells=[32])
+        >>> s = torch.zeros(3, 4)
+        >>> batch = TensorDict({"observation": s, "next": {"observation": s + 1}}, [3])
+        >>> model.get_dist(batch).probs.shape
+        torch.Size([3, 2])
+    """
+    network = MLP(
+        in_features=2 * observation_dim,
+        out_features=num_actions,
+        num_cells=list(num_cells),
+        activation_class=activation_class,
+    )
+    keys = ["observation", ("next", "observation")]
+    return _categorical(TensorDictModule(network, keys, ["logits"]))
+
+
+def _categorical(logits: TensorDictModule) -> ProbabilisticActor:
+    return ProbabilisticActor(
+        logits,
+        in_keys=["logits"],
+        out_keys=["action"],
+        distribution_class=OneHotCategorical,
+        return_log_prob=True,
+    )
+
+
+def discrete_critic_ensemble(
+    observation_dim: int,
+    num_actions: int,
+    *,
+    num_qvalue_nets: int = 2,
+    num_cells: Sequence[int] = (256, 256),
+    activation_class: type[nn.Module] = nn.ReLU,
+) -> list[TensorDictModule]:
+    """Return Q networks that read ``"observation"`` and value all actions at once.
+
+    A list, for the reason that :func:`~torchrl_osr.modules.critic_ensemble` gives.
+
+    Args:
+        observation_dim: size of the observation, ``S``.
+        num_actions: number of actions, ``n``.
+        num_qvalue_nets: number of critics, ``N``.
+        num_cells: width of each hidden layer.
+        activation_class: activation between the layers.
+
+    Returns:
+        ``N`` modules that write ``"action_value"``, ``[B, n]``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> critic, _ = discrete_critic_ensemble(4, 2, num_cells=[32])
+        >>> batch = TensorDict({"observation": torch.zeros(3, 4)}, [3])
+        >>> critic(batch)["action_value"].shape
+        torch.Size([3, 2])
+    """
+    return [
+        TensorDictModule(
+            MLP(
+                in_features=observation_dim,
+                out_features=num_actions,
+                num_cells=list(num_cells),
+                activation_class=activation_class,
+            ),
+            ["observation"],
+            ["action_value"],
+        )
+        for _ in range(num_qvalue_nets)
+    ]
