@@ -21,12 +21,13 @@ from typing import Any
 
 import torch
 from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
 from tensordict import TensorDict, TensorDictBase
 from torchrl import torchrl_logger
 from torchrl.objectives import SoftUpdate
 from torchrl.record.loggers import CSVLogger
 
-from torchrl_osr import OSRLoss, StatePerturbation, config
+from torchrl_osr import StatePerturbation, config
 from torchrl_osr.data import make_replay_buffer
 from torchrl_osr.modules import (
     critic_ensemble,
@@ -65,11 +66,12 @@ def main(rounds: int, steps: int, overrides: list[str]) -> dict[str, float | str
     torch.set_num_threads(cfg.trainer.num_threads)
     torch.manual_seed(0)
     cells = list(cfg.network.num_cells)
-    loss = OSRLoss(
+    number = cfg.loss.num_qvalue_nets
+    loss = instantiate(
+        cfg.loss,
         tanh_gaussian_actor(OBSERVATION, ACTION, num_cells=cells),
-        critic_ensemble(OBSERVATION, ACTION, **cfg.network),
+        critic_ensemble(OBSERVATION, ACTION, num_qvalue_nets=number, **cfg.network),
         tanh_gaussian_inverse_dynamics(OBSERVATION, ACTION, num_cells=cells),
-        **cfg.loss,
     )
     loss.make_value_estimator(gamma=cfg.optim.gamma)
     updater = SoftUpdate(loss, tau=cfg.optim.tau)

@@ -1,7 +1,6 @@
 """OSR for discrete actions on CartPole, from the data to a table, in about a minute.
 
-    python examples/discrete_osr.py
-    python examples/discrete_osr.py --seed 1 --loss osr --output cartpole.json
+    python examples/discrete_osr.py --seed 1 --output cartpole.json
 
 The data are rolled out here: a rule that balances the pole, spoilt by random actions.
 Two policies are then learnt from them alone, by CQL and by OSR. Both play from the
@@ -42,13 +41,13 @@ from torchrl_osr.modules import (
     discrete_critic_ensemble,
 )
 
-TASK, OBSERVATION_DIM, NUM_ACTIONS = "CartPole-v1", 4, 2
+TASK, SIZES = "CartPole-v1", (4, 2)  # of the observation, and number of actions
 EPSILONS = (0.4, 0.6, 0.8, 1.0)  # shares of random actions in the data, by episode
 STARTS = {"own": 0.05, "wide": 0.15}  # the four numbers of a first state lie within +-
 EVALUATION_SEED = 10_000_000  # above the seeds of the data's episodes
 PERTURBATION = 0.05  # standard deviation, in units of the data's own
-CELLS = [64, 64]
 WEIGHTS = {"cql": 0.0, "osr": 0.5}  # the two losses differ in recovery_weight alone
+CELLS = [64, 64]
 PACKAGES = ("torchrl-osr", "torchrl", "tensordict", "torch", "gymnasium", "numpy")
 
 Policy = Callable[[NDArray[Any]], NDArray[Any]]
@@ -89,15 +88,14 @@ def play(policy: Policy, seeds: NDArray[np.int64], start: float = STARTS["own"])
         observation = following
     envs.close()
     joined = [np.concatenate(column) for column in zip(*steps, strict=True)]
-    returns = np.bincount(joined[0], weights=joined[4])
     observation, action, following, *rest = map(torch.from_numpy, joined[1:])
     reward, terminated, truncated = (column.unsqueeze(-1) for column in rest)
     data = TensorDict({"observation": observation}, [len(action)])
-    data["action"] = torch.nn.functional.one_hot(action, NUM_ACTIONS)
+    data["action"] = torch.nn.functional.one_hot(action, SIZES[1])
     data["next"] = {"observation": following, "reward": reward.float()}
     data["next"].update({"terminated": terminated, "truncated": truncated})
     data["next", "done"] = terminated | truncated
-    return data, returns
+    return data, np.bincount(joined[0], weights=joined[4])
 
 
 def spoilt_rule(num_episodes: int, rng: np.random.Generator) -> Policy:
@@ -107,7 +105,7 @@ def spoilt_rule(num_episodes: int, rng: np.random.Generator) -> Policy:
     def policy(observation: NDArray[Any]) -> NDArray[Any]:
         rule = observation[:, 2] + 0.5 * observation[:, 3] > 0  # angle and its velocity
         chance = rng.random(num_episodes) < epsilon
-        return np.where(chance, rng.integers(NUM_ACTIONS, size=num_episodes), rule)
+        return np.where(chance, rng.integers(SIZES[1], size=num_episodes), rule)
 
     return policy
 
@@ -138,7 +136,6 @@ def train(loss: LossModule, buffer: ReplayBuffer, steps: int, updater: Any) -> N
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
     """Data, inverse dynamics model, policies; return everything that was measured."""
-    sizes = OBSERVATION_DIM, NUM_ACTIONS
     rng = np.random.default_rng(args.seed)
     seeds = rng.integers(EVALUATION_SEED, size=args.data_episodes)
     data, returns = play(spoilt_rule(args.data_episodes, rng), seeds)
@@ -154,16 +151,15 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         return make_replay_buffer(data, batch_size=128, seed=args.seed, transform=twin)
 
     torch.manual_seed(args.seed)
-    model = categorical_inverse_dynamics(*sizes, num_cells=CELLS)
+    model = categorical_inverse_dynamics(*SIZES, num_cells=CELLS)
     train(DiscreteInverseDynamicsLoss(model), buffer(), args.model_steps, None)
-    likelihood = DiscreteInverseDynamicsLoss(model, states="clean")(held_out)
-    results["model_nll"] = likelihood["loss_inverse_dynamics"].item()
+    (nll,) = DiscreteInverseDynamicsLoss(model, states="clean")(held_out).values()
     seeds = EVALUATION_SEED + np.arange(args.episodes)
-    results |= {"episode_seeds": seeds.tolist(), "returns": {}}
+    results |= {"model_nll": nll.item(), "episode_seeds": seeds.tolist(), "returns": {}}
     for name in args.loss:
         torch.manual_seed(args.seed)  # the same networks to begin with
-        actor = categorical_actor(*sizes, num_cells=CELLS)
-        critics = discrete_critic_ensemble(*sizes, num_cells=CELLS)
+        actor = categorical_actor(*SIZES, num_cells=CELLS)
+        critics = discrete_critic_ensemble(*SIZES, num_cells=CELLS)
         loss = DiscreteOSRLoss(actor, critics, model, recovery_weight=WEIGHTS[name])
         train(loss, buffer(), args.steps, SoftUpdate(loss, tau=5e-3))
         for starts, bound in STARTS.items():
@@ -178,23 +174,22 @@ def table(results: dict[str, Any]) -> str:
     lines = [f"{'':16}{'return':>8}   95 % interval     episodes"]
     for name, returns in rows.items():
         mean, low, high = mean_interval(returns)
-        interval = f"{low:.1f} to {high:.1f}"
-        lines.append(f"{name:16}{mean:8.1f}   {interval:16}{len(returns):10}")
+        span = f"{low:.1f} to {high:.1f}"
+        lines.append(f"{name:16}{mean:8.1f}   {span:16}{len(returns):10}")
     return "\n".join(lines)
 
 
 def main(arguments: Sequence[str]) -> None:
     """Run all of it, print the table, write the file."""
-    args = parse_arguments(arguments)
     torchrl_logger.setLevel("WARNING")
     torch.set_num_threads(1)
+    args = parse_arguments(arguments)
     results = run(args)
     print(f"{TASK}, {results['rows']} transitions, seed {args.seed}")
     print(f"inverse dynamics, held out: {results['model_nll']:.4f} nats")
     print(table(results))
     if args.output is not None:
         results["command"] = f"python examples/discrete_osr.py {' '.join(arguments)}"
-        results["options"] = vars(args) | {"output": str(args.output)}
         results["versions"] = {name: version(name) for name in PACKAGES}
         args.output.parent.mkdir(parents=True, exist_ok=True)
         args.output.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")

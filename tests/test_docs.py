@@ -65,6 +65,15 @@ def described() -> tuple[set[str], set[int]]:
     return names, ids
 
 
+def leaves(tree: dict, prefix: str = "") -> list[str]:
+    """Dotted names of all values of a nested dictionary."""
+    names = []
+    for key, value in tree.items():
+        name = f"{prefix}{key}"
+        names += leaves(value, f"{name}.") if isinstance(value, dict) else [name]
+    return names
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_python_blocks_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -126,7 +135,7 @@ def test_public_functions_and_configuration_are_in_the_reference():
 def test_every_configuration_key_is_documented_with_its_values():
     page = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
     row = re.compile(r"(?m)^\| `([\w.]+)` \| `(.+?)` \| `(.+?)` \|")
-    section = page.split("## Every key")[1].split("## Sweeps")[0]
+    section = page.split("## Every key")[1].split("## Losses")[0]
     rows = {key: values for key, *values in row.findall(section)}
     config.register()
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
@@ -135,13 +144,8 @@ def test_every_configuration_key_is_documented_with_its_values():
             for name in ("quick", "paper")
         ]
     for column, cfg in enumerate(presets):
-        tree = OmegaConf.to_container(cfg)
-        keys = {
-            f"{group}.{key}" if isinstance(value, dict) else group
-            for group, value in tree.items()
-            for key in (value if isinstance(value, dict) else [group])
-        }
-        assert keys == rows.keys()
+        tree = OmegaConf.to_container(cfg, resolve=True)
+        assert set(leaves(tree)) == rows.keys()
         for key, values in rows.items():
             there = reduce(lambda node, part: node[part], key.split("."), tree)
             (said,) = OmegaConf.create(f"[{values[column]}]")
@@ -151,7 +155,15 @@ def test_every_configuration_key_is_documented_with_its_values():
 
 def test_options_of_every_group_are_documented():
     page = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
-    for group in ("env", "data", "loss", "logger", "preset", "hydra/launcher"):
+    for group in (
+        "env",
+        "data",
+        "inverse_dynamics",
+        "loss",
+        "logger",
+        "preset",
+        "hydra/launcher",
+    ):
         (row,) = re.findall(rf"(?m)^\| `{group}` \|.*$", page)
         for path in (ROOT / "conf" / group).glob("*.yaml"):
             assert f"`{path.stem}`" in row

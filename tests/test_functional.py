@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
-from torch.distributions import Normal, kl_divergence
+from torch.distributions import Categorical, Normal, kl_divergence
 from torchrl.modules import TanhNormal
 from torchrl.objectives.value import TD0Estimator
 
@@ -211,11 +211,103 @@ def test_state_recovery_rejects_unknown_options(option, value) -> None:
         functional.state_recovery(*tensors(0, 1, 0, 1), **{option: value})
 
 
+# (.4 + .2)^2 / (2 * .5^2) and (1 - 0)^2 / (2 * 2^2), by hand.
+@pytest.mark.parametrize(("reduction", "expected"), [("sum", 0.845), ("mean", 0.4225)])
+def test_deterministic_recovery_matches_hand_computed_numbers(
+    reduction, expected
+) -> None:
+    action, loc, scale = torch.tensor([[0.4, 1.0], [-0.2, 0.0], [0.5, 2.0]]).double()
+    action.requires_grad_()
+    value = functional.deterministic_recovery(
+        action, loc, scale, action_reduction=reduction
+    )
+    assert value.item() == pytest.approx(expected, abs=1e-6)
+    value.backward()
+    share = 1 if reduction == "sum" else 2
+    torch.testing.assert_close(action.grad, (action - loc) / scale**2 / share)
+    assert functional.deterministic_recovery(loc, loc, scale).item() == 0.0
+
+
+@given(locations, scales, locations, scales)
+@settings(deadline=None)
+def test_deterministic_recovery_is_what_a_policy_of_constant_width_sees(
+    loc, scale, other_loc, other_scale
+) -> None:
+    loc, scale, *other = tensors(loc, scale, other_loc, other_scale)
+    away, there = (
+        functional.state_recovery(mean, scale, *other, direction="reverse")
+        for mean in (loc, other[0])
+    )
+    value = functional.deterministic_recovery(loc, *other)
+    torch.testing.assert_close(value, away - there, rtol=1e-9, atol=1e-9)
+
+
 def test_policy_value_takes_the_smallest_critic_and_seeks_high_values() -> None:
     qvalue = torch.tensor([[1.0, 5.0], [2.0, 3.0]])
     value = functional.soft_policy_value(torch.tensor([0.5, -1.0]), qvalue, 0.2)
     # By hand: .2 * .5 - 1 and .2 * -1 - 3.
     torch.testing.assert_close(value, torch.tensor([-0.9, -3.2]))
+
+
+def test_categorical_kl_equals_torchs() -> None:
+    p, q = torch.randn(2, 7, 5, dtype=torch.float64)
+    p, q = (Categorical(logits=logits) for logits in (p, q))
+    value = functional.categorical_kl(p.logits, q.logits)
+    torch.testing.assert_close(value, kl_divergence(p, q), rtol=1e-12, atol=1e-12)
+    assert (functional.categorical_kl(p.logits, p.logits) == 0).all()
+
+
+# By hand: 0 + log 2 / 2 with p = (1/2, 1/2, 0), q = (1/2, 1/4, 1/4), and 0 log 0 = 0.
+@pytest.mark.parametrize(
+    ("p", "q", "expected"),
+    [
+        ([0.5, 0.5, 0.0], [0.5, 0.25, 0.25], 0.3465736),
+        ([0.5, 0.5, 0.0], [0.5, 0.5, 0.0], 0.0),
+        ([0.0, 0.0, 1.0], [0.5, 0.25, 0.25], 1.3862944),
+        ([0.5, 0.25, 0.25], [0.5, 0.5, 0.0], math.inf),
+    ],
+)
+def test_categorical_kl_of_actions_that_are_never_taken(p, q, expected) -> None:
+    p, q = (torch.tensor(probs).log().requires_grad_() for probs in (p, q))
+    value = functional.categorical_kl(p, q)
+    assert value.item() == pytest.approx(expected, abs=1e-6)
+    value.backward()
+    assert q.grad.isfinite().all()
+    assert p.grad.isfinite().all() or math.isinf(expected)
+
+
+def test_discrete_policy_value_is_the_expectation_of_the_sampled_one() -> None:
+    policy = Categorical(logits=torch.randn(6, 4, dtype=torch.float64))
+    qvalue = torch.randn(3, 6, 4, dtype=torch.float64)
+    value = functional.discrete_policy_value(policy.logits, qvalue, 0.3)
+    expected = sum(
+        policy.probs[:, a]
+        * functional.soft_policy_value(policy.logits[:, a], qvalue[..., a], 0.3)
+        for a in range(4)
+    )
+    torch.testing.assert_close(value, expected, rtol=1e-12, atol=1e-12)
+    # -V, in nats times alpha: the entropy bonus alone is left without values.
+    bonus = functional.discrete_policy_value(policy.logits, 0 * qvalue, 0.3)
+    torch.testing.assert_close(bonus, -0.3 * policy.entropy(), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.3])
+def test_discrete_policy_value_of_an_action_that_is_never_taken(alpha) -> None:
+    logits = torch.tensor([0.5, -math.inf, 1.0], requires_grad=True)
+    log_prob = torch.log_softmax(logits, -1)
+    value = functional.discrete_policy_value(log_prob, torch.randn(2, 3), alpha)
+    value.backward()
+    assert value.isfinite()
+    assert logits.grad.isfinite().all()
+    assert logits.grad[1] == 0
+
+
+def test_conservative_gap_over_all_actions_is_the_exact_one() -> None:
+    qvalue = torch.tensor([[1.0, 2.0, -3.0]], dtype=torch.float64)
+    zero = torch.zeros_like(qvalue)
+    gap = functional.conservative_gap(qvalue, zero, qvalue[:, 1], temperature=2.0)
+    total = sum(math.exp(value / 2) for value in (1, 2, -3))
+    assert gap.item() == pytest.approx(2 * math.log(total) - 2)
 
 
 def test_temperature_rises_when_the_policy_has_too_little_entropy() -> None:

@@ -259,6 +259,21 @@ def test_nothing_receives_a_gradient(real, objective, method, grad) -> None:
 
 
 @both_objectives
+def test_entries_that_are_not_perturbed_come_along_alone(real, objective) -> None:
+    goal = torch.zeros(6, 1, dtype=torch.float64, requires_grad=True)
+    real.states["goal"] = goal
+
+    def writing_policy(states) -> TanhNormal:
+        states["action"] = states["observation"]
+        return real.policy(states)
+
+    twin = Adversary(objective).perturb(real.states, KEYS, writing_policy, real.qvalue)
+    assert set(real.states.keys()) == set(twin.keys()) == {"observation", "goal"}
+    assert torch.equal(twin["goal"], goal)
+    assert not twin["goal"].requires_grad
+
+
+@both_objectives
 @both_methods
 def test_a_box_without_width_leaves_the_states(real, objective, method) -> None:
     twin = perturb(real, Adversary(objective, method, epsilon=0.0))

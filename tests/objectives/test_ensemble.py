@@ -6,9 +6,9 @@ import math
 
 import pytest
 import torch
+from torch.distributions import Normal, kl_divergence
 
 from torchrl_osr import OSRLoss
-from torchrl_osr.functional import state_recovery
 
 
 def build(networks, **kwargs) -> OSRLoss:
@@ -26,7 +26,9 @@ def build(networks, **kwargs) -> OSRLoss:
 
 
 @pytest.mark.parametrize("num_critics", [1, 3, 10])
-def test_losses_are_sac_n_restated(make_networks, make_batch, num_critics) -> None:
+def test_losses_are_sac_n_restated(
+    make_networks, make_batch, check, num_critics
+) -> None:
     """SAC-N (An et al., 2021, equation 2) critic by critic, with the same draws."""
     networks, batch = make_networks(num_critics=num_critics), make_batch(10)
     loss = build(
@@ -63,17 +65,17 @@ def test_losses_are_sac_n_restated(make_networks, make_batch, num_critics) -> No
         .mean()
     )
     actor = (0.25 * log_prob - values(state, action).amin(0)).mean()
-    torch.testing.assert_close(out["loss_qvalue"], td)
-    torch.testing.assert_close(out["loss_actor"], actor)
+    got = [out["loss_qvalue"], out["loss_actor"]]
+    check("SAC-N", got, [td, actor], tolerance=1e-9)
     names = list(out.keys())
     assert names == loss.out_keys
     assert "loss_cql" not in names
 
 
-def test_osr_10_adds_the_recovery_term_alone(make_networks, make_batch) -> None:
+def test_osr_10_adds_the_recovery_term_alone(make_networks, make_batch, check) -> None:
     networks, batch = make_networks(num_critics=10), make_batch(10)
     batch["next", "done"][:] = False
-    loss = build(networks, recovery_weight=0.7)
+    loss = build(networks, recovery_weight=0.75)
     out = loss(batch.clone())
     kl = []
     for state in (batch["observation"], batch["perturbed", "observation"]):
@@ -82,8 +84,10 @@ def test_osr_10_adds_the_recovery_term_alone(make_networks, make_batch) -> None:
             networks.actor.get_dist(pair),
             networks.inverse_dynamics.get_dist(pair),
         )
-        kl.append(state_recovery(pi.loc, pi.scale, model.loc, model.scale))
-    torch.testing.assert_close(out["loss_recovery"], 0.7 * torch.stack(kl).mean())
+        policy, model = Normal(pi.loc, pi.scale), Normal(model.loc, model.scale)
+        kl.append(kl_divergence(model, policy).sum(-1))
+    wanted = 0.75 * torch.stack(kl).mean()
+    check("OSR-10", [out["loss_recovery"]], [wanted], tolerance=1e-9)
     assert set(out.keys()) == {
         "loss_actor", "loss_alpha", "loss_qvalue", "loss_recovery", "alpha",
         "entropy", "pred_value", "target_value", "recovery_kl",

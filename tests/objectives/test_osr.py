@@ -168,7 +168,8 @@ def test_losses_and_gradients_equal_the_restatement(
     expected = restatement.losses(batch, seed=5)
     assert set(losses) == set(expected) == set(LOSSES[: 5 if weight else 4])
     values = [losses[key] for key in expected]
-    check("losses", values, expected.values(), tolerance=1e-8)
+    name = "OSR, official variant" if options else "OSR" if weight else "CQL(H)"
+    check(name, values, expected.values(), tolerance=1e-8)
 
     # The sum of ours is correct training; the plain one needs each group by itself.
     actor = list(restatement.policy_net.parameters())
@@ -190,7 +191,7 @@ def test_losses_and_gradients_equal_the_restatement(
     ours += [p.grad for p in loss.qvalue_network_params.values(True, True)]
     ours.append(loss.log_alpha.grad)
     wanted = [*expected_actor, *stacked, expected_alpha]
-    check("gradients", ours, wanted, tolerance=1e-7)
+    check(name, ours, wanted, tolerance=1e-7)
 
 
 @pytest.mark.parametrize("recovery_weight", [0.75, 0.0])

@@ -133,7 +133,7 @@ class Restatement:
     ("low", "high"), [([-1.0, -1.0], [1.0, 1.0]), ([-1.0, -0.5], [2.0, 1.5])]
 )
 def test_losses_and_gradients_equal_the_restatement(
-    make_networks, make_batch, policy_values, number, low, high
+    make_networks, make_batch, check, policy_values, number, low, high
 ) -> None:
     bounds = {"low": torch.tensor(low).double(), "high": torch.tensor(high).double()}
     networks, batch = make_networks(**bounds), make_batch(10)
@@ -143,8 +143,7 @@ def test_losses_and_gradients_equal_the_restatement(
     losses = {key: value for key, value in out.items() if key.startswith("loss_")}
     expected = restated.losses(batch, 5, number, policy_values == "logsumexp")
     assert list(losses) == LOSSES
-    for key in LOSSES:
-        torch.testing.assert_close(losses[key], expected[key], rtol=1e-9, atol=1e-9)
+    check("OSR-v", losses.values(), expected.values(), tolerance=1e-9)
 
     # The sum of ours is correct training; the plain one needs each group by itself.
     actor = list(restated.policy_net.parameters())
@@ -160,8 +159,7 @@ def test_losses_and_gradients_equal_the_restatement(
     ours = [p.grad for p in loss.actor_network_params.values(True, True)]
     ours += [p.grad for p in loss.qvalue_network_params.values(True, True)]
     ours.append(loss.log_alpha.grad)
-    for got, gradient in zip(ours, wanted, strict=True):
-        torch.testing.assert_close(got, gradient, rtol=1e-9, atol=1e-9)
+    check("OSR-v", ours, wanted, tolerance=1e-9)
 
 
 def test_metrics_say_what_they_are_called(make_networks, make_batch) -> None:

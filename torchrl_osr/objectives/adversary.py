@@ -43,8 +43,8 @@ class Adversary:
 
     * ``"action_diff"``: :math:`KL(\pi(s) \| \pi(\hat s)) + KL(\pi(\hat s) \| \pi(s))`;
     * ``"min_Q"``: :math:`-\frac1N \sum_i Q_i(s, a)` with the deterministic action
-      :math:`a = \tanh(\mu(\hat s))`. The critics see the true state: what counts is
-      where the misled action leads from there.
+      :math:`a = \tanh(\mu(\hat s))`, within its bounds. The critics see the true
+      state: what counts is where the misled action leads from there.
 
     The methods, with the names of the RORL attacks:
 

@@ -72,6 +72,12 @@ class CategoricalActorCritic(RecoveryActorCriticLoss):
         self, states: TensorDictBase, params: TensorDictParams, pi: Any
     ) -> Tensor:
         """Return the values of all actions, ``[N, B, n]``; ``pi`` tells ``n``."""
+        if self.tensor_keys.action in self.qvalue_network.in_keys:
+            raise ValueError(
+                f"The critics read {self.tensor_keys.action!r}: for discrete actions a "
+                "critic reads the state alone and values every action, see "
+                "torchrl_osr.modules.discrete_critic_ensemble."
+            )
         batch = self._critic_inputs(states)
         qvalue = self._critics(batch, params, self.tensor_keys.action_value)
         check_num_actions("qvalue_network", qvalue.shape[-1], pi.logits.shape[-1])

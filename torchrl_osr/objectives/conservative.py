@@ -7,10 +7,11 @@ sampled actions of a kind. The equations are in :mod:`torchrl_osr.functional`.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictParams
 from torch import Tensor
 from torchrl.modules import TanhNormal
 from torchrl.modules.distributions.utils import rsample_and_log_prob
@@ -18,6 +19,7 @@ from torchrl.objectives.utils import _vmap_func
 
 from torchrl_osr import functional
 from torchrl_osr.objectives.base import check_weight
+from torchrl_osr.objectives.chunks import chunked, is_rowwise
 from torchrl_osr.objectives.tanh_gaussian import TanhGaussianActorCritic
 
 
@@ -35,6 +37,7 @@ class ConservativeCritics(TanhGaussianActorCritic):
         with_lagrange: bool,
         lagrange_thresh: float,
         diversity_weight: float,
+        chunk_size: int | None,
         **options: Any,
     ) -> None:
         check_weight("min_q_weight", min_q_weight)
@@ -46,7 +49,13 @@ class ConservativeCritics(TanhGaussianActorCritic):
                 "clip_diff_min must be below clip_diff_max, got "
                 f"{clip_diff[0]} and {clip_diff[1]}."
             )
+        if chunk_size is not None and chunk_size < 1:
+            raise ValueError(
+                f"chunk_size must be at least 1 or None, got {chunk_size}."
+            )
         super().__init__(*networks, **options)
+        self.chunk_size = chunk_size
+        self.rowwise = is_rowwise(self.qvalue_network)
         if diversity_weight and self.num_qvalue_nets < 2:
             raise ValueError(
                 f"diversity_weight={diversity_weight} compares critics with each "
@@ -152,20 +161,74 @@ class ConservativeCritics(TanhGaussianActorCritic):
     ) -> tuple[Tensor, Tensor]:
         """Return the values of the data's actions and CQL's gap, each ``[N, B]``."""
         action, log_prob = self._proposals(policy[:2].detach(), data_action)
-        # One pass of the critics for the data's action and all proposals.
-        action = torch.cat([data_action.unsqueeze(0), action])
-        clean = states[0].expand(action.shape[:-1])
-        qvalue = self._qvalue(clean, action, self.qvalue_network_params)
-        pred_value, sampled = qvalue[:, 0], qvalue[:, 1:].movedim(1, -1)
-        gap = functional.conservative_gap(
-            sampled,
-            log_prob.movedim(0, -1) if self.importance_sample else None,
-            pred_value,
-            temperature=self.temperature,
-        )
+        params = self.qvalue_network_params
+        if self.chunk_size is not None and self._can_be_chunked(data_action):
+            pred_value = self._qvalue(states[0], data_action, params)
+            gap = self._chunked_soft_maximum(states[0], action, log_prob, data_action)
+            gap = gap - pred_value
+        else:
+            # One pass of the critics for the data's action and all proposals.
+            action = torch.cat([data_action.unsqueeze(0), action])
+            clean = states[0].expand(action.shape[:-1])
+            qvalue = self._qvalue(clean, action, params)
+            pred_value, sampled = qvalue[:, 0], qvalue[:, 1:].movedim(1, -1)
+            gap = functional.conservative_gap(
+                sampled,
+                log_prob.movedim(0, -1) if self.importance_sample else None,
+                pred_value,
+                temperature=self.temperature,
+            )
         if self.clip_diff != (-math.inf, math.inf):
             gap = gap.clamp(*self.clip_diff)
         return pred_value, gap
+
+    def _can_be_chunked(self, like: Tensor) -> bool:
+        """Return whether the critics may take the path that a CPU's cache likes."""
+        return (
+            self.rowwise
+            and like.device.type == "cpu"
+            and torch.is_grad_enabled()
+            and not torch.compiler.is_compiling()
+        )
+
+    def _chunked_soft_maximum(
+        self,
+        state: TensorDictBase,
+        action: Tensor,
+        log_prob: Tensor,
+        data_action: Tensor,
+    ) -> Tensor:
+        """Return the log-sum-exp of the conservative gap, ``[N, B]``."""
+        if not self.importance_sample:
+            action = torch.cat([action, data_action.unsqueeze(0)])
+        batch = data_action.shape[:-1]
+        state = self._critic_inputs(state).reshape(-1)
+        action = action.reshape(len(action), -1, action.shape[-1])
+        density = log_prob.flatten(1).T if self.importance_sample else None
+
+        def soft_maximum(params: TensorDictParams, rows: slice) -> Tensor:
+            chunk = action[:, rows]
+            states = state[rows].expand(chunk.shape[:-1])
+            qvalue = self._qvalue(states, chunk, params).movedim(1, -1)
+            return functional.soft_maximum(
+                qvalue,
+                None if density is None else density[rows],
+                temperature=self.temperature,
+            )
+
+        params, size = self.qvalue_network_params, cast(int, self.chunk_size)
+        value = chunked(soft_maximum, params, batch.numel(), size)
+        return value.reshape(-1, *batch)
+
+    def _in_chunks(self, like: Tensor) -> bool:
+        """Return whether the critics take the path that a CPU's cache likes."""
+        return (
+            self.chunk_size is not None
+            and like.device.type == "cpu"
+            and self.rowwise
+            and torch.is_grad_enabled()
+            and not torch.compiler.is_compiling()
+        )
 
     def _action_gradients(self, state: TensorDictBase, action: Tensor) -> Tensor:
         """Return the gradient of each critic by the action, ``[N, B, A]``."""

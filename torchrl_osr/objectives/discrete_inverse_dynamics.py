@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
-from torchrl_osr.objectives.base import Reduction, check_choice
+from torchrl_osr.objectives.base import Reduction
 from torchrl_osr.objectives.distributions import action_index, check_categorical
 from torchrl_osr.objectives.inverse_dynamics import InverseDynamicsLoss
 
@@ -68,13 +68,10 @@ class DiscreteInverseDynamicsLoss(InverseDynamicsLoss):
         states: Literal["both", "clean"] = "both",
         reduction: Reduction = None,
     ) -> None:
-        check_choice("states", states, ("both", "clean"))
-        # Past the parent's own constructor, which asks for a TanhNormal.
-        super(InverseDynamicsLoss, self).__init__(reduction)
-        check_categorical(inverse_dynamics_network, "inverse_dynamics_network")
-        self.convert_to_functional(inverse_dynamics_network, "inverse_dynamics_network")
-        self.states = states
-        self.has_latent = False
+        super().__init__(inverse_dynamics_network, states=states, reduction=reduction)
+
+    def _check_distribution(self, network: ProbabilisticTensorDictSequential) -> None:
+        check_categorical(network, "inverse_dynamics_network")
 
     def _action_loss(self, output: TensorDictBase, action: Tensor) -> Tensor:
         model = self.inverse_dynamics_network.build_dist_from_params(output)

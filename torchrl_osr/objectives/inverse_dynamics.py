@@ -139,12 +139,16 @@ class InverseDynamicsLoss(BaseLoss):
         check_choice("loss_function", loss_function, ("nll", "mse"))
         check_weight("latent_weight", latent_weight)
         super().__init__(reduction)
-        action_bounds(inverse_dynamics_network, "inverse_dynamics_network")
+        self._check_distribution(inverse_dynamics_network)
         self.convert_to_functional(inverse_dynamics_network, "inverse_dynamics_network")
         self.states = states
         self.loss_function = loss_function
         self.latent_weight = latent_weight
         self.has_latent = set(LATENT_KEYS) <= set(inverse_dynamics_network.out_keys)
+
+    def _check_distribution(self, network: ProbabilisticTensorDictSequential) -> None:
+        """Raise unless the network's distribution is what the loss computes with."""
+        action_bounds(network, "inverse_dynamics_network")
 
     def _input_keys(self) -> list[NestedKey]:
         network_keys = self.inverse_dynamics_network.in_keys

@@ -93,6 +93,10 @@ class OSRLoss(ConservativeCritics):
         lagrange_thresh: the tolerated gap, in units of the value. Default 0.0.
         diversity_weight: EDAC's :math:`\eta`, weight of the similarity of the critics'
             gradients by the action. Default 0.0, which leaves it out for good.
+        chunk_size: on a CPU, how many states of a batch go through the critics at a
+            time, with all their sampled actions, so that activations stay in the
+            cache; for networks of linear layers, layer normalisation and activations
+            only. ``None`` for all at once. Default 64. No effect on the mathematics.
         num_qvalue_nets: ``N``, for a single critic; a list has its own length.
             Default 2.
         loss_function: distance of the TD error: ``"l2"`` (default), ``"l1"`` or
@@ -162,6 +166,7 @@ class OSRLoss(ConservativeCritics):
         with_lagrange: bool = False,
         lagrange_thresh: float = 0.0,
         diversity_weight: float = 0.0,
+        chunk_size: int | None = 64,
         num_qvalue_nets: int = 2,
         loss_function: str = "l2",
         alpha_init: float = 1.0,
@@ -199,6 +204,7 @@ class OSRLoss(ConservativeCritics):
             with_lagrange=with_lagrange,
             lagrange_thresh=lagrange_thresh,
             diversity_weight=diversity_weight,
+            chunk_size=chunk_size,
             num_qvalue_nets=num_qvalue_nets,
             loss_function=loss_function,
             alpha_init=alpha_init,

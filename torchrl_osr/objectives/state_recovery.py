@@ -54,7 +54,8 @@ class StateRecoveryLoss(BaseLoss):
     writes the action) is pulled to the model's mean, by
     :func:`~torchrl_osr.functional.deterministic_recovery`: an addition, not in the
     paper. A module should squash its action itself, with a tanh at its end: beyond the
-    bounds the gradient is finite, but huge.
+    bounds the gradient is finite, but huge. Where that tanh has saturated there is no
+    gradient; with a ``TanhDelta`` there is.
 
     Args:
         actor_network: ends in a :class:`~torchrl.modules.TanhNormal`, or deterministic.

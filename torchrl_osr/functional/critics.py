@@ -1,0 +1,190 @@
+"""What the critics minimise.
+
+Shapes: ``B`` batch (any leading dimensions), ``A`` action, ``N`` critics, ``M``
+sampled actions of one state.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def td_target(
+    reward: Tensor, terminated: Tensor, next_qvalue: Tensor, gamma: float | Tensor
+) -> Tensor:
+    r"""Return the one-step target of equation (2) with the pessimistic ensemble value.
+
+    .. math::
+        r + \gamma\,(1 - \text{terminated})\,\min_i \bar Q_i(s', a'),
+        \quad a' \sim \pi(s')
+
+    ``terminated``, not ``done``: a time-out cuts the recording, not the task. A value
+    at a terminated ``s'`` is ignored even when it is not finite.
+
+    ``OSRLoss`` reaches the same number through the value estimator that its user
+    chose with ``make_value_estimator``; this is its default, TD(0), spelled out.
+
+    Args:
+        reward: ``[B]``.
+        terminated: bool, ``[B]``.
+        next_qvalue: target networks' values of the policy's action at ``s'``,
+            ``[N, B]``.
+        gamma: discount factor.
+
+    Returns:
+        ``[B]``.
+    """
+    next_value = next_qvalue.min(0).values
+    return reward + gamma * torch.where(terminated, 0.0, next_value)
+
+
+def soft_maximum(
+    qvalue: Tensor, log_prob: Tensor | None, *, temperature: float = 1.0
+) -> Tensor:
+    r"""Return the log-sum-exp of values of sampled actions, weighted by densities.
+
+    .. math::
+        \tau \log \sum_{j=1}^{M} \exp\!\big((Q(s, a_j) - \log p(a_j)) / \tau\big)
+
+    Args:
+        qvalue: values of the sampled actions, ``[B, M]``.
+        log_prob: log-density of each action under what drew it, ``[B, M]``, or
+            ``None`` for a plain sum.
+        temperature: :math:`\tau`, in units of the value.
+
+    Returns:
+        ``[B]``.
+    """
+    logits = qvalue if log_prob is None else qvalue - log_prob
+    return temperature * torch.logsumexp(logits / temperature, -1)
+
+
+def conservative_gap(
+    sampled_qvalue: Tensor,
+    sampled_log_prob: Tensor | None,
+    data_qvalue: Tensor,
+    *,
+    temperature: float = 1.0,
+) -> Tensor:
+    r"""Return the CQL(H) regulariser with importance-weighted actions.
+
+    .. math::
+        \tau \log \sum_{j=1}^{M} \exp\!\big((Q(s, a_j) - \log p(a_j)) / \tau\big)
+        - Q(s, a)
+
+    with ``M = 3K`` actions: uniform, from ``pi(s)`` and from ``pi(s')``, *all scored
+    at* ``s`` and all in one log-sum-exp ("Conservative Q-Learning", Kumar et al.
+    2020, appendix F, https://arxiv.org/abs/2006.04779). The paper prints the simpler
+    (3); its authors' code, like the reference CQL code, computes this. As there, the
+    sum is not divided by ``M``: a constant, without effect on the gradient.
+
+    Without densities the sum is plain, and the data's action is one of its ``M + 1``
+    terms, as in the reference CQL code (its ``min_q_version=2``) and in CORL with
+    ``cql_importance_sample=False``.
+
+    TorchRL 0.14.1 ``CQLLoss`` differs: it takes the log-sum-exp over three actions at
+    a time and scores the actions of ``pi(s')`` at ``s'``.
+
+    Args:
+        sampled_qvalue: values of the sampled actions at ``s``, ``[B, M]``.
+        sampled_log_prob: log-density of each action under what drew it, ``[B, M]``, or
+            ``None`` for a plain sum.
+        data_qvalue: value of the data's action, ``[B]``.
+        temperature: :math:`\tau`, in units of the value.
+
+    Returns:
+        ``[B]``.
+    """
+    if sampled_log_prob is None:
+        sampled_qvalue = torch.cat([sampled_qvalue, data_qvalue.unsqueeze(-1)], -1)
+    soft = soft_maximum(sampled_qvalue, sampled_log_prob, temperature=temperature)
+    return soft - data_qvalue
+
+
+def lagrange_terms(
+    gap: Tensor, log_multiplier: Tensor, threshold: float
+) -> tuple[Tensor, Tensor]:
+    r"""Return both sides of CQL's Lagrangian, each to be minimised.
+
+    .. math::
+        \max_{\alpha' \ge 0} \min_Q \; \alpha' \, (\text{gap}(Q) - \tau)
+
+    CQL's appendix F (https://arxiv.org/abs/2006.04779). The multiplier is constant in
+    the critics' term and the gap is constant in the multiplier's, so that one backward
+    over the sum of both moves each the right way. TorchRL 0.14.1 ``CQLLoss`` detaches
+    neither: there the multiplier's loss raises the gap.
+
+    Args:
+        gap: the conservative gap, ``[B]``.
+        log_multiplier: :math:`\log\alpha'`, a scalar.
+        threshold: :math:`\tau`, the gap that is tolerated, in units of the value.
+
+    Returns:
+        The critics' term and the multiplier's, each ``[B]``.
+    """
+    # The bound is that of the reference code: a gap that cannot be closed would let
+    # the multiplier overflow.
+    multiplier = log_multiplier.exp().clamp(max=1e6)
+    excess = gap - threshold
+    return multiplier.detach() * excess, -multiplier * excess.detach()
+
+
+def value_constraint(
+    policy_qvalue: Tensor,
+    inverse_dynamics_qvalue: Tensor,
+    *,
+    log_prob: Tensor | None = None,
+    temperature: float = 1.0,
+) -> Tensor:
+    r"""Return OSR-v's constraint on the values, equation (8).
+
+    .. math::
+        \mathbb E_{\hat a \sim \pi(\tilde s)} Q(\tilde s, \hat a)
+        - \mathbb E_{a \sim I(\tilde s, s')} Q(\tilde s, a)
+
+    Minimised over Q, it lowers actions with unknown consequences and raises those that
+    lead to ``s'``. With ``log_prob`` the first expectation is a log-sum-exp over
+    importance-weighted actions instead, as in :func:`conservative_gap`: an addition,
+    not in the paper, which puts the weight on the actions that Q overrates.
+
+    Args:
+        policy_qvalue: values of the sampled actions at ``s~``, ``[B, M]``.
+        inverse_dynamics_qvalue: values of the model's actions at ``s~``, ``[B, K]``.
+        log_prob: log-density of each sampled action under what drew it, ``[B, M]``.
+            Default ``None``, the paper's plain mean.
+        temperature: of the log-sum-exp, in units of the value.
+
+    Returns:
+        ``[B]``.
+    """
+    target = inverse_dynamics_qvalue.mean(-1)
+    if log_prob is None:
+        return policy_qvalue.mean(-1) - target
+    return conservative_gap(policy_qvalue, log_prob, target, temperature=temperature)
+
+
+def gradient_diversity(action_gradients: Tensor) -> Tensor:
+    r"""Return EDAC's ensemble similarity, to be minimised.
+
+    .. math::
+        \frac{1}{N - 1} \sum_{i \ne j} \Big\langle
+            \frac{\nabla_a Q_i(s, a)}{\|\nabla_a Q_i(s, a)\|},
+            \frac{\nabla_a Q_j(s, a)}{\|\nabla_a Q_j(s, a)\|} \Big\rangle
+
+    "Uncertainty-Based Offline Reinforcement Learning with Diversified Q-Ensemble" (An
+    et al. 2021, equation 4), https://arxiv.org/abs/2110.01548.
+
+    Args:
+        action_gradients: of each critic at the data's action, ``[N, B, A]``,
+            ``N >= 2``.
+
+    Returns:
+        ``[B]``, between -N / (N - 1) and N.
+    """
+    number = action_gradients.shape[0]
+    # Without eps: a dead critic's zero gradient would be 0 / 0.
+    unit = torch.nn.functional.normalize(action_gradients, dim=-1, eps=1e-10)
+    # All pairs at once: |sum_i g_i|^2 - sum_i |g_i|^2, with |g_i| = 1.
+    pairs = unit.sum(0).square().sum(-1) - unit.square().sum((0, -1))
+    return pairs / (number - 1)
