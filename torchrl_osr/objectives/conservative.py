@@ -11,15 +11,14 @@ from typing import Any, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictParams
 from torch import Tensor
 from torchrl.modules import TanhNormal
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives.utils import _vmap_func
 
 from torchrl_osr import functional
+from torchrl_osr.objectives import mlp_critics
 from torchrl_osr.objectives.base import check_weight
-from torchrl_osr.objectives.chunks import chunked, is_rowwise
 from torchrl_osr.objectives.tanh_gaussian import TanhGaussianActorCritic
 
 
@@ -55,7 +54,6 @@ class ConservativeCritics(TanhGaussianActorCritic):
             )
         super().__init__(*networks, **options)
         self.chunk_size = chunk_size
-        self.rowwise = is_rowwise(self.qvalue_network)
         if diversity_weight and self.num_qvalue_nets < 2:
             raise ValueError(
                 f"diversity_weight={diversity_weight} compares critics with each "
@@ -162,9 +160,9 @@ class ConservativeCritics(TanhGaussianActorCritic):
         """Return the values of the data's actions and CQL's gap, each ``[N, B]``."""
         action, log_prob = self._proposals(policy[:2].detach(), data_action)
         params = self.qvalue_network_params
-        if self.chunk_size is not None and self._can_be_chunked(data_action):
+        if self._takes_the_fast_path(states[0], data_action):
             pred_value = self._qvalue(states[0], data_action, params)
-            gap = self._chunked_soft_maximum(states[0], action, log_prob, data_action)
+            gap = self._fast_soft_maximum(states[0], action, log_prob, data_action)
             gap = gap - pred_value
         else:
             # One pass of the critics for the data's action and all proposals.
@@ -182,16 +180,19 @@ class ConservativeCritics(TanhGaussianActorCritic):
             gap = gap.clamp(*self.clip_diff)
         return pred_value, gap
 
-    def _can_be_chunked(self, like: Tensor) -> bool:
-        """Return whether the critics may take the path that a CPU's cache likes."""
+    def _takes_the_fast_path(self, state: TensorDictBase, action: Tensor) -> bool:
+        """Return whether plain MLP critics shall be run chunk by chunk, on a CPU."""
         return (
-            self.rowwise
-            and like.device.type == "cpu"
+            self.chunk_size is not None
+            and self._plain_layers() is not None
+            and action.device.type == "cpu"
             and torch.is_grad_enabled()
+            and not torch.is_autocast_enabled("cpu")
             and not torch.compiler.is_compiling()
+            and not any(value.requires_grad for value in state.values(True, True))
         )
 
-    def _chunked_soft_maximum(
+    def _fast_soft_maximum(
         self,
         state: TensorDictBase,
         action: Tensor,
@@ -201,34 +202,16 @@ class ConservativeCritics(TanhGaussianActorCritic):
         """Return the log-sum-exp of the conservative gap, ``[N, B]``."""
         if not self.importance_sample:
             action = torch.cat([action, data_action.unsqueeze(0)])
-        batch = data_action.shape[:-1]
-        state = self._critic_inputs(state).reshape(-1)
-        action = action.reshape(len(action), -1, action.shape[-1])
-        density = log_prob.flatten(1).T if self.importance_sample else None
-
-        def soft_maximum(params: TensorDictParams, rows: slice) -> Tensor:
-            chunk = action[:, rows]
-            states = state[rows].expand(chunk.shape[:-1])
-            qvalue = self._qvalue(states, chunk, params).movedim(1, -1)
-            return functional.soft_maximum(
-                qvalue,
-                None if density is None else density[rows],
-                temperature=self.temperature,
-            )
-
-        params, size = self.qvalue_network_params, cast(int, self.chunk_size)
-        value = chunked(soft_maximum, params, batch.numel(), size)
-        return value.reshape(-1, *batch)
-
-    def _in_chunks(self, like: Tensor) -> bool:
-        """Return whether the critics take the path that a CPU's cache likes."""
-        return (
-            self.chunk_size is not None
-            and like.device.type == "cpu"
-            and self.rowwise
-            and torch.is_grad_enabled()
-            and not torch.compiler.is_compiling()
+        value = mlp_critics.soft_maximum(
+            self.qvalue_network_params,
+            cast(list[str], self._plain_layers()),
+            self._critic_state(state).flatten(0, -2),
+            action.flatten(1, -2),
+            log_prob.flatten(1) if self.importance_sample else None,
+            temperature=self.temperature,
+            chunk_size=cast(int, self.chunk_size),
         )
+        return value.reshape(-1, *data_action.shape[:-1])
 
     def _action_gradients(self, state: TensorDictBase, action: Tensor) -> Tensor:
         """Return the gradient of each critic by the action, ``[N, B, A]``."""

@@ -1,4 +1,4 @@
-"""The inverse dynamics model inside a loss: run on D_tot, frozen where it teaches.
+"""How a loss runs its networks: the frozen inverse dynamics model, half precision.
 
 Shapes: ``B`` batch (any leading dimensions), ``D`` state sets of D_tot (2 or 1).
 """
@@ -17,6 +17,18 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from torchrl_osr.objectives.mixed_states import States, transitions
+
+
+def full_precision(output: TensorDictBase) -> TensorDictBase:
+    """Return what layers wrote in half precision, under autocast, as float32.
+
+    Densities, divergences and log-sum-exps are differences of large numbers: they are
+    computed from it in float32.
+    """
+    if not (torch.is_autocast_enabled("cpu") or torch.is_autocast_enabled("cuda")):
+        return output
+    half = (torch.bfloat16, torch.float16)
+    return output.apply(lambda value: value.float() if value.dtype in half else value)
 
 
 def freeze(params: TensorDictParams) -> TensorDictParams:
@@ -59,5 +71,6 @@ def frozen_distribution(
         params.to_module(network, preserve_module_state=False),
         set_interaction_type(InteractionType.DETERMINISTIC),
     ):
-        distribution: Distribution = network.get_dist(batch)
+        output = full_precision(network.get_dist_params(batch))
+    distribution: Distribution = network.build_dist_from_params(output)
     return distribution

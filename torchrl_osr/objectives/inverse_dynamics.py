@@ -27,6 +27,7 @@ from torchrl_osr.objectives.base import (
     check_weight,
 )
 from torchrl_osr.objectives.distributions import action_bounds, check_action
+from torchrl_osr.objectives.frozen_model import full_precision
 from torchrl_osr.objectives.mixed_states import (
     column,
     entry,
@@ -182,7 +183,7 @@ class InverseDynamicsLoss(BaseLoss):
             ),
             set_interaction_type(InteractionType.RANDOM),
         ):
-            return self.inverse_dynamics_network.get_dist_params(batch)
+            return full_precision(self.inverse_dynamics_network.get_dist_params(batch))
 
     def _action_loss(self, output: TensorDictBase, action: Tensor) -> Tensor:
         """Return how badly the network tells the data's action, ``[1 or 2, B]``."""

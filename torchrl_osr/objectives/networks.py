@@ -31,7 +31,11 @@ from torchrl_osr.objectives.base import (
     check_choice,
 )
 from torchrl_osr.objectives.distributions import check_apart
-from torchrl_osr.objectives.frozen_model import freeze, frozen_distribution
+from torchrl_osr.objectives.frozen_model import (
+    freeze,
+    frozen_distribution,
+    full_precision,
+)
 from torchrl_osr.objectives.mixed_states import (
     States,
     column,
@@ -243,7 +247,7 @@ class ActorCriticNetworks(BaseLoss):
         with self.actor_network_params.to_module(
             self.actor_network, preserve_module_state=False
         ):
-            return self.actor_network.get_dist_params(states.copy())
+            return full_precision(self.actor_network.get_dist_params(states.copy()))
 
     def _distribution(self, policy: TensorDictBase) -> Any:
         return self.actor_network.build_dist_from_params(policy)
@@ -252,7 +256,7 @@ class ActorCriticNetworks(BaseLoss):
         self, batch: TensorDictBase, params: TensorDictParams, key: NestedKey
     ) -> Tensor:
         """Return what all critics write under ``key``, ``[N, B, ...]``."""
-        value = self._vmap_qvalue(batch, params).get(key, None)
+        value = full_precision(self._vmap_qvalue(batch, params)).get(key, None)
         if value is None:
             raise KeyError(
                 f"The critics write {self.qvalue_network.out_keys}, not {key!r}: give "

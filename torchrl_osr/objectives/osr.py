@@ -93,10 +93,9 @@ class OSRLoss(ConservativeCritics):
         lagrange_thresh: the tolerated gap, in units of the value. Default 0.0.
         diversity_weight: EDAC's :math:`\eta`, weight of the similarity of the critics'
             gradients by the action. Default 0.0, which leaves it out for good.
-        chunk_size: on a CPU, how many states of a batch go through the critics at a
-            time, with all their sampled actions, so that activations stay in the
-            cache; for networks of linear layers, layer normalisation and activations
-            only. ``None`` for all at once. Default 64. No effect on the mathematics.
+        chunk_size: on a CPU, how many states go through the critics at a time, with
+            all their sampled actions, if the critics are plain MLPs; ``None`` for all
+            at once, as other networks go. Default 64. The mathematics is the same.
         num_qvalue_nets: ``N``, for a single critic; a list has its own length.
             Default 2.
         loss_function: distance of the TD error: ``"l2"`` (default), ``"l1"`` or

@@ -17,6 +17,7 @@ from torchrl.modules import TanhNormal
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 
 from torchrl_osr import functional
+from torchrl_osr.objectives import mlp_critics
 from torchrl_osr.objectives.actor_critic import RecoveryActorCriticLoss
 from torchrl_osr.objectives.adversary import Adversary
 from torchrl_osr.objectives.distributions import (
@@ -114,10 +115,23 @@ class TanhGaussianActorCritic(RecoveryActorCriticLoss):
         check_action(action, pi.loc.shape[-1], key)
         return action
 
+    def _plain_layers(self) -> list[str] | None:
+        """Return the names of the critics' linear layers, if they are plain MLPs."""
+        return mlp_critics.linear_layers(self.qvalue_network, self.tensor_keys.action)
+
+    def _critic_state(self, states: TensorDictBase) -> Tensor:
+        """Return what plain critics read besides the action, ``[B, S]``."""
+        keys = self.qvalue_network.in_keys[:-1]
+        return torch.cat([states.get(key) for key in keys], -1)
+
     def _qvalue(
         self, states: TensorDictBase, action: Tensor, params: TensorDictParams
     ) -> Tensor:
         """Return the values of all critics, ``[N, B]``, at states and actions."""
+        layers = self._plain_layers()
+        if layers is not None:
+            state = self._critic_state(states)
+            return mlp_critics.qvalue(params, layers, state, action)
         batch = self._critic_inputs(states)
         batch.set(self.tensor_keys.action, action)
         key = self.tensor_keys.state_action_value
