@@ -42,6 +42,7 @@ from torchrl_osr.evaluation.inverse_dynamics import describe, inverse_dynamics_r
 from torchrl_osr.evaluation.summary import score_table
 from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
 from torchrl_osr.trainers import OfflineTrainer, run_folder
+from torchrl_osr.trainers.hardware import check_hardware
 from torchrl_osr.trainers.loggers import make_loggers
 
 EVALUATION_SEED = 10_000  # far from the seeds of the data's episodes
@@ -65,8 +66,9 @@ def run(cfg: DictConfig, folder: Path) -> float:
     """Data, inverse dynamics model, policy, report."""
     torchrl_logger.setLevel("WARNING")
     torch.set_num_threads(cfg.trainer.num_threads)
+    torch.set_float32_matmul_precision(cfg.trainer.matmul_precision)
     torch.manual_seed(cfg.seed)
-    device = torch.device(cfg.trainer.device)
+    device, autocast = check_hardware(cfg.trainer.device, cfg.trainer.precision)
 
     # Data: standardised once, the same numbers for every batch and every evaluation.
     data, manifest = load_local_dataset(
@@ -95,6 +97,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
         "log_interval": cfg.trainer.log_interval,
         "checkpoint_interval": cfg.trainer.checkpoint_interval,
         "progress": cfg.trainer.progress,
+        "autocast_dtype": autocast,
     }
 
     # Networks.

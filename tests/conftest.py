@@ -8,6 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict, unravel_key
 from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
 from torchrl.modules import (
     MLP,
     NormalParamExtractor,
@@ -80,6 +81,7 @@ def make_networks():
         num_critics: int = 2,
         seed: int = 0,
         distribution_class: type = TanhNormal,
+        critic_activation: type[nn.Module] = nn.Tanh,
     ) -> SimpleNamespace:
         torch.manual_seed(seed)
         kwargs = {"low": low, "high": high} if distribution_class is TanhNormal else {}
@@ -105,7 +107,12 @@ def make_networks():
             actor=probabilistic(observation),
             critics=[
                 ValueOperator(
-                    MLP(OBSERVATION_DIM + ACTION_DIM, 1, num_cells=[8]),
+                    MLP(
+                        OBSERVATION_DIM + ACTION_DIM,
+                        1,
+                        num_cells=[8],
+                        activation_class=critic_activation,
+                    ),
                     in_keys=[observation, action],
                     out_keys=["state_action_value"],
                 ).double()

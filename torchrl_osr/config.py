@@ -116,6 +116,8 @@ class TrainerConfig:
         checkpoint_interval: steps between checkpoints.
         num_threads: torch threads; several fight where the machine is shared.
         device: cpu or cuda.
+        precision: float32 or bfloat16, of the losses' matrix products.
+        matmul_precision: torch's, of float32 products: highest, high or medium.
         progress: progress bars, when on a terminal.
     """
 
@@ -129,6 +131,8 @@ class TrainerConfig:
     checkpoint_interval: int = MISSING
     num_threads: int = MISSING
     device: str = MISSING
+    precision: str = MISSING
+    matmul_precision: str = MISSING
     progress: bool = MISSING
 
 

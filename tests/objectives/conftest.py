@@ -1,14 +1,41 @@
-"""Small networks and transitions with discrete actions."""
+"""The family of losses: how each is built, and what its contract says.
+
+A test with an argument ``name`` runs once for every loss; the arguments in ``PARTS``
+stand for some of them. ``family`` and ``family_batch`` build what the name says.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
 import torch
-from tensordict import TensorDict, unravel_key
+from tensordict import NestedKey, TensorDict, unravel_key
 from tensordict.nn import TensorDictModule
-from torchrl.modules import MLP, OneHotCategorical, ProbabilisticActor
+from torch import Tensor, nn
+from torch.distributions import Categorical
+from torchrl.modules import (
+    MLP,
+    Actor,
+    OneHotCategorical,
+    ProbabilisticActor,
+    TanhDelta,
+)
+from torchrl.objectives import LossModule, SoftUpdate
+
+from torchrl_osr import (
+    Adversary,
+    DiscreteInverseDynamicsLoss,
+    DiscreteOSRLoss,
+    InverseDynamicsLoss,
+    OSRLoss,
+    OSRVLoss,
+    StateRecoveryLoss,
+)
+from torchrl_osr.modules import cvae_inverse_dynamics
 
 NUM_ACTIONS = 4
 
@@ -71,3 +98,410 @@ def make_discrete_batch(make_batch):
         return batch
 
     return make
+
+
+class Squash(nn.Module):
+    """The last layer of a plain actor: a tanh and the action's bounds."""
+
+    def __init__(self, low=-1.0, high=1.0) -> None:
+        super().__init__()
+        self.center, self.half = (high + low) / 2, (high - low) / 2
+
+    def forward(self, value: Tensor) -> Tensor:
+        return self.center + self.half * torch.tanh(value)
+
+
+def deterministic_actor(
+    kind: str, *, observation="observation", action="action", seed: int = 0, **bounds
+):
+    """A deterministic actor, float64.
+
+    Args:
+        kind: ``"delta"`` ends in a TanhDelta, ``"actor"`` is TorchRL's Actor,
+            ``"module"`` a bare module.
+        observation, action: its keys.
+        seed: of the weights.
+        bounds: ``low``, ``high`` and further options of the TanhDelta.
+    """
+    torch.manual_seed(seed)
+    mlp = MLP(3, 2, num_cells=[8])
+    if kind == "delta":
+        return ProbabilisticActor(
+            TensorDictModule(mlp, [observation], ["param"]),
+            in_keys=["param"],
+            out_keys=[action],
+            distribution_class=TanhDelta,
+            distribution_kwargs=bounds,
+        ).double()
+    network = nn.Sequential(mlp, Squash(**bounds))
+    actor_class = Actor if kind == "actor" else TensorDictModule
+    return actor_class(network, in_keys=[observation], out_keys=[action]).double()
+
+
+@pytest.fixture
+def make_deterministic_actor():
+    """Return a factory, see :func:`deterministic_actor`."""
+    return deterministic_actor
+
+
+def latent_model(*, observation, action, seed: int):
+    """The conditional VAE, float64; ``action`` is not among its inputs."""
+    torch.manual_seed(seed)
+    model = cvae_inverse_dynamics(3, 2, latent_dim=2, num_cells=[8]).double()
+    model.in_keys = [observation, unravel_key(("next", observation))]
+    model[0].in_keys = model.in_keys
+    return model
+
+
+ACTOR, CRITICS, MODEL = (
+    f"{network}_network_params" for network in ("actor", "qvalue", "inverse_dynamics")
+)
+NEXT, TWIN = ("next", "observation"), ("perturbed", "observation")
+TRANSITION = ["observation", "action", NEXT]
+TRANSITION += [("next", key) for key in ("reward", "done", "terminated")]
+MODEL_KEYS = {key: key for key in ("action", "done", "perturbed")}
+RECOVERY_KEYS = MODEL_KEYS | {"priority_weight": "priority_weight"}
+CRITIC_KEYS = RECOVERY_KEYS | {
+    "value": "state_value",
+    "reward": "reward",
+    "terminated": "terminated",
+    "priority": "td_error",
+}
+WEIGHTS = {
+    "recovery_weight": ["loss_recovery"],
+    "min_q_weight": ["loss_cql", "loss_alpha_prime"],
+    "diversity_weight": ["loss_diversity"],
+}
+
+
+@dataclass(frozen=True)
+class Member:
+    """A loss: the class and its options, and what the contract expects.
+
+    Attributes:
+        loss_class: is given those of the networks that it takes, and ``options``.
+        groups: the parameters that each ``loss_*`` trains, in the order of the losses.
+        metrics: what else it writes, after the losses.
+        in_keys: what it reads, in this order.
+        keys: what can be renamed, with the defaults.
+        options: keywords of the loss.
+        networks: keywords of the networks' factory.
+        replace: factories of networks that stand in the place of the usual ones.
+    """
+
+    loss_class: type[LossModule]
+    groups: dict[str, str]
+    metrics: list[str]
+    in_keys: list[NestedKey]
+    keys: dict[str, str]
+    options: dict[str, object] = field(default_factory=dict)
+    networks: dict[str, object] = field(default_factory=dict)
+    replace: dict[str, Callable] = field(default_factory=dict)
+
+    @property
+    def out_keys(self) -> list[str]:
+        return [*self.groups, *self.metrics]
+
+    @property
+    def reads_twin(self) -> bool:
+        return TWIN in self.in_keys
+
+    @property
+    def has_critics(self) -> bool:
+        return CRITICS in self.groups.values()
+
+    @property
+    def discrete(self) -> bool:
+        return self.loss_class in (DiscreteOSRLoss, DiscreteInverseDynamicsLoss)
+
+    @property
+    def index(self) -> bool:
+        """Whether actions are indices and not one-hot."""
+        return self.networks.get("distribution_class") is Categorical
+
+    @property
+    def parts(self) -> list[str]:
+        """The networks that the loss is given, in this order."""
+        if MODEL in self.groups.values():
+            return ["inverse_dynamics"]
+        return ["actor", *["critics"] * self.has_critics, "inverse_dynamics"]
+
+    @property
+    def weights(self) -> dict[str, list[str]]:
+        """The coefficients that may be assigned, and the losses that they scale."""
+        scaled = {
+            weight: [key for key in losses if key in self.groups]
+            for weight, losses in WEIGHTS.items()
+        }
+        return {weight: losses for weight, losses in scaled.items() if losses}
+
+
+def actor_critic(
+    loss_class: type[LossModule],
+    groups: dict[str, str],
+    *metrics: str,
+    twin: bool = True,
+    networks: dict[str, object] | None = None,
+    **options: object,
+) -> Member:
+    """A loss with critics: its own terms, metrics and options."""
+    value = "action_value" if loss_class is DiscreteOSRLoss else "state_action_value"
+    draws = {} if loss_class is DiscreteOSRLoss else {"num_random": 3}
+    return Member(
+        loss_class,
+        SOFT_ACTOR_CRITIC | groups,
+        ["alpha", "entropy", "pred_value", "target_value", *metrics],
+        [*TRANSITION, *[TWIN] * twin],
+        CRITIC_KEYS | {value: value},
+        {"alpha_init": 0.5, "recovery_weight": 0.5} | draws | options,
+        networks or {},
+    )
+
+
+SOFT_ACTOR_CRITIC = {
+    "loss_actor": ACTOR,
+    "loss_alpha": "log_alpha",
+    "loss_qvalue": CRITICS,
+}
+CQL, RECOVERY = {"loss_cql": CRITICS}, {"loss_recovery": ACTOR}
+# Critics that are plain MLPs with ReLUs have a path of their own.
+RELU = {"critic_activation": nn.ReLU}
+recovery_loss = partial(
+    Member,
+    StateRecoveryLoss,
+    RECOVERY,
+    ["recovery_kl"],
+    ["observation", NEXT, ("next", "done"), TWIN],
+    RECOVERY_KEYS,
+)
+
+
+def model_loss(loss_class: type[LossModule] = InverseDynamicsLoss, **rest) -> Member:
+    in_keys = ["observation", NEXT, "action", ("next", "done"), TWIN]
+    groups = {"loss_inverse_dynamics": MODEL}
+    return Member(loss_class, groups, [], in_keys, MODEL_KEYS, **rest)
+
+
+FAMILY = {
+    "osr": actor_critic(OSRLoss, CQL | RECOVERY, "recovery_kl", networks=RELU),
+    "official": actor_critic(
+        OSRLoss,
+        CQL | RECOVERY,
+        "recovery_kl",
+        recovery_direction="reverse",
+        action_reduction="mean",
+        recovery_states="perturbed",
+        actor_states="clean",
+    ),
+    "adversarial": actor_critic(
+        OSRLoss,
+        CQL | RECOVERY,
+        "recovery_kl",
+        twin=False,
+        adversary=Adversary(epsilon=0.1, num_samples=3),
+    ),
+    "osr-10": actor_critic(
+        OSRLoss,
+        RECOVERY,
+        "recovery_kl",
+        networks={"num_critics": 3},
+        min_q_weight=0.0,
+        deterministic_backup=False,
+    ),
+    "cql": actor_critic(OSRLoss, CQL, twin=False, recovery_weight=0.0),
+    "cql-options": actor_critic(
+        OSRLoss,
+        CQL | {"loss_alpha_prime": "log_alpha_prime"},
+        "alpha_prime",
+        twin=False,
+        networks=RELU,
+        recovery_weight=0.0,
+        with_lagrange=True,
+        lagrange_thresh=1.0,
+        max_q_backup=True,
+        deterministic_backup=False,
+        importance_sample=False,
+        temperature=1.5,
+    ),
+    "edac": actor_critic(
+        OSRLoss,
+        {"loss_diversity": CRITICS},
+        twin=False,
+        networks={"num_critics": 3} | RELU,
+        recovery_weight=0.0,
+        min_q_weight=0.0,
+        deterministic_backup=False,
+        diversity_weight=0.75,
+    ),
+    "osrv": actor_critic(OSRVLoss, {"loss_recovery": CRITICS}, "recovery_gap"),
+    "osrv-logsumexp": actor_critic(
+        OSRVLoss,
+        {"loss_recovery": CRITICS},
+        "recovery_gap",
+        networks=RELU,
+        policy_values="logsumexp",
+    ),
+    "discrete": actor_critic(DiscreteOSRLoss, CQL | RECOVERY, "recovery_kl"),
+    "discrete-cql": actor_critic(
+        DiscreteOSRLoss,
+        CQL,
+        twin=False,
+        networks={"distribution_class": Categorical},
+        recovery_weight=0.0,
+    ),
+    "recovery": recovery_loss(),
+    # With safe=True TorchRL 0.14.1 refuses to compile a TanhDelta, on any torch.
+    "recovery-delta": recovery_loss(
+        options={"direction": "reverse"},
+        replace={"actor": partial(deterministic_actor, "delta", safe=False)},
+    ),
+    "recovery-plain": recovery_loss(
+        options={"direction": "reverse"},
+        replace={"actor": partial(deterministic_actor, "actor")},
+    ),
+    "idm": model_loss(),
+    "idm-mse": model_loss(options={"loss_function": "mse"}),
+    "cvae": model_loss(replace={"inverse_dynamics": latent_model}),
+    "discrete-idm": model_loss(DiscreteInverseDynamicsLoss),
+}
+
+
+def those(condition: Callable[[Member], bool]) -> list[str]:
+    return [name for name, member in FAMILY.items() if condition(member)]
+
+
+PARTS = {
+    "name": list(FAMILY),
+    "critic_loss": those(lambda member: member.has_critics),
+    "recovering": those(lambda member: "loss_recovery" in member.groups),
+    "conservative": those(lambda member: "loss_cql" in member.groups),
+    # Without a recovery term for good: no model and no perturbed state.
+    "unrecovering": those(lambda member: member.options.get("recovery_weight") == 0.0),
+    "twin_reading": those(lambda member: member.reads_twin),
+    "prioritized": those(lambda member: "priority_weight" in member.keys),
+    "scheduled": those(lambda member: member.weights != {}),
+}
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Run a test for every loss that its argument stands for."""
+    for argument, names in PARTS.items():
+        if argument in metafunc.fixturenames:
+            metafunc.parametrize(argument, names)
+
+
+class Family:
+    """``family[name]`` tells what to expect, ``family(name)`` builds the loss."""
+
+    def __init__(self, continuous: Callable, discrete: Callable) -> None:
+        self._continuous, self._discrete = continuous, discrete
+
+    def __getitem__(self, name: str) -> Member:
+        return FAMILY[name]
+
+    def networks(
+        self, name: str, *, observation="observation", action="action", seed=0, **rest
+    ) -> SimpleNamespace:
+        """The loss's own kind of networks, with any keys and number of critics."""
+        keys = {"observation": observation, "action": action, "seed": seed}
+        member = FAMILY[name]
+        make = self._discrete if member.discrete else self._continuous
+        networks = make(**keys, **(member.networks | rest))
+        for part, replacement in member.replace.items():
+            setattr(networks, part, replacement(**keys))
+        return networks
+
+    def __call__(
+        self, name: str, networks=None, *, updated: bool = True, **options
+    ) -> LossModule:
+        """The loss in float64.
+
+        Args:
+            name: of the loss.
+            networks: by default those of :meth:`networks`.
+            updated: whether somebody moves the target networks.
+            options: in the place of the table's.
+        """
+        member = FAMILY[name]
+        networks = networks or self.networks(name)
+        if member.has_critics and options.get("reduction") == "none":
+            options = {"scalar_output_mode": "exclude"} | options
+        parts = [getattr(networks, part) for part in member.parts]
+        loss = member.loss_class(*parts, **(member.options | options)).double()
+        if member.has_critics and updated:
+            SoftUpdate(loss, tau=0.1)
+        return loss
+
+
+@pytest.fixture
+def family(make_networks, make_discrete_networks) -> Family:
+    """Return the factory of every loss, by its name."""
+    return Family(make_networks, make_discrete_networks)
+
+
+@pytest.fixture
+def family_batch(make_batch, make_discrete_batch):
+    """Return a factory of a loss's batch, with a twin if the loss reads one."""
+
+    def make(name: str, *size: int, twin: bool | None = None) -> TensorDict:
+        member = FAMILY[name]
+        twin = member.reads_twin if twin is None else twin
+        batch = (make_discrete_batch if member.discrete else make_batch)(
+            *size, twin=twin
+        )
+        if member.index:
+            batch["action"] = batch["action"].argmax(-1)
+        return batch
+
+    return make
+
+
+@pytest.fixture
+def seeded():
+    """Return a function that calls a loss with the same draws every time."""
+
+    def call(loss, *args, **kwargs):
+        torch.manual_seed(2)
+        return loss(*args, **kwargs)
+
+    return call
+
+
+@pytest.fixture
+def record(seeded):
+    """Return a function that lists losses and their gradients, one loss at a time."""
+
+    def call(loss, batch: TensorDict, keys=None) -> list[Tensor]:
+        out, parameters = seeded(loss, batch), list(loss.parameters())
+        keys = keys or [key for key in out.keys() if key.startswith("loss_")]  # noqa: SIM118
+        found: list[Tensor] = []
+        for key in keys:
+            gradients = torch.autograd.grad(
+                out[key].sum(), parameters, allow_unused=True, retain_graph=True
+            )
+            found += [out[key].detach(), *(g for g in gradients if g is not None)]
+        return found
+
+    return call
+
+
+@pytest.fixture
+def assert_same():
+    """Return an assertion that two lists of tensors agree, to 1e-12 by default."""
+
+    def compare(got, wanted, tolerance: float = 1e-12) -> None:
+        for ours, theirs in zip(got, wanted, strict=True):
+            torch.testing.assert_close(ours, theirs, rtol=tolerance, atol=tolerance)
+
+    return compare
+
+
+@pytest.fixture
+def assert_same_bits():
+    """Return an assertion that two lists of tensors are equal."""
+
+    def compare(got, wanted) -> None:
+        assert len(got) == len(wanted)
+        assert all(map(torch.equal, got, wanted))
+
+    return compare

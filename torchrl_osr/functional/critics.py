@@ -173,7 +173,7 @@ def gradient_diversity(action_gradients: Tensor) -> Tensor:
             \frac{\nabla_a Q_j(s, a)}{\|\nabla_a Q_j(s, a)\|} \Big\rangle
 
     "Uncertainty-Based Offline Reinforcement Learning with Diversified Q-Ensemble" (An
-    et al. 2021, equation 4), https://arxiv.org/abs/2110.01548.
+    et al. 2021), https://arxiv.org/abs/2110.01548.
 
     Args:
         action_gradients: of each critic at the data's action, ``[N, B, A]``,

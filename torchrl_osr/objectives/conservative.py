@@ -187,7 +187,6 @@ class ConservativeCritics(TanhGaussianActorCritic):
             and self._plain_layers() is not None
             and action.device.type == "cpu"
             and torch.is_grad_enabled()
-            and not torch.is_autocast_enabled("cpu")
             and not torch.compiler.is_compiling()
             and not any(value.requires_grad for value in state.values(True, True))
         )

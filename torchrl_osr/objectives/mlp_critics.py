@@ -99,7 +99,8 @@ def soft_maximum(
     Differentiable by the critics' parameters, once. The gradient is exact for every use
     of the result. It costs nothing more where all rows weigh the same, as in a mean or
     a sum; otherwise, with masks or importance weights, the chunks are computed once
-    more with the weights that they have.
+    more with the weights that they have. Under autocast the products are in its
+    precision; values, log-sum-exps and the gradient's sum stay in the inputs'.
 
     Args:
         params: of all critics, stacked.
@@ -114,7 +115,9 @@ def soft_maximum(
         ``[N, B]``.
     """
     flat = weights_and_biases(params, names)
-    arguments = (state, action, log_prob, temperature, chunk_size, *flat)
+    autocast = torch.is_autocast_enabled("cpu")
+    dtype = torch.get_autocast_dtype("cpu") if autocast else state.dtype
+    arguments = (state, action, log_prob, temperature, chunk_size, dtype, *flat)
     value: Tensor = _SoftMaximum.apply(*arguments)  # type: ignore[no-untyped-call]
     return value
 
@@ -123,7 +126,8 @@ class _SoftMaximum(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> Any:
         ctx.arguments = arguments
-        value, gradient = _evaluate(None, *arguments)
+        with torch.autocast("cpu", enabled=False):  # it would cast once more
+            value, gradient = _evaluate(None, *arguments)
         ctx.save_for_backward(*gradient)
         return value
 
@@ -135,7 +139,7 @@ class _SoftMaximum(torch.autograd.Function):
             gradient = list(torch._foreach_mul(ctx.saved_tensors, weight))
         else:
             _, gradient = _evaluate(upstream, *ctx.arguments)
-        return (None, None, None, None, None, *gradient)
+        return (*[None] * 6, *gradient)
 
 
 def _evaluate(
@@ -145,15 +149,18 @@ def _evaluate(
     log_prob: Tensor | None,
     temperature: float,
     chunk_size: int,
+    dtype: torch.dtype,
     *flat: Tensor,
 ) -> tuple[Tensor, list[Tensor]]:
     """Return the values and the gradient of their sum, weighted by ``upstream``."""
     gradient = [torch.zeros_like(each) for each in flat]
-    widths = [weight.shape[1] for weight in flat[:-2:2]]
+    value = state.new_empty(len(flat[0]), len(state))
+    flat = tuple(each.to(dtype) for each in flat)
+    state, action = state.to(dtype), action.to(dtype)
     rows = len(action) * min(chunk_size, len(state))
+    widths = [weight.shape[1] for weight in flat[:-2:2]]
     # Two buffers a layer, used again and again: activations, and their gradients.
     buffers = [[state.new_empty(rows, width) for width in widths] for _ in range(2)]
-    value = state.new_empty(len(flat[0]), len(state))
     for start in range(0, len(state), chunk_size):
         chunk = slice(start, start + chunk_size)
         density = 0.0 if log_prob is None else log_prob[:, chunk]
@@ -162,14 +169,14 @@ def _evaluate(
             each = [_layers(tensors, critic) for tensors in (flat, gradient)]
             hidden = _forward(inputs, each[0], buffers[0])
             weight, bias = each[0][-1]
-            qvalue = torch.mv(hidden[-1], weight[0]).add_(bias)
+            qvalue = torch.mv(hidden[-1], weight[0]).to(value.dtype) + bias
             logits = (qvalue.view(inputs[1].shape[:-1]) - density) / temperature
             soft = logits.logsumexp(0)
             torch.mul(soft, temperature, out=value[critic, chunk])
             share = (logits - soft).exp_()
             if upstream is not None:
                 share *= upstream[critic, chunk]
-            _backward(inputs, share.view(-1), hidden, each, buffers[1])
+            _backward(inputs, share.view(-1).to(dtype), hidden, each, buffers[1])
     return value, gradient
 
 
@@ -210,22 +217,30 @@ def _backward(
     state, action = inputs
     above = [buffer[: len(share)] for buffer in buffers]
     weight, bias = gradients[-1]
-    weight[0].addmv_(hidden[-1].T, share)
-    bias.add_(share.sum())
+    weight[0] += torch.mv(hidden[-1].T, share)
+    bias += share.sum()
     torch.mul(share.unsqueeze(1), layers[-1][0], out=above[-1])
     for layer in range(len(hidden) - 1, -1, -1):
         _mask(above[layer], hidden[layer])
         if layer:
             weight, bias = gradients[layer]
-            weight.addmm_(above[layer].T, hidden[layer - 1])
-            bias.add_(above[layer].sum(0))
+            _add_product(weight, above[layer].T, hidden[layer - 1])
+            bias += above[layer].sum(0)
             torch.mm(above[layer], layers[layer][0], out=above[layer - 1])
     weight, bias = gradients[0]
     size = state.shape[-1]
-    weight[:, size:].addmm_(above[0].T, action.reshape(len(share), -1))
+    _add_product(weight[:, size:], above[0].T, action.reshape(len(share), -1))
     shared = above[0].view(len(action), len(state), -1).sum(0)
-    weight[:, :size].addmm_(shared.T, state)
-    bias.add_(shared.sum(0))
+    _add_product(weight[:, :size], shared.T, state)
+    bias += shared.sum(0)
+
+
+def _add_product(total: Tensor, left: Tensor, right: Tensor) -> None:
+    """Add a product, in the total's precision, to the total."""
+    if total.dtype == left.dtype:
+        total.addmm_(left, right)
+    else:
+        total += torch.mm(left, right)
 
 
 def _mask(gradient: Tensor, activation: Tensor) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.trainers import OptimizationStepper, Trainer
 
@@ -44,11 +45,21 @@ class SumOfLosses(OptimizationStepper):
 
     TorchRL 0.14.1's default stepper hands back losses with their graph attached and
     reads the gradient norm back to the host at every step; this one does neither.
+
+    Args:
+        autocast_dtype: of the matrix products of the losses. Default: that of the
+            parameters.
     """
+
+    def __init__(self, autocast_dtype: torch.dtype | None = None) -> None:
+        self.autocast_dtype = autocast_dtype
 
     def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
         """Run one update and return the detached losses and metrics."""
-        losses = trainer.compute_loss(sub_batch)
+        device = next(trainer.loss_module.parameters()).device.type
+        enabled = self.autocast_dtype is not None
+        with torch.autocast(device, self.autocast_dtype, enabled=enabled):
+            losses = trainer.compute_loss(sub_batch)
         total = sum(value for key, value in losses.items() if key.startswith("loss_"))
         total.backward()
         trainer.optimizer.step()

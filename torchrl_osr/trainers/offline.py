@@ -71,6 +71,8 @@ class OfflineTrainer(Trainer):
         checkpoint_interval: steps between checkpoints. Default: ``eval_interval``.
         description: names the phase in the progress bar and the logs. Default "train".
         progress: show a progress bar when on a terminal. Default ``True``.
+        autocast_dtype: compute the losses' matrix products in this precision
+            (``torch.bfloat16``). Default: that of the parameters.
 
     Raises:
         FloatingPointError: while training, if a loss is not finite.
@@ -96,6 +98,7 @@ class OfflineTrainer(Trainer):
         checkpoint_interval: int | None = None,
         description: str = "train",
         progress: bool = True,
+        autocast_dtype: torch.dtype | None = None,
     ) -> None:
         intervals = (log_interval, eval_interval, checkpoint_interval or eval_interval)
         if total_steps < 1 or min(intervals) < 1:
@@ -111,7 +114,7 @@ class OfflineTrainer(Trainer):
             optim_steps_per_batch=1,
             loss_module=loss_module,
             optimizer=optimizer,
-            optimization_stepper=SumOfLosses(),
+            optimization_stepper=SumOfLosses(autocast_dtype),
             progress_bar=False,
             auto_log_optim_steps=False,
         )

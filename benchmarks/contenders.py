@@ -1,0 +1,249 @@
+"""The updates that ``update_speed.py`` times: ours, TorchRL's CQL, the plain reference.
+
+Each is a generator that does one update and names each part of it when it is done, so
+that one clock outside can tell the parts apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from matmul_bound import Products, osr_passes
+from plain_reference import Batch, PlainOSR
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.data import Bounded, ReplayBuffer
+from torchrl.envs.utils import ExplorationType
+from torchrl.modules import (
+    MLP,
+    NormalParamExtractor,
+    ProbabilisticActor,
+    TanhNormal,
+    ValueOperator,
+)
+from torchrl.objectives import CQLLoss, LossModule, SoftUpdate, group_optimizers
+
+from torchrl_osr import OSRLoss, OSRVLoss, StatePerturbation
+from torchrl_osr.data import make_replay_buffer
+from torchrl_osr.modules import (
+    critic_ensemble,
+    tanh_gaussian_actor,
+    tanh_gaussian_inverse_dynamics,
+)
+
+Casting = Callable[[], AbstractContextManager]
+Update = Callable[[Any, Casting], Iterator[str]]
+
+GAMMA, TAU, RATE, BATCH, NUM_RANDOM, ROWS = 0.99, 5e-3, 3e-4, 256, 10, 100_000
+OURS = ("OSR", "CQL(H)", "OSR-v", "OSR-10")
+TORCHRL, PLAIN, SAMPLING = "TorchRL CQL", "plain OSR", "sampling"
+PRODUCTS, PRODUCTS_BF16 = "products", "products in bfloat16"
+DIMENSIONS = {"hopper": (11, 3), "walker2d": (17, 6), "halfcheetah": (17, 6)}
+
+
+@dataclass(frozen=True)
+class Size:
+    """A task's dimensions and the hidden layers of all networks."""
+
+    observations: int
+    actions: int
+    cells: tuple[int, ...]
+
+    @classmethod
+    def parse(cls, name: str) -> Size:
+        """Return the size of a name such as ``hopper-2x256``."""
+        task, _, layers = name.partition("-")
+        depth, width = (int(number) for number in layers.split("x"))
+        return cls(*DIMENSIONS[task], (width,) * depth)
+
+
+def make_buffer(size: Size, device: torch.device) -> ReplayBuffer:
+    """Return the package's buffer, of random transitions with perturbed twins."""
+    ends = torch.rand(ROWS, 1) < 2e-3
+    following = {
+        "observation": torch.randn(ROWS, size.observations),
+        "reward": torch.randn(ROWS, 1),
+        "done": ends,
+        "terminated": ends & (torch.rand(ROWS, 1) < 0.5),
+    }
+    data = {
+        "observation": torch.randn(ROWS, size.observations),
+        "action": torch.rand(ROWS, size.actions) * 1.8 - 0.9,
+        "next": following,
+    }
+    return make_replay_buffer(
+        TensorDict(data, [ROWS]),
+        batch_size=BATCH,
+        seed=0,
+        transform=StatePerturbation(1e-3, seed=0),
+        device=device,
+    )
+
+
+def unpack(batch: TensorDictBase) -> Batch:
+    """Return a batch as the plain reference reads it."""
+    return Batch(
+        state=batch["observation"],
+        action=batch["action"],
+        reward=batch["next", "reward"].squeeze(-1),
+        next_state=batch["next", "observation"],
+        done=batch["next", "done"].squeeze(-1),
+        terminated=batch["next", "terminated"].squeeze(-1),
+        perturbed=batch["perturbed", "observation"],
+    )
+
+
+def our_update(loss: LossModule) -> Update:
+    """Return the update that the README shows: one backward, one optimizer."""
+    loss.make_value_estimator(gamma=GAMMA)
+    updater = SoftUpdate(loss, tau=TAU)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=RATE, fused=True)
+
+    def update(batch: TensorDictBase, casting: Casting) -> Iterator[str]:
+        with casting():
+            losses = loss(batch.copy())
+        yield "forward"
+        terms = [value for key, value in losses.items() if key.startswith("loss_")]
+        sum(terms).backward()
+        yield "backward"
+        optimizer.step()
+        optimizer.zero_grad(set_to_none=True)
+        yield "optimizer"
+        updater.step()
+        yield "targets"
+
+    return update
+
+
+def our_loss(name: str, size: Size) -> LossModule:
+    """Return one of the package's losses, with its defaults otherwise."""
+    sizes = (size.observations, size.actions)
+    cells = list(size.cells)
+    actor = tanh_gaussian_actor(*sizes, num_cells=cells)
+    model = tanh_gaussian_inverse_dynamics(*sizes, num_cells=cells)
+    number = 10 if name == "OSR-10" else 2
+    critics = critic_ensemble(*sizes, num_cells=cells, num_qvalue_nets=number)
+    if name == "OSR-v":
+        return OSRVLoss(actor, critics, model)
+    if name == "CQL(H)":
+        return OSRLoss(actor, critics, recovery_weight=0)
+    if name == "OSR-10":
+        return OSRLoss(
+            actor, critics, model, min_q_weight=0, deterministic_backup=False
+        )
+    return OSRLoss(actor, critics, model)
+
+
+def torchrl_cql_loss(size: Size, device: torch.device) -> CQLLoss:
+    """Return TorchRL's CQL with the options of its own offline script."""
+    low = -torch.ones(size.actions, device=device)
+    widths: dict[str, Any] = {
+        "num_cells": list(size.cells),
+        "activation_class": nn.ReLU,
+    }
+    head = nn.Sequential(
+        MLP(size.observations, 2 * size.actions, **widths),
+        NormalParamExtractor(scale_mapping="biased_softplus_1.0", scale_lb=0.1),
+    )
+    actor = ProbabilisticActor(
+        TensorDictModule(head, ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        spec=Bounded(low, -low),
+        distribution_class=TanhNormal,
+        distribution_kwargs={"low": low, "high": -low, "tanh_loc": False},
+        default_interaction_type=ExplorationType.RANDOM,
+    )
+    qvalue = ValueOperator(
+        MLP(size.observations + size.actions, 1, **widths), ["observation", "action"]
+    )
+    return CQLLoss(
+        actor.to(device),
+        qvalue.to(device),
+        loss_function="l2",
+        deterministic_backup=False,
+        num_random=NUM_RANDOM,
+        with_lagrange=True,
+        lagrange_thresh=5.0,
+    )
+
+
+def torchrl_cql_update(loss: CQLLoss, device: torch.device) -> Update:
+    """Return the update of that script: four optimizers, and behaviour cloning.
+
+    Which of the policy's two losses counts is chosen on the device: both are computed.
+    """
+    loss.make_value_estimator(gamma=GAMMA)
+    updater = SoftUpdate(loss, tau=TAU)
+    groups = [
+        loss.actor_network_params.flatten_keys().values(),
+        loss.qvalue_network_params.flatten_keys().values(),
+        [loss.log_alpha],
+        [loss.log_alpha_prime],
+    ]
+    optimizer = group_optimizers(*[torch.optim.Adam(group, RATE) for group in groups])
+    cloned_until, step = torch.tensor(40_000, device=device), 0
+
+    def update(batch: TensorDictBase, casting: Casting) -> Iterator[str]:
+        nonlocal step
+        now, step = torch.tensor(step, device=device), step + 1
+        with casting():
+            losses = loss(batch.copy())
+            actor = torch.where(
+                now >= cloned_until, losses["loss_actor"], losses["loss_actor_bc"]
+            )
+            critic = losses["loss_qvalue"] + losses["loss_cql"]
+            total = actor + critic + losses["loss_alpha"] + losses["loss_alpha_prime"]
+        yield "forward"
+        total.backward()
+        yield "backward"
+        optimizer.step()
+        optimizer.zero_grad(set_to_none=True)
+        yield "optimizer"
+        updater.step()
+        yield "targets"
+
+    return update
+
+
+def products_update(size: Size, dtype: torch.dtype, device: torch.device) -> Update:
+    """Return OSR's matrix products, in the pieces in which the loss runs them."""
+    in_pieces = device.type == "cpu" and dtype == torch.float32
+    chunk = our_loss("OSR", size).chunk_size if in_pieces else None
+    sizes = (size.observations, size.actions, size.cells)
+    passes = osr_passes(*sizes, batch=BATCH, num_random=NUM_RANDOM, chunk=chunk)
+    return Products(passes, dtype, device).update
+
+
+def make_contender(
+    name: str, size: Size, device: torch.device
+) -> tuple[Update, list[Any]]:
+    """Return an update and the batches that it reads, the same for every name."""
+    buffer = make_buffer(size, device)
+    batches = [buffer.sample() for _ in range(8)]
+    if name == SAMPLING:
+
+        def sample(*_: object) -> Iterator[str]:
+            buffer.sample()
+            yield "sampling"
+
+        return sample, batches
+    if name == PLAIN:
+        sizes = (size.observations, size.actions, size.cells)
+        plain = PlainOSR(*sizes, num_random=NUM_RANDOM, device=device)
+        return plain.update, [unpack(batch) for batch in batches]
+    if name in (PRODUCTS, PRODUCTS_BF16):
+        dtype = torch.float32 if name == PRODUCTS else torch.bfloat16
+        return products_update(size, dtype, device), batches
+    # CQL has no use for perturbed states, and needs not carry them.
+    if name == TORCHRL:
+        batches = [batch.exclude("perturbed") for batch in batches]
+        return torchrl_cql_update(torchrl_cql_loss(size, device), device), batches
+    loss = our_loss(name, size).to(device)
+    if not loss.recovers:
+        batches = [batch.exclude("perturbed") for batch in batches]
+    return our_update(loss), batches

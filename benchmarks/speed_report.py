@@ -1,0 +1,186 @@
+"""Tables and figure of what ``update_speed.py`` measured."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from contenders import OURS, PLAIN, PRODUCTS, PRODUCTS_BF16, SAMPLING, TORCHRL
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+MARKERS = ("<!-- tables -->\n", "<!-- end of tables -->\n")
+TITLES = {
+    "float32": "float32, PyTorch's default",
+    "medium": 'float32 with torch.set_float32_matmul_precision("medium"), all alike',
+    "bfloat16": "bfloat16 autocast of the losses; the plain reference is in float32",
+}
+LABELS = {
+    TORCHRL: "TorchRL's CQLLoss",
+    PLAIN: "plain reference (OSR)",
+    PRODUCTS: "matrix products of OSR alone",
+    PRODUCTS_BF16: "matrix products of OSR alone",
+}
+# Okabe and Ito's palette, which colour-blind readers can tell apart.
+COLORS = {
+    "OSR": "#0072B2",
+    "CQL(H)": "#56B4E9",
+    "OSR-v": "#009E73",
+    "OSR-10": "#E69F00",
+    TORCHRL: "#D55E00",
+    PLAIN: "#CC79A7",
+    PRODUCTS: "#BBBBBB",
+    PRODUCTS_BF16: "#BBBBBB",
+}
+KINDS = ("matrix products", "elementwise", "copies", "rest")
+PARTS = ("forward", "backward", "optimizer", "targets")
+
+
+def markdown(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """Return a table."""
+    lines = [list(header), *map(list, rows)]
+    lines.insert(1, ["---"] * len(lines[0]))
+    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
+
+
+def label(name: str, precision: str) -> str:
+    """Return what a contender is called in the tables and in the figure."""
+    autocast = name == PLAIN and precision == "bfloat16"
+    return LABELS.get(name, name) + ", autocast" * autocast
+
+
+def speed_table(sizes: Mapping[str, Any], precision: str) -> str:
+    """Return updates a CPU second, and how they compare with the plain reference."""
+
+    def cell(name: str, size: str) -> str:
+        row = sizes[size][precision][name]
+        if row["failure"]:
+            return "failed"
+        return f"{row['updates_per_cpu_second']:.1f} ({row['ratio']:.2f}x)"
+
+    names = [n for n in next(iter(sizes.values()))[precision] if n != SAMPLING]
+    rows = [
+        [label(name, precision), *(cell(name, size) for size in sizes)]
+        for name in names
+    ]
+    shares = [results[precision]["OSR"]["products_share"] for results in sizes.values()]
+    rows.append(
+        [
+            "matrix products' share of OSR",
+            *("failed" if share is None else f"{share:.0%}" for share in shares),
+        ]
+    )
+    return markdown(["updates a CPU second (x plain reference)", *sizes], rows)
+
+
+def detail_table(results: Mapping[str, Any], precision: str) -> str:
+    """Return where the time of an update of one size goes, and what else it costs."""
+    rows = []
+    for name, row in results.items():
+        if name == SAMPLING:
+            continue
+        if row["failure"]:
+            rows.append([label(name, precision), row["failure"].partition("\n")[0]])
+            continue
+        parts = row["cpu_seconds_by_part"]
+        rows.append(
+            [
+                label(name, precision),
+                *(f"{1000 * parts[p]:.1f}" if p in parts else "" for p in PARTS),
+                *(f"{row['time_by_kind'][kind]:.0%}" for kind in KINDS),
+                f"{row['flops'] / 1e9:.1f}",
+                f"{row['kernels']}",
+                f"{row['host_reads']}",
+                f"{row['page_faults']:.0f}",
+                f"{row['peak_memory_bytes'] / 1e6:.0f}",
+            ]
+        )
+    header = ["implementation", *(f"{part} ms" for part in PARTS), *KINDS]
+    costs = ["GFLOP", "kernels", "host reads", "page faults", "peak MB"]
+    return markdown([*header, *costs], rows)
+
+
+def tables(results: Mapping[str, Any]) -> str:
+    """Return all tables as Markdown; the details are those of the first size."""
+    sizes, machine = results["sizes"], results["machine"]
+    first = next(iter(sizes))
+    text = (
+        f"`{results['command']}`: {machine.get('gpu', machine['cpu'])} "
+        f"({machine['cpus']} cores, {machine['capability']}, "
+        f"{' and '.join(machine['bfloat16_units']) or 'no units for bfloat16'}), "
+        f"{machine['threads']} thread(s), medians of {machine['rounds']} rounds, load "
+        f"average {machine['load_average'][0]:.1f} at the start, commit "
+        f"`{machine['commit']}`, torch {machine['torch']}, TorchRL "
+        f"{machine['torchrl']}, tensordict {machine['tensordict']}, {machine['date']}."
+        "\n"
+    )
+    for precision, title in TITLES.items():
+        text += f"\n### {title}\n\n{speed_table(sizes, precision)}"
+        text += f"\nOne update of `{first}`:\n\n"
+        text += detail_table(sizes[first][precision], precision)
+    sampling = sizes[first]["float32"][SAMPLING]["updates_per_cpu_second"]
+    return text + (
+        f"\nSampling a batch of `{first}` with perturbed twins, which no number above "
+        f"includes, took {1000 / sampling:.2f} ms.\n"
+    )
+
+
+def write_tables(text: str, readme: Path) -> None:
+    """Put the tables between the markers of a README, where there is one."""
+    if readme.exists():
+        before, _, rest = readme.read_text(encoding="utf-8").partition(MARKERS[0])
+        _, _, after = rest.partition(MARKERS[1])
+        whole = before + MARKERS[0] + text + MARKERS[1] + after
+        readme.write_text(whole, encoding="utf-8")
+
+
+def draw_precision(axes: Axes, sizes: Mapping[str, Any], precision: str) -> None:
+    """Draw a bar for each contender and size: its speed over the plain reference's."""
+    names = [*OURS, TORCHRL]
+    names += [PLAIN, PRODUCTS_BF16] if precision == "bfloat16" else [PRODUCTS]
+    names = [name for name in names if name in next(iter(sizes.values()))[precision]]
+    width = 0.85 / len(names)
+    for i, name in enumerate(names):
+        for position, results in enumerate(sizes.values()):
+            row = results[precision][name]
+            if row["ratio"] is None:
+                continue
+            x = position + (i - (len(names) - 1) / 2) * width
+            spread = [
+                [row["ratio"] - row["ratio_lowest"]],
+                [row["ratio_highest"] - row["ratio"]],
+            ]
+            axes.bar(
+                x, row["ratio"], width * 0.92, color=COLORS[name], yerr=spread,
+                label=label(name, precision) if position == 0 else None,
+                error_kw={"elinewidth": 0.8, "ecolor": "#444444"},
+            )  # fmt: skip
+            axes.annotate(
+                f"{row['ratio']:.2f}", (x, row["ratio_highest"]), (0, 2),
+                textcoords="offset points", ha="center", fontsize=7,
+            )  # fmt: skip
+    axes.axhline(
+        1, color="black", linewidth=1, linestyle="--",
+        label="plain reference (OSR)" + ", float32" * (precision == "bfloat16"),
+    )  # fmt: skip
+    axes.set_xticks(range(len(sizes)), list(sizes))
+    axes.set_title(TITLES[precision], fontsize=10, loc="left")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.margins(y=0.12)
+    axes.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
+
+
+def draw(results: Mapping[str, Any], path: Path) -> None:
+    """Draw a panel for each precision."""
+    figure = Figure(figsize=(11, 9), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(len(TITLES), 1)
+    for axes, precision in zip(panels, TITLES, strict=True):
+        draw_precision(axes, results["sizes"], precision)
+    figure.supylabel(
+        "speed of an update; plain reference, measured in the same rounds, = 1",
+        fontsize=10,
+    )
+    figure.savefig(path, dpi=130)

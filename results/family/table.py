@@ -1,0 +1,114 @@
+"""Write docs/family.md from a test run: what was checked against what, how far off.
+
+    pytest tests -o junit_family=xunit1 --junitxml=checks.xml
+    python results/family/table.py checks.xml
+
+Tests note their largest deviation (the fixture ``check``) and the rows that critics
+score; this script adds only what a loss is called, its equation and its command line.
+"""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections import defaultdict
+from pathlib import Path
+from xml.etree import ElementTree
+
+PAGE = Path(__file__).parents[2] / "docs" / "family.md"
+REST = "critic by critic and action by action, torch.distributions"
+# Label of the checks: class and equation, configuration, what it is compared with.
+FAMILY = {
+    "Inverse dynamics": (
+        "`InverseDynamicsLoss`, 4.2", "`inverse_dynamics=tanh_gaussian`",
+        "density by the change of variables",
+    ),
+    "Inverse dynamics, conditional VAE": (
+        "`InverseDynamicsLoss(loss_function=\"mse\")`, released code",
+        "`inverse_dynamics=cvae`", "squared error and divergence written out",
+    ),
+    "OSR": ("`OSRLoss`, (11), 4.4", "`loss=osr`", REST),
+    "OSR, official variant": (
+        "`OSRLoss`, released code", "`loss=osr_official`", REST,
+    ),
+    "OSR-v": ("`OSRVLoss`, (8), 4.4", "`loss=osr_v`", REST),
+    "OSR-10": ("`OSRLoss`, appendix D.4", "`loss=osr_10`", "`kl_divergence` of torch"),
+    "CQL(H)": ("`OSRLoss`, CQL appendix F", "`loss=cql`", REST),
+    "CQL(H) with its options": (
+        "`OSRLoss`, CQL appendix F and CORL", "`loss=cql loss.with_lagrange=true ...`",
+        REST,
+    ),
+    "SAC-N": ("`OSRLoss`, SAC-N", "`loss=sac_10`", REST),
+    "EDAC": ("`OSRLoss`, EDAC", "`loss=edac_10`", "all pairs of gradients"),
+    "Adversary": (
+        "`Adversary`, RORL", "`loss=osr_adversarial`", "a loop over the same draws",
+    ),
+    "State recovery alone": (
+        "`StateRecoveryLoss`, (11)", "`examples/iql_with_recovery.py`",
+        "`kl_divergence` of torch",
+    ),
+    "Discrete OSR": (
+        "`DiscreteOSRLoss`, (11), 4.4", "`examples/discrete_osr.py`",
+        "action by action, `torch.distributions.Categorical`",
+    ),
+    "Discrete CQL(H)": (
+        "`DiscreteOSRLoss`, CQL (4)", "`examples/discrete_osr.py --loss cql`",
+        "action by action, `torch.distributions.Categorical`",
+    ),
+    "Discrete inverse dynamics": (
+        "`DiscreteInverseDynamicsLoss`, 4.2", "`examples/discrete_osr.py`",
+        "`torch.distributions.Categorical`",
+    ),
+}  # fmt: skip
+HEAD = """# The family of losses
+
+Every loss is compared with a restatement of its published formula that shares no code with the package: losses and gradients, in float64, on random networks and batches with the same random draws. The last column is the largest deviation over all those numbers, relative to the larger of 1 and the number itself. Critic rows are the state-action pairs (for discrete actions: states) that all critics together score for one row of a batch, with two critics and K = 10 where there is a K, and ten critics for the ensembles; the policy's own action and the target's are counted.
+
+| loss | class, equation | configuration | critic rows | compared with | checks | largest deviation |
+|---|---|---|---|---|---|---|
+"""  # noqa: E501
+TAIL = """
+This page is written by a test run:
+
+```bash
+pytest tests -o junit_family=xunit1 --junitxml=checks.xml
+python results/family/table.py checks.xml
+```
+
+One training run of each on Hopper, and the discrete loss on CartPole, are in
+`results/family/`.
+"""
+
+
+def read(path: Path) -> tuple[dict[str, list[float]], dict[str, int]]:
+    """Return all deviations by label, and the critic rows."""
+    deviations: dict[str, list[float]] = defaultdict(list)
+    rows: dict[str, int] = {}
+    # A file that the caller's own test run wrote.
+    for element in ElementTree.parse(path).iter("property"):
+        name = element.get("name")
+        if name in ("check", "rows"):
+            label, number = ast.literal_eval(element.get("value", ""))
+            if name == "check":
+                deviations[label].append(number)
+            else:
+                rows[label] = int(number)
+    return deviations, rows
+
+
+def main(path: Path) -> None:
+    """Write the page."""
+    deviations, rows = read(path)
+    missing = FAMILY.keys() ^ deviations.keys()
+    if missing:
+        raise SystemExit(f"checks and table differ in {sorted(missing)}")
+    lines = [
+        f"| {label} | {equation} | {configuration} | {rows.get(label, '')} | {against} "
+        f"| {len(deviations[label])} | {max(deviations[label]):.0e} |\n"
+        for label, (equation, configuration, against) in FAMILY.items()
+    ]
+    PAGE.write_text(HEAD + "".join(lines) + TAIL)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

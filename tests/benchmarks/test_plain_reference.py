@@ -1,0 +1,135 @@
+"""The reference that the benchmark compares with computes what OSRLoss computes."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+
+import pytest
+import torch
+from plain_reference import Batch, Noise, PlainOSR
+from torchrl.objectives import SoftUpdate
+
+from torchrl_osr import OSRLoss
+from torchrl_osr.modules import (
+    critic_ensemble,
+    tanh_gaussian_actor,
+    tanh_gaussian_inverse_dynamics,
+)
+
+# Observation, action, hidden layers and batch; the first two are make_batch's.
+S, A, CELLS, B, K = 3, 2, [8, 8], 10, 4
+LOSSES = ["loss_actor", "loss_alpha", "loss_qvalue", "loss_cql", "loss_recovery"]
+
+
+@pytest.fixture
+def both() -> tuple[OSRLoss, SoftUpdate, PlainOSR]:
+    """Both with the same weights, target critics and temperatures off the start."""
+    # Numbers as bounds would be float32, and the actions equal to 1e-8 only.
+    bounds = {"low": -torch.ones(A).double(), "high": torch.ones(A).double()}
+    actor = tanh_gaussian_actor(S, A, num_cells=CELLS, **bounds)
+    critics = critic_ensemble(S, A, num_cells=CELLS)
+    model = tanh_gaussian_inverse_dynamics(S, A, num_cells=CELLS, **bounds)
+    plain = PlainOSR(S, A, CELLS, num_random=K)
+    pairs = [
+        (actor, [plain.actor]),
+        (model, [plain.model]),
+        (critics[0], [plain.critic_1, plain.target_1]),
+        (critics[1], [plain.critic_2, plain.target_2]),
+    ]
+    for source, copies in pairs:
+        for copied in copies:
+            copied.double()
+            theirs = zip(copied.parameters(), source.parameters(), strict=True)
+            for parameter, value in theirs:
+                parameter.data.copy_(value.data)
+    loss = OSRLoss(actor, critics, model, num_random=K, alpha_init=0.3).double()
+    loss.make_value_estimator(gamma=plain.gamma)
+    updater = SoftUpdate(loss, tau=plain.tau)
+    loss.target_qvalue_network_params.apply_(lambda tensor: tensor.mul_(0.8))
+    for target in (plain.target_1, plain.target_2):
+        for parameter in target.parameters():
+            parameter.data.mul_(0.8)
+    plain.log_alpha.data = loss.log_alpha.data.clone()
+    return loss, updater, plain
+
+
+def unpack(batch) -> Batch:
+    return Batch(
+        state=batch["observation"],
+        action=batch["action"],
+        reward=batch["next", "reward"].squeeze(-1),
+        next_state=batch["next", "observation"],
+        done=batch["next", "done"].squeeze(-1),
+        terminated=batch["next", "terminated"].squeeze(-1),
+        perturbed=batch["perturbed", "observation"],
+    )
+
+
+def draw_as_ours(*_) -> Noise:
+    """Torch's draws in the order in which OSRLoss makes them, K before B there."""
+
+    def swap(noise: torch.Tensor) -> torch.Tensor:
+        return noise.transpose(0, 1).reshape(-1, A)
+
+    like = {"dtype": torch.float64}
+    actor = torch.randn(2 * B, A, **like)
+    uniform = 2 * torch.rand(K, B, A, **like) - 1
+    proposals = torch.randn(K, 2, B, A, **like)
+    target = torch.randn(B, A, **like)
+    current, following = swap(proposals[:, 0]), swap(proposals[:, 1])
+    return Noise(actor, target, swap(uniform), current, following)
+
+
+def test_losses_and_gradients_equal_ours(both, make_batch, check) -> None:
+    loss, _, plain = both
+    torch.manual_seed(5)
+    ours = loss(make_batch(B))
+    torch.manual_seed(5)
+    reference = plain.losses(unpack(make_batch(B)), draw_as_ours())
+    assert set(reference) == set(LOSSES)
+    check(
+        "plain reference",
+        [ours[key] for key in LOSSES],
+        [reference[key] for key in LOSSES],
+        tolerance=1e-9,
+    )
+    sum(ours[key] for key in LOSSES).backward()
+    actor = reference["loss_actor"] + reference["loss_recovery"]
+    critic = reference["loss_qvalue"] + reference["loss_cql"]
+    wanted = list(torch.autograd.grad(actor, list(plain.actor.parameters())))
+    wanted += torch.autograd.grad(reference["loss_alpha"], [plain.log_alpha])
+    each = [list(c.parameters()) for c in (plain.critic_1, plain.critic_2)]
+    gradients = torch.autograd.grad(critic, each[0] + each[1])
+    half = len(each[0])
+    pairs = zip(gradients[:half], gradients[half:], strict=True)
+    wanted += [torch.stack(pair) for pair in pairs]
+    got = [p.grad for p in loss.actor_network_params.values(True, True)]
+    got.append(loss.log_alpha.grad)
+    got += [p.grad for p in loss.qvalue_network_params.values(True, True)]
+    check("plain reference", got, wanted, tolerance=1e-8)
+
+
+def test_update_moves_the_same_weights_as_ours(both, make_batch, check) -> None:
+    loss, updater, plain = both
+    optimizer = torch.optim.Adam(loss.parameters(), lr=plain.rate)
+    plain.draw = draw_as_ours
+    for seed in range(3):
+        torch.manual_seed(seed)
+        losses = loss(make_batch(B))
+        sum(losses[key] for key in LOSSES).backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        updater.step()
+        torch.manual_seed(seed)
+        phases = list(plain.update(unpack(make_batch(B)), nullcontext))
+        assert phases == ["forward", *["backward", "optimizer"] * 3, "targets"]
+    got = list(loss.actor_network_params.values(True, True))
+    wanted = list(plain.actor.parameters())
+    for params, (first, second) in (
+        (loss.qvalue_network_params, (plain.critic_1, plain.critic_2)),
+        (loss.target_qvalue_network_params, (plain.target_1, plain.target_2)),
+    ):
+        got += params.values(True, True)
+        pairs = zip(first.parameters(), second.parameters(), strict=True)
+        wanted += [torch.stack(pair) for pair in pairs]
+    check("plain reference, after three updates", got, wanted, tolerance=1e-6)

@@ -1,0 +1,109 @@
+"""The speed benchmark: its matrix products, and a run from end to end."""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import subprocess
+import sys
+from contextlib import nullcontext
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from contenders import OURS, Size, make_contender, our_loss
+from diagnostics import count_flops
+from matmul_bound import Products, osr_passes
+from speed_report import tables
+from update_speed import PRECISIONS, summarize
+
+SCRIPT = Path(__file__).parents[2] / "benchmarks" / "update_speed.py"
+autocast = partial(torch.autocast, "cpu", dtype=torch.bfloat16)
+NUMBERS = [
+    "updates_per_cpu_second", "updates_per_second", "ratio", "ratio_lowest",
+    "ratio_highest", "products_share", "page_faults", "peak_memory_bytes",
+    "operations", "kernels", "host_reads", "flops",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["hopper-2x64", "halfcheetah-3x32"])
+def test_products_are_those_of_our_update(name) -> None:
+    size = Size.parse(name)
+    update, batches = make_contender("OSR", size, torch.device("cpu"))
+    chunk = our_loss("OSR", size).chunk_size
+    for casting, pieces in ((nullcontext, chunk), (autocast, None)):
+        passes = osr_passes(size.observations, size.actions, size.cells, chunk=pieces)
+        told = sum(each.flops() for each in passes)
+        counted = count_flops(lambda casting=casting: update(batches[0], casting))
+        assert told == pytest.approx(counted, rel=0.03)
+
+
+@pytest.mark.parametrize("chunk", [None, 5])
+def test_products_run_as_many_operations_as_their_shapes_tell(chunk) -> None:
+    passes = osr_passes(3, 2, (8, 4), batch=12, num_random=2, critics=3, chunk=chunk)
+    products = Products(passes, torch.float32, "cpu")
+    assert count_flops(products.update) == sum(each.flops() for each in passes)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> tuple[str, dict, Path]:
+    folder = tmp_path_factory.mktemp("speed")
+    text = "Before.\n<!-- tables -->\nold\n<!-- end of tables -->\nAfter.\n"
+    (folder / "README.md").write_text(text)
+    sizes = ["--sizes=hopper-1x8", "--rounds=2", "--seconds=0.001"]
+    completed = subprocess.run(
+        [sys.executable, str(SCRIPT), *sizes, f"--output={folder}"],
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert completed.returncode == 0, completed.stderr
+    results = json.loads((folder / "speed.json").read_text())
+    return completed.stdout, results, folder
+
+
+def test_file_has_every_contender_and_round(run) -> None:
+    _, results, _ = run
+    assert set(results) == {"command", "machine", "sizes"}
+    assert {"cpu", "torch", "threads", "rounds", "commit"} <= set(results["machine"])
+    (by_precision,) = results["sizes"].values()
+    assert list(by_precision) == list(PRECISIONS)
+    for precision, names in PRECISIONS.items():
+        assert set(OURS) < set(names)
+        assert list(by_precision[precision]) == list(names)
+        for row in by_precision[precision].values():
+            assert row["failure"] is None
+            assert all(row[number] >= 0 for number in NUMBERS)
+            assert len(row["rounds"]) == 2
+            assert sum(row["time_by_kind"].values()) == pytest.approx(1)
+            seconds = sum(row["cpu_seconds_by_part"].values())
+            assert seconds == pytest.approx(1 / row["updates_per_cpu_second"], rel=0.5)
+
+
+def test_a_failure_is_told_and_ends_nothing_else(run) -> None:
+    _, results, _ = run
+    sizes = copy.deepcopy(results["sizes"])
+    rows = sizes["hopper-1x8"]["bfloat16"]
+    failed = SimpleNamespace(rounds=[], diagnosis={}, failure="RuntimeError: dtypes")
+    rows["OSR"] = summarize(failed, failed, failed, "cpu_seconds")
+    assert rows["OSR"]["ratio"] is rows["OSR"]["updates_per_second"] is None
+    text = tables({**results, "sizes": sizes})
+    assert "| OSR | failed |" in text
+    assert "| OSR | RuntimeError: dtypes |" in text
+
+
+def test_tables_are_printed_and_put_into_the_readme(run) -> None:
+    printed, results, folder = run
+    readme = (folder / "README.md").read_text()
+    assert readme.startswith("Before.\n<!-- tables -->\n")
+    assert readme.endswith("<!-- end of tables -->\nAfter.\n")
+    assert "old" not in readme
+    assert printed.strip() in readme
+    osr = results["sizes"]["hopper-1x8"]["float32"]["OSR"]
+    cell = f"| OSR | {osr['updates_per_cpu_second']:.1f} ({osr['ratio']:.2f}x) |"
+    assert cell in printed
+    assert (folder / "speed.png").stat().st_size > 10_000

@@ -1,0 +1,180 @@
+"""What a loss does with its batch: reductions, masks, weights, what it leaves alone."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+
+REDUCTIONS = ["mean", "sum", "none"]
+# Rows without a next state count neither in the sum nor in the number of rows.
+OF_TRANSITIONS = ("loss_recovery", "loss_inverse_dynamics")
+
+
+def flag(batch, key: str) -> torch.Tensor:
+    return batch["next", key].squeeze(-1)
+
+
+@pytest.mark.parametrize("size", [(10,), (2, 5)])
+def test_reductions_agree(family, family_batch, seeded, name, size) -> None:
+    batch, member = family_batch(name, *size), family[name]
+    out = {key: seeded(family(name, reduction=key), batch) for key in REDUCTIONS}
+    assert out["none"].batch_size == batch.batch_size
+    done = flag(batch, "done")
+    for key in member.groups:
+        each, skips = out["none"][key], key in OF_TRANSITIONS
+        assert each.shape == size
+        assert ((each == 0) == (done & skips)).all()
+        rows = (~done).sum() if skips else done.numel()
+        torch.testing.assert_close(out["sum"][key], each.sum())
+        torch.testing.assert_close(out["mean"][key], each.sum() / rows)
+    for key in member.metrics:
+        assert torch.equal(out["sum"][key], out["mean"][key])
+
+
+def test_metric_is_the_unweighted_recovery_term(
+    family, family_batch, recovering
+) -> None:
+    out = family(recovering)(family_batch(recovering, 10))
+    metric = out[family[recovering].metrics[-1]]
+    assert not metric.requires_grad
+    torch.testing.assert_close(out["loss_recovery"].detach(), 0.5 * metric)
+
+
+def test_time_dimension_changes_no_number(
+    family, family_batch, seeded, assert_same, name
+) -> None:
+    # The same rows, [10] and [2, 5]: the draws have the same count and order.
+    flat = family_batch(name, 10)
+    shaped = flat.reshape(2, 5)
+    expected, out = seeded(family(name), flat), seeded(family(name), shaped)
+    assert_same([out[key] for key in expected.keys()], expected.values())  # noqa: SIM118
+    if family[name].has_critics:
+        assert torch.equal(shaped["td_error"], flat["td_error"].reshape(2, 5))
+
+
+def other_action(action: torch.Tensor) -> torch.Tensor:
+    """Actions that nobody took: out at the border, or another one of the discrete."""
+    if action.is_floating_point():
+        return torch.full_like(action, 0.99)
+    # A one-hot vector moves by an action, and so does an index.
+    return action.roll(1, -1) if action.ndim > 2 else (action + 1) % 4
+
+
+def spoil(batch, rows: torch.Tensor):
+    """The batch with garbage in some rows."""
+    spoiled = batch.clone()
+    for key in ("observation", ("next", "observation"), ("perturbed", "observation")):
+        if key in batch.keys(True):
+            spoiled[key][rows] = 30.0
+    spoiled["action"][rows] = other_action(batch["action"])[rows]
+    spoiled["next", "reward"][rows] = -1e6
+    spoiled["next", "done"][rows] = False
+    return spoiled
+
+
+@pytest.mark.parametrize("reduction", REDUCTIONS)
+def test_padding_changes_neither_losses_nor_gradients(
+    family, family_batch, record, assert_same, name, reduction
+) -> None:
+    loss, batch = family(name, reduction=reduction), family_batch(name, 2, 5)
+    mask = torch.ones(2, 5, 1, dtype=torch.bool)
+    mask[:, 3:] = False
+    batch["collector", "mask"] = mask
+    spoiled = spoil(batch, ~mask.squeeze(-1))
+    wanted = record(loss, batch)
+    assert_same(record(loss, spoiled), wanted)
+    # Without the mask the same garbage does show.
+    del spoiled["collector"]
+    with pytest.raises(AssertionError):
+        assert_same(record(loss, spoiled), wanted)
+
+
+def test_mean_is_over_unmasked_rows(family, family_batch, seeded, name) -> None:
+    batch = family_batch(name, 10)
+    valid = torch.arange(10) < 6
+    rows = seeded(family(name, reduction="none"), batch)
+    batch["collector", "mask"] = valid.unsqueeze(-1)
+    out = seeded(family(name), batch)
+    for key in family[name].groups:
+        counted = valid & ~flag(batch, "done") if key in OF_TRANSITIONS else valid
+        torch.testing.assert_close(out[key], rows[key][counted].mean())
+
+
+def test_rows_weigh_as_much_as_their_priority_weight(
+    family, family_batch, seeded, prioritized
+) -> None:
+    batch = family_batch(prioritized, 10)
+    rows = seeded(family(prioritized, reduction="none"), batch)
+    weight = batch["priority_weight"] = torch.rand(10, dtype=torch.float64) + 0.1
+    out = seeded(family(prioritized), batch)
+    ignoring = seeded(family(prioritized, use_prioritized_weights=False), batch)
+    for key in family[prioritized].groups:
+        counts = ~flag(batch, "done") if key in OF_TRANSITIONS else weight > 0
+        counted = weight * counts
+        expected = (rows[key] * counted).sum() / counted.sum()
+        torch.testing.assert_close(out[key], expected)
+        torch.testing.assert_close(ignoring[key], rows[key][counts].mean())
+    for key in family[prioritized].metrics:
+        assert torch.equal(out[key], ignoring[key])
+
+
+def test_batch_is_unchanged_but_for_the_priority(family, family_batch, name) -> None:
+    loss, batch = family(name), family_batch(name, 10)
+    # A batch straight from a buffer may carry what the networks write.
+    batch["loc"] = torch.ones(10, 2)
+    before = batch.clone()
+    loss(batch)
+    new = set(batch.keys(True, True)) - set(before.keys(True, True))
+    assert new == ({"td_error"} if family[name].has_critics else set())
+    assert (batch.select(*before.keys(True, True)) == before).all()
+    for key, value in batch.items(True, True):
+        assert not value.requires_grad, key
+
+
+def test_copies_compute_the_same_and_train_apart(
+    family, family_batch, record, assert_same_bits, name
+) -> None:
+    loss, batch = family(name), family_batch(name, 10)
+    wanted = record(loss, batch)
+    twin = copy.deepcopy(loss)
+    assert_same_bits(record(twin, batch), wanted)
+    for parameter in twin.parameters():
+        parameter.data.add_(1.0)
+    assert_same_bits(record(loss, batch), wanted)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_losses_have_the_batch_dtype(family, family_batch, record, name, dtype) -> None:
+    loss = family(name).to(dtype)
+    batch = family_batch(name, 10)
+    batch = batch.apply(lambda t: t.to(dtype) if t.is_floating_point() else t)
+    for value in record(loss, batch):
+        assert value.dtype == dtype
+        assert value.isfinite().all()
+
+
+# The terms without a random draw: recovery, likelihood, and the critics' values.
+DRAWLESS = {
+    "osr": ["loss_recovery", "pred_value"],
+    "official": ["loss_recovery", "pred_value"],
+    "osr-10": ["loss_recovery", "pred_value"],
+    "edac": ["loss_diversity", "pred_value"],
+    "recovery": ["loss_recovery"],
+    "recovery-delta": ["loss_recovery"],
+    "recovery-plain": ["loss_recovery"],
+    "idm": ["loss_inverse_dynamics"],
+    "discrete-idm": ["loss_inverse_dynamics"],
+}
+
+
+def test_order_of_the_rows_does_not_matter(family, family_batch, name) -> None:
+    loss, batch, member = family(name), family_batch(name, 10), family[name]
+    keys = DRAWLESS.get(name, ["pred_value"] * member.has_critics)
+    # No draw at all with discrete actions and critics.
+    if member.discrete:
+        keys = member.out_keys
+    out, flipped = loss(batch), loss(batch[torch.arange(9, -1, -1)])
+    for key in keys:
+        torch.testing.assert_close(out[key], flipped[key])

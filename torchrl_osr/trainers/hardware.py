@@ -1,0 +1,49 @@
+"""What a run asks of the machine, checked before any long work."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+
+Precision = Literal["float32", "bfloat16"]
+
+
+def check_hardware(
+    device: str, precision: Precision
+) -> tuple[torch.device, torch.dtype | None]:
+    """Return the device and what to autocast to, or say what this machine lacks.
+
+    Args:
+        device: ``"cpu"``, ``"cuda"`` or ``"cuda:1"``.
+        precision: ``"float32"``, or ``"bfloat16"`` for autocast: matrix products in
+            half precision; parameters, targets, densities, log-sum-exps and the
+            optimizer stay in float32.
+
+    Raises:
+        ValueError: if there is no such device or precision, or the device does not
+            compute in it.
+    """
+    if precision not in ("float32", "bfloat16"):
+        raise ValueError(
+            f"precision must be 'float32' or 'bfloat16', got {precision!r}."
+        )
+    where = torch.device(device)
+    if where.type == "cuda" and not torch.cuda.is_available():
+        raise ValueError(
+            f"device={device!r}, but torch {torch.__version__} sees no CUDA device "
+            "here. Use device=cpu, or install a CUDA build of torch."
+        )
+    if precision == "float32":
+        return where, None
+    if where.type == "cuda" and not torch.cuda.is_bf16_supported():
+        raise ValueError(
+            f"{torch.cuda.get_device_name(where)} does not compute in bfloat16: use "
+            "precision=float32."
+        )
+    if where.type == "cpu" and not torch.ops.mkldnn._is_mkldnn_bf16_supported():
+        raise ValueError(
+            "This CPU has no bfloat16 products (it would need AVX-512): use "
+            "precision=float32."
+        )
+    return where, torch.bfloat16
