@@ -171,3 +171,28 @@ def test_multirun_names_the_failed_job(tmp_path, environment):
     assert failed.startswith("0_data.held_out=0.1")
     assert "at least 1" in status[failed]["error"]
     assert done.startswith("1_")
+
+
+def test_every_other_loss_runs_to_its_end(tmp_path, environment):
+    """One sweep over them, warm start included; the main one has its own tests."""
+    losses = "cql,osr_v,osr_10,sac_10,edac_10,osr_adversarial"
+    arguments = [*TINY, f"loss={losses}", "trainer.bc_steps=20"]
+    code, output = run(tmp_path, environment, "-m", *arguments, "hydra.sweep.dir=sweep")
+    assert code == 0, output
+    assert "Warning" not in output
+    folders = list((tmp_path / "sweep").glob("*/returns.json"))
+    assert len(folders) == 6
+    for path in folders:
+        assert json.loads(path.read_text())["last"]["step"] == 40
+
+
+def test_official_preset_with_its_model_runs_in_half_precision(tmp_path, environment):
+    arguments = [*TINY, "preset=official", "trainer.precision=bfloat16"]
+    code, output = run(tmp_path, environment, *arguments, "hydra.run.dir=run")
+    if "has no bfloat16" in output:
+        assert code != 0
+        return
+    assert code == 0, output
+    config = (tmp_path / "run" / "config.yaml").read_text()
+    assert "standardize: false" in config
+    assert "cvae_inverse_dynamics" in config

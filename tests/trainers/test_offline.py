@@ -317,3 +317,27 @@ def test_any_loss_module_can_be_trained(tmp_path):
 def test_intervals_must_be_positive(tmp_path, name):
     with pytest.raises(ValueError, match="at least 1"):
         make_trainer(tmp_path, **{name: 0})
+
+
+def test_step_counts_the_running_update_through_a_resume(tmp_path):
+    """What a warm start asks for: a hook on each batch knows which update it is."""
+    seen: list[int] = []
+
+    def watched() -> OfflineTrainer:
+        trainer = make_trainer(tmp_path)
+
+        def note(batch):
+            seen.append(trainer.step)
+            return batch
+
+        trainer.register_op("process_optim_batch", note)
+        return trainer
+
+    stop_at(watched(), 12)
+    assert seen == list(range(1, 14))
+    seen.clear()
+    trainer = watched()
+    trainer.train()
+    # The last checkpoint before update 13 is that of step 10.
+    assert seen == list(range(11, STEPS + 1))
+    assert trainer.step == STEPS

@@ -78,7 +78,7 @@ def qvalue(
     batch, flat = hidden.shape[:-1], weights_and_biases(params, names)
     hidden = hidden.reshape(-1, hidden.shape[-1]).expand(len(flat[0]), -1, -1)
     for weight, bias in zip(flat[:-2:2], flat[1:-2:2], strict=True):
-        hidden = torch.baddbmm(bias.unsqueeze(1), hidden, weight.mT).relu()
+        hidden = torch.baddbmm(bias.unsqueeze(1), hidden, weight.mT).relu_()
     value = torch.baddbmm(flat[-1].unsqueeze(1), hidden, flat[-2].mT)
     # Under autocast the layers compute in half precision; what follows does not.
     return value.reshape(-1, *batch).to(state.dtype)

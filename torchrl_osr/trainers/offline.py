@@ -27,7 +27,11 @@ from torchrl_osr.trainers.checkpointing import (
     load_latest,
     safe_checkpoint,
 )
-from torchrl_osr.trainers.gradient_steps import GradientSteps, SumOfLosses
+from torchrl_osr.trainers.gradient_steps import (
+    GradientSteps,
+    SumOfLosses,
+    pandas_settled,
+)
 
 try:
     from tqdm.auto import tqdm
@@ -174,7 +178,7 @@ class OfflineTrainer(Trainer):
             # None: silent where the output is not a terminal.
             disable=None if self.progress else True,
         )
-        with self._bar:
+        with self._bar, pandas_settled():
             super().train()
 
     def resume(self) -> Path | None:
