@@ -7,26 +7,19 @@ that one clock outside can tell the parts apart.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
-from matmul_bound import Products, osr_passes
+from diagnostics import count_flops
+from matmul_bound import Pass, Products, osr_passes, total_flops
 from plain_reference import Batch, PlainOSR
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule
-from torch import nn
-from torchrl.data import Bounded, ReplayBuffer
-from torchrl.envs.utils import ExplorationType
-from torchrl.modules import (
-    MLP,
-    NormalParamExtractor,
-    ProbabilisticActor,
-    TanhNormal,
-    ValueOperator,
-)
-from torchrl.objectives import CQLLoss, LossModule, SoftUpdate, group_optimizers
+from torchrl.data import ReplayBuffer
+from torchrl.objectives import LossModule, SoftUpdate
+from torchrl_cql import cql_loss, cql_update
 
 from torchrl_osr import OSRLoss, OSRVLoss, StatePerturbation
 from torchrl_osr.data import make_replay_buffer
@@ -139,84 +132,25 @@ def our_loss(name: str, size: Size) -> LossModule:
     return OSRLoss(actor, critics, model)
 
 
-def torchrl_cql_loss(size: Size, device: torch.device) -> CQLLoss:
-    """Return TorchRL's CQL with the options of its own offline script."""
-    low = -torch.ones(size.actions, device=device)
-    widths: dict[str, Any] = {
-        "num_cells": list(size.cells),
-        "activation_class": nn.ReLU,
-    }
-    head = nn.Sequential(
-        MLP(size.observations, 2 * size.actions, **widths),
-        NormalParamExtractor(scale_mapping="biased_softplus_1.0", scale_lb=0.1),
-    )
-    actor = ProbabilisticActor(
-        TensorDictModule(head, ["observation"], ["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        spec=Bounded(low, -low),
-        distribution_class=TanhNormal,
-        distribution_kwargs={"low": low, "high": -low, "tanh_loc": False},
-        default_interaction_type=ExplorationType.RANDOM,
-    )
-    qvalue = ValueOperator(
-        MLP(size.observations + size.actions, 1, **widths), ["observation", "action"]
-    )
-    return CQLLoss(
-        actor.to(device),
-        qvalue.to(device),
-        loss_function="l2",
-        deterministic_backup=False,
-        num_random=NUM_RANDOM,
-        with_lagrange=True,
-        lagrange_thresh=5.0,
-    )
+def osr_products(
+    size: Size, dtype: torch.dtype, device: torch.device
+) -> tuple[list[Pass], int]:
+    """Return OSR's matrix products, and how many operations they were counted to be.
 
-
-def torchrl_cql_update(loss: CQLLoss, device: torch.device) -> Update:
-    """Return the update of that script: four optimizers, and behaviour cloning.
-
-    Which of the policy's two losses counts is chosen on the device: both are computed.
+    ``OSRLoss`` has two ways for many sampled actions, by network and device; the one
+    that it takes is the one that has as many operations.
     """
-    loss.make_value_estimator(gamma=GAMMA)
-    updater = SoftUpdate(loss, tau=TAU)
-    groups = [
-        loss.actor_network_params.flatten_keys().values(),
-        loss.qvalue_network_params.flatten_keys().values(),
-        [loss.log_alpha],
-        [loss.log_alpha_prime],
-    ]
-    optimizer = group_optimizers(*[torch.optim.Adam(group, RATE) for group in groups])
-    cloned_until, step = torch.tensor(40_000, device=device), 0
-
-    def update(batch: TensorDictBase, casting: Casting) -> Iterator[str]:
-        nonlocal step
-        now, step = torch.tensor(step, device=device), step + 1
-        with casting():
-            losses = loss(batch.copy())
-            actor = torch.where(
-                now >= cloned_until, losses["loss_actor"], losses["loss_actor_bc"]
-            )
-            critic = losses["loss_qvalue"] + losses["loss_cql"]
-            total = actor + critic + losses["loss_alpha"] + losses["loss_alpha_prime"]
-        yield "forward"
-        total.backward()
-        yield "backward"
-        optimizer.step()
-        optimizer.zero_grad(set_to_none=True)
-        yield "optimizer"
-        updater.step()
-        yield "targets"
-
-    return update
-
-
-def products_update(size: Size, dtype: torch.dtype, device: torch.device) -> Update:
-    """Return OSR's matrix products, in the pieces in which the loss runs them."""
-    in_pieces = device.type == "cpu" and dtype == torch.float32
-    chunk = our_loss("OSR", size).chunk_size if in_pieces else None
+    loss, batch = our_loss("OSR", size).to(device), make_buffer(size, device).sample()
+    autocast = partial(torch.autocast, device.type, dtype=dtype)
+    casting = nullcontext if dtype == torch.float32 else autocast
+    update = our_update(loss)
+    counted = count_flops(lambda: update(batch, casting))
     sizes = (size.observations, size.actions, size.cells)
-    passes = osr_passes(*sizes, batch=BATCH, num_random=NUM_RANDOM, chunk=chunk)
-    return Products(passes, dtype, device).update
+    ways = [
+        osr_passes(*sizes, batch=BATCH, num_random=NUM_RANDOM, chunk=chunk)
+        for chunk in (None, loss.chunk_size)
+    ]
+    return min(ways, key=lambda way: abs(total_flops(way) - counted)), counted
 
 
 def make_contender(
@@ -238,11 +172,14 @@ def make_contender(
         return plain.update, [unpack(batch) for batch in batches]
     if name in (PRODUCTS, PRODUCTS_BF16):
         dtype = torch.float32 if name == PRODUCTS else torch.bfloat16
-        return products_update(size, dtype, device), batches
+        passes, _ = osr_products(size, dtype, device)
+        return Products(passes, dtype, device).update, batches
     # CQL has no use for perturbed states, and needs not carry them.
     if name == TORCHRL:
         batches = [batch.exclude("perturbed") for batch in batches]
-        return torchrl_cql_update(torchrl_cql_loss(size, device), device), batches
+        sizes = (size.observations, size.actions, size.cells)
+        update = cql_update(cql_loss(*sizes, num_random=NUM_RANDOM, device=device))
+        return update, batches
     loss = our_loss(name, size).to(device)
     if not loss.recovers:
         batches = [batch.exclude("perturbed") for batch in batches]

@@ -47,6 +47,11 @@ class Pass:
         return 2 * self.rows * self.copies * total
 
 
+def total_flops(passes: Sequence[Pass]) -> int:
+    """Return the floating point operations of all passes."""
+    return sum(each.flops() for each in passes)
+
+
 def osr_passes(
     observations: int,
     actions: int,
@@ -65,9 +70,8 @@ def osr_passes(
         batch: rows of a batch.
         num_random: ``K``, actions drawn of each kind.
         critics: how many.
-        chunk: how many states of the batch the critics take at a time, with all their
-            sampled actions, where they do so: the first layer's product with a state is
-            then the same for all of its actions. ``None`` for all rows at once.
+        chunk: states that the critics take at a time with all their sampled actions,
+            which share the first layer's product with the state; ``None`` for all rows.
     """
     actor = (observations, *cells, 2 * actions)
     model = (2 * observations, *cells, 2 * actions)
@@ -85,12 +89,9 @@ def osr_passes(
         return [*passes, learning(critic, (sampled + 1) * batch)]
     states = tuple(min(chunk, batch - start) for start in range(0, batch, chunk))
     rows = tuple(sampled * number for number in states)
-    return [
-        *passes,
-        learning(critic, batch),  # the data's actions
-        learning((observations, cells[0]), batch, pieces=states),
-        learning((actions, *cells, 1), sampled * batch, pieces=rows),
-    ]
+    apart = learning((observations, cells[0]), batch, pieces=states)
+    together = learning((actions, *cells, 1), sampled * batch, pieces=rows)
+    return [*passes, learning(critic, batch), apart, together]
 
 
 class Products:

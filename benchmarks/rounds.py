@@ -7,6 +7,7 @@ again, depends on everything that a process has allocated before.
 
 from __future__ import annotations
 
+import ctypes
 import multiprocessing
 import resource
 import time
@@ -100,6 +101,14 @@ class Timer:
         return counts | profile_update(self.once, self.device, steps)
 
 
+def keep_memory() -> None:
+    """Let glibc keep the memory that is freed, for the next time it is asked for."""
+    trim_threshold, mmap_max = -1, -4  # of malloc.h
+    libc = ctypes.CDLL(None)
+    if not libc.mallopt(trim_threshold, 2**31 - 1) or not libc.mallopt(mmap_max, 0):
+        raise OSError("This system's malloc cannot be told to keep memory.")
+
+
 def serve(
     connection: Connection,
     name: str,
@@ -108,8 +117,11 @@ def serve(
     device: str,
     threads: int,
     seconds: float,
+    keep: bool,
 ) -> None:
     """Answer each request with what it asks for, or with what went wrong."""
+    if keep:
+        keep_memory()
     torch.set_num_threads(threads)
     torch.manual_seed(0)
     timer = None
@@ -134,13 +146,16 @@ class Contender:
         failure: what went wrong, if something did; it takes part no more then.
     """
 
-    def __init__(self, *arguments: Any) -> None:
+    def __init__(self, name: str, precision: str, **settings: Any) -> None:
         self.rounds: list[dict[str, Any]] = []
         self.diagnosis: dict[str, Any] = {}
         self.failure: str | None = None
         self._connection, theirs = FORK.Pipe()
         self._process = FORK.Process(
-            target=serve, args=(theirs, *arguments), daemon=True
+            target=serve,
+            args=(theirs, name, precision),
+            kwargs=settings,
+            daemon=True,
         )
         self._process.start()
         theirs.close()

@@ -116,8 +116,8 @@ def tables(results: Mapping[str, Any]) -> str:
         f"{machine['torchrl']}, tensordict {machine['tensordict']}, {machine['date']}."
         "\n"
     )
-    for precision, title in TITLES.items():
-        text += f"\n### {title}\n\n{speed_table(sizes, precision)}"
+    for precision in sizes[first]:
+        text += f"\n### {TITLES[precision]}\n\n{speed_table(sizes, precision)}"
         text += f"\nOne update of `{first}`:\n\n"
         text += detail_table(sizes[first][precision], precision)
     sampling = sizes[first]["float32"][SAMPLING]["updates_per_cpu_second"]
@@ -160,6 +160,7 @@ def draw_precision(axes: Axes, sizes: Mapping[str, Any], precision: str) -> None
             axes.annotate(
                 f"{row['ratio']:.2f}", (x, row["ratio_highest"]), (0, 2),
                 textcoords="offset points", ha="center", fontsize=7,
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5},
             )  # fmt: skip
     axes.axhline(
         1, color="black", linewidth=1, linestyle="--",
@@ -174,10 +175,11 @@ def draw_precision(axes: Axes, sizes: Mapping[str, Any], precision: str) -> None
 
 def draw(results: Mapping[str, Any], path: Path) -> None:
     """Draw a panel for each precision."""
-    figure = Figure(figsize=(11, 9), layout="constrained")
+    precisions = list(next(iter(results["sizes"].values())))
+    figure = Figure(figsize=(11, 3 * len(precisions)), layout="constrained")
     FigureCanvasAgg(figure)
-    panels = figure.subplots(len(TITLES), 1)
-    for axes, precision in zip(panels, TITLES, strict=True):
+    panels = figure.subplots(len(precisions), 1, squeeze=False)[:, 0]
+    for axes, precision in zip(panels, precisions, strict=True):
         draw_precision(axes, results["sizes"], precision)
     figure.supylabel(
         "speed of an update; plain reference, measured in the same rounds, = 1",

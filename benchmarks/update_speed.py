@@ -84,14 +84,22 @@ def summarize(
 
 
 def measure(
-    name: str, *, rounds: int, seconds: float, threads: int, device: str
+    name: str, *, precisions: Sequence[str], rounds: int, device: str, **settings: Any
 ) -> dict[str, dict[str, Any]]:
-    """Return the results of one size, by precision and contender."""
-    size = Size.parse(name)
+    """Return the results of one size, by precision and contender.
+
+    Args:
+        name: of the size.
+        precisions: some of :data:`PRECISIONS`.
+        rounds: how many.
+        device: where.
+        settings: what :func:`rounds.serve` takes besides.
+    """
+    common = {"size": Size.parse(name), "device": device, **settings}
     contenders = {
-        (precision, who): Contender(who, precision, size, device, threads, seconds)
-        for precision, members in PRECISIONS.items()
-        for who in members
+        (precision, who): Contender(who, precision, **common)
+        for precision in precisions
+        for who in PRECISIONS[precision]
     }
     for number in range(rounds):
         print(f"{name}: round {number + 1} of {rounds}", file=sys.stderr, flush=True)
@@ -101,7 +109,7 @@ def measure(
         contender.diagnose()
         contender.close()
     clock = "wall_seconds" if device == "cuda" else "cpu_seconds"
-    results: dict[str, dict[str, Any]] = {precision: {} for precision in PRECISIONS}
+    results: dict[str, dict[str, Any]] = {precision: {} for precision in precisions}
     for (precision, who), contender in contenders.items():
         # Autocast is compared with the plain reference without it.
         exact = "float32" if precision == "bfloat16" else precision
@@ -139,20 +147,35 @@ def machine() -> dict[str, Any]:
     }
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Measure, write and print."""
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Return the options of the command line."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--sizes", default=SIZES, help="task-layersxwidth, by commas")
+    parser.add_argument(
+        "--precisions", default=",".join(PRECISIONS), help="float32 among them"
+    )
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--seconds", type=float, default=1.0, help="of each round")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
+    parser.add_argument(
+        "--keep", action="store_true", help="let glibc keep freed memory, for all alike"
+    )
     parser.add_argument("--output", type=Path, default=Path("results/speed"))
     options = parser.parse_args(arguments)
+    options.precisions = options.precisions.split(",")
+    if not {"float32"} <= set(options.precisions) <= set(PRECISIONS):
+        parser.error(f"--precisions takes float32 and others of {list(PRECISIONS)}")
+    return options
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure, write and print."""
+    options = parse(arguments)
     torchrl_logger.setLevel("WARNING")
     settings = {
         name: getattr(options, name)
-        for name in ("rounds", "seconds", "threads", "device")
+        for name in ("precisions", "rounds", "seconds", "threads", "device", "keep")
     }
     given = sys.argv[1:] if arguments is None else arguments
     results = {

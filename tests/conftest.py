@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from types import SimpleNamespace
 
 import pytest
@@ -20,6 +21,12 @@ from torchrl.modules import (
 torch.set_num_threads(1)
 
 OBSERVATION_DIM, ACTION_DIM = 3, 2
+
+
+def pytest_collection_finish() -> None:
+    """Spare the garbage collector the walk through everything that was imported."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)

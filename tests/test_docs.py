@@ -167,3 +167,12 @@ def test_options_of_every_group_are_documented():
         (row,) = re.findall(rf"(?m)^\| `{group}` \|.*$", page)
         for path in (ROOT / "conf" / group).glob("*.yaml"):
             assert f"`{path.stem}`" in row
+
+
+def test_family_page_has_every_loss_of_the_configuration():
+    page = (ROOT / "docs" / "family.md").read_text(encoding="utf-8")
+    for path in (ROOT / "conf" / "loss").glob("*.yaml"):
+        assert f"`loss={path.stem}" in page
+    deviations = [float(cell) for cell in re.findall(r"\| (\de[-+]\d+) \|$", page, re.M)]
+    assert len(deviations) == page.count("\n| ") - 1
+    assert max(deviations) < 1e-8

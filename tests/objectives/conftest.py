@@ -264,7 +264,7 @@ SOFT_ACTOR_CRITIC = {
     "loss_qvalue": CRITICS,
 }
 CQL, RECOVERY = {"loss_cql": CRITICS}, {"loss_recovery": ACTOR}
-# Critics that are plain MLPs with ReLUs have a path of their own.
+# Critics that are plain MLPs with ReLUs have a path of their own; the others are vmapped.
 RELU = {"critic_activation": nn.ReLU}
 recovery_loss = partial(
     Member,
@@ -288,6 +288,7 @@ FAMILY = {
         OSRLoss,
         CQL | RECOVERY,
         "recovery_kl",
+        networks=RELU,
         recovery_direction="reverse",
         action_reduction="mean",
         recovery_states="perturbed",
@@ -298,13 +299,14 @@ FAMILY = {
         CQL | RECOVERY,
         "recovery_kl",
         twin=False,
+        networks=RELU,
         adversary=Adversary(epsilon=0.1, num_samples=3),
     ),
     "osr-10": actor_critic(
         OSRLoss,
         RECOVERY,
         "recovery_kl",
-        networks={"num_critics": 3},
+        networks={"num_critics": 3} | RELU,
         min_q_weight=0.0,
         deterministic_backup=False,
     ),
@@ -327,7 +329,7 @@ FAMILY = {
         OSRLoss,
         {"loss_diversity": CRITICS},
         twin=False,
-        networks={"num_critics": 3} | RELU,
+        networks={"num_critics": 3},
         recovery_weight=0.0,
         min_q_weight=0.0,
         deterministic_backup=False,
@@ -472,7 +474,8 @@ def record(seeded):
     """Return a function that lists losses and their gradients, one loss at a time."""
 
     def call(loss, batch: TensorDict, keys=None) -> list[Tensor]:
-        out, parameters = seeded(loss, batch), list(loss.parameters())
+        out = seeded(loss, batch)
+        parameters = [each for each in loss.parameters() if each.requires_grad]
         keys = keys or [key for key in out.keys() if key.startswith("loss_")]  # noqa: SIM118
         found: list[Tensor] = []
         for key in keys:

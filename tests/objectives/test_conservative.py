@@ -13,7 +13,7 @@ import math
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.distributions import Independent, Normal, TransformedDistribution
 from torch.distributions.transforms import AffineTransform, TanhTransform
 from torchrl.objectives import SoftUpdate
@@ -189,15 +189,23 @@ BOX = (torch.tensor([-1.0, -0.5]).double(), torch.tensor([2.0, 1.5]).double())
 UNIT = (-torch.ones(2).double(), torch.ones(2).double())
 
 
-@pytest.mark.parametrize("bounds", [UNIT, BOX], ids=["unit", "box"])
-@pytest.mark.parametrize("count", [2, 4])
-@pytest.mark.parametrize("deactivate_vmap", [False, True], ids=["vmap", "loop"])
+# Critics with ReLUs are plain MLPs, which have a path of their own on a CPU.
+WAYS = {
+    "vmap": (UNIT, {"num_critics": 2}, False),
+    "loop": (BOX, {"num_critics": 4}, True),
+    "plain": (UNIT, {"num_critics": 4, "critic_activation": nn.ReLU}, False),
+    "plain box": (BOX, {"num_critics": 2, "critic_activation": nn.ReLU}, False),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("case", CASES)
 def test_critic_losses_and_gradients_equal_the_restatement(
-    make_networks, make_batch, check, case, deactivate_vmap, count, bounds
+    make_networks, make_batch, check, case, way
 ) -> None:
+    bounds, critics, deactivate_vmap = WAYS[way]
     low, high = bounds
-    networks = make_networks(low=low, high=high, num_critics=count)
+    networks = make_networks(low=low, high=high, **critics)
     batch, options = make_batch(10), DEFAULTS | CASES[case]
     reference = copy.deepcopy(networks)
     expected = restated(reference, batch, 5, bounds, **options)

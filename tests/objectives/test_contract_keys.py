@@ -133,7 +133,10 @@ def test_nested_and_renamed_keys_give_the_same_numbers(
     family, family_batch, seeded, assert_same, name
 ) -> None:
     batch = weighted(family_batch(name, 10))
-    expected, loss = seeded(family(name), batch.copy()), renamed_loss(family, name, "never")
+    expected, loss = (
+        seeded(family(name), batch.copy()),
+        renamed_loss(family, name, "never"),
+    )
     enough = renamed(batch).select(*loss.in_keys, RENAMED["priority_weight"])
     check_renamed(loss, enough, expected, assert_same)
 
@@ -200,7 +203,9 @@ def test_losses_without_recovery_need_no_model_and_no_twin(
     loss = family(unrecovering, networks)
     out = seeded(loss, family_batch(unrecovering, 10, twin=False))
     assert list(out.keys()) == list(expected.keys())
-    assert all(torch.equal(out[key], expected[key]) for key in family[unrecovering].out_keys)
+    assert all(
+        torch.equal(out[key], expected[key]) for key in family[unrecovering].out_keys
+    )
 
 
 def test_losses_without_the_conservative_term_read_the_same(
@@ -217,3 +222,15 @@ def test_losses_without_the_conservative_term_read_the_same(
 
 # The multiplier has nothing to hold without the term.
 NOT_LAGRANGE = {"cql-options": {"with_lagrange": False}}
+
+
+@pytest.mark.parametrize(
+    "model", ["recovery", "recovery-delta", "recovery-plain", "idm", "discrete-idm"]
+)
+def test_clean_states_need_no_twin(family, family_batch, seeded, model) -> None:
+    loss = family(model, states="clean")
+    assert all(key[0] != "perturbed" for key in loss.in_keys)
+    with_twin, without = (
+        seeded(loss, family_batch(model, 10, twin=twin)) for twin in (True, False)
+    )
+    assert all(torch.equal(with_twin[key], without[key]) for key in loss.out_keys)

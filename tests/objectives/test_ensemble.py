@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from torch import nn
 from torch.distributions import Normal, kl_divergence
 
 from torchrl_osr import OSRLoss
@@ -26,11 +27,14 @@ def build(networks, **kwargs) -> OSRLoss:
 
 
 @pytest.mark.parametrize("num_critics", [1, 3, 10])
+# Critics with ReLUs are plain MLPs, which have a path of their own.
+@pytest.mark.parametrize("activation", [nn.Tanh, nn.ReLU])
 def test_losses_are_sac_n_restated(
-    make_networks, make_batch, check, num_critics
+    make_networks, make_batch, check, num_critics, activation
 ) -> None:
     """SAC-N (An et al., 2021, equation 2) critic by critic, with the same draws."""
-    networks, batch = make_networks(num_critics=num_critics), make_batch(10)
+    networks = make_networks(num_critics=num_critics, critic_activation=activation)
+    batch = make_batch(10)
     loss = build(
         networks, recovery_weight=0.0, alpha_init=0.25, deterministic_backup=False
     )

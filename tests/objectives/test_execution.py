@@ -1,4 +1,4 @@
-"""The same numbers with and without vmap, and with and without torch.compile."""
+"""The same numbers with and without vmap and torch.compile, and how many rows."""
 
 from __future__ import annotations
 
@@ -6,77 +6,58 @@ import inspect
 
 import pytest
 import torch
-from torchrl.objectives import SoftUpdate
-
-from torchrl_osr import InverseDynamicsLoss, OSRLoss, OSRVLoss
-
-MODES = ["osr", "cql", "osrv", "osrv-logsumexp"]
 
 
-def build(mode: str, networks, **kwargs) -> OSRLoss | OSRVLoss:
-    loss_class = OSRVLoss if mode.startswith("osrv") else OSRLoss
-    if mode == "osrv-logsumexp":
-        kwargs["policy_values"] = "logsumexp"
-    loss = loss_class(
-        networks.actor,
-        networks.critics,
-        networks.inverse_dynamics,
-        recovery_weight=0.0 if mode == "cql" else 0.5,
-        **({"num_random": 3} | kwargs),
-    ).double()
-    loss.make_value_estimator(gamma=0.99)
-    SoftUpdate(loss, tau=0.1)
-    return loss
-
-
-def losses_and_gradients(loss, parameters, batch) -> list[torch.Tensor]:
-    torch.manual_seed(2)
-    losses = [v for k, v in loss(batch).items() if k.startswith("loss_")]
-    return [*losses, *torch.autograd.grad(sum(losses), list(parameters))]
-
-
-@pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("count", [1, 3])
 def test_a_loop_over_critics_equals_vmap(
-    make_networks, make_batch, mode, count
+    family, family_batch, record, assert_same, critic_loss, count
 ) -> None:
-    results = []
-    for deactivate in (False, True):
-        loss = build(mode, make_networks(num_critics=count), deactivate_vmap=deactivate)
-        results.append(losses_and_gradients(loss, loss.parameters(), make_batch(10)))
-    for looped, mapped in zip(*results, strict=True):
-        torch.testing.assert_close(looped, mapped, rtol=1e-12, atol=1e-12)
+    if count == 1 and critic_loss == "edac":
+        count = 2  # whose critics are compared with each other
+    looped, mapped = (
+        record(
+            family(
+                critic_loss,
+                family.networks(critic_loss, num_critics=count),
+                deactivate_vmap=deactivate,
+            ),
+            family_batch(critic_loss, 10),
+        )
+        for deactivate in (True, False)
+    )
+    assert_same(looped, mapped)
 
 
 # Raised inside tensordict 0.14.3 and TorchRL 0.14.1 while torch 2.13 traces them.
 @pytest.mark.filterwarnings("ignore:.*autograd.function.Function:DeprecationWarning")
 @pytest.mark.filterwarnings("ignore:.*inline_inbuilt_nn_modules:FutureWarning")
 @pytest.mark.filterwarnings("ignore:Using lock_.. inside a compiled:UserWarning")
-@pytest.mark.parametrize("name", [*MODES, "idm"])
 def test_compiled_loss_equals_eager_without_graph_breaks(
-    make_networks, make_batch, name
+    family, family_batch, seeded, record, assert_same, name
 ) -> None:
-    networks, batch = make_networks(), make_batch(10)
-    if name == "idm":
-        loss = InverseDynamicsLoss(networks.inverse_dynamics)
-    else:
-        loss = build(name, networks)
-    eager = losses_and_gradients(loss, loss.parameters(), batch)
+    loss, batch = family(name), family_batch(name, 10)
+    eager, metrics = record(loss, batch), seeded(loss, batch)
     torch.compiler.reset()
     compiled = torch.compile(loss, backend="eager", fullgraph=True)
-    found = losses_and_gradients(compiled, loss.parameters(), batch)
-    for ours, theirs in zip(found, eager, strict=True):
-        torch.testing.assert_close(ours, theirs, rtol=1e-12, atol=1e-12)
+    assert_same(record(compiled, batch), eager)
+    out = seeded(compiled, batch)
+    keys = family[name].out_keys
+    assert_same([out[key] for key in keys], [metrics[key] for key in keys])
 
 
-def rows_scored(mode: str, networks, batch, **kwargs) -> float:
-    """How many actions all critics together score for one row of the batch."""
-    scored = []
+def rows_scored(family, name: str, batch, *, critics: int = 2, **options) -> float:
+    """How many rows all critics together score for one row of the batch.
+
+    A row is a state and an action, or a state where a critic values all actions.
+    """
+    networks, scored = family.networks(name, num_critics=critics), []
     for critic in networks.critics:
         critic.module.register_forward_pre_hook(
             lambda _, inputs: scored.append(inputs[0].shape[:-1].numel())
         )
-    build(mode, networks, deactivate_vmap=True, **kwargs)(batch)
+    loss = family(name, networks, deactivate_vmap=True, **options)
+    out = loss(batch)
+    sum(out[key] for key in loss.out_keys if key.startswith("loss_")).backward()
     return sum(scored) / batch.numel()
 
 
@@ -84,44 +65,52 @@ def rows_scored(mode: str, networks, batch, **kwargs) -> float:
 # the next action, and with K = 3 the proposals: 3K at the state of the data, or those
 # of policy and model (and uniform ones) at both states.
 @pytest.mark.parametrize(
-    ("mode", "rows"),
+    ("counted", "rows"),
     [
         ("cql", 1 + 1 + 1 + 9),
         ("osr", 1 + 2 + 1 + 9),
         ("osrv", 1 + 2 + 1 + 2 * 6),
         ("osrv-logsumexp", 1 + 2 + 1 + 2 * 9),
+        ("discrete", 1 + 2 + 1),
+        ("discrete-cql", 1 + 1 + 1),
     ],
 )
 @pytest.mark.parametrize("count", [1, 2])
 def test_critics_score_no_more_rows_than_the_equations_ask(
-    make_networks, make_batch, mode, rows, count
+    family, family_batch, counted, rows, count
 ) -> None:
-    networks, batch = make_networks(num_critics=count), make_batch(10)
-    assert rows_scored(mode, networks, batch) == count * rows
+    batch = family_batch(counted, 10)
+    assert rows_scored(family, counted, batch, critics=count) == count * rows
 
 
 ENSEMBLE = {"min_q_weight": 0.0, "deterministic_backup": False}
 
 
-# What the documentation says that a row costs; K = 10 of CQL is its default.
+# What the documentation says that a row costs; K is the loss's default.
 @pytest.mark.parametrize(
-    ("mode", "critics", "options", "rows"),
+    ("label", "counted", "critics", "options", "rows"),
     [
-        ("cql", 2, {}, 66),
-        ("osr", 2, {}, 68),
-        ("osr", 2, {"actor_states": "clean"}, 66),
-        ("osr", 2, {"max_q_backup": True}, 86),
-        ("osrv", 2, {}, 16),
-        ("cql", 10, ENSEMBLE, 30),
-        ("cql", 10, ENSEMBLE | {"diversity_weight": 1.0}, 40),
-        ("osr", 10, ENSEMBLE | {"actor_states": "clean"}, 30),
-        ("osr", 10, ENSEMBLE, 40),
+        ("CQL(H)", "cql", 2, {}, 66),
+        ("OSR", "osr", 2, {}, 68),
+        ("OSR, official variant", "official", 2, {}, 66),
+        (None, "osr", 2, {"max_q_backup": True}, 86),
+        ("OSR-v", "osrv", 2, {}, 16),
+        ("SAC-N", "cql", 10, ENSEMBLE, 30),
+        ("EDAC", "cql", 10, ENSEMBLE | {"diversity_weight": 1.0}, 40),
+        ("OSR-10", "osr", 10, ENSEMBLE, 40),
+        (None, "osr", 10, ENSEMBLE | {"actor_states": "clean"}, 30),
+        ("Discrete OSR", "discrete", 2, {}, 8),
+        ("Discrete CQL(H)", "discrete-cql", 2, {}, 6),
     ],
 )
 def test_rows_scored_with_the_defaults(
-    make_networks, make_batch, mode, critics, options, rows
+    family, family_batch, record_property, label, counted, critics, options, rows
 ) -> None:
-    default = inspect.signature(OSRVLoss if mode == "osrv" else OSRLoss)
-    number = default.parameters["num_random"].default
-    networks, batch = make_networks(num_critics=critics), make_batch(10)
-    assert rows_scored(mode, networks, batch, num_random=number, **options) == rows
+    defaults = inspect.signature(family[counted].loss_class).parameters
+    if "num_random" in defaults:
+        options = {"num_random": defaults["num_random"].default} | options
+    batch = family_batch(counted, 10)
+    scored = rows_scored(family, counted, batch, critics=critics, **options)
+    if label:
+        record_property("rows", (label, scored))
+    assert scored == rows

@@ -6,39 +6,13 @@ import math
 
 import pytest
 import torch
-from torchrl.objectives import SoftUpdate
 
-from torchrl_osr import InverseDynamicsLoss, OSRLoss, OSRVLoss
-
-ACTOR, CRITICS = "actor_network_params", "qvalue_network_params"
-SHARED = {"loss_actor": ACTOR, "loss_qvalue": CRITICS, "loss_alpha": "log_alpha"}
-GROUPS = {
-    "osr": SHARED | {"loss_cql": CRITICS, "loss_recovery": ACTOR},
-    "cql": SHARED | {"loss_cql": CRITICS},
-    "osrv": SHARED | {"loss_recovery": CRITICS},
-    "osrv-logsumexp": SHARED | {"loss_recovery": CRITICS},
-}
-# A constant added to Q is in both halves of a gap and cancels.
-OUTPUT_BIAS = f"{CRITICS}.module.2.bias"
-MODES = list(GROUPS)
-RECOVERING = [mode for mode in MODES if mode != "cql"]
-CASES = [(mode, key) for mode, groups in GROUPS.items() for key in groups]
-
-
-def make_loss(networks, mode: str, **kwargs) -> OSRLoss | OSRVLoss:
-    loss_class = OSRVLoss if mode.startswith("osrv") else OSRLoss
-    if mode == "osrv-logsumexp":
-        kwargs["policy_values"] = "logsumexp"
-    loss = loss_class(
-        networks.actor,
-        networks.critics,
-        networks.inverse_dynamics,
-        recovery_weight=0.0 if mode == "cql" else 0.5,
-        num_random=3,
-        **kwargs,
-    ).double()
-    SoftUpdate(loss, tau=0.1)
-    return loss
+REDUCTIONS = ["mean", "sum", "none"]
+OF_TRANSITIONS = ("loss_recovery", "loss_inverse_dynamics")
+# A constant added to Q is in both halves of a gap and cancels; no gradient by the
+# action knows of it.
+CANCELS = ("loss_cql", "loss_recovery", "loss_diversity")
+OUTPUT_BIAS = "qvalue_network_params.module.2.bias"
 
 
 def gradients(loss, value: torch.Tensor) -> dict[str, torch.Tensor | None]:
@@ -47,54 +21,44 @@ def gradients(loss, value: torch.Tensor) -> dict[str, torch.Tensor | None]:
     return dict(zip(names, found, strict=True))
 
 
-@pytest.mark.parametrize(("mode", "key"), CASES)
-@pytest.mark.parametrize("reduction", ["mean", "sum", "none"])
+@pytest.mark.parametrize("reduction", REDUCTIONS)
 def test_each_loss_reaches_its_own_parameters_only(
-    make_networks, make_batch, mode, key, reduction
+    family, family_batch, name, reduction
 ) -> None:
-    loss = make_loss(
-        make_networks(), mode, reduction=reduction, scalar_output_mode="exclude"
-    )
-    value = loss(make_batch(10))[key].sum()
-    for name, gradient in gradients(loss, value).items():
-        if name.startswith(GROUPS[mode][key]):
-            assert gradient is not None, name
-            # A constant added to Q is in both halves of a gap, and cancels.
-            if key in ("loss_cql", "loss_recovery") and name == OUTPUT_BIAS:
-                assert gradient.abs().max() < 1e-12, name
+    loss, member = family(name, reduction=reduction), family[name]
+    out = loss(family_batch(name, 10))
+    for key, group in member.groups.items():
+        for parameter, gradient in gradients(loss, out[key].sum()).items():
+            if parameter.split(".")[0] != group:
+                assert gradient is None, (key, parameter)
+            elif key in CANCELS and parameter == OUTPUT_BIAS and not member.discrete:
+                assert gradient is None or gradient.abs().max() < 1e-12, key
             else:
-                assert gradient.abs().max() > 1e-9, name
-        else:
-            assert gradient is None, name
+                assert gradient.abs().max() > 1e-9, (key, parameter)
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_nothing_else_can_be_trained(make_networks, make_batch, mode) -> None:
-    networks = make_networks()
-    loss = make_loss(networks, mode)
-    groups = {name.split(".")[0] for name, _ in loss.named_parameters()}
-    assert groups == {ACTOR, CRITICS, "log_alpha"}
-    sum(v for k, v in loss(make_batch(10)).items() if k in GROUPS[mode]).backward()
-    assert all(p.grad is None for p in networks.inverse_dynamics.parameters())
+def test_nothing_else_can_be_trained(family, family_batch, name) -> None:
+    networks, member = family.networks(name), family[name]
+    loss = family(name, networks)
+    groups = {key.split(".")[0] for key, _ in loss.named_parameters()}
+    assert groups == set(member.groups.values())
+    out = loss(family_batch(name, 10))
+    assert not any(out[key].requires_grad for key in member.metrics)
+    sum(out[key] for key in member.groups).backward()
+    assert all(parameter.grad is not None for parameter in loss.parameters())
+    if "inverse_dynamics_network_params" not in groups:
+        parameters = networks.inverse_dynamics.parameters()
+        assert all(parameter.grad is None for parameter in parameters)
     assert not any(buffer.requires_grad for buffer in loss.buffers())
 
 
-def test_fixed_alpha_is_no_parameter(make_networks, make_batch) -> None:
-    loss = make_loss(make_networks(), "osr", fixed_alpha=True, alpha_init=0.25)
+def test_fixed_alpha_is_no_parameter(family, family_batch, critic_loss) -> None:
+    loss = family(critic_loss, fixed_alpha=True, alpha_init=0.25)
     assert "log_alpha" not in dict(loss.named_parameters())
-    out = loss(make_batch(10))
+    out = loss(family_batch(critic_loss, 10))
     assert not out["loss_alpha"].requires_grad
     # float32: the constructor takes the logarithm before .double().
     assert out["alpha"].item() == pytest.approx(0.25, rel=1e-6)
-
-
-def losses_and_gradients(loss, batch, keys) -> list[torch.Tensor | None]:
-    torch.manual_seed(3)
-    out = loss(batch)
-    record: list[torch.Tensor | None] = []
-    for key in keys:
-        record += [out[key].detach(), *gradients(loss, out[key]).values()]
-    return record
 
 
 def spoil(batch, flag: torch.Tensor, value: float):
@@ -103,84 +67,82 @@ def spoil(batch, flag: torch.Tensor, value: float):
     return batch
 
 
-def assert_same_bits(got, wanted) -> None:
-    for ours, theirs in zip(got, wanted, strict=True):
-        assert (ours is None) == (theirs is None)
-        assert ours is None or torch.equal(ours, theirs)
-
-
-@pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("garbage", [math.nan, math.inf, 1e6])
-def test_next_state_of_terminated_rows_changes_no_bit_of_any_loss(
-    make_networks, make_batch, mode, garbage
+def test_next_state_of_ended_rows_changes_no_bit_of_any_loss(
+    family, family_batch, record, assert_same_bits, name, garbage
 ) -> None:
-    loss, batch = make_loss(make_networks(), mode), make_batch(10)
-    keys = GROUPS[mode]
-    wanted = losses_and_gradients(loss, batch, keys)
-    spoiled = spoil(batch, batch["next", "terminated"], garbage)
-    assert_same_bits(losses_and_gradients(loss, spoiled, keys), wanted)
+    loss, batch = family(name), family_batch(name, 10)
+    # A row cut by a time limit has a next state for the critics, and for them alone.
+    flag = "terminated" if family[name].has_critics else "done"
+    spoiled = spoil(batch, batch["next", flag], garbage)
+    assert_same_bits(record(loss, spoiled), record(loss, batch))
 
 
-# Finite for OSRLoss: its gradient passes through the actor, which does see s' here.
+# Finite where the gradient passes through the actor, which does see s' here.
 @pytest.mark.parametrize(
-    ("mode", "garbage"),
-    [(mode, 1e6) for mode in RECOVERING]
-    + [(mode, math.nan) for mode in RECOVERING if mode != "osr"],
+    ("cut", "garbage"),
+    [
+        ("osr", 1e6),
+        ("official", 1e6),
+        ("osr-10", 1e6),
+        ("adversarial", 1e6),
+        ("discrete", 1e6),
+        ("osrv", 1e6),
+        ("osrv", math.nan),
+        ("osrv-logsumexp", math.nan),
+    ],
 )
 def test_next_state_of_cut_rows_is_bootstrapped_from_but_never_recovered_to(
-    make_networks, make_batch, mode, garbage
+    family, family_batch, seeded, record, assert_same_bits, cut, garbage
 ) -> None:
-    loss, batch = make_loss(make_networks(), mode), make_batch(10)
-    cut = batch["next", "done"] & ~batch["next", "terminated"]
-    spoiled = spoil(batch, cut, garbage)
-    recovery, value = (
-        losses_and_gradients(loss, batch, [key])
-        for key in ("loss_recovery", "loss_qvalue")
-    )
-    assert_same_bits(losses_and_gradients(loss, spoiled, ["loss_recovery"]), recovery)
-    assert not torch.equal(
-        losses_and_gradients(loss, spoiled, ["loss_qvalue"])[0], value[0]
-    )
+    loss, batch = family(cut), family_batch(cut, 10)
+    at_the_limit = batch["next", "done"] & ~batch["next", "terminated"]
+    spoiled = spoil(batch, at_the_limit, garbage)
+    keys = ["loss_recovery"]
+    assert_same_bits(record(loss, spoiled, keys), record(loss, batch, keys))
+    for key in ("loss_qvalue", "target_value"):
+        assert seeded(loss, spoiled)[key] != seeded(loss, batch)[key]
 
 
-@pytest.mark.parametrize("states", ["both", "clean"])
+@pytest.mark.parametrize(
+    ("model", "states"),
+    [
+        ("idm", "clean"),
+        ("recovery", "clean"),
+        ("recovery", "perturbed"),
+        ("recovery-delta", "clean"),
+        ("recovery-plain", "perturbed"),
+    ],
+)
 @pytest.mark.parametrize("garbage", [math.nan, 1e6])
-def test_next_state_of_done_rows_changes_no_bit_of_the_model_loss(
-    make_networks, make_batch, states, garbage
+def test_next_state_of_done_rows_counts_on_neither_half_of_the_states(
+    family, family_batch, record, assert_same_bits, model, states, garbage
 ) -> None:
-    loss = InverseDynamicsLoss(make_networks().inverse_dynamics, states=states)
-    batch = make_batch(10)
-    keys = ["loss_inverse_dynamics"]
-    wanted = losses_and_gradients(loss, batch, keys)
+    loss, batch = family(model, states=states), family_batch(model, 10)
     spoiled = spoil(batch, batch["next", "done"], garbage)
-    assert_same_bits(losses_and_gradients(loss, spoiled, keys), wanted)
+    assert_same_bits(record(loss, spoiled), record(loss, batch))
 
 
-@pytest.mark.parametrize("mode", RECOVERING)
-def test_a_batch_without_any_transition_gives_no_recovery_loss(
-    make_networks, make_batch, mode
+def test_a_batch_without_any_transition_gives_no_loss_of_transitions(
+    family, family_batch, name
 ) -> None:
-    networks, batch = make_networks(), make_batch(10)
-    batch["next", "done"] = torch.ones_like(batch["next", "done"])
-    loss = make_loss(networks, mode)
-    assert loss(batch)["loss_recovery"].item() == 0.0
-    model_loss = InverseDynamicsLoss(make_networks().inverse_dynamics)
-    assert model_loss(batch)["loss_inverse_dynamics"].item() == 0.0
+    batch = family_batch(name, 10)
+    batch["next", "done"][:] = True
+    out = family(name)(batch)
+    for key in family[name].groups:
+        assert (key not in OF_TRANSITIONS) or out[key].item() == 0.0, key
 
 
+@pytest.mark.parametrize("pessimist", ["osr", "cql", "cql-options", "osrv", "discrete"])
 def test_the_lowest_critic_alone_decides_actor_and_target(
-    make_networks, make_batch
+    family, family_batch, seeded, pessimist
 ) -> None:
     # A third critic that is lower everywhere decides actor and target alone.
-    networks = make_networks(num_critics=3)
-    networks.critics[2].module[-1].bias.data -= 100.0
-    loss, batch = make_loss(networks, "cql"), make_batch(10)
-    alone = make_networks(num_critics=3)
-    alone.critics = [networks.critics[2]]
-    single = make_loss(alone, "cql")
-    torch.manual_seed(3)
-    wanted = single(batch)
-    torch.manual_seed(3)
-    out = loss(batch)
+    networks, alone = (family.networks(pessimist, num_critics=3) for _ in range(2))
+    for each in (networks, alone):
+        each.critics[2].module[-1].bias.data -= 100.0
+    alone.critics = alone.critics[2:]
+    batch = family_batch(pessimist, 10)
+    out, wanted = (seeded(family(pessimist, each), batch) for each in (networks, alone))
     for key in ("loss_actor", "target_value"):
         torch.testing.assert_close(out[key], wanted[key], rtol=1e-12, atol=1e-12)

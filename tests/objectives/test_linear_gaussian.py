@@ -25,8 +25,6 @@ from torchrl.modules import (
 from torchrl_osr import InverseDynamicsLoss, OSRLoss
 
 A, B, GAIN, BEHAVIOR_STD, NOISE_STD = 0.9, 0.5, -0.3, 0.4, 0.1
-VARIANCE = NOISE_STD**2 + B**2 * BEHAVIOR_STD**2
-MODEL_GAIN = B * BEHAVIOR_STD**2 / VARIANCE
 # So wide that the tanh is a straight line where the actions are, to 1 %.
 BOUND = 20.0
 STATE, PUSHED = 1.0, 1.4
@@ -49,10 +47,23 @@ def linear_gaussian(*inputs) -> ProbabilisticActor:
     ).double()
 
 
-def transitions(state: torch.Tensor, behavior_std: float) -> TensorDict:
-    """Behaviour and dynamics at the given states, ``[B, 1]``."""
-    action = GAIN * state + behavior_std * torch.randn_like(state)
-    following = A * state + B * action + NOISE_STD * torch.randn_like(state)
+def exact_draws(*size: int) -> torch.Tensor:
+    """Gaussian draws whose mean is 0 and whose covariance is the identity, exactly.
+
+    All that is learnt below depends on these moments alone: few rows are enough.
+    """
+    draws = torch.randn(*size, dtype=torch.float64)
+    draws = draws - draws.mean(0)
+    factor = torch.linalg.cholesky(draws.T @ draws / len(draws))
+    return torch.linalg.solve_triangular(factor, draws.T, upper=False).T
+
+
+def transitions(
+    state: torch.Tensor, draws: torch.Tensor, behavior_std: float
+) -> TensorDict:
+    """Behaviour and dynamics at the given states ``[B, 1]``, with draws ``[B, 2]``."""
+    action = GAIN * state + behavior_std * draws[:, :1]
+    following = A * state + B * action + NOISE_STD * draws[:, 1:]
     no = torch.zeros_like(state, dtype=torch.bool)
     return TensorDict(
         {
@@ -71,7 +82,7 @@ def transitions(state: torch.Tensor, behavior_std: float) -> TensorDict:
 
 def minimize(loss, key: str, parameters, batch: TensorDict) -> None:
     optimizer = torch.optim.LBFGS(
-        list(parameters), max_iter=60, line_search_fn="strong_wolfe"
+        list(parameters), max_iter=200, line_search_fn="strong_wolfe"
     )
 
     def closure() -> torch.Tensor:
@@ -94,7 +105,8 @@ def test_what_is_left_of_a_push_is_the_closed_form(behavior_std) -> None:
             MLP(2, 1, num_cells=[4]), in_keys=["observation", "action"]
         ).double(),
     )
-    data = transitions(torch.randn(100_000, 1).double(), behavior_std)
+    draws = exact_draws(2_000, 3)
+    data = transitions(draws[:, :1], draws[:, 1:], behavior_std)
     model_loss = InverseDynamicsLoss(networks.model, states="clean")
     minimize(model_loss, "loss_inverse_dynamics", model_loss.parameters(), data)
     by_state, by_next = BOUND * networks.model[0][0].module[0].weight[0]
@@ -103,7 +115,8 @@ def test_what_is_left_of_a_push_is_the_closed_form(behavior_std) -> None:
     assert by_state.item() == pytest.approx(GAIN - gain * (A + B * GAIN), abs=0.02)
 
     # One state and one push, so that the policy can know where it came from.
-    batch = transitions(torch.full((50_000, 1), STATE).double(), behavior_std)
+    state = torch.full((2_000, 1), STATE, dtype=torch.float64)
+    batch = transitions(state, exact_draws(2_000, 2), behavior_std)
     batch["perturbed", "observation"] = torch.full_like(batch["observation"], PUSHED)
     loss = OSRLoss(
         networks.actor,

@@ -7,7 +7,7 @@ import math
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.distributions import Normal, kl_divergence
 from torchrl.objectives import SoftUpdate
 
@@ -156,11 +156,14 @@ OFFICIAL = {
 @pytest.mark.parametrize(
     ("low", "high"), [([-1.0, -1.0], [1.0, 1.0]), ([-1.0, -0.5], [2.0, 1.5])]
 )
+# Critics with ReLUs are plain MLPs, which have a path of their own.
+@pytest.mark.parametrize("activation", [nn.Tanh, nn.ReLU])
 def test_losses_and_gradients_equal_the_restatement(
-    make_networks, make_batch, check, weight, options, low, high
+    make_networks, make_batch, check, weight, options, low, high, activation
 ) -> None:
     bounds = {"low": torch.tensor(low).double(), "high": torch.tensor(high).double()}
-    networks, batch = make_networks(**bounds), make_batch(10)
+    networks = make_networks(**bounds, critic_activation=activation)
+    batch = make_batch(10)
     restatement = Restatement(networks, **bounds, weight=weight, official=bool(options))
     loss = make_osr(networks, weight=weight, **options)
     torch.manual_seed(5)

@@ -132,11 +132,14 @@ class Restatement:
 @pytest.mark.parametrize(
     ("low", "high"), [([-1.0, -1.0], [1.0, 1.0]), ([-1.0, -0.5], [2.0, 1.5])]
 )
+# Critics with ReLUs are plain MLPs, which have a path of their own.
+@pytest.mark.parametrize("activation", [nn.Tanh, nn.ReLU])
 def test_losses_and_gradients_equal_the_restatement(
-    make_networks, make_batch, check, policy_values, number, low, high
+    make_networks, make_batch, check, policy_values, number, low, high, activation
 ) -> None:
     bounds = {"low": torch.tensor(low).double(), "high": torch.tensor(high).double()}
-    networks, batch = make_networks(**bounds), make_batch(10)
+    networks = make_networks(**bounds, critic_activation=activation)
+    batch = make_batch(10)
     restated = Restatement(networks, **bounds)
     loss = make_osr_v(networks, num_random=number, policy_values=policy_values)
     out = seeded(loss, batch)

@@ -1,4 +1,4 @@
-"""Where TorchRL 0.14.1 is not CQL(H). A failure says that TorchRL has mended it."""
+"""Where TorchRL 0.14.1 is wrong. A failure says that TorchRL has mended it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import math
 
 import pytest
 import torch
-from torchrl.objectives import CQLLoss, SoftUpdate
+from torchrl.data.postprocs import MultiStep
+from torchrl.objectives import CQLLoss, SACLoss, SoftUpdate
 
 from torchrl_osr import OSRLoss
 
@@ -111,3 +112,30 @@ def test_cql_loss_of_torchrl_lets_the_multiplier_train_the_critics(
     )
     cosine = torch.cosine_similarity(conservative, multiplier, dim=0)
     assert cosine.item() == pytest.approx(-1.0, abs=1e-6)
+
+
+# TorchRL is wrong: the next state moves to where the n steps end, the flags do not. A
+# return that reaches the terminal state is bootstrapped from it, by every loss.
+def test_multi_step_of_torchrl_leaves_the_flags_of_the_first_step(make_batch) -> None:
+    batch = make_batch(1, 3)
+    batch["next", "terminated"][:] = False
+    batch["next", "terminated"][:, 2] = True
+    batch["next", "done"] = batch["next", "terminated"].clone()
+    shifted = MultiStep(0.9, 3)(batch.clone())
+    assert shifted["steps_to_next_obs"].tolist() == [[3, 2, 1]]
+    last = batch["next", "observation"][:, 2:].expand(1, 3, 3)
+    assert torch.equal(shifted["next", "observation"], last)
+    assert shifted["next", "terminated"].flatten().tolist() == [False, False, True]
+
+
+# tensordict 0.14.3 moves a buffer by assigning its data, which torch refuses between a
+# real device and the meta device. From one real device to another it does not.
+@pytest.mark.parametrize("loss_class", [OSRLoss, SACLoss])
+def test_losses_of_torchrl_cannot_be_moved_to_meta(make_networks, loss_class) -> None:
+    networks = make_networks()
+    options = {"recovery_weight": 0.0} if loss_class is OSRLoss else {}
+    loss = loss_class(
+        networks.actor, networks.critics, target_entropy=-2.0, **options
+    ).double()
+    with pytest.raises(RuntimeError, match="incompatible tensor type"):
+        loss.to("meta")

@@ -117,7 +117,10 @@ class TanhGaussianActorCritic(RecoveryActorCriticLoss):
 
     def _plain_layers(self) -> list[str] | None:
         """Return the names of the critics' linear layers, if they are plain MLPs."""
-        return mlp_critics.linear_layers(self.qvalue_network, self.tensor_keys.action)
+        keys, network = self.tensor_keys, self.qvalue_network
+        if keys.state_action_value not in network.out_keys:
+            return None
+        return mlp_critics.linear_layers(network, keys.action)
 
     def _critic_state(self, states: TensorDictBase) -> Tensor:
         """Return what plain critics read besides the action, ``[B, S]``."""

@@ -1,0 +1,312 @@
+"""Plain MLP critics on a CPU: the same numbers, a few states at a time or all at once.
+
+Shapes: ``B`` states, ``N`` critics.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import nn
+from torchrl.modules import MLP, ValueOperator
+
+from torchrl_osr.objectives import mlp_critics
+
+CHUNKS = [1, 3, 64]
+
+
+def critic(*, in_keys=("observation", "action"), size: int = 5, **options):
+    """A critic of three hidden layers; ReLUs unless told otherwise."""
+    options = {"num_cells": [8, 6, 4], "activation_class": nn.ReLU} | options
+    network = MLP(size, 1, **options)
+    return ValueOperator(network, in_keys=list(in_keys)).double()
+
+
+def networks_of(family, name: str, *, plain: bool = True, **options):
+    """Networks with two deeper critics, the same in every call.
+
+    Args:
+        family: the factory.
+        name: of the loss.
+        plain: whether nobody has put a hook on the critics, which else are run as
+            modules.
+        options: of the critics.
+    """
+    networks = family.networks(name)
+    networks.critics = [critic(**options) for _ in range(2)]
+    for each in networks.critics if not plain else []:
+        each.module.register_forward_hook(lambda *_: None)
+    return networks
+
+
+def masked(batch):
+    batch["collector", "mask"] = torch.arange(10).reshape(*batch.batch_size, 1) % 4 > 0
+    return batch
+
+
+def weighted(batch):
+    weight = torch.linspace(0.5, 2.0, 10).double()
+    batch["priority_weight"] = weight.reshape(batch.batch_size)
+    return batch
+
+
+CASES = {
+    "cql": ("cql", {}, (10,), []),
+    "osr": ("osr", {}, (10,), []),
+    "time dimension": ("cql", {}, (2, 5), []),
+    "masks": ("cql", {}, (10,), [masked]),
+    "masks and time": ("osr", {}, (2, 5), [masked]),
+    "weights": ("cql", {}, (10,), [weighted]),
+    "masks and weights": ("osr", {}, (10,), [masked, weighted]),
+    "clipped": ("cql", {"clip_diff_min": 3.4, "clip_diff_max": 3.7}, (10,), []),
+    "lagrange": ("cql", {"with_lagrange": True, "lagrange_thresh": 1.0}, (10,), []),
+    "temperature": ("cql", {"temperature": 1.7}, (10,), []),
+    "plain sum": ("cql", {"importance_sample": False}, (2, 5), []),
+    "everything": ("cql-options", {"clip_diff_max": 3.46}, (10,), [masked, weighted]),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("reduction", ["mean", "sum", "none"])
+def test_chunks_change_neither_losses_nor_gradients(
+    family, family_batch, record, assert_same, case, reduction
+) -> None:
+    name, options, size, changes = CASES[case]
+    batch = family_batch(name, *size)
+    for change in changes:
+        batch = change(batch)
+
+    def numbers(chunk_size: int | None, **networks):
+        loss = family(
+            name,
+            networks_of(family, name, **networks),
+            reduction=reduction,
+            chunk_size=chunk_size,
+            **options,
+        )
+        return record(loss, batch)
+
+    modules = numbers(None, plain=False)
+    for chunk_size in (*CHUNKS, None):
+        assert_same(numbers(chunk_size), modules)
+
+
+@pytest.mark.parametrize("case", ["clipped", "everything"])
+def test_clip_bounds_reach_some_rows_and_not_others(
+    family, family_batch, seeded, case
+) -> None:
+    name, options, _, _ = CASES[case]
+    free, bound = (
+        seeded(
+            family(name, networks_of(family, name), reduction="none", **each),
+            family_batch(name, 10),
+        )["loss_cql"]
+        for each in ({}, options)
+    )
+    assert 0 < (free == bound).sum() < 10, free
+
+
+def test_default_is_a_chunk_size(
+    family, family_batch, record, assert_same_bits
+) -> None:
+    batch = family_batch("cql", 10)
+    default, given = (
+        record(family("cql", networks_of(family, "cql"), **options), batch)
+        for options in ({}, {"chunk_size": 64})
+    )
+    assert_same_bits(default, given)
+
+
+def test_critics_of_several_observations(
+    family, family_batch, record, assert_same
+) -> None:
+    batch = family_batch("cql", 10)
+    for group in (batch, batch["next"]):
+        group["goal"] = 0.5 * group["observation"]
+    options = {"in_keys": ["goal", "observation", "action"], "size": 8}
+    modules, chunked = (
+        record(family("cql", networks_of(family, "cql", plain=plain, **options)), batch)
+        for plain in (False, True)
+    )
+    assert_same(chunked, modules)
+
+
+def test_frozen_layers_stay_without_gradient(
+    family, family_batch, record, assert_same
+) -> None:
+    batch, numbers = family_batch("cql", 10), []
+    for plain in (False, True):
+        networks = networks_of(family, "cql", plain=plain)
+        loss = family("cql", networks)
+        loss.qvalue_network_params["module", "2", "weight"].requires_grad_(False)
+        numbers.append(record(loss, batch))
+    assert len(numbers[0]) < len(
+        record(family("cql", networks_of(family, "cql")), batch)
+    )
+    assert_same(*numbers)
+
+
+def test_nothing_is_kept_where_no_gradient_is_wanted(
+    family, family_batch, seeded, assert_same
+) -> None:
+    loss, batch = family("cql", networks_of(family, "cql")), family_batch("cql", 10)
+    expected = seeded(loss, batch)
+    with torch.no_grad():
+        out = seeded(loss, batch)
+    assert not out["loss_cql"].requires_grad
+    assert_same([out["loss_cql"]], [expected["loss_cql"].detach()])
+
+
+def test_gradient_is_that_of_a_small_step(family, family_batch, seeded) -> None:
+    loss, batch = family("cql", networks_of(family, "cql")), family_batch("cql", 10)
+    batch = weighted(batch)
+    params = list(loss.qvalue_network_params.parameters())
+    out = seeded(loss, batch)["loss_cql"]
+    gradients = torch.autograd.grad(out, params, allow_unused=True)
+    for parameter, gradient in zip(params, gradients, strict=True):
+        index, step = (0,) * parameter.ndim, 1e-6
+        values = []
+        for sign in (1, -1):
+            parameter.data[index] += sign * step
+            values.append(seeded(loss, batch)["loss_cql"].item())
+            parameter.data[index] -= sign * step
+        slope = (values[0] - values[1]) / (2 * step)
+        assert gradient[index].item() == pytest.approx(slope, abs=1e-7)
+
+
+def test_second_derivatives_need_the_critics_all_at_once(family, family_batch) -> None:
+    batch = family_batch("cql", 10)
+    for chunk_size in (3, None):
+        loss = family("cql", networks_of(family, "cql"), chunk_size=chunk_size)
+        params = list(loss.qvalue_network_params.parameters())
+        out = loss(batch)["loss_cql"].square()
+        first = torch.autograd.grad(out, params, create_graph=True)
+        norm = sum(gradient.square().sum() for gradient in first)
+        if chunk_size is None:
+            norm.backward()
+            assert any(p.grad.abs().max() > 0 for p in params if p.grad is not None)
+        else:
+            with pytest.raises(RuntimeError, match="once_differentiable"):
+                norm.backward()
+
+
+@pytest.mark.parametrize("chunk_size", [0, -1])
+def test_chunks_without_a_state_are_refused(family, chunk_size) -> None:
+    expected = f"chunk_size must be at least 1 or None, got {chunk_size}"
+    with pytest.raises(ValueError, match=expected):
+        family("cql", chunk_size=chunk_size)
+
+
+OTHERS = {
+    "another activation": {"activation_class": nn.Tanh},
+    "layer normalisation": {
+        "norm_class": nn.LayerNorm,
+        "norm_kwargs": [{"normalized_shape": width} for width in (8, 6, 4)],
+    },
+    "batch normalisation": {
+        "norm_class": nn.BatchNorm1d,
+        "norm_kwargs": [{"num_features": width} for width in (8, 6, 4)],
+    },
+    "dropout": {"dropout": 0.5},
+    "activation at the end": {"activate_last_layer": True},
+    "no bias": {"bias_last_layer": False},
+    "a single layer": {"num_cells": [], "depth": 0},
+    "the action first": {"in_keys": ("action", "observation")},
+}
+
+
+@pytest.mark.parametrize("kind", OTHERS)
+def test_other_critics_go_as_modules(kind) -> None:
+    assert mlp_critics.linear_layers(critic(), "action") is not None
+    assert mlp_critics.linear_layers(critic(), "choice") is None
+    assert mlp_critics.linear_layers(critic(**OTHERS[kind]), "action") is None
+
+
+def test_critics_that_are_no_mlp_go_as_modules() -> None:
+    layers = nn.Sequential(nn.Linear(5, 8), nn.ReLU(), nn.Linear(8, 1))
+    other = ValueOperator(layers, in_keys=["observation", "action"])
+    assert mlp_critics.linear_layers(other, "action") is None
+    pruned = critic()
+    nn.utils.parametrizations.weight_norm(pruned.module[0])
+    assert mlp_critics.linear_layers(pruned, "action") is None
+
+
+@pytest.mark.parametrize(
+    "kind", ["another activation", "layer normalisation", "dropout"]
+)
+def test_chunks_do_not_concern_other_critics(
+    family, family_batch, record, assert_same_bits, kind
+) -> None:
+    # Not a bit differs: the draws of a dropout are those of one pass.
+    batch = family_batch("cql", 10)
+    one, whole = (
+        record(
+            family(
+                "cql",
+                networks_of(family, "cql", **OTHERS[kind]),
+                chunk_size=chunk_size,
+            ),
+            batch,
+        )
+        for chunk_size in (1, None)
+    )
+    assert_same_bits(one, whole)
+
+
+@pytest.fixture
+def count_rows(monkeypatch):
+    """Return a list that grows by the rows of every pass of a plain critic."""
+    counted: list[int] = []
+    forward, qvalue = mlp_critics._forward, mlp_critics.qvalue
+
+    def counting_forward(inputs, *rest):
+        counted.append(inputs[1].shape[:-1].numel())
+        return forward(inputs, *rest)
+
+    def counting_qvalue(params, names, state, action):
+        counted.append(2 * action.shape[:-1].numel())
+        return qvalue(params, names, state, action)
+
+    monkeypatch.setattr(mlp_critics, "_forward", counting_forward)
+    monkeypatch.setattr(mlp_critics, "qvalue", counting_qvalue)
+    return counted
+
+
+# 2 critics and K = 10: 33 actions a state, 30 of them sampled. Where rows differ in
+# weight the sampled ones are computed once more.
+@pytest.mark.parametrize(
+    ("reduction", "change", "rows"),
+    [("mean", None, 66), ("sum", None, 66), ("mean", weighted, 66 + 60)],
+)
+@pytest.mark.parametrize("chunk_size", CHUNKS)
+def test_no_row_is_scored_twice_where_all_weigh_the_same(
+    family, family_batch, count_rows, reduction, change, rows, chunk_size
+) -> None:
+    batch = family_batch("cql", 10)
+    batch = batch if change is None else change(batch)
+    loss = family(
+        "cql",
+        networks_of(family, "cql"),
+        num_random=10,
+        reduction=reduction,
+        chunk_size=chunk_size,
+    )
+    out = loss(batch)
+    sum(out[key] for key in family["cql"].groups).backward()
+    assert sum(count_rows) / batch.numel() == rows
+
+
+def test_autocast_changes_the_numbers_as_it_does_those_of_modules(
+    family, family_batch, seeded
+) -> None:
+    batch = family_batch("cql", 10)
+    batch = batch.apply(lambda t: t.float() if t.is_floating_point() else t)
+    out = []
+    for plain in (True, False):
+        loss = family("cql", networks_of(family, "cql", plain=plain)).float()
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            out.append(seeded(loss, batch)["loss_cql"])
+        exact = seeded(loss, batch)["loss_cql"]
+        assert out[-1] != exact
+        torch.testing.assert_close(out[-1], exact, rtol=0.02, atol=0.05)
+    assert out[0].dtype == torch.float32

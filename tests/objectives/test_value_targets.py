@@ -1,0 +1,133 @@
+"""The critics' target: its kinds, its discount, and returns of several steps."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+import torch
+from torchrl.data.postprocs import MultiStep
+from torchrl.objectives import ValueEstimators
+from torchrl.objectives.value import TD0Estimator
+
+
+def target_value(family, seeded, name: str, batch, *args, **kwargs) -> torch.Tensor:
+    loss = family(name)
+    loss.make_value_estimator(*args, **kwargs)
+    return seeded(loss, batch)["target_value"]
+
+
+def test_the_kinds_of_target_agree_where_they_must(
+    family, family_batch, seeded, critic_loss
+) -> None:
+    batch = family_batch(critic_loss, 2, 5)
+    target = partial(target_value, family, seeded, critic_loss, batch)
+    td0 = target()
+    assert td0 == target("td0", gamma=0.99)
+    assert td0 == target(ValueEstimators.TD0)
+    assert td0 == target(TD0Estimator(gamma=0.99, value_network=None))
+    td1 = target(ValueEstimators.TD1)
+    assert td0 != td1
+    # TD(lambda) is TD(0) at lambda = 0 and TD(1) at lambda = 1.
+    for lmbda, wanted in {0.0: td0, 1.0: td1}.items():
+        # The vectorised estimator of TorchRL 0.14.1 fails at lambda = 0.
+        found = target(ValueEstimators.TDLambda, lmbda=lmbda, vectorized=False)
+        torch.testing.assert_close(found, wanted)
+
+
+@pytest.mark.parametrize("kind", ["gae", ValueEstimators.GAE, ValueEstimators.VTrace])
+def test_estimators_without_an_action_value_are_refused(
+    family, critic_loss, kind
+) -> None:
+    with pytest.raises(NotImplementedError):
+        family(critic_loss).make_value_estimator(kind)
+
+
+def test_gamma_scales_the_bootstrap(family, family_batch, seeded, critic_loss) -> None:
+    batch = family_batch(critic_loss, 10)
+    target = partial(target_value, family, seeded, critic_loss, batch)
+    zero, half, one = (target(gamma=gamma) for gamma in (0.0, 0.5, 1.0))
+    torch.testing.assert_close(zero, batch["next", "reward"].mean())
+    assert one != zero
+    torch.testing.assert_close(half, (zero + one) / 2)
+
+
+GAMMA, STEPS = 0.875, 3
+
+
+def state_only(networks, discrete: bool):
+    """Critics that ignore the action: the target's draws do not matter."""
+    for critic in networks.critics:
+        if not discrete:
+            critic.module[0].weight.data[:, 3:] = 0.0
+    return networks
+
+
+def next_values(networks, discrete: bool, state: torch.Tensor) -> torch.Tensor:
+    """What the policy is worth at a state, by the lowest critic."""
+    if discrete:
+        lowest = torch.stack([critic.module(state) for critic in networks.critics])
+        return (networks.actor[0].module(state).softmax(-1) * lowest.amin(0)).sum(-1)
+    action = torch.zeros(*state.shape[:-1], 2, dtype=state.dtype)
+    values = [critic.module(state, action) for critic in networks.critics]
+    return torch.cat(values, -1).amin(-1)
+
+
+def pred_values(networks, batch) -> list[torch.Tensor]:
+    state, action = batch["observation"], batch["action"]
+    if action.is_floating_point():
+        return [c.module(state, action).squeeze(-1) for c in networks.critics]
+    index = action if action.ndim == 2 else action.argmax(-1)
+    index = index.unsqueeze(-1)
+    return [c.module(state).gather(-1, index).squeeze(-1) for c in networks.critics]
+
+
+def multi_step_loss(networks, batch, discrete: bool) -> torch.Tensor:
+    """``loss_qvalue`` of n-step returns, row by row."""
+    total = 0.0
+    pred, following = pred_values(networks, batch), batch["next"]
+    for trajectory in range(2):
+        for first in range(5):
+            target, discount = 0.0, 1.0
+            for step in range(first, min(first + STEPS, 5)):
+                row = following[trajectory, step]
+                target = target + discount * row["reward"].squeeze()
+                discount *= GAMMA
+                if row["done"]:
+                    break
+            # The flag of the first step, which is the one that MultiStep leaves.
+            if not following["terminated"][trajectory, first]:
+                value = next_values(networks, discrete, row["observation"])
+                target = target + discount * value
+            for values in pred:
+                total = total + (values[trajectory, first] - target).square() / 10
+    return total
+
+
+def test_multi_step_returns_are_discounted_by_their_steps(
+    family, family_batch, critic_loss
+) -> None:
+    discrete = family[critic_loss].discrete
+    networks = state_only(family.networks(critic_loss), discrete)
+    batch = family_batch(critic_loss, 2, 5)
+    with torch.no_grad():
+        expected = multi_step_loss(networks, batch, discrete)
+    # The temperature is next to nothing for those with the entropy in the target.
+    loss = family(critic_loss, networks, alpha_init=1e-15)
+    loss.make_value_estimator(gamma=GAMMA)
+    batch = MultiStep(GAMMA, STEPS)(batch)
+    out = loss(batch.copy())["loss_qvalue"].detach()
+    torch.testing.assert_close(out, expected, rtol=1e-9, atol=1e-9)
+    # As in TorchRL's own losses, the number of steps is not among the in_keys: a batch
+    # without it is discounted as if every return were of one step.
+    assert "steps_to_next_obs" not in loss.in_keys
+    one_step = loss(batch.select(*loss.in_keys))["loss_qvalue"].detach()
+    assert (one_step - expected).abs() > 1e-3
+
+
+def test_multi_step_of_one_step_changes_nothing(
+    family, family_batch, record, assert_same, critic_loss
+) -> None:
+    loss, batch = family(critic_loss), family_batch(critic_loss, 2, 5)
+    shifted = MultiStep(GAMMA, 1)(batch.clone())
+    assert_same(record(loss, shifted), record(loss, batch))
