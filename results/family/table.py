@@ -52,7 +52,7 @@ FAMILY = {
         "action by action, `torch.distributions.Categorical`",
     ),
     "Discrete CQL(H)": (
-        "`DiscreteOSRLoss`, CQL (4)", "`examples/discrete_osr.py --loss cql`",
+        "`DiscreteOSRLoss`, CQL (4)", "`examples/discrete_osr.py`",
         "action by action, `torch.distributions.Categorical`",
     ),
     "Discrete inverse dynamics": (

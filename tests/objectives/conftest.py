@@ -264,7 +264,7 @@ SOFT_ACTOR_CRITIC = {
     "loss_qvalue": CRITICS,
 }
 CQL, RECOVERY = {"loss_cql": CRITICS}, {"loss_recovery": ACTOR}
-# Critics that are plain MLPs with ReLUs have a path of their own; the others are vmapped.
+# Critics that are plain MLPs with ReLUs have a path of their own, others are vmapped.
 RELU = {"critic_activation": nn.ReLU}
 recovery_loss = partial(
     Member,

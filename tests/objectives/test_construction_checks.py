@@ -6,10 +6,18 @@ import math
 
 import pytest
 import torch
+from tensordict.nn import TensorDictModule
+from torch import nn
 from torch.distributions import Categorical
-from torchrl.modules import TruncatedNormal
+from torchrl.modules import (
+    NormalParamExtractor,
+    ProbabilisticActor,
+    TanhNormal,
+    TruncatedNormal,
+)
+from torchrl.objectives import SoftUpdate
 
-from torchrl_osr import OSRVLoss
+from torchrl_osr import OSRLoss, OSRVLoss, StateRecoveryLoss
 
 CONTINUOUS = ["osr", "cql", "osrv", "idm", "recovery"]
 RECOVERING = ["osr", "osrv", "recovery"]
@@ -199,3 +207,52 @@ def test_no_critics_at_all_are_refused(family, critic_loss) -> None:
     networks = family.networks(critic_loss, num_critics=0)
     with pytest.raises(ValueError, match="at least one critic"):
         family(critic_loss, networks)
+
+
+def deep_networks(size: int, *, tells: bool) -> ProbabilisticActor:
+    """An actor whose last layers tell its actions' size, or do not."""
+    head = nn.Sequential(nn.Linear(3, 2 * size), NormalParamExtractor())
+    if not tells:
+        head.append(Pair())
+    return ProbabilisticActor(
+        TensorDictModule(head, ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+    ).double()
+
+
+class Pair(nn.Module):
+    """Hides what comes before behind a layer that nobody knows."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.last = nn.Linear(1, 1)
+
+    def forward(self, pair):
+        return pair
+
+
+# A model of one dimension would broadcast against any policy.
+@pytest.mark.parametrize("loss_class", [OSRLoss, OSRVLoss, StateRecoveryLoss])
+@pytest.mark.parametrize("size", [1, 3])
+@pytest.mark.parametrize("tells", [True, False])
+def test_model_of_another_action_size_is_refused(
+    make_networks, make_batch, loss_class, size, tells
+) -> None:
+    networks = make_networks()
+    networks.inverse_dynamics = deep_networks(size, tells=tells)
+    arguments = [networks.actor, networks.critics, networks.inverse_dynamics]
+    if loss_class is StateRecoveryLoss:
+        del arguments[1]
+
+    def build_and_call() -> None:
+        loss = loss_class(*arguments)
+        assert not tells, "it is to be refused at construction"
+        if loss_class is not StateRecoveryLoss:
+            SoftUpdate(loss, tau=0.1)
+        loss.double()(make_batch(4))
+
+    with pytest.raises(
+        ValueError, match=f"has {size} actions, but actor_network has 2"
+    ):
+        build_and_call()

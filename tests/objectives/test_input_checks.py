@@ -110,13 +110,12 @@ def test_continuous_critics_are_refused(family, family_batch) -> None:
         family("discrete", networks)(family_batch("discrete", 10))
 
 
-@pytest.mark.parametrize("writing", ["cql", "edac", "osrv", "discrete"])
 def test_critics_that_write_another_entry_are_named(
-    family, family_batch, writing
+    family, family_batch, critic_loss
 ) -> None:
-    networks = family.networks(writing)
+    networks = family.networks(critic_loss)
     (key,) = networks.critics[0].out_keys
     for critic in networks.critics:
         critic.out_keys = ["values"]
     with pytest.raises(KeyError, match=rf"write \['values'\], not '{key}'"):
-        family(writing, networks)(family_batch(writing, 10))
+        family(critic_loss, networks)(family_batch(critic_loss, 10))

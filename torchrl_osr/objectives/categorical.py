@@ -21,6 +21,7 @@ from torchrl_osr.objectives.distributions import (
     action_index,
     check_categorical,
     check_num_actions,
+    check_same_size,
 )
 from torchrl_osr.objectives.mixed_states import entry
 from torchrl_osr.objectives.networks import ActorCriticNetworks
@@ -63,6 +64,7 @@ class CategoricalActorCritic(RecoveryActorCriticLoss):
         check_categorical(actor_network, "actor_network")
         if inverse_dynamics_network is not None:
             check_categorical(inverse_dynamics_network, "inverse_dynamics_network")
+            check_same_size(actor_network, inverse_dynamics_network)
 
     def _data_action(self, tensordict: TensorDictBase, pi: Any) -> Tensor:
         key = self.tensor_keys.action

@@ -15,7 +15,12 @@ from tensordict.nn import ProbabilisticTensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torch.distributions import Categorical
 from torch.distributions import OneHotCategorical as TorchOneHotCategorical
-from torchrl.modules import MaskedOneHotCategorical, OneHotCategorical, TanhNormal
+from torchrl.modules import (
+    MaskedOneHotCategorical,
+    NormalParamExtractor,
+    OneHotCategorical,
+    TanhNormal,
+)
 
 ONE_HOT = (OneHotCategorical, MaskedOneHotCategorical, TorchOneHotCategorical)
 """Distributions whose actions are one-hot vectors."""
@@ -109,15 +114,46 @@ def check_action(action: Tensor, action_dim: int, key: NestedKey) -> None:
         )
 
 
+def _action_size(network: TensorDictModuleBase) -> int | None:
+    """Return the size of a network's actions, where its last layers tell."""
+    kinds = (nn.Linear, NormalParamExtractor)
+    layers = [layer for layer in network.modules() if isinstance(layer, kinds)]
+    if layers and isinstance(layers[-1], nn.Linear):
+        categorical = _is_a(_head(network)[0], *CATEGORICAL)
+        return int(layers[-1].out_features) if categorical else None
+    if len(layers) > 1 and isinstance(layers[-2], nn.Linear):
+        return int(layers[-2].out_features) // 2
+    return None
+
+
+def check_same_size(
+    actor_network: TensorDictModuleBase, inverse_dynamics_network: TensorDictModuleBase
+) -> None:
+    """Raise unless policy and inverse dynamics model have actions of one size.
+
+    Where the networks do not tell, the losses compare what they compute.
+
+    Raises:
+        ValueError: naming both sizes.
+    """
+    policy, model = _action_size(actor_network), _action_size(inverse_dynamics_network)
+    if policy is not None and model is not None:
+        check_num_actions("inverse_dynamics_network", model, policy)
+
+
 def check_num_actions(name: str, number: int, policy: int) -> None:
-    """Raise unless a network knows as many actions as the policy.
+    """Raise unless a network's actions are of the policy's size.
+
+    The size is the number of actions, or of an action's dimensions. Broadcasting would
+    compare a size of 1 with any other without a word.
 
     Raises:
         ValueError: naming the network and both numbers.
     """
     if number != policy:
         raise ValueError(
-            f"{name} has {number} actions, but actor_network has {policy}."
+            f"{name} has {number} actions, but actor_network has {policy}: build both "
+            "with the same number (of action dimensions, if actions are continuous)."
         )
 
 

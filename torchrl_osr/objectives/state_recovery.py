@@ -24,7 +24,12 @@ from torchrl.modules.distributions.utils import safeatanh_noeps
 
 from torchrl_osr import functional
 from torchrl_osr.objectives.base import BaseLoss, Reduction, check_choice, check_weight
-from torchrl_osr.objectives.distributions import action_bounds, check_same_bounds
+from torchrl_osr.objectives.distributions import (
+    action_bounds,
+    check_num_actions,
+    check_same_bounds,
+    check_same_size,
+)
 from torchrl_osr.objectives.frozen_model import freeze, frozen_distribution
 from torchrl_osr.objectives.mixed_states import (
     States,
@@ -150,6 +155,8 @@ class StateRecoveryLoss(BaseLoss):
         self.register_buffer("action_low", low, persistent=False)
         self.register_buffer("action_high", high, persistent=False)
         self._check_actor(actor_network, bounds)
+        if not self.deterministic:
+            check_same_size(actor_network, inverse_dynamics_network)
         density = partial(functional.state_recovery, direction=direction)
         recovery = functional.deterministic_recovery if self.deterministic else density
         self._recovery = partial(recovery, action_reduction=action_reduction)
@@ -239,7 +246,10 @@ class StateRecoveryLoss(BaseLoss):
         mixed = transitions(
             tensordict, keys, done=done, perturbed=perturbed, states=states
         )
-        kl = self._recovery(*self._policy(mixed), model.loc, model.scale).mean(0)
+        policy = self._policy(mixed)
+        size = policy[0].shape[-1]
+        check_num_actions("inverse_dynamics_network", model.loc.shape[-1], size)
+        kl = self._recovery(*policy, model.loc, model.scale).mean(0)
         mean = reduce_transitions(self, kl.detach(), done, tensordict, reduction="mean")
         kl = reduce_transitions(self, kl, done, tensordict, self._weights(tensordict))
         losses = {"loss_recovery": self.recovery_weight * kl}

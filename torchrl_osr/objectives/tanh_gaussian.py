@@ -23,7 +23,9 @@ from torchrl_osr.objectives.adversary import Adversary
 from torchrl_osr.objectives.distributions import (
     action_bounds,
     check_action,
+    check_num_actions,
     check_same_bounds,
+    check_same_size,
 )
 from torchrl_osr.objectives.mixed_states import entry, nested, select
 from torchrl_osr.objectives.networks import ActorCriticNetworks
@@ -84,6 +86,7 @@ class TanhGaussianActorCritic(RecoveryActorCriticLoss):
         if inverse_dynamics_network is not None:
             name = "inverse_dynamics_network"
             check_same_bounds(bounds, action_bounds(inverse_dynamics_network, name))
+            check_same_size(actor_network, inverse_dynamics_network)
 
     def _perturbed_keys(self) -> list[NestedKey]:
         keys = super()._perturbed_keys()
@@ -114,6 +117,12 @@ class TanhGaussianActorCritic(RecoveryActorCriticLoss):
         action = entry(tensordict, key)
         check_action(action, pi.loc.shape[-1], key)
         return action
+
+    def _inverse_dynamics(self, tensordict: TensorDictBase, done: Tensor) -> TanhNormal:
+        model: TanhNormal = super()._inverse_dynamics(tensordict, done)
+        size = tensordict.get(self.tensor_keys.action).shape[-1]
+        check_num_actions("inverse_dynamics_network", model.loc.shape[-1], size)
+        return model
 
     def _plain_layers(self) -> list[str] | None:
         """Return the names of the critics' linear layers, if they are plain MLPs."""
