@@ -110,13 +110,16 @@ def run(cfg: DictConfig, folder: Path) -> float:
     model = instantiate(cfg.inverse_dynamics.network, *sizes, num_cells=cells)
     model = model.to(device)
 
+    # The policy's loss first, so that a wrong option stops here. It holds the model's
+    # own tensors, frozen: what the model learns next, the loss knows.
+    loss = instantiate(cfg.loss, actor, critics, model).to(device)
+    loss.make_value_estimator(gamma=cfg.optim.gamma)
+
     # First phase: which action leads from s~ to s'?
     if cfg.loss.recovery_weight > 0:
         train_inverse_dynamics(cfg, folder, model, held_out, training)
 
     # Second phase: the policy, taught by the critics and by the frozen model.
-    loss = instantiate(cfg.loss, actor, critics, model).to(device)
-    loss.make_value_estimator(gamma=cfg.optim.gamma)
     critic_params = list(loss.qvalue_network_params.parameters())
     known = set(critic_params)
     policy_params = [each for each in loss.parameters() if each not in known]

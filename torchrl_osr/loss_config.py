@@ -77,6 +77,7 @@ class OSRLossConfig(CriticLossConfig):
         with_lagrange: learn a multiplier of the conservative term.
         lagrange_thresh: the gap that it tolerates.
         diversity_weight: EDAC's eta.
+        chunk_size: states that go through plain critics at a time on a CPU, or null.
     """
 
     _target_: str = "torchrl_osr.OSRLoss"
@@ -93,6 +94,7 @@ class OSRLossConfig(CriticLossConfig):
     with_lagrange: bool = MISSING
     lagrange_thresh: float = MISSING
     diversity_weight: float = MISSING
+    chunk_size: int | None = MISSING
 
 
 @dataclass

@@ -174,20 +174,32 @@ def test_gradient_is_that_of_a_small_step(family, family_batch, seeded) -> None:
         assert gradient[index].item() == pytest.approx(slope, abs=1e-7)
 
 
-def test_second_derivatives_need_the_critics_all_at_once(family, family_batch) -> None:
+def second_derivative(loss, batch, squared: bool) -> list[torch.Tensor]:
+    """Gradient of the squared gradient of the conservative term, or of its square."""
+    params = list(loss.qvalue_network_params.parameters())
+    out = loss(batch)["loss_cql"]
+    out = out.square() if squared else out
+    first = torch.autograd.grad(out, params, create_graph=True)
+    norm = sum(gradient.square().sum() for gradient in first)
+    norm.backward()
+    return [parameter.grad for parameter in params if parameter.grad is not None]
+
+
+@pytest.mark.parametrize("squared", [True, False])
+def test_second_derivatives_need_the_critics_all_at_once(
+    family, family_batch, squared
+) -> None:
     batch = family_batch("cql", 10)
-    for chunk_size in (3, None):
-        loss = family("cql", networks_of(family, "cql"), chunk_size=chunk_size)
-        params = list(loss.qvalue_network_params.parameters())
-        out = loss(batch)["loss_cql"].square()
-        first = torch.autograd.grad(out, params, create_graph=True)
-        norm = sum(gradient.square().sum() for gradient in first)
-        if chunk_size is None:
-            norm.backward()
-            assert any(p.grad.abs().max() > 0 for p in params if p.grad is not None)
-        else:
-            with pytest.raises(RuntimeError, match="once_differentiable"):
-                norm.backward()
+    chunked, whole = (
+        family("cql", networks_of(family, "cql"), chunk_size=chunk_size)
+        for chunk_size in (3, None)
+    )
+    assert any(
+        gradient.abs().max() > 0
+        for gradient in second_derivative(whole, batch, squared)
+    )
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        second_derivative(chunked, batch, squared)
 
 
 @pytest.mark.parametrize("chunk_size", [0, -1])

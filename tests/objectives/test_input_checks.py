@@ -97,10 +97,12 @@ def test_actions_of_another_kind_are_named(
 def test_numbers_of_actions_that_differ_are_named(
     family, family_batch, option, name_of_network
 ) -> None:
-    loss = family("discrete", family.networks("discrete", **{option: 5}))
+    networks = family.networks("discrete", **{option: 5})
+    batch = family_batch("discrete", 10)
     expected = f"{name_of_network} has 5 actions, but actor_network has 4"
+    # A model tells its number at construction, critics in the call.
     with pytest.raises(ValueError, match=expected):
-        loss(family_batch("discrete", 10))
+        family("discrete", networks)(batch)
 
 
 def test_continuous_critics_are_refused(family, family_batch) -> None:

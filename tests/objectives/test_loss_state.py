@@ -244,3 +244,16 @@ def test_randomness_of_vmap_can_be_chosen(family, family_batch, critic_loss) -> 
         loss(batch)
     with pytest.raises(ValueError, match="should be one of"):
         loss.set_vmap_randomness("some")
+
+
+def test_what_the_model_learns_later_the_loss_knows(
+    family, family_batch, seeded, recovering
+) -> None:
+    # The example builds the policy's loss before the model is trained.
+    model_loss = "discrete-idm" if family[recovering].discrete else "idm"
+    batch, networks = family_batch(recovering, 10), family.networks(recovering)
+    early = family(recovering, networks)
+    shift(family(model_loss, networks).inverse_dynamics_network_params, 0.3)
+    late = family(recovering, networks)
+    key = "loss_recovery"
+    assert torch.equal(seeded(early, batch)[key], seeded(late, batch)[key])

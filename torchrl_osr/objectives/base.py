@@ -110,7 +110,8 @@ class BaseLoss(LossModule):
         """Return the rows' importance weights, if there are any to be used."""
         if self.use_prioritized_weights is False:
             return None
-        weights: Tensor | None = self._maybe_get_priority_weight(tensordict)
+        # Not TorchRL's _maybe_get_priority_weight, which fails with a nested key.
+        weights: Tensor | None = tensordict.get(self.tensor_keys.priority_weight, None)
         return weights
 
     def _reduce(self, value: Tensor, tensordict: TensorDictBase) -> Tensor:

@@ -132,6 +132,7 @@ class ConservativeCritics(TanhGaussianActorCritic):
     ) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
         """Return the values of the data's actions ``[N, B]``, losses and metrics."""
         losses: dict[str, Tensor] = {}
+        duals: dict[str, Tensor] = {}
         metrics: dict[str, Tensor] = {}
         if self.conserves:
             pred_value, gap = self._conservative_gap(states, policy, data_action)
@@ -140,7 +141,7 @@ class ConservativeCritics(TanhGaussianActorCritic):
                     gap, self.log_alpha_prime, self.lagrange_thresh
                 )
                 dual = self._reduce(dual.mean(0), tensordict)
-                losses["loss_alpha_prime"] = self.min_q_weight * dual
+                duals["loss_alpha_prime"] = self.min_q_weight * dual
                 metrics["alpha_prime"] = self.log_alpha_prime.detach().exp()
             gap = self._reduce(gap.sum(0), tensordict)
             losses["loss_cql"] = self.min_q_weight * gap
@@ -152,7 +153,7 @@ class ConservativeCritics(TanhGaussianActorCritic):
             diversity = functional.gradient_diversity(gradients)
             diversity = self._reduce(diversity, tensordict)
             losses["loss_diversity"] = self.diversity_weight * diversity
-        return pred_value, losses, metrics
+        return pred_value, losses | duals, metrics
 
     def _conservative_gap(
         self, states: TensorDictBase, policy: TensorDictBase, data_action: Tensor

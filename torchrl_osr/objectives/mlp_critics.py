@@ -20,7 +20,6 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 from torchrl.modules import MLP
 
 Layers = Sequence[tuple[Tensor, Tensor]]
@@ -132,8 +131,14 @@ class _SoftMaximum(torch.autograd.Function):
         return value
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> Any:
+        # Not torch's decorator of that name: it objects only where the upstream
+        # gradient has a gradient itself, which that of a mean has not.
+        if torch.is_grad_enabled():
+            raise RuntimeError(
+                "Critics in chunks are once_differentiable: pass chunk_size=None for "
+                "second derivatives."
+            )
         weight = upstream.flatten()[0]
         if bool((upstream == weight).all()):
             gradient = list(torch._foreach_mul(ctx.saved_tensors, weight))
