@@ -96,6 +96,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
         "loggers": make_loggers(folder=folder, **cfg.logger),
         "log_interval": cfg.trainer.log_interval,
         "checkpoint_interval": cfg.trainer.checkpoint_interval,
+        "checkpoints_kept": cfg.trainer.checkpoints_kept,
         "progress": cfg.trainer.progress,
         "autocast_dtype": autocast,
     }

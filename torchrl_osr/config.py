@@ -114,6 +114,7 @@ class TrainerConfig:
         eval_interval: steps between evaluations.
         eval_episodes: complete episodes of an evaluation.
         checkpoint_interval: steps between checkpoints.
+        checkpoints_kept: how many of the newest stay, beside the best.
         num_threads: torch threads; several fight where the machine is shared.
         device: cpu or cuda.
         precision: float32 or bfloat16, of the losses' matrix products.
@@ -129,6 +130,7 @@ class TrainerConfig:
     eval_interval: int = MISSING
     eval_episodes: int = MISSING
     checkpoint_interval: int = MISSING
+    checkpoints_kept: int = MISSING
     num_threads: int = MISSING
     device: str = MISSING
     precision: str = MISSING

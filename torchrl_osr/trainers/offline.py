@@ -40,8 +40,6 @@ except ImportError as error:
         f"the trainer needs {error.name!r}: pip install torchrl-osr[examples]"
     ) from error
 
-CHECKPOINTS_KEPT = 2
-
 
 class OfflineTrainer(Trainer):
     """Train a loss module on a replay buffer, with evaluation, checkpoints and resume.
@@ -73,6 +71,7 @@ class OfflineTrainer(Trainer):
         log_interval: steps between log entries, which are means over them. Default 200.
         eval_interval: steps between evaluations. Default 5000.
         checkpoint_interval: steps between checkpoints. Default: ``eval_interval``.
+        checkpoints_kept: how many of the newest stay, beside the best. Default 2.
         description: names the phase in the progress bar and the logs. Default "train".
         progress: show a progress bar when on a terminal. Default ``True``.
         autocast_dtype: compute the losses' matrix products in this precision
@@ -100,6 +99,7 @@ class OfflineTrainer(Trainer):
         log_interval: int = 200,
         eval_interval: int = 5000,
         checkpoint_interval: int | None = None,
+        checkpoints_kept: int = 2,
         description: str = "train",
         progress: bool = True,
         autocast_dtype: torch.dtype | None = None,
@@ -138,7 +138,7 @@ class OfflineTrainer(Trainer):
         self.register_op("post_steps", self._update_bar)
         self.progress = progress
 
-        self.rotation = CheckpointRotation(folder, keep_last=CHECKPOINTS_KEPT)
+        self.rotation = CheckpointRotation(folder, keep_last=checkpoints_kept)
         self._model_components = ("loss_module", *(components or {}))
         self.checkpoint_of_run = safe_checkpoint(
             loss_module=loss_module,
