@@ -117,7 +117,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
     loss.make_value_estimator(gamma=cfg.optim.gamma)
 
     # First phase: which action leads from s~ to s'?
-    if cfg.loss.recovery_weight > 0:
+    if hasattr(loss, "inverse_dynamics_network"):
         train_inverse_dynamics(cfg, folder, model, held_out, training)
 
     # Second phase: the policy, taught by the critics and by the frozen model.
@@ -183,9 +183,17 @@ def train_inverse_dynamics(
         description="inverse_dynamics",
         **training,
     )
+    if cfg.inverse_dynamics.shuffle_next:
+        trainer.register_op("process_optim_batch", shuffle_next)
     trainer.train()
     run_folder.write_json(folder / "inverse_dynamics.json", trainer.history[-1])
     print(describe(trainer.history[-1]))
+
+
+def shuffle_next(batch: TensorDict) -> TensorDict:
+    """Give every row the next state of another: an ablation of the model."""
+    key = ("next", "observation")
+    return batch.set(key, batch[key].roll(1, 0))  # the rows came in random order
 
 
 def report(

@@ -66,7 +66,8 @@ class OSRLossConfig(CriticLossConfig):
     Attributes:
         recovery_direction: forward or reverse.
         action_reduction: sum or mean.
-        recovery_states: both or perturbed.
+        recovery_target: inverse_dynamics or data.
+        recovery_states: both, perturbed or clean.
         actor_states: both or clean.
         min_q_weight: alpha.
         importance_sample: weigh the drawn actions by their densities.
@@ -83,6 +84,7 @@ class OSRLossConfig(CriticLossConfig):
     _target_: str = "torchrl_osr.OSRLoss"
     recovery_direction: str = MISSING
     action_reduction: str = MISSING
+    recovery_target: str = MISSING
     recovery_states: str = MISSING
     actor_states: str = MISSING
     min_q_weight: float = MISSING
@@ -138,7 +140,9 @@ class InverseDynamicsConfig:
     Attributes:
         network: the function that builds it.
         loss: its loss.
+        shuffle_next: train it with the next state of another row, an ablation.
     """
 
     network: TargetConfig = field(default_factory=TargetConfig)
     loss: InverseDynamicsLossConfig = field(default_factory=InverseDynamicsLossConfig)
+    shuffle_next: bool = False

@@ -34,6 +34,15 @@ FAMILY = {
     "OSR-v": ("`OSRVLoss`, (8), 4.4", "`loss=osr_v`", REST),
     "OSR-10": ("`OSRLoss`, appendix D.4", "`loss=osr_10`", "`kl_divergence` of torch"),
     "CQL(H)": ("`OSRLoss`, CQL appendix F", "`loss=cql`", REST),
+    "OSR, clean states": (
+        "`OSRLoss`, (11) on D alone", "`loss=osr loss.recovery_states=clean`", REST,
+    ),
+    "CQL(H) and cloning": (
+        "`OSRLoss`, CQL appendix F and -log pi", "`loss=cql_bc`", REST,
+    ),
+    "CQL(H) and noisy cloning": (
+        "`OSRLoss`, CQL appendix F and -log pi", "`loss=cql_noisy_bc`", REST,
+    ),
     "CQL(H) with its options": (
         "`OSRLoss`, CQL appendix F and CORL", "`loss=cql loss.with_lagrange=true ...`",
         REST,

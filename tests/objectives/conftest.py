@@ -211,6 +211,12 @@ class Member:
         return CRITICS in self.groups.values()
 
     @property
+    def modelled(self) -> bool:
+        """Whether it holds a model that somebody else has trained."""
+        cloning = self.options.get("recovery_target") == "data"
+        return "loss_recovery" in self.groups and not cloning
+
+    @property
     def discrete(self) -> bool:
         return self.loss_class in (DiscreteOSRLoss, DiscreteInverseDynamicsLoss)
 
@@ -311,6 +317,17 @@ FAMILY = {
         deterministic_backup=False,
     ),
     "cql": actor_critic(OSRLoss, CQL, twin=False, recovery_weight=0.0),
+    "cloning": actor_critic(
+        OSRLoss,
+        CQL | RECOVERY,
+        "recovery_nll",
+        twin=False,
+        recovery_target="data",
+        recovery_states="clean",
+    ),
+    "noisy-cloning": actor_critic(
+        OSRLoss, CQL | RECOVERY, "recovery_nll", recovery_target="data"
+    ),
     "cql-options": actor_critic(
         OSRLoss,
         CQL | {"loss_alpha_prime": "log_alpha_prime"},
@@ -376,6 +393,7 @@ PARTS = {
     "name": list(FAMILY),
     "critic_loss": those(lambda member: member.has_critics),
     "recovering": those(lambda member: "loss_recovery" in member.groups),
+    "modelled": those(lambda member: member.modelled),
     "conservative": those(lambda member: "loss_cql" in member.groups),
     # Without a recovery term for good: no model and no perturbed state.
     "unrecovering": those(lambda member: member.options.get("recovery_weight") == 0.0),

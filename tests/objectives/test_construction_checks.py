@@ -114,9 +114,12 @@ OPTIONS = {
     "scalar_output_mode": ["keep"],
 }
 DIRECTIONS = {"recovery_direction": ["backward"], "action_reduction": ["max"]}
-STATES = {"recovery_states": ["clean"], "actor_states": ["perturbed"]}
+STATES = {"recovery_states": ["noisy"], "actor_states": ["perturbed"]}
 WRONG = {
-    "osr": OPTIONS | DIRECTIONS | STATES | {"num_random": [0]},
+    "osr": OPTIONS
+    | DIRECTIONS
+    | STATES
+    | {"num_random": [0], "recovery_target": ["model"]},
     "cql": OPTIONS | {"num_random": [0]},
     "osrv": OPTIONS | {"num_random": [0]},
     "discrete": OPTIONS | STATES | {"recovery_direction": ["both"]},

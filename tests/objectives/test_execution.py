@@ -93,6 +93,8 @@ ENSEMBLE = {"min_q_weight": 0.0, "deterministic_backup": False}
         ("CQL(H)", "cql", 2, {}, 66),
         ("OSR", "osr", 2, {}, 68),
         ("OSR, official variant", "official", 2, {}, 66),
+        ("CQL(H) and cloning", "cloning", 2, {}, 66),
+        ("CQL(H) and noisy cloning", "noisy-cloning", 2, {}, 68),
         (None, "osr", 2, {"max_q_backup": True}, 86),
         ("OSR-v", "osrv", 2, {}, 16),
         ("SAC-N", "cql", 10, ENSEMBLE, 30),

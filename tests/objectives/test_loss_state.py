@@ -85,13 +85,13 @@ def test_every_number_is_cast_with_the_loss(family, name) -> None:
 
 
 def test_a_trained_model_loss_hands_its_model_over(
-    family, family_batch, seeded, recovering
+    family, family_batch, seeded, modelled
 ) -> None:
     # The recovery term reads the network that the model's loss trained in place.
-    model_loss = "discrete-idm" if family[recovering].discrete else "idm"
-    batch, networks = family_batch(recovering, 10), family.networks(recovering)
+    model_loss = "discrete-idm" if family[modelled].discrete else "idm"
+    batch, networks = family_batch(modelled, 10), family.networks(modelled)
     shift(family(model_loss, networks).inverse_dynamics_network_params, 0.3)
-    trained, untrained = family(recovering, networks), family(recovering)
+    trained, untrained = family(modelled, networks), family(modelled)
     key = "loss_recovery"
     assert seeded(trained, batch)[key] != seeded(untrained, batch)[key]
 
@@ -207,9 +207,7 @@ def test_reset_redraws_what_is_trained_and_keeps_a_frozen_model(family, name) ->
     for key, params in held(loss).items():
         trains = key.removeprefix("target_") in groups.values()
         (trained if trains else frozen)[key] = params
-    assert list(frozen) == ["inverse_dynamics_network_params"] * (
-        "loss_recovery" in groups
-    )
+    assert list(frozen) == ["inverse_dynamics_network_params"] * family[name].modelled
     kept = [values(params) for params in frozen.values()]
     draws = []
     for _ in range(2):
@@ -247,13 +245,13 @@ def test_randomness_of_vmap_can_be_chosen(family, family_batch, critic_loss) -> 
 
 
 def test_what_the_model_learns_later_the_loss_knows(
-    family, family_batch, seeded, recovering
+    family, family_batch, seeded, modelled
 ) -> None:
     # The example builds the policy's loss before the model is trained.
-    model_loss = "discrete-idm" if family[recovering].discrete else "idm"
-    batch, networks = family_batch(recovering, 10), family.networks(recovering)
-    early = family(recovering, networks)
+    model_loss = "discrete-idm" if family[modelled].discrete else "idm"
+    batch, networks = family_batch(modelled, 10), family.networks(modelled)
+    early = family(modelled, networks)
     shift(family(model_loss, networks).inverse_dynamics_network_params, 0.3)
-    late = family(recovering, networks)
+    late = family(modelled, networks)
     key = "loss_recovery"
     assert torch.equal(seeded(early, batch)[key], seeded(late, batch)[key])

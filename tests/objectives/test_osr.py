@@ -48,7 +48,7 @@ class Restatement:
     """The equations once more: critics in a loop, densities by hand, no torchrl_osr."""
 
     def __init__(
-        self, networks, *, low: Tensor, high: Tensor, weight: float, official: bool
+        self, networks, *, low: Tensor, high: Tensor, weight: float, variant: str
     ) -> None:
         networks = copy.deepcopy(networks)
         self.policy_net, self.idm_net = networks.actor[0], networks.inverse_dynamics[0]
@@ -59,7 +59,7 @@ class Restatement:
                 parameter.data.mul_(TARGET_SCALE)
         self.log_alpha = torch.tensor(math.log(ALPHA)).double().requires_grad_()
         self.center, self.half = (high + low) / 2, (high - low) / 2
-        self.weight, self.official = weight, official
+        self.weight, self.variant = weight, variant
 
     def policy(self, state: Tensor) -> Normal:
         _, loc, scale = self.policy_net(state)
@@ -72,6 +72,12 @@ class Restatement:
         log_prob = gaussian.log_prob(x) - torch.log(self.half * (1 - squashed**2))
         return self.center + self.half * squashed, log_prob.sum(-1)
 
+    def log_prob(self, gaussian: Normal, action: Tensor) -> Tensor:
+        """Log-density of a given action, by the change of variables."""
+        squashed = (action - self.center) / self.half
+        log_prob = gaussian.log_prob(torch.atanh(squashed))
+        return (log_prob - torch.log(self.half * (1 - squashed**2))).sum(-1)
+
     def losses(self, batch, seed: int) -> dict[str, Tensor]:
         s, a = batch["observation"], batch["action"]
         reward = batch["next", "reward"].squeeze(-1)
@@ -81,9 +87,12 @@ class Restatement:
         s_next = torch.where(terminated, s, batch["next", "observation"])
         s_tot = torch.stack([s, batch["perturbed", "observation"]])
         # Where values are sought, and where the policy recovers: the paper's D_tot, or
-        # what the authors' released code has.
-        s_actor = s_tot[:1] if self.official or not self.weight else s_tot
-        s_recover = s_tot[1:] if self.official else s_tot
+        # what the authors' released code has, or the data alone.
+        official, cloning = "official" in self.variant, "cloning" in self.variant
+        if self.variant in CLEAN:
+            s_tot = s_tot[:1]
+        s_actor = s_tot[:1] if official else s_tot
+        s_recover = s_tot[1:] if official else s_tot
         # The draws, in the order in which the loss makes them.
         torch.manual_seed(seed)
         like = {"dtype": torch.float64}
@@ -129,29 +138,38 @@ class Restatement:
                 s_next = s_next.expand_as(s_recover)
                 _, loc, scale = self.idm_net(s_recover, s_next)
             model, policy = Normal(loc, scale), self.policy(s_recover)
-            kl = (
-                kl_divergence(policy, model).mean(-1)
-                if self.official
-                else kl_divergence(model, policy).sum(-1)
-            )
+            if cloning:
+                kl = -self.log_prob(policy, a.expand_as(loc))
+            elif official:
+                kl = kl_divergence(policy, model).mean(-1)
+            else:
+                kl = kl_divergence(model, policy).sum(-1)
             valid = ~done.squeeze(-1)
             losses["loss_recovery"] = self.weight * kl.mean(0)[valid].mean()
         return losses
 
 
-OFFICIAL = {
-    "recovery_direction": "reverse",
-    "action_reduction": "mean",
-    "recovery_states": "perturbed",
-    "actor_states": "clean",
+VARIANTS = {
+    "OSR": {},
+    "CQL(H)": {"weight": 0.0},
+    "OSR, official variant": {
+        "recovery_direction": "reverse",
+        "action_reduction": "mean",
+        "recovery_states": "perturbed",
+        "actor_states": "clean",
+    },
+    "OSR, clean states": {"recovery_states": "clean"},
+    "CQL(H) and cloning": {
+        "recovery_target": "data",
+        "recovery_states": "clean",
+    },
+    "CQL(H) and noisy cloning": {"recovery_target": "data"},
 }
 
+CLEAN = ["CQL(H)", "OSR, clean states", "CQL(H) and cloning"]  # no perturbed state
 
-@pytest.mark.parametrize(
-    ("weight", "options"),
-    [(0.75, {}), (0.0, {}), (0.75, OFFICIAL)],
-    ids=["osr", "cql", "official"],
-)
+
+@pytest.mark.parametrize("variant", VARIANTS)
 # Bounds are float64 tensors: TorchRL would keep numbers in float32, to 1e-8 only.
 @pytest.mark.parametrize(
     ("low", "high"), [([-1.0, -1.0], [1.0, 1.0]), ([-1.0, -0.5], [2.0, 1.5])]
@@ -159,20 +177,21 @@ OFFICIAL = {
 # Critics with ReLUs are plain MLPs, which have a path of their own.
 @pytest.mark.parametrize("activation", [nn.Tanh, nn.ReLU])
 def test_losses_and_gradients_equal_the_restatement(
-    make_networks, make_batch, check, weight, options, low, high, activation
+    make_networks, make_batch, check, variant, low, high, activation
 ) -> None:
+    options = {"weight": 0.75} | VARIANTS[variant]
+    weight = options["weight"]
     bounds = {"low": torch.tensor(low).double(), "high": torch.tensor(high).double()}
     networks = make_networks(**bounds, critic_activation=activation)
     batch = make_batch(10)
-    restatement = Restatement(networks, **bounds, weight=weight, official=bool(options))
-    loss = make_osr(networks, weight=weight, **options)
+    restatement = Restatement(networks, **bounds, weight=weight, variant=variant)
+    loss = make_osr(networks, **options)
     torch.manual_seed(5)
     losses = network_losses(loss, batch)
     expected = restatement.losses(batch, seed=5)
     assert set(losses) == set(expected) == set(LOSSES[: 5 if weight else 4])
     values = [losses[key] for key in expected]
-    name = "OSR, official variant" if options else "OSR" if weight else "CQL(H)"
-    check(name, values, expected.values(), tolerance=1e-8)
+    check(variant, values, expected.values(), tolerance=1e-8)
 
     # The sum of ours is correct training; the plain one needs each group by itself.
     actor = list(restatement.policy_net.parameters())
@@ -194,7 +213,7 @@ def test_losses_and_gradients_equal_the_restatement(
     ours += [p.grad for p in loss.qvalue_network_params.values(True, True)]
     ours.append(loss.log_alpha.grad)
     wanted = [*expected_actor, *stacked, expected_alpha]
-    check(name, ours, wanted, tolerance=1e-7)
+    check(variant, ours, wanted, tolerance=1e-7)
 
 
 @pytest.mark.parametrize("recovery_weight", [0.75, 0.0])

@@ -26,9 +26,6 @@ from torchrl_osr.objectives.networks import ActorCriticNetworks
 class RecoveryActorCriticLoss(ActorCriticNetworks):
     """Abstract base: the losses differ in their actions and in their constraints."""
 
-    # Rows of [s, s', s^] on which the policy is improved: D_tot.
-    _actor_rows = slice(None, None, 2)
-
     def _before(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the batch that the terms are computed from; it may be another one."""
         return tensordict
@@ -113,7 +110,7 @@ class RecoveryActorCriticLoss(ActorCriticNetworks):
 
     def _recovery_policy(self, policy: TensorDictBase, pi: Any) -> Any:
         """Return the policy where it is to recover: on D_tot, or at ``s^`` alone."""
-        rows = slice(None, None, 2) if self.recovery_states == "both" else slice(2, 3)
+        rows = slice(2, 3) if self.recovery_states == "perturbed" else slice(0, None, 2)
         # One object for both terms where it is the same: no work done twice.
         return pi if rows == self._actor_rows else self._distribution(policy[rows])
 

@@ -73,7 +73,8 @@ class DiscreteOSRLoss(CategoricalActorCritic):
         temperature: :math:`\tau`, in units of the value. Default 1.0.
         recovery_direction: ``"forward"`` (default) for ``KL(I || pi)`` or ``"reverse"``
             for ``KL(pi || I)``.
-        recovery_states: ``"both"`` (default) for D_tot, or ``"perturbed"`` alone.
+        recovery_states: ``"both"`` (default) for D_tot, ``"perturbed"`` alone, or
+            ``"clean"``: no perturbed state is read, D_tot is the data.
         actor_states: where the policy seeks values: ``"both"`` (default) or ``"clean"``
             states alone.
         num_qvalue_nets: ``N``, for a single critic; a list has its own length.
@@ -135,7 +136,7 @@ class DiscreteOSRLoss(CategoricalActorCritic):
         min_q_weight: float = 5.0,
         temperature: float = 1.0,
         recovery_direction: Literal["forward", "reverse"] = "forward",
-        recovery_states: Literal["both", "perturbed"] = "both",
+        recovery_states: Literal["both", "perturbed", "clean"] = "both",
         actor_states: Literal["both", "clean"] = "both",
         num_qvalue_nets: int = 2,
         loss_function: str = "l2",
@@ -152,7 +153,6 @@ class DiscreteOSRLoss(CategoricalActorCritic):
         check_weight("recovery_weight", recovery_weight)
         check_weight("min_q_weight", min_q_weight)
         check_choice("recovery_direction", recovery_direction, ("forward", "reverse"))
-        check_choice("actor_states", actor_states, ("both", "clean"))
         if not temperature > 0:
             raise ValueError(f"temperature must be above 0, got {temperature}.")
         if recovery_weight and inverse_dynamics_network is None:
@@ -164,7 +164,9 @@ class DiscreteOSRLoss(CategoricalActorCritic):
             actor_network,
             qvalue_network,
             inverse_dynamics_network if recovery_weight else None,
+            recovers=recovery_weight > 0,
             recovery_states=recovery_states,
+            actor_states=actor_states,
             num_qvalue_nets=num_qvalue_nets,
             loss_function=loss_function,
             alpha_init=alpha_init,
@@ -182,8 +184,6 @@ class DiscreteOSRLoss(CategoricalActorCritic):
         self.conserves = min_q_weight > 0
         self.temperature = temperature
         self.recovery_direction = recovery_direction
-        if actor_states == "clean":
-            self._actor_rows = slice(0, 1)
 
     def _output_keys(self) -> tuple[list[NestedKey], list[NestedKey]]:
         losses: list[NestedKey] = ["loss_actor", "loss_alpha", "loss_qvalue"]

@@ -1,7 +1,7 @@
 """The networks of the recovery losses: how they are held, and how they are run.
 
 Shapes: ``B`` batch (any leading dimensions), ``N`` critics, ``D`` state sets of D_tot
-(2: clean and perturbed; 1 where nothing recovers). The state sets are always stacked
+(2: clean and perturbed; 1 where nothing is perturbed). They are always stacked
 as ``[s, s', s^]``: rows ``[:2]`` are the true states, ``[::2]`` D_tot.
 """
 
@@ -91,13 +91,18 @@ class ActorCriticNetworks(BaseLoss):
     inverse_dynamics_network_params: TensorDictParams
     target_inverse_dynamics_network_params: TensorDictParams
 
+    # Rows of [s, s', s^] on which the policy is improved: D_tot.
+    _actor_rows = slice(0, None, 2)
+
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
         qvalue_network: TensorDictModule | Sequence[TensorDictModule],
         inverse_dynamics_network: ProbabilisticTensorDictSequential | None,
         *,
+        recovers: bool = True,
         recovery_states: States = "both",
+        actor_states: Literal["both", "clean"] = "both",
         num_qvalue_nets: int,
         loss_function: str,
         alpha_init: float,
@@ -109,7 +114,9 @@ class ActorCriticNetworks(BaseLoss):
         use_prioritized_weights: bool | Literal["auto"],
         scalar_output_mode: ScalarOutputMode,
     ) -> None:
-        check_choice("recovery_states", recovery_states, ("both", "perturbed"))
+        choices = ("both", "perturbed", "clean")
+        check_choice("recovery_states", recovery_states, choices)
+        check_choice("actor_states", actor_states, ("both", "clean"))
         check_choice("loss_function", loss_function, ("l2", "l1", "smooth_l1"))
         super().__init__(
             reduction,
@@ -117,8 +124,12 @@ class ActorCriticNetworks(BaseLoss):
             scalar_output_mode=scalar_output_mode,
         )
         self.deactivate_vmap = deactivate_vmap
-        self.recovers = inverse_dynamics_network is not None
+        self.recovers = recovers
         self.recovery_states = recovery_states
+        # Whether s^ is there: else D_tot, whose rows are [::2], is s alone.
+        self.perturbs = recovers and recovery_states != "clean"
+        if actor_states == "clean":
+            self._actor_rows = slice(0, 1)
         self._check_distributions(actor_network, inverse_dynamics_network)
         check_apart(
             actor_network=actor_network,
@@ -214,16 +225,19 @@ class ActorCriticNetworks(BaseLoss):
         in_keys += [
             nested("next", key) for key in (keys.reward, keys.done, keys.terminated)
         ]
-        if self.recovers:
-            network_keys = self.inverse_dynamics_network.in_keys
-            in_keys += network_keys
+        in_keys += self._model_keys()
+        if self.perturbs:
             in_keys += [nested(keys.perturbed, key) for key in self._perturbed_keys()]
         return in_keys
 
     def _perturbed_keys(self) -> list[NestedKey]:
         """The state entries whose perturbed twins are read from the batch."""
-        network_keys = self.inverse_dynamics_network.in_keys
-        return [*self._observation_keys(), *state_keys(network_keys)]
+        return [*self._observation_keys(), *state_keys(self._model_keys())]
+
+    def _model_keys(self) -> list[NestedKey]:
+        """What the inverse dynamics model reads, if there is one."""
+        model = getattr(self, "inverse_dynamics_network", None)
+        return [] if model is None else list(model.in_keys)
 
     def _flag(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
         """Return a boolean entry below ``"next"``, ``[B]``."""
@@ -238,7 +252,7 @@ class ActorCriticNetworks(BaseLoss):
         for key in keys:
             following.set(key, replace_next(tensordict, key, terminated))
         stack = [clean, following]
-        if self.recovers:
+        if self.perturbs:
             stack.append(perturbed_twin(tensordict, keys, self.tensor_keys.perturbed))
         return torch.stack(stack)
 

@@ -67,7 +67,12 @@ class OSRLoss(ConservativeCritics):
             ``"reverse"`` (``KL(pi || I)``, the released code's).
         action_reduction: of the divergence over action dimensions: ``"sum"`` (default,
             the paper's) or ``"mean"`` (the released code's).
-        recovery_states: ``"both"`` (default) for D_tot, or ``"perturbed"`` alone.
+        recovery_target: what the policy is pulled to: ``"inverse_dynamics"``
+            (default), the model, or ``"data"``, the data's action,
+            ``-log pi(a | s~)`` in the place of the divergence. The latter is CQL with
+            behaviour cloning, noisy on D_tot: what OSR would be without its model.
+        recovery_states: ``"both"`` (default) for D_tot, ``"perturbed"`` alone, or
+            ``"clean"``: no perturbed state is read, D_tot is the data.
         actor_states: where the policy seeks values: ``"both"`` (default) or ``"clean"``
             states alone.
         adversary: finds the perturbed states in the place of the batch's, see
@@ -150,7 +155,8 @@ class OSRLoss(ConservativeCritics):
         recovery_weight: float = 0.5,
         recovery_direction: Literal["forward", "reverse"] = "forward",
         action_reduction: Literal["sum", "mean"] = "sum",
-        recovery_states: Literal["both", "perturbed"] = "both",
+        recovery_target: Literal["inverse_dynamics", "data"] = "inverse_dynamics",
+        recovery_states: Literal["both", "perturbed", "clean"] = "both",
         actor_states: Literal["both", "clean"] = "both",
         adversary: Adversary | None = None,
         behavior_cloning: bool = False,
@@ -180,8 +186,10 @@ class OSRLoss(ConservativeCritics):
         check_weight("recovery_weight", recovery_weight)
         check_choice("recovery_direction", recovery_direction, ("forward", "reverse"))
         check_choice("action_reduction", action_reduction, ("sum", "mean"))
-        check_choice("actor_states", actor_states, ("both", "clean"))
-        if recovery_weight and inverse_dynamics_network is None:
+        choices = ("inverse_dynamics", "data")
+        check_choice("recovery_target", recovery_target, choices)
+        has_model = recovery_weight > 0 and recovery_target == "inverse_dynamics"
+        if has_model and inverse_dynamics_network is None:
             raise ValueError(
                 f"recovery_weight={recovery_weight} needs an inverse_dynamics_network; "
                 "pass one, or recovery_weight=0 for CQL."
@@ -189,8 +197,10 @@ class OSRLoss(ConservativeCritics):
         super().__init__(
             actor_network,
             qvalue_network,
-            inverse_dynamics_network if recovery_weight else None,
+            inverse_dynamics_network if has_model else None,
+            recovers=recovery_weight > 0,
             recovery_states=recovery_states,
+            actor_states=actor_states,
             adversary=adversary,
             behavior_cloning=behavior_cloning,
             min_q_weight=min_q_weight,
@@ -217,17 +227,20 @@ class OSRLoss(ConservativeCritics):
         )
         self.register_coeff_buffer("recovery_weight", float(recovery_weight))
         self.recovery_direction = recovery_direction
+        self.recovery_target = recovery_target
         self.action_reduction = action_reduction
-        if actor_states == "clean":
-            self._actor_rows = slice(0, 1)
 
     def _output_keys(self) -> tuple[list[NestedKey], list[NestedKey]]:
         losses: list[NestedKey] = ["loss_actor", "loss_alpha", "loss_qvalue"]
         metrics: list[NestedKey] = ["alpha", "entropy", "pred_value", "target_value"]
         critic_losses, critic_metrics = self._critic_keys()
         losses += critic_losses + ["loss_recovery"] * self.recovers
-        metrics += critic_metrics + ["recovery_kl"] * self.recovers
+        metrics += critic_metrics + [self._recovery_metric] * self.recovers
         return losses, metrics
+
+    @property
+    def _recovery_metric(self) -> str:
+        return "recovery_nll" if self.recovery_target == "data" else "recovery_kl"
 
     def _constraints(
         self,
@@ -242,10 +255,22 @@ class OSRLoss(ConservativeCritics):
         )
         if not self.recovers:
             return pred_value, losses, metrics
+        pi = self._recovery_policy(policy, pi)
+        value = self._recovery_divergence(tensordict, pi, data_action)
+        value, mean = self._reduce_recovery(value, tensordict)
+        losses["loss_recovery"] = self.recovery_weight * value
+        return pred_value, losses, metrics | {self._recovery_metric: mean}
+
+    def _recovery_divergence(
+        self, tensordict: TensorDictBase, pi: TanhNormal, data_action: Tensor
+    ) -> Tensor:
+        """Return how far the policy is from its target on D_tot, ``[D, B]``."""
+        if self.recovery_target == "data":
+            log_prob: Tensor = pi.log_prob(data_action.expand_as(pi.loc))
+            return -log_prob
         done = self._flag(tensordict, self.tensor_keys.done)
         model = self._inverse_dynamics(tensordict, done)
-        pi = self._recovery_policy(policy, pi)
-        kl = functional.state_recovery(
+        return functional.state_recovery(
             pi.loc,
             pi.scale,
             model.loc,
@@ -253,6 +278,3 @@ class OSRLoss(ConservativeCritics):
             direction=self.recovery_direction,
             action_reduction=self.action_reduction,
         )
-        kl, mean_kl = self._reduce_recovery(kl, tensordict)
-        losses["loss_recovery"] = self.recovery_weight * kl
-        return pred_value, losses, metrics | {"recovery_kl": mean_kl}

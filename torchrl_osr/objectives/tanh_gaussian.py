@@ -73,7 +73,7 @@ class TanhGaussianActorCritic(RecoveryActorCriticLoss):
         self.num_random = num_random
         self.temperature = temperature
         self.behavior_cloning = behavior_cloning
-        self.adversary = adversary if self.recovers else None
+        self.adversary = adversary if self.perturbs else None
 
     def _check_distributions(
         self,
