@@ -18,7 +18,6 @@ from typing import Any
 import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.utils import instantiate
 from omegaconf import DictConfig
 from tensordict import TensorDict
 from torchrl import torchrl_logger
@@ -27,7 +26,7 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_osr import InverseDynamicsLoss, StatePerturbation, config
 from torchrl_osr.data import (
-    load_local_dataset,
+    load_mixture,
     make_replay_buffer,
     observation_statistics,
     split_held_out,
@@ -40,7 +39,7 @@ from torchrl_osr.evaluation.episodes import (
 from torchrl_osr.evaluation.figures import learning_curve, read_scalars
 from torchrl_osr.evaluation.inverse_dynamics import describe, inverse_dynamics_report
 from torchrl_osr.evaluation.summary import score_table
-from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
+from torchrl_osr.from_config import make_learner
 from torchrl_osr.trainers import OfflineTrainer, run_folder
 from torchrl_osr.trainers.hardware import check_hardware
 from torchrl_osr.trainers.loggers import make_loggers
@@ -71,9 +70,10 @@ def run(cfg: DictConfig, folder: Path) -> float:
     device, autocast = check_hardware(cfg.trainer.device, cfg.trainer.precision)
 
     # Data: standardised once, the same numbers for every batch and every evaluation.
-    data, manifest = load_local_dataset(
+    data, manifest = load_mixture(
         cfg.env.name,
         cfg.data.level,
+        random_share=cfg.data.random_share,
         num_transitions=cfg.data.num_transitions,
         seed=cfg.data.seed,
         progress=cfg.trainer.progress,
@@ -101,20 +101,9 @@ def run(cfg: DictConfig, folder: Path) -> float:
         "autocast_dtype": autocast,
     }
 
-    # Networks.
-    sizes = (data["observation"].shape[-1], data["action"].shape[-1])
-    cells = list(cfg.network.num_cells)
-    actor = tanh_gaussian_actor(*sizes, num_cells=cells).to(device)
-    critics = critic_ensemble(
-        *sizes, num_qvalue_nets=cfg.loss.num_qvalue_nets, **cfg.network
-    )
-    model = instantiate(cfg.inverse_dynamics.network, *sizes, num_cells=cells)
-    model = model.to(device)
-
-    # The policy's loss first, so that a wrong option stops here. It holds the model's
-    # own tensors, frozen: what the model learns next, the loss knows.
-    loss = instantiate(cfg.loss, actor, critics, model).to(device)
-    loss.make_value_estimator(gamma=cfg.optim.gamma)
+    # The policy's loss first, so that a wrong option stops here.
+    sizes = data["observation"].shape[-1], data["action"].shape[-1]
+    actor, model, loss = make_learner(cfg, *sizes, device)
 
     # First phase: which action leads from s~ to s'?
     if hasattr(loss, "inverse_dynamics_network"):

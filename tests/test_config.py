@@ -43,6 +43,16 @@ def test_every_option_composes_without_a_missing_value(override):
     assert isinstance(OmegaConf.to_object(cfg), config.OfflineOSRConfig)
 
 
+@pytest.mark.parametrize("name", options("experiment"))
+def test_every_experiment_composes_and_sweeps_over_values_that_compose(name):
+    raw = OmegaConf.load(CONF / "experiment" / f"{name}.yaml")
+    assert not OmegaConf.missing_keys(composed(f"+experiment={name}"))
+    for key, values in raw.hydra.sweeper.params.items():
+        overrides = [f"{key}={value}" for value in str(values).split(",")]
+        found = {str(composed(f"+experiment={name}", each)) for each in overrides}
+        assert len(found) == len(overrides)
+
+
 def test_groups_name_what_the_package_has():
     assert options("data") == sorted(LEVELS)
     assert options("env") == sorted(load_behavior_card())

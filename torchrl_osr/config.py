@@ -44,6 +44,7 @@ class DataConfig:
         level: random, medium, medium-replay, medium-expert or expert.
         num_transitions: rows of the data set.
         seed: of the rollouts.
+        random_share: of the rows that are random instead, for limited valuable data.
         held_out: share of the rows kept from training to judge the inverse dynamics.
         standardize: observations to mean 0 and standard deviation 1, once.
     """
@@ -51,6 +52,7 @@ class DataConfig:
     level: str = MISSING
     num_transitions: int = MISSING
     seed: int = MISSING
+    random_share: float = MISSING
     held_out: float = MISSING
     standardize: bool = MISSING
 

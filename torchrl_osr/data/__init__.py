@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from torchrl_osr.data.environment import make_environment
     from torchrl_osr.data.levels import LEVELS, collect_level
     from torchrl_osr.data.local import load_local_dataset
+    from torchrl_osr.data.mixtures import load_mixture, mix_datasets
 
 _NEEDS_EXAMPLES_EXTRA = {
     "LEVELS": "levels",
@@ -46,6 +47,8 @@ _NEEDS_EXAMPLES_EXTRA = {
     "make_environment": "environment",
     "measure_policy": "collection",
     "load_local_dataset": "local",
+    "load_mixture": "mixtures",
+    "mix_datasets": "mixtures",
 }
 
 __all__ = [
@@ -60,9 +63,11 @@ __all__ = [
     "load_behavior_card",
     "load_behavior_policy",
     "load_local_dataset",
+    "load_mixture",
     "make_environment",
     "make_replay_buffer",
     "measure_policy",
+    "mix_datasets",
     "normalized_score",
     "observation_statistics",
     "save_behavior_policy",

@@ -1,0 +1,60 @@
+"""Networks and loss as a configuration describes them, see :mod:`torchrl_osr.config`.
+
+The trainer's script builds them to be trained; whoever loads a trained run builds them
+once more and fills them from its checkpoint.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+from tensordict.nn import ProbabilisticTensorDictSequential
+from torchrl.objectives import LossModule
+
+from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
+
+
+class Learner(NamedTuple):
+    """A policy's loss and the networks in it.
+
+    Attributes:
+        actor: the policy.
+        model: the inverse dynamics model, whether the loss uses it or not.
+        loss: holds the tensors of both, the model's frozen: what either learns, the
+            loss knows.
+    """
+
+    actor: ProbabilisticTensorDictSequential
+    model: ProbabilisticTensorDictSequential
+    loss: LossModule
+
+
+def make_learner(
+    cfg: DictConfig,
+    observation_size: int,
+    action_size: int,
+    device: torch.device | str = "cpu",
+) -> Learner:
+    """Build networks and loss, drawn anew from torch's global generator.
+
+    Args:
+        cfg: a whole configuration of ``examples/offline_osr.py``.
+        observation_size, action_size: of the data.
+        device: where they shall be. Default CPU.
+
+    Raises:
+        ValueError: if an option of the loss is out of its range.
+    """
+    sizes, cells = (observation_size, action_size), list(cfg.network.num_cells)
+    actor = tanh_gaussian_actor(*sizes, num_cells=cells).to(device)
+    critics = critic_ensemble(
+        *sizes, num_qvalue_nets=cfg.loss.num_qvalue_nets, **cfg.network
+    )
+    model = instantiate(cfg.inverse_dynamics.network, *sizes, num_cells=cells)
+    model = model.to(device)
+    loss = instantiate(cfg.loss, actor, critics, model).to(device)
+    loss.make_value_estimator(gamma=cfg.optim.gamma)
+    return Learner(actor, model, loss)
