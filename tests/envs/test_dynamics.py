@@ -1,0 +1,126 @@
+"""Factors of the dynamics, against MuJoCo's own numbers."""
+
+from __future__ import annotations
+
+import copy
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchrl_osr.data import make_environment
+from torchrl_osr.envs import DynamicsChange
+
+DERIVED = ["body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0"]
+BARE = make_environment("Walker2d-v5").unwrapped.model
+factors = st.floats(0.05, 20)
+
+
+def same(one, other, *, but=()):
+    """Whether two models have the same numbers, up to the named arrays."""
+    names = [
+        name
+        for name in dir(one)
+        if isinstance(getattr(one, name, None), np.ndarray) and name not in but
+    ]
+    assert len(names) > 100
+    return all(np.array_equal(getattr(one, n), getattr(other, n)) for n in names)
+
+
+@given(factors)
+@settings(deadline=None, max_examples=10)
+def test_masses_and_inertia_are_those_of_mujocos_total_mass(factor):
+    env = DynamicsChange(make_environment("Walker2d-v5"), mass=factor)
+    model, witness = env.unwrapped.model, copy.deepcopy(BARE)
+    mujoco.mj_setTotalmass(witness, factor * BARE.body_mass.sum())
+    mujoco.mj_setConst(witness, mujoco.MjData(witness))
+    for name in ("body_mass", "body_inertia", *DERIVED):
+        ours, theirs = getattr(model, name), getattr(witness, name)
+        np.testing.assert_allclose(ours, theirs, rtol=1e-9, err_msg=name)
+    env.close()
+
+
+@given(factors, st.floats(0, 20))
+@settings(deadline=None, max_examples=10)
+def test_friction_and_gravity(friction, gravity):
+    env = DynamicsChange(
+        make_environment("Walker2d-v5"), friction=friction, gravity=gravity
+    )
+    model = env.unwrapped.model
+    assert (model.geom_friction == friction * BARE.geom_friction).all()
+    assert (model.opt.gravity == gravity * BARE.opt.gravity).all()
+    assert same(model, BARE, but=["geom_friction"])
+    env.close()
+
+
+def test_falling_is_by_the_changed_gravity():
+    env = DynamicsChange(make_environment("Hopper-v5"), gravity=2.0)
+    env.reset(seed=0)
+    bare = env.unwrapped
+    qpos = bare.data.qpos.copy()
+    qpos[1] += 100
+    bare.set_state(qpos, np.zeros(bare.model.nv))
+    env.step(np.zeros(3, np.float32))
+    mujoco.mj_subtreeVel(bare.model, bare.data)
+    # 2 g for 8 ms, in which the legs' joint stops may stir.
+    fall = bare.data.subtree_linvel[0, 2]
+    assert fall == pytest.approx(-2 * 9.81 * 0.008, rel=0.01)
+
+
+def test_friction_of_contacts(play):
+    for factor in (1.0, 0.5):
+        env = DynamicsChange(make_environment("HalfCheetah-v5"), friction=factor)
+        play(env, 30)
+        data = env.unwrapped.data
+        assert data.ncon
+        # Cheetah and ground both have 0.4.
+        assert data.contact.friction[:, 0] == pytest.approx(0.4 * factor)
+
+
+def test_factors_do_not_accumulate_and_close_restores_the_model():
+    env = make_environment("Walker2d-v5")
+    original = env.unwrapped.model
+    for _ in range(3):
+        wrapped = DynamicsChange(env, mass=2.0, friction=0.5, gravity=0.5)
+        for seed in range(3):
+            wrapped.reset(seed=seed)
+            wrapped.step(wrapped.action_space.low)
+            model = env.unwrapped.model
+            assert (model.body_mass == 2 * BARE.body_mass).all()
+            assert (model.opt.gravity == 0.5 * BARE.opt.gravity).all()
+        wrapped.close()
+        wrapped.close()
+        assert env.unwrapped.model is original
+        assert same(original, BARE)
+
+
+def test_nested_changes_multiply():
+    inner = DynamicsChange(make_environment("Walker2d-v5"), gravity=0.5)
+    outer = DynamicsChange(inner, gravity=0.5)
+    assert (outer.unwrapped.model.opt.gravity == 0.25 * BARE.opt.gravity).all()
+    outer.close()
+    assert same(outer.unwrapped.model, BARE)
+
+
+def test_wrapping_in_the_middle_of_an_episode_leaves_the_state(play):
+    env = make_environment("Walker2d-v5")
+    play(env, 5)
+    before = env.unwrapped.data.qpos.copy()
+    DynamicsChange(env, mass=2.0)
+    assert (env.unwrapped.data.qpos == before).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"mass": 0.0}, "mass must be finite, above 0, got 0.0; 1 is off"),
+        ({"friction": -1.0}, "friction must be finite, at least 0, got -1.0"),
+        ({"gravity": float("nan")}, "gravity must be finite"),
+        ({"mass": float("inf")}, "mass must be finite"),
+    ],
+)
+def test_wrong_arguments(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        DynamicsChange(make_environment("Hopper-v5"), **arguments)

@@ -1,0 +1,261 @@
+"""Attacked policies: the box, what each attack finds, and trained losses."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torchrl.envs import ObservationNorm
+from torchrl.objectives import SoftUpdate
+
+from torchrl_osr import OSRLoss
+from torchrl_osr.envs import attacked_policy, networks_of
+from torchrl_osr.evaluation.episodes import EpisodeEvaluator, deterministic_policy
+from torchrl_osr.functional import jeffreys_divergence
+from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
+
+KINDS = ["random", "action_diff", "min_Q"]
+EPSILON, SAMPLES = 0.2, 50
+each_kind = pytest.mark.parametrize("kind", KINDS)
+
+
+@pytest.fixture(scope="module")
+def trained():
+    """A loss after a few gradient steps, and its networks."""
+    torch.manual_seed(0)
+    actor = tanh_gaussian_actor(11, 3, num_cells=[16])
+    critics = critic_ensemble(11, 3, num_cells=[16])
+    loss = OSRLoss(actor, critics, recovery_weight=0, num_random=2)
+    updater = SoftUpdate(loss, tau=0.1)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
+    flag = torch.zeros(32, 1, dtype=torch.bool)
+    batch = TensorDict(
+        {
+            "observation": torch.randn(32, 11),
+            "action": torch.rand(32, 3) - 0.5,
+            "next": {
+                "observation": torch.randn(32, 11),
+                "reward": torch.randn(32, 1),
+                "done": flag,
+                "terminated": flag,
+            },
+        },
+        [32],
+    )
+    for _ in range(5):
+        losses = loss(batch.copy())
+        optimizer.zero_grad()
+        sum(losses[key] for key in loss.out_keys if key.startswith("loss_")).backward()
+        optimizer.step()
+        updater.step()
+    policy, qvalue = networks_of(loss)
+    norm = ObservationNorm(
+        torch.randn(11), torch.rand(11) + 0.5, ["observation"], standard_normal=True
+    )
+    return SimpleNamespace(
+        actor=actor, loss=loss, policy=policy, qvalue=qvalue, norm=norm
+    )
+
+
+def states_of(observation):
+    return TensorDict({"observation": observation}, observation.shape[:-1])
+
+
+def shown(trained, observation, **arguments):
+    """What the attacked policy is shown in the place of standardised observations."""
+    seen = []
+
+    def policy(states):
+        seen.append(states["observation"])
+        return trained.policy(states)
+
+    attacked_policy(policy, trained.qvalue, **arguments)(observation)
+    return seen[-1]
+
+
+def divergence(trained, clean, observation):
+    p, q = (trained.policy(states_of(each)) for each in (clean, observation))
+    return jeffreys_divergence(p.loc, p.scale, q.loc, q.scale).detach()
+
+
+def value(trained, clean, observation):
+    """Mean value, at the true state, of the action at the observation."""
+    action = trained.policy(states_of(observation)).deterministic_sample
+    return trained.qvalue(states_of(clean), action).mean(0).detach()
+
+
+def draws(seed, *shape):
+    generator = torch.Generator().manual_seed(seed)
+    return EPSILON * (2 * torch.rand(shape, generator=generator) - 1)
+
+
+@given(
+    st.sampled_from(KINDS),
+    st.sampled_from(["sample", "gradient"]),
+    st.floats(0, 3),
+    st.integers(1, 5),
+    st.integers(0, 2**32),
+)
+@settings(deadline=None, max_examples=40)
+def test_observations_stay_in_the_box(trained, kind, method, epsilon, episodes, seed):
+    clean = torch.randn(episodes, 11, generator=torch.Generator().manual_seed(seed))
+    observation = shown(
+        trained,
+        clean,
+        kind=kind,
+        method=method,
+        epsilon=epsilon,
+        num_samples=3,
+        seed=seed,
+    )
+    # The sum of state and perturbation is rounded.
+    unit = torch.finfo(clean.dtype).eps * (clean.abs() + epsilon)
+    assert ((observation - clean).abs() <= epsilon + 2 * unit).all()
+    assert observation.shape == clean.shape
+    if epsilon > 1e-3:
+        assert not torch.equal(observation, clean) or kind == "min_Q"
+
+
+@each_kind
+def test_epsilon_0_is_the_bare_policy(trained, kind):
+    observation = torch.randn(8, 11)
+
+    def never(states, action):
+        raise AssertionError("there is nothing to look for")
+
+    policy = attacked_policy(
+        trained.actor.get_dist, never, trained.norm, kind=kind, epsilon=0.0
+    )
+    bare = deterministic_policy(trained.actor, trained.norm)
+    assert torch.equal(policy(observation), bare(observation))
+
+
+@each_kind
+def test_boxes_are_in_units_of_the_datas_deviation(trained, kind):
+    standard = torch.randn(8, 11)
+    raw = standard * trained.norm.scale + trained.norm.loc
+    arguments = {"kind": kind, "epsilon": EPSILON, "seed": 3}
+    seen = shown(trained, raw, observation_norm=trained.norm, **arguments)
+    torch.testing.assert_close(seen, shown(trained, standard, **arguments))
+
+
+def test_random_is_uniform(trained):
+    clean = torch.randn(2000, 11)
+    noise = shown(trained, clean, kind="random", epsilon=EPSILON) - clean
+    torch.testing.assert_close(noise, draws(0, 2000, 11), atol=1e-6, rtol=0)
+    # 22,000 draws of variance 1/3, five standard errors.
+    assert (noise / EPSILON).square().mean().item() == pytest.approx(1 / 3, abs=0.011)
+
+
+def test_action_difference_is_the_largest_of_its_samples(trained):
+    clean = torch.randn(6, 11)
+    arguments = {"epsilon": EPSILON, "seed": 4, "num_samples": SAMPLES}
+    found = divergence(
+        trained, clean, shown(trained, clean, kind="action_diff", **arguments)
+    )
+    candidates = clean + draws(4, SAMPLES, 6, 11)
+    all_found = divergence(trained, clean.expand_as(candidates), candidates)
+    torch.testing.assert_close(found, all_found.max(0).values)
+    # The random attack's draw is the first of them.
+    at_random = shown(trained, clean, kind="random", **arguments)
+    torch.testing.assert_close(at_random, candidates[0])
+    assert (found >= divergence(trained, clean, at_random) - 1e-6).all()
+
+
+def test_min_q_is_the_lowest_of_its_samples_and_of_none(trained):
+    clean = torch.randn(6, 11)
+    found = value(
+        trained,
+        clean,
+        shown(trained, clean, kind="min_Q", epsilon=EPSILON, seed=4),
+    )
+    candidates = clean + torch.cat([torch.zeros(1, 6, 11), draws(4, SAMPLES, 6, 11)])
+    values = value(trained, clean.expand_as(candidates), candidates)
+    torch.testing.assert_close(found, values.min(0).values)
+
+
+@pytest.mark.parametrize(
+    ("kind", "score"), [("action_diff", divergence), ("min_Q", value)]
+)
+def test_gradients_find_more_than_a_random_draw(trained, kind, score):
+    clean = torch.randn(40, 11)
+    random = shown(trained, clean, kind="random", epsilon=EPSILON)
+    found = shown(
+        trained, clean, kind=kind, epsilon=EPSILON, method="gradient", num_samples=20
+    )
+    sign = 1 if kind == "action_diff" else -1
+    better = sign * (score(trained, clean, found) - score(trained, clean, random))
+    assert better.mean() > 0
+    assert (better > 0).float().mean() > 0.9
+
+
+def test_networks_of_a_loss_are_its_trained_ones(trained):
+    states = states_of(torch.randn(8, 11))
+    ours, theirs = trained.policy(states), trained.actor.get_dist(states.copy())
+    assert torch.equal(ours.deterministic_sample, theirs.deterministic_sample)
+    action = ours.deterministic_sample
+    values = trained.qvalue(states, action)
+    batch = states.copy().set("action", action)
+    for index in range(2):
+        params = trained.loss.qvalue_network_params[index]
+        with params.to_module(trained.loss.qvalue_network):
+            expected = trained.loss.qvalue_network(batch.copy())["state_action_value"]
+        torch.testing.assert_close(values[index], expected.squeeze(-1))
+
+
+@each_kind
+def test_seeds_decide_and_the_global_generator_is_left_alone(trained, kind):
+    observation = torch.randn(8, 11)
+
+    def play(seed):
+        policy = attacked_policy(
+            trained.policy, trained.qvalue, kind=kind, epsilon=0.5, seed=seed
+        )
+        return torch.stack([policy(observation) for _ in range(3)])
+
+    state = torch.get_rng_state()
+    first = play(1)
+    assert torch.equal(state, torch.get_rng_state())
+    torch.manual_seed(5)
+    assert torch.equal(first, play(1))
+    assert not torch.equal(first, play(2))
+    assert not torch.equal(first[0], first[1]), "draws go on from call to call"
+    assert not first.requires_grad
+
+
+def test_attacks_in_the_batched_evaluator(trained):
+    evaluator = EpisodeEvaluator("Hopper-v5", num_episodes=3)
+
+    def play(epsilon):
+        arguments = {"kind": "min_Q", "epsilon": epsilon, "num_samples": 5}
+        policy = attacked_policy(trained.policy, trained.qvalue, **arguments)
+        return evaluator(policy).returns.tolist()
+
+    assert play(0.0) == evaluator(deterministic_policy(trained.actor)).returns.tolist()
+    assert play(0.3) == play(0.3) != play(0.0)
+    evaluator.close()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"kind": "hard"}, "kind must be one of .*'min_Q'.* got 'hard'"),
+        ({"epsilon": -0.1}, "epsilon must be at least 0, got -0.1"),
+        ({"num_samples": 0}, "num_samples must be at least 1, got 0"),
+        ({"method": "newton"}, "method must be one of .* got 'newton'"),
+        ({"kind": "min_Q"}, "kind='min_Q' needs qvalue"),
+    ],
+)
+def test_wrong_arguments(trained, arguments, message):
+    arguments = {"kind": "random", "epsilon": 0.1} | arguments
+    with pytest.raises(ValueError, match=message):
+        attacked_policy(trained.policy, **arguments)
+
+
+def test_networks_of_something_else_is_an_error():
+    with pytest.raises(TypeError, match="Expected an OSRLoss or OSRVLoss, got Linear"):
+        networks_of(torch.nn.Linear(2, 2))
