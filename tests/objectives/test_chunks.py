@@ -7,19 +7,38 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import nn
 from torchrl.modules import MLP, ValueOperator
 
+from torchrl_osr.modules import critic_ensemble
 from torchrl_osr.objectives import mlp_critics
+from torchrl_osr.objectives.mlp_layers import PlainMLP, plain_mlp
 
 CHUNKS = [1, 3, 64]
+CELLS = [8, 6, 4]
+
+
+def normalised(norm_class: type[nn.Module] = nn.LayerNorm, **options):
+    """Options of a critic that normalises each hidden layer."""
+    each = [{"normalized_shape": width} | options for width in CELLS]
+    return {"norm_class": norm_class, "norm_kwargs": each}
 
 
 def critic(*, in_keys=("observation", "action"), size: int = 5, **options):
     """A critic of three hidden layers; ReLUs unless told otherwise."""
-    options = {"num_cells": [8, 6, 4], "activation_class": nn.ReLU} | options
+    options = {"num_cells": CELLS, "activation_class": nn.ReLU} | options
     network = MLP(size, 1, **options)
+    for layer in network:
+        if isinstance(layer, nn.LayerNorm) and layer.bias is not None:
+            nn.init.normal_(layer.weight)
+            nn.init.normal_(layer.bias)
     return ValueOperator(network, in_keys=list(in_keys)).double()
+
+
+# An eps that is not the default, and large enough to count.
+KINDS = {"linear": {}, "normalised": normalised(eps=1e-2)}
+each_kind = pytest.mark.parametrize("kind", KINDS)
 
 
 def networks_of(family, name: str, *, plain: bool = True, **options):
@@ -68,8 +87,9 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("reduction", ["mean", "sum", "none"])
+@each_kind
 def test_chunks_change_neither_losses_nor_gradients(
-    family, family_batch, record, assert_same, case, reduction
+    family, family_batch, record, assert_same, case, reduction, kind
 ) -> None:
     name, options, size, changes = CASES[case]
     batch = family_batch(name, *size)
@@ -79,7 +99,7 @@ def test_chunks_change_neither_losses_nor_gradients(
     def numbers(chunk_size: int | None, **networks):
         loss = family(
             name,
-            networks_of(family, name, **networks),
+            networks_of(family, name, **networks, **KINDS[kind]),
             reduction=reduction,
             chunk_size=chunk_size,
             **options,
@@ -157,9 +177,10 @@ def test_nothing_is_kept_where_no_gradient_is_wanted(
     assert_same([out["loss_cql"]], [expected["loss_cql"].detach()])
 
 
-def test_gradient_is_that_of_a_small_step(family, family_batch, seeded) -> None:
-    loss, batch = family("cql", networks_of(family, "cql")), family_batch("cql", 10)
-    batch = weighted(batch)
+@each_kind
+def test_gradient_is_that_of_a_small_step(family, family_batch, seeded, kind) -> None:
+    loss = family("cql", networks_of(family, "cql", **KINDS[kind]))
+    batch = weighted(family_batch("cql", 10))
     params = list(loss.qvalue_network_params.parameters())
     out = seeded(loss, batch)["loss_cql"]
     gradients = torch.autograd.grad(out, params, allow_unused=True)
@@ -211,15 +232,17 @@ def test_chunks_without_a_state_are_refused(family, chunk_size) -> None:
 
 OTHERS = {
     "another activation": {"activation_class": nn.Tanh},
-    "layer normalisation": {
-        "norm_class": nn.LayerNorm,
-        "norm_kwargs": [{"normalized_shape": width} for width in (8, 6, 4)],
-    },
+    "another activation of normalised layers": {"activation_class": nn.Tanh}
+    | normalised(),
+    "normalisation without parameters": normalised(elementwise_affine=False),
+    "normalisation without shift": normalised(bias=False),
+    "another normalisation": normalised(nn.RMSNorm),
     "batch normalisation": {
         "norm_class": nn.BatchNorm1d,
-        "norm_kwargs": [{"num_features": width} for width in (8, 6, 4)],
+        "norm_kwargs": [{"num_features": width} for width in CELLS],
     },
     "dropout": {"dropout": 0.5},
+    "dropout of normalised layers": {"dropout": 0.5} | normalised(),
     "activation at the end": {"activate_last_layer": True},
     "no bias": {"bias_last_layer": False},
     "a single layer": {"num_cells": [], "depth": 0},
@@ -229,22 +252,84 @@ OTHERS = {
 
 @pytest.mark.parametrize("kind", OTHERS)
 def test_other_critics_go_as_modules(kind) -> None:
-    assert mlp_critics.linear_layers(critic(), "action") is not None
-    assert mlp_critics.linear_layers(critic(), "choice") is None
-    assert mlp_critics.linear_layers(critic(**OTHERS[kind]), "action") is None
+    assert plain_mlp(critic(**OTHERS[kind]), "action") is None
+
+
+def test_layers_of_plain_critics_are_known_by_name() -> None:
+    linear, norm = (critic(**options) for options in KINDS.values())
+    assert plain_mlp(linear, "action") == PlainMLP(["0", "2", "4", "6"], [], [])
+    assert plain_mlp(norm, "action") == PlainMLP(
+        ["0", "3", "6", "9"], ["1", "4", "7"], [1e-2] * 3
+    )
+    assert plain_mlp(norm, "choice") is None
+    for built in critic_ensemble(3, 2, layer_norm=True):
+        assert plain_mlp(built, "action").norms == ["1", "4"]
 
 
 def test_critics_that_are_no_mlp_go_as_modules() -> None:
     layers = nn.Sequential(nn.Linear(5, 8), nn.ReLU(), nn.Linear(8, 1))
     other = ValueOperator(layers, in_keys=["observation", "action"])
-    assert mlp_critics.linear_layers(other, "action") is None
+    assert plain_mlp(other, "action") is None
     pruned = critic()
     nn.utils.parametrizations.weight_norm(pruned.module[0])
-    assert mlp_critics.linear_layers(pruned, "action") is None
+    assert plain_mlp(pruned, "action") is None
+
+    class Shifted(MLP):
+        def forward(self, *inputs):
+            return super().forward(*inputs) + 1
+
+    other = ValueOperator(Shifted(5, 1, num_cells=CELLS, activation_class=nn.ReLU))
+    other.in_keys = ["observation", "action"]
+    assert plain_mlp(other, "action") is None
+
+
+@pytest.mark.parametrize("replacement", [nn.Identity(), nn.LayerNorm((10, 8))])
+def test_all_or_no_hidden_layers_are_normalised_by_themselves(replacement) -> None:
+    other = critic(**normalised())
+    other.module[1] = replacement
+    assert plain_mlp(other, "action") is None
+
+
+HOOKS = {
+    "forward": lambda module: module.register_forward_hook(lambda *_: None),
+    "before": lambda module: module.register_forward_pre_hook(lambda *_: None),
+    "backward": lambda module: module.register_full_backward_hook(lambda *_: None),
+}
+
+
+@pytest.mark.parametrize("hook", HOOKS)
+@pytest.mark.parametrize("place", ["network", "module", "layer"])
+def test_critics_with_a_hook_go_as_modules(hook, place) -> None:
+    network = critic(**normalised())
+    places = {"network": network, "module": network.module, "layer": network.module[1]}
+    handle = HOOKS[hook](places[place])
+    assert plain_mlp(network, "action") is None
+    handle.remove()
+    assert plain_mlp(network, "action") is not None
+
+
+@each_kind
+def test_a_loss_follows_a_hook_and_a_change_of_its_critics(
+    family, family_batch, seeded, count_rows, kind
+) -> None:
+    loss = family("cql", networks_of(family, "cql", **KINDS[kind]))
+    batch, calls = family_batch("cql", 10), []
+    plain = seeded(loss, batch)["loss_cql"]
+    assert count_rows
+    count_rows.clear()
+    module = loss.qvalue_network.module
+    handle = module[0].register_forward_hook(lambda *_: calls.append(1))
+    torch.testing.assert_close(seeded(loss, batch)["loss_cql"], plain)
+    handle.remove()
+    assert calls
+    module[-2] = nn.Tanh()
+    assert not torch.isclose(seeded(loss, batch)["loss_cql"], plain)
+    assert not count_rows
 
 
 @pytest.mark.parametrize(
-    "kind", ["another activation", "layer normalisation", "dropout"]
+    "kind",
+    ["another activation", "normalisation without parameters", "dropout"],
 )
 def test_chunks_do_not_concern_other_critics(
     family, family_batch, record, assert_same_bits, kind
@@ -271,13 +356,13 @@ def count_rows(monkeypatch):
     counted: list[int] = []
     forward, qvalue = mlp_critics._forward, mlp_critics.qvalue
 
-    def counting_forward(inputs, *rest):
-        counted.append(inputs[1].shape[:-1].numel())
-        return forward(inputs, *rest)
+    def counting_forward(chunk, *rest):
+        counted.append(len(chunk.action))
+        return forward(chunk, *rest)
 
-    def counting_qvalue(params, names, state, action):
+    def counting_qvalue(params, mlp, state, action):
         counted.append(2 * action.shape[:-1].numel())
-        return qvalue(params, names, state, action)
+        return qvalue(params, mlp, state, action)
 
     monkeypatch.setattr(mlp_critics, "_forward", counting_forward)
     monkeypatch.setattr(mlp_critics, "qvalue", counting_qvalue)
@@ -291,14 +376,15 @@ def count_rows(monkeypatch):
     [("mean", None, 66), ("sum", None, 66), ("mean", weighted, 66 + 60)],
 )
 @pytest.mark.parametrize("chunk_size", CHUNKS)
+@each_kind
 def test_no_row_is_scored_twice_where_all_weigh_the_same(
-    family, family_batch, count_rows, reduction, change, rows, chunk_size
+    family, family_batch, count_rows, reduction, change, rows, chunk_size, kind
 ) -> None:
     batch = family_batch("cql", 10)
     batch = batch if change is None else change(batch)
     loss = family(
         "cql",
-        networks_of(family, "cql"),
+        networks_of(family, "cql", **KINDS[kind]),
         num_random=10,
         reduction=reduction,
         chunk_size=chunk_size,
@@ -308,17 +394,58 @@ def test_no_row_is_scored_twice_where_all_weigh_the_same(
     assert sum(count_rows) / batch.numel() == rows
 
 
+@each_kind
 def test_autocast_changes_the_numbers_as_it_does_those_of_modules(
-    family, family_batch, seeded
+    family, family_batch, seeded, kind
 ) -> None:
     batch = family_batch("cql", 10)
     batch = batch.apply(lambda t: t.float() if t.is_floating_point() else t)
     out = []
     for plain in (True, False):
-        loss = family("cql", networks_of(family, "cql", plain=plain)).float()
+        networks = networks_of(family, "cql", plain=plain, **KINDS[kind])
+        loss = family("cql", networks).float()
         with torch.autocast("cpu", dtype=torch.bfloat16):
             out.append(seeded(loss, batch)["loss_cql"])
         exact = seeded(loss, batch)["loss_cql"]
         assert out[-1] != exact
         torch.testing.assert_close(out[-1], exact, rtol=0.02, atol=0.05)
+    torch.testing.assert_close(*out, rtol=0.02, atol=0.05)
     assert out[0].dtype == torch.float32
+
+
+@pytest.mark.parametrize("weighs", [True, False])
+@each_kind
+def test_half_precision_leaves_values_and_gradients_as_close_as_modules_do(
+    family, kind, weighs
+) -> None:
+    loss = family("cql", networks_of(family, "cql", **KINDS[kind])).float()
+    params = loss.qvalue_network_params
+    state, action = torch.randn(256, 3), torch.rand(9, 256, 2)
+    log_prob = torch.randn(9, 256) if weighs else None
+
+    def chunked() -> torch.Tensor:
+        mlp = plain_mlp(loss.qvalue_network, "action")
+        arguments = (params, mlp, state, action, log_prob)
+        return mlp_critics.soft_maximum(*arguments, temperature=1.0, chunk_size=64)
+
+    def modules() -> torch.Tensor:
+        states = TensorDict({"observation": state.expand(9, -1, -1)}, [9, 256])
+        with loss.qvalue_network.module.register_forward_hook(lambda *_: None):
+            qvalue = loss._qvalue(states, action, params)
+        density = 0.0 if log_prob is None else log_prob
+        return (qvalue - density).logsumexp(1)
+
+    def numbers(function, *, half: bool) -> tuple[torch.Tensor, torch.Tensor]:
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=half):
+            value = function()
+        gradients = torch.autograd.grad(value.sum(), list(params.parameters()))
+        assert value.dtype == torch.float32
+        return value.detach(), torch.cat([each.flatten() for each in gradients])
+
+    exact = numbers(modules, half=False)
+    for wanted, ours, theirs in zip(
+        exact, numbers(chunked, half=True), numbers(modules, half=True), strict=True
+    ):
+        assert not torch.equal(ours, wanted), "nothing was computed in half precision"
+        assert (ours - wanted).norm() < 2e-2 * wanted.norm()
+        assert (theirs - wanted).norm() < 2e-2 * wanted.norm()

@@ -10,6 +10,7 @@ import warnings
 from abc import abstractmethod
 from typing import Any, Literal
 
+import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
@@ -86,7 +87,11 @@ class BaseLoss(LossModule):
     def in_keys(self) -> list[NestedKey]:
         """The entries that the loss reads."""
         if self._in_keys is None:
-            self._in_keys = list(dict.fromkeys(self._input_keys()))
+            keys = list(dict.fromkeys(self._input_keys()))
+            if torch.compiler.is_compiling():
+                # Kept, they would make torch.compile trace the second call anew.
+                return keys
+            self._in_keys = keys
         return self._in_keys
 
     @in_keys.setter

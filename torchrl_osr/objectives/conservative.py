@@ -19,6 +19,7 @@ from torchrl.objectives.utils import _vmap_func
 from torchrl_osr import functional
 from torchrl_osr.objectives import mlp_critics
 from torchrl_osr.objectives.base import check_weight
+from torchrl_osr.objectives.mlp_layers import PlainMLP
 from torchrl_osr.objectives.tanh_gaussian import TanhGaussianActorCritic
 
 
@@ -185,7 +186,7 @@ class ConservativeCritics(TanhGaussianActorCritic):
         """Return whether plain MLP critics shall be run chunk by chunk, on a CPU."""
         return (
             self.chunk_size is not None
-            and self._plain_layers() is not None
+            and self._plain_critics() is not None
             and action.device.type == "cpu"
             and torch.is_grad_enabled()
             and not torch.compiler.is_compiling()
@@ -204,7 +205,7 @@ class ConservativeCritics(TanhGaussianActorCritic):
             action = torch.cat([action, data_action.unsqueeze(0)])
         value = mlp_critics.soft_maximum(
             self.qvalue_network_params,
-            cast(list[str], self._plain_layers()),
+            cast(PlainMLP, self._plain_critics()),
             self._critic_state(state).flatten(0, -2),
             action.flatten(1, -2),
             log_prob.flatten(1) if self.importance_sample else None,

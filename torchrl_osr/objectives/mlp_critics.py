@@ -4,63 +4,27 @@ CQL's critics score 3K actions of every state. All at once, each layer writes an
 again activations of many megabytes, which go through memory and are given back to the
 operating system at every step. Here a few states at a time go forward and backward
 through buffers that stay in the cache, in place, and only the gradient is kept. What
-is left is the time of the matrix products.
+is left is the time of the matrix products, and of layer normalisations if there are.
 
-Shapes: ``B`` states, ``S`` observation, ``A`` action, ``M`` sampled actions of a state,
-``N`` critics.
+Shapes: ``B`` states, ``b`` of them in a chunk, ``S`` observation, ``A`` action, ``M``
+sampled actions of a state, ``N`` critics, ``H`` cells of a hidden layer.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import pairwise
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import torch
-from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
-from torchrl.modules import MLP
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.nn.functional import layer_norm
 
-Layers = Sequence[tuple[Tensor, Tensor]]
-"""Weight ``[out, in]`` and bias ``[out]`` of each linear layer of one critic."""
-
-
-def linear_layers(
-    network: TensorDictModuleBase, action_key: NestedKey
-) -> list[str] | None:
-    """Return the names of a plain MLP's linear layers, or ``None`` for another network.
-
-    Plain is a :class:`~torchrl.modules.MLP` of linear layers with bias and ReLUs in
-    between, with one output, that reads observations and then the action, and on which
-    nobody has put a hook.
-    """
-    module = getattr(network, "module", None)
-    if not isinstance(module, MLP) or network.in_keys[-1] != action_key:
-        return None
-    if any(each._forward_hooks or each._forward_pre_hooks for each in module.modules()):
-        return None
-    linear = {
-        name: layer
-        for name, layer in module.named_children()
-        if isinstance(layer, nn.Linear)
-    }
-    kinds = [type(layer) for layer in module]
-    plain = kinds == [nn.Linear, *[nn.ReLU, nn.Linear] * (len(linear) - 1)]
-    if not plain or len(linear) < 2 or module[-1].out_features != 1:
-        return None
-    if any(layer.bias is None for layer in linear.values()):
-        return None
-    return list(linear)
-
-
-def weights_and_biases(params: TensorDictBase, names: Sequence[str]) -> list[Tensor]:
-    """Return ``[N, out, in]`` and ``[N, out]`` of each layer, one after the other."""
-    return [params.get(("module", n, k)) for n in names for k in ("weight", "bias")]
+from torchrl_osr.objectives.mlp_layers import Layer, PlainMLP
 
 
 def qvalue(
-    params: TensorDictBase, names: Sequence[str], state: Tensor, action: Tensor
+    params: TensorDictBase, mlp: PlainMLP, state: Tensor, action: Tensor
 ) -> Tensor:
     """Return the critics' values, ``[N, B]``: what calling the modules returns.
 
@@ -69,23 +33,29 @@ def qvalue(
 
     Args:
         params: of all critics, stacked.
-        names: of the linear layers, see :func:`linear_layers`.
+        mlp: their layers.
         state: ``[B, S]``.
         action: ``[B, A]``.
     """
     hidden = torch.cat([state, action], -1)
-    batch, flat = hidden.shape[:-1], weights_and_biases(params, names)
-    hidden = hidden.reshape(-1, hidden.shape[-1]).expand(len(flat[0]), -1, -1)
-    for weight, bias in zip(flat[:-2:2], flat[1:-2:2], strict=True):
-        hidden = torch.baddbmm(bias.unsqueeze(1), hidden, weight.mT).relu_()
-    value = torch.baddbmm(flat[-1].unsqueeze(1), hidden, flat[-2].mT)
+    batch, layers = hidden.shape[:-1], mlp.layers(mlp.parameters(params))
+    hidden = hidden.reshape(-1, hidden.shape[-1]).expand(len(layers[0].bias), -1, -1)
+    for index, layer in enumerate(layers):
+        hidden = torch.baddbmm(layer.bias.unsqueeze(1), hidden, layer.weight.mT)
+        if layer.norm:
+            # Not layer_norm's own scale and shift, which all critics would share.
+            hidden = layer_norm(hidden, hidden.shape[-1:], eps=mlp.eps[index])
+            scale, shift = (each.unsqueeze(1) for each in layer.norm)
+            hidden = torch.addcmul(shift, hidden, scale)
+        if layer is not layers[-1]:
+            hidden = hidden.relu_()
     # Under autocast the layers compute in half precision; what follows does not.
-    return value.reshape(-1, *batch).to(state.dtype)
+    return hidden.reshape(-1, *batch).to(state.dtype)
 
 
 def soft_maximum(
     params: TensorDictBase,
-    names: Sequence[str],
+    mlp: PlainMLP,
     state: Tensor,
     action: Tensor,
     log_prob: Tensor | None,
@@ -103,7 +73,7 @@ def soft_maximum(
 
     Args:
         params: of all critics, stacked.
-        names: of the linear layers, see :func:`linear_layers`.
+        mlp: their layers.
         state: ``[B, S]``.
         action: ``[M, B, A]``.
         log_prob: log-density of each action ``[M, B]``, or ``None`` for a plain sum.
@@ -113,11 +83,12 @@ def soft_maximum(
     Returns:
         ``[N, B]``.
     """
-    flat = weights_and_biases(params, names)
     autocast = torch.is_autocast_enabled("cpu")
     dtype = torch.get_autocast_dtype("cpu") if autocast else state.dtype
-    arguments = (state, action, log_prob, temperature, chunk_size, dtype, *flat)
-    value: Tensor = _SoftMaximum.apply(*arguments)  # type: ignore[no-untyped-call]
+    arguments = (state, action, log_prob, temperature, chunk_size, dtype, mlp)
+    value: Tensor = _SoftMaximum.apply(  # type: ignore[no-untyped-call]
+        *arguments, *mlp.parameters(params)
+    )
     return value
 
 
@@ -144,7 +115,39 @@ class _SoftMaximum(torch.autograd.Function):
             gradient = list(torch._foreach_mul(ctx.saved_tensors, weight))
         else:
             _, gradient = _evaluate(upstream, *ctx.arguments)
-        return (*[None] * 6, *gradient)
+        return (*[None] * 7, *gradient)
+
+
+class _Chunk(NamedTuple):
+    """A few states and their actions, with the buffers that they go through.
+
+    Attributes:
+        rows: where they are in the batch.
+        state: ``[b, S]``.
+        action: ``[M * b, A]``.
+        products: for each hidden layer's product, ``[M * b, H]``.
+        gradients: for the gradient by each hidden layer's output, but the last one's.
+    """
+
+    rows: slice
+    state: Tensor
+    action: Tensor
+    products: list[Tensor]
+    gradients: list[Tensor]
+
+
+class _Hidden(NamedTuple):
+    """What the backward pass needs of a hidden layer.
+
+    Attributes:
+        product: ``[M * b, H]``; without layer normalisation it has become the output.
+        output: of the ReLU, ``[M * b, H]``.
+        statistics: mean and inverse deviation of each row that was normalised.
+    """
+
+    product: Tensor
+    output: Tensor
+    statistics: Sequence[Tensor] = ()
 
 
 def _evaluate(
@@ -155,89 +158,123 @@ def _evaluate(
     temperature: float,
     chunk_size: int,
     dtype: torch.dtype,
+    mlp: PlainMLP,
     *flat: Tensor,
 ) -> tuple[Tensor, list[Tensor]]:
     """Return the values and the gradient of their sum, weighted by ``upstream``."""
-    gradient = [torch.zeros_like(each) for each in flat]
     value = state.new_empty(len(flat[0]), len(state))
-    flat = tuple(each.to(dtype) for each in flat)
-    state, action = state.to(dtype), action.to(dtype)
-    rows = len(action) * min(chunk_size, len(state))
-    widths = [weight.shape[1] for weight in flat[:-2:2]]
-    # Two buffers a layer, used again and again: activations, and their gradients.
-    buffers = [[state.new_empty(rows, width) for width in widths] for _ in range(2)]
-    for start in range(0, len(state), chunk_size):
-        chunk = slice(start, start + chunk_size)
-        density = 0.0 if log_prob is None else log_prob[:, chunk]
-        inputs = state[chunk], action[:, chunk]
-        for critic in range(len(value)):
-            each = [_layers(tensors, critic) for tensors in (flat, gradient)]
-            hidden = _forward(inputs, each[0], buffers[0])
-            weight, bias = each[0][-1]
-            qvalue = torch.mv(hidden[-1], weight[0]).to(value.dtype) + bias
-            logits = (qvalue.view(inputs[1].shape[:-1]) - density) / temperature
+    gradient = [torch.zeros_like(each) for each in flat]
+    critics = [[layer.to(dtype) for layer in each] for each in mlp.critics(flat)]
+    totals = mlp.critics(gradient)
+    widths = [len(layer.bias) for layer in totals[0][:-1]]
+    for chunk in _chunks(state.to(dtype), action.to(dtype), chunk_size, widths):
+        density = 0.0 if log_prob is None else log_prob[:, chunk.rows]
+        for index, layers in enumerate(critics):
+            hidden = _forward(chunk, layers, mlp.eps)
+            output = torch.mv(hidden[-1].output, layers[-1].weight[0])
+            qvalue = output.to(value.dtype) + layers[-1].bias
+            logits = (qvalue.view(len(action), -1) - density) / temperature
             soft = logits.logsumexp(0)
-            torch.mul(soft, temperature, out=value[critic, chunk])
+            torch.mul(soft, temperature, out=value[index, chunk.rows])
             share = (logits - soft).exp_()
             if upstream is not None:
-                share *= upstream[critic, chunk]
-            _backward(inputs, share.view(-1).to(dtype), hidden, each, buffers[1])
+                share *= upstream[index, chunk.rows]
+            _backward(chunk, share.view(-1).to(dtype), hidden, layers, totals[index])
     return value, gradient
 
 
-def _layers(flat: Sequence[Tensor], critic: int) -> Layers:
-    """Return weight and bias of each layer of one critic."""
-    return [(w[critic], b[critic]) for w, b in zip(flat[::2], flat[1::2], strict=True)]
+def _chunks(
+    state: Tensor, action: Tensor, chunk_size: int, widths: list[int]
+) -> Iterator[_Chunk]:
+    """Return the chunks of a batch; all go through the same buffers."""
+    rows = len(action) * min(chunk_size, len(state))
+    buffers = [
+        [state.new_empty(rows, width) for width in each]
+        for each in (widths, widths[:-1])
+    ]
+    for start in range(0, len(state), chunk_size):
+        part = slice(start, start + chunk_size)
+        flat = action[:, part].flatten(0, 1)
+        views = [[buffer[: len(flat)] for buffer in each] for each in buffers]
+        yield _Chunk(part, state[part], flat, *views)
 
 
-def _forward(
-    inputs: tuple[Tensor, Tensor], layers: Layers, buffers: list[Tensor]
-) -> list[Tensor]:
-    """Write the hidden activations of a chunk into the buffers."""
-    state, action = inputs
-    rows, size = action.shape[:-1].numel(), state.shape[-1]
-    hidden = [buffer[:rows] for buffer in buffers]
-    weight, bias = layers[0]
-    torch.mm(action.reshape(rows, -1), weight[:, size:].T, out=hidden[0])
-    # The state's share of the first layer is the same for all of its actions.
-    shared = torch.addmm(bias, state, weight[:, :size].T)
-    hidden[0].view(len(action), *shared.shape).add_(shared)
-    hidden[0].relu_()
-    for (before, after), (weight, bias) in zip(
-        pairwise(hidden), layers[1:-1], strict=True
-    ):
-        torch.addmm(bias, before, weight.T, out=after).relu_()
+def _forward(chunk: _Chunk, layers: list[Layer], eps: list[float]) -> list[_Hidden]:
+    """Run a chunk through the hidden layers."""
+    hidden: list[_Hidden] = []
+    for index, layer in enumerate(layers[:-1]):
+        product = chunk.products[index]
+        if index:
+            torch.addmm(layer.bias, hidden[-1].output, layer.weight.T, out=product)
+        else:
+            _first_product(chunk, layer)
+        if layer.norm:
+            scale, shift = layer.norm
+            output, *statistics = torch.native_layer_norm(
+                product, scale.shape, scale, shift, eps[index]
+            )
+            hidden.append(_Hidden(product, output.relu_(), statistics))
+        else:
+            hidden.append(_Hidden(product, product.relu_()))
     return hidden
 
 
-def _backward(
-    inputs: tuple[Tensor, Tensor],
-    share: Tensor,
-    hidden: list[Tensor],
-    layers_and_gradients: Sequence[Layers],
-    buffers: list[Tensor],
-) -> None:
-    """Add the gradient of a chunk, from that of the values ``[M * b]``."""
-    layers, gradients = layers_and_gradients
-    state, action = inputs
-    above = [buffer[: len(share)] for buffer in buffers]
-    weight, bias = gradients[-1]
-    weight[0] += torch.mv(hidden[-1].T, share)
-    bias += share.sum()
-    torch.mul(share.unsqueeze(1), layers[-1][0], out=above[-1])
-    for layer in range(len(hidden) - 1, -1, -1):
-        _mask(above[layer], hidden[layer])
-        if layer:
-            weight, bias = gradients[layer]
-            _add_product(weight, above[layer].T, hidden[layer - 1])
-            bias += above[layer].sum(0)
-            torch.mm(above[layer], layers[layer][0], out=above[layer - 1])
-    weight, bias = gradients[0]
+def _first_product(chunk: _Chunk, layer: Layer) -> None:
+    """Write the product of the first layer."""
+    state, action, product = chunk.state, chunk.action, chunk.products[0]
     size = state.shape[-1]
-    _add_product(weight[:, size:], above[0].T, action.reshape(len(share), -1))
-    shared = above[0].view(len(action), len(state), -1).sum(0)
-    _add_product(weight[:, :size], shared.T, state)
+    torch.mm(action, layer.weight[:, size:].T, out=product)
+    # The state's share of the first layer is the same for all of its actions.
+    shared = torch.addmm(layer.bias, state, layer.weight[:, :size].T)
+    product.view(-1, *shared.shape).add_(shared)
+
+
+def _backward(
+    chunk: _Chunk,
+    share: Tensor,
+    hidden: list[_Hidden],
+    layers: list[Layer],
+    total: list[Layer],
+) -> None:
+    """Add a chunk's gradient, from that of the values ``[M * b]``, to the total."""
+    output = hidden[-1].output
+    total[-1].weight[0] += torch.mv(output.T, share)
+    total[-1].bias.add_(share.sum())
+    above = _relu_backward(layers[-1].weight.expand_as(output), output)
+    above.mul_(share.unsqueeze(1))
+    for index in range(len(hidden) - 1, -1, -1):
+        if layers[index].norm:
+            each = hidden[index], layers[index], total[index]
+            above = _normalisation_backward(above, *each)
+        if index:
+            output, below = hidden[index - 1].output, chunk.gradients[index - 1]
+            _add_product(total[index].weight, above.T, output)
+            total[index].bias.add_(above.sum(0))
+            torch.mm(above, layers[index].weight, out=below)
+            above = _relu_backward(below, output)
+    size = chunk.state.shape[-1]
+    weight, bias, *_ = total[0]
+    _add_product(weight[:, size:], above.T, chunk.action)
+    shared = above.view(-1, len(chunk.state), above.shape[-1]).sum(0)
+    _add_product(weight[:, :size], shared.T, chunk.state)
     bias += shared.sum(0)
+
+
+def _normalisation_backward(
+    above: Tensor, hidden: _Hidden, layer: Layer, total: Layer
+) -> Tensor:
+    """Return the gradient by what is normalised; add those of scale and shift."""
+    # Not in half precision: torch 2.13 also adds up the rows' gradients by scale and
+    # shift in it, whose sums are then off by half for two thousand rows.
+    dtype = total.bias.dtype
+    product, statistics = hidden.product.to(dtype), hidden.statistics
+    gradient, *others = torch.ops.aten.native_layer_norm_backward(
+        above.to(dtype), product, layer.bias.shape, *statistics, *layer.norm, [True] * 3
+    )
+    for each, other in zip(total.norm, others, strict=True):
+        each.add_(other)
+    result: Tensor = gradient.to(above.dtype)
+    return result
 
 
 def _add_product(total: Tensor, left: Tensor, right: Tensor) -> None:
@@ -248,8 +285,9 @@ def _add_product(total: Tensor, left: Tensor, right: Tensor) -> None:
         total += torch.mm(left, right)
 
 
-def _mask(gradient: Tensor, activation: Tensor) -> None:
-    """Set a gradient to 0, in place, where the ReLU did so with its input."""
-    torch.ops.aten.threshold_backward.grad_input(
-        gradient, activation, 0, grad_input=gradient
+def _relu_backward(gradient: Tensor, output: Tensor) -> Tensor:
+    """Return the gradient by a ReLU's input, in the place of what it has put out."""
+    masked: Tensor = torch.ops.aten.threshold_backward.grad_input(
+        gradient, output, 0, grad_input=output
     )
+    return masked

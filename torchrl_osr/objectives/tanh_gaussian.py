@@ -28,6 +28,7 @@ from torchrl_osr.objectives.distributions import (
     check_same_size,
 )
 from torchrl_osr.objectives.mixed_states import entry, nested, select
+from torchrl_osr.objectives.mlp_layers import PlainMLP, plain_mlp
 from torchrl_osr.objectives.networks import ActorCriticNetworks
 
 
@@ -124,12 +125,12 @@ class TanhGaussianActorCritic(RecoveryActorCriticLoss):
         check_num_actions("inverse_dynamics_network", model.loc.shape[-1], size)
         return model
 
-    def _plain_layers(self) -> list[str] | None:
-        """Return the names of the critics' linear layers, if they are plain MLPs."""
+    def _plain_critics(self) -> PlainMLP | None:
+        """Return the critics' layers, if they are plain MLPs."""
         keys, network = self.tensor_keys, self.qvalue_network
         if keys.state_action_value not in network.out_keys:
             return None
-        return mlp_critics.linear_layers(network, keys.action)
+        return plain_mlp(network, keys.action)
 
     def _critic_state(self, states: TensorDictBase) -> Tensor:
         """Return what plain critics read besides the action, ``[B, S]``."""
@@ -140,10 +141,9 @@ class TanhGaussianActorCritic(RecoveryActorCriticLoss):
         self, states: TensorDictBase, action: Tensor, params: TensorDictParams
     ) -> Tensor:
         """Return the values of all critics, ``[N, B]``, at states and actions."""
-        layers = self._plain_layers()
-        if layers is not None:
-            state = self._critic_state(states)
-            return mlp_critics.qvalue(params, layers, state, action)
+        mlp = self._plain_critics()
+        if mlp is not None:
+            return mlp_critics.qvalue(params, mlp, self._critic_state(states), action)
         batch = self._critic_inputs(states)
         batch.set(self.tensor_keys.action, action)
         key = self.tensor_keys.state_action_value
