@@ -28,6 +28,7 @@ from torchrl_osr.modules import (
     tanh_gaussian_actor,
     tanh_gaussian_inverse_dynamics,
 )
+from torchrl_osr.trainers.captured import CapturedUpdate, make_capturable
 
 Casting = Callable[[], AbstractContextManager]
 Update = Callable[[Any, Casting], Iterator[str]]
@@ -36,6 +37,10 @@ GAMMA, TAU, RATE, BATCH, NUM_RANDOM, ROWS = 0.99, 5e-3, 3e-4, 256, 10, 100_000
 OURS = ("OSR", "CQL(H)", "OSR-v", "OSR-10")
 TORCHRL, PLAIN, SAMPLING = "TorchRL CQL", "plain OSR", "sampling"
 PRODUCTS, PRODUCTS_BF16 = "products", "products in bfloat16"
+COMPILED, GRAPH, BOTH = "OSR, compiled", "OSR, graph", "OSR, graph and compiled"
+# Beside plain OSR, and only there. Operations and host reads are counted in Python: of
+# a compiled loss as if it were not compiled, of a graph none at all.
+ON_GPU = (COMPILED, GRAPH, BOTH)
 DIMENSIONS = {"hopper": (11, 3), "walker2d": (17, 6), "halfcheetah": (17, 6)}
 
 
@@ -91,11 +96,13 @@ def unpack(batch: TensorDictBase) -> Batch:
     )
 
 
-def our_update(loss: LossModule) -> Update:
+def our_update(loss: LossModule, *, captured: bool = False) -> Update:
     """Return the update that the README shows: one backward, one optimizer."""
     loss.make_value_estimator(gamma=GAMMA)
     updater = SoftUpdate(loss, tau=TAU)
     optimizer = torch.optim.Adam(loss.parameters(), lr=RATE, fused=True)
+    if captured:
+        make_capturable(loss, optimizer, loss.log_alpha.device)
 
     def update(batch: TensorDictBase, casting: Casting) -> Iterator[str]:
         with casting():
@@ -111,6 +118,27 @@ def our_update(loss: LossModule) -> Update:
         yield "targets"
 
     return update
+
+
+def graph_update(loss: LossModule, like: TensorDictBase) -> Update:
+    """Return :func:`our_update` as a CUDA graph, into whose batch others are copied."""
+    update, static = our_update(loss, captured=True), like.clone()
+    castings: list[Casting] = []
+
+    def once() -> TensorDictBase:
+        for _ in update(static, castings[-1]):
+            pass
+        return TensorDict({"updates": torch.ones_like(loss.log_alpha)})
+
+    replayed = CapturedUpdate(once, list, loss.log_alpha.device)
+
+    def update_graph(batch: TensorDictBase, casting: Casting) -> Iterator[str]:
+        castings[:] = [casting]
+        static.update_(batch)
+        replayed()
+        yield "update"
+
+    return update_graph
 
 
 def our_loss(name: str, size: Size) -> LossModule:
@@ -183,4 +211,8 @@ def make_contender(
     loss = our_loss(name, size).to(device)
     if not loss.recovers:
         batches = [batch.exclude("perturbed") for batch in batches]
+    if name in (COMPILED, BOTH):
+        loss.compile()
+    if name in (GRAPH, BOTH):
+        return graph_update(loss, batches[0]), batches
     return our_update(loss), batches

@@ -50,8 +50,8 @@ class Timer:
         torch.set_float32_matmul_precision("medium" if medium else "highest")
         self.precision, self.device = precision, device
         self.update, self.batches = update, cycle(batches)
-        self.steps = 3
-        self.round()  # warm-up
+        self.steps = 5
+        self.round()  # warm-up, with the capture of a CUDA graph
         self.steps = max(1, round(seconds / self.round()["wall_seconds"]))
 
     def casting(self) -> AbstractContextManager:

@@ -51,14 +51,15 @@ def label(name: str, precision: str) -> str:
     return LABELS.get(name, name) + ", autocast" * autocast
 
 
-def speed_table(sizes: Mapping[str, Any], precision: str) -> str:
-    """Return updates a CPU second, and how they compare with the plain reference."""
+def speed_table(sizes: Mapping[str, Any], precision: str, *, on_gpu: bool) -> str:
+    """Return updates a second, and how they compare with the plain reference."""
+    unit = "second" if on_gpu else "cpu_second"
 
     def cell(name: str, size: str) -> str:
         row = sizes[size][precision][name]
         if row["failure"]:
             return "failed"
-        return f"{row['updates_per_cpu_second']:.1f} ({row['ratio']:.2f}x)"
+        return f"{row[f'updates_per_{unit}']:.1f} ({row['ratio']:.2f}x)"
 
     names = [n for n in next(iter(sizes.values()))[precision] if n != SAMPLING]
     rows = [
@@ -72,7 +73,8 @@ def speed_table(sizes: Mapping[str, Any], precision: str) -> str:
             *("failed" if share is None else f"{share:.0%}" for share in shares),
         ]
     )
-    return markdown(["updates a CPU second (x plain reference)", *sizes], rows)
+    name = "updates a second" if on_gpu else "updates a CPU second"
+    return markdown([f"{name} (x plain reference)", *sizes], rows)
 
 
 def detail_table(results: Mapping[str, Any], precision: str) -> str:
@@ -117,7 +119,8 @@ def tables(results: Mapping[str, Any]) -> str:
         "\n"
     )
     for precision in sizes[first]:
-        text += f"\n### {TITLES[precision]}\n\n{speed_table(sizes, precision)}"
+        table = speed_table(sizes, precision, on_gpu="gpu" in machine)
+        text += f"\n### {TITLES[precision]}\n\n{table}"
         text += f"\nOne update of `{first}`:\n\n"
         text += detail_table(sizes[first][precision], precision)
     sampling = sizes[first]["float32"][SAMPLING]["updates_per_cpu_second"]

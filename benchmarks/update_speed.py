@@ -2,10 +2,12 @@
 
     python benchmarks/update_speed.py
     python benchmarks/update_speed.py --sizes hopper-2x256 --rounds 3 --output speed
+    python benchmarks/update_speed.py --device cuda --output speed
 
 All run in turn, round after round, each in a process of its own, so that a machine
 which slows down slows all of them; medians over the rounds are reported. One thread,
-and CPU seconds, which other processes disturb least, beside the wall clock. Writes
+and CPU seconds, which other processes disturb least, beside the wall clock. On a GPU
+the wall clock counts, and OSR runs compiled and as a CUDA graph too. Writes
 ``speed.json`` with every round, ``speed.png``, and the tables into the README of that
 folder, if it has one.
 """
@@ -28,7 +30,16 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from contenders import OURS, PLAIN, PRODUCTS, PRODUCTS_BF16, SAMPLING, TORCHRL, Size
+from contenders import (
+    ON_GPU,
+    OURS,
+    PLAIN,
+    PRODUCTS,
+    PRODUCTS_BF16,
+    SAMPLING,
+    TORCHRL,
+    Size,
+)
 from rounds import Contender
 from speed_report import draw, tables, write_tables
 from torchrl import torchrl_logger
@@ -99,7 +110,7 @@ def measure(
     contenders = {
         (precision, who): Contender(who, precision, **common)
         for precision in precisions
-        for who in PRECISIONS[precision]
+        for who in (*PRECISIONS[precision], *(ON_GPU if device == "cuda" else ()))
     }
     for number in range(rounds):
         print(f"{name}: round {number + 1} of {rounds}", file=sys.stderr, flush=True)

@@ -45,6 +45,9 @@ from torchrl_osr.trainers.hardware import check_hardware
 from torchrl_osr.trainers.loggers import make_loggers
 
 EVALUATION_SEED = 10_000  # far from the seeds of the data's episodes
+# Of both phases:
+TRAINER_OPTIONS = ("log_interval", "checkpoint_interval", "checkpoints_kept")
+TRAINER_OPTIONS += ("progress", "compile", "cudagraph")
 
 config.register()
 
@@ -67,7 +70,12 @@ def run(cfg: DictConfig, folder: Path) -> float:
     torch.set_num_threads(cfg.trainer.num_threads)
     torch.set_float32_matmul_precision(cfg.trainer.matmul_precision)
     torch.manual_seed(cfg.seed)
-    device, autocast = check_hardware(cfg.trainer.device, cfg.trainer.precision)
+    device, autocast = check_hardware(
+        cfg.trainer.device, cfg.trainer.precision, cudagraph=cfg.trainer.cudagraph
+    )
+    if cfg.trainer.cudagraph and cfg.trainer.bc_steps:
+        # A graph repeats one update; the loss would change on the way.
+        raise ValueError("trainer.bc_steps must be 0 with trainer.cudagraph=true.")
 
     # Data: standardised once, the same numbers for every batch and every evaluation.
     data, manifest = load_mixture(
@@ -83,23 +91,20 @@ def run(cfg: DictConfig, folder: Path) -> float:
         *statistics,
         in_keys=["observation", ("next", "observation")],
         standard_normal=True,
-    ).to(device)
-    data = norm(data.to(device))
-    data, held_out = split_held_out(data, cfg.data.held_out, seed=cfg.data.seed)
-    perturbation = StatePerturbation(**cfg.perturbation, seed=cfg.seed)
-    buffer = make_replay_buffer(
-        data, batch_size=cfg.trainer.batch_size, seed=cfg.seed, transform=perturbation
     )
+    data, held_out = split_held_out(norm(data), cfg.data.held_out, seed=cfg.data.seed)
+    norm, held_out = norm.to(device), held_out.to(device)
+    perturbation = StatePerturbation(**cfg.perturbation, seed=cfg.seed)
+    rows = cfg.trainer.batch_size
+    buffer = make_replay_buffer(data, batch_size=rows, seed=cfg.seed, device=device)
+    buffer.append_transform(perturbation)
     training: dict[str, Any] = {
         "replay_buffer": buffer,
         "components": {"perturbation": perturbation, "observation_norm": norm},
         "loggers": make_loggers(folder=folder, **cfg.logger),
-        "log_interval": cfg.trainer.log_interval,
-        "checkpoint_interval": cfg.trainer.checkpoint_interval,
-        "checkpoints_kept": cfg.trainer.checkpoints_kept,
-        "progress": cfg.trainer.progress,
         "autocast_dtype": autocast,
     }
+    training |= {name: cfg.trainer[name] for name in TRAINER_OPTIONS}
 
     # The policy's loss first, so that a wrong option stops here.
     sizes = data["observation"].shape[-1], data["action"].shape[-1]
@@ -144,7 +149,8 @@ def run(cfg: DictConfig, folder: Path) -> float:
         loss.behavior_cloning = trainer.step <= cfg.trainer.bc_steps
         return batch
 
-    trainer.register_op("process_optim_batch", warm_start)
+    if cfg.trainer.bc_steps:
+        trainer.register_op("process_optim_batch", warm_start)
     trainer.train()
     evaluator.close()
     return report(cfg, folder, manifest["normalized_score"], trainer)

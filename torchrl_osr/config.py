@@ -121,6 +121,8 @@ class TrainerConfig:
         device: cpu or cuda.
         precision: float32 or bfloat16, of the losses' matrix products.
         matmul_precision: torch's, of float32 products: highest, high or medium.
+        compile: the losses with ``torch.compile``.
+        cudagraph: each update as one CUDA graph; needs ``device=cuda``.
         progress: progress bars, when on a terminal.
     """
 
@@ -137,6 +139,8 @@ class TrainerConfig:
     device: str = MISSING
     precision: str = MISSING
     matmul_precision: str = MISSING
+    compile: bool = MISSING
+    cudagraph: bool = MISSING
     progress: bool = MISSING
 
 

@@ -7,12 +7,15 @@ import json
 import os
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
+import contenders
 import pytest
 import torch
-from contenders import OURS, Size, osr_products
+import update_speed
+from contenders import GRAPH, ON_GPU, OURS, Size, make_contender, osr_products
 from diagnostics import count_flops
 from matmul_bound import Products, osr_passes, total_flops
 from speed_report import tables
@@ -102,3 +105,49 @@ def test_tables_are_printed_and_put_into_the_readme(run) -> None:
     cell = f"| OSR | {osr['updates_per_cpu_second']:.1f} ({osr['ratio']:.2f}x) |"
     assert cell in printed
     assert (folder / "speed.png").stat().st_size > 10_000
+
+
+class WithoutGraph:
+    """Stands for CapturedUpdate where there is no GPU."""
+
+    def __init__(self, update, generators, device) -> None:
+        self.update = update
+
+    def __call__(self) -> None:
+        self.update()
+
+
+def test_graph_reads_the_batch_and_moves_the_same_weights(monkeypatch) -> None:
+    monkeypatch.setattr(contenders, "CapturedUpdate", WithoutGraph)
+    size, device, weights = Size.parse("hopper-1x8"), torch.device("cpu"), []
+    for name in ("OSR", GRAPH):
+        made, original = [], contenders.our_loss
+        monkeypatch.setattr(
+            contenders,
+            "our_loss",
+            lambda *arguments, made=made, original=original: (
+                made.append(original(*arguments)) or made[-1]
+            ),
+        )
+        torch.manual_seed(0)
+        update, batches = make_contender(name, size, device)
+        for batch in batches[:3]:
+            list(update(batch, nullcontext))
+        weights.append(list(made[-1].state_dict().values()))
+    assert all(torch.equal(a, b) for a, b in zip(*weights, strict=True))
+
+
+@pytest.mark.parametrize(("device", "number"), [("cpu", 0), ("cuda", len(ON_GPU))])
+def test_graphs_and_compilation_take_part_on_a_gpu(monkeypatch, device, number) -> None:
+    asked = []
+
+    def contender(name, precision, **_):
+        asked.append(name)
+        return SimpleNamespace(
+            rounds=[], diagnosis={}, failure="", diagnose=list, close=list
+        )
+
+    monkeypatch.setattr(update_speed, "Contender", contender)
+    update_speed.measure("hopper-1x8", precisions=["float32"], rounds=0, device=device)
+    assert len([name for name in asked if name in ON_GPU]) == number
+    assert set(OURS) < set(asked)

@@ -6,7 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from tensordict import TensorDict
 
+from torchrl_osr.data.replay_buffer import check_memory
 from torchrl_osr.trainers import hardware
 from torchrl_osr.trainers.gradient_steps import SumOfLosses
 
@@ -47,6 +49,36 @@ def test_a_gpu_without_bfloat16_is_named(monkeypatch) -> None:
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "an old GPU")
     with pytest.raises(ValueError, match="an old GPU does not compute in bfloat16"):
         hardware.check_hardware("cuda", "bfloat16")
+
+
+def test_a_cuda_graph_needs_cuda() -> None:
+    match = "cudagraph=True needs a CUDA device, got device='cpu': use device=cuda"
+    with pytest.raises(ValueError, match=match):
+        hardware.check_hardware("cpu", "float32", cudagraph=True)
+
+
+@pytest.mark.parametrize("where", ["cpu", "cuda"])
+def test_data_that_do_not_fit_on_a_gpu_are_refused_with_both_sizes(
+    monkeypatch, where
+) -> None:
+    rows = torch.zeros(100, 10)  # 4000 bytes
+    data = SimpleNamespace(
+        bytes=TensorDict({"observation": rows}, [100]).bytes,
+        device=torch.device(where),
+        shape=torch.Size([100]),
+    )
+    copies = 1 if where == "cuda" else 2
+    cached = 300 - 100
+    for name, number in (("memory_reserved", 300), ("memory_allocated", 100)):
+        monkeypatch.setattr(torch.cuda, name, lambda _, number=number: number)
+    device, free = torch.device("cuda"), 4000 * copies - cached
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: (free, 10**9))
+    check_memory(data, device)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: (free - 1, 10**9))
+    match = f"needs {4000 * copies:,} bytes on cuda, which has {4000 * copies - 1:,}"
+    with pytest.raises(MemoryError, match=match):
+        check_memory(data, device)
+    check_memory(data, torch.device("cpu"))
 
 
 @pytest.mark.parametrize("dtype", [None, torch.bfloat16])

@@ -17,6 +17,23 @@ from torchrl.envs.transforms import Transform
 MIN_OBSERVATION_SCALE = 1e-3
 
 
+def check_memory(data: TensorDictBase, device: torch.device) -> None:
+    """Raise a MemoryError unless a data set fits into a GPU, with a copy to it."""
+    if device.type != "cuda":
+        return
+    there = data.device is not None and data.device.type == "cuda"
+    needed = data.bytes() * (1 if there else 2)
+    free = torch.cuda.mem_get_info(device)[0]
+    # What torch keeps for the next that asks is not free to others, but to us.
+    free += torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    if needed > free:
+        raise MemoryError(
+            f"The data set needs {needed:,} bytes on {device}, which has {free:,} "
+            f"free: take fewer than {data.shape[0]:,} rows (data.num_transitions), or "
+            "keep it on the CPU (trainer.device=cpu)."
+        )
+
+
 def make_replay_buffer(
     data: TensorDictBase,
     *,
@@ -50,6 +67,7 @@ def make_replay_buffer(
 
     Raises:
         ValueError: ``data`` is not flat or has no rows.
+        MemoryError: it does not fit into the GPU that ``device`` is.
 
     Examples:
         >>> import torch
@@ -66,6 +84,7 @@ def make_replay_buffer(
             "expected a flat [N] with at least one row."
         )
     device = torch.device(device or data.device or "cpu")
+    check_memory(data, device)
     buffer = ReplayBuffer(
         storage=LazyTensorStorage(data.shape[0], device=device),
         batch_size=batch_size,

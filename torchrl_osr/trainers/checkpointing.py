@@ -113,6 +113,20 @@ def safe_checkpoint(**components: Any) -> Checkpoint:
     return checkpoint
 
 
+def find_damage(path: Path) -> str | None:
+    """Return what is wrong with a checkpoint's file, ``None`` if it is whole.
+
+    Args:
+        path: of the archive; every member is read and its checksum compared.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError) as error:
+        return str(error)
+    return None if damaged is None else f"wrong checksum of {damaged}"
+
+
 def load_latest(checkpoint: Checkpoint, rotation: CheckpointRotation) -> Path | None:
     """Restore the newest undamaged checkpoint of a folder.
 
@@ -130,14 +144,10 @@ def load_latest(checkpoint: Checkpoint, rotation: CheckpointRotation) -> Path | 
     pattern = f"{rotation.prefix}-*.torchrl"
     found: list[Path] = sorted(rotation.directory.glob(pattern), reverse=True)
     for path in found:
-        try:
-            with zipfile.ZipFile(path) as archive:
-                damaged = archive.testzip()
-            if damaged is not None:
-                raise zipfile.BadZipFile(f"wrong checksum of {damaged}")
-        except (zipfile.BadZipFile, zlib.error, EOFError, OSError) as error:
+        damage = find_damage(path)
+        if damage is not None:
             torchrl_logger.warning(
-                f"Checkpoint {path} is damaged ({error}); trying the one before."
+                f"Checkpoint {path} is damaged ({damage}); trying the one before."
             )
             continue
         try:

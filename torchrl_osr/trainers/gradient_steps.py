@@ -12,6 +12,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.trainers import OptimizationStepper, Trainer
 
+from torchrl_osr.trainers.captured import CapturedUpdate
+
 
 class GradientSteps:
     """The clock that stands in for a collector: an empty batch of n rows is n steps.
@@ -83,9 +85,12 @@ class SumOfLosses(OptimizationStepper):
         with torch.autocast(device, self.autocast_dtype, enabled=enabled):
             losses = trainer.compute_loss(sub_batch)
         total = sum(value for key, value in losses.items() if key.startswith("loss_"))
-        total.backward()
-        trainer.optimizer.step()
-        trainer.optimizer.zero_grad(set_to_none=True)
+        try:
+            total.backward()
+            trainer.optimizer.step()
+        finally:
+            # Also where this is broken off: the next one must not add to the rest.
+            trainer.optimizer.zero_grad(set_to_none=True)
         return losses.detach()
 
     def state_dict(self) -> dict[str, Any]:
@@ -94,3 +99,44 @@ class SumOfLosses(OptimizationStepper):
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Do nothing: the stepper has no state."""
+
+
+class TickTrainer(Trainer):
+    """Abstract base: a trainer that does as many updates as its batch has rows.
+
+    Attributes:
+        captured: runs an update in the place of TorchRL's loop, if it is there.
+    """
+
+    captured: CapturedUpdate | None = None
+
+    @property
+    def step(self) -> int:
+        """Gradient steps so far, from the run's beginning; the running one counts."""
+        return int(self._optim_count)
+
+    def update(self) -> TensorDictBase:
+        """Do one update with its hooks; return the detached losses and metrics.
+
+        TorchRL's loop calls the same three; alone they are what a graph captures.
+        """
+        batch = self._process_optim_batch_hook(None)
+        losses: TensorDictBase = self.optimization_stepper.step(self, batch)
+        self._post_optim_hook()
+        return losses
+
+    def optim_steps(self, batch: TensorDictBase) -> None:
+        """Do the updates of a tick, and log their mean losses."""
+        self.optim_steps_per_batch = batch.numel()
+        if self.captured is None:
+            super().optim_steps(batch)
+            return
+        self._pre_optim_hook()
+        self._pre_epoch_log_hook(batch)
+        self._pre_epoch_hook(batch)
+        for _ in range(batch.numel()):
+            self._optim_count += 1
+            self.captured()
+        self._post_epoch_log_hook(batch)
+        self._post_epoch_hook()
+        self._post_optim_complete_log_hook(self._optim_count, self.captured.means())

@@ -9,8 +9,17 @@ import torch
 Precision = Literal["float32", "bfloat16"]
 
 
+def check_cudagraph(device: torch.device) -> None:
+    """Raise a ValueError unless updates on ``device`` can be CUDA graphs."""
+    if device.type != "cuda":
+        raise ValueError(
+            f"cudagraph=True needs a CUDA device, got device='{device}': use "
+            "device=cuda, or cudagraph=False."
+        )
+
+
 def check_hardware(
-    device: str, precision: Precision
+    device: str, precision: Precision, *, cudagraph: bool = False
 ) -> tuple[torch.device, torch.dtype | None]:
     """Return the device and what to autocast to, or say what this machine lacks.
 
@@ -20,15 +29,20 @@ def check_hardware(
             half precision; parameters, targets, densities, log-sum-exps and the
             optimizer stay in float32.
 
+    Keyword Args:
+        cudagraph: whether updates shall be CUDA graphs.
+
     Raises:
         ValueError: if there is no such device or precision, or the device does not
-            compute in it.
+            compute in it or has no CUDA graphs.
     """
     if precision not in ("float32", "bfloat16"):
         raise ValueError(
             f"precision must be 'float32' or 'bfloat16', got {precision!r}."
         )
     where = torch.device(device)
+    if cudagraph:
+        check_cudagraph(where)
     if where.type == "cuda" and not torch.cuda.is_available():
         raise ValueError(
             f"device={device!r}, but torch {torch.__version__} sees no CUDA device "

@@ -11,6 +11,7 @@ import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,8 +21,8 @@ from torchrl.checkpoint import CheckpointRotation, GlobalRNGState
 from torchrl.data import ReplayBuffer
 from torchrl.objectives import LossModule, TargetNetUpdater
 from torchrl.record.loggers import Logger
-from torchrl.trainers import Trainer
 
+from torchrl_osr.trainers.captured import capture, check_updater
 from torchrl_osr.trainers.checkpointing import (
     GeneratorState,
     load_latest,
@@ -30,8 +31,10 @@ from torchrl_osr.trainers.checkpointing import (
 from torchrl_osr.trainers.gradient_steps import (
     GradientSteps,
     SumOfLosses,
+    TickTrainer,
     pandas_settled,
 )
+from torchrl_osr.trainers.hardware import check_cudagraph
 
 try:
     from tqdm.auto import tqdm
@@ -41,7 +44,7 @@ except ImportError as error:
     ) from error
 
 
-class OfflineTrainer(Trainer):
+class OfflineTrainer(TickTrainer):
     """Train a loss module on a replay buffer, with evaluation, checkpoints and resume.
 
     It knows no algorithm: any :class:`~torchrl.objectives.LossModule` whose ``loss_*``
@@ -76,8 +79,14 @@ class OfflineTrainer(Trainer):
         progress: show a progress bar when on a terminal. Default ``True``.
         autocast_dtype: compute the losses' matrix products in this precision
             (``torch.bfloat16``). Default: that of the parameters.
+        compile: call the loss module through :func:`torch.compile`, in place. It draws
+            other random numbers then. Default ``False``.
+        cudagraph: run each update, from the batch to the target networks, as one CUDA
+            graph. The hooks ``process_optim_batch`` and ``post_optim`` are in it, see
+            :class:`~torchrl_osr.trainers.captured.CapturedUpdate`. Default ``False``.
 
     Raises:
+        ValueError: if ``cudagraph`` is asked for where it cannot be had.
         FloatingPointError: while training, if a loss is not finite.
         CheckpointError: if a checkpoint in ``folder`` does not fit.
     """
@@ -103,6 +112,8 @@ class OfflineTrainer(Trainer):
         description: str = "train",
         progress: bool = True,
         autocast_dtype: torch.dtype | None = None,
+        compile: bool = False,
+        cudagraph: bool = False,
     ) -> None:
         intervals = (log_interval, eval_interval, checkpoint_interval or eval_interval)
         if total_steps < 1 or min(intervals) < 1:
@@ -111,6 +122,12 @@ class OfflineTrainer(Trainer):
                 f"total_steps={total_steps} and log, eval and checkpoint intervals "
                 f"{intervals}."
             )
+        device = next(loss_module.parameters()).device
+        if cudagraph:
+            check_cudagraph(device)
+            check_updater(target_net_updater)
+        if compile:
+            loss_module.compile()
         super().__init__(
             collector=GradientSteps(total_steps, intervals),
             total_frames=total_steps,
@@ -128,8 +145,10 @@ class OfflineTrainer(Trainer):
         self.history: list[dict[str, Any]] = []
         self._progress = {"step": 0}
         # Not handed to Trainer: it would put the whole data set into checkpoints.
-        generator = torch.Generator(next(loss_module.parameters()).device)
-        replay_buffer.set_rng(generator.manual_seed(seed))
+        generator = torch.Generator(device).manual_seed(seed)
+        replay_buffer.set_rng(generator)
+        self.cudagraph = cudagraph
+        self._capture = partial(capture, self, generator, replay_buffer.transform)
         self.register_op("process_optim_batch", lambda _: replay_buffer.sample())
         if target_net_updater is not None:
             self.register_op("post_optim", target_net_updater.step)
@@ -149,11 +168,6 @@ class OfflineTrainer(Trainer):
             progress=self._progress,
             **(components or {}),
         )
-
-    @property
-    def step(self) -> int:
-        """Gradient steps so far, from the run's beginning; the running one counts."""
-        return int(self._optim_count)
 
     @property
     def best_path(self) -> Path:
@@ -193,12 +207,9 @@ class OfflineTrainer(Trainer):
         path = load_latest(self.checkpoint_of_run, self.rotation)
         step = self._progress["step"]
         self.collected_frames = self._optim_count = self.collector.step = step
+        # Anew: the optimizer's state may be other tensors now.
+        self.captured = self._capture() if self.cudagraph else None
         return path
-
-    def optim_steps(self, batch: TensorDictBase) -> None:
-        """Run as many updates as the tick has rows."""
-        self.optim_steps_per_batch = batch.numel()
-        super().optim_steps(batch)
 
     def save_trainer(self, force_save: bool = False) -> None:
         """Write a checkpoint where one is due, and at the end."""

@@ -87,12 +87,22 @@ class StatePerturbation(Transform):
             unit = 1.0 if relative_to is None else relative_to[i]
             self.register_buffer(f"_unit_{i}", torch.as_tensor(unit))
         self._generator: torch.Generator | None = None
+        self._loaded: Tensor | None = None
 
     def _generator_on(self, device: torch.device) -> torch.Generator:
         """Return the noise's generator, made on the device of the first batch."""
         if self._generator is None or self._generator.device != device:
             self._generator = torch.Generator(device).manual_seed(self.seed)
+            self._continue(self._generator)
         return self._generator
+
+    def _continue(self, generator: torch.Generator) -> None:
+        """Set the loaded state, unless it is that of a generator on another device."""
+        loaded = self._loaded
+        # A CUDA generator's state is 16 bytes, a CPU one's 5056: the size tells.
+        if loaded is not None and loaded.numel() == generator.get_state().numel():
+            generator.set_state(loaded)
+            self._loaded = None
 
     def _perturb(self, state: Tensor, key: NestedKey, scale: Tensor) -> Tensor:
         if not state.is_floating_point():
@@ -121,6 +131,10 @@ class StatePerturbation(Transform):
                     f"StatePerturbation reads {key!r}, but the batch has "
                     f"{sorted(map(str, tensordict.keys(True, True)))}."
                 )
+            if self.std.device != state.device:
+                # Once: a copy from the host at each draw keeps a GPU waiting, and
+                # cannot be captured in a CUDA graph.
+                self.to(state.device)
             unit: Tensor = getattr(self, f"_unit_{i}")
             tensordict.set(twin, self._perturb(state, key, self.std * unit))
         return tensordict
@@ -148,12 +162,14 @@ class StatePerturbation(Transform):
 
     def get_extra_state(self) -> Tensor:
         """Return the generator's state, for the state dict."""
+        if self._generator is None and self._loaded is not None:
+            return self._loaded
         generator = self._generator or torch.Generator().manual_seed(self.seed)
         return generator.get_state()
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Continue the noise from a saved state."""
-        # A CUDA generator's state is 16 bytes, a CPU one's 5056: the size tells.
-        device = "cpu" if state.numel() > 16 else "cuda"
-        self._generator = torch.Generator(device)
-        self._generator.set_state(state.cpu())
+        """Continue the noise from a saved state; on another device it starts anew."""
+        self._loaded = state.cpu()
+        if self._generator is not None:
+            # Into the generator that is there, which a CUDA graph may hold.
+            self._continue(self._generator)
