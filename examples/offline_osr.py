@@ -12,6 +12,11 @@ The data are rolled out on this machine at the first run and cached. A run leave
 
 from __future__ import annotations
 
+import os
+
+# Threads that wait shall not spin; read once, when torch is imported.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
 from pathlib import Path
 from typing import Any
 

@@ -157,6 +157,20 @@ def test_bad_input_is_named(finished, environment, arguments, named):
     assert json.loads((folder / "status.json").read_text()) == {"status": "done"}
 
 
+@pytest.mark.parametrize(("chosen", "found"), [(None, "PASSIVE"), ("active", "ACTIVE")])
+def test_waiting_threads_do_not_spin_unless_asked_to(
+    tmp_path, environment, chosen, found
+):
+    # GNU's OpenMP says what it has read, when torch is imported.
+    environment = {k: v for k, v in environment.items() if k != "OMP_WAIT_POLICY"}
+    environment |= {"OMP_DISPLAY_ENV": "true"}
+    if chosen is not None:
+        environment["OMP_WAIT_POLICY"] = chosen
+    code, printed = run(tmp_path, environment, "--cfg", "job")
+    assert code == 0
+    assert f"OMP_WAIT_POLICY = '{found}'" in printed
+
+
 def test_multirun_names_the_failed_job(tmp_path, environment):
     tiny = [each for each in TINY if not each.startswith("trainer.steps")]
     arguments = [*tiny, "loss=cql", "trainer.steps=0,20", "hydra.sweep.dir=sweep"]
