@@ -8,6 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchrl_osr.evaluation import mean_interval
+from torchrl_osr.evaluation.statistics import (
+    interquartile_mean,
+    nested_resamples,
+    percentile_interval,
+    performance_profile,
+    stratified_resamples,
+)
 
 FINITE = st.floats(-1e6, 1e6)
 
@@ -45,3 +52,89 @@ def test_single_value_is_its_own_interval():
 def test_no_or_non_finite_values_are_an_error(values):
     with pytest.raises(ValueError, match="finite"):
         mean_interval(values)
+
+
+def test_interquartile_mean_is_that_of_the_sorted_middle():
+    # By hand: of eight values two go at each end, of nine two as well.
+    assert interquartile_mean([9, 1, 100, 2, 3, -50, 4, 8]) == (2 + 3 + 4 + 8) / 4
+    assert (
+        interquartile_mean([9, 1, 100, 2, 3, -50, 4, 8, 5]) == (2 + 3 + 4 + 5 + 8) / 5
+    )
+    assert interquartile_mean([7.0]) == 7
+    rows = np.random.default_rng(0).normal(size=(5, 12))
+    wanted = [sum(sorted(row)[3:9]) / 6 for row in rows.tolist()]
+    np.testing.assert_allclose(interquartile_mean(rows), wanted)
+
+
+def test_profile_of_a_known_sample():
+    # Strictly above, so a score counts for no threshold that equals it.
+    scores = [[0.0, 10.0, 10.0, 40.0], [50.0, 60.0, 70.0, 80.0]]
+    profile = performance_profile(scores, [-1, 0, 10, 39, 45, 80])
+    np.testing.assert_array_equal(
+        profile, [[1, 0.75, 0.25, 0.25, 0, 0], [1, 1, 1, 1, 1, 0]]
+    )
+
+
+@given(st.lists(st.integers(1, 4), min_size=1, max_size=3), FINITE)
+def test_resamples_of_a_constant_are_that_constant(sizes, value):
+    runs = [np.full((size, 2), value) for size in sizes]
+    np.testing.assert_allclose(nested_resamples(runs, num_resamples=20), value)
+    strata = [np.full(size, value) for size in sizes]
+    resamples = stratified_resamples(strata, num_resamples=20)
+    assert resamples.shape == (20, sum(sizes))
+    assert (resamples == value).all()
+    low, high = percentile_interval(interquartile_mean(resamples))
+    assert low == high == pytest.approx(value)
+
+
+def test_strata_keep_their_places_and_sizes():
+    resamples = stratified_resamples([[1, 2], [10, 20, 30]])
+    assert set(np.unique(resamples[:, :2])) == {1, 2}
+    assert set(np.unique(resamples[:, 2:])) == {10, 20, 30}
+
+
+def test_nested_resamples_spread_as_theory_says():
+    # Of S runs of E episodes with unit variances between and within: resampling runs
+    # and then episodes has the variance (between + within / E) / S of the sample.
+    rng = np.random.default_rng(0)
+    runs = [rng.normal(loc, 1, size=(25, 1)) for loc in rng.normal(size=12)]
+    means = np.array([run.mean() for run in runs])
+    within = np.mean([run.var() for run in runs]) / 25
+    resamples = nested_resamples(runs, num_resamples=10_000)
+    assert resamples.mean() == pytest.approx(means.mean(), abs=0.02)
+    assert resamples.var() == pytest.approx((means.var() + within) / 12, rel=0.06)
+
+
+def test_nested_resamples_are_those_of_a_loop_over_draws():
+    # An independent restatement: draw a run, then its episodes one by one.
+    runs = [np.array([[0.0], [1.0], [5.0]]), np.array([[10.0], [12.0]])]
+    rng = np.random.default_rng(1)
+    loop = [
+        np.mean([
+            np.mean([run[rng.integers(len(run)), 0] for _ in run])
+            for run in (runs[rng.integers(2)] for _ in runs)
+        ])
+        for _ in range(8000)
+    ]  # fmt: skip
+    ours = nested_resamples(runs, num_resamples=8000)[:, 0]
+    for share in (5, 25, 50, 75, 95):
+        wanted = np.percentile(loop, share)
+        assert np.percentile(ours, share) == pytest.approx(wanted, abs=0.35)
+
+
+def test_numbers_of_an_episode_stay_together():
+    first = np.random.default_rng(0).normal(size=(30, 1))
+    resamples = nested_resamples([np.hstack([first, 3 - first])] * 2)
+    np.testing.assert_allclose(resamples.sum(1), 3)
+
+
+@pytest.mark.parametrize("runs", [[], [np.ones((0, 2))], [np.ones(3)]])
+def test_no_episodes_are_an_error(runs):
+    with pytest.raises(ValueError, match="episodes"):
+        nested_resamples(runs)
+
+
+@pytest.mark.parametrize("strata", [[], [[1.0], []]])
+def test_an_empty_stratum_is_an_error(strata):
+    with pytest.raises(ValueError, match="every stratum"):
+        stratified_resamples(strata)

@@ -1,16 +1,25 @@
-"""Means and intervals that a claim can stand on."""
+"""Means and intervals that a claim can stand on.
+
+Shapes: ``E`` episodes of a run, ``K`` numbers of an episode, ``R`` resamples, ``N``
+runs, ``T`` thresholds.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+
+NUM_RESAMPLES = 2000
+"""Bootstrap resamples of every interval."""
 
 
 def mean_interval(
     values: ArrayLike,
     *,
     confidence: float = 0.95,
-    num_resamples: int = 2000,
+    num_resamples: int = NUM_RESAMPLES,
     seed: int = 0,
 ) -> tuple[float, float, float]:
     """Return the mean and its percentile-bootstrap confidence interval.
@@ -42,3 +51,131 @@ def mean_interval(
     tail = 50 * (1 - confidence)
     low, high = np.percentile(resamples.mean(1), [tail, 100 - tail])
     return float(sample.mean()), float(low), float(high)
+
+
+def percentile_interval(
+    resamples: NDArray[np.float64], *, confidence: float = 0.95
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return lower and upper end of the percentile interval, over the first axis.
+
+    Args:
+        resamples: a statistic of each resample, ``[R, ...]``.
+
+    Keyword Args:
+        confidence: coverage of the interval. Default 0.95.
+    """
+    tail = 50 * (1 - confidence)
+    low, high = np.percentile(resamples, [tail, 100 - tail], axis=0)
+    return low, high
+
+
+def nested_resamples(
+    runs: Sequence[ArrayLike], *, num_resamples: int = NUM_RESAMPLES, seed: int = 0
+) -> NDArray[np.float64]:
+    """Return means over resampled runs, and in each of them resampled episodes.
+
+    The numbers of an episode stay together, so that a ratio or a difference of them is
+    one of pairs. With one run only its episodes are resampled.
+
+    Args:
+        runs: numbers of the episodes of each run, ``[E, K]``; ``E`` may differ.
+
+    Keyword Args:
+        num_resamples: ``R``. Default 2000.
+        seed: of the resampling. Default 0.
+
+    Returns:
+        Means, every run with equal weight, ``[R, K]``.
+
+    Raises:
+        ValueError: if there are no runs, or one of them has no episodes.
+
+    Examples:
+        >>> resamples = nested_resamples([[[1.0, 5.0]] * 3, [[1.0, 5.0]] * 4])
+        >>> resamples.shape, resamples[0].tolist()
+        ((2000, 2), [1.0, 5.0])
+    """
+    tables = [np.asarray(run, dtype=np.float64) for run in runs]
+    if not tables or any(table.ndim != 2 or not len(table) for table in tables):
+        shapes = [table.shape for table in tables]
+        raise ValueError(f"nested_resamples needs episodes [E, K], got {shapes}.")
+    rng = np.random.default_rng(seed)
+    drawn = rng.integers(len(tables), size=(num_resamples, len(tables)))
+    total = np.zeros((num_resamples, tables[0].shape[1]))
+    for place in drawn.T:
+        for number, table in enumerate(tables):
+            rows = np.flatnonzero(place == number)
+            size = len(table)
+            # How often each episode is drawn: the same as drawing them, and faster.
+            counts = rng.multinomial(size, np.full(size, 1 / size), size=len(rows))
+            total[rows] += counts @ table / size
+    return total / len(tables)
+
+
+def stratified_resamples(
+    strata: Sequence[ArrayLike], *, num_resamples: int = NUM_RESAMPLES, seed: int = 0
+) -> NDArray[np.float64]:
+    """Return resamples that keep the number of runs of every stratum.
+
+    Args:
+        strata: a number of each run, a sequence for each data set.
+
+    Keyword Args:
+        num_resamples: ``R``. Default 2000.
+        seed: of the resampling. Default 0.
+
+    Returns:
+        The runs of all strata side by side, ``[R, N]``.
+
+    Raises:
+        ValueError: if there are no strata, or one of them is empty.
+    """
+    samples = [np.asarray(stratum, dtype=np.float64) for stratum in strata]
+    if not samples or not all(sample.size for sample in samples):
+        raise ValueError("stratified_resamples needs a value in every stratum.")
+    rng = np.random.default_rng(seed)
+    return np.concatenate(
+        [
+            sample[rng.integers(sample.size, size=(num_resamples, sample.size))]
+            for sample in samples
+        ],
+        axis=1,
+    )
+
+
+def interquartile_mean(values: ArrayLike) -> NDArray[np.float64]:
+    """Return the mean without the lowest and the highest quarter, over the last axis.
+
+    As rliable has it (Agarwal et al., 2021, https://arxiv.org/abs/2108.13264): of ``N``
+    values ``N // 4`` are left out at each end.
+
+    Examples:
+        >>> float(interquartile_mean([0.0, 3.0, 5.0, 1000.0]))
+        4.0
+    """
+    ordered = np.sort(np.asarray(values, dtype=np.float64), axis=-1)
+    cut = ordered.shape[-1] // 4
+    mean: NDArray[np.float64] = ordered[..., cut : ordered.shape[-1] - cut].mean(-1)
+    return mean
+
+
+def performance_profile(
+    values: ArrayLike, thresholds: ArrayLike
+) -> NDArray[np.float64]:
+    """Return the share of values above each threshold, over the last axis.
+
+    Args:
+        values: scores, ``[..., N]``.
+        thresholds: ``[T]``.
+
+    Returns:
+        Shares between 0 and 1, ``[..., T]``.
+
+    Examples:
+        >>> performance_profile([10.0, 20.0, 30.0, 40.0], [0.0, 20.0, 50.0]).tolist()
+        [1.0, 0.5, 0.0]
+    """
+    table = np.asarray(values, dtype=np.float64)
+    # One threshold after the other: all at once would fill the memory.
+    shares = [(table > each).mean(-1) for each in np.asarray(thresholds)]
+    return np.stack(shares, axis=-1)
