@@ -26,9 +26,11 @@ PACKAGES = [
     for name in (
         "",
         ".data",
+        ".envs",
         ".evaluation",
         ".modules",
         ".objectives",
+        ".report",
         ".trainers",
         ".transforms",
     )

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import torch
@@ -20,8 +20,17 @@ from torchrl.envs import ObservationNorm
 from torchrl_osr.data import make_environment, normalized_score
 from torchrl_osr.evaluation.statistics import mean_interval
 
+if TYPE_CHECKING:
+    import gymnasium
+
 Policy = Callable[[Tensor], Tensor]
 """Maps observations ``[E, S]`` as the environment gives them to actions ``[E, A]``."""
+
+Wrap: TypeAlias = "Callable[[gymnasium.Env[Any, Any]], gymnasium.Env[Any, Any]]"
+"""Puts wrappers around an environment."""
+
+Watch = Callable[[int, NDArray[Any], bool, dict[str, Any]], None]
+"""Is told episode, observation ``[S]``, terminated and info at each reset and step."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +86,11 @@ class EpisodeEvaluator:
         num_episodes: ``E``. Default 10.
         seed: the episodes are seeded ``seed, seed + 1, ...``. Default 0.
         device: where the policy is. Default CPU.
+        wrap: put around each environment. Default: nothing.
+        fixed_batch: call the policy with all ``E`` rows to the end, those of finished
+            episodes as they were left. How torch rounds depends on the number of rows;
+            with it fixed, an episode does not depend on when others end. Default
+            ``False``.
 
     Examples:
         >>> import torch
@@ -93,33 +107,50 @@ class EpisodeEvaluator:
         num_episodes: int = 10,
         seed: int = 0,
         device: torch.device | str = "cpu",
+        wrap: Wrap | None = None,
+        fixed_batch: bool = False,
     ) -> None:
         if num_episodes < 1:
             raise ValueError(f"num_episodes must be at least 1, got {num_episodes}.")
         self.environments = [make_environment(env_id) for _ in range(num_episodes)]
+        if wrap is not None:
+            self.environments = [wrap(each) for each in self.environments]
         self.seeds = seed + np.arange(num_episodes)
         self.device = device
+        self.fixed_batch = fixed_batch
 
-    def __call__(self, policy: Policy) -> EpisodeResults:
-        """Return the raw results of one episode a seed."""
+    def __call__(self, policy: Policy, watch: Watch | None = None) -> EpisodeResults:
+        """Return the raw results of one episode a seed.
+
+        Args:
+            policy: the same for all episodes.
+            watch: told what happens in each step. Default: nobody.
+        """
         episodes = len(self.environments)
         returns = np.zeros(episodes)
         lengths = np.zeros(episodes, dtype=np.int64)
-        observations = np.stack(
-            [
-                environment.reset(seed=int(seed))[0]
-                for environment, seed in zip(self.environments, self.seeds, strict=True)
-            ]
-        ).astype(np.float32)
+        starts = [
+            environment.reset(seed=int(seed))
+            for environment, seed in zip(self.environments, self.seeds, strict=True)
+        ]
+        observations = np.stack([start for start, _ in starts]).astype(np.float32)
+        if watch is not None:
+            for episode, (start, info) in enumerate(starts):
+                watch(episode, start, False, info)
         running = np.arange(episodes)
         while running.size:
-            batch = torch.from_numpy(observations[running]).to(self.device)
+            rows = np.arange(episodes) if self.fixed_batch else running
+            batch = torch.from_numpy(observations[rows]).to(self.device)
             actions = policy(batch).cpu().numpy()
             unfinished = np.ones(running.size, dtype=bool)
-            for row, episode in enumerate(running):
-                observation, reward, terminated, truncated, _ = self.environments[
+            if self.fixed_batch:
+                actions = actions[running]
+            for row, episode in enumerate(running.tolist()):
+                observation, reward, terminated, truncated, info = self.environments[
                     episode
                 ].step(actions[row])
+                if watch is not None:
+                    watch(episode, observation, terminated, info)
                 observations[episode] = observation
                 returns[episode] += float(reward)
                 lengths[episode] += 1

@@ -1,0 +1,155 @@
+"""Disturb a trained policy: what does it lose, and does it come back to its data?
+
+    python examples/evaluate.py checkpoint=outputs/hopper-medium-replay/seed0-...
+    python examples/evaluate.py checkpoint=<run's folder> suite=torque episodes=20
+    python examples/evaluate.py checkpoint=<run's folder>/checkpoint/policy/best.torchrl
+
+Each of the run's last checkpoints plays pairs of episodes, one of each pair disturbed.
+The run's folder gets ``robustness-<suite>.json``, all raw results, and a figure of the
+same name. What is measured is in ``docs/robustness.md``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import hydra
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torchrl import torchrl_logger
+from tqdm.auto import tqdm
+
+from torchrl_osr import evaluate_config
+from torchrl_osr.data import load_mixture, observation_statistics
+from torchrl_osr.evaluation.data_distance import DataDistance
+from torchrl_osr.evaluation.episodes import deterministic_policy
+from torchrl_osr.evaluation.robustness import evaluate_paired
+from torchrl_osr.evaluation.robustness_figure import robustness_figure
+from torchrl_osr.evaluation.robustness_summary import (
+    evaluation_json,
+    summarize_levels,
+)
+from torchrl_osr.evaluation.robustness_table import robustness_table
+from torchrl_osr.evaluation.suite import make_levels
+from torchrl_osr.evaluation.trained_run import (
+    checkpoints_of,
+    load_trained,
+    run_folder_of,
+)
+from torchrl_osr.trainers import run_folder
+
+JSON_FORMAT = 1
+SEED_STRIDE = 1000  # between checkpoints: no two of them play the same episodes
+PACKAGES = ("torchrl-osr", "torch", "torchrl", "tensordict", "gymnasium", "mujoco")
+
+evaluate_config.register()
+
+
+@hydra.main(version_base="1.3", config_path="../conf", config_name="evaluate")
+def main(cfg: DictConfig) -> None:
+    """Evaluate, unless it is done already, and print the table."""
+    torchrl_logger.setLevel("WARNING")
+    torch.set_num_threads(cfg.num_threads)
+    if min(cfg.last, cfg.episodes - 1) < 1:
+        raise ValueError(
+            f"last must be at least 1 and episodes at least 2, got last={cfg.last}, "
+            f"episodes={cfg.episodes}: one pair of episodes has no interval."
+        )
+    folder = run_folder_of(cfg.checkpoint)
+    files, name = [Path(cfg.checkpoint)], f"robustness-{cfg.suite.name}"
+    if files[0].is_dir():
+        files = checkpoints_of(folder)[-cfg.last :]
+    else:
+        name = f"{files[0].stem}-{name}"  # beside the one of the whole run
+    path = folder / f"{name}.json"
+    request = requested(cfg, files)
+    results = finished(path, request)
+    if cfg.force or results is None:
+        results = request | evaluate(cfg, files)
+        run_folder.write_json(path, results)
+    else:
+        print(f"{path} is there already; force=true does it again.")
+    figure = path.with_suffix(".png")
+    title = (
+        f"{results['env']} {results['data']}, suite {cfg.suite.name}: "
+        f"{len(files)} x {cfg.episodes} pairs of episodes"
+    )
+    robustness_figure(results["summary"], results["evaluations"], figure, title=title)
+    print("\n" + robustness_table(title, results["summary"]))
+    print(f"  files  {path}\n         {figure}")
+
+
+def requested(cfg: DictConfig, files: list[Path]) -> dict[str, Any]:
+    """Return what decides the results: settings, the checkpoints' bits, versions."""
+    return {
+        "format": JSON_FORMAT,
+        "versions": {each.replace("-", "_"): version(each) for each in PACKAGES},
+        "suite": cfg.suite.name,
+        "levels": OmegaConf.to_container(cfg.suite.levels, resolve=True),
+        "episodes": cfg.episodes,
+        "seed": cfg.seed,
+        "checkpoints": {
+            file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files
+        },
+    }
+
+
+def finished(path: Path, request: dict[str, Any]) -> dict[str, Any] | None:
+    """Return what an evaluation of the same request has left, if there was one."""
+    if not path.exists():
+        return None
+    results: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    # Through JSON, as the file's: it knows no tuples.
+    same = json.loads(json.dumps(request)).items() <= results.items()
+    return results if same else None
+
+
+def evaluate(cfg: DictConfig, files: list[Path]) -> dict[str, Any]:
+    """Play all checkpoints of one run."""
+    run = load_trained(files[0]).config
+    data, _ = load_mixture(
+        run.env.name,
+        run.data.level,
+        random_share=run.data.get("random_share", 0.0),  # older runs do not say
+        num_transitions=run.data.num_transitions,
+        seed=run.data.seed,
+        progress=cfg.progress,
+    )
+    distance = DataDistance(data, seed=run.data.seed)
+    _, scale = observation_statistics(data)
+    evaluations = []
+    bar = tqdm(
+        total=len(files) * (len(cfg.suite.levels) + 1),  # the clean episodes are one
+        desc=cfg.suite.name,
+        unit="level",
+        disable=None if cfg.progress else True,  # None: silent off a terminal
+    )
+    with bar:
+        for number, file in enumerate(files):
+            trained = load_trained(file)
+            seed = cfg.seed + SEED_STRIDE * number
+            paired = evaluate_paired(
+                deterministic_policy(trained.actor, trained.observation_norm),
+                run.env.id,
+                make_levels(cfg.suite.levels, trained, scale.numpy(), seed=seed),
+                distance,
+                num_episodes=cfg.episodes,
+                seed=seed,
+                advance=bar.update,
+            )
+            evaluations.append(evaluation_json(trained.step, paired, run.env.name))
+    return {
+        "env": run.env.name,
+        "data": run.data.level,
+        "threshold": distance.threshold,
+        "evaluations": evaluations,
+        "summary": summarize_levels(evaluations),
+    }
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,123 @@
+"""Survival and the way back, on trajectories that were written down by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_osr.evaluation.recovery import (
+    STEPS_AFTER,
+    STEPS_BEFORE,
+    Recorder,
+    Trajectory,
+    disturbed_at,
+    measure_recovery,
+)
+
+
+class Distance:
+    """The first number of an observation; up to 2 is in the data."""
+
+    threshold = 2.0
+
+    def __call__(self, rows: torch.Tensor) -> torch.Tensor:
+        return rows[:, 0]
+
+
+def trajectory(distances, disturbed=(), *, fell=False) -> Trajectory:
+    """Entry 0 is the reset."""
+    rows = [np.array([each, 9.0], dtype=np.float32) for each in distances]
+    return Trajectory(rows, [i in disturbed for i in range(len(rows))], fell)
+
+
+def measure(*disturbed: Trajectory, clean: Trajectory | None = None):
+    clean = clean or trajectory([1.0] * 200)
+    return measure_recovery(disturbed, [clean] * len(disturbed), Distance())
+
+
+@pytest.mark.parametrize(
+    ("after", "fell", "survived", "alive", "steps"),
+    [
+        ([2.0, 3.0], False, True, None, 0),  # at the threshold is within
+        ([3.0, 2.1, 1.9, 5.0], False, True, None, 2),
+        ([3.0] * 50, False, True, None, None),  # never back before the end
+        ([3.0] * 120 + [1.0], False, True, True, 120),  # later than the curve
+        ([3.0], True, False, False, None),  # fell in the disturbance
+        ([1.0], True, False, False, None),  # and where it lies is in the data
+        ([3.0, 3.0, 1.0], True, True, False, None),  # the same, a little later
+        ([3.0, 1.0, 3.0], True, True, False, 1),  # back, and fell afterwards
+        ([3.0] * 101, True, True, False, None),  # fell in the last step that counts
+        ([3.0] * 102, True, True, True, None),  # fell one later
+        ([3.0] * 101, False, True, True, None),  # the time limit, just not too early
+        ([3.0] * 100, False, True, None, None),  # too early to say
+    ],
+)
+def test_one_episode(after, fell, survived, alive, steps):
+    before = [1.0, 1.0, 4.0]
+    recovery = measure(trajectory([*before, *after], {2, 3}, fell=fell))
+    assert recovery.ended_at == [2]
+    assert recovery.survived == [survived]
+    assert recovery.alive_after == [alive]
+    assert recovery.steps == [steps]
+
+
+def test_episodes_without_the_disturbance_say_nothing():
+    recovery = measure(trajectory([1.0, 9.0, 9.0], fell=True))
+    for entry in (recovery.ended_at, recovery.survived, recovery.alive_after):
+        assert entry == [None]
+    assert recovery.steps == recovery.clean_alive_after == [None]
+    assert set(recovery.distance.mean()) == {None}
+
+
+@pytest.mark.parametrize(
+    ("disturbed", "step"), [(set(), None), ({0}, 0), ({1}, 0), ({3, 4}, 2)]
+)
+def test_moment_counts_steps_from_zero(disturbed, step):
+    assert disturbed_at(trajectory([1.0] * 6, disturbed)) == step
+
+
+def test_the_first_of_two_disturbances_counts():
+    recovery = measure(trajectory([1, 1, 4, 3, 1, 1, 8, 8], {2, 6}))
+    assert recovery.ended_at == [1]
+    assert recovery.steps == [2]
+
+
+def test_undisturbed_pairs_are_looked_at_at_the_same_step():
+    disturbed = trajectory([1.0, 4.0, 1.0, 1.0], {1})
+    fallen = trajectory([1.0] * 50, fell=True)
+    whole = trajectory([1.0] * 150, fell=True)
+    ended = trajectory([1.0] * 50)
+    recovery = measure_recovery([disturbed] * 3, [fallen, whole, ended], Distance())
+    assert recovery.clean_alive_after == [False, True, None]
+    offset = STEPS_BEFORE + 60
+    assert recovery.clean_distance.count[STEPS_BEFORE] == 3
+    assert recovery.clean_distance.count[offset] == 1
+
+
+def test_curve_is_the_mean_of_those_who_are_there():
+    long = trajectory([1.0] * 20 + [6.0] + [2.0] * 200, {20})
+    short = trajectory([1.0, 1.0, 4.0, 3.0], {2}, fell=True)
+    recovery = measure(long, short)
+    mean, count = recovery.distance.mean(), recovery.distance.count
+    assert len(mean) == len(count) == STEPS_BEFORE + 1 + STEPS_AFTER
+    # In units of the threshold, 2: (6 + 4) / 2 / 2 and (2 + 3) / 2 / 2.
+    assert mean[STEPS_BEFORE : STEPS_BEFORE + 3] == [2.5, 1.25, 1.0]
+    assert count[STEPS_BEFORE : STEPS_BEFORE + 3].tolist() == [2, 2, 1]
+    assert count[:STEPS_BEFORE].tolist() == [1] * 8 + [2] * 2  # the reset is entry 0
+    assert count[-1] == 1
+    assert mean[0] == 0.5
+
+
+def test_recorder_keeps_what_it_was_told():
+    recorder = Recorder(2)
+    row = np.array([1.0, 2.0])
+    recorder(1, row, False, {})
+    row[:] = 7  # an environment may use its array again
+    recorder(1, row, True, {"disturbed": True})
+    kept = recorder.trajectories[1]
+    assert np.stack(kept.observations).tolist() == [[1, 2], [7, 7]]
+    assert kept.disturbed == [False, True]
+    assert kept.terminated
+    assert kept.last == 1
+    assert recorder.trajectories[0].observations == []

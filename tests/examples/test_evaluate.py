@@ -1,0 +1,202 @@
+"""Train a tiny run, disturb it: the two examples as a user runs them."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.errors import ConfigCompositionException, MissingConfigException
+from omegaconf import OmegaConf
+
+from torchrl_osr import evaluate_config
+from torchrl_osr.data import make_environment
+from torchrl_osr.evaluation.robustness import check_levels
+from torchrl_osr.evaluation.suite import make_levels
+from torchrl_osr.evaluation.trained_run import load_trained
+
+ROOT = Path(__file__).parents[2]
+SUITES = sorted(path.stem for path in (ROOT / "conf" / "suite").glob("*.yaml"))
+TINY = [
+    "data=random",
+    "data.num_transitions=600",
+    "data.held_out=0.1",
+    "network.num_cells=[8]",
+    "trainer.batch_size=8",
+    "trainer.inverse_dynamics_steps=10",
+    "trainer.steps=30",
+    "trainer.log_interval=10",
+    "trainer.eval_interval=30",
+    "trainer.eval_episodes=2",
+    "trainer.checkpoint_interval=10",
+]
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory):
+    cache = str(tmp_path_factory.mktemp("cache"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TORCHRL_OSR_CACHE", cache)
+        patch.setenv("OMP_NUM_THREADS", "1")
+        yield dict(os.environ)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, environment) -> Path:
+    """A run with three checkpoints."""
+    cwd = tmp_path_factory.mktemp("evaluate")
+    start(cwd, environment, "offline_osr.py", *TINY, "hydra.run.dir=run")
+    return cwd / "run"
+
+
+def start(cwd: Path, environment: dict[str, str], script: str, *arguments: str) -> str:
+    command = [sys.executable, str(ROOT / "examples" / script), *arguments]
+    process = subprocess.run(
+        command, cwd=cwd, env=environment, text=True, timeout=240,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    )  # fmt: skip
+    assert process.returncode == 0, process.stdout
+    return process.stdout
+
+
+@pytest.fixture(scope="module")
+def example():
+    """The script as a module: without the start of a process for each case."""
+    path = ROOT / "examples" / "evaluate.py"
+    spec = importlib.util.spec_from_file_location("evaluate_example", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def evaluated(folder, environment) -> str:
+    """Run as a user would; the other tests take it from there."""
+    return start(
+        folder.parent, environment, "evaluate.py", "checkpoint=run", "episodes=2",
+        "last=2", "progress=false",
+    )  # fmt: skip
+
+
+def composed(*overrides: str):
+    evaluate_config.register()
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        return compose("evaluate", ["progress=false", *overrides])
+
+
+def test_table_json_and_figure_are_left_in_the_runs_folder(folder, evaluated):
+    levels = composed("checkpoint=run").suite.levels
+    results = json.loads((folder / "robustness-oos.json").read_text())
+    assert results["format"] == 1
+    assert results["suite"] == "oos"
+    assert (results["env"], results["data"]) == ("hopper", "random")
+    assert {"torchrl_osr", "torch", "mujoco"} < results["versions"].keys()
+    assert results["threshold"] > 0
+    assert [each["step"] for each in results["evaluations"]] == [20, 30]
+    seeds = [each["clean"]["seeds"] for each in results["evaluations"]]
+    assert seeds == [[20_000, 20_001], [21_000, 21_001]]
+    for each in results["evaluations"]:
+        assert [level["name"] for level in each["levels"]] == list(levels)
+        for level in each["levels"]:
+            assert level["seeds"] == each["clean"]["seeds"]
+            assert len(level["returns"]) == len(level["scores"]) == 2
+    assert [row["name"] for row in results["summary"]] == list(levels)
+    assert (folder / "robustness-oos.png").read_bytes().startswith(b"\x89PNG")
+    for name in levels:
+        assert name in evaluated
+    assert str(folder / "robustness-oos.json") in evaluated or "run/" in evaluated
+    for word in ("Warning", "Traceback"):
+        assert word not in evaluated
+    left = {path.name for path in folder.parent.iterdir()}
+    assert left == {"run"}, "nothing is left where it was called from"
+
+
+def test_finished_evaluation_is_not_done_again(folder, evaluated, example, capsys):
+    path = folder / "robustness-oos.json"
+    before = path.stat().st_mtime_ns
+    same = ["episodes=2", "last=2", f"checkpoint={folder}"]
+    example.main(composed(*same))
+    assert "is there already" in capsys.readouterr().out
+    assert path.stat().st_mtime_ns == before
+    content = json.loads(path.read_text())
+    example.main(composed(*same, "force=true"))
+    assert path.stat().st_mtime_ns > before
+    assert json.loads(path.read_text()) == content, "the same numbers again"
+    example.main(composed(*same, "seed=5"))
+    assert json.loads(path.read_text())["evaluations"] != content["evaluations"]
+
+
+def test_one_checkpoint_has_a_file_of_its_own(folder, example):
+    best = folder / "checkpoint" / "policy" / "best.torchrl"
+    example.main(composed(f"checkpoint={best}", "episodes=2", "suite=start"))
+    results = json.loads((folder / "best-robustness-start.json").read_text())
+    assert len(results["evaluations"]) == 1
+    assert not (folder / "robustness-start.json").exists()
+
+
+@pytest.mark.parametrize("env_id", ["Walker2d-v5", "HalfCheetah-v5"])
+def test_every_suite_is_possible_for_other_environments(folder, env_id):
+    trained = load_trained(folder)
+    environment = make_environment(env_id)
+    scale = np.full(environment.observation_space.shape, 0.5)
+    environment.close()
+    for name in SUITES:
+        suite = composed(f"suite={name}", "checkpoint=none").suite
+        assert suite.name == name
+        levels = make_levels(suite.levels, trained, scale)
+        assert len(levels) >= 3
+        check_levels(env_id, [each for each in levels if each.wrap] or levels)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "error", "named"),
+    [
+        (["episodes=1"], ValueError, "episodes=1"),
+        (["last=0"], ValueError, "last=0"),
+        (["checkpoint=nowhere"], FileNotFoundError, "nowhere"),
+        (["checkpoint=/"], FileNotFoundError, r"config\.yaml"),
+        (["suite=out"], MissingConfigException, "torque"),
+        (["episode=2"], ConfigCompositionException, "episode"),
+        (["suite.levels.mass.kindd=a"], ConfigCompositionException, "kindd"),
+        (["episodes=many"], ConfigCompositionException, "many"),
+    ],
+)
+def test_bad_input_is_named(example, folder, overrides, error, named):
+    with pytest.raises(error, match=named):
+        example.main(composed(f"checkpoint={folder}", *overrides))
+
+
+def test_level_needs_one_of_wrapper_and_attack(folder):
+    suite = composed("suite=start", "checkpoint=none").suite
+    name = next(iter(suite.levels))
+    suite.levels[name].wrap = None
+    with pytest.raises(ValueError, match=f"{name}' needs either"):
+        make_levels(suite.levels, load_trained(folder), np.full(11, 0.5))
+
+
+def test_attacks_need_standardised_networks(folder):
+    suite = composed("suite=observation_attack", "checkpoint=none").suite
+    trained = load_trained(folder)
+    trained.config.data.standardize = False
+    with pytest.raises(ValueError, match="data.standardize=false"):
+        make_levels(suite.levels, trained, np.full(11, 0.5))
+
+
+def test_every_key_and_suite_is_documented():
+    page = (ROOT / "docs" / "robustness.md").read_text(encoding="utf-8")
+    rows = dict(re.findall(r"(?m)^\| `([\w.]+)` \| `(.+?)` \|", page))
+    cfg = OmegaConf.to_container(composed())
+    del cfg["suite"]
+    assert cfg.keys() == {key for key in rows if key in cfg}
+    for key, value in cfg.items():
+        if value != "???" and key != "progress":
+            assert OmegaConf.create(f"[{rows[key]}]")[0] == value, key
+    for name in SUITES:
+        assert f"| `{name}` |" in page

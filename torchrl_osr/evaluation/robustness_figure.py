@@ -1,0 +1,153 @@
+"""The figure of an evaluation under disturbances."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchrl_osr.evaluation.figures import BLUE, GREY
+
+try:
+    from matplotlib import colormaps
+    from matplotlib.axes import Axes
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+except ImportError as error:
+    raise ImportError(
+        f"figures need {error.name!r}: pip install torchrl-osr[examples]"
+    ) from error
+
+UNDISTURBED = "undisturbed"
+
+# Colour-blind readers can tell them apart, and a printer too.
+COLORS = colormaps["viridis"]
+
+
+def robustness_figure(
+    summary: Sequence[Mapping[str, Any]],
+    evaluations: Sequence[Mapping[str, Any]],
+    path: Path | str,
+    *,
+    title: str,
+) -> None:
+    """Draw the score at each level, and the distance to the data after disturbances.
+
+    Where each kind has several strengths, the score is over the strength; otherwise
+    one line a level. Without a disturbance that ends there is no second panel.
+
+    Args:
+        summary: of
+            :func:`~torchrl_osr.evaluation.robustness_summary.summarize_levels`.
+        evaluations: the raw results that it summarises.
+        path: the PNG to write.
+
+    Keyword Args:
+        title: what was evaluated.
+    """
+    curves = distance_curves(evaluations)
+    figure = Figure(figsize=(11 if curves else 6.5, 4.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title)
+    axes = figure.subplots(1, 2 if curves else 1, squeeze=False)[0]
+    series: dict[str, list[Mapping[str, Any]]] = {}
+    for row in summary:
+        series.setdefault(row["kind"], []).append(row)
+    strengths = [{row["strength"] for row in rows} for rows in series.values()]
+    sweep = all(len(each) > 1 for each in strengths) and (
+        sum(map(len, strengths)) == len(summary)
+    )
+    (_over_strength if sweep else _one_by_one)(axes[0], series)
+    clean = summary[0]["clean_score"]
+    line = axes[0].axhline if sweep else axes[0].axvline
+    line(clean, color=GREY, linestyle="--", linewidth=1, label=UNDISTURBED)
+    axes[0].legend(frameon=False, fontsize=8)
+    if curves:
+        _draw_curves(axes[1], curves)
+    for each in figure.axes:
+        each.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=150)
+
+
+def distance_curves(
+    evaluations: Sequence[Mapping[str, Any]],
+) -> dict[str, tuple[list[int], list[float]]]:
+    """Return mean distances over all checkpoints by level, as offsets and values.
+
+    Also those of the undisturbed episodes, all levels' together, as ``"undisturbed"``.
+    Offsets with fewer than a tenth of the episodes there at offset 0 are left out: a
+    mean of the last one or two on their feet says nothing about the level.
+
+    Args:
+        evaluations: raw results; levels without a distance are left out.
+    """
+    parts: dict[str, list[tuple[Any, Any]]] = {}
+    offset: list[int] = []
+    for level in (level for each in evaluations for level in each["levels"]):
+        distance = level["distance"]
+        if distance is None:
+            continue
+        offset = distance["offset"]
+        for name, prefix in ((level["name"], ""), (UNDISTURBED, "clean_")):
+            pair = distance[f"{prefix}mean"], distance[f"{prefix}count"]
+            parts.setdefault(name, []).append(pair)
+    curves = {}
+    for name, pairs in parts.items():
+        mean, count = (np.array(each, dtype=float) for each in zip(*pairs, strict=True))
+        episodes = count.sum(0)
+        shown = episodes >= max(0.1 * episodes[offset.index(0)], 1)
+        total = np.where(count > 0, mean * count, 0).sum(0)  # None became NaN
+        curves[name] = (
+            np.array(offset)[shown].tolist(),
+            (total[shown] / episodes[shown]).tolist(),
+        )
+    return {name: curve for name, curve in curves.items() if curve[0]}
+
+
+def _over_strength(axes: Axes, series: Mapping[str, list[Mapping[str, Any]]]) -> None:
+    colors = COLORS(np.linspace(0.1, 0.8, len(series)))
+    for color, (kind, rows) in zip(colors, series.items(), strict=True):
+        rows = sorted(rows, key=lambda row: float(row["strength"]))
+        x = [row["strength"] for row in rows]
+        axes.fill_between(
+            x, [row["score_low"] for row in rows], [row["score_high"] for row in rows],
+            color=color, alpha=0.15, linewidth=0,
+        )  # fmt: skip
+        axes.plot(x, [row["score"] for row in rows], "o-", color=color, label=kind)
+    axes.set(
+        xlabel="strength", ylabel="normalised score (95 % interval)", ylim=(0, None)
+    )
+
+
+def _one_by_one(axes: Axes, series: Mapping[str, list[Mapping[str, Any]]]) -> None:
+    rows = [row for each in series.values() for row in each][::-1]
+    score = np.array([row["score"] for row in rows])
+    ends = np.array([[row["score_low"], row["score_high"]] for row in rows]).T
+    axes.errorbar(
+        score, range(len(rows)), xerr=np.abs(ends - score), fmt="o", color=BLUE,
+        capsize=3, label="disturbed (mean, 95 % interval)",
+    )  # fmt: skip
+    axes.set_yticks(range(len(rows)), [row["name"] for row in rows])
+    axes.set(xlabel="normalised score", xlim=(min(0, ends.min()), None))
+
+
+def _draw_curves(
+    axes: Axes, curves: Mapping[str, tuple[list[int], list[float]]]
+) -> None:
+    levels = {name: curve for name, curve in curves.items() if name != UNDISTURBED}
+    colors = COLORS(np.linspace(0, 0.9, len(levels)))
+    for color, (name, curve) in zip(colors, levels.items(), strict=True):
+        axes.plot(*curve, color=color, linewidth=1.5, label=name)
+    if UNDISTURBED in curves:
+        axes.plot(*curves[UNDISTURBED], color=GREY, linewidth=1.5, label=UNDISTURBED)
+    axes.axhline(1, color=GREY, linestyle="--", linewidth=1, label="95 % of the data")
+    axes.axvline(0, color=GREY, linewidth=0.5)
+    axes.set(
+        xlabel="steps since the disturbance ended",
+        ylabel="distance to the data / threshold",
+        ylim=(0, None),
+    )
+    axes.set_title("mean of the episodes that still run", fontsize=9)
+    axes.legend(frameon=False, fontsize=8)

@@ -1,0 +1,125 @@
+"""A trained policy, from the folder of its run."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tensordict.nn import ProbabilisticTensorDictSequential
+from torchrl.checkpoint import CheckpointError
+from torchrl.envs import ObservationNorm
+from torchrl.objectives import LossModule
+
+from torchrl_osr.data import make_environment
+from torchrl_osr.from_config import make_learner
+from torchrl_osr.trainers.checkpointing import find_damage, safe_checkpoint
+from torchrl_osr.trainers.run_folder import CONFIG
+
+CHECKPOINTS = Path("checkpoint") / "policy"
+"""Where a run keeps the checkpoints of its policy."""
+
+
+class TrainedRun(NamedTuple):
+    """One checkpoint of a run, on the CPU.
+
+    Attributes:
+        config: the run's configuration.
+        actor: the policy; shares its parameters with the loss.
+        loss: holds the critics, too.
+        observation_norm: how the networks' observations were standardised.
+        step: gradient steps until then.
+        path: the checkpoint's file.
+        folder: the run's.
+    """
+
+    config: DictConfig
+    actor: ProbabilisticTensorDictSequential
+    loss: LossModule
+    observation_norm: ObservationNorm
+    step: int
+    path: Path
+    folder: Path
+
+
+def run_folder_of(path: Path | str) -> Path:
+    """Return the run's folder of a run's folder or of one of its checkpoints.
+
+    Raises:
+        FileNotFoundError: if nothing is there, or no run.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"there is no run and no checkpoint at {path}.")
+    folder = path if path.is_dir() else path.absolute().parent.parent.parent
+    if not (folder / CONFIG).exists():
+        raise FileNotFoundError(
+            f"{path} is no run's: there is no {CONFIG} in {folder}. Give the folder of "
+            f"a run, or a file in its {CHECKPOINTS}."
+        )
+    return folder
+
+
+def checkpoints_of(folder: Path | str) -> list[Path]:
+    """Return the checkpoints that a run has kept of its policy, oldest first.
+
+    The best one is not among them: it is a copy of one of the evaluations.
+
+    Args:
+        folder: of the run.
+
+    Raises:
+        FileNotFoundError: if there is no run, or it has no checkpoint yet.
+    """
+    folder = run_folder_of(folder)
+    found = sorted((folder / CHECKPOINTS).glob("checkpoint-*.torchrl"))
+    if not found:
+        raise FileNotFoundError(
+            f"the run in {folder} has no checkpoint of its policy in {CHECKPOINTS}."
+        )
+    return found
+
+
+def load_trained(path: Path | str) -> TrainedRun:
+    """Load one checkpoint, weights only: loading cannot run code.
+
+    torch's global generator is left as it was.
+
+    Args:
+        path: a checkpoint's file in its run's folder, or the folder for the newest.
+
+    Raises:
+        FileNotFoundError: if there is no run or no checkpoint.
+        CheckpointError: if the file is damaged, or does not fit the run's
+            configuration; tensors of another shape are named.
+    """
+    folder = run_folder_of(path)
+    path = checkpoints_of(path)[-1] if Path(path).is_dir() else Path(path)
+    damage = find_damage(path)
+    if damage is not None:
+        raise CheckpointError(f"checkpoint {path} is damaged: {damage}.")
+    config = OmegaConf.load(folder / CONFIG)
+    assert isinstance(config, DictConfig)
+    environment = make_environment(config.env.id)
+    (observation_size,) = environment.observation_space.shape or (0,)
+    (action_size,) = environment.action_space.shape or (0,)
+    environment.close()
+    with torch.random.fork_rng(devices=[]):
+        actor, _, loss = make_learner(config, observation_size, action_size)
+    shape = (observation_size,) if config.data.standardize else ()
+    norm = ObservationNorm(
+        torch.zeros(shape), torch.ones(shape), in_keys=["observation"],
+        standard_normal=True,
+    )  # fmt: skip
+    checkpoint = safe_checkpoint(loss_module=loss, observation_norm=norm)
+    try:
+        manifest = checkpoint.load(path, map_location="cpu").manifest
+    except CheckpointError as error:
+        raise CheckpointError(
+            f"{path} does not fit {folder / CONFIG}: {error}", error.result
+        ) from error
+    numbered = re.fullmatch(r"checkpoint-(\d+)\.torchrl", path.name)
+    step = int(numbered[1]) if numbered else int(manifest["metadata"]["step"])
+    return TrainedRun(config, actor, loss, norm, step, path, folder)
