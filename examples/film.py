@@ -1,0 +1,212 @@
+"""Film a recovery: who comes back after a push, and where did they go?
+
+    python examples/film.py checkpoint=outputs/hopper-medium-replay/seed0-...
+    python examples/film.py checkpoint=<run's folder> knock=5 rule=time
+    python examples/film.py checkpoint=<run's folder> push=1 film_seed=30004
+
+Figure 3 of the paper: after a push, the behaviour policy, the inverse dynamics model as
+a controller and the trained policy go on from the very same state. The run's folder
+gets ``film.png``, ``film.gif``, ``visited.png`` and ``film.json``; the table says how
+many of all episodes survive. How to read them is in ``docs/film.md``.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from functools import partial
+from importlib import import_module
+from typing import Any
+
+if sys.platform == "linux":  # before MuJoCo is imported; egl needs no display
+    os.environ.setdefault("MUJOCO_GL", "egl")
+try:
+    import_module("mujoco")  # loads OpenGL, whose libraries fail in all sorts of ways
+except ModuleNotFoundError:
+    raise
+except Exception as error:
+    raise RuntimeError(
+        f"OpenGL did not start with MUJOCO_GL={os.environ.get('MUJOCO_GL', '')}: set "
+        "it to egl (no display), osmesa (no graphics driver) or glfw (a display)."
+    ) from error
+
+import hydra
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torchrl import torchrl_logger
+
+from torchrl_osr.data import load_behavior_policy, load_mixture, make_environment
+from torchrl_osr.data.levels import level_policies
+from torchrl_osr.envs import ActionKnock, ExternalPush
+from torchrl_osr.evaluation.data_distance import DataDistance
+from torchrl_osr.evaluation.episodes import Policy, Wrap, deterministic_policy
+from torchrl_osr.evaluation.film_figures import Camera, Take, film_gif, film_strip
+from torchrl_osr.evaluation.inverse_dynamics_control import (
+    InverseDynamicsController,
+    frozen_model,
+)
+from torchrl_osr.evaluation.survival import Survival, survival_table
+from torchrl_osr.evaluation.takeover import BEHAVIOR, Controller, play_takeovers
+from torchrl_osr.evaluation.trained_run import TrainedRun, load_trained
+from torchrl_osr.evaluation.visited_states import visited_states
+from torchrl_osr.objectives.base import check_choice
+from torchrl_osr.trainers.run_folder import write_json
+
+PUSH_STEPS = 5
+STEPS_BEFORE = 10  # in the film
+MODEL, RULES = "inverse dynamics, ", ("time", "nearest")
+
+
+@hydra.main(version_base="1.3", config_path="../conf", config_name="film")
+def main(cfg: DictConfig) -> None:
+    """Play all episodes with every controller, print the table, film one of them."""
+    torchrl_logger.setLevel("WARNING")
+    torch.set_num_threads(cfg.num_threads)
+    trained = load_trained(cfg.checkpoint)
+    run = trained.config
+    camera = Camera(make_environment(run.env.id), 224)  # fails before the work
+    data, _ = load_mixture(
+        run.env.name, run.data.level, seed=run.data.seed, progress=False,
+        random_share=run.data.get("random_share", 0.0),  # older runs do not say
+        num_transitions=run.data.num_transitions,
+    )  # fmt: skip
+    event, duration, wrap = disturbance(cfg)
+    played, ends = play_takeovers(
+        run.env.id, behavior_of(trained), controllers(trained), wrap, duration=duration,
+        latest=cfg.window[1], after=cfg.after, num_episodes=cfg.episodes, seed=cfg.seed,
+    )  # fmt: skip
+
+    # Who falls without a push cannot be said to have fallen by it.
+    kept = played[BEHAVIOR].up_clean(ends, cfg.after)
+    if not kept:
+        raise ValueError(
+            f"in every episode the behaviour policy falls by itself, {cfg.after} steps "
+            f"after the {event} at the latest: choose an earlier window."
+        )
+    measure = (kept, ends, DataDistance(data), (cfg.after // 2, cfg.after))
+    results = {name: each.survival(*measure) for name, each in played.items()}
+    filmed = [BEHAVIOR, MODEL + cfg.rule, list(played)[-1]]
+    episode, why = choose(cfg, kept, [results[name].up for name in filmed])
+    end = int(ends[episode])
+    takes = [
+        Take.of(name, played[name].disturbed, episode, end - duration, end)
+        for name in filmed
+    ]
+    title = f"{run.env.name} {run.data.level}: {in_words(cfg, takes[0].force)}"
+    one = f"one episode: seed {cfg.seed + episode}, {why}"
+    draw(cfg, takes, camera, data["observation"], trained, results, title, one)
+    write_json(
+        trained.folder / "film.json",
+        {
+            "gradient_step": trained.step,
+            "options": OmegaConf.to_container(cfg),
+            "filmed": {"seed": cfg.seed + episode, "why": why, f"{event}_over": end},
+            "seeds": [cfg.seed + each for each in kept],
+            "controllers": {name: vars(each) for name, each in results.items()},
+        },
+    )
+    strength = cfg.push if cfg.knock is None else cfg.knock
+    print(
+        f"{run.env.name} {run.data.level}, {event}={strength:g}, {len(kept)} episodes"
+    )
+    print(survival_table(results))
+    print(f"  filmed: {one}\n  files:  {trained.folder}")
+
+
+def draw(
+    cfg: DictConfig,
+    takes: list[Take],
+    camera: Camera,
+    states: torch.Tensor,
+    trained: TrainedRun,
+    results: dict[str, Survival],
+    title: str,
+    one: str,
+) -> None:
+    """Write the three pictures."""
+    event, duration, _ = disturbance(cfg)
+    total = len(results[BEHAVIOR].alive)
+    up = "; ".join(f"{take.name} {sum(results[take.name].up)}" for take in takes)
+    note = (
+        f"This is {one}. Until the {event} ends, the behaviour policy plays in all "
+        f"rows.\nOf {total} such episodes, up {cfg.after} steps later: {up}."
+    )
+    first, folder = -duration - STEPS_BEFORE, trained.folder
+    later = [round(share * cfg.after) for share in (0.125, 0.25, 0.5, 0.75, 1)]
+    columns, frames = [first, -duration, 0, *later], range(first, cfg.after + 1)
+    options = {"title": title, "event": event}
+    film_strip(
+        takes, camera, folder / "film.png", offsets=columns, note=note, **options
+    )
+    film_gif(takes, camera, folder / "film.gif", offsets=frames, note=one, **options)
+    camera.close()
+    path, rows = folder / "visited.png", states.numpy()
+    visited_states(rows, takes, path, note=one, steps=cfg.after, **options)
+
+
+def disturbance(cfg: DictConfig) -> tuple[str, int, Wrap]:
+    """Return what it is called, how many steps it lasts, and its wrapper."""
+    check_choice("rule", cfg.rule, RULES)
+    if cfg.window[0] < STEPS_BEFORE or cfg.after < 2:
+        raise ValueError(
+            f"window must begin at {STEPS_BEFORE} or later and after be at least 2, "
+            f"got {cfg.window} and {cfg.after}."
+        )
+    moment: dict[str, Any] = {"at": "random", "window": tuple(cfg.window)}
+    if cfg.knock is not None:
+        knock = partial(ActionKnock, steps=cfg.knock, mode="torque", **moment)
+        return "knock", cfg.knock, knock
+    strength: dict[str, Any] = {"force": cfg.push, "unit": "body_weight"}
+    push = partial(ExternalPush, duration=PUSH_STEPS, **strength, **moment)
+    return "push", PUSH_STEPS, push
+
+
+def in_words(cfg: DictConfig, force: float) -> str:
+    """Return the filmed disturbance in words."""
+    if cfg.knock is not None:
+        return f"{cfg.knock} steps of random full-strength actions"
+    way = "forwards" if force > 0 else "backwards"
+    return f"pushed {way} with {cfg.push:g} x body weight for {PUSH_STEPS} steps"
+
+
+def behavior_of(trained: TrainedRun) -> Policy:
+    """Return the last, hence best, behaviour policy of the run's data."""
+    run = trained.config
+    names = level_policies(run.data.level)
+    if not names:
+        raise ValueError(f"{run.data.level} data have no behaviour policy to film.")
+    policy = load_behavior_policy(run.env.name, names[-1])
+    return lambda states: torch.from_numpy(policy.deterministic(states.numpy()))
+
+
+def controllers(trained: TrainedRun) -> dict[str, Controller]:
+    """Return who takes over from the behaviour policy; the trained policy is last."""
+    norm = trained.observation_norm
+    driven = partial(
+        InverseDynamicsController, frozen_model(trained.loss), observation_norm=norm
+    )
+    named: dict[str, Controller] = {
+        MODEL + rule: partial(driven, rule=rule) for rule in RULES
+    }
+    policy = deterministic_policy(trained.actor, norm)
+    name = type(trained.loss).__name__.removesuffix("Loss")
+    return named | {f"{name} policy": lambda references: policy}
+
+
+def choose(cfg: DictConfig, kept: list[int], up: list[list[bool]]) -> tuple[int, str]:
+    """Return which episode to film, and why that."""
+    if cfg.film_seed is not None:
+        if cfg.film_seed - cfg.seed not in kept:
+            raise ValueError(
+                f"film_seed={cfg.film_seed} is none of the episodes that count: "
+                f"{[cfg.seed + each for each in kept]}."
+            )
+        return cfg.film_seed - cfg.seed, "as asked for"
+    for episode, outcomes in zip(kept, zip(*up, strict=True), strict=True):
+        if len(set(outcomes)) > 1:
+            return episode, "the first with different outcomes"
+    return kept[0], "the first; all end alike"
+
+
+if __name__ == "__main__":
+    main()

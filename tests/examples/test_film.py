@@ -1,0 +1,123 @@
+"""The film as a user makes it, of a run of a few steps."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.errors import ConfigCompositionException
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+TINY = [
+    "data=medium",
+    "data.num_transitions=600",
+    "network.num_cells=[8]",
+    "trainer.batch_size=8",
+    "trainer.inverse_dynamics_steps=10",
+    "trainer.steps=10",
+    "trainer.log_interval=10",
+    "trainer.eval_interval=10",
+    "trainer.eval_episodes=1",
+    "trainer.checkpoint_interval=10",
+    "hydra.run.dir=run",
+]
+SHORT = ["checkpoint=run", "episodes=2", "window=[20,30]", "after=16"]
+
+
+@pytest.fixture(scope="module")
+def script():
+    """The script's functions."""
+    before = os.environ.get("MUJOCO_GL")
+    spec = importlib.util.spec_from_file_location("film", EXAMPLES / "film.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    # Not for the other tests of this process.
+    if before is None:
+        os.environ.pop("MUJOCO_GL", None)
+    return module
+
+
+def composed(*overrides: str):
+    with initialize_config_dir(str(EXAMPLES.parent / "conf"), version_base="1.3"):
+        return compose("film", overrides=["checkpoint=run", *overrides])
+
+
+def run(cwd: Path, *command: str) -> tuple[int, str]:
+    wanted = {"TORCHRL_OSR_CACHE": str(cwd / "cache"), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, *command], cwd=cwd, env=os.environ | wanted, text=True,
+        timeout=240, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False,
+    )  # fmt: skip
+    return done.returncode, done.stdout
+
+
+def test_film_leaves_pictures_numbers_and_a_table(tmp_path):
+    code, output = run(tmp_path, str(EXAMPLES / "offline_osr.py"), *TINY)
+    assert code == 0, output
+    code, output = run(tmp_path, str(EXAMPLES / "film.py"), *SHORT)
+    if code != 0 and "OpenGL did not start" in output:
+        pytest.skip(f"no OpenGL to draw with here: {output.splitlines()[-1]}")
+    assert code == 0, output
+    assert "Warning" not in output
+    folder = tmp_path / "run"
+    for name in ("film.png", "visited.png"):
+        assert (folder / name).read_bytes().startswith(b"\x89PNG")
+    film_gif = (folder / "film.gif").read_bytes()
+    assert film_gif.startswith(b"GIF89a")
+    assert len(film_gif) < 3_000_000
+    film_json = json.loads((folder / "film.json").read_text())
+    assert film_json["seeds"] == [30_000, 30_001]
+    assert film_json["filmed"]["seed"] in film_json["seeds"]
+    assert 25 <= film_json["filmed"]["push_over"] < 35
+    names = ["behaviour policy", "inverse dynamics, time", "inverse dynamics, nearest"]
+    assert list(film_json["controllers"]) == [*names, "OSR policy"]
+    for name, numbers in film_json["controllers"].items():
+        assert name in output
+        assert len(numbers["returns"]) == len(numbers["alive"]) == 2
+        assert all(0 <= steps <= 16 for steps in numbers["alive"])
+    assert film_json["controllers"]["behaviour policy"]["alive_clean"] == [16, 16]
+
+
+def test_filmed_is_the_first_in_which_not_all_fare_alike(script):
+    up = [[True, True, False], [True, False, False]]
+    episode, why = script.choose(composed("seed=7"), [0, 2, 5], up)
+    assert (episode, why) == (2, "the first with different outcomes")
+    alike = [each[:1] for each in up]
+    assert script.choose(composed(), [3], alike) == (3, "the first; all end alike")
+    wanted = composed("seed=7", "film_seed=12")
+    assert script.choose(wanted, [0, 2, 5], up) == (5, "as asked for")
+    with pytest.raises(ValueError, match=r"film_seed=12 .* \[7, 9\]"):
+        script.choose(wanted, [0, 2], [])
+
+
+def test_knock_takes_the_place_of_the_push(script):
+    assert script.disturbance(composed())[:2] == ("push", 5)
+    name, steps, wrap = script.disturbance(composed("knock=20"))
+    assert (name, steps, wrap.keywords["mode"]) == ("knock", 20, "torque")
+    assert script.in_words(composed("push=2"), -3.0).startswith(
+        "pushed backwards with 2 x"
+    )
+
+
+@pytest.mark.parametrize(
+    ("option", "named"),
+    [
+        ("rule=next", "nearest"),
+        ("window=[5,9]", "at 10 or later"),
+        ("after=1", "after"),
+    ],
+)
+def test_bad_input_is_named(script, option, named):
+    with pytest.raises(ValueError, match=named):
+        script.disturbance(composed(option))
+
+
+def test_unknown_option_is_named():
+    with pytest.raises(ConfigCompositionException, match="pushh"):
+        composed("pushh=1")
