@@ -24,7 +24,7 @@ from torchrl import torchrl_logger
 from tqdm.auto import tqdm
 
 from torchrl_osr import evaluate_config
-from torchrl_osr.data import load_mixture, observation_statistics
+from torchrl_osr.data import observation_statistics
 from torchrl_osr.evaluation.data_distance import DataDistance
 from torchrl_osr.evaluation.episodes import deterministic_policy
 from torchrl_osr.evaluation.robustness import evaluate_paired
@@ -40,6 +40,7 @@ from torchrl_osr.evaluation.trained_run import (
     load_trained,
     run_folder_of,
 )
+from torchrl_osr.from_config import load_data
 from torchrl_osr.trainers import run_folder
 
 JSON_FORMAT = 1
@@ -111,14 +112,7 @@ def finished(path: Path, request: dict[str, Any]) -> dict[str, Any] | None:
 def evaluate(cfg: DictConfig, files: list[Path]) -> dict[str, Any]:
     """Play all checkpoints of one run."""
     run = load_trained(files[0]).config
-    data, _ = load_mixture(
-        run.env.name,
-        run.data.level,
-        random_share=run.data.get("random_share", 0.0),  # older runs do not say
-        num_transitions=run.data.num_transitions,
-        seed=run.data.seed,
-        progress=cfg.progress,
-    )
+    data, _ = load_data(run, progress=cfg.progress)
     distance = DataDistance(data, seed=run.data.seed)
     _, scale = observation_statistics(data)
     evaluations = []

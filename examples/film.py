@@ -35,7 +35,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torchrl import torchrl_logger
 
-from torchrl_osr.data import load_behavior_policy, load_mixture, make_environment
+from torchrl_osr.data import load_behavior_policy, make_environment
 from torchrl_osr.data.levels import level_policies
 from torchrl_osr.envs import ActionKnock, ExternalPush
 from torchrl_osr.evaluation.data_distance import DataDistance
@@ -49,6 +49,7 @@ from torchrl_osr.evaluation.survival import Survival, survival_table
 from torchrl_osr.evaluation.takeover import BEHAVIOR, Controller, play_takeovers
 from torchrl_osr.evaluation.trained_run import TrainedRun, load_trained
 from torchrl_osr.evaluation.visited_states import visited_states
+from torchrl_osr.from_config import load_data
 from torchrl_osr.objectives.base import check_choice
 from torchrl_osr.trainers.run_folder import write_json
 
@@ -65,11 +66,7 @@ def main(cfg: DictConfig) -> None:
     trained = load_trained(cfg.checkpoint)
     run = trained.config
     camera = Camera(make_environment(run.env.id), 224)  # fails before the work
-    data, _ = load_mixture(
-        run.env.name, run.data.level, seed=run.data.seed, progress=False,
-        random_share=run.data.get("random_share", 0.0),  # older runs do not say
-        num_transitions=run.data.num_transitions,
-    )  # fmt: skip
+    data, _ = load_data(run, progress=False)
     event, duration, wrap = disturbance(cfg)
     played, ends = play_takeovers(
         run.env.id, behavior_of(trained), controllers(trained), wrap, duration=duration,

@@ -4,6 +4,7 @@
     python examples/offline_osr.py env=walker2d data=medium-expert seed=3 preset=paper
     python examples/offline_osr.py -m env=hopper,walker2d seed=0,1,2 hydra/launcher=pool
     python examples/offline_osr.py resume=outputs/hopper-medium-replay/seed0-...
+    python examples/offline_osr.py population=4 trainer.device=cuda
 
 The data are rolled out on this machine at the first run and cached. A run leaves
 ``curve.png``, ``returns.json``, ``inverse_dynamics.json``, ``config.yaml``,
@@ -17,6 +18,7 @@ import os
 # Threads that wait shall not spin; read once, when torch is imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +28,12 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from tensordict import TensorDict
 from torchrl import torchrl_logger
+from torchrl.data import ReplayBuffer, TensorStorage
 from torchrl.envs import ObservationNorm
 from torchrl.objectives import SoftUpdate
 
 from torchrl_osr import InverseDynamicsLoss, StatePerturbation, config
 from torchrl_osr.data import (
-    load_mixture,
     make_replay_buffer,
     observation_statistics,
     split_held_out,
@@ -44,10 +46,11 @@ from torchrl_osr.evaluation.episodes import (
 from torchrl_osr.evaluation.figures import learning_curve, read_scalars
 from torchrl_osr.evaluation.inverse_dynamics import describe, inverse_dynamics_report
 from torchrl_osr.evaluation.summary import score_table
-from torchrl_osr.from_config import make_learner
+from torchrl_osr.from_config import load_data, make_learner
 from torchrl_osr.trainers import OfflineTrainer, run_folder
 from torchrl_osr.trainers.hardware import check_hardware
 from torchrl_osr.trainers.loggers import make_loggers
+from torchrl_osr.trainers.members import Run, launch
 
 EVALUATION_SEED = 10_000  # far from the seeds of the data's episodes
 # Of both phases:
@@ -59,22 +62,19 @@ config.register()
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="offline_osr")
 def main(cfg: DictConfig) -> float:
-    """Run or resume one training run; return its last score, for a sweeper."""
+    """Run or resume a run or a population; return its last score, for a sweeper."""
     job = HydraConfig.get()
     folder = Path(job.runtime.output_dir)
     if cfg.resume is not None:
         cfg = run_folder.saved_config(folder, job.overrides.task)
-    run_folder.claim(folder, cfg)
-    with run_folder.status(folder):
-        return run(cfg, folder)
+    return launch(cfg, folder, __file__, job.overrides.task, prepare_data, run)
 
 
-def run(cfg: DictConfig, folder: Path) -> float:
-    """Data, inverse dynamics model, policy, report."""
+def prepare_data(cfg: DictConfig) -> tuple[Any, ...]:
+    """Standardise once: the same numbers for every run, batch and evaluation."""
     torchrl_logger.setLevel("WARNING")
     torch.set_num_threads(cfg.trainer.num_threads)
     torch.set_float32_matmul_precision(cfg.trainer.matmul_precision)
-    torch.manual_seed(cfg.seed)
     device, autocast = check_hardware(
         cfg.trainer.device, cfg.trainer.precision, cudagraph=cfg.trainer.cudagraph
     )
@@ -82,26 +82,23 @@ def run(cfg: DictConfig, folder: Path) -> float:
         # A graph repeats one update; the loss would change on the way.
         raise ValueError("trainer.bc_steps must be 0 with trainer.cudagraph=true.")
 
-    # Data: standardised once, the same numbers for every batch and every evaluation.
-    data, manifest = load_mixture(
-        cfg.env.name,
-        cfg.data.level,
-        random_share=cfg.data.random_share,
-        num_transitions=cfg.data.num_transitions,
-        seed=cfg.data.seed,
-        progress=cfg.trainer.progress,
-    )
+    data, manifest = load_data(cfg, progress=cfg.trainer.progress)
     statistics = observation_statistics(data) if cfg.data.standardize else (0.0, 1.0)
-    norm = ObservationNorm(
-        *statistics,
-        in_keys=["observation", ("next", "observation")],
-        standard_normal=True,
-    )
+    keys = ["observation", ("next", "observation")]
+    norm = ObservationNorm(*statistics, in_keys=keys, standard_normal=True)
     data, held_out = split_held_out(norm(data), cfg.data.held_out, seed=cfg.data.seed)
+    data = make_replay_buffer(data, batch_size=1, seed=0, device=device)[:]
     norm, held_out = norm.to(device), held_out.to(device)
+    return device, autocast, data, held_out, norm, manifest["normalized_score"]
+
+
+def run(cfg: DictConfig, folder: Path, shared: tuple[Any, ...]) -> Run:
+    """Inverse dynamics model, policy, report; each trainer that is yielded is run."""
+    device, autocast, data, held_out, norm, data_score = shared
+    torch.manual_seed(cfg.seed)
     perturbation = StatePerturbation(**cfg.perturbation, seed=cfg.seed)
-    rows = cfg.trainer.batch_size
-    buffer = make_replay_buffer(data, batch_size=rows, seed=cfg.seed, device=device)
+    storage = TensorStorage(data)  # the rows are shared, the generator is not
+    buffer = ReplayBuffer(storage=storage, batch_size=cfg.trainer.batch_size)
     buffer.append_transform(perturbation)
     training: dict[str, Any] = {
         "replay_buffer": buffer,
@@ -117,29 +114,22 @@ def run(cfg: DictConfig, folder: Path) -> float:
 
     # First phase: which action leads from s~ to s'?
     if hasattr(loss, "inverse_dynamics_network"):
-        train_inverse_dynamics(cfg, folder, model, held_out, training)
+        yield from train_inverse_dynamics(cfg, folder, model, held_out, training)
 
     # Second phase: the policy, taught by the critics and by the frozen model.
     critic_params = list(loss.qvalue_network_params.parameters())
     known = set(critic_params)
     policy_params = [each for each in loss.parameters() if each not in known]
-    optimizer = torch.optim.Adam(
-        [
-            {"params": critic_params, "lr": cfg.optim.qvalue_lr},
-            {"params": policy_params, "lr": cfg.optim.actor_lr},
-        ],
-        fused=True,
-    )
-    evaluator = EpisodeEvaluator(
-        cfg.env.id,
-        num_episodes=cfg.trainer.eval_episodes,
-        seed=EVALUATION_SEED,
-        device=device,
-    )
+    groups = [
+        {"params": critic_params, "lr": cfg.optim.qvalue_lr},
+        {"params": policy_params, "lr": cfg.optim.actor_lr},
+    ]
+    episodes = {"num_episodes": cfg.trainer.eval_episodes, "seed": EVALUATION_SEED}
+    evaluator = EpisodeEvaluator(cfg.env.id, **episodes, device=device)
     policy = deterministic_policy(actor, norm)
     trainer = OfflineTrainer(
         loss,
-        optimizer,
+        torch.optim.Adam(groups, fused=True),
         total_steps=cfg.trainer.steps,
         folder=folder / "checkpoint" / "policy",
         seed=cfg.seed + 1,
@@ -156,9 +146,9 @@ def run(cfg: DictConfig, folder: Path) -> float:
 
     if cfg.trainer.bc_steps:
         trainer.register_op("process_optim_batch", warm_start)
-    trainer.train()
+    yield trainer
     evaluator.close()
-    return report(cfg, folder, manifest["normalized_score"], trainer)
+    return report(cfg, folder, data_score, trainer)
 
 
 def train_inverse_dynamics(
@@ -167,7 +157,7 @@ def train_inverse_dynamics(
     model: torch.nn.Module,
     held_out: TensorDict,
     training: dict[str, Any],
-) -> None:
+) -> Iterator[OfflineTrainer]:
     """Fit the model to the mixed data set and say how well it does on held-out rows."""
     loss = InverseDynamicsLoss(model, **cfg.inverse_dynamics.loss)
     rate = cfg.optim.inverse_dynamics_lr
@@ -185,7 +175,7 @@ def train_inverse_dynamics(
     )
     if cfg.inverse_dynamics.shuffle_next:
         trainer.register_op("process_optim_batch", shuffle_next)
-    trainer.train()
+    yield trainer
     run_folder.write_json(folder / "inverse_dynamics.json", trainer.history[-1])
     print(describe(trainer.history[-1]))
 
@@ -197,7 +187,7 @@ def shuffle_next(batch: TensorDict) -> TensorDict:
 
 
 def report(
-    cfg: DictConfig, folder: Path, data_score: float, trainer: OfflineTrainer
+    cfg: DictConfig, folder: Path, data_score: float | None, trainer: OfflineTrainer
 ) -> float:
     """Write raw returns and the figure, print the table."""
     history, best = trainer.history, trainer.best()

@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 
 from torchrl_osr import Adversary, InverseDynamicsLoss, config, loss_config
 from torchrl_osr.data import LEVELS, load_behavior_card
+from torchrl_osr.data.sources import FILE_SOURCES
 
 CONF = Path(__file__).parents[1] / "conf"
 GROUPS = ["env", "data", "inverse_dynamics", "loss", "logger", "preset"]
@@ -54,7 +55,7 @@ def test_every_experiment_composes_and_sweeps_over_values_that_compose(name):
 
 
 def test_groups_name_what_the_package_has():
-    assert options("data") == sorted(LEVELS)
+    assert options("data") == sorted([*LEVELS, *FILE_SOURCES])
     assert options("env") == sorted(load_behavior_card())
     for name, entry in load_behavior_card().items():
         assert composed(f"env={name}").env == {"name": name, "id": entry["env"]}

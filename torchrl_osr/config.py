@@ -38,10 +38,13 @@ class EnvConfig:
 
 @dataclass
 class DataConfig:
-    """Which data set, rolled out locally from the packaged behaviour policies.
+    """Which data set: rolled out from the packaged behaviour policies, or recorded.
 
     Attributes:
-        level: random, medium, medium-replay, medium-expert or expert.
+        level: random, medium, medium-replay, medium-expert or expert; minari, d4rl or
+            file for recorded data.
+        path: of recorded data, see docs/your_data.md.
+        download: fetch a set that path names.
         num_transitions: rows of the data set.
         seed: of the rollouts.
         random_share: of the rows that are random instead, for limited valuable data.
@@ -50,6 +53,8 @@ class DataConfig:
     """
 
     level: str = MISSING
+    path: str | None = None
+    download: bool = MISSING
     num_transitions: int = MISSING
     seed: int = MISSING
     random_share: float = MISSING
@@ -167,6 +172,7 @@ class OfflineOSRConfig:
         seed: of networks, sampling, noise and evaluation episodes.
         num_random: what ``loss.num_random`` is for the losses with CQL's term.
         resume: folder of a killed run to continue.
+        population: number of seeds, or a list of mappings, to be trained at once.
     """
 
     env: EnvConfig = field(default_factory=EnvConfig)
@@ -183,6 +189,7 @@ class OfflineOSRConfig:
     seed: int = MISSING
     num_random: int = MISSING
     resume: str | None = None
+    population: Any = None  # int | list[dict[str, Any]] | None
 
 
 def register() -> None:

@@ -1,4 +1,4 @@
-"""Networks and loss as a configuration describes them, see :mod:`torchrl_osr.config`.
+"""Data, networks and loss as a configuration has them, see :mod:`torchrl_osr.config`.
 
 The trainer's script builds them to be trained; whoever loads a trained run builds them
 once more and fills them from its checkpoint.
@@ -6,15 +6,42 @@ once more and fills them from its checkpoint.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
+from tensordict import TensorDict
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torchrl.objectives import LossModule
 
+from torchrl_osr.data import load_dataset
 from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
+
+
+def load_data(
+    cfg: DictConfig, *, progress: bool = True
+) -> tuple[TensorDict, dict[str, Any]]:
+    """Load the run's data set, see :func:`~torchrl_osr.data.load_dataset`.
+
+    Args:
+        cfg: a whole configuration of ``examples/offline_osr.py``; that of an older run
+            may lack the newer keys.
+
+    Keyword Args:
+        progress: show a progress bar when on a terminal. Default: ``True``.
+    """
+    return load_dataset(
+        cfg.env.name,
+        cfg.data.level,
+        env_id=cfg.env.id,
+        path=cfg.data.get("path"),
+        download=cfg.data.get("download", False),
+        random_share=cfg.data.get("random_share", 0.0),
+        num_transitions=cfg.data.num_transitions,
+        seed=cfg.data.seed,
+        progress=progress,
+    )
 
 
 class Learner(NamedTuple):

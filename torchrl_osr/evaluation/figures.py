@@ -52,7 +52,7 @@ def learning_curve(
     path: Path | str,
     *,
     title: str,
-    data_score: float,
+    data_score: float | None,
 ) -> None:
     """Draw the score with its interval, and the losses, over gradient steps.
 
@@ -64,7 +64,7 @@ def learning_curve(
 
     Keyword Args:
         title: what was trained on what.
-        data_score: mean normalised score of the data's episodes.
+        data_score: mean normalised score of the data's episodes, if it is known.
     """
     panels = [name for name in PANELS if scalars.get(name)]
     figure = Figure(figsize=(9, 6.4), layout="constrained")
@@ -80,7 +80,9 @@ def learning_curve(
         steps, [row["score"] for row in history], "o-", color=BLUE, markersize=4,
         label="policy (mean of the episodes, 95 % interval)",
     )  # fmt: skip
-    axes.axhline(data_score, color=ORANGE, linestyle="--", label="data (mean episode)")
+    if data_score is not None:
+        label = "data (mean episode)"
+        axes.axhline(data_score, color=ORANGE, linestyle="--", label=label)
     axes.set(xlabel="gradient steps", ylabel="normalised score")
     axes.legend(loc="upper left", frameon=False)
     for column, name in enumerate(panels):

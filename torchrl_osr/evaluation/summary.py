@@ -24,7 +24,7 @@ def score_table(
     title: str,
     history: Sequence[Mapping[str, Any]],
     best: Mapping[str, Any],
-    data_score: float,
+    data_score: float | None,
     folder: Path,
 ) -> str:
     """Return the table of data's and policy's scores.
@@ -34,15 +34,16 @@ def score_table(
         history: all evaluations with their ``"step"``, see
             :func:`~torchrl_osr.evaluation.episodes.summarize`.
         best: the best of them; chosen by its own episodes, hence optimistic.
-        data_score: mean normalised score of the data's episodes.
+        data_score: mean normalised score of the data's episodes, if it is known.
         folder: where the run's files are.
     """
 
     def with_interval(row: Mapping[str, Any]) -> str:
         return f"{row['score']:6.1f}  [{row['score_low']:.1f}, {row['score_high']:.1f}]"
 
+    known = "unknown" if data_score is None else f"{data_score:6.1f}"
     rows = [
-        ("data, mean episode", f"{data_score:6.1f}"),
+        ("data, mean episode", known),
         ("policy, last", with_interval(history[-1])),
         (
             f"policy, mean of last {min(NUM_RECENT, len(history))}",

@@ -70,7 +70,7 @@ def _setting_notes(runs: Sequence[Run]) -> list[str]:
     for data in data_of(runs):
         rivals = [run for run in runs if run.data == data]
         facts = [
-            comparable(run) | {"data's own score": round(run.data_score, 1)}
+            comparable(run) | {"data's own score": run.known_data_score}
             for run in rivals
         ]
         # A preset changes many keys along the same line between runs: one sentence.

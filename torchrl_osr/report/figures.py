@@ -159,7 +159,8 @@ def draw_curves(runs: Sequence[Run], styles: Styles, path: Path) -> Path:
             if (data, method) in groups:
                 curve = learning_curve(groups[data, method])
                 draw(axes, curve._replace(x=curve.x / 1000), style)
-        for score in {round(run.data_score, 1) for run in runs if run.data == data}:
+        scores = [run.data_score for run in runs if run.data == data]
+        for score in {round(each, 1) for each in scores if each is not None}:
             axes.axhline(score, color=GREY, linestyle=(0, (1, 2)), linewidth=1.4)
         axes.set_title(plain(data), fontsize=11)
         axes.set_xlabel("thousand gradient steps")

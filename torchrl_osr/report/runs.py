@@ -35,7 +35,7 @@ class Run:
         folder: as it was found.
         config: the whole configuration, with dotted keys.
         overrides: what stood on the command line; ``None`` if nobody wrote it down.
-        data_score: mean normalised score of the data's episodes.
+        data_score: mean normalised score of the data's episodes, if it is known.
         evaluations: in the order of their steps, with the raw ``"returns"``.
         suites: content of each ``robustness-<suite>.json``, by suite.
         versions: of the packages, as far as recorded.
@@ -46,7 +46,7 @@ class Run:
     folder: Path
     config: Mapping[str, Any]
     overrides: tuple[str, ...] | None
-    data_score: float
+    data_score: float | None
     evaluations: Sequence[Mapping[str, Any]]
     suites: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
@@ -59,11 +59,18 @@ class Run:
         return str(self.config["env.name"])
 
     @property
+    def known_data_score(self) -> str:
+        """The data's own score, or that it is unknown."""
+        return "unknown" if self.data_score is None else f"{self.data_score:.1f}"
+
+    @property
     def data(self) -> str:
         """Name of the data set."""
         share = self.config.get("data.random_share") or 0
         mixed = f", {100 * share:g} % random" if share else ""
-        return f"{self.env} {self.config['data.level']}{mixed}"
+        path = self.config.get("data.path")
+        recorded = f" {path}" if path else ""
+        return f"{self.env} {self.config['data.level']}{recorded}{mixed}"
 
     @property
     def seed(self) -> int:
@@ -149,7 +156,7 @@ def read_run(folder: Path) -> tuple[Run, list[LeftOut]]:
         folder,
         config,
         tuple(map(str, OmegaConf.load(overrides))) if overrides.exists() else None,
-        float(returns["data_score"]),
+        None if returns["data_score"] is None else float(returns["data_score"]),
         evaluations,
         suites,
         _merge_versions([each.get("versions", {}) for each in sources]),

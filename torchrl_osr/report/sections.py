@@ -70,7 +70,7 @@ def clean_section(runs: Sequence[Run]) -> str:
                 f"{group[0].steps:,}",
                 str(last_score(group)),
                 str(recent_score(group)),
-                f"{group[0].data_score:.1f}",
+                group[0].known_data_score,
             ]
             for (where, method), group in cells(runs).items()
             if where == data

@@ -1,5 +1,6 @@
 """Offline training on TorchRL's trainer."""
 
 from torchrl_osr.trainers.offline import OfflineTrainer
+from torchrl_osr.trainers.population import train_together
 
-__all__ = ["OfflineTrainer"]
+__all__ = ["OfflineTrainer", "train_together"]

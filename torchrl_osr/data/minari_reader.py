@@ -1,0 +1,232 @@
+"""Minari data sets, HDF5 or Arrow, read through the ``minari`` library.
+
+TorchRL 0.11 to 0.14.1 has a reader of them whose every field is zero
+(``MinariExperienceReplay``), hence this one. Minari stores ``T + 1`` observations of an
+episode, so that every row has its true next observation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import reduce
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+from tensordict import TensorDict
+from torchrl.data import ReplayBuffer
+
+from torchrl_osr.data.columns import ActionBounds
+from torchrl_osr.data.episodes import transitions_from_episodes
+from torchrl_osr.data.replay_buffer import make_replay_buffer
+
+try:
+    import minari
+except ImportError as error:
+    raise ImportError(
+        f"Minari data sets need {error.name!r}: pip install torchrl-osr[minari]"
+    ) from error
+
+# What a damaged set makes Minari's storages raise.
+DAMAGE = (
+    *(AssertionError, AttributeError, IndexError, KeyError),
+    *(OSError, RuntimeError, TypeError, ValueError),
+)
+
+Leaves = dict[tuple[str, ...], gymnasium.spaces.Box]
+
+
+def load_minari(
+    dataset: str | Path,
+    *,
+    download: bool = False,
+    observation_keys: Sequence[str] | None = None,
+    action_bounds: ActionBounds | None = None,
+    clip_actions: bool = False,
+    progress: bool = True,
+) -> tuple[TensorDict, dict[str, Any]]:
+    """Load a Minari data set.
+
+    Observations that are dictionaries become one vector: keys in alphabetical order on
+    every level, nested ones in the place of their parent, each array row by row. That
+    is the order of :func:`gymnasium.spaces.flatten`.
+
+    Args:
+        dataset: id, such as ``"mujoco/hopper/medium-v0"``, below
+            ``MINARI_DATASETS_PATH`` or ``~/.minari/datasets``; or the folder of a set.
+            A folder of that name goes first.
+
+    Keyword Args:
+        download: let Minari fetch a set that is not on this machine. Default:
+            ``False``, nothing is fetched.
+        observation_keys: of a dictionary, the entries to take and their order; nested
+            ones as ``"outer/inner"``. Default: all, in the order above.
+        action_bounds: lowest and highest action, mapped to -1 and 1. Default: those of
+            the set's action space.
+        clip_actions: see :func:`~torchrl_osr.data.transitions_from_rows`.
+        progress: show a progress bar when on a terminal. Default: ``True``.
+
+    Returns:
+        The transitions ``[N]``, and the manifest of
+        :func:`~torchrl_osr.data.transitions_from_episodes` with ``source``,
+        ``dataset_id``, ``env_id`` (or ``None``), ``minari_version``, ``action_bounds``
+        and ``observation_layout``, a list of names and sizes.
+
+    Raises:
+        FileNotFoundError: the set is not on this machine and ``download`` is false.
+        ValueError: actions that are not real vectors, observations that are not made
+            of them, unknown keys, a damaged set, or data that
+            :func:`~torchrl_osr.data.transitions_from_rows` refuses.
+
+    Examples:
+        >>> import os, tempfile
+        >>> from torchrl_osr.data import load_minari
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     os.environ["MINARI_DATASETS_PATH"] = folder
+        ...     load_minari("mujoco/hopper/medium-v0")
+        Traceback (most recent call last):
+            ...
+        FileNotFoundError: Minari set 'mujoco/hopper/medium-v0' is not on this ...
+        >>> _ = os.environ.pop("MINARI_DATASETS_PATH")
+    """
+    opened = _open(str(dataset), download)
+    actions = opened.action_space
+    if not isinstance(actions, gymnasium.spaces.Box):
+        raise ValueError(
+            f"{dataset} has actions {actions}; expected a Box, real vectors. Discrete "
+            "actions are not supported by this reader."
+        )
+    leaves = _chosen(_leaves(opened.observation_space), observation_keys)
+    bounds = action_bounds or (actions.low.ravel(), actions.high.ravel())
+    data, manifest = transitions_from_episodes(
+        _episodes(dataset, opened, leaves),
+        action_bounds=bounds,
+        clip_actions=clip_actions,
+        total=opened.total_episodes,
+        progress=progress,
+    )
+    spec = opened.env_spec
+    return data, {
+        "source": str(dataset),
+        "dataset_id": opened.id,
+        "env_id": None if spec is None else spec.id,
+        "minari_version": opened.minari_version,
+        "action_bounds": [np.asarray(bound).tolist() for bound in bounds],
+        "observation_layout": [
+            ["/".join(name), int(np.prod(box.shape))] for name, box in leaves.items()
+        ],
+    } | manifest
+
+
+def minari_replay_buffer(
+    dataset: str, *, batch_size: int = 256, seed: int = 0, **options: Any
+) -> ReplayBuffer:
+    """Load a Minari data set into a replay buffer.
+
+    Importing ``torchrl_osr.data`` registers it with TorchRL as ``osr-minari``, beside
+    TorchRL's own ``minari``, so that
+    ``torchrl.data.datasets.load_dataset("osr-minari:mujoco/hopper/medium-v0")`` works.
+
+    Args:
+        dataset: as in :func:`load_minari`.
+
+    Keyword Args:
+        batch_size: rows per ``sample()``. Default: 256.
+        seed: of the sampling. Default: 0.
+        **options: of :func:`load_minari`.
+    """
+    data, _ = load_minari(dataset, **options)
+    return make_replay_buffer(data, batch_size=batch_size, seed=seed)
+
+
+def _open(dataset: str, download: bool) -> minari.MinariDataset:
+    path = Path(dataset).expanduser()
+    try:
+        for folder in (path / "data", path):
+            if (folder / "metadata.json").is_file():
+                return minari.MinariDataset(folder)
+        return minari.load_dataset(dataset, download=download)
+    except FileNotFoundError as error:
+        raise FileNotFoundError(
+            f"Minari set {dataset!r} is not on this machine: fetch it with "
+            "download=True (data.download=true), or give its folder."
+        ) from error
+    except DAMAGE as error:
+        raise _damaged(dataset, error) from error
+
+
+def _damaged(dataset: str | Path, error: Exception) -> ValueError:
+    return ValueError(
+        f"Minari cannot read {dataset} ({type(error).__name__}: {error}). If its "
+        "download was interrupted, delete it (minari delete) and fetch it again."
+    )
+
+
+def _leaves(space: gymnasium.Space[Any], name: tuple[str, ...] = ()) -> Leaves:
+    """Return the boxes that an observation is made of, in order of their names."""
+    if isinstance(space, gymnasium.spaces.Dict):
+        parts = [_leaves(space[key], (*name, key)) for key in sorted(space.keys())]
+        return {key: box for part in parts for key, box in part.items()}
+    if not isinstance(space, gymnasium.spaces.Box):
+        raise ValueError(
+            f"observation {'/'.join(name) or 'space'} is {space}; expected a Box, or a "
+            "Dict of them."
+        )
+    if space.dtype == np.uint8 and len(space.shape) > 1:
+        raise ValueError(
+            f"observation {'/'.join(name) or 'space'} is an image, {space.shape}; "
+            "expected real vectors."
+        )
+    return {name: space}
+
+
+def _chosen(leaves: Leaves, keys: Sequence[str] | None) -> Leaves:
+    if keys is None:
+        return leaves
+    named = {"/".join(name): name for name in leaves}
+    if not keys or isinstance(keys, str) or not set(keys) <= set(named):
+        raise ValueError(
+            f"observation_keys={keys!r}; expected some of {', '.join(named) or 'none'}."
+        )
+    return {named[key]: leaves[named[key]] for key in keys}
+
+
+def _episodes(
+    dataset: str | Path, opened: minari.MinariDataset, leaves: Leaves
+) -> Iterator[dict[str, NDArray[Any]]]:
+    """Read episode by episode; raise if some of what the set announces is missing."""
+    steps = episodes = 0
+    try:
+        for number, episode in enumerate(opened.iterate_episodes()):
+            steps, episodes = steps + len(episode), episodes + 1
+            yield {
+                "observation": _flatten(number, episode.observations, leaves),
+                "action": np.asarray(episode.actions).reshape(len(episode), -1),
+                "reward": np.asarray(episode.rewards),
+                "terminated": np.asarray(episode.terminations),
+                "truncated": np.asarray(episode.truncations),
+            }
+        announced = opened.total_episodes, opened.total_steps
+        if (episodes, steps) != announced:
+            raise ValueError(
+                f"it gave {episodes} episodes with {steps} steps; "
+                f"its metadata say {announced[0]} with {announced[1]}; from Arrow and "
+                "Parquet, Minari 0.5.4 reads no more than 32,767 steps of an episode"
+            )
+    except DAMAGE as error:
+        raise _damaged(dataset, error) from error
+
+
+def _flatten(number: int, observations: Any, leaves: Leaves) -> NDArray[Any]:
+    parts = []
+    for name, box in leaves.items():
+        array = np.asarray(reduce(lambda node, key: node[key], name, observations))
+        if array.shape[1:] != box.shape:
+            raise ValueError(
+                f"observations {'/'.join(name)} of episode {number} have shape "
+                f"{array.shape}; expected rows of {box.shape}"
+            )
+        parts.append(array.reshape(len(array), -1))
+    return np.concatenate(parts, axis=1)

@@ -1,0 +1,211 @@
+"""From recorded steps to the transitions that training reads.
+
+What every reader has in common: which row ends a trajectory, which row has a true next
+state, what is dropped for want of one, and how well the recorded behaviour did.
+
+Shapes: ``N`` rows, ``S`` observation, ``A`` action.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from tensordict import TensorDict
+
+from torchrl_osr.data.collection import ACTION_LIMIT
+from torchrl_osr.data.columns import ActionBounds, checked_columns
+from torchrl_osr.data.validation import check_dataset
+
+Columns = dict[str, NDArray[Any]]
+
+# Two recordings of one state may differ by rounding, relative to its entries.
+SAME_STATE = 1e-6
+
+
+def transitions_from_rows(
+    rows: Mapping[str, ArrayLike],
+    *,
+    action_bounds: ActionBounds = (-1.0, 1.0),
+    clip_actions: bool = False,
+) -> tuple[TensorDict, dict[str, Any]]:
+    """Turn recorded steps, in order of time, into a data set.
+
+    A trajectory ends where a row is terminated or truncated, where the episode number
+    changes, and at the last row; an end without a flag becomes ``truncated``. Without
+    ``next_observation``, a row's next state is the observation of the following row.
+    The last row of a trajectory has none: if it is terminated it stays, with its own
+    observation in that place, which no loss reads; else it is dropped and counted, and
+    the row before it becomes ``truncated``.
+
+    Args:
+        rows: ``observation`` ``[N, S]``, ``action`` ``[N, A]``, ``reward`` and
+            ``terminated`` ``[N]`` or ``[N, 1]``; of the same shape ``truncated`` or
+            ``episode`` (whole numbers) or both; possibly ``next_observation``
+            ``[N, S]``. Flags are bool, or 0 and 1.
+
+    Keyword Args:
+        action_bounds: lowest and highest action, mapped to -1 and 1. Default: -1 and 1.
+            The actions are then clipped to ±0.999, see ``ACTION_LIMIT``.
+        clip_actions: clip actions that are outside of their bounds, as MuJoCo does with
+            what it is given, rather than raise. Default: ``False``.
+
+    Returns:
+        The transitions in float32, see :func:`~torchrl_osr.data.check_dataset`, and a
+        manifest: ``num_transitions``, ``dropped_rows``, ``terminal_rows_filled``,
+        ``clipped_actions`` (rows), ``action_limit``, and of the complete episodes
+        ``num_complete_episodes``, ``return``, ``episode_length``, ``episode_returns``
+        and ``episode_lengths``.
+
+    Raises:
+        ValueError: the columns are not as above, hold a NaN or an infinity, or a field
+            is zero everywhere. The message names the column and the row.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_osr.data import transitions_from_rows
+        >>> rows = {
+        ...     "observation": np.arange(1.0, 9.0).reshape(4, 2),
+        ...     "action": np.full((4, 1), 0.5),
+        ...     "reward": np.ones(4),
+        ...     "terminated": [False, True, False, False],
+        ...     "truncated": [False, False, False, True],
+        ... }
+        >>> data, manifest = transitions_from_rows(rows)
+        >>> data["next", "observation"].tolist()  # of row 1: no loss reads it
+        [[3.0, 4.0], [3.0, 4.0], [7.0, 8.0]]
+        >>> manifest["dropped_rows"], manifest["episode_returns"]
+        (1, [2.0, 2.0])
+    """
+    columns, clipped = checked_columns(
+        rows, action_bounds=action_bounds, clip_actions=clip_actions
+    )
+    count = len(columns["reward"])
+    columns.setdefault("truncated", np.zeros(count, np.bool_))
+    flagged = columns["terminated"] | columns["truncated"]
+    ends = flagged | _last_rows(columns.pop("episode", None), count)
+    statistics = _episode_statistics(
+        columns, ends, flagged, np.asarray(rows["reward"]), trusted="episode" in rows
+    )
+    keep, filled = _fill_next_observations(columns, ends)
+    columns["truncated"] = _mark_cuts(columns, ends, keep)
+    if not keep.all():
+        columns = {name: column[keep] for name, column in columns.items()}
+    if not keep.any():
+        raise ValueError(
+            f"none of the {count} rows has a true next state: each is the last of its "
+            "episode. Give next_observation."
+        )
+    data = _as_tensordict(columns)
+    check_dataset(data)
+    return data, {
+        "num_transitions": len(data),
+        "dropped_rows": int(count - keep.sum()),
+        "terminal_rows_filled": filled,
+        "clipped_actions": clipped,
+        "action_limit": ACTION_LIMIT,
+        **statistics,
+    }
+
+
+def _last_rows(episode: NDArray[Any] | None, count: int) -> NDArray[np.bool_]:
+    """Return which rows are followed by another episode, or by none."""
+    last = np.zeros(count, np.bool_)
+    last[-1] = True
+    if episode is not None:
+        last[:-1] = episode[1:] != episode[:-1]
+        first = np.flatnonzero(np.r_[True, last[:-1]])
+        numbers, seen = np.unique(episode[first], return_counts=True)
+        if (seen > 1).any():
+            again = numbers[seen > 1][0]
+            raise ValueError(
+                f"'episode' {again} comes back in row "
+                f"{first[episode[first] == again][1]}; expected the rows of an episode "
+                "together, in order of time."
+            )
+    return last
+
+
+def _episode_statistics(
+    columns: Columns,
+    ends: NDArray[np.bool_],
+    flagged: NDArray[np.bool_],
+    reward: NDArray[Any],
+    *,
+    trusted: bool,
+) -> dict[str, Any]:
+    """Describe the episodes that were recorded to their end, dropped rows included."""
+    stops = np.flatnonzero(ends)
+    starts = np.r_[0, stops[:-1] + 1]
+    complete = flagged[stops]
+    if "next_observation" in columns and not trusted:
+        # Rows that do not follow one another have no sum of rewards.
+        before, after = columns["next_observation"][:-1], columns["observation"][1:]
+        slack = SAME_STATE * np.maximum(1, np.abs(after))
+        jumps = (np.abs(before - after) > slack).any(1) & ~ends[:-1]
+        complete &= np.add.reduceat(np.r_[jumps, False].astype(int), starts) == 0
+    reward = reward.reshape(-1).astype(np.float64)
+    returns = np.add.reduceat(reward, starts)[complete]
+    lengths = (stops - starts + 1)[complete]
+    return {
+        "num_complete_episodes": len(returns),
+        "return": _summary(returns),
+        "episode_length": _summary(lengths),
+        "episode_returns": returns.tolist(),
+        "episode_lengths": lengths.tolist(),
+    }
+
+
+def _summary(values: NDArray[Any]) -> dict[str, float] | None:
+    names = ("mean", "std", "min", "max")
+    if not len(values):
+        return None
+    return {name: float(getattr(values, name)()) for name in names}
+
+
+def _fill_next_observations(
+    columns: Columns, ends: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], int]:
+    """Fill in what is missing; return which rows stay, and how many ends are filled."""
+    if "next_observation" in columns:
+        return np.ones(len(ends), np.bool_), 0
+    observation, terminated = columns["observation"], columns["terminated"]
+    following = np.roll(observation, -1, axis=0)
+    following[terminated] = observation[terminated]
+    columns["next_observation"] = following
+    return ~ends | terminated, int(terminated.sum())
+
+
+def _mark_cuts(
+    columns: Columns, ends: NDArray[np.bool_], keep: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Mark trajectories that end without a flag, or before a dropped row."""
+    last = ends.copy()
+    last[:-1] |= ~keep[1:]  # only an end is dropped, so the row before goes on to it
+    truncated: NDArray[np.bool_] = columns["truncated"] | (
+        last & ~columns["terminated"]
+    )
+    return truncated
+
+
+def _as_tensordict(columns: Columns) -> TensorDict:
+    tensors = {name: torch.from_numpy(array) for name, array in columns.items()}
+    flags = {name: tensors[name][:, None] for name in ("terminated", "truncated")}
+    following = {
+        "observation": tensors["next_observation"],
+        "reward": tensors["reward"][:, None],
+        "done": flags["terminated"] | flags["truncated"],
+        **flags,
+    }
+    size = [len(tensors["reward"])]
+    return TensorDict(
+        {
+            "observation": tensors["observation"],
+            "action": tensors["action"],
+            "next": TensorDict(following, size),
+        },
+        size,
+    )
