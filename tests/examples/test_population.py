@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_osr import config
 from torchrl_osr.evaluation.trained_run import load_trained
-from torchrl_osr.trainers import OfflineTrainer, members
+from torchrl_osr.trainers import OfflineTrainer, members, processes
 from torchrl_osr.trainers.members import launch, make_members
 
 ROOT = Path(__file__).parents[2]
@@ -192,7 +192,7 @@ def test_failed_member_is_named_and_the_others_go_on(tmp_path, capsys):
     unquote = 'folder = folder.replace("\\\\\'", "\'")'
     body = f"{unquote}\nprint('Here', folder)\nsys.exit(folder[-1] == 'b')"
     with pytest.raises(RuntimeError, match="1 of 3 members failed.*it's b"):
-        members.train_in_processes(make_script(tmp_path, body), folders, 2)
+        processes.train_in_processes(make_script(tmp_path, body), folders, 2)
     output = capsys.readouterr().out
     assert all(f"Here {each}" in output for each in folders)
 
@@ -211,11 +211,11 @@ def test_at_most_so_many_at_once_and_none_when_broken_off(tmp_path, monkeypatch)
     def broken_off(_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(members.subprocess, "Popen", Watched)
-    monkeypatch.setattr(members.time, "sleep", broken_off)
+    monkeypatch.setattr(processes.subprocess, "Popen", Watched)
+    monkeypatch.setattr(processes.time, "sleep", broken_off)
     script = make_script(tmp_path, "time.sleep(60)")
     with pytest.raises(KeyboardInterrupt):
-        members.train_in_processes(script, folders, 2)
+        processes.train_in_processes(script, folders, 2)
     assert [process.returncode for process in started] == [-signal.SIGTERM] * 2
 
 
@@ -223,7 +223,7 @@ def test_process_that_was_left_behind_is_not_joined_by_another(tmp_path):
     left = {"status": "running", "pid": os.getpid()}
     (tmp_path / "status.json").write_text(json.dumps(left))
     with pytest.raises(RuntimeError, match=f"worked on by process {os.getpid()}"):
-        members.train_in_processes(SCRIPT, [tmp_path], 1)
+        processes.train_in_processes(SCRIPT, [tmp_path], 1)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from torchrl.record.loggers import CSVLogger
 from torchrl_osr import StatePerturbation
 from torchrl_osr.evaluation.figures import read_scalars
 from torchrl_osr.trainers import OfflineTrainer, train_together
-from torchrl_osr.trainers.vectorized_loss import MemberNoise
+from torchrl_osr.trainers.member_noise import MemberNoise
 
 STEPS, TOLERANCE = 20, 1e-9
 # What members may have for themselves, all of it at once.

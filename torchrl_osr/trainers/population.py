@@ -7,8 +7,8 @@ backward pass. Everything else, from the batch to the checkpoint, each does for 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import Any
 
@@ -18,65 +18,12 @@ from tqdm.auto import tqdm
 
 from torchrl_osr.trainers.captured import CapturedUpdate, generators_of, networks_of
 from torchrl_osr.trainers.gradient_steps import SumOfLosses, pandas_settled
+from torchrl_osr.trainers.member_noise import OwnRandomness
 from torchrl_osr.trainers.offline import OfflineTrainer
 from torchrl_osr.trainers.vectorized_loss import (
-    OwnRandomness,
     differences,
     vectorized_loss,
 )
-
-
-def train_together(runs: Sequence[Generator[OfflineTrainer, None, Any]]) -> list[Any]:
-    """Do several runs at once; return what they return.
-
-    A run is a generator: what a script of one run does, but that it yields each trainer
-    in the place of calling its ``train``. It may seed the global random generators and
-    draw from them as if it were alone.
-
-    Args:
-        runs: with the same trainers, one after the other; see
-            :class:`PopulationTrainer`. A single one is trained as ever.
-
-    Raises:
-        ValueError: if there is none, or trainers cannot be trained together.
-
-    Examples:
-        >>> def run(seed):
-        ...     torch.manual_seed(seed)
-        ...     trainer = make_trainer(seed)
-        ...     yield trainer
-        ...     return trainer.best()
-        >>> train_together([run(seed) for seed in range(8)])  # doctest: +SKIP
-    """
-    if not runs:
-        raise ValueError("A population has at least one member.")
-    if len(runs) > 1 and torch.cuda.is_available():
-        torch.cuda.init()  # type: ignore[no-untyped-call]  # it has a state from then on
-    randomness = [OwnRandomness() for _ in runs]
-    results: list[Any] = []
-    try:
-        while not results:
-            trainers = []
-            for run, own in zip(runs, randomness, strict=True):
-                with own.active():
-                    try:
-                        trainers.append(next(run))
-                    except StopIteration as end:
-                        results.append(end.value)
-            if results and trainers:
-                raise ValueError("The runs of a population have different phases.")
-            if len(trainers) == 1:
-                with randomness[0].active():
-                    trainers[0].train()
-            elif trainers:
-                PopulationTrainer(trainers, randomness).train()
-    except BaseException as error:
-        # Each run shall know, and write down, that and why it came to nothing.
-        for run in runs:
-            with suppress(BaseException):
-                run.throw(error)
-        raise
-    return results
 
 
 class PlainUpdate:
