@@ -105,7 +105,7 @@ def test_update_that_cannot_be_captured_goes_on_without(tmp_path, graphs, runs, 
         return runs.state(trainer), numbers, trainer
 
     state, numbers, _ = trained("plain")
-    assert not caplog.records[-1].exc_info
+    assert not any(record.exc_info for record in caplog.records)
     mine, again, trainer = trained("captured", cudagraph=True)
     assert_same_bits(mine, state)
     assert [value for *_, value in again] == pytest.approx(
