@@ -11,7 +11,6 @@ import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -148,7 +147,8 @@ class OfflineTrainer(TickTrainer):
         generator = torch.Generator(device).manual_seed(seed)
         replay_buffer.set_rng(generator)
         self.cudagraph = cudagraph
-        self._capture = partial(capture, self, generator, replay_buffer.transform)
+        # What an update draws from, besides the loss.
+        self.sampler_generator, self.transform = generator, replay_buffer.transform
         self.register_op("process_optim_batch", lambda _: replay_buffer.sample())
         if target_net_updater is not None:
             self.register_op("post_optim", target_net_updater.step)
@@ -208,7 +208,8 @@ class OfflineTrainer(TickTrainer):
         step = self._progress["step"]
         self.collected_frames = self._optim_count = self.collector.step = step
         # Anew: the optimizer's state may be other tensors now.
-        self.captured = self._capture() if self.cudagraph else None
+        if self.cudagraph:
+            self.captured = capture(self, self.sampler_generator, self.transform)
         return path
 
     def save_trainer(self, force_save: bool = False) -> None:

@@ -119,7 +119,7 @@ class PopulationTrainer:
         for index, member, tick in zip(group, members, ticks, strict=True):
             with self.randomness[index].active():
                 _before_updates(member, tick)
-        with _only_own_draws([member._capture.args[1] for member in members]):
+        with _only_own_draws([member.sampler_generator for member in members]):
             for _ in range(ticks[0].numel()):
                 for member in members:
                     member._optim_count += 1
@@ -138,10 +138,10 @@ class PopulationTrainer:
     def _generators(self, group: list[int]) -> Iterator[torch.Generator]:
         """Yield what an update draws from."""
         for index in group:
-            _, sampler, transform = self.members[index]._capture.args
-            modules = networks_of(self.members[index].loss_module)
-            yield from (self._noise[index], sampler)
-            yield from generators_of([*transform.modules(), *modules])
+            member = self.members[index]
+            modules = networks_of(member.loss_module)
+            yield from (self._noise[index], member.sampler_generator)
+            yield from generators_of([*member.transform.modules(), *modules])
 
     def _update(self, group: list[int]) -> TensorDict:
         """Do one update of some members; return their losses and metrics, ``[K]``."""
