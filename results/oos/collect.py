@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 
 HERE = Path(__file__).parent
-REPORT = HERE.parents[1] / "examples" / "report.py"
+REPORT = ("runs", "--reference", "cql_noisy_bc")
 RAW = ("returns.json", "inverse_dynamics.json", "robustness-oos.json", "status.json")
 
 
@@ -41,7 +41,7 @@ def main(folder: Path) -> None:
         gather(run, HERE / "runs" / run.relative_to(folder))
     # From here, so that the page names the runs as they lie in the repository.
     subprocess.run(
-        [sys.executable, str(REPORT), "runs", "--reference", "cql_noisy_bc"],
+        [sys.executable, "../../examples/report.py", *REPORT],
         cwd=HERE,
         check=True,
     )
