@@ -81,6 +81,7 @@ def prepare_data(cfg: DictConfig) -> tuple[Any, ...]:
     if cfg.trainer.cudagraph and cfg.trainer.bc_steps:
         # A graph repeats one update; the loss would change on the way.
         raise ValueError("trainer.bc_steps must be 0 with trainer.cudagraph=true.")
+    make_learner(cfg, 1, 1)  # a wrong option of the loss stops here, not after the data
 
     data, manifest = load_data(cfg, progress=cfg.trainer.progress)
     statistics = observation_statistics(data) if cfg.data.standardize else (0.0, 1.0)
@@ -108,7 +109,7 @@ def run(cfg: DictConfig, folder: Path, shared: tuple[Any, ...]) -> Run:
     }
     training |= {name: cfg.trainer[name] for name in TRAINER_OPTIONS}
 
-    # The policy's loss first, so that a wrong option stops here.
+    # The policy's loss first: it holds the model that is trained next.
     sizes = data["observation"].shape[-1], data["action"].shape[-1]
     actor, model, loss = make_learner(cfg, *sizes, device)
 

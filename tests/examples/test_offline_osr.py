@@ -157,6 +157,25 @@ def test_bad_input_is_named(finished, environment, arguments, named):
     assert json.loads((folder / "status.json").read_text()) == {"status": "done"}
 
 
+@pytest.mark.parametrize(
+    ("override", "named"),
+    [
+        ("loss.chunk_size=0", "chunk_size must be at least 1 or None, got 0"),
+        ("trainer.cudagraph=true", "cudagraph=True needs a CUDA device"),
+        ("population=0", "population must be a number of seeds, at least 1"),
+        ("population=[{network.layer_norm:true}]", "network.layer_norm must be the"),
+    ],
+)
+def test_bad_input_is_named_before_data_are_made(
+    tmp_path, environment, override, named
+):
+    environment = environment | {"TORCHRL_OSR_CACHE": str(tmp_path / "cache")}
+    code, output = run(tmp_path, environment, override)
+    assert code != 0
+    assert named in output
+    assert not (tmp_path / "cache").exists()
+
+
 @pytest.mark.parametrize(("chosen", "found"), [(None, "PASSIVE"), ("active", "ACTIVE")])
 def test_waiting_threads_do_not_spin_unless_asked_to(
     tmp_path, environment, chosen, found
