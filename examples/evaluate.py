@@ -11,7 +11,6 @@ same name. What is measured is in ``docs/robustness.md``.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from importlib.metadata import version
 from pathlib import Path
@@ -25,6 +24,7 @@ from tqdm.auto import tqdm
 
 from torchrl_osr import evaluate_config
 from torchrl_osr.data import observation_statistics
+from torchrl_osr.data.manifest import sha256_of
 from torchrl_osr.evaluation.data_distance import DataDistance
 from torchrl_osr.evaluation.episodes import deterministic_policy
 from torchrl_osr.evaluation.robustness import evaluate_paired
@@ -93,9 +93,7 @@ def requested(cfg: DictConfig, files: list[Path]) -> dict[str, Any]:
         "levels": OmegaConf.to_container(cfg.suite.levels, resolve=True),
         "episodes": cfg.episodes,
         "seed": cfg.seed,
-        "checkpoints": {
-            file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files
-        },
+        "checkpoints": {file.name: sha256_of(file) for file in files},
     }
 
 

@@ -34,10 +34,10 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_osr import InverseDynamicsLoss, StatePerturbation, config
 from torchrl_osr.data import (
-    make_replay_buffer,
     observation_statistics,
     split_held_out,
 )
+from torchrl_osr.data.replay_buffer import check_memory
 from torchrl_osr.evaluation.episodes import (
     EpisodeEvaluator,
     deterministic_policy,
@@ -88,8 +88,8 @@ def prepare_data(cfg: DictConfig) -> tuple[Any, ...]:
     keys = ["observation", ("next", "observation")]
     norm = ObservationNorm(*statistics, in_keys=keys, standard_normal=True)
     data, held_out = split_held_out(norm(data), cfg.data.held_out, seed=cfg.data.seed)
-    data = make_replay_buffer(data, batch_size=1, seed=0, device=device)[:]
-    norm, held_out = norm.to(device), held_out.to(device)
+    check_memory(data, device)
+    data, norm, held_out = (each.to(device) for each in (data, norm, held_out))
     return device, autocast, data, held_out, norm, manifest["normalized_score"]
 
 

@@ -7,13 +7,10 @@ observation there. Neither is a state that any action led to.
 
 from __future__ import annotations
 
-import hashlib
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import platformdirs
 from numpy.typing import NDArray
 from tensordict import TensorDict
 from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
@@ -21,7 +18,8 @@ from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 from torchrl_osr.data.columns import ActionBounds
 from torchrl_osr.data.download import download_file
 from torchrl_osr.data.hdf5 import read_hdf5
-from torchrl_osr.data.local import CACHE_VARIABLE
+from torchrl_osr.data.local import cache_root
+from torchrl_osr.data.manifest import sha256_of
 from torchrl_osr.data.trajectories import transitions_from_rows
 
 # D4RL's names of our columns; a file's other arrays and groups are not read.
@@ -102,9 +100,7 @@ def load_d4rl(
         action_bounds=action_bounds,
         clip_actions=clip_actions,
     )
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return data, {"source": str(source), "data_sha256": digest} | manifest
+    return data, {"source": str(source), "data_sha256": sha256_of(path)} | manifest
 
 
 def _locate(
@@ -119,9 +115,7 @@ def _locate(
             "set, such as hopper-medium-v2; torchrl.data.datasets.d4rl_infos has all."
         )
     url: str = D4RL_DATASETS[str(source)]
-    default = platformdirs.user_cache_dir("torchrl-osr")
-    root = Path(cache_dir or os.environ.get(CACHE_VARIABLE) or default).expanduser()
-    path = root / "d4rl" / f"{source}.hdf5"
+    path = cache_root(cache_dir) / "d4rl" / f"{source}.hdf5"
     if not path.exists():
         if not download:
             raise FileNotFoundError(

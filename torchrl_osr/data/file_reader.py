@@ -5,7 +5,6 @@ All three hold the same columns; nothing is unpickled.
 
 from __future__ import annotations
 
-import hashlib
 import zipfile
 import zlib
 from pathlib import Path
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 
 from torchrl_osr.data.columns import ActionBounds
+from torchrl_osr.data.manifest import sha256_of
 from torchrl_osr.data.trajectories import transitions_from_rows
 
 
@@ -80,9 +80,7 @@ def load_file(
     data, manifest = transitions_from_rows(
         rows, action_bounds=action_bounds, clip_actions=clip_actions
     )
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return data, {"source": str(path), "data_sha256": digest} | manifest
+    return data, {"source": str(path), "data_sha256": sha256_of(path)} | manifest
 
 
 def _read_npz(path: Path) -> dict[str, NDArray[Any]]:

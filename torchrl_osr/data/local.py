@@ -28,6 +28,7 @@ from torchrl_osr.data.behavior import behavior_policy_path
 from torchrl_osr.data.collection import Collection
 from torchrl_osr.data.environment import environment_id
 from torchrl_osr.data.levels import collect_level, level_policies
+from torchrl_osr.data.manifest import describe_episodes, sha256_of
 from torchrl_osr.data.reference_scores import normalized_score
 from torchrl_osr.data.validation import DATASET_KEYS, check_dataset
 
@@ -95,8 +96,10 @@ def load_local_dataset(
         (500, 'Hopper-v5')
     """
     request = _request(env_name, level, num_transitions, seed)
-    folder = _cache_root(cache_dir) / (
-        f"{env_name}-{level}-{num_transitions}-seed{seed}"
+    folder = (
+        cache_root(cache_dir)
+        / "local"
+        / (f"{env_name}-{level}-{num_transitions}-seed{seed}")
     )
     # Without the lock first: a whole set can be read from a folder that is read-only.
     with suppress(OSError, ValueError):
@@ -117,10 +120,10 @@ def load_local_dataset(
         return _read(folder, request)
 
 
-def _cache_root(cache_dir: Path | str | None) -> Path:
+def cache_root(cache_dir: Path | str | None) -> Path:
+    """Return the folder of all cached data sets: as given, or as the user has it."""
     root = cache_dir or os.environ.get(CACHE_VARIABLE)
-    default = platformdirs.user_cache_dir("torchrl-osr")
-    return Path(root or default).expanduser() / "local"
+    return Path(root or platformdirs.user_cache_dir("torchrl-osr")).expanduser()
 
 
 def _request(
@@ -141,7 +144,7 @@ def _request(
         "num_transitions": num_transitions,
         "seed": seed,
         "behavior_sha256": {
-            name: _sha256(behavior_policy_path(env_name, name))
+            name: sha256_of(behavior_policy_path(env_name, name))
             for name in level_policies(level)
         },
         "versions": versions,
@@ -179,10 +182,6 @@ def _read(folder: Path, request: dict[str, Any]) -> tuple[TensorDict, dict[str, 
     return data, manifest
 
 
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
 def _array_name(key: str | tuple[str, ...]) -> str:
     return key if isinstance(key, str) else "/".join(key)
 
@@ -201,7 +200,7 @@ def _write(folder: Path, request: dict[str, Any], collection: Collection) -> Non
             np.savez(file, **{name: array.numpy() for name, array in arrays.items()})
             _sync(file)
         manifest = request | _statistics(request["env_name"], collection)
-        manifest["data_sha256"] = _sha256(fresh / "data.npz")
+        manifest["data_sha256"] = sha256_of(fresh / "data.npz")
         with (fresh / "manifest.json").open("w", encoding="utf-8") as file:
             json.dump(manifest, file, indent=1)
             _sync(file)
@@ -222,14 +221,10 @@ def _statistics(env_name: str, collection: Collection) -> dict[str, Any]:
     returns, lengths = collection.episode_returns, collection.episode_lengths
     return {
         "torchrl_osr_version": _own_version(),
-        "num_complete_episodes": len(returns),
-        "return": _summary(returns),
-        "episode_length": _summary(lengths),
+        **describe_episodes(returns, lengths),
         "normalized_score": (
             normalized_score(env_name, float(returns.mean())) if len(returns) else None
         ),
-        "episode_returns": returns.tolist(),
-        "episode_lengths": lengths.tolist(),
     }
 
 
@@ -238,14 +233,6 @@ def _own_version() -> str:
         return version("torchrl-osr")
     except PackageNotFoundError:
         return "not installed"
-
-
-def _summary(values: np.ndarray[Any, Any]) -> dict[str, float] | None:
-    """Return mean, std, min and max; ``None`` if no episode was completed."""
-    if not len(values):
-        return None
-    names = ("mean", "std", "min", "max")
-    return {name: float(getattr(values, name)()) for name in names}
 
 
 @contextmanager

@@ -18,6 +18,7 @@ from tensordict import TensorDict
 
 from torchrl_osr.data.collection import ACTION_LIMIT
 from torchrl_osr.data.columns import ActionBounds, checked_columns
+from torchrl_osr.data.manifest import describe_episodes
 from torchrl_osr.data.validation import check_dataset
 
 Columns = dict[str, NDArray[Any]]
@@ -150,20 +151,7 @@ def _episode_statistics(
     reward = reward.reshape(-1).astype(np.float64)
     returns = np.add.reduceat(reward, starts)[complete]
     lengths = (stops - starts + 1)[complete]
-    return {
-        "num_complete_episodes": len(returns),
-        "return": _summary(returns),
-        "episode_length": _summary(lengths),
-        "episode_returns": returns.tolist(),
-        "episode_lengths": lengths.tolist(),
-    }
-
-
-def _summary(values: NDArray[Any]) -> dict[str, float] | None:
-    names = ("mean", "std", "min", "max")
-    if not len(values):
-        return None
-    return {name: float(getattr(values, name)()) for name in names}
+    return describe_episodes(returns, lengths)
 
 
 def _fill_next_observations(
