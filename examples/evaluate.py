@@ -6,7 +6,8 @@
 
 Each of the run's last checkpoints plays pairs of episodes, one of each pair disturbed.
 The run's folder gets ``robustness-<suite>.json``, all raw results, and a figure of the
-same name. What is measured is in ``docs/robustness.md``.
+same name. A killed evaluation goes on after the last checkpoint that was done. What is
+measured is in ``docs/robustness.md``.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from tqdm.auto import tqdm
 
 from torchrl_osr import evaluate_config
 from torchrl_osr.data import observation_statistics
-from torchrl_osr.data.manifest import sha256_of
+from torchrl_osr.data.limits import read_json
+from torchrl_osr.data.manifest import SEAL, check_seal, sealed, sha256_of
 from torchrl_osr.evaluation.data_distance import DataDistance
 from torchrl_osr.evaluation.episodes import deterministic_policy
 from torchrl_osr.evaluation.robustness import evaluate_paired
@@ -68,12 +70,15 @@ def main(cfg: DictConfig) -> None:
         name = f"{files[0].stem}-{name}"  # beside the one of the whole run
     path = folder / f"{name}.json"
     request = requested(cfg, files)
-    results = finished(path, request)
+    results = left_by(path, request)
+    # Hidden from those who look for results.
+    partial = path.with_name(f".{name}.partial.json")
     if cfg.force or results is None:
-        results = request | evaluate(cfg, files)
+        results = request | evaluate(cfg, files, partial, request)
         run_folder.write_json(path, results)
     else:
         print(f"{path} is there already; force=true does it again.")
+    partial.unlink(missing_ok=True)
     figure = path.with_suffix(".png")
     title = (
         f"{results['env']} {results['data']}, suite {cfg.suite.name}: "
@@ -97,32 +102,45 @@ def requested(cfg: DictConfig, files: list[Path]) -> dict[str, Any]:
     }
 
 
-def finished(path: Path, request: dict[str, Any]) -> dict[str, Any] | None:
+def left_by(path: Path, request: dict[str, Any]) -> dict[str, Any] | None:
     """Return what an evaluation of the same request has left, if there was one."""
     if not path.exists():
         return None
-    results: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    try:
+        results = read_json(path)
+        if SEAL in results:
+            check_seal(results)
+    except ValueError as error:
+        print(f"{path} is of no use: {error}.")
+        return None
     # Through JSON, as the file's: it knows no tuples.
     same = json.loads(json.dumps(request)).items() <= results.items()
     return results if same else None
 
 
-def evaluate(cfg: DictConfig, files: list[Path]) -> dict[str, Any]:
-    """Play all checkpoints of one run."""
+def evaluate(
+    cfg: DictConfig, files: list[Path], partial: Path, request: dict[str, Any]
+) -> dict[str, Any]:
+    """Play all checkpoints of one run, but those that ``partial`` has already."""
     run = load_trained(files[0]).config
     data, _ = load_data(run, progress=cfg.progress)
     distance = DataDistance(data, seed=run.data.seed)
     _, scale = observation_statistics(data)
-    evaluations = []
+    begun = left_by(partial, request) or {"evaluations": []}
+    evaluations = begun["evaluations"]
+    if evaluations:
+        print(f"{partial} has {len(evaluations)} of {len(files)} checkpoints already.")
+    levels = len(cfg.suite.levels) + 1  # the clean episodes are one
     bar = tqdm(
-        total=len(files) * (len(cfg.suite.levels) + 1),  # the clean episodes are one
+        initial=len(evaluations) * levels,
+        total=len(files) * levels,
         desc=cfg.suite.name,
         unit="level",
         disable=None if cfg.progress else True,  # None: silent off a terminal
     )
     with bar:
-        for number, file in enumerate(files):
-            trained = load_trained(file)
+        for number in range(len(evaluations), len(files)):
+            trained = load_trained(files[number])
             seed = cfg.seed + SEED_STRIDE * number
             paired = evaluate_paired(
                 deterministic_policy(trained.actor, trained.observation_norm),
@@ -134,6 +152,8 @@ def evaluate(cfg: DictConfig, files: list[Path]) -> dict[str, Any]:
                 advance=bar.update,
             )
             evaluations.append(evaluation_json(trained.step, paired, run.env.name))
+            begun = sealed(request | {"evaluations": evaluations})
+            run_folder.write_json(partial, begun)
     return {
         "env": run.env.name,
         "data": run.data.level,

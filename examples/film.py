@@ -37,6 +37,7 @@ from torchrl import torchrl_logger
 
 from torchrl_osr.data import load_behavior_policy, make_environment
 from torchrl_osr.data.levels import level_policies
+from torchrl_osr.data.on_disk import observations
 from torchrl_osr.envs import ActionKnock, ExternalPush
 from torchrl_osr.evaluation.data_distance import DataDistance
 from torchrl_osr.evaluation.episodes import Policy, Wrap, deterministic_policy
@@ -91,7 +92,7 @@ def main(cfg: DictConfig) -> None:
     ]
     title = f"{run.env.name} {run.data.level}: {in_words(cfg, takes[0].force)}"
     one = f"one episode: seed {cfg.seed + episode}, {why}"
-    draw(cfg, takes, camera, data["observation"], trained, results, title, one)
+    draw(cfg, takes, camera, observations(data), trained, results, title, one)
     write_json(
         trained.folder / "film.json",
         {

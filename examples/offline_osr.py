@@ -28,16 +28,9 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from tensordict import TensorDict
 from torchrl import torchrl_logger
-from torchrl.data import ReplayBuffer, TensorStorage
-from torchrl.envs import ObservationNorm
 from torchrl.objectives import SoftUpdate
 
 from torchrl_osr import InverseDynamicsLoss, StatePerturbation, config
-from torchrl_osr.data import (
-    observation_statistics,
-    split_held_out,
-)
-from torchrl_osr.data.replay_buffer import check_memory
 from torchrl_osr.evaluation.episodes import (
     EpisodeEvaluator,
     deterministic_policy,
@@ -46,16 +39,20 @@ from torchrl_osr.evaluation.episodes import (
 from torchrl_osr.evaluation.figures import learning_curve, read_scalars
 from torchrl_osr.evaluation.inverse_dynamics import describe, inverse_dynamics_report
 from torchrl_osr.evaluation.summary import score_table
-from torchrl_osr.from_config import load_data, make_learner
+from torchrl_osr.from_config import make_learner
 from torchrl_osr.trainers import OfflineTrainer, run_folder
 from torchrl_osr.trainers.hardware import check_hardware
 from torchrl_osr.trainers.loggers import make_loggers
 from torchrl_osr.trainers.members import Run, launch
+from torchrl_osr.trainers.value_bounds import largest_value
+from torchrl_osr.training_data import load_training_data
 
 EVALUATION_SEED = 10_000  # far from the seeds of the data's episodes
 # Of both phases:
-TRAINER_OPTIONS = ("log_interval", "checkpoint_interval", "checkpoints_kept")
-TRAINER_OPTIONS += ("progress", "compile", "cudagraph")
+TRAINER_OPTIONS = (
+    *("log_interval", "checkpoint_interval", "checkpoints_kept"),
+    *("progress", "compile", "cudagraph", "nonfinite"),
+)
 
 config.register()
 
@@ -71,7 +68,7 @@ def main(cfg: DictConfig) -> float:
 
 
 def prepare_data(cfg: DictConfig) -> tuple[Any, ...]:
-    """Standardise once: the same numbers for every run, batch and evaluation."""
+    """Set torch up and load the data: the same for every run of a population."""
     torchrl_logger.setLevel("WARNING")
     torch.set_num_threads(cfg.trainer.num_threads)
     torch.set_float32_matmul_precision(cfg.trainer.matmul_precision)
@@ -83,39 +80,32 @@ def prepare_data(cfg: DictConfig) -> tuple[Any, ...]:
         raise ValueError("trainer.bc_steps must be 0 with trainer.cudagraph=true.")
     make_learner(cfg, 1, 1)  # a wrong option of the loss stops here, not after the data
 
-    data, manifest = load_data(cfg, progress=cfg.trainer.progress)
-    statistics = observation_statistics(data) if cfg.data.standardize else (0.0, 1.0)
-    keys = ["observation", ("next", "observation")]
-    norm = ObservationNorm(*statistics, in_keys=keys, standard_normal=True)
-    data, held_out = split_held_out(norm(data), cfg.data.held_out, seed=cfg.data.seed)
-    check_memory(data, device)
-    data, norm, held_out = (each.to(device) for each in (data, norm, held_out))
-    return device, autocast, data, held_out, norm, manifest["normalized_score"]
+    return device, autocast, load_training_data(cfg, device)
 
 
 def run(cfg: DictConfig, folder: Path, shared: tuple[Any, ...]) -> Run:
     """Inverse dynamics model, policy, report; each trainer that is yielded is run."""
-    device, autocast, data, held_out, norm, data_score = shared
+    device, autocast, data = shared
     torch.manual_seed(cfg.seed)
     perturbation = StatePerturbation(**cfg.perturbation, seed=cfg.seed)
-    storage = TensorStorage(data)  # the rows are shared, the generator is not
-    buffer = ReplayBuffer(storage=storage, batch_size=cfg.trainer.batch_size)
+    buffer = data.buffer(cfg.trainer.batch_size)
     buffer.append_transform(perturbation)
     training: dict[str, Any] = {
         "replay_buffer": buffer,
-        "components": {"perturbation": perturbation, "observation_norm": norm},
+        "components": {"perturbation": perturbation, "observation_norm": data.norm},
         "loggers": make_loggers(folder=folder, **cfg.logger),
         "autocast_dtype": autocast,
     }
-    training |= {name: cfg.trainer[name] for name in TRAINER_OPTIONS}
+    # The configuration of an older run lacks some.
+    training |= {key: cfg.trainer[key] for key in TRAINER_OPTIONS if key in cfg.trainer}
 
     # The policy's loss first: it holds the model that is trained next.
-    sizes = data["observation"].shape[-1], data["action"].shape[-1]
+    sizes: tuple[int, int] = data.sizes
     actor, model, loss = make_learner(cfg, *sizes, device)
 
     # First phase: which action leads from s~ to s'?
     if hasattr(loss, "inverse_dynamics_network"):
-        yield from train_inverse_dynamics(cfg, folder, model, held_out, training)
+        yield from train_inverse_dynamics(cfg, folder, model, data.held_out, training)
 
     # Second phase: the policy, taught by the critics and by the frozen model.
     critic_params = list(loss.qvalue_network_params.parameters())
@@ -127,7 +117,8 @@ def run(cfg: DictConfig, folder: Path, shared: tuple[Any, ...]) -> Run:
     ]
     episodes = {"num_episodes": cfg.trainer.eval_episodes, "seed": EVALUATION_SEED}
     evaluator = EpisodeEvaluator(cfg.env.id, **episodes, device=device)
-    policy = deterministic_policy(actor, norm)
+    policy = deterministic_policy(actor, data.norm)
+    limit = largest_value(data.largest_reward, cfg.optim.gamma)
     trainer = OfflineTrainer(
         loss,
         torch.optim.Adam(groups, fused=True),
@@ -138,6 +129,7 @@ def run(cfg: DictConfig, folder: Path, shared: tuple[Any, ...]) -> Run:
         evaluate=lambda: summarize(evaluator(policy), cfg.env.name),
         eval_interval=cfg.trainer.eval_interval,
         description="policy",
+        bounds={"pred_value": limit, "target_value": limit},
         **training,
     )
 
@@ -149,7 +141,7 @@ def run(cfg: DictConfig, folder: Path, shared: tuple[Any, ...]) -> Run:
         trainer.register_op("process_optim_batch", warm_start)
     yield trainer
     evaluator.close()
-    return report(cfg, folder, data_score, trainer)
+    return report(cfg, folder, data.score, trainer)
 
 
 def train_inverse_dynamics(

@@ -13,6 +13,8 @@ from omegaconf import OmegaConf
 
 from torchrl_osr import Adversary, InverseDynamicsLoss, config, loss_config
 from torchrl_osr.data import LEVELS, load_behavior_card
+from torchrl_osr.data.environment import MAZE_IDS
+from torchrl_osr.data.mazes import MAZE_LEVELS
 from torchrl_osr.data.sources import FILE_SOURCES
 
 CONF = Path(__file__).parents[1] / "conf"
@@ -55,8 +57,10 @@ def test_every_experiment_composes_and_sweeps_over_values_that_compose(name):
 
 
 def test_groups_name_what_the_package_has():
-    assert options("data") == sorted([*LEVELS, *FILE_SOURCES])
-    assert options("env") == sorted(load_behavior_card())
+    assert options("data") == sorted([*LEVELS, *MAZE_LEVELS, *FILE_SOURCES])
+    assert options("env") == sorted([*load_behavior_card(), *MAZE_IDS])
+    for name, env_id in MAZE_IDS.items():
+        assert composed(f"env={name}").env == {"name": name, "id": env_id}
     for name, entry in load_behavior_card().items():
         assert composed(f"env={name}").env == {"name": name, "id": entry["env"]}
 
@@ -133,6 +137,22 @@ def test_official_preset_reaches_every_group_and_quick_sizes_stay_possible():
     quick = composed("loss=osr_official", "inverse_dynamics=cvae")
     assert quick.loss.recovery_direction == "reverse"
     assert quick.trainer.steps == composed().trainer.steps
+
+
+def test_antmaze_preset_is_corls_cql():
+    cfg, paper = composed("preset=antmaze"), composed("preset=paper")
+    # tinkoff-ai/CORL at 140648a, configs/offline/cql/antmaze/umaze_v2.yaml
+    assert (cfg.data.reward_scale, cfg.data.reward_shift) == (10, -5)
+    assert (cfg.loss.with_lagrange, cfg.loss.lagrange_thresh) == (True, 0.8)
+    assert (cfg.loss.min_q_weight, cfg.loss.clip_diff_min) == (5, -200)
+    assert (cfg.loss.max_q_backup, cfg.loss.deterministic_backup) == (True, True)
+    assert (cfg.loss.num_random, cfg.loss.temperature) == (10, 1)
+    assert (cfg.optim.actor_lr, cfg.optim.qvalue_lr) == (1e-4, 3e-4)
+    assert (cfg.optim.gamma, cfg.optim.tau) == (0.99, 5e-3)
+    assert (cfg.trainer.eval_episodes, cfg.trainer.steps) == (100, 1_000_000)
+    assert (cfg.trainer.eval_interval, cfg.trainer.batch_size) == (50_000, 256)
+    assert (cfg.trainer.bc_steps, cfg.loss.clip_diff_max) == (0, float("inf"))
+    assert cfg.optim == paper.optim
 
 
 def test_number_of_sampled_actions_is_the_presets_where_cqls_term_is():

@@ -41,15 +41,18 @@ class DataConfig:
     """Which data set: rolled out from the packaged behaviour policies, or recorded.
 
     Attributes:
-        level: random, medium, medium-replay, medium-expert or expert; minari, d4rl or
-            file for recorded data.
+        level: random, medium, medium-replay, medium-expert or expert; diverse or play
+            in a maze; minari, d4rl or file for recorded data.
         path: of recorded data, see docs/your_data.md.
         download: fetch a set that path names.
         num_transitions: rows of the data set.
         seed: of the rollouts.
         random_share: of the rows that are random instead, for limited valuable data.
+        storage: memory, or disk for sets that do not fit, see docs/large_data.md.
         held_out: share of the rows kept from training to judge the inverse dynamics.
         standardize: observations to mean 0 and standard deviation 1, once.
+        reward_scale: factor of the rewards that are trained on.
+        reward_shift: added to them after it; evaluation has the task's own rewards.
     """
 
     level: str = MISSING
@@ -58,8 +61,11 @@ class DataConfig:
     num_transitions: int = MISSING
     seed: int = MISSING
     random_share: float = MISSING
+    storage: str = MISSING
     held_out: float = MISSING
     standardize: bool = MISSING
+    reward_scale: float = MISSING
+    reward_shift: float = MISSING
 
 
 @dataclass
@@ -122,6 +128,7 @@ class TrainerConfig:
         eval_episodes: complete episodes of an evaluation.
         checkpoint_interval: steps between checkpoints.
         checkpoints_kept: how many of the newest stay, beside the best.
+        nonfinite: stop at a loss or gradient that is not finite, or skip that update.
         num_threads: torch threads; several fight where the machine is shared.
         device: cpu or cuda.
         precision: float32 or bfloat16, of the losses' matrix products.
@@ -140,6 +147,7 @@ class TrainerConfig:
     eval_episodes: int = MISSING
     checkpoint_interval: int = MISSING
     checkpoints_kept: int = MISSING
+    nonfinite: str = MISSING
     num_threads: int = MISSING
     device: str = MISSING
     precision: str = MISSING

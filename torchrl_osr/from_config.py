@@ -15,14 +15,19 @@ from tensordict import TensorDict
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torchrl.objectives import LossModule
 
-from torchrl_osr.data import load_dataset
+from torchrl_osr.data import TransitionsOnDisk, load_dataset
 from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
+from torchrl_osr.objectives.base import check_choice
 
 
 def load_data(
     cfg: DictConfig, *, progress: bool = True
-) -> tuple[TensorDict, dict[str, Any]]:
+) -> tuple[TensorDict | TransitionsOnDisk, dict[str, Any]]:
     """Load the run's data set, see :func:`~torchrl_osr.data.load_dataset`.
+
+    Its rewards become ``data.reward_scale * r + data.reward_shift``; the manifest has
+    the task's own, and so has a set on disk (``data.storage=disk``), of which the
+    batches are scaled.
 
     Args:
         cfg: a whole configuration of ``examples/offline_osr.py``; that of an older run
@@ -31,7 +36,7 @@ def load_data(
     Keyword Args:
         progress: show a progress bar when on a terminal. Default: ``True``.
     """
-    return load_dataset(
+    data, manifest = load_dataset(
         cfg.env.name,
         cfg.data.level,
         env_id=cfg.env.id,
@@ -41,7 +46,31 @@ def load_data(
         num_transitions=cfg.data.num_transitions,
         seed=cfg.data.seed,
         progress=progress,
+        on_disk=check_storage(cfg) == "disk",
     )
+    scale = cfg.data.get("reward_scale", 1.0)
+    shift = cfg.data.get("reward_shift", 0.0)
+    if (scale, shift) != (1.0, 0.0) and isinstance(data, TensorDict):
+        data["next", "reward"] = scale * data["next", "reward"] + shift
+    return data, manifest
+
+
+def check_storage(cfg: DictConfig) -> str:
+    """Return where the data shall be.
+
+    Raises:
+        ValueError: it is no such place, or cannot be had with the other options.
+    """
+    # The configuration of an older run has no such key.
+    storage = str(cfg.data.get("storage", "memory"))
+    check_choice("data.storage", storage, ("memory", "disk"))
+    if storage == "disk" and cfg.trainer.cudagraph:
+        raise ValueError(
+            "trainer.cudagraph=true cannot be had with data.storage=disk: a CUDA graph "
+            "repeats kernels, and reading a file is none. Take data.storage=memory, or "
+            "trainer.cudagraph=false."
+        )
+    return storage
 
 
 class Learner(NamedTuple):

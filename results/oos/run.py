@@ -28,6 +28,11 @@ METHODS = {
     "osr_beta_0": ["loss=osr", "perturbation.std=0"],
     "osr_beta_1e-2": ["loss=osr", "perturbation.std=0.01"],
     "osr_beta_1e-1": ["loss=osr", "perturbation.std=0.1"],
+    "osr_beta_1e-1_clean_model": [
+        "loss=osr",
+        "perturbation.std=0.1",
+        "inverse_dynamics.loss.states=clean",
+    ],
     "cql_noisy_bc_beta_1e-1": ["loss=cql_noisy_bc", "perturbation.std=0.1"],
 }
 DATA = [

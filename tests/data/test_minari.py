@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
+from contextlib import suppress
 
 import minari
 import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from minari.data_collector import EpisodeBuffer
 from torchrl.data.datasets import load_dataset as load_from_torchrl
 
@@ -177,6 +180,29 @@ def test_nothing_is_fetched_unless_it_is_said(monkeypatch):
     assert (asked, len(data)) == (["test/far-v0"], sum(LENGTHS))
     load_minari("test/far-v0", download=True)
     assert asked == ["test/far-v0"]
+
+
+def test_the_environment_of_the_metadata_is_not_made(tmp_path):
+    """Minari asks it for spaces that are missing; it can be any function."""
+    make("test/crafted-v0")
+    marker = tmp_path / "marker"
+    spec = EnvSpec("Crafted-v0", entry_point="os:mkdir", kwargs={"path": str(marker)})
+    folder = tmp_path / "minari" / "test" / "crafted-v0" / "data"
+    path = folder / "metadata.json"
+    sound = json.loads(path.read_text())
+    crafted = sound | {"env_spec": spec.to_json()}
+    del crafted["action_space"]
+    path.write_text(json.dumps(crafted))
+    with pytest.raises(ValueError, match=r"its metadata\.json has no action_space"):
+        load_minari("test/crafted-v0")
+    assert not marker.exists()
+    with suppress(Exception):  # what it makes is no environment
+        minari.load_dataset("test/crafted-v0")
+    assert marker.exists(), "the crafted metadata works"
+    path.write_text(json.dumps(sound))
+    os.truncate(path, 10**9)
+    with pytest.raises(ValueError, match="has more than 268,435,456 bytes"):
+        load_minari("test/crafted-v0")
 
 
 def damage_metadata(folder):

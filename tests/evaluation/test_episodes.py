@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import gymnasium
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from torchrl_osr.evaluation.episodes import (
     deterministic_policy,
     summarize,
 )
+from torchrl_osr.evaluation.summary import score_table
 from torchrl_osr.modules import tanh_gaussian_actor
 
 
@@ -85,6 +88,48 @@ def test_summary_is_json_and_normalised():
     assert summary["score_high"] == pytest.approx(100)
     assert summary["returns"] == [3234.3, -20.272305]
     assert summary["length"] == 510
+
+
+def test_tasks_without_successes_have_none():
+    results = EpisodeEvaluator("Hopper-v5", num_episodes=2)(linear_policy)
+    assert results.successes is None
+    assert not [key for key in summarize(results, "hopper") if "success" in key]
+
+
+def test_successes_are_those_that_reached_the_goal():
+    evaluator = EpisodeEvaluator("PointMaze_UMaze-v3", num_episodes=8)
+
+    def sideways(observation: torch.Tensor) -> torch.Tensor:
+        """Reaches the goals in the same row; the others take all their time."""
+        way = (observation[:, 2:4] - observation[:, :2]).clamp(-0.5, 0.5)
+        return way * torch.tensor([1.0, 0.0])
+
+    results = evaluator(sideways)
+    assert results.successes.tolist() == (results.lengths < 300).tolist()
+    assert results.successes.tolist() == results.returns.astype(bool).tolist()
+    assert len(set(results.successes.tolist())) == 2, "some shall miss it here"
+    evaluator.close()
+
+
+def test_success_rate_has_wilsons_interval():
+    successes = np.array([True, True, False, False])
+    results = EpisodeResults(
+        successes.astype(float), np.full(4, 300), np.arange(4), successes
+    )
+    summary = summarize(results, "pointmaze-umaze")
+    assert (summary["score"], summary["success_rate"]) == (50, 0.5)
+    # By hand in test_statistics.
+    interval = summary["success_low"], summary["success_high"]
+    assert interval == pytest.approx((0.15004, 0.84996), abs=1e-5)
+    assert summary["successes"] == [True, True, False, False]
+    table = score_table("maze", [summary], summary | {"step": 1}, None, Path("run"))
+    (line,) = [line for line in table.splitlines() if "success" in line]
+    assert line.split()[3:] == [
+        *["50.0", "[15.0,", "85.0]", "%", "of", "4", "episodes,", "Wilson", "interval"]
+    ]
+    summary = {k: v for k, v in summary.items() if "success" not in k}
+    table = score_table("maze", [summary], summary | {"step": 1}, None, Path("run"))
+    assert "success" not in table
 
 
 def test_no_episodes_is_an_error():

@@ -14,6 +14,7 @@ from torchrl_osr.evaluation.statistics import (
     percentile_interval,
     performance_profile,
     stratified_resamples,
+    wilson_interval,
 )
 
 FINITE = st.floats(-1e6, 1e6)
@@ -138,3 +139,12 @@ def test_no_episodes_are_an_error(runs):
 def test_an_empty_stratum_is_an_error(strata):
     with pytest.raises(ValueError, match="every stratum"):
         stratified_resamples(strata)
+
+
+def test_wilson_interval_is_that_of_the_formula():
+    # p = 0.5, n = 4, z^2 = 3.8415: 0.5 -+ 1.95996 * sqrt(1 + 0.96036) / 7.84146.
+    low, high = wilson_interval(2, 4)
+    assert (low, high) == pytest.approx((0.15004, 0.84996), abs=1e-5)
+    assert wilson_interval(0, 20)[0] == pytest.approx(0, abs=1e-12)
+    with pytest.raises(ValueError, match="3 of 2"):
+        wilson_interval(3, 2)

@@ -15,7 +15,6 @@ from torchrl_osr.evaluation.survival import (
     discordant,
     steps_alive,
     survival_table,
-    wilson_interval,
 )
 from torchrl_osr.evaluation.takeover import BEHAVIOR, NEVER, hand_over, play_takeovers
 
@@ -86,15 +85,6 @@ def test_steps_alive_do_not_count_the_fall():
     assert steps_alive(trajectory(8, terminated=True), 10, 15) == 0
     with pytest.raises(ValueError, match="broken off 20 steps after entry 10, not 21"):
         steps_alive(trajectory(31, terminated=False), 10, 21)
-
-
-def test_wilson_interval_is_that_of_the_formula():
-    # p = 0.5, n = 4, z^2 = 3.8415: 0.5 -+ 1.95996 * sqrt(1 + 0.96036) / 7.84146.
-    low, high = wilson_interval(2, 4)
-    assert (low, high) == pytest.approx((0.15004, 0.84996), abs=1e-5)
-    assert wilson_interval(0, 20)[0] == pytest.approx(0, abs=1e-12)
-    with pytest.raises(ValueError, match="3 of 2"):
-        wilson_interval(3, 2)
 
 
 def test_table_counts_by_horizon_and_in_pairs():

@@ -121,6 +121,20 @@ def test_another_environment_or_size_is_refused(tmp_path, key, value, shapes):
         load_trained(folder)
 
 
+def test_a_run_of_somebody_else_calls_nothing_of_theirs(tmp_path):
+    folder, marker = tmp_path / "run", tmp_path / "marker"
+    make_run(folder)
+    cfg = OmegaConf.load(folder / "config.yaml")
+    crafted = {"_target_": "os.mkdir", "path": str(marker)}
+    OmegaConf.update(cfg, "loss.adversary", crafted, force_add=True)
+    OmegaConf.save(cfg, folder / "config.yaml")
+    with pytest.raises(ValueError, match=r"'os\.mkdir' called, which is none of"):
+        load_trained(folder)
+    assert not marker.exists()
+    make_learner(cfg, 11, 3)
+    assert marker.exists(), "the crafted configuration works"
+
+
 def test_damage_is_found(tmp_path):
     folder = tmp_path / "run"
     make_run(folder)

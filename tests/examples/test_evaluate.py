@@ -6,6 +6,7 @@ import importlib.util
 import json
 import os
 import re
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -21,6 +22,7 @@ from torchrl_osr.data import make_environment
 from torchrl_osr.evaluation.robustness import check_levels
 from torchrl_osr.evaluation.suite import make_levels
 from torchrl_osr.evaluation.trained_run import load_trained
+from torchrl_osr.report.files import read_suites
 
 ROOT = Path(__file__).parents[2]
 SUITES = sorted(path.stem for path in (ROOT / "conf" / "suite").glob("*.yaml"))
@@ -131,6 +133,52 @@ def test_finished_evaluation_is_not_done_again(folder, evaluated, example, capsy
     assert json.loads(path.read_text()) == content, "the same numbers again"
     example.main(composed(*same, "seed=5"))
     assert json.loads(path.read_text())["evaluations"] != content["evaluations"]
+
+
+def test_killed_evaluation_goes_on_to_the_same_bytes(
+    folder, example, monkeypatch, capsys
+):
+    """From the first checkpoint that was not done, and without the network."""
+    same = composed(f"checkpoint={folder}", "episodes=2", "suite=start")
+    path, partial = (
+        folder / name
+        for name in ("robustness-start.json", ".robustness-start.partial.json")
+    )
+    played = []
+    play = example.evaluate_paired
+
+    def dying(*args, **options):
+        played.append(options["seed"])
+        if len(played) == 3:
+            raise SystemExit("killed")
+        return play(*args, **options)
+
+    def refuse(*_):
+        raise AssertionError("the network was asked for")
+
+    monkeypatch.setattr(socket.socket, "connect", refuse)
+    monkeypatch.setattr(example, "evaluate_paired", dying)
+    with pytest.raises(SystemExit):
+        example.main(same)
+    assert not path.exists()
+    assert len(json.loads(partial.read_text())["evaluations"]) == 2
+    assert "start" not in read_suites(folder)[0], "a part is no result"
+    example.main(same)
+    assert played == [20_000, 21_000, 22_000, 22_000]
+    assert "has 2 of 3 checkpoints already" in capsys.readouterr().out
+    assert not partial.exists()
+    continued = path.read_bytes()
+    monkeypatch.setattr(example, "evaluate_paired", play)
+    path.unlink()
+    # What another request has left, and what is damaged, is not continued.
+    other = json.loads(continued) | {"seed": 1}
+    for left in (json.dumps(other), continued[:100].decode()):
+        partial.write_text(left)
+        example.main(composed(f"checkpoint={folder}", "episodes=2", "suite=start"))
+        assert path.read_bytes() == continued
+        assert not partial.exists()
+        path.unlink()
+    assert f"{partial} is of no use" in capsys.readouterr().out
 
 
 def test_one_checkpoint_has_a_file_of_its_own(folder, example):

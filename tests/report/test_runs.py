@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import runpy
 from pathlib import Path
 from types import SimpleNamespace
@@ -77,6 +78,19 @@ def test_what_is_not_finished_or_broken_is_left_out_and_named(tmp_path, spoil, r
     assert [run.folder.name for run in runs] == ["good"]
     assert path == tmp_path / "bad"
     assert reason in why
+
+
+def test_what_is_far_too_large_is_left_out(tmp_path):
+    for number, name in enumerate(("returns.json", "config.yaml")):
+        folder = tmp_path / str(number)
+        fakes.write_run(folder, CURVE)
+        os.truncate(folder / name, 10**9)  # a hole: no byte of it is on the disk
+    runs, left_out = find_runs([tmp_path])
+    assert runs == []
+    assert [each.reason for each in left_out] == [
+        "returns.json has more than 268,435,456 bytes",
+        "config.yaml has more than 1,048,576 bytes",
+    ]
 
 
 def test_a_broken_robustness_file_leaves_the_run_in(tmp_path):

@@ -10,6 +10,7 @@ from tensordict import TensorDict
 
 from torchrl_osr.data.replay_buffer import check_memory
 from torchrl_osr.trainers import hardware
+from torchrl_osr.trainers.finite_guard import FiniteGuard
 from torchrl_osr.trainers.gradient_steps import SumOfLosses
 
 
@@ -97,8 +98,12 @@ def test_only_the_losses_are_computed_in_half_precision(dtype) -> None:
     optimizer = torch.optim.SGD(layer.parameters(), lr=0.1)
     before = layer.weight.detach().clone()
     trainer = SimpleNamespace(
-        loss_module=layer, optimizer=optimizer, compute_loss=compute_loss
+        loss_module=layer,
+        optimizer=optimizer,
+        compute_loss=compute_loss,
+        cudagraph=False,
     )
+    trainer.guard = FiniteGuard(trainer, "stop")
     SumOfLosses(dtype).step(trainer, torch.ones(5, 4))
     assert seen == [dtype or torch.float32]
     assert layer.weight.dtype == torch.float32

@@ -210,6 +210,7 @@ def test_member_continues_alone_and_joins_again(tmp_path, make, runs, check, kil
         ({"loss_options": {"layer_norm": True}}, "qvalue_network_params"),
         ({"name": "OSR-v"}, "class: OSRLoss and OSRVLoss"),
         ({"autocast_dtype": torch.bfloat16}, "autocast_dtype"),
+        ({"nonfinite": "skip"}, "nonfinite=skip: False and True"),
     ],
 )
 def test_members_that_differ_are_refused_by_name(tmp_path, make, options, named):
@@ -269,11 +270,35 @@ def test_a_failed_member_ends_every_run_with_the_reason(tmp_path, make):
         trainer.loss_module.min_q_weight = float("nan")
         yield trainer
 
-    with pytest.raises(FloatingPointError, match="loss_cql"):
+    with pytest.raises(FloatingPointError, match="member 1: .* losses loss_cql"):
         train_together([noted(0), spoiled(1), noted(2)])
     assert len(reasons) == 2
     assert "loss_cql" in reasons[0]
     assert not list(tmp_path.glob("1/ckpt/checkpoint-*"))
+
+
+@pytest.mark.parametrize("captured", [False, True])
+def test_a_member_skips_its_own_updates(tmp_path, make, runs, graphs, check, captured):
+    def poison(trainer: OfflineTrainer) -> None:
+        count = torch.zeros(())
+
+        def spoil(batch):
+            count.add_(1)
+            reward = batch["next", "reward"].masked_fill(count == 7, torch.nan)
+            return batch.set(("next", "reward"), reward)
+
+        trainer.register_op("process_optim_batch", spoil)
+
+    members = [
+        run(make, tmp_path, 0, nonfinite="skip", cudagraph=captured),
+        run(make, tmp_path, 1, nonfinite="skip", cudagraph=captured, then=poison),
+    ]
+    first, second = train_together(members)
+    assert (first.guard.skipped, second.guard.skipped) == (0, 1)
+    (alone,) = train_together(
+        [run(make, tmp_path / "alone", 1, nonfinite="skip", then=poison)]
+    )
+    assert_same(runs, check, second, alone)
 
 
 def test_runs_of_different_lengths_are_refused(tmp_path, make):

@@ -21,6 +21,7 @@ from torchrl_osr.data.behavior import (
     save_behavior_policy,
     update_behavior_card,
 )
+from torchrl_osr.data.on_disk import TransitionsOnDisk
 from torchrl_osr.data.reference_scores import (
     REFERENCE_RETURNS,
     ReferenceReturns,
@@ -30,6 +31,7 @@ from torchrl_osr.data.replay_buffer import (
     make_replay_buffer,
     observation_statistics,
     split_held_out,
+    split_on_disk,
 )
 from torchrl_osr.data.validation import check_dataset
 
@@ -40,6 +42,7 @@ if TYPE_CHECKING:
         measure_policy,
     )
     from torchrl_osr.data.d4rl_reader import load_d4rl
+    from torchrl_osr.data.disk_writer import write_on_disk
     from torchrl_osr.data.environment import make_environment
     from torchrl_osr.data.episodes import transitions_from_episodes
     from torchrl_osr.data.file_reader import load_file
@@ -69,6 +72,7 @@ _NEEDS_EXTRA = {
     "mix_datasets": "mixtures",
     "transitions_from_episodes": "episodes",
     "transitions_from_rows": "trajectories",
+    "write_on_disk": "disk_writer",
 }
 
 __all__ = [
@@ -77,6 +81,7 @@ __all__ = [
     "BehaviorPolicy",
     "Collection",
     "ReferenceReturns",
+    "TransitionsOnDisk",
     "check_dataset",
     "collect_level",
     "collect_transitions",
@@ -98,9 +103,11 @@ __all__ = [
     "observation_statistics",
     "save_behavior_policy",
     "split_held_out",
+    "split_on_disk",
     "transitions_from_episodes",
     "transitions_from_rows",
     "update_behavior_card",
+    "write_on_disk",
 ]
 
 # By name, so that Minari is imported when such a set is asked for.

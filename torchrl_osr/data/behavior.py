@@ -21,6 +21,8 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_osr.data.limits import read_arrays, read_json
+
 FloatArray = NDArray[np.float32]
 
 BEHAVIOR_POLICIES_DIR = Path(__file__).parent / "behavior_policies"
@@ -29,6 +31,9 @@ BEHAVIOR_POLICIES_DIR = Path(__file__).parent / "behavior_policies"
 # The bounds the actors were trained with: outside them exp() gives a standard
 # deviation that is either zero in float32 or saturates the tanh.
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
+
+# Two layers of 256 units have 0.3 MB.
+MAX_POLICY_BYTES = 64 * 2**20
 
 
 class Affine(NamedTuple):
@@ -133,9 +138,7 @@ def load_behavior_card(folder: Path | str | None = None) -> dict[str, Any]:
     Returns:
         ``{env_name: {"env": gymnasium id, "policies": {policy_name: {...}}}}``.
     """
-    path = Path(folder or BEHAVIOR_POLICIES_DIR) / "card.json"
-    card: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return card
+    return read_json(Path(folder or BEHAVIOR_POLICIES_DIR) / "card.json")
 
 
 def behavior_policy_path(
@@ -183,7 +186,7 @@ def load_behavior_policy(
 
     Raises:
         ValueError: unknown name (the message lists the known ones), or a file that
-            lacks an array.
+            lacks an array, is damaged, or unpacks to more than 64 MiB.
 
     Examples:
         >>> from torchrl_osr.data import load_behavior_policy
@@ -192,15 +195,19 @@ def load_behavior_policy(
     """
     path = behavior_policy_path(env_name, policy_name, folder)
     layers = {}
-    with np.load(path, allow_pickle=False) as arrays:
-        for field in fields(BehaviorPolicy):
-            names = (f"{field.name}.weight", f"{field.name}.bias")
-            missing = [name for name in names if name not in arrays]
-            if missing:
-                raise ValueError(f"{path} lacks the arrays: {', '.join(missing)}.")
-            layers[field.name] = Affine(
-                *(arrays[name].astype(np.float32) for name in names)
-            )
+    try:
+        with path.open("rb") as file:
+            arrays = read_arrays(file, max_bytes=MAX_POLICY_BYTES)
+    except ValueError as error:
+        raise ValueError(f"{path} is no policy, or damaged: {error}.") from error
+    for field in fields(BehaviorPolicy):
+        names = (f"{field.name}.weight", f"{field.name}.bias")
+        missing = [name for name in names if name not in arrays]
+        if missing:
+            raise ValueError(f"{path} lacks the arrays: {', '.join(missing)}.")
+        layers[field.name] = Affine(
+            *(arrays[name].astype(np.float32) for name in names)
+        )
     return BehaviorPolicy(**layers)
 
 

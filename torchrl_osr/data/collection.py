@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 
 from torchrl_osr.data.behavior import BehaviorPolicy
+from torchrl_osr.data.partial import PartialCollection, Progress
 
 try:
     import gymnasium
@@ -81,6 +82,7 @@ def collect_transitions(
     *,
     seed: int | Sequence[int] = 0,
     progress: bool = True,
+    partial: PartialCollection | None = None,
 ) -> Collection:
     """Roll out an exact number of transitions, in equal shares of several policies.
 
@@ -100,6 +102,8 @@ def collect_transitions(
         seed: non-negative seed or seeds; global generators are neither read nor
             touched. Default: 0.
         progress: show a progress bar when on a terminal. Default: ``True``.
+        partial: where to keep what there is so far, and to go on from. The data are
+            the same, bit for bit. Default: ``None``, nothing is kept.
 
     Returns:
         The transitions, ordered by policy and time, and the episode statistics.
@@ -115,10 +119,11 @@ def collect_transitions(
     columns = _allocate(num_transitions, env)
     bounds = [num_transitions * i // len(samplers) for i in range(len(samplers) + 1)]
     seeds = np.random.SeedSequence(seed).spawn(len(samplers))
-    returns: list[float] = []
-    lengths: list[int] = []
+    saved = partial.restore(columns) if partial else None
+    done, generator, returns, lengths = saved or Progress(0, {}, [], [])
     # disable=None: no bar where the output is not a terminal.
     with tqdm(
+        initial=done,
         total=num_transitions,
         desc="collect",
         unit="step",
@@ -128,6 +133,8 @@ def collect_transitions(
             samplers, seeds, pairwise(bounds), strict=True
         ):
             rng = np.random.default_rng(child)
+            if start < done:  # this share is begun, or full
+                start, rng.bit_generator.state = done, generator
             while start < stop:
                 rows = {name: column[start:stop] for name, column in columns.items()}
                 length, episode_return = _play_episode(env, sampler, rng, rows)
@@ -136,6 +143,10 @@ def collect_transitions(
                     lengths.append(length)
                 start += length
                 bar.update(length)
+                if partial:
+                    state = rng.bit_generator.state
+                    now = Progress(start, dict(state), returns, lengths)
+                    partial.save_if_due(columns, now)
     return Collection(
         _as_tensordict(columns),
         np.asarray(returns, dtype=np.float64),

@@ -7,6 +7,7 @@ observation there. Neither is a state that any action led to.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,11 @@ from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 
 from torchrl_osr.data.columns import ActionBounds
 from torchrl_osr.data.download import download_file
+from torchrl_osr.data.file_slices import open_hdf5
 from torchrl_osr.data.hdf5 import read_hdf5
 from torchrl_osr.data.local import cache_root
 from torchrl_osr.data.manifest import sha256_of
+from torchrl_osr.data.slices import Slices, whole_trajectories
 from torchrl_osr.data.trajectories import transitions_from_rows
 
 # D4RL's names of our columns; a file's other arrays and groups are not read.
@@ -91,16 +94,50 @@ def load_d4rl(
         (3, 1)
     """
     path = _locate(source, download, cache_dir, progress)
-    arrays = read_hdf5(path, COLUMNS)
-    _check_arrays(path, arrays)
-    if "timeouts" not in arrays:
-        arrays["timeouts"] = _timeouts(path, arrays["terminals"], max_episode_steps)
     data, manifest = transitions_from_rows(
-        {COLUMNS[name]: array for name, array in arrays.items()},
+        _columns(path, read_hdf5(path, COLUMNS), max_episode_steps),
         action_bounds=action_bounds,
         clip_actions=clip_actions,
     )
     return data, {"source": str(source), "data_sha256": sha256_of(path)} | manifest
+
+
+def slices_of_d4rl(
+    source: str | Path,
+    *,
+    download: bool = False,
+    cache_dir: Path | str | None = None,
+    max_episode_steps: int | None = None,
+    action_bounds: ActionBounds = (-1.0, 1.0),
+    clip_actions: bool = False,
+    progress: bool = True,
+) -> Slices:
+    """Open a D4RL data set for reading in slices, see :func:`load_d4rl`."""
+    path = _locate(source, download, cache_dir, progress)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file {path}.")
+    total, read_arrays = open_hdf5(path, COLUMNS)
+
+    def read(start: int, stop: int) -> dict[str, NDArray[Any]]:
+        return _columns(path, read_arrays(start, stop), max_episode_steps)
+
+    return Slices(
+        {"source": str(source), "files": [str(path)]},
+        total,
+        partial(whole_trajectories, read, total),
+        action_bounds,
+        clip_actions,
+    )
+
+
+def _columns(
+    path: Path, arrays: dict[str, NDArray[Any]], max_episode_steps: int | None
+) -> dict[str, NDArray[Any]]:
+    """Return our columns of whole trajectories, the first of which begins in row 0."""
+    _check_arrays(path, arrays)
+    if "timeouts" not in arrays:
+        arrays["timeouts"] = _timeouts(path, arrays["terminals"], max_episode_steps)
+    return {COLUMNS[name]: array for name, array in arrays.items()}
 
 
 def _locate(

@@ -60,14 +60,27 @@ def transitions_from_episodes(
         >>> len(data), manifest["episode_lengths"]
         (6, [3, 3])
     """
-    parts: dict[str, list[NDArray[Any]]] = {}
-    sizes: dict[str, tuple[int, ...]] = {}
-    empty = 0
     # disable=None: no bar where the output is not a terminal.
     bar = tqdm(
         episodes, "read", total, unit="episode", disable=None if progress else True
     )
-    for number, episode in enumerate(bar):
+    rows, empty = join_episodes(enumerate(bar))
+    if not rows:
+        raise ValueError(f"none of the {empty} episodes has a step.")
+    data, manifest = transitions_from_rows(
+        rows, action_bounds=action_bounds, clip_actions=clip_actions
+    )
+    return data, manifest | {"empty_episodes": empty}
+
+
+def join_episodes(
+    episodes: Iterable[tuple[int, Mapping[str, ArrayLike]]],
+) -> tuple[dict[str, NDArray[Any]], int]:
+    """Return the columns of numbered episodes, and how many of them have no step."""
+    parts: dict[str, list[NDArray[Any]]] = {}
+    sizes: dict[str, tuple[int, ...]] = {}
+    empty = 0
+    for number, episode in episodes:
         rows = _rows_of(number, episode)
         if not len(rows["reward"]):
             empty += 1
@@ -79,14 +92,7 @@ def transitions_from_episodes(
                     f"{list(array.shape[1:])}; it was {list(sizes[name])} before."
                 )
             parts.setdefault(name, []).append(array)
-    if not parts:
-        raise ValueError(f"none of the {empty} episodes has a step.")
-    data, manifest = transitions_from_rows(
-        {name: np.concatenate(arrays) for name, arrays in parts.items()},
-        action_bounds=action_bounds,
-        clip_actions=clip_actions,
-    )
-    return data, manifest | {"empty_episodes": empty}
+    return {name: np.concatenate(arrays) for name, arrays in parts.items()}, empty
 
 
 def _rows_of(number: int, episode: Mapping[str, ArrayLike]) -> dict[str, NDArray[Any]]:

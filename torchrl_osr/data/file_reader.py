@@ -5,16 +5,16 @@ All three hold the same columns; nothing is unpickled.
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib.format import MAGIC_PREFIX
 from numpy.typing import NDArray
 from tensordict import TensorDict
 
 from torchrl_osr.data.columns import ActionBounds
+from torchrl_osr.data.limits import read_arrays, refuse_size
 from torchrl_osr.data.manifest import sha256_of
 from torchrl_osr.data.trajectories import transitions_from_rows
 
@@ -46,8 +46,8 @@ def load_file(
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: another ending, a damaged file, or columns that differ from the
-            above.
+        ValueError: another ending, a damaged file, one that unpacks to more than both
+            4 GiB and its own size, or columns that differ from the above.
 
     Examples:
         >>> import tempfile, numpy as np
@@ -85,13 +85,11 @@ def load_file(
 
 def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
     try:
-        # Opened here, because NumPy leaves it open where it is no archive.
         with path.open("rb") as file:
-            arrays = np.load(file, allow_pickle=False)
-            if isinstance(arrays, np.ndarray):
+            if file.read(len(MAGIC_PREFIX)) == MAGIC_PREFIX:
                 raise ValueError("it is a single array")
-            return {name: arrays[name] for name in arrays}
-    except (ValueError, EOFError, OSError, zipfile.BadZipFile, zlib.error) as error:
+            return read_arrays(file)
+    except (ValueError, OSError) as error:
         raise ValueError(
             f"{path} is no NumPy archive of plain arrays, or damaged: {error}"
         ) from error
@@ -112,14 +110,23 @@ def _read_parquet(path: Path) -> dict[str, NDArray[Any]]:
             f"Parquet files need {error.name!r}: pip install torchrl-osr[minari]"
         ) from error
     try:
+        refuse_size(path.stat().st_size, 8 * _count_values(parquet.ParquetFile(path)))
         # The file alone: not the columns that names of its folders might stand for.
         table = parquet.read_table(path, partitioning=None)
-    except (pyarrow.ArrowException, OSError) as error:
+    except (pyarrow.ArrowException, OSError, ValueError) as error:
         raise ValueError(f"{path} is no Parquet file, or damaged: {error}") from error
-    return {name: _as_numpy(name, table[name]) for name in table.column_names}
+    return {name: as_numpy(name, table[name]) for name in table.column_names}
 
 
-def _as_numpy(name: str, column: Any) -> NDArray[Any]:
+def _count_values(file: Any) -> int:
+    """Return how many values a Parquet file announces, in all columns together."""
+    groups = (file.metadata.row_group(i) for i in range(file.num_row_groups))
+    return sum(
+        group.column(i).num_values for group in groups for i in range(group.num_columns)
+    )
+
+
+def as_numpy(name: str, column: Any) -> NDArray[Any]:
     """Return a Parquet column ``[N]``, or ``[N, D]`` if it holds lists."""
     import pyarrow
 

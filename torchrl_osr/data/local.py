@@ -13,7 +13,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -24,13 +24,20 @@ from filelock import FileLock
 from tensordict import TensorDict
 from torchrl import torchrl_logger
 
-from torchrl_osr.data.behavior import behavior_policy_path
 from torchrl_osr.data.collection import Collection
-from torchrl_osr.data.environment import environment_id
-from torchrl_osr.data.levels import collect_level, level_policies
-from torchrl_osr.data.manifest import describe_episodes, sha256_of
+from torchrl_osr.data.environment import MAZE_IDS, environment_id, make_environment
+from torchrl_osr.data.levels import behavior_of, collect_level
+from torchrl_osr.data.limits import MAX_JSON_BYTES, read_arrays, read_json
+from torchrl_osr.data.manifest import (
+    check_seal,
+    describe_episodes,
+    sealed,
+    sha256_of,
+)
+from torchrl_osr.data.partial import PartialCollection
 from torchrl_osr.data.reference_scores import normalized_score
 from torchrl_osr.data.validation import DATASET_KEYS, check_dataset
+from torchrl_osr.disk_space import check_disk_space
 
 try:
     import platformdirs
@@ -45,8 +52,13 @@ CACHE_VARIABLE = "TORCHRL_OSR_CACHE"
 # Raise it whenever the recipe or the layout changes: older folders are then re-made.
 FORMAT_VERSION = 1
 
+# Humanoid, the widest of Gymnasium's tasks, has 3,000 bytes a row. Of an episode, which
+# has one row at least, the manifest has return and length.
+MAX_ROW_BYTES, MAX_EPISODE_BYTES = 2**14, 64
+
 # Other versions of these give other data for the same seed.
 DATA_PACKAGES = ("numpy", "gymnasium", "mujoco")
+MAZE_PACKAGES = (*DATA_PACKAGES, "gymnasium-robotics")
 
 
 def load_local_dataset(
@@ -61,14 +73,16 @@ def load_local_dataset(
     """Load a data set rolled out on this machine, collecting it on first use.
 
     About 10,000 transitions a second are collected; a set of a million takes one or
-    two minutes once. Processes that ask for the same set at once wait for one of them
-    to collect it. The same seed gives the same data on one machine and one set of
-    library versions, not across machines: contact dynamics are chaotic.
+    two minutes once. A killed collection loses the last 50,000 or so, and goes on to
+    the same bytes. Processes that ask for the same set at once wait for one of them to
+    collect it. The same seed gives the same data on one machine and one set of library
+    versions, not across machines: contact dynamics are chaotic.
 
     Args:
-        env_name: ``"hopper"``, ``"walker2d"`` or ``"halfcheetah"`` (Gymnasium v5).
+        env_name: ``"hopper"``, ``"walker2d"`` or ``"halfcheetah"`` (Gymnasium v5);
+            ``"pointmaze-umaze"``, ``-medium`` or ``-large`` (gymnasium-robotics).
         level: ``"random"``, ``"medium"``, ``"medium-replay"``, ``"medium-expert"`` or
-            ``"expert"``.
+            ``"expert"``; of a maze ``"diverse"`` or ``"play"``.
 
     Keyword Args:
         num_transitions: exact number of transitions ``N``.
@@ -111,12 +125,17 @@ def load_local_dataset(
         except (OSError, ValueError) as flaw:
             if folder.exists():
                 torchrl_logger.warning(f"Collecting {folder} anew: {flaw}.")
+        _check_room(folder, request)
+        beside = folder.with_name(f".{folder.name}.partial")
+        partial = PartialCollection(beside, request)
         collection = collect_level(
-            env_name, level, num_transitions, seed=seed, progress=progress
-        )
+            env_name, level, num_transitions, seed=seed, progress=progress,
+            partial=partial,
+        )  # fmt: skip
         check_dataset(collection.data)
         with _explained_write_errors(folder):
             _write(folder, request, collection)
+        partial.remove()
         return _read(folder, request)
 
 
@@ -130,11 +149,14 @@ def _request(
     env_name: str, level: str, num_transitions: int, seed: int
 ) -> dict[str, Any]:
     """Return the part of the manifest that decides what the data are."""
+    maze = env_name in MAZE_IDS
+    extra = "examples,mazes" if maze else "examples"
+    packages = MAZE_PACKAGES if maze else DATA_PACKAGES
     try:
-        versions = {package: version(package) for package in DATA_PACKAGES}
+        versions = {package: version(package) for package in packages}
     except PackageNotFoundError as error:
         raise ImportError(
-            f"collecting data needs {error.name!r}: pip install torchrl-osr[examples]"
+            f"collecting data needs {error.name!r}: pip install torchrl-osr[{extra}]"
         ) from error
     return {
         "format_version": FORMAT_VERSION,
@@ -143,12 +165,21 @@ def _request(
         "level": level,
         "num_transitions": num_transitions,
         "seed": seed,
-        "behavior_sha256": {
-            name: sha256_of(behavior_policy_path(env_name, name))
-            for name in level_policies(level)
-        },
+        **behavior_of(env_name, level),
         "versions": versions,
     }
+
+
+def _check_room(folder: Path, request: dict[str, Any]) -> None:
+    """Raise an OSError unless the set, and its parts until then, fit on the disk."""
+    with closing(make_environment(request["env_id"])) as env:
+        observation, action = env.observation_space.shape, env.action_space.shape
+    assert observation is not None
+    assert action is not None
+    numbers = 2 * observation[0] + action[0] + 1  # both states, action, reward
+    row = numbers * np.dtype(np.float32).itemsize + 3  # and three flags
+    what = f"the data set and its parts ({CACHE_VARIABLE}=/path chooses the folder)"
+    check_disk_space(folder, 2 * request["num_transitions"] * row, what)
 
 
 @contextmanager
@@ -165,20 +196,27 @@ def _locked(folder: Path) -> Iterator[None]:
 
 def _read(folder: Path, request: dict[str, Any]) -> tuple[TensorDict, dict[str, Any]]:
     """Return a cached set; raise OSError or ValueError, with the reason, if unfit."""
-    manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
-    if not isinstance(manifest, dict):
-        raise ValueError("its manifest.json is not an object")
+    rows = request["num_transitions"]
+    longest = MAX_JSON_BYTES + MAX_EPISODE_BYTES * rows
+    manifest = read_json(folder / "manifest.json", max_bytes=longest)
     for key, wanted in request.items():
         if manifest.get(key) != wanted:
             raise ValueError(f"its {key} is {manifest.get(key)!r}, wanted {wanted!r}")
+    check_seal(manifest)
+    if (folder / "data.npz").stat().st_size > MAX_ROW_BYTES * (rows + 1):
+        raise ValueError("its data.npz is too large")
     # Hash and parse the same bytes: the folder may be replaced at any moment.
     content = (folder / "data.npz").read_bytes()
     if hashlib.sha256(content).hexdigest() != manifest.get("data_sha256"):
         raise ValueError("the checksum of its data.npz is wrong")
+    # As it is written, nothing in it is compressed.
+    arrays = read_arrays(io.BytesIO(content), max_bytes=0)
     data = TensorDict({}, batch_size=[manifest["num_transitions"]])
-    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+    try:
         for key in DATASET_KEYS:
             data.set(key, torch.from_numpy(arrays[_array_name(key)]))
+    except (KeyError, RuntimeError) as error:
+        raise ValueError(f"its data.npz is not what it says: {error}") from error
     return data, manifest
 
 
@@ -202,7 +240,7 @@ def _write(folder: Path, request: dict[str, Any], collection: Collection) -> Non
         manifest = request | _statistics(request["env_name"], collection)
         manifest["data_sha256"] = sha256_of(fresh / "data.npz")
         with (fresh / "manifest.json").open("w", encoding="utf-8") as file:
-            json.dump(manifest, file, indent=1)
+            json.dump(sealed(manifest), file, indent=1)
             _sync(file)
         if folder.exists():
             os.replace(folder, stale)

@@ -6,10 +6,15 @@ Shapes: ``E`` complete episodes.
 from __future__ import annotations
 
 import hashlib
+import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
+
+SEAL = "seal"
+"""Where a record has the SHA-256 of all that is in it besides."""
 
 
 def describe_episodes(returns: NDArray[Any], lengths: NDArray[Any]) -> dict[str, Any]:
@@ -23,12 +28,45 @@ def describe_episodes(returns: NDArray[Any], lengths: NDArray[Any]) -> dict[str,
         max; ``None`` without an episode), ``episode_returns`` and ``episode_lengths``.
     """
     return {
-        "num_complete_episodes": len(returns),
-        "return": _summary(returns),
-        "episode_length": _summary(lengths),
+        **summarize_episodes(returns, lengths),
         "episode_returns": returns.tolist(),
         "episode_lengths": lengths.tolist(),
     }
+
+
+def summarize_episodes(returns: NDArray[Any], lengths: NDArray[Any]) -> dict[str, Any]:
+    """Return the same without the single episodes, of which there may be millions."""
+    return {
+        "num_complete_episodes": len(returns),
+        "return": _summary(returns),
+        "episode_length": _summary(lengths),
+    }
+
+
+def sealed(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a JSON-compatible record with a checksum of itself in it.
+
+    Examples:
+        >>> from torchrl_osr.data.manifest import check_seal, sealed
+        >>> check_seal(sealed({"rows": 7}))
+        >>> check_seal(sealed({"rows": 7}) | {"rows": 8})
+        Traceback (most recent call last):
+            ...
+        ValueError: its seal is wrong
+    """
+    return dict(record) | {SEAL: _checksum(record)}
+
+
+def check_seal(record: Mapping[str, Any]) -> None:
+    """Raise a ValueError unless a record, read from JSON, is as :func:`sealed` it."""
+    if record.get(SEAL) != _checksum(record):
+        raise ValueError(f"its {SEAL} is {'wrong' if SEAL in record else 'missing'}")
+
+
+def _checksum(record: Mapping[str, Any]) -> str:
+    # Sorted: the order of a JSON object's keys says nothing.
+    rest = {key: value for key, value in record.items() if key != SEAL}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
 
 def _summary(values: NDArray[Any]) -> dict[str, float] | None:

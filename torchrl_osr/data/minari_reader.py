@@ -20,10 +20,14 @@ from torchrl.data import ReplayBuffer
 
 from torchrl_osr.data.columns import ActionBounds
 from torchrl_osr.data.episodes import transitions_from_episodes
+from torchrl_osr.data.limits import read_json
 from torchrl_osr.data.replay_buffer import make_replay_buffer
 
 try:
     import minari
+    from minari.storage import get_dataset_path, hosting
+
+    from torchrl_osr.data.hdf5 import check_hdf5
 except ImportError as error:
     raise ImportError(
         f"Minari data sets need {error.name!r}: pip install torchrl-osr[minari]"
@@ -77,7 +81,8 @@ def load_minari(
     Raises:
         FileNotFoundError: the set is not on this machine and ``download`` is false.
         ValueError: actions that are not real vectors, observations that are not made
-            of them, unknown keys, a damaged set, or data that
+            of them, unknown keys, a damaged set, an HDF5 file that unpacks to more than
+            both 4 GiB and its own size or leads into other files, or data that
             :func:`~torchrl_osr.data.transitions_from_rows` refuses.
 
     Examples:
@@ -91,6 +96,26 @@ def load_minari(
         FileNotFoundError: Minari set 'mujoco/hopper/medium-v0' is not on this ...
         >>> _ = os.environ.pop("MINARI_DATASETS_PATH")
     """
+    opened, leaves, bounds = open_minari(
+        dataset, download, observation_keys, action_bounds
+    )
+    data, manifest = transitions_from_episodes(
+        read_episodes(dataset, opened, leaves),
+        action_bounds=bounds,
+        clip_actions=clip_actions,
+        total=opened.total_episodes,
+        progress=progress,
+    )
+    return data, about_minari(dataset, opened, leaves, bounds) | manifest
+
+
+def open_minari(
+    dataset: str | Path,
+    download: bool,
+    observation_keys: Sequence[str] | None,
+    action_bounds: ActionBounds | None,
+) -> tuple[minari.MinariDataset, Leaves, ActionBounds]:
+    """Return the set, what its observations are made of, and its actions' bounds."""
     opened = _open(str(dataset), download)
     actions = opened.action_space
     if not isinstance(actions, gymnasium.spaces.Box):
@@ -99,16 +124,18 @@ def load_minari(
             "actions are not supported by this reader."
         )
     leaves = _chosen(_leaves(opened.observation_space), observation_keys)
-    bounds = action_bounds or (actions.low.ravel(), actions.high.ravel())
-    data, manifest = transitions_from_episodes(
-        _episodes(dataset, opened, leaves),
-        action_bounds=bounds,
-        clip_actions=clip_actions,
-        total=opened.total_episodes,
-        progress=progress,
-    )
+    return opened, leaves, action_bounds or (actions.low.ravel(), actions.high.ravel())
+
+
+def about_minari(
+    dataset: str | Path,
+    opened: minari.MinariDataset,
+    leaves: Leaves,
+    bounds: ActionBounds,
+) -> dict[str, Any]:
+    """Return what the manifest says of the source."""
     spec = opened.env_spec
-    return data, {
+    return {
         "source": str(dataset),
         "dataset_id": opened.id,
         "env_id": None if spec is None else spec.id,
@@ -117,7 +144,7 @@ def load_minari(
         "observation_layout": [
             ["/".join(name), int(np.prod(box.shape))] for name, box in leaves.items()
         ],
-    } | manifest
+    }
 
 
 def minari_replay_buffer(
@@ -143,11 +170,17 @@ def minari_replay_buffer(
 
 def _open(dataset: str, download: bool) -> minari.MinariDataset:
     path = Path(dataset).expanduser()
+    here = get_dataset_path(dataset) / "data"
     try:
         for folder in (path / "data", path):
             if (folder / "metadata.json").is_file():
-                return minari.MinariDataset(folder)
-        return minari.load_dataset(dataset, download=download)
+                here = folder
+                break
+        else:
+            if download and not here.exists():
+                hosting.download_dataset(dataset)
+        _check_folder(here)
+        return minari.MinariDataset(here)
     except FileNotFoundError as error:
         raise FileNotFoundError(
             f"Minari set {dataset!r} is not on this machine: fetch it with "
@@ -155,6 +188,20 @@ def _open(dataset: str, download: bool) -> minari.MinariDataset:
         ) from error
     except DAMAGE as error:
         raise _damaged(dataset, error) from error
+
+
+def _check_folder(folder: Path) -> None:
+    """Raise where Minari would read or run what somebody else has put there.
+
+    Without the two spaces it makes the environment of the metadata to ask for them,
+    and that can name any function of any package.
+    """
+    metadata = read_json(folder / "metadata.json")
+    for key in ("observation_space", "action_space"):
+        if not isinstance(metadata.get(key), str):
+            raise ValueError(f"its metadata.json has no {key}")
+    if (folder / "main_data.hdf5").exists():
+        check_hdf5(folder / "main_data.hdf5")
 
 
 def _damaged(dataset: str | Path, error: Exception) -> ValueError:
@@ -193,13 +240,17 @@ def _chosen(leaves: Leaves, keys: Sequence[str] | None) -> Leaves:
     return {named[key]: leaves[named[key]] for key in keys}
 
 
-def _episodes(
-    dataset: str | Path, opened: minari.MinariDataset, leaves: Leaves
+def read_episodes(
+    dataset: str | Path, opened: minari.MinariDataset, leaves: Leaves, first: int = 0
 ) -> Iterator[dict[str, NDArray[Any]]]:
-    """Read episode by episode; raise if some of what the set announces is missing."""
+    """Read episode by episode; raise if some of what the set announces is missing.
+
+    From a later one than the first on, the caller has to count.
+    """
     steps = episodes = 0
     try:
-        for number, episode in enumerate(opened.iterate_episodes()):
+        numbers = range(first, opened.total_episodes)
+        for number, episode in enumerate(opened.iterate_episodes(numbers), first):
             steps, episodes = steps + len(episode), episodes + 1
             yield {
                 "observation": _flatten(number, episode.observations, leaves),
@@ -209,7 +260,7 @@ def _episodes(
                 "truncated": np.asarray(episode.truncations),
             }
         announced = opened.total_episodes, opened.total_steps
-        if (episodes, steps) != announced:
+        if not first and (episodes, steps) != announced:
             raise ValueError(
                 f"it gave {episodes} episodes with {steps} steps; "
                 f"its metadata say {announced[0]} with {announced[1]}; from Arrow and "

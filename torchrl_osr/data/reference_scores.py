@@ -6,6 +6,10 @@ https://github.com/Farama-Foundation/D4RL.
 
 They were measured on the v2 tasks of the old ``mujoco-py``. On Gymnasium's v5 tasks
 they are a common scale, not the same task: do not put the two in one column.
+
+In the mazes the return is 1 where the goal was reached and 0 where it was not, and
+D4RL's references of AntMaze are 0 and 1: the normalised score is the success rate in
+percent. We take them for the point as well.
 """
 
 from __future__ import annotations
@@ -27,6 +31,12 @@ REFERENCE_RETURNS: dict[str, ReferenceReturns] = {
     "hopper": ReferenceReturns(random=-20.272305, expert=3234.3),
     "halfcheetah": ReferenceReturns(random=-280.178953, expert=12135.0),
     "walker2d": ReferenceReturns(random=1.629008, expert=4592.3),
+    "pointmaze-umaze": ReferenceReturns(random=0.0, expert=1.0),
+    "pointmaze-medium": ReferenceReturns(random=0.0, expert=1.0),
+    "pointmaze-large": ReferenceReturns(random=0.0, expert=1.0),
+    "antmaze-umaze": ReferenceReturns(random=0.0, expert=1.0),
+    "antmaze-medium": ReferenceReturns(random=0.0, expert=1.0),
+    "antmaze-large": ReferenceReturns(random=0.0, expert=1.0),
 }
 """Reference returns by short environment name."""
 

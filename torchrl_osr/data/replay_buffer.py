@@ -8,13 +8,19 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.data import ImmutableDatasetWriter, LazyTensorStorage, ReplayBuffer
 from torchrl.envs.transforms import Transform
+
+from torchrl_osr.data.disk_storage import DiskStorage
+from torchrl_osr.data.on_disk import TransitionsOnDisk
 
 # A constant observation entry would otherwise be divided by zero, and one that barely
 # moves would be blown up until it drowns the others. 1e-3 is what TD3+BC adds to the
 # standard deviation; as a floor it leaves all larger entries exactly unit-variance.
 MIN_OBSERVATION_SCALE = 1e-3
+
+MAX_HELD_OUT = 50_000
+"""Held-out rows of a set on disk that are read into memory, at most."""
 
 
 def check_memory(data: TensorDictBase, device: torch.device) -> None:
@@ -35,7 +41,7 @@ def check_memory(data: TensorDictBase, device: torch.device) -> None:
 
 
 def make_replay_buffer(
-    data: TensorDictBase,
+    data: TensorDictBase | TransitionsOnDisk,
     *,
     batch_size: int,
     seed: int,
@@ -53,14 +59,15 @@ def make_replay_buffer(
     book-keeping that uniform sampling has no use for.
 
     Args:
-        data: transitions ``[N]``.
+        data: transitions ``[N]``. Those on disk stay there; a batch is read when it is
+            drawn, and the same seed draws the same rows.
 
     Keyword Args:
         batch_size: rows per ``sample()``.
         seed: seed of the sampling generator.
         transform: applied to each sampled batch. Default: none.
-        device: where the rows are stored and sampled. Default: the device of ``data``,
-            or CPU if it has none.
+        device: where the rows are stored and sampled, or, of a set on disk, where the
+            batches are. Default: the device of ``data``, or CPU if it has none.
 
     Returns:
         A buffer that holds the ``N`` rows.
@@ -78,6 +85,15 @@ def make_replay_buffer(
         >>> buffer.sample()["observation"].shape
         torch.Size([8, 3])
     """
+    if isinstance(data, TransitionsOnDisk):
+        return ReplayBuffer(
+            storage=DiskStorage(data, device=device or "cpu"),
+            writer=ImmutableDatasetWriter(),
+            batch_size=batch_size,
+            transform=transform,
+            collate_fn=_as_it_is,
+            generator=torch.Generator(device or "cpu").manual_seed(seed),
+        )
     if data.ndim != 1 or data.shape[0] == 0:
         raise ValueError(
             f"data has batch size {list(data.shape)}; "
@@ -95,14 +111,21 @@ def make_replay_buffer(
     return buffer
 
 
-def observation_statistics(data: TensorDictBase) -> tuple[Tensor, Tensor]:
+def _as_it_is(batch: TensorDictBase) -> TensorDictBase:
+    return batch
+
+
+def observation_statistics(
+    data: TensorDictBase | TransitionsOnDisk,
+) -> tuple[Tensor, Tensor]:
     """Return mean and standard deviation of each observation entry.
 
     Both are accumulated in float64, since the float32 sum of a million rows loses
     digits, and returned in the type of the observations.
 
     Args:
-        data: transitions ``[N]`` with ``observation`` ``[N, S]``.
+        data: transitions ``[N]`` with ``observation`` ``[N, S]``. Those on disk are
+            not read: both numbers were computed when they were written.
 
     Returns:
         ``loc`` ``[S]`` and ``scale`` ``[S]``; the scale is at least
@@ -117,6 +140,9 @@ def observation_statistics(data: TensorDictBase) -> tuple[Tensor, Tensor]:
         >>> observation_statistics(data)
         (tensor([2., 5.]), tensor([1.0000, 0.0010]))
     """
+    if isinstance(data, TransitionsOnDisk):
+        loc, scale = data.observation_moments()
+        return loc.float(), scale.clamp_min(MIN_OBSERVATION_SCALE).float()
     observation = data.get("observation")
     scale, loc = torch.std_mean(observation.double(), dim=0, correction=0)
     scale = scale.clamp_min(MIN_OBSERVATION_SCALE)
@@ -152,6 +178,39 @@ def split_held_out(
         (8, 2)
     """
     rows = data.shape[0]
+    mask = torch.zeros(rows, dtype=torch.bool)
+    mask[_held_out_rows(rows, held_out, seed)] = True
+    mask = mask.to(data.device or "cpu")
+    return data[~mask], data[mask]
+
+
+def split_on_disk(
+    data: TransitionsOnDisk, held_out: int | float, *, seed: int
+) -> tuple[TransitionsOnDisk, TensorDict]:
+    """Split a set on disk as :func:`split_held_out` does one in memory.
+
+    The training rows stay on disk: those that are held out are passed over. To choose
+    them takes 8 bytes of memory a row, for a moment.
+
+    Args:
+        data: transitions ``[N]``.
+        held_out: see there.
+
+    Keyword Args:
+        seed: see there; the same seed holds out the same rows.
+
+    Returns:
+        Training rows, and in memory the held-out rows, or ``MAX_HELD_OUT`` of them.
+
+    Raises:
+        ValueError: see there.
+    """
+    rows = _held_out_rows(len(data), held_out, seed)
+    return data.without(rows.sort().values), data[rows[:MAX_HELD_OUT].sort().values]
+
+
+def _held_out_rows(rows: int, held_out: int | float, seed: int) -> Tensor:
+    """Return the numbers of the held-out rows, in random order."""
     count = round(held_out * rows) if isinstance(held_out, float) else held_out
     if not 0 < count < rows:
         raise ValueError(
@@ -159,7 +218,4 @@ def split_held_out(
             "expected at least one row on each side."
         )
     order = torch.randperm(rows, generator=torch.Generator().manual_seed(seed))
-    mask = torch.zeros(rows, dtype=torch.bool)
-    mask[order[:count]] = True
-    mask = mask.to(data.device or "cpu")
-    return data[~mask], data[mask]
+    return order[:count].clone()  # not the rest of the memory with it

@@ -6,10 +6,13 @@ from contextlib import closing
 from typing import Any
 
 import gymnasium
+import torch
 from tensordict import TensorDict
 
+from torchrl_osr.data.disk_cache import store_mixture, store_recorded
 from torchrl_osr.data.environment import make_environment
 from torchrl_osr.data.mixtures import load_mixture
+from torchrl_osr.data.on_disk import TransitionsOnDisk
 from torchrl_osr.data.reference_scores import REFERENCE_RETURNS, normalized_score
 
 FILE_SOURCES = ("minari", "d4rl", "file")
@@ -24,8 +27,9 @@ def load_dataset(
     path: str | None = None,
     download: bool = False,
     progress: bool = True,
+    on_disk: bool = False,
     **mixture: Any,
-) -> tuple[TensorDict, dict[str, Any]]:
+) -> tuple[TensorDict | TransitionsOnDisk, dict[str, Any]]:
     """Load a rolled-out data set by its level, or a recorded one by its path.
 
     Args:
@@ -42,6 +46,9 @@ def load_dataset(
         path: of recorded data: what the reader takes. They are used whole.
         download: let the reader fetch a set that it knows by name. Default: ``False``.
         progress: show a progress bar when on a terminal. Default: ``True``.
+        on_disk: rows are read from disk as they are drawn. At first use they are
+            written into the cache folder: recorded data in slices, what is rolled out
+            from memory. Default: ``False``.
         **mixture: ``random_share``, ``num_transitions`` and ``seed``, of data that are
             rolled out; with recorded data the share must be 0.
 
@@ -67,7 +74,8 @@ def load_dataset(
                 f"data.path={path} has no use with data={level}, which is rolled out; "
                 f"it goes with data={', '.join(FILE_SOURCES)}."
             )
-        return load_mixture(env_name, level, progress=progress, **mixture)
+        load = store_mixture if on_disk else load_mixture
+        return load(env_name, level, progress=progress, **mixture)
     if path is None:
         raise ValueError(f"data={level} needs data.path=..., the name or path of it.")
     if mixture.get("random_share"):
@@ -75,15 +83,18 @@ def load_dataset(
             f"data.random_share={mixture['random_share']} is for data that are rolled "
             f"out; with data={level} it must be 0."
         )
-    data, manifest = _read(level, path, download, progress)
+    read = store_recorded if on_disk else _read
+    data, manifest = read(level, path, download, progress)
     if env_id is not None:
-        _check_sizes(data, env_id, path)
-    mean = manifest["return"] and manifest["return"]["mean"]
-    known = mean is not None and env_name in REFERENCE_RETURNS
+        _check_sizes(data[torch.zeros(1, dtype=torch.long)], env_id, path)
+    mean = (manifest.get("return") or {}).get("mean")
+    score = None
+    if mean is not None and env_name in REFERENCE_RETURNS:
+        score = normalized_score(env_name, mean)
     return data, manifest | {
         "env_name": env_name,
         "level": level,
-        "normalized_score": normalized_score(env_name, mean) if known else None,
+        "normalized_score": score,
     }
 
 
@@ -112,7 +123,13 @@ def _check_sizes(data: TensorDict, env_id: str, path: str) -> None:
         ]
     ours = [data[name].shape[-1] for name in ("observation", "action")]
     if ours != sizes:
+        cure = "choose the env that the data are of."
+        if isinstance(env.unwrapped.observation_space, gymnasium.spaces.Dict):
+            cure += (
+                " Its observations hold the goal. D4RL's own files of the ant do not, "
+                "and are of a mirrored maze: data=minari, see docs/mazes.md."
+            )
         raise ValueError(
             f"{path} has {ours[0]} observation and {ours[1]} action entries, {env_id} "
-            f"has {sizes[0]} and {sizes[1]}: choose the env that the data are of."
+            f"has {sizes[0]} and {sizes[1]}: {cure}"
         )

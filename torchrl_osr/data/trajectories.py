@@ -9,7 +9,7 @@ Shapes: ``N`` rows, ``S`` observation, ``A`` action.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -81,6 +81,54 @@ def transitions_from_rows(
         >>> manifest["dropped_rows"], manifest["episode_returns"]
         (1, [2.0, 2.0])
     """
+    part = transitions_of(rows, action_bounds=action_bounds, clip_actions=clip_actions)
+    manifest = part.manifest()
+    if not len(part.data):
+        raise ValueError(none_left(manifest["dropped_rows"]))
+    check_dataset(part.data)
+    return part.data, manifest
+
+
+class Part(NamedTuple):
+    """Transitions of some whole trajectories, and what is known of them.
+
+    Attributes:
+        data: flat tensordict ``[N]``; of a part of a data set, it may have no rows.
+        counts: dropped, filled and clipped rows, as the manifest names them.
+        returns, lengths: of the complete episodes.
+    """
+
+    data: TensorDict
+    counts: dict[str, int]
+    returns: list[float]
+    lengths: list[int]
+
+    def manifest(self) -> dict[str, Any]:
+        """Return the manifest of a data set that has no other parts."""
+        return {
+            "num_transitions": len(self.data),
+            **self.counts,
+            "action_limit": ACTION_LIMIT,
+            **describe_episodes(np.asarray(self.returns), np.asarray(self.lengths)),
+        }
+
+
+def none_left(rows: int) -> str:
+    """Return what is wrong with data that have no next states."""
+    return (
+        f"none of the {rows} rows has a true next state: each is the last of its "
+        "episode. Give next_observation."
+    )
+
+
+def transitions_of(
+    rows: Mapping[str, ArrayLike], *, action_bounds: ActionBounds, clip_actions: bool
+) -> Part:
+    """Turn whole trajectories, of a data set or a part of one, into transitions.
+
+    See :func:`transitions_from_rows`, which also looks for what only a whole set can
+    lack.
+    """
     columns, clipped = checked_columns(
         rows, action_bounds=action_bounds, clip_actions=clip_actions
     )
@@ -88,28 +136,19 @@ def transitions_from_rows(
     columns.setdefault("truncated", np.zeros(count, np.bool_))
     flagged = columns["terminated"] | columns["truncated"]
     ends = flagged | _last_rows(columns.pop("episode", None), count)
-    statistics = _episode_statistics(
+    returns, lengths = _episode_statistics(
         columns, ends, flagged, np.asarray(rows["reward"]), trusted="episode" in rows
     )
     keep, filled = _fill_next_observations(columns, ends)
     columns["truncated"] = _mark_cuts(columns, ends, keep)
     if not keep.all():
         columns = {name: column[keep] for name, column in columns.items()}
-    if not keep.any():
-        raise ValueError(
-            f"none of the {count} rows has a true next state: each is the last of its "
-            "episode. Give next_observation."
-        )
-    data = _as_tensordict(columns)
-    check_dataset(data)
-    return data, {
-        "num_transitions": len(data),
+    counts = {
         "dropped_rows": int(count - keep.sum()),
         "terminal_rows_filled": filled,
         "clipped_actions": clipped,
-        "action_limit": ACTION_LIMIT,
-        **statistics,
     }
+    return Part(_as_tensordict(columns), counts, returns.tolist(), lengths.tolist())
 
 
 def _last_rows(episode: NDArray[Any] | None, count: int) -> NDArray[np.bool_]:
@@ -137,8 +176,8 @@ def _episode_statistics(
     reward: NDArray[Any],
     *,
     trusted: bool,
-) -> dict[str, Any]:
-    """Describe the episodes that were recorded to their end, dropped rows included."""
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return returns and lengths of the episodes recorded to their end, all rows."""
     stops = np.flatnonzero(ends)
     starts = np.r_[0, stops[:-1] + 1]
     complete = flagged[stops]
@@ -150,8 +189,7 @@ def _episode_statistics(
         complete &= np.add.reduceat(np.r_[jumps, False].astype(int), starts) == 0
     reward = reward.reshape(-1).astype(np.float64)
     returns = np.add.reduceat(reward, starts)[complete]
-    lengths = (stops - starts + 1)[complete]
-    return describe_episodes(returns, lengths)
+    return returns, (stops - starts + 1)[complete]
 
 
 def _fill_next_observations(

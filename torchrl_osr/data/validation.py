@@ -43,23 +43,36 @@ def check_dataset(data: TensorDictBase) -> None:
             ...
         ValueError: the data set lacks ('next', 'observation'), 'action', ...
     """
+    check_rows(data)
+    for key in VECTOR_KEYS:
+        if not bool((data.get(key) != 0).any()):
+            raise zero_everywhere(key, data.shape[0])
+
+
+def check_rows(data: TensorDictBase) -> None:
+    """Raise if rows cannot be those of a data set, see :func:`check_dataset`.
+
+    In a few rows of one, a field may well be zero.
+    """
     _check_keys(data)
     _check_shapes(data)
     for key in (*VECTOR_KEYS, REWARD_KEY):
         _check_finite(key, data.get(key))
-    for key in VECTOR_KEYS:
-        if not bool((data.get(key) != 0).any()):
-            raise ValueError(
-                f"{key!r} is zero in all {data.shape[0]} rows; expected real data. "
-                "TorchRL 0.11 to 0.14.1 is known to do this to Minari sets "
-                "(MinariExperienceReplay)."
-            )
     terminated, truncated = data["next", "terminated"], data["next", "truncated"]
     wrong = int((data["next", "done"] != (terminated | truncated)).sum())
     if wrong:
         raise ValueError(
             f"('next', 'done') differs from terminated | truncated in {wrong} rows."
         )
+
+
+def zero_everywhere(key: NestedKey, rows: int) -> ValueError:
+    """Return the error of a field that was never filled."""
+    return ValueError(
+        f"{key!r} is zero in all {rows} rows; expected real data. "
+        "TorchRL 0.11 to 0.14.1 is known to do this to Minari sets "
+        "(MinariExperienceReplay)."
+    )
 
 
 def _check_keys(data: TensorDictBase) -> None:

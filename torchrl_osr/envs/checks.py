@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
+from gymnasium.envs.mujoco import MujocoEnv
 
 from torchrl_osr.envs.base import gymnasium, mujoco
 
@@ -72,6 +73,27 @@ def simulated(env: gymnasium.Env[Any, Any], name: str) -> Any:
         raise TypeError(
             f"{name} acts on a MuJoCo simulation, but {bare} has no model and data of "
             "types mujoco.MjModel and mujoco.MjData; use one of Gymnasium's MuJoCo "
+            "tasks, 'Hopper-v5' for instance."
+        )
+    return bare
+
+
+def owns_simulation(env: gymnasium.Env[Any, Any], name: str) -> Any:
+    """Return the bare environment, one of Gymnasium's own MuJoCo tasks.
+
+    Args:
+        env: the environment, wrapped or not.
+        name: of what asks, for the message.
+
+    Raises:
+        TypeError: if there is no MuJoCo simulation, or it is another environment's, as
+            in the mazes, whose state and model cannot be set from outside.
+    """
+    bare = simulated(env, name)
+    if not isinstance(bare, MujocoEnv):
+        raise TypeError(
+            f"{name} sets state or model of a MuJoCo task, and those of {bare} belong "
+            "to another environment inside it; use one of Gymnasium's own MuJoCo "
             "tasks, 'Hopper-v5' for instance."
         )
     return bare

@@ -6,7 +6,7 @@ import copy
 import math
 
 from torchrl_osr.envs.base import Disturbance, Vector, gymnasium, mujoco
-from torchrl_osr.envs.checks import simulated
+from torchrl_osr.envs.checks import owns_simulation
 
 
 class DynamicsChange(Disturbance):
@@ -32,7 +32,7 @@ class DynamicsChange(Disturbance):
 
     Raises:
         ValueError: if a factor is negative or infinite, or ``mass`` is 0.
-        TypeError: if there is no MuJoCo model.
+        TypeError: if it is none of Gymnasium's own MuJoCo tasks.
 
     Examples:
         >>> from torchrl_osr.data import make_environment
@@ -63,7 +63,7 @@ class DynamicsChange(Disturbance):
         changed = any(factor != 1 for factor in factors.values())
         super().__init__(env, always=changed)
         self.mass, self.friction, self.gravity = mass, friction, gravity
-        self._bare = simulated(env, "DynamicsChange")
+        self._bare = owns_simulation(env, "DynamicsChange")
         self._original = self._bare.model
         if changed:
             self._bare.model = self._change(self._original)

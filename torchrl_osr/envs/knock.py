@@ -122,6 +122,9 @@ class ActionKnock(TimedDisturbance):
             for _ in range(self.steps):
                 extra = self._generator.random(shape) * SMALL
                 observation, *_ = self.unwrapped.step(extra)
+            space = self.unwrapped.observation_space
+            if isinstance(space, gymnasium.spaces.Dict):  # a vector in make_environment
+                observation = gymnasium.spaces.flatten(space, observation)
         flag(info, knocked)["knock_steps"] = np.int64(self.steps * knocked)
         return observation, reward, terminated, truncated, info
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_osr.envs.base import Disturbance, Vector, flag, gymnasium, mujoco
-from torchrl_osr.envs.checks import check_strength, simulated
+from torchrl_osr.envs.checks import check_strength, owns_simulation
 
 
 class StartStateNoise(Disturbance):
@@ -27,7 +27,7 @@ class StartStateNoise(Disturbance):
 
     Raises:
         ValueError: if ``std`` is negative.
-        TypeError: if there is no MuJoCo model.
+        TypeError: if it is none of Gymnasium's own MuJoCo tasks.
 
     Examples:
         >>> from torchrl_osr.data import make_environment
@@ -42,7 +42,7 @@ class StartStateNoise(Disturbance):
         check_strength("std", std)
         super().__init__(env)
         self.std = std
-        self._bare = simulated(env, "StartStateNoise")
+        self._bare = owns_simulation(env, "StartStateNoise")
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_osr.data.on_disk import TransitionsOnDisk
 from torchrl_osr.data.replay_buffer import observation_statistics
 
 # More of them fall out of the processor's cache and are slower.
@@ -28,7 +29,8 @@ class DataDistance:
     within: states that are in no subset that they are compared with.
 
     Args:
-        data: transitions ``[N]`` with raw ``observation`` ``[N, S]``.
+        data: transitions ``[N]`` with raw ``observation`` ``[N, S]``, in memory or on
+            disk.
 
     Keyword Args:
         num_neighbors: ``K``. Default 10.
@@ -58,7 +60,7 @@ class DataDistance:
 
     def __init__(
         self,
-        data: TensorDictBase,
+        data: TensorDictBase | TransitionsOnDisk,
         *,
         num_neighbors: int = 10,
         max_reference: int = 20_000,
@@ -71,22 +73,26 @@ class DataDistance:
                 "num_neighbors and max_held_out must be at least 1, quantile above 0 "
                 f"and at most 1, got {num_neighbors}, {max_held_out} and {quantile}."
             )
-        observation = data.get("observation").cpu()
-        held_out = min(max_held_out, len(observation) // 5)
-        reference = min(max_reference, len(observation) - held_out)
+        held_out = min(max_held_out, len(data) // 5)
+        reference = min(max_reference, len(data) - held_out)
         if reference < num_neighbors or held_out < 1:
             raise ValueError(
-                f"{len(observation)} rows, max_reference={max_reference}: too few for "
+                f"{len(data)} rows, max_reference={max_reference}: too few for "
                 f"{num_neighbors} neighbours and a held-out state."
             )
         loc, scale = observation_statistics(data)
         self._loc, self._scale = loc.cpu().double(), scale.cpu().double()
         generator = torch.Generator().manual_seed(seed)
-        order = torch.randperm(len(observation), generator=generator)
+        order = torch.randperm(len(data), generator=generator)
+        # Read, of a set on disk, and not the rest.
+        states, others = (
+            data[rows]["observation"].cpu()
+            for rows in (order[held_out:][:reference], order[:held_out])
+        )
         self.num_neighbors = num_neighbors
-        self._states = self._standard(observation[order[held_out:][:reference]])
+        self._states = self._standard(states)
         self._squares = self._states.square().sum(-1)
-        distances = self(observation[order[:held_out]])
+        distances = self(others)
         self.threshold = float(torch.quantile(distances.double(), quantile))
 
     def __call__(self, observation: Tensor) -> Tensor:

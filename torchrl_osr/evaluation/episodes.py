@@ -18,7 +18,7 @@ from torch import Tensor
 from torchrl.envs import ObservationNorm
 
 from torchrl_osr.data import make_environment, normalized_score
-from torchrl_osr.evaluation.statistics import mean_interval
+from torchrl_osr.evaluation.statistics import mean_interval, wilson_interval
 
 if TYPE_CHECKING:
     import gymnasium
@@ -41,11 +41,14 @@ class EpisodeResults:
         returns: undiscounted sum of rewards, ``[E]``.
         lengths: steps until the end, ``[E]``.
         seeds: what ``env.reset`` was seeded with, ``[E]``.
+        successes: whether the goal was reached, as ``info["success"]`` of the last step
+            says, ``[E]``. Default: ``None``, the task has no such entry.
     """
 
     returns: NDArray[np.float64]
     lengths: NDArray[np.int64]
     seeds: NDArray[np.int64]
+    successes: NDArray[np.bool_] | None = None
 
 
 def deterministic_policy(
@@ -129,6 +132,7 @@ class EpisodeEvaluator:
         episodes = len(self.environments)
         returns = np.zeros(episodes)
         lengths = np.zeros(episodes, dtype=np.int64)
+        infos: list[dict[str, Any]] = [{} for _ in range(episodes)]
         starts = [
             environment.reset(seed=int(seed))
             for environment, seed in zip(self.environments, self.seeds, strict=True)
@@ -154,9 +158,13 @@ class EpisodeEvaluator:
                 observations[episode] = observation
                 returns[episode] += float(reward)
                 lengths[episode] += 1
+                infos[episode] = info
                 unfinished[row] = not (terminated or truncated)
             running = running[unfinished]
-        return EpisodeResults(returns, lengths, self.seeds)
+        successes = None
+        if all("success" in info for info in infos):
+            successes = np.array([bool(info["success"]) for info in infos])
+        return EpisodeResults(returns, lengths, self.seeds, successes)
 
     def close(self) -> None:
         """Close the environments."""
@@ -174,10 +182,12 @@ def summarize(results: EpisodeResults, env_name: str) -> dict[str, Any]:
     Returns:
         ``"score"`` with its 95 % bootstrap interval ``"score_low"``, ``"score_high"``
         over the episodes, ``"return"`` (mean), ``"length"`` (mean), and the lists
-        ``"returns"``, ``"lengths"`` and ``"seeds"``.
+        ``"returns"``, ``"lengths"`` and ``"seeds"``. Where the task reports successes,
+        also their share ``"success_rate"`` with Wilson's 95 % interval
+        ``"success_low"``, ``"success_high"``, and the list ``"successes"``.
     """
     score, low, high = mean_interval(normalized_score(env_name, results.returns))
-    return {
+    summary = {
         "score": score,
         "score_low": low,
         "score_high": high,
@@ -186,4 +196,14 @@ def summarize(results: EpisodeResults, env_name: str) -> dict[str, Any]:
         "returns": results.returns.tolist(),
         "lengths": results.lengths.tolist(),
         "seeds": results.seeds.tolist(),
+    }
+    if results.successes is None:
+        return summary
+    count, total = int(results.successes.sum()), len(results.successes)
+    low, high = wilson_interval(count, total)
+    return summary | {
+        "success_rate": count / total,
+        "success_low": low,
+        "success_high": high,
+        "successes": results.successes.tolist(),
     }

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +27,24 @@ PANELS = {
     "pred_value": "Q of the data's actions",
 }
 """Logged numbers that the figure shows below the score, and what they are called."""
+
+
+@contextmanager
+def whole_picture(path: Path | str) -> Iterator[Path]:
+    """Yield a path beside ``path`` to write to; renamed once it is whole.
+
+    Args:
+        path: where the picture shall be.
+    """
+    path = Path(path)
+    beside = path.with_name(f".{path.name}.new")
+    try:
+        yield beside
+        with beside.open("rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
 
 
 def read_scalars(folder: Path | str) -> dict[str, list[tuple[int, float]]]:
@@ -94,4 +114,5 @@ def learning_curve(
         small.ticklabel_format(axis="x", style="sci", scilimits=(3, 3))
     for each in figure.axes:
         each.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=150)
+    with whole_picture(path) as beside:
+        figure.savefig(beside, dpi=150, format="png")

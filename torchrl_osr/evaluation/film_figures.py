@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_osr.evaluation.figures import BLUE, GREY, ORANGE
+from torchrl_osr.evaluation.figures import BLUE, GREY, ORANGE, whole_picture
 from torchrl_osr.evaluation.takeover import PoseRecorder
 
 try:
@@ -178,7 +178,8 @@ def film_strip(
         axes.set_title(
             f"{text}\n{offset * camera.seconds:+.2f} s", fontsize=10, color=color
         )
-    figure.savefig(path, dpi=110)
+    with whole_picture(path) as beside:
+        figure.savefig(beside, dpi=110, format="png")
 
 
 def _two_lines(name: str) -> str:
@@ -256,6 +257,8 @@ def film_gif(
     first, *others = [
         each.quantize(palette=palette, dither=Image.Dither.NONE) for each in pictures
     ]
-    first.save(
-        path, save_all=True, append_images=others, duration=GIF_MILLISECONDS, loop=0
-    )
+    with whole_picture(path) as beside:
+        first.save(
+            beside, format="GIF", save_all=True, append_images=others,
+            duration=GIF_MILLISECONDS, loop=0,
+        )  # fmt: skip

@@ -30,7 +30,8 @@ class Trajectory:
     Attributes:
         observations: of the reset and of each step, float32 ``[S]`` each.
         disturbed: whether the disturbance acted there, as ``info`` says.
-        terminated: whether the episode ended by a fall, not by the time limit.
+        terminated: whether the episode ended by a fall, neither by the time limit nor
+            at a goal.
     """
 
     observations: list[NDArray[np.float32]] = field(default_factory=list)
@@ -65,7 +66,7 @@ class Recorder:
         # astype copies: an environment may write into the same array again.
         trajectory.observations.append(observation.astype(np.float32))
         trajectory.disturbed.append(bool(info.get("disturbed", False)))
-        trajectory.terminated = bool(terminated)
+        trajectory.terminated = bool(terminated) and not info.get("success", False)
 
 
 class DistanceCurve:

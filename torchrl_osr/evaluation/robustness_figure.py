@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_osr.evaluation.figures import BLUE, GREY
+from torchrl_osr.evaluation.figures import BLUE, GREY, whole_picture
 
 try:
     from matplotlib import colormaps
@@ -68,7 +68,8 @@ def robustness_figure(
         _draw_curves(axes[1], curves)
     for each in figure.axes:
         each.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=150)
+    with whole_picture(path) as beside:
+        figure.savefig(beside, dpi=150, format="png")
 
 
 def distance_curves(

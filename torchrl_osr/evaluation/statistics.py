@@ -6,6 +6,7 @@ runs, ``T`` thresholds.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,6 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 NUM_RESAMPLES = 2000
 """Bootstrap resamples of every interval."""
+
+NORMAL_QUANTILE_975 = 1.959963984540054
+"""A normal variable is below this many standard deviations with probability 0.975."""
 
 
 def mean_interval(
@@ -51,6 +55,31 @@ def mean_interval(
     tail = 50 * (1 - confidence)
     low, high = np.percentile(resamples.mean(1), [tail, 100 - tail])
     return float(sample.mean()), float(low), float(high)
+
+
+def wilson_interval(count: int, total: int) -> tuple[float, float]:
+    """Return Wilson's 95 % interval of a share, which is honest at 0 and 1, too.
+
+    Args:
+        count: successes.
+        total: trials.
+
+    Raises:
+        ValueError: if there is no trial, or there are more successes than trials.
+
+    Examples:
+        >>> from torchrl_osr.evaluation.statistics import wilson_interval
+        >>> low, high = wilson_interval(20, 20)
+        >>> round(low, 3), round(high, 3)
+        (0.839, 1.0)
+    """
+    if not 0 <= count <= total or total < 1:
+        raise ValueError(f"wilson_interval needs trials, got {count} of {total}.")
+    square = NORMAL_QUANTILE_975**2
+    centre = (count + square / 2) / (total + square)
+    spread = math.sqrt(count * (total - count) / total + square / 4)
+    half = NORMAL_QUANTILE_975 * spread / (total + square)
+    return centre - half, min(centre + half, 1.0)
 
 
 def percentile_interval(

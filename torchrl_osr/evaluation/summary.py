@@ -51,6 +51,13 @@ def score_table(
         ),
         ("policy, best evaluation", f"{with_interval(best)}  at step {best['step']}"),
     ]
+    if "success_rate" in history[-1]:
+        last = history[-1]
+        rate, low, high = (
+            100 * last[name] for name in ("success_rate", "success_low", "success_high")
+        )
+        said = f"{rate:6.1f}  [{low:.1f}, {high:.1f}]  % of {len(last['successes'])}"
+        rows.insert(2, ("policy, last, success", f"{said} episodes, Wilson interval"))
     lines = [f"{title}: normalised score, 0 random and 100 expert [95 % interval]"]
     lines += [f"  {label:<25}{value}" for label, value in rows]
     return "\n".join([*lines, f"  {'files':<26}{folder}"])

@@ -5,41 +5,13 @@ Shapes: ``E`` episodes; entry ``e`` of every list belongs to the same start stat
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from torchrl_osr.evaluation.recovery import Trajectory
-
-NORMAL_QUANTILE_975 = 1.959963984540054
-"""A normal variable is below this many standard deviations with probability 0.975."""
-
-
-def wilson_interval(count: int, total: int) -> tuple[float, float]:
-    """Return Wilson's 95 % interval of a share, which is honest at 0 and 1, too.
-
-    Args:
-        count: successes.
-        total: trials.
-
-    Raises:
-        ValueError: if there is no trial, or there are more successes than trials.
-
-    Examples:
-        >>> from torchrl_osr.evaluation.survival import wilson_interval
-        >>> low, high = wilson_interval(20, 20)
-        >>> round(low, 3), round(high, 3)
-        (0.839, 1.0)
-    """
-    if not 0 <= count <= total or total < 1:
-        raise ValueError(f"wilson_interval needs trials, got {count} of {total}.")
-    square = NORMAL_QUANTILE_975**2
-    centre = (count + square / 2) / (total + square)
-    spread = math.sqrt(count * (total - count) / total + square / 4)
-    half = NORMAL_QUANTILE_975 * spread / (total + square)
-    return centre - half, min(centre + half, 1.0)
+from torchrl_osr.evaluation.statistics import wilson_interval
 
 
 def steps_alive(trajectory: Trajectory, moment: int, steps: int) -> int:

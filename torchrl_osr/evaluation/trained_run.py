@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torchrl.checkpoint import CheckpointError
 from torchrl.envs import ObservationNorm
 from torchrl.objectives import LossModule
 
 from torchrl_osr.data import make_environment
+from torchrl_osr.evaluation.run_config import check_targets, read_config
 from torchrl_osr.from_config import make_learner
 from torchrl_osr.trainers.checkpointing import find_damage, safe_checkpoint
 from torchrl_osr.trainers.run_folder import CONFIG
@@ -83,7 +84,7 @@ def checkpoints_of(folder: Path | str) -> list[Path]:
 
 
 def load_trained(path: Path | str) -> TrainedRun:
-    """Load one checkpoint, weights only: loading cannot run code.
+    """Load one checkpoint, weights only: loading runs no code of whoever made it.
 
     torch's global generator is left as it was.
 
@@ -94,14 +95,16 @@ def load_trained(path: Path | str) -> TrainedRun:
         FileNotFoundError: if there is no run or no checkpoint.
         CheckpointError: if the file is damaged, or does not fit the run's
             configuration; tensors of another shape are named.
+        ValueError: if the configuration has something built that is not of this
+            package, see :func:`~torchrl_osr.evaluation.run_config.check_targets`.
     """
     folder = run_folder_of(path)
     path = checkpoints_of(path)[-1] if Path(path).is_dir() else Path(path)
     damage = find_damage(path)
     if damage is not None:
         raise CheckpointError(f"checkpoint {path} is damaged: {damage}.")
-    config = OmegaConf.load(folder / CONFIG)
-    assert isinstance(config, DictConfig)
+    config = read_config(folder / CONFIG)
+    check_targets(config)
     environment = make_environment(config.env.id)
     (observation_size,) = environment.observation_space.shape or (0,)
     (action_size,) = environment.action_space.shape or (0,)

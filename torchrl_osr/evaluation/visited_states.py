@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_osr.evaluation.figures import whole_picture
 from torchrl_osr.evaluation.film_figures import COLORS, Take
 
 try:
@@ -112,7 +113,8 @@ def visited_states(
     )
     _legend(figure, event, steps)
     figure.colorbar(cells, ax=panels, label="rows of the data in a cell", pad=0.01)
-    figure.savefig(path, dpi=110)
+    with whole_picture(path) as beside:
+        figure.savefig(beside, dpi=110, format="png")
 
 
 def _draw_way(

@@ -6,13 +6,13 @@ where they cover nothing.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from torchrl_osr.evaluation.figures import whole_picture
 from torchrl_osr.report.checks import cells, data_of, methods_of
 from torchrl_osr.report.runs import Run
 from torchrl_osr.report.scores import (
@@ -144,9 +144,8 @@ def draw(axes: Axes, curve: Curve, style: Style) -> None:
 
 def save(figure: Figure, path: Path) -> Path:
     """Write a figure, all or nothing; return where."""
-    beside = path.with_name(f".{path.name}.new")
-    figure.savefig(beside, dpi=DPI, facecolor="white", format="png")
-    os.replace(beside, path)
+    with whole_picture(path) as beside:
+        figure.savefig(beside, dpi=DPI, facecolor="white", format="png")
     return path
 
 

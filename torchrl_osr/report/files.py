@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from torchrl_osr.data.limits import read_json
 
 ROBUSTNESS_FORMAT = 1
 
@@ -21,22 +22,6 @@ class LeftOut(NamedTuple):
 
     path: Path
     reason: str
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Read an object.
-
-    Raises:
-        OSError: if the file cannot be read.
-        ValueError: if it holds something else, naming the file.
-    """
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path.name} is no JSON: {error}") from error
-    if not isinstance(value, dict):
-        raise ValueError(f"{path.name} holds no object")
-    return value
 
 
 def check_evaluations(evaluations: Sequence[Mapping[str, Any]], steps: int) -> None:

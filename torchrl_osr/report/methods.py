@@ -22,6 +22,8 @@ IGNORED = (
     "logger.",
     "trainer.progress",
     "trainer.num_threads",
+    "trainer.nonfinite",
+    "trainer.cudagraph",
     "trainer.log_interval",
     "trainer.checkpoint_interval",
     "trainer.checkpoints_kept",

@@ -15,12 +15,9 @@ from omegaconf import OmegaConf
 from yaml import YAMLError
 
 from torchrl_osr.data import normalized_score
-from torchrl_osr.report.files import (
-    LeftOut,
-    check_evaluations,
-    read_json,
-    read_suites,
-)
+from torchrl_osr.data.limits import read_json
+from torchrl_osr.evaluation.run_config import read_config, read_yaml
+from torchrl_osr.report.files import LeftOut, check_evaluations, read_suites
 from torchrl_osr.trainers.run_folder import CONFIG, STATUS
 
 RETURNS = "returns.json"
@@ -134,7 +131,7 @@ def read_run(folder: Path) -> tuple[Run, list[LeftOut]]:
         ValueError: if the run is not finished, or its files say nonsense.
         KeyError: if an entry is missing.
     """
-    config = flatten(OmegaConf.to_container(OmegaConf.load(folder / CONFIG)))
+    config = flatten(OmegaConf.to_container(read_config(folder / CONFIG)))
     for key in ("env.name", "data.level", "seed", "trainer.steps"):
         config[key]  # a configuration of another program has none of them
     # An archive of results need not have kept the status.
@@ -155,7 +152,7 @@ def read_run(folder: Path) -> tuple[Run, list[LeftOut]]:
     run = Run(
         folder,
         config,
-        tuple(map(str, OmegaConf.load(overrides))) if overrides.exists() else None,
+        tuple(map(str, read_yaml(overrides))) if overrides.exists() else None,
         None if returns["data_score"] is None else float(returns["data_score"]),
         evaluations,
         suites,

@@ -8,9 +8,11 @@ memory-mapped tensordict), and a way back from a damaged newest file.
 
 from __future__ import annotations
 
+import shutil
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,9 @@ from torchrl.checkpoint import (
     CheckpointError,
     CheckpointRotation,
 )
+
+from torchrl_osr.data.limits import refuse_archive
+from torchrl_osr.disk_space import check_disk_space
 
 
 class WeightsOnlyAdapter(CheckpointAdapter):
@@ -54,6 +59,8 @@ class WeightsOnlyAdapter(CheckpointAdapter):
     ) -> None:
         """Restore the component's state from the folder ``path``."""
         del tensor_load_kwargs
+        with zipfile.ZipFile(path / self.filename) as archive:
+            refuse_archive(archive)
         state = torch.load(
             path / self.filename, map_location=map_location, weights_only=True
         )
@@ -113,16 +120,102 @@ def safe_checkpoint(**components: Any) -> Checkpoint:
     return checkpoint
 
 
+def check_room(
+    rotation: CheckpointRotation,
+    loss_module: torch.nn.Module,
+    optimizer: torch.optim.Optimizer,
+) -> None:
+    """Raise an OSError unless all checkpoints of a run will fit on the disk."""
+    groups = optimizer.param_groups
+    trained = [each for group in groups for each in group["params"]]
+    # The networks, and Adam's two moments of what is trained.
+    held = [*loss_module.parameters(), *loss_module.buffers(), *trained, *trained]
+    size = sum(each.numel() * each.element_size() for each in held)
+    number = rotation.keep_last + 2  # the best, and one that is being written
+    there = sum(path.stat().st_size for path in rotation.directory.glob("*.torchrl"))
+    what = f"{number} checkpoints"
+    check_disk_space(rotation.directory, number * size - there, what)
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove the unfinished writes of a killed run; only one run uses a folder."""
+    for leftover in folder.glob(".*.torchrl.*"):
+        if leftover.is_dir():
+            shutil.rmtree(leftover)
+        else:
+            leftover.unlink()
+
+
+@contextmanager
+def explained_write_errors(
+    rotation: CheckpointRotation, what: str = "a checkpoint"
+) -> Iterator[None]:
+    """Say of an error in writing what to do about it."""
+    try:
+        yield
+    # torch.save turns a full disk into a RuntimeError.
+    except (OSError, RuntimeError) as error:
+        raise OSError(
+            f"Cannot write {what} of {rotation.directory}: {error}. "
+            "Free space or mend the folder's rights and run again: the last whole "
+            f"checkpoint is {rotation.latest()}."
+        ) from error
+
+
+def save_step(
+    checkpoint: Checkpoint,
+    rotation: CheckpointRotation,
+    step: int,
+    *,
+    interval: int,
+    in_turn: bool = True,
+) -> None:
+    """Write the checkpoint of a step; the oldest that was in turn makes room.
+
+    What a preempted run has written out of turn goes as soon as the next in turn is
+    there: in the end the folder holds what that of an undisturbed run does.
+
+    Args:
+        checkpoint: the live components.
+        rotation: the folder.
+        step: of the run.
+
+    Keyword Args:
+        interval: steps between those in turn.
+        in_turn: whether this one is.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    out_of_turn = [
+        path for path in rotation.checkpoints()
+        if (saved := int(path.stem.rpartition("-")[2])) % interval and saved != step
+    ]  # fmt: skip
+    kept = rotation.keep_last
+    rotation.keep_last += len(out_of_turn) + (not in_turn)
+    try:
+        with explained_write_errors(rotation):
+            rotation.save(checkpoint, step=step)
+    finally:
+        rotation.keep_last = kept
+    for path in out_of_turn:
+        path.unlink()
+
+
 def find_damage(path: Path) -> str | None:
     """Return what is wrong with a checkpoint's file, ``None`` if it is whole.
+
+    Members that lead out of the archive and those that are packed, which ours are not,
+    are wrong too: torchrl.checkpoint unpacks whatever the manifest lists.
 
     Args:
         path: of the archive; every member is read and its checksum compared.
     """
     try:
         with zipfile.ZipFile(path) as archive:
+            refuse_archive(archive)
             damaged = archive.testzip()
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError) as error:
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError) as error:
         return str(error)
     return None if damaged is None else f"wrong checksum of {damaged}"
 

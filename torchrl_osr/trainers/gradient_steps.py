@@ -10,9 +10,13 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torchrl import torchrl_logger
+from torchrl.checkpoint import CheckpointRotation
 from torchrl.trainers import OptimizationStepper, Trainer
 
 from torchrl_osr.trainers.captured import CapturedUpdate
+from torchrl_osr.trainers.finite_guard import FiniteGuard
+from torchrl_osr.trainers.preemption import Preempted, Termination
 
 
 class GradientSteps:
@@ -22,12 +26,22 @@ class GradientSteps:
 
     Args:
         total: steps of the whole run.
-        intervals: steps between the things that may be due.
+        intervals: steps between the things that may be due: log entries, evaluations,
+            checkpoints.
+
+    Raises:
+        ValueError: if one of them is not at least 1.
     """
 
     init_random_frames = 0
 
     def __init__(self, total: int, intervals: Sequence[int]) -> None:
+        if total < 1 or min(intervals) < 1:
+            raise ValueError(
+                "steps and intervals must be at least 1, got "
+                f"total_steps={total} and log, eval and checkpoint intervals "
+                f"{intervals}."
+            )
         self.total = total
         self.intervals = intervals
         self.step = 0
@@ -65,7 +79,7 @@ def pandas_settled() -> Iterator[None]:
 
 
 class SumOfLosses(OptimizationStepper):
-    """One backward and one step on the sum of the ``loss_*`` entries.
+    """One backward and one step on the sum of the ``loss_*`` entries, if it is finite.
 
     TorchRL 0.14.1's default stepper hands back losses with their graph attached and
     reads the gradient norm back to the host at every step; this one does neither.
@@ -78,7 +92,7 @@ class SumOfLosses(OptimizationStepper):
     def __init__(self, autocast_dtype: torch.dtype | None = None) -> None:
         self.autocast_dtype = autocast_dtype
 
-    def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
+    def step(self, trainer: TickTrainer, sub_batch: TensorDictBase) -> TensorDictBase:
         """Run one update and return the detached losses and metrics."""
         device = next(trainer.loss_module.parameters()).device.type
         enabled = self.autocast_dtype is not None
@@ -87,11 +101,10 @@ class SumOfLosses(OptimizationStepper):
         total = sum(value for key, value in losses.items() if key.startswith("loss_"))
         try:
             total.backward()
-            trainer.optimizer.step()
+            return trainer.guard.step(sub_batch, losses.detach())
         finally:
             # Also where this is broken off: the next one must not add to the rest.
             trainer.optimizer.zero_grad(set_to_none=True)
-        return losses.detach()
 
     def state_dict(self) -> dict[str, Any]:
         """Return nothing: the stepper has no state."""
@@ -106,14 +119,54 @@ class TickTrainer(Trainer):
 
     Attributes:
         captured: runs an update in the place of TorchRL's loop, if it is there.
+        guard: steps the optimizer.
+        termination: whether to stop before the next update.
+        description: names the phase.
+        rotation: where checkpoints go.
     """
 
     captured: CapturedUpdate | None = None
+    guard: FiniteGuard
+    termination = Termination()
+    description: str
+    rotation: CheckpointRotation
+    _progress: dict[str, int]
 
     @property
     def step(self) -> int:
         """Gradient steps so far, from the run's beginning; the running one counts."""
         return int(self._optim_count)
+
+    def preempt(self, step: int) -> Preempted:
+        """Save a run that shall end, between two updates; return what to raise.
+
+        The rest of the tick is done by the run that goes on. The means that it logs are
+        over that rest; nothing else differs.
+
+        Args:
+            step: the updates that were done.
+        """
+        self._optim_count = self.collected_frames = step
+        self.guard.settle(whole=False)
+        if step != self._progress["step"]:
+            self.save_trainer(force_save=True, in_turn=False)
+        reason = (
+            f"{self.description}: stopped by SIGTERM at step {step}; the last "
+            f"checkpoint is {self.rotation.latest()}. Run again to go on from there."
+        )
+        torchrl_logger.warning(reason)
+        return Preempted(reason)
+
+    def _stop_if_asked(self) -> None:
+        """Raise before an update, which is counted already, if the run shall end."""
+        if self.termination.asked:
+            raise self.preempt(self._optim_count - 1)
+
+    def _process_optim_batch_hook(self, batch: TensorDictBase | None) -> Any:
+        # TorchRL's loop begins an update here. A captured one is not broken off.
+        if self.captured is None:
+            self._stop_if_asked()
+        return super()._process_optim_batch_hook(batch)
 
     def update(self) -> TensorDictBase:
         """Do one update with its hooks; return the detached losses and metrics.
@@ -136,6 +189,7 @@ class TickTrainer(Trainer):
         self._pre_epoch_hook(batch)
         for _ in range(batch.numel()):
             self._optim_count += 1
+            self._stop_if_asked()
             self.captured()
         self._post_epoch_log_hook(batch)
         self._post_epoch_hook()

@@ -7,10 +7,7 @@ and the trainer's own loop, hooks and optimization stepper are used as they are.
 
 from __future__ import annotations
 
-import math
-import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,9 +21,14 @@ from torchrl.record.loggers import Logger
 from torchrl_osr.trainers.captured import capture, check_updater
 from torchrl_osr.trainers.checkpointing import (
     GeneratorState,
+    check_room,
+    explained_write_errors,
     load_latest,
+    remove_leftovers,
     safe_checkpoint,
+    save_step,
 )
+from torchrl_osr.trainers.finite_guard import FiniteGuard
 from torchrl_osr.trainers.gradient_steps import (
     GradientSteps,
     SumOfLosses,
@@ -34,6 +36,8 @@ from torchrl_osr.trainers.gradient_steps import (
     pandas_settled,
 )
 from torchrl_osr.trainers.hardware import check_cudagraph
+from torchrl_osr.trainers.preemption import sigterm_noted
+from torchrl_osr.trainers.value_bounds import ValueBounds
 
 try:
     from tqdm.auto import tqdm
@@ -83,11 +87,18 @@ class OfflineTrainer(TickTrainer):
         cudagraph: run each update, from the batch to the target networks, as one CUDA
             graph. The hooks ``process_optim_batch`` and ``post_optim`` are in it, see
             :class:`~torchrl_osr.trainers.captured.CapturedUpdate`. Default ``False``.
+        nonfinite: what a loss or gradient that is not finite does: ``"stop"`` the run,
+            with all that led to it saved, or ``"skip"`` that update, see
+            :class:`~torchrl_osr.trainers.finite_guard.FiniteGuard`. Default ``"stop"``.
+        bounds: the largest plausible magnitude of a mean, by its name; a word is said
+            when it is exceeded for the first time. Default: none.
 
     Raises:
-        ValueError: if ``cudagraph`` is asked for where it cannot be had.
-        FloatingPointError: while training, if a loss is not finite.
+        ValueError: if ``cudagraph`` or ``nonfinite`` cannot be had.
+        FloatingPointError: while training, if a loss or a gradient is not finite.
+        Preempted: while training, after SIGTERM, when a checkpoint is written.
         CheckpointError: if a checkpoint in ``folder`` does not fit.
+        OSError: if there is no room for the checkpoints.
     """
 
     def __init__(
@@ -113,14 +124,10 @@ class OfflineTrainer(TickTrainer):
         autocast_dtype: torch.dtype | None = None,
         compile: bool = False,
         cudagraph: bool = False,
+        nonfinite: Literal["stop", "skip"] = "stop",
+        bounds: Mapping[str, float] | None = None,
     ) -> None:
         intervals = (log_interval, eval_interval, checkpoint_interval or eval_interval)
-        if total_steps < 1 or min(intervals) < 1:
-            raise ValueError(
-                "steps and intervals must be at least 1, got "
-                f"total_steps={total_steps} and log, eval and checkpoint intervals "
-                f"{intervals}."
-            )
         device = next(loss_module.parameters()).device
         if cudagraph:
             check_cudagraph(device)
@@ -142,11 +149,13 @@ class OfflineTrainer(TickTrainer):
         self.evaluate, self.metric = evaluate, metric
         self.loggers, self.description = loggers, description
         self.history: list[dict[str, Any]] = []
-        self._progress = {"step": 0}
+        self._progress = {"step": 0, "skipped_updates": 0}
         # Not handed to Trainer: it would put the whole data set into checkpoints.
         generator = torch.Generator(device).manual_seed(seed)
         replay_buffer.set_rng(generator)
         self.cudagraph = cudagraph
+        self.guard = FiniteGuard(self, nonfinite)
+        self._bounds = ValueBounds(bounds or {})
         # What an update draws from, besides the loss.
         self.sampler_generator, self.transform = generator, replay_buffer.transform
         self.register_op("process_optim_batch", lambda _: replay_buffer.sample())
@@ -192,50 +201,45 @@ class OfflineTrainer(TickTrainer):
             # None: silent where the output is not a terminal.
             disable=None if self.progress else True,
         )
-        with self._bar, pandas_settled():
+        if self.collected_frames < self.total_frames:
+            check_room(self.rotation, self.loss_module, self.optimizer)
+        with self._bar, pandas_settled(), sigterm_noted() as self.termination:
             super().train()
+        if self.termination.asked:  # in the last evaluation: all is done and saved
+            raise self.preempt(self.step)
 
     def resume(self) -> Path | None:
         """Restore the newest whole checkpoint of the folder, if there is one."""
         self.rotation.directory.mkdir(parents=True, exist_ok=True)
-        for leftover in self.rotation.directory.glob(".*.torchrl.*"):
-            # Unfinished writes of a killed run; only this run uses the folder.
-            if leftover.is_dir():
-                shutil.rmtree(leftover)
-            else:
-                leftover.unlink()
+        remove_leftovers(self.rotation.directory)
         path = load_latest(self.checkpoint_of_run, self.rotation)
         step = self._progress["step"]
         self.collected_frames = self._optim_count = self.collector.step = step
+        # A checkpoint from before updates could be skipped has no count of them.
+        self.guard.restart(self._progress.get("skipped_updates", 0))
         # Anew: the optimizer's state may be other tensors now.
         if self.cudagraph:
             self.captured = capture(self, self.sampler_generator, self.transform)
         return path
 
-    def save_trainer(self, force_save: bool = False) -> None:
-        """Write a checkpoint where one is due, and at the end."""
-        step = self.collected_frames
-        if force_save or step % self.checkpoint_interval == 0:
-            self._progress["step"] = step
-            with self._explained_write_errors():
-                self.rotation.save(self.checkpoint_of_run, step=step)
+    def save_trainer(self, force_save: bool = False, *, in_turn: bool = True) -> None:
+        """Write a checkpoint where one is due, at the end, and where a run stops."""
+        step, interval = self.collected_frames, self.checkpoint_interval
+        if force_save or step % interval == 0:
+            self._progress.update(step=step, skipped_updates=self.guard.skipped)
+            run, rotation = self.checkpoint_of_run, self.rotation
+            save_step(run, rotation, step, interval=interval, in_turn=in_turn)
 
     def _log_losses(self, _: int, losses: TensorDictBase) -> None:
         """Log the means over a tick; one copy to the host for all of them."""
+        share = self.guard.settle()
         names = list(losses.keys())
         values = torch.stack([losses[name].float() for name in names]).tolist()
-        self._send(dict(zip(names, values, strict=True)))
-        bad = [
-            name for name, value in zip(names, values, strict=True)
-            if not math.isfinite(value)
-        ]  # fmt: skip
-        if bad:
-            raise FloatingPointError(
-                f"{self.description}: {', '.join(bad)} not finite in the "
-                f"{self.optim_steps_per_batch} updates up to step "
-                f"{self.collected_frames}. Lower the learning rates or look at the "
-                f"data; the last checkpoint is {self.rotation.latest()}."
-            )
+        means = {name: share * value for name, value in zip(names, values, strict=True)}
+        self._bounds.check(means, f"{self.description}, step {self.collected_frames}")
+        if self.guard.skips:
+            means["skipped_updates"] = self.guard.skipped
+        self._send(means)
 
     def _evaluate(self, _: TensorDictBase) -> None:
         step = self.collected_frames
@@ -252,31 +256,19 @@ class OfflineTrainer(TickTrainer):
         name, _mode = self.metric
         self._bar.set_postfix_str(f"{name} {results[name]:.4g}")
         if self.best() is results:
-            with self._explained_write_errors():
+            with explained_write_errors(self.rotation):
                 self.checkpoint_of_run.save(
                     self.best_path,
                     components=self._model_components,
                     metadata={"step": step, name: results[name]},
                 )
 
-    @contextmanager
-    def _explained_write_errors(self) -> Iterator[None]:
-        try:
-            yield
-        # torch.save turns a full disk into a RuntimeError.
-        except (OSError, RuntimeError) as error:
-            raise OSError(
-                f"Cannot write a checkpoint to {self.rotation.directory}: {error}. "
-                "Free space or mend the folder's rights and run again: the last whole "
-                f"checkpoint is {self.rotation.latest()}."
-            ) from error
-
     def _update_bar(self) -> None:
         self._bar.update(self.collected_frames - self._bar.n)
 
     def _send(self, numbers: Mapping[str, float]) -> None:
-        for logger in self.loggers:
-            for name, value in numbers.items():
-                logger.log_scalar(
-                    f"{self.description}/{name}", value, step=self.collected_frames
-                )
+        step = self.collected_frames
+        with explained_write_errors(self.rotation, "the log"):
+            for logger in self.loggers:
+                for name, value in numbers.items():
+                    logger.log_scalar(f"{self.description}/{name}", value, step=step)

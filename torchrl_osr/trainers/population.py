@@ -17,9 +17,11 @@ from tensordict import TensorDict, TensorDictBase
 from tqdm.auto import tqdm
 
 from torchrl_osr.trainers.captured import CapturedUpdate, generators_of, networks_of
+from torchrl_osr.trainers.checkpointing import check_room
 from torchrl_osr.trainers.gradient_steps import SumOfLosses, pandas_settled
 from torchrl_osr.trainers.member_noise import OwnRandomness
 from torchrl_osr.trainers.offline import OfflineTrainer
+from torchrl_osr.trainers.preemption import Preempted, Termination, sigterm_noted
 from torchrl_osr.trainers.vectorized_loss import (
     differences,
     vectorized_loss,
@@ -63,8 +65,11 @@ class PopulationTrainer:
 
     Raises:
         ValueError: if members differ in what one update must have in common.
-        FloatingPointError: while training, if a member's loss is not finite.
+        FloatingPointError: while training, naming the member whose loss or gradient is
+            not finite.
+        Preempted: while training, after SIGTERM, when all members are saved.
         CheckpointError: if a checkpoint does not fit.
+        OSError: if there is no room for a member's checkpoints.
     """
 
     def __init__(
@@ -79,11 +84,15 @@ class PopulationTrainer:
 
     def train(self) -> None:
         """Run, or continue, all members to the last step."""
-        with pandas_settled(), ExitStack() as bars:
+        with pandas_settled(), sigterm_noted() as termination, ExitStack() as bars:
             for index, own in enumerate(self.randomness):
                 member = self.members[index]
                 with own.active():
                     member.resume()
+                    if member.collected_frames < member.total_frames:
+                        check_room(
+                            member.rotation, member.loss_module, member.optimizer
+                        )
                     member._setup_hook()
                 member._bar = bars.enter_context(
                     tqdm(
@@ -95,7 +104,9 @@ class PopulationTrainer:
                     )
                 )
             while group := self._behind():
-                self._tick(group)
+                self._tick(group, termination)
+        if termination.asked:  # in the last evaluations: all is done and saved
+            raise self._preempt()
         for member, own in zip(self.members, self.randomness, strict=True):
             with own.active():
                 member._shutdown_hook()
@@ -110,7 +121,7 @@ class PopulationTrainer:
         }
         return [index for index in steps if steps[index] == min(steps.values())]
 
-    def _tick(self, group: list[int]) -> None:
+    def _tick(self, group: list[int], termination: Termination) -> None:
         """Do the updates up to the next step at which something is due, and do that."""
         if group != self._group:
             self._group, self._update_all = group, self._new_update(group)
@@ -121,13 +132,24 @@ class PopulationTrainer:
                 _before_updates(member, tick)
         with _only_own_draws([member.sampler_generator for member in members]):
             for _ in range(ticks[0].numel()):
+                if termination.asked:
+                    raise self._preempt()
                 for member in members:
                     member._optim_count += 1
                 self._update_all()
         means = self._update_all.means()
         for row, (index, tick) in enumerate(zip(group, ticks, strict=True)):
-            with self.randomness[index].active():
+            with self.randomness[index].active(), _named(index):
                 _after_updates(self.members[index], tick, means[row])
+
+    def _preempt(self) -> Preempted:
+        """Save all members where they are; return what to raise."""
+        reasons = []
+        for index, own in enumerate(self.randomness):
+            with own.active(), _named(index):
+                member = self.members[index]
+                reasons.append(member.preempt(member.step).reason)
+        return Preempted(" ".join(reasons))
 
     def _new_update(self, group: list[int]) -> PlainUpdate | CapturedUpdate:
         update = partial(self._update, group)
@@ -159,14 +181,17 @@ class PopulationTrainer:
         )
         try:
             total.backward()
-            for member in members:
-                member.optimizer.step()
+            rows = []
+            for row, index in enumerate(group):
+                with _named(index):
+                    guard, own = self.members[index].guard, losses.detach()[row]
+                    rows.append(guard.step(batches[row], own))
         finally:
             for member in members:
                 member.optimizer.zero_grad(set_to_none=True)
         for member in members:
             member._post_optim_hook()
-        return losses.detach()
+        return torch.stack(rows)
 
 
 def _before_updates(member: OfflineTrainer, tick: TensorDictBase) -> None:
@@ -191,6 +216,15 @@ def _after_updates(
     member._post_steps_log_hook(tick)
     at_end = member.collected_frames >= member.total_frames
     member.save_trainer(force_save=at_end or member._stop_training)
+
+
+@contextmanager
+def _named(index: int) -> Iterator[None]:
+    """Say whose losses are not finite."""
+    try:
+        yield
+    except FloatingPointError as error:
+        raise FloatingPointError(f"member {index}: {error}") from error
 
 
 @contextmanager
@@ -229,6 +263,7 @@ def _common(trainer: OfflineTrainer) -> Mapping[str, Any]:
         "total_steps": trainer.total_frames,
         "intervals (log, eval, checkpoint)": trainer.collector.intervals,
         "cudagraph": trainer.cudagraph,
+        "nonfinite=skip": trainer.guard.skips,
         "optimizer": type(trainer.optimizer),
         "autocast_dtype": trainer.optimization_stepper.autocast_dtype,
     }

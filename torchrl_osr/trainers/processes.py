@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
+from torchrl_osr.trainers.preemption import EX_TEMPFAIL, Preempted, sigterm_noted
 from torchrl_osr.trainers.run_folder import STATUS
 
 LOG = "output.log"
@@ -21,6 +24,7 @@ def train_in_processes(
     """Do the run of each folder in a process of its own, and print what it printed.
 
     All are stopped when this is broken off. One that fails does not stop the others.
+    SIGTERM is passed on: each saves its run and ends, and then so does this.
 
     Args:
         script: does one run with ``resume=<folder>``.
@@ -30,14 +34,21 @@ def train_in_processes(
     Raises:
         RuntimeError: at the end, naming the runs that failed; or at the start, if one
             of them is still being done by a process that was left behind.
+        Preempted: if a run was, and none has failed.
     """
     for folder in folders:
         _check_not_running(folder)
     waiting = list(folders)
     running: dict[Path, subprocess.Popen[bytes]] = {}
-    failed: list[Path] = []
-    try:
+    codes: dict[Path, int] = {}
+    passed_on = False
+    with sigterm_noted() as termination, _ended(running):
         while waiting or running:
+            if termination.asked and not passed_on:
+                passed_on = True
+                waiting.clear()
+                for process in running.values():
+                    process.terminate()
             while waiting and len(running) < max(at_once, 1):
                 folder = waiting.pop(0)
                 running[folder] = _start(script, folder)
@@ -45,19 +56,29 @@ def train_in_processes(
             for folder, process in list(running.items()):
                 if process.poll() is None:
                     continue
-                del running[folder]
+                codes[folder] = running.pop(folder).returncode
                 print(f"\n{folder}:\n{(folder / LOG).read_text(encoding='utf-8')}")
-                if process.returncode:
-                    failed.append(folder)
-    finally:
-        for process in running.values():
-            process.terminate()
-            process.wait()
+    # Killed before its handler was there, or after it had saved: nothing was lost.
+    early = -signal.SIGTERM if termination.asked else EX_TEMPFAIL
+    failed = [each for each in codes if codes[each] not in (0, EX_TEMPFAIL, early)]
     if failed:
         raise RuntimeError(
             f"{len(failed)} of {len(folders)} members failed, see {STATUS} and {LOG} "
             f"in {', '.join(map(str, failed))}."
         )
+    if termination.asked or any(codes.values()):
+        raise Preempted(f"{script}: members were stopped by SIGTERM, and are saved.")
+
+
+@contextmanager
+def _ended(running: Mapping[Path, subprocess.Popen[bytes]]) -> Iterator[None]:
+    """Let no process outlive this."""
+    try:
+        yield
+    finally:
+        for process in running.values():
+            process.terminate()
+            process.wait()
 
 
 def _start(script: Path | str, folder: Path) -> subprocess.Popen[bytes]:

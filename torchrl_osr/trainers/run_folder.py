@@ -11,6 +11,8 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_osr.trainers.preemption import Preempted
+
 CONFIG, STATUS = "config.yaml", "status.json"
 
 # May differ when a run is continued: they do not touch a single number.
@@ -103,10 +105,13 @@ def saved_config(folder: Path | str, overrides: Sequence[str]) -> DictConfig:
 
 @contextmanager
 def status(folder: Path) -> Iterator[None]:
-    """Keep ``status.json`` true: running, then done, or failed and why."""
+    """Keep ``status.json`` true: running, then done, preempted, or failed and why."""
     write_json(folder / STATUS, {"status": "running", "pid": os.getpid()})
     try:
         yield
+    except Preempted as error:
+        write_json(folder / STATUS, {"status": "preempted", "reason": error.reason})
+        raise
     except BaseException as error:
         reason = f"{type(error).__name__}: {error}"
         write_json(folder / STATUS, {"status": "failed", "error": reason})

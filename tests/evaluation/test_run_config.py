@@ -1,0 +1,95 @@
+"""The configuration of somebody else's run: read, and nothing of theirs is called."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from torchrl_osr import config
+from torchrl_osr.evaluation.run_config import check_targets, read_config, read_yaml
+
+CONF = Path(__file__).parents[2] / "conf"
+OPTIONS = [
+    f"{group}={path.stem}"
+    for group in ("loss", "inverse_dynamics")
+    for path in (CONF / group).glob("*.yaml")
+]
+
+
+@pytest.mark.parametrize("option", OPTIONS)
+def test_every_configuration_of_ours_is_let_through(tmp_path, option):
+    config.register()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        cfg = compose("offline_osr", [option])
+    OmegaConf.save(cfg, tmp_path / "config.yaml", resolve=True)
+    again = read_config(tmp_path / "config.yaml")
+    assert again == OmegaConf.load(tmp_path / "config.yaml")
+    check_targets(again)
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        "os.mkdir",
+        "torchrl_osr.data.behavior.os.mkdir",
+        "torchrl_osr.data.load_file",
+        "torchrl_osr",
+        "mine.Loss",
+        "",
+        3,
+    ],
+)
+@pytest.mark.parametrize("place", ["loss", "loss.adversary", "loss.more"])
+def test_nothing_else_may_be_called(target, place):
+    cfg = OmegaConf.create({"loss": {"_target_": "torchrl_osr.OSRLoss", "more": [{}]}})
+    entry = {"_target_": target}
+    value = [entry] if place == "loss.more" else entry
+    OmegaConf.update(cfg, place, value, force_add=True)
+    with pytest.raises(ValueError, match=r"has .* called, which is none of"):
+        check_targets(cfg)
+
+
+def test_no_module_is_imported_for_an_environment():
+    cfg = OmegaConf.create({"env": {"id": "mine.evil:Hopper-v5"}})
+    with pytest.raises(ValueError, match=r"mine\.evil:Hopper-v5 imports a module"):
+        check_targets(cfg)
+
+
+def test_the_crafted_configuration_would_work(tmp_path):
+    """What :func:`check_targets` is for."""
+    marker = tmp_path / "marker"
+    cfg = OmegaConf.create({"_target_": "os.mkdir", "path": str(marker)})
+    with pytest.raises(ValueError, match=r"'os\.mkdir'"):
+        check_targets(cfg)
+    assert not marker.exists()
+    instantiate(cfg)
+    assert marker.exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("a: &a [1, 1]\nb: [*a, *a]\n", "aliases"),
+        ("loss: '${oc.create:\"{_target_: os.mkdir}\"}'", "has the interpolation"),
+        ('loss: "\\x24{oc.env:HOME}"', "has the interpolation"),
+        ("- a\n", "holds no mapping"),
+        ("# " + "a" * 2**20, "more than 1,048,576 bytes"),
+    ],
+)
+def test_what_no_run_writes_is_refused(tmp_path, text, reason):
+    path = tmp_path / "config.yaml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=reason):
+        read_config(path)
+
+
+def test_overrides_are_read_as_they_were_typed(tmp_path):
+    path = tmp_path / "overrides.yaml"
+    path.write_text("- seed=1\n- data.path=${oc.env:HOME}\n")
+    assert read_yaml(path) == ["seed=1", "data.path=${oc.env:HOME}"]
+    assert os.environ.get("HOME", "") not in read_yaml(path)

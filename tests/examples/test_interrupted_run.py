@@ -1,0 +1,133 @@
+"""The main example, stopped by SIGTERM and started again, in processes of its own."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import pytest
+import torch
+
+SCRIPT = Path(__file__).parents[2] / "examples" / "offline_osr.py"
+TINY = [
+    "data=random",
+    "data.num_transitions=600",
+    "data.held_out=0.1",
+    "network.num_cells=[8]",
+    "trainer.batch_size=8",
+    "trainer.inverse_dynamics_steps=30",
+    "trainer.steps=300",
+    "trainer.log_interval=10",
+    "trainer.eval_interval=150",
+    "trainer.eval_episodes=1",
+    "trainer.checkpoint_interval=50",
+]
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory) -> dict[str, str]:
+    cache = str(tmp_path_factory.mktemp("cache"))
+    return os.environ | {"TORCHRL_OSR_CACHE": cache, "OMP_NUM_THREADS": "1"}
+
+
+def start(cwd: Path, environment: dict[str, str], *arguments: str) -> subprocess.Popen:
+    return subprocess.Popen(
+        [sys.executable, str(SCRIPT), *arguments, *TINY],
+        cwd=cwd,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def run(cwd: Path, environment: dict[str, str], *arguments: str) -> tuple[int, str]:
+    process = start(cwd, environment, *arguments)
+    output, _ = process.communicate(timeout=240)
+    return process.returncode, output
+
+
+def terminate_in_policy_phase(process: subprocess.Popen, cwd: Path) -> tuple[int, str]:
+    """Send SIGTERM somewhere in the second phase of the run in a folder's folder."""
+    pattern = "*/checkpoint/policy/checkpoint-000000000050.torchrl"
+    while not list(cwd.glob(pattern)):
+        assert process.poll() is None, process.stdout.read()
+        time.sleep(0.001)
+    time.sleep(random.uniform(0.0, 0.3))
+    process.send_signal(signal.SIGTERM)
+    output, _ = process.communicate(timeout=60)
+    return process.returncode, output
+
+
+def status(folder: Path) -> str:
+    return json.loads((folder / "status.json").read_text())["status"]
+
+
+def tensors(folder: Path) -> dict[str, torch.Tensor]:
+    """Return all tensors of the last checkpoint, but for the process's generators."""
+    found = {}
+    path = folder / "checkpoint/policy/checkpoint-000000000300.torchrl"
+    with zipfile.ZipFile(path) as archive:
+        for name in archive.namelist():
+            if name.endswith("state.pt") and "global_rng" not in name:
+                content = io.BytesIO(archive.read(name))
+                state = torch.load(content, weights_only=True)
+                rows = state.get("state", {}) if "optimizer" in name else {name: state}
+                found |= {
+                    f"{name} {row} {key}": value
+                    for row, each in rows.items()
+                    for key, value in each.items()
+                    if torch.is_tensor(value)
+                }
+    return found
+
+
+def test_terminated_run_goes_on_to_the_same_bits(tmp_path, environment):
+    code, output = run(tmp_path, environment, "hydra.run.dir=undisturbed")
+    assert code == 0, output
+    (tmp_path / "here").mkdir()
+    process = start(tmp_path, environment, "hydra.run.dir=here/run")
+    code, output = terminate_in_policy_phase(process, tmp_path / "here")
+    assert code == 75, output
+    assert "stopped by SIGTERM at step" in output
+    folder = tmp_path / "here" / "run"
+    assert status(folder) == "preempted"
+    # The same command, as a queue gives it again.
+    code, output = run(tmp_path, environment, "hydra.run.dir=here/run")
+    assert code == 0, output
+    assert status(folder) == "done"
+    mine, theirs = tensors(folder), tensors(tmp_path / "undisturbed")
+    assert len(mine) > 20
+    assert mine.keys() == theirs.keys()
+    assert all(torch.equal(mine[key], theirs[key]) for key in theirs)
+    returns = (folder / "returns.json").read_text()
+    assert returns == (tmp_path / "undisturbed" / "returns.json").read_text()
+
+
+def test_second_sweep_continues_what_is_not_done(tmp_path, environment):
+    arguments = ["-m", "loss=cql", "seed=0,1", "hydra.sweep.dir=sweep"]
+    process = start(tmp_path, environment, *arguments)
+    code, output = terminate_in_policy_phase(process, tmp_path / "sweep")
+    assert code == 75, output
+    (folder,) = (each for each in (tmp_path / "sweep").iterdir() if each.is_dir())
+    assert status(folder) == "preempted"
+    code, output = run(tmp_path, environment, *arguments)
+    assert code == 0, output
+    pattern = "sweep/*/checkpoint/policy/checkpoint-*"
+    written = {path: path.stat().st_mtime_ns for path in tmp_path.glob(pattern)}
+    assert len(list(tmp_path.glob("sweep/*/returns.json"))) == 2
+    # And once more, when all is done: nothing is trained.
+    code, output = run(tmp_path, environment, *arguments)
+    assert code == 0, output
+    again = {path: path.stat().st_mtime_ns for path in tmp_path.glob(pattern)}
+    assert again == written
+    for path in tmp_path.glob("sweep/*/status.json"):
+        assert status(path.parent) == "done"

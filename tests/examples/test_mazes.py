@@ -1,0 +1,170 @@
+"""The mazes as a user runs them: recorded ants, a point of our own, disturbances."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from contextlib import closing
+from pathlib import Path
+
+import gymnasium
+import minari
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from minari.data_collector import EpisodeBuffer
+
+from torchrl_osr.data import load_minari, make_environment
+
+# Minari asks for an author's address, and more, whenever a set is made.
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:minari")
+
+ROOT = Path(__file__).parents[2]
+ANTS = "test/antmaze-v0"
+ANT_SEEDS = (0, 1, 6)  # the last of them starts at its goal
+TINY = [
+    "data.held_out=0.1",
+    "network.num_cells=[8]",
+    "trainer.batch_size=8",
+    "trainer.inverse_dynamics_steps=2",
+    "trainer.steps=2",
+    "trainer.log_interval=1",
+    "trainer.eval_interval=2",
+    "trainer.eval_episodes=2",
+    "trainer.checkpoint_interval=2",
+    "hydra.run.dir=run",
+]
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory):
+    homes = {
+        "TORCHRL_OSR_CACHE": str(tmp_path_factory.mktemp("cache")),
+        "MINARI_DATASETS_PATH": str(tmp_path_factory.mktemp("minari")),
+        "OMP_NUM_THREADS": "1",
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        for name, home in homes.items():
+            patch.setenv(name, home)
+        yield dict(os.environ)
+
+
+@pytest.fixture(scope="module")
+def evaluation():
+    """The script as a module: without the start of a process for each case."""
+    path = ROOT / "examples" / "evaluate.py"
+    spec = importlib.util.spec_from_file_location("evaluate_example", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def train(cwd: Path, environment: dict[str, str], *arguments: str) -> str:
+    script = str(ROOT / "examples" / "offline_osr.py")
+    process = subprocess.run(
+        [sys.executable, script, *TINY, *arguments], cwd=cwd, env=environment,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=240,
+    )  # fmt: skip
+    assert process.returncode == 0, process.stdout
+    return process.stdout
+
+
+def play_ants(env):
+    """Return the steps of random ants in one cell, an episode each."""
+    cell = np.array([1, 1])
+    for seed in ANT_SEEDS:
+        rng = np.random.default_rng(seed)
+        options = {"reset_cell": cell, "goal_cell": cell}
+        steps, over = [(env.reset(seed=seed, options=options)[0],)], False
+        while not over and len(steps) <= 20:
+            action = rng.uniform(-1, 1, 8).astype(np.float32)
+            observation, reward, over, *_ = env.step(action)
+            steps.append((observation, action, reward, over))
+        yield steps
+
+
+def record_ants() -> None:
+    """Leave a set as Minari's own collector would, which needs JAX."""
+    buffers = []
+    with closing(gymnasium.make("AntMaze_UMaze-v4", continuing_task=False)) as env:
+        Path(env.unwrapped.tmp_xml_file_path).unlink()  # it is not removed by itself
+        for steps in play_ants(env):
+            observations = [step[0] for step in steps]
+            _, actions, rewards, ends = zip(*steps[1:], strict=True)
+            rows = {
+                "observations": {
+                    key: np.stack([each[key] for each in observations])
+                    for key in env.observation_space
+                },
+                "actions": np.stack(actions),
+                "rewards": np.array(rewards),
+                "terminations": np.array(ends),
+                "truncations": np.zeros(len(ends), bool),
+            }
+            rows["truncations"][-1] = not ends[-1]
+            buffers.append(EpisodeBuffer(**rows))
+        minari.create_dataset_from_buffers(
+            ANTS, buffers, observation_space=env.observation_space,
+            action_space=env.action_space, data_format="hdf5",
+        )  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore:.*AntMaze_UMaze-v4 is out of date")
+def test_recorded_ants_are_trained_on(environment, tmp_path):
+    with closing(make_environment("AntMaze_UMaze-v4")) as env:
+        episodes = [[step[0] for step in steps] for steps in play_ants(env)]
+    observations = np.concatenate([np.stack(rows[:-1]) for rows in episodes])
+    record_ants()
+    data, manifest = load_minari(ANTS)
+    expected = observations.astype(np.float32)
+    assert np.array_equal(data["observation"], expected), "one order of the entries"
+    assert manifest["observation_layout"] == [
+        *(["achieved_goal", 2], ["desired_goal", 2], ["observation", 27])
+    ]
+    printed = train(
+        tmp_path, environment, "env=antmaze-umaze", "data=minari",
+        f"data.path={ANTS}", "preset=antmaze",
+    )  # fmt: skip
+    assert "policy, last, success" in printed
+    for word in ("Warning", "WARN", "Traceback", "Adroit"):
+        assert word not in printed
+    last = json.loads((tmp_path / "run" / "returns.json").read_text())["last"]
+    assert len(last["successes"]) == 2
+    assert last["success_rate"] == np.mean(last["successes"])
+    assert max(last["lengths"]) <= 700
+
+
+def test_a_point_is_trained_and_disturbed(environment, tmp_path, evaluation):
+    train(
+        tmp_path, environment, "env=pointmaze-umaze", "data=diverse",
+        "preset=pointmaze", "data.num_transitions=600",
+    )  # fmt: skip
+    folder = tmp_path / "run"
+
+    def evaluate(suite: str) -> None:
+        with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+            evaluation.main(
+                compose(
+                    "evaluate",
+                    [
+                        *(f"suite={suite}", f"checkpoint={folder}", "episodes=2"),
+                        *("last=1", "progress=false"),
+                    ],
+                )
+            )
+
+    evaluate("torque")
+    results = json.loads((folder / "robustness-torque.json").read_text())
+    levels = results["evaluations"][0]["levels"]
+    assert [level["name"] for level in levels] == [
+        f"torque-{steps}" for steps in (2, 5, 10, 15, 20)
+    ]
+    for level in levels:
+        assert set(level["scores"]) <= {0.0, 100.0}
+    message = "level 'mass-0.75' is not possible for PointMaze_UMaze-v3: DynamicsChange"
+    with pytest.raises(ValueError, match=message):
+        evaluate("dynamics")
+    assert not (folder / "robustness-dynamics.json").exists()

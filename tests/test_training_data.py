@@ -1,0 +1,119 @@
+"""Training from disk and from memory: the same batches, the same losses."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+
+from torchrl_osr import config
+from torchrl_osr.evaluation.data_distance import DataDistance
+from torchrl_osr.from_config import load_data
+from torchrl_osr.trainers.members import launch
+from torchrl_osr.training_data import load_training_data
+
+ROOT = Path(__file__).parents[1]
+SCRIPT = ROOT / "examples" / "offline_osr.py"
+CPU = torch.device("cpu")
+TINY = [
+    "data=random",
+    "data.num_transitions=600",
+    "data.held_out=0.1",
+    "network.num_cells=[8]",
+    "trainer.batch_size=8",
+    "trainer.inverse_dynamics_steps=10",
+    "trainer.steps=10",
+    "trainer.log_interval=1",
+    "trainer.eval_interval=10",
+    "trainer.eval_episodes=1",
+    "trainer.checkpoint_interval=10",
+]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _cache(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TORCHRL_OSR_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+def composed(*overrides: str):
+    config.register()
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        return compose("offline_osr", overrides=[*TINY, *overrides])
+
+
+@pytest.mark.parametrize(
+    "more",
+    [[], ["data.standardize=false"], ["data.reward_scale=3.0", "data.reward_shift=-1"]],
+)
+def test_the_same_seed_gives_the_same_batches(more):
+    here, there = (
+        load_training_data(composed(f"data.storage={storage}", *more), CPU)
+        for storage in ("memory", "disk")
+    )
+    assert here.sizes == there.sizes == (11, 3)
+    torch.testing.assert_close(there.held_out, here.held_out, rtol=0, atol=1e-6)
+    assert there.score == here.score
+    # On disk it is that of all rows, the held-out ones among them.
+    assert there.largest_reward >= here.largest_reward > 0
+    buffers = [each.buffer(32) for each in (here, there, there)]
+    for buffer in buffers:  # the last shares the rows, but not the generator
+        buffer.set_rng(torch.Generator().manual_seed(5))
+    for _ in range(20):
+        batch, other, third = (buffer.sample() for buffer in buffers)
+        torch.testing.assert_close(other, batch, rtol=1e-6, atol=1e-6)
+        assert (other == third).all()
+
+
+def losses(folder: Path) -> dict[str, list[float]]:
+    values = {}
+    for path in sorted((folder / "csv").rglob("*.csv")):
+        with path.open() as file:
+            values[path.name] = [float(row[-1]) for row in csv.reader(file)]
+    return values
+
+
+def test_the_same_seed_gives_the_same_training(tmp_path):
+    spec = importlib.util.spec_from_file_location("offline_osr", SCRIPT)
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    results = []
+    for storage in ("memory", "disk"):
+        cfg, folder = composed(f"data.storage={storage}"), tmp_path / storage
+        launch(cfg, folder, SCRIPT, [], script.prepare_data, script.run)
+        results.append(losses(folder))
+    here, there = results
+    assert len(here) > 5
+    assert here.keys() == there.keys()
+    for name, values in here.items():
+        assert there[name] == pytest.approx(values, rel=1e-5, abs=1e-6), name
+
+
+def test_distances_are_those_of_memory():
+    data, _ = load_data(composed(), progress=False)
+    stored, _ = load_data(composed("data.storage=disk"), progress=False)
+    here, there = (DataDistance(each, max_reference=300) for each in (data, stored))
+    assert there.threshold == pytest.approx(here.threshold, rel=1e-5)
+    states = torch.randn(20, 11)
+    torch.testing.assert_close(there(states), here(states), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["data.storage=tape"], "data.storage must be one of"),
+        (
+            ["data.storage=disk", "trainer.cudagraph=true"],
+            "trainer.cudagraph=true cannot be had with data.storage=disk",
+        ),
+    ],
+)
+def test_what_cannot_be_had_is_refused_before_the_data(overrides, message, monkeypatch):
+    monkeypatch.setattr("torchrl_osr.from_config.load_dataset", None)
+    with pytest.raises(ValueError, match=message):
+        load_training_data(composed(*overrides), CPU)

@@ -1,0 +1,103 @@
+"""The configuration of a run that may be somebody else's.
+
+Networks and loss are built by calling what the configuration names as ``_target_``. Of
+a run that was handed over, nothing is called but what this package offers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import DictConfig, OmegaConf
+
+from torchrl_osr.data.limits import read_text
+
+# Those of our runs have 4 kB.
+MAX_CONFIG_BYTES = 2**20
+
+TARGET_PACKAGES = ("torchrl_osr", "torchrl_osr.modules", "torchrl_osr.objectives")
+"""Whose public names a configuration may have called."""
+
+
+def read_config(path: Path) -> DictConfig:
+    """Read a run's configuration; nothing is built.
+
+    Args:
+        path: of the YAML file.
+
+    Raises:
+        OSError: if it cannot be read.
+        ValueError: if it is no mapping, has interpolations, which no run writes and
+            which would hide what is called, or :func:`read_yaml` refuses it.
+    """
+    content = read_yaml(path)
+    if not isinstance(content, dict):
+        raise ValueError(f"{path.name} holds no mapping")
+    for _, value in _entries(content):
+        if isinstance(value, str) and "${" in value:
+            raise ValueError(f"{path.name} has the interpolation {value!r}")
+    return OmegaConf.create(content)
+
+
+def read_yaml(path: Path) -> Any:
+    """Read a YAML file of a run's folder into plain containers.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        OSError: if it cannot be read.
+        ValueError: if it is too large, or has aliases, which no run writes and a few
+            of which can fill the memory.
+        YAMLError: if it is no YAML.
+    """
+    text = read_text(path, max_bytes=MAX_CONFIG_BYTES)
+    if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
+        raise ValueError(f"{path.name} has YAML aliases, which no run writes")
+    return OmegaConf.to_container(OmegaConf.create(text))
+
+
+def check_targets(config: DictConfig) -> None:
+    """Raise unless all that is called to build networks and loss is this package's.
+
+    Gymnasium imports the module that an environment's id begins with, as in
+    ``"module:Name-v0"``; that is not let through either.
+
+    Args:
+        config: of the run.
+
+    Raises:
+        ValueError: naming what is not.
+    """
+    env_id = str(OmegaConf.select(config, "env.id", default=""))
+    if ":" in env_id:
+        raise ValueError(
+            f"env.id={env_id} imports a module, and a run may come from somebody else: "
+            "import it yourself and leave the module out of the id."
+        )
+    for key, target in _entries(OmegaConf.to_container(config)):
+        if key != "_target_":
+            continue
+        package, _, name = str(target).rpartition(".")
+        known = package in TARGET_PACKAGES and name in import_module(package).__all__
+        if not known:
+            raise ValueError(
+                f"the configuration has {target!r} called, which is none of "
+                f"{', '.join(TARGET_PACKAGES)}: a run may come from somebody else, and "
+                "loading it calls nothing else."
+            )
+
+
+def _entries(value: Any, key: Any = None) -> Iterator[tuple[Any, Any]]:
+    """Yield every key and value, however deep; a list's entries have its key."""
+    yield key, value
+    if isinstance(value, Mapping):
+        for name, each in value.items():
+            yield from _entries(each, name)
+    elif isinstance(value, list):
+        for each in value:
+            yield from _entries(each, key)
