@@ -25,8 +25,8 @@ from tqdm.auto import tqdm
 
 from torchrl_osr import evaluate_config
 from torchrl_osr.data import observation_statistics
-from torchrl_osr.data.limits import read_json
-from torchrl_osr.data.manifest import SEAL, check_seal, sealed, sha256_of
+from torchrl_osr.data.limits import parse_json, read_text
+from torchrl_osr.data.manifest import SEAL, sealed, sha256_of, unsealed
 from torchrl_osr.evaluation.data_distance import DataDistance
 from torchrl_osr.evaluation.episodes import deterministic_policy
 from torchrl_osr.evaluation.robustness import evaluate_paired
@@ -107,9 +107,10 @@ def left_by(path: Path, request: dict[str, Any]) -> dict[str, Any] | None:
     if not path.exists():
         return None
     try:
-        results = read_json(path)
+        text = read_text(path)
+        results = parse_json(text, path.name)
         if SEAL in results:
-            check_seal(results)
+            unsealed(text, path.name)
     except ValueError as error:
         print(f"{path} is of no use: {error}.")
         return None

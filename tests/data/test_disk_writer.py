@@ -17,6 +17,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
+from torchrl import torchrl_logger
 
 from torchrl_osr.data import write_on_disk
 
@@ -231,5 +232,29 @@ def test_the_log_is_json_a_line(tmp_path):
         write_on_disk(cut(transitions(), 20, stop=2), tmp_path / "set", progress=False)
     text = (tmp_path / ".set.partial" / "chunks.jsonl").read_text()
     first, *lines = map(json.loads, text.splitlines())
-    assert first == {"request": {}}
+    assert first["request"] == {}
     assert [line["rows"] for line in lines] == [20, 20]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda content: content.replace(b'"mean": [', b'"mean": [1', 1),
+        lambda content: content[: len(content) // 2],
+        lambda content: b"",
+        lambda content: b"\xff" + content[1:],
+        lambda content: b"[]\n" + content,
+    ],
+)
+def test_a_damaged_log_is_said_and_not_gone_on_from(tmp_path, monkeypatch, damage):
+    messages: list[str] = []
+    monkeypatch.setattr(torchrl_logger, "warning", messages.append)
+    right = write_on_disk(cut(transitions(), 20), tmp_path / "right", progress=False)
+    with pytest.raises(KeyboardInterrupt):
+        write_on_disk(cut(transitions(), 20, stop=2), tmp_path / "set", progress=False)
+    log = tmp_path / ".set.partial" / "chunks.jsonl"
+    log.write_bytes(damage(log.read_bytes()))
+    stored = write_on_disk(cut(transitions(), 20), tmp_path / "set", progress=False)
+    assert stored.manifest == right.manifest
+    assert len(messages) == 1
+    assert "chunks.jsonl" in messages[0]

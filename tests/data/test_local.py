@@ -101,7 +101,7 @@ def test_environment_variable_moves_the_cache(tmp_path, monkeypatch):
         ({"format_version": 0}, "its format_version is 0, wanted"),
         ({"versions": {"numpy": "1.0"}}, "its versions is"),
         ({"seed": 9}, "its seed is 9, wanted 0"),
-        ({"normalized_score": 99.0}, "its seal is wrong"),
+        ({"normalized_score": 99.0}, "the seal of its manifest.json is wrong"),
     ],
 )
 def test_a_manifest_that_does_not_fit_is_remade(

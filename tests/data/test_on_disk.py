@@ -18,6 +18,7 @@ from torchrl_osr.data import (
     split_on_disk,
     write_on_disk,
 )
+from torchrl_osr.data.manifest import sealed
 from torchrl_osr.data.on_disk import observations
 
 ROWS, ROW_BYTES = 200, 44  # 3 + 2 + 3 + 1 numbers, flags and the checksum
@@ -181,8 +182,15 @@ def test_a_short_file_is_refused(folder):
 )
 def test_a_wrong_manifest_is_refused(folder, changes, message):
     path = folder / "manifest.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+    path.write_text(json.dumps(sealed(json.loads(path.read_text()) | changes)))
     with pytest.raises(ValueError, match=message):
+        TransitionsOnDisk(folder)
+
+
+def test_a_changed_manifest_is_refused(folder):
+    path = folder / "manifest.json"
+    path.write_text(path.read_text().replace('"max": ', '"max": 1'))
+    with pytest.raises(ValueError, match="the seal of its manifest.json is wrong"):
         TransitionsOnDisk(folder)
 
 

@@ -67,7 +67,7 @@ def test_members_that_unpack_to_more_than_the_file_are_refused(path):
 
 @pytest.mark.parametrize("entry", ["path", "files"])
 def test_torchrl_writes_nothing_outside_of_its_folder(path, entry):
-    """Of TorchRL, which is given the archive when its table of contents is sound."""
+    """Neither do we let TorchRL have it, nor would it do that."""
 
     def craft(name, content):
         if name != "manifest.json":
@@ -78,9 +78,18 @@ def test_torchrl_writes_nothing_outside_of_its_folder(path, entry):
         return name, json.dumps(manifest)
 
     rewritten(path, craft)
-    assert find_damage(path) is None
+    assert "out" in find_damage(path)
     with pytest.raises(CheckpointError, match="Unsafe archive member path"):
         safe_checkpoint(network=torch.nn.Linear(3, 2), history=[]).load(path)
+
+
+@pytest.mark.parametrize("lost", ["manifest.json", "components/0001-network/state.pt"])
+def test_a_member_under_another_name_is_missing(path, lost):
+    """A bit of a name in the table of contents; nothing has a checksum of it."""
+    with zipfile.ZipFile(path) as archive:
+        assert lost in archive.namelist()
+    rewritten(path, lambda name, content: (name.replace(lost, lost[:-1]), content))
+    assert find_damage(path)
 
 
 def test_packed_tensors_are_refused(path):

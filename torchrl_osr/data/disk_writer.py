@@ -25,6 +25,7 @@ from torchrl import torchrl_logger
 from tqdm.auto import tqdm
 
 from torchrl_osr.data.chunk_statistics import merged, statistics_of
+from torchrl_osr.data.manifest import sealed, unsealed
 from torchrl_osr.data.on_disk import FORMAT_VERSION, MANIFEST, ROWS, TransitionsOnDisk
 from torchrl_osr.data.records import RecordLayout
 from torchrl_osr.data.validation import REWARD_KEY, VECTOR_KEYS, check_rows
@@ -216,35 +217,53 @@ class _Partial:
             "sha256": checksum,
         }
         with (self.folder / MANIFEST).open("w", encoding="utf-8") as out:
-            json.dump(manifest, out, indent=1, allow_nan=False)
+            json.dump(sealed(manifest), out, indent=1, allow_nan=False)
             out.flush()
             os.fsync(out.fileno())
 
     def _restore(self) -> int:
         """Take over what a killed run has left; return how much of the log that is."""
-        try:
-            content = (self.folder / CHUNKS).read_bytes()
-            size = (self.folder / ROWS).stat().st_size
-            raw = content.split(b"\n")[:-1]  # a line without its end was being written
-            first, *lines = map(json.loads, raw)
-        except (OSError, ValueError):
-            return 0
-        if first != {"request": self.request}:
-            torchrl_logger.warning(f"Not continuing {self.folder}: of another request.")
-            return 0
-        for line in lines:
-            layout = self.layout
-            if line["rows"]:
-                layout = RecordLayout(len(line["mean"]), line["action_size"])
-            rows = self.rows + line["rows"]
-            if layout and rows * layout.dtype.itemsize > size:
-                break  # the rows of this line did not reach the disk
-            self.layout = layout
-            self.lines.append(line)
-        return sum(len(line) + 1 for line in raw[: 1 + len(self.lines)])
+        log, rows = self.folder / CHUNKS, self.folder / ROWS
+        content = log.read_bytes() if log.exists() else b""
+        size = rows.stat().st_size if rows.exists() else 0
+        taken = self._take_over(content, size)
+        if taken < len(content) or self.rows * self._row_bytes < size:
+            torchrl_logger.warning(
+                f"{self.folder}: what follows row {self.rows:,} was not written whole, "
+                f"is damaged ({CHUNKS}, {ROWS}) or of another request. Writing it anew."
+            )
+        return taken
+
+    def _take_over(self, content: bytes, size: int) -> int:
+        """Note the chunks that are whole; return how many bytes of the log they are."""
+        taken = 0
+        for raw in content.split(b"\n")[:-1]:  # a line without its end is not whole
+            try:
+                line = unsealed(raw.decode(), CHUNKS)
+            except ValueError:
+                break
+            if not taken:
+                if line["request"] != self.request:
+                    break
+            elif not self._fits(line, size):
+                break
+            taken += len(raw) + 1
+        return taken
+
+    def _fits(self, line: dict[str, Any], size: int) -> bool:
+        """Note a chunk, if its rows have reached the disk."""
+        layout = self.layout
+        if line["rows"]:
+            layout = RecordLayout(len(line["mean"]), line["action_size"])
+        rows = self.rows + line["rows"]
+        if layout and rows * layout.dtype.itemsize > size:
+            return False
+        self.layout = layout
+        self.lines.append(line)
+        return True
 
     def _write_line(self, line: dict[str, Any]) -> None:
-        self._log.write(json.dumps(line, allow_nan=False).encode() + b"\n")
+        self._log.write(json.dumps(sealed(line), allow_nan=False).encode() + b"\n")
         _sync(self._log)
 
 

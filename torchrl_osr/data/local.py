@@ -27,12 +27,12 @@ from torchrl import torchrl_logger
 from torchrl_osr.data.collection import Collection
 from torchrl_osr.data.environment import MAZE_IDS, environment_id, make_environment
 from torchrl_osr.data.levels import behavior_of, collect_level
-from torchrl_osr.data.limits import MAX_JSON_BYTES, read_arrays, read_json
+from torchrl_osr.data.limits import MAX_JSON_BYTES, parse_json, read_arrays, read_text
 from torchrl_osr.data.manifest import (
-    check_seal,
     describe_episodes,
     sealed,
     sha256_of,
+    unsealed,
 )
 from torchrl_osr.data.partial import PartialCollection
 from torchrl_osr.data.reference_scores import normalized_score
@@ -198,11 +198,12 @@ def _read(folder: Path, request: dict[str, Any]) -> tuple[TensorDict, dict[str, 
     """Return a cached set; raise OSError or ValueError, with the reason, if unfit."""
     rows = request["num_transitions"]
     longest = MAX_JSON_BYTES + MAX_EPISODE_BYTES * rows
-    manifest = read_json(folder / "manifest.json", max_bytes=longest)
+    text = read_text(folder / "manifest.json", max_bytes=longest)
+    manifest = parse_json(text, "manifest.json")
     for key, wanted in request.items():
         if manifest.get(key) != wanted:
             raise ValueError(f"its {key} is {manifest.get(key)!r}, wanted {wanted!r}")
-    check_seal(manifest)
+    unsealed(text, "manifest.json")
     if (folder / "data.npz").stat().st_size > MAX_ROW_BYTES * (rows + 1):
         raise ValueError("its data.npz is too large")
     # Hash and parse the same bytes: the folder may be replaced at any moment.

@@ -13,6 +13,8 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from torchrl_osr.data.limits import parse_json
+
 SEAL = "seal"
 """Where a record has the SHA-256 of all that is in it besides."""
 
@@ -47,20 +49,37 @@ def sealed(record: Mapping[str, Any]) -> dict[str, Any]:
     """Return a JSON-compatible record with a checksum of itself in it.
 
     Examples:
-        >>> from torchrl_osr.data.manifest import check_seal, sealed
-        >>> check_seal(sealed({"rows": 7}))
-        >>> check_seal(sealed({"rows": 7}) | {"rows": 8})
+        >>> import json
+        >>> from torchrl_osr.data.manifest import sealed, unsealed
+        >>> text = json.dumps(sealed({"rows": 7}))
+        >>> unsealed(text, "card.json")["rows"]
+        7
+        >>> unsealed(text.replace("7", "8", 1), "card.json")
         Traceback (most recent call last):
             ...
-        ValueError: its seal is wrong
+        ValueError: the seal of its card.json is wrong
     """
     return dict(record) | {SEAL: _checksum(record)}
 
 
-def check_seal(record: Mapping[str, Any]) -> None:
-    """Raise a ValueError unless a record, read from JSON, is as :func:`sealed` it."""
+def unsealed(text: str, name: str) -> dict[str, Any]:
+    """Read a record that :func:`sealed` has sealed.
+
+    Args:
+        text: JSON, as Python writes it: on one line, or with ``indent=1``.
+        name: of its file, for the message.
+
+    Raises:
+        ValueError: it was changed, or never sealed.
+    """
+    record = parse_json(text, name)
+    flaw = "is wrong" if SEAL in record else "is missing"
     if record.get(SEAL) != _checksum(record):
-        raise ValueError(f"its {SEAL} is {'wrong' if SEAL in record else 'missing'}")
+        raise ValueError(f"the seal of its {name} {flaw}")
+    # 1e-05 and 1E-05 are one number, but somebody or something has been at the file.
+    if text.strip() not in (json.dumps(record), json.dumps(record, indent=1)):
+        raise ValueError(f"its {name} is not as it was written")
+    return record
 
 
 def _checksum(record: Mapping[str, Any]) -> str:

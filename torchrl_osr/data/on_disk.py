@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
 
-from torchrl_osr.data.limits import read_json
+from torchrl_osr.data.limits import read_text
+from torchrl_osr.data.manifest import unsealed
 from torchrl_osr.data.records import RecordLayout
 
 ROWS, MANIFEST = "rows.bin", "manifest.json"
@@ -95,7 +96,7 @@ class TransitionsOnDisk:
                 "that write_on_disk has written."
             )
         try:
-            self.manifest = read_json(self.folder / MANIFEST)
+            self.manifest = unsealed(read_text(self.folder / MANIFEST), MANIFEST)
             self.layout = _layout(self.manifest)
         except ValueError as error:
             raise ValueError(f"{self.folder}: {error}.") from error

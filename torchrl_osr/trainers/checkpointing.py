@@ -209,15 +209,29 @@ def find_damage(path: Path) -> str | None:
     are wrong too: torchrl.checkpoint unpacks whatever the manifest lists.
 
     Args:
-        path: of the archive; every member is read and its checksum compared.
+        path: of the archive; every member is read and its checksum compared, and the
+            list of the components' files is gone through.
     """
     try:
         with zipfile.ZipFile(path) as archive:
             refuse_archive(archive)
             damaged = archive.testzip()
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError) as error:
+            members = set(archive.namelist())
+        if damaged is not None:
+            return f"wrong checksum of {damaged}"
+        # The names of the members have no checksum.
+        listed = {
+            f"{component['path']}/{file}"
+            for component in Checkpoint.manifest(path)["components"].values()
+            for file in component["files"]
+        }
+    except (
+        zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, KeyError,
+        TypeError, AttributeError, NotImplementedError, CheckpointError,
+    ) as error:  # fmt: skip
         return str(error)
-    return None if damaged is None else f"wrong checksum of {damaged}"
+    missing = sorted(listed - members)
+    return f"{', '.join(missing)} missing" if missing else None
 
 
 def load_latest(checkpoint: Checkpoint, rotation: CheckpointRotation) -> Path | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -114,7 +114,8 @@ def status(folder: Path) -> Iterator[None]:
         raise
     except BaseException as error:
         reason = f"{type(error).__name__}: {error}"
-        write_json(folder / STATUS, {"status": "failed", "error": reason})
+        with suppress(OSError):  # on a full disk the error itself says more
+            write_json(folder / STATUS, {"status": "failed", "error": reason})
         raise
     write_json(folder / STATUS, {"status": "done"})
 
