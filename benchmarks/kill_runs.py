@@ -157,7 +157,7 @@ def main() -> None:
     """Do both runs, compare, write."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=50)
-    parser.add_argument("--longest", type=float, default=30.0, help="seconds of a life")
+    parser.add_argument("--longest", type=float, default=12.0, help="seconds of a life")
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     parser.add_argument("--folder", type=Path, required=True)
     parser.add_argument("--output", type=Path, default=OUTPUT)
