@@ -28,6 +28,7 @@ from same_run import differences, file_names
 ROOT = Path(__file__).resolve().parents[1]
 OUTPUT = ROOT / "results" / "reliability" / "kills.json"
 TRAIN = (
+    "data.num_transitions=100_000",
     "trainer.steps=6000",
     "trainer.eval_interval=2000",
     "trainer.eval_episodes=4",
@@ -36,6 +37,7 @@ TRAIN = (
 )
 EVALUATE = ("suite=torque", "last=2", "episodes=4", "progress=false")
 PHASES = ("inverse_dynamics", "policy")
+FOR_EVALUATION = 6  # of the kills: it is short, and comes last
 
 
 class Run:
@@ -145,7 +147,8 @@ def kill_until_done(
     """Kill a run at random moments, at most ``kills`` times, and let it end."""
     killed: list[dict[str, Any]] = []
     while not run.finished:
-        seconds = rng.uniform(0, longest) if len(killed) < kills else None
+        left = kills - len(killed) - (0 if run.trained else FOR_EVALUATION)
+        seconds = rng.uniform(0, longest) if left > 0 else None
         entry = live(run, log, seconds)
         if entry is not None:
             killed.append(entry)
@@ -157,7 +160,7 @@ def main() -> None:
     """Do both runs, compare, write."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=50)
-    parser.add_argument("--longest", type=float, default=12.0, help="seconds of a life")
+    parser.add_argument("--longest", type=float, default=25.0, help="seconds of a life")
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     parser.add_argument("--folder", type=Path, required=True)
     parser.add_argument("--output", type=Path, default=OUTPUT)

@@ -152,7 +152,7 @@ def test_the_request_of_other_tasks_is_what_it_was():
         "behavior_sha256": {"medium": sha256_of(path)}
     }
     assert behavior_of("hopper", "random") == {"behavior_sha256": {}}
-    request = local._request("hopper", "medium", 500, 0)
+    request = local.request_of("hopper", "medium", 500, 0)
     assert list(request) == [
         *["format_version", "env_name", "env_id", "level", "num_transitions", "seed"],
         *["behavior_sha256", "versions"],

@@ -84,7 +84,7 @@ def store_mixture(
     rows, seed = mixture["num_transitions"], mixture.get("seed", 0)
     levels = [level, "random"] if mixture["random_share"] else [level]
     request = mixture | {
-        "sources": [local._request(env_name, each, rows, seed) for each in levels]
+        "sources": [local.request_of(env_name, each, rows, seed) for each in levels]
     }
     manifest: dict[str, Any] = {}
 

@@ -109,7 +109,7 @@ def load_local_dataset(
         >>> len(data), manifest["env_id"]
         (500, 'Hopper-v5')
     """
-    request = _request(env_name, level, num_transitions, seed)
+    request = request_of(env_name, level, num_transitions, seed)
     folder = (
         cache_root(cache_dir)
         / "local"
@@ -145,7 +145,7 @@ def cache_root(cache_dir: Path | str | None) -> Path:
     return Path(root or platformdirs.user_cache_dir("torchrl-osr")).expanduser()
 
 
-def _request(
+def request_of(
     env_name: str, level: str, num_transitions: int, seed: int
 ) -> dict[str, Any]:
     """Return the part of the manifest that decides what the data are."""
