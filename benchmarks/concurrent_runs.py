@@ -21,6 +21,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -115,8 +116,9 @@ def kill_job(folder: Path, spared: list[str], rng: random.Random) -> str:
         }
         job = rng.choice([*running]) if running else ""
         if running and job not in spared:
-            os.kill(running[job], signal.SIGKILL)
-            return job
+            with suppress(ProcessLookupError):  # it has ended since
+                os.kill(running[job], signal.SIGKILL)
+                return job
 
 
 def disturbed_sweep(folder: Path) -> dict[str, Any]:

@@ -191,6 +191,18 @@ def test_how_numbers_are_computed_keeps_no_runs_apart(tmp_path):
     assert not any("different settings" in note for note in comparison_notes(runs))
 
 
+def test_a_key_that_older_runs_lack_keeps_apart_only_who_uses_it(tmp_path):
+    lacking, as_before, other = {}, {"data.reward_scale": 1.0}, {"data.reward_scale": 9}
+    for seed, changes in enumerate((lacking, as_before)):
+        fakes.write_run(tmp_path / str(seed), CURVE, seed=seed, changes=changes)
+    runs, _ = named(tmp_path)
+    assert methods_of(runs) == ["osr"]
+    assert not any("different settings" in note for note in comparison_notes(runs))
+    fakes.write_run(tmp_path / "2", CURVE, seed=2, changes=other)
+    runs, _ = named(tmp_path)
+    assert len(set(methods_of(runs))) == 2
+
+
 def test_a_second_run_of_a_seed_is_no_second_seed(tmp_path):
     for name in ("a", "b"):
         fakes.write_run(tmp_path / name, CURVE)

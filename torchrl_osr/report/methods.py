@@ -32,6 +32,17 @@ IGNORED = (
 )
 """Keys of the configuration that decide how a number is computed, not which."""
 
+LATER = {
+    "data.path": None,
+    "data.download": False,
+    "data.storage": "memory",
+    "data.reward_scale": 1.0,
+    "data.reward_shift": 0.0,
+    "trainer.compile": False,
+    "population": None,
+}
+"""Keys that the configurations of older runs lack, and what those runs did."""
+
 IDENTITY = ("seed", "env.", "data.level", "data.random_share")
 """Keys that the report sorts runs by."""
 
@@ -122,7 +133,7 @@ def comparable(run: Run) -> dict[str, Any]:
     """Return what must be equal for two runs to be averaged."""
     facts = {
         key: value
-        for key, value in run.config.items()
+        for key, value in (LATER | dict(run.config)).items()
         if not key.startswith((*IGNORED, *IDENTITY))
     }
     return facts | {"evaluated at": [row["step"] for row in run.evaluations]}
