@@ -26,7 +26,7 @@ from tqdm.auto import tqdm
 from torchrl_osr import evaluate_config
 from torchrl_osr.data import observation_statistics
 from torchrl_osr.data.limits import parse_json, read_text
-from torchrl_osr.data.manifest import SEAL, sealed, sha256_of, unsealed
+from torchrl_osr.data.manifest import SEAL, check_seal, sealed, sha256_of
 from torchrl_osr.evaluation.data_distance import DataDistance
 from torchrl_osr.evaluation.episodes import deterministic_policy
 from torchrl_osr.evaluation.robustness import evaluate_paired
@@ -110,7 +110,7 @@ def left_by(path: Path, request: dict[str, Any]) -> dict[str, Any] | None:
         text = read_text(path)
         results = parse_json(text, path.name)
         if SEAL in results:
-            unsealed(text, path.name)
+            check_seal(results, text, path.name)
     except ValueError as error:
         print(f"{path} is of no use: {error}.")
         return None

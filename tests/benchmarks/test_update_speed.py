@@ -78,10 +78,15 @@ def test_file_has_every_contender_and_round(run) -> None:
             assert all(row[number] >= 0 for number in NUMBERS)
             assert len(row["rounds"]) == 2
             assert sum(row["time_by_kind"].values()) == pytest.approx(1)
-            # In seconds, of an update: not more exactly, for they are two measurements
-            # of moments, and others may work on this machine in one of them.
+            # Round by round, and their medians, which of two rounds are their means:
+            # the mean of seconds is not one over the mean of rates.
+            cpu = [each["cpu_seconds"] for each in row["rounds"]]
+            parts = [each["cpu_seconds_by_part"].values() for each in row["rounds"]]
+            assert [sum(each) for each in parts] == pytest.approx(cpu, rel=0.5)
             seconds = sum(row["cpu_seconds_by_part"].values())
-            assert 0.1 < seconds * row["updates_per_cpu_second"] < 10
+            assert seconds == pytest.approx(sum(cpu) / 2, rel=0.5)
+            rates = [1 / each for each in cpu]
+            assert row["updates_per_cpu_second"] == pytest.approx(sum(rates) / 2)
 
 
 def test_a_failure_is_told_and_ends_nothing_else(run) -> None:

@@ -29,10 +29,10 @@ from torchrl_osr.data.environment import MAZE_IDS, environment_id, make_environm
 from torchrl_osr.data.levels import behavior_of, collect_level
 from torchrl_osr.data.limits import MAX_JSON_BYTES, parse_json, read_arrays, read_text
 from torchrl_osr.data.manifest import (
+    check_seal,
     describe_episodes,
     sealed,
     sha256_of,
-    unsealed,
 )
 from torchrl_osr.data.partial import PartialCollection
 from torchrl_osr.data.reference_scores import normalized_score
@@ -203,7 +203,7 @@ def _read(folder: Path, request: dict[str, Any]) -> tuple[TensorDict, dict[str, 
     for key, wanted in request.items():
         if manifest.get(key) != wanted:
             raise ValueError(f"its {key} is {manifest.get(key)!r}, wanted {wanted!r}")
-    unsealed(text, "manifest.json")
+    check_seal(manifest, text, "manifest.json")
     if (folder / "data.npz").stat().st_size > MAX_ROW_BYTES * (rows + 1):
         raise ValueError("its data.npz is too large")
     # Hash and parse the same bytes: the folder may be replaced at any moment.

@@ -73,13 +73,18 @@ def unsealed(text: str, name: str) -> dict[str, Any]:
         ValueError: it was changed, or never sealed.
     """
     record = parse_json(text, name)
+    check_seal(record, text, name)
+    return record
+
+
+def check_seal(record: Mapping[str, Any], text: str, name: str) -> None:
+    """Raise as :func:`unsealed` does, of a record that was read already."""
     flaw = "is wrong" if SEAL in record else "is missing"
     if record.get(SEAL) != _checksum(record):
         raise ValueError(f"the seal of its {name} {flaw}")
     # 1e-05 and 1E-05 are one number, but somebody or something has been at the file.
     if text.strip() not in (json.dumps(record), json.dumps(record, indent=1)):
         raise ValueError(f"its {name} is not as it was written")
-    return record
 
 
 def _checksum(record: Mapping[str, Any]) -> str:
