@@ -3,43 +3,32 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
 ROWS = ["cql, own starts", "cql, wide starts", "osr, own starts", "osr, wide starts"]
 
 
-def run(folder: Path, *options: str) -> tuple[str, dict]:
-    # A process of its own, as a user runs it.
+@pytest.fixture(scope="module")
+def train(run):
+    """Return a function that runs it: what was printed, and its file."""
     sizes = ["--steps=5", "--model-steps=5", "--data-episodes=8", "--episodes=3"]
-    completed = subprocess.run(
-        [
-            sys.executable,
-            str(ROOT / "examples" / "discrete_osr.py"),
-            *sizes,
-            "--output=new/returns.json",
-            *options,
-        ],
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert completed.returncode == 0, completed.stderr
-    text = (folder / "new" / "returns.json").read_text(encoding="utf-8")
-    return completed.stdout, json.loads(text)
+
+    def train(folder: Path, *options: str) -> tuple[str, dict]:
+        output = "--output=new/returns.json"
+        code, printed = run(folder, "discrete_osr.py", *sizes, output, *options)
+        assert code == 0, printed
+        text = (folder / "new" / "returns.json").read_text(encoding="utf-8")
+        return printed, json.loads(text)
+
+    return train
 
 
 @pytest.fixture(scope="module")
-def both(tmp_path_factory) -> tuple[str, dict]:
-    return run(tmp_path_factory.mktemp("both"))
+def both(tmp_path_factory, train) -> tuple[str, dict]:
+    return train(tmp_path_factory.mktemp("both"))
 
 
 def test_table_has_a_row_for_the_data_and_each_policy(both) -> None:
@@ -67,10 +56,10 @@ def test_file_has_every_episode_and_how_it_was_made(both) -> None:
 
 
 def test_the_same_seed_gives_the_same_numbers_and_a_loss_can_be_chosen(
-    both, tmp_path
+    both, train, tmp_path
 ) -> None:
     _, results = both
-    printed, again = run(tmp_path, "--loss", "osr")
+    printed, again = train(tmp_path, "--loss", "osr")
     assert again["data_returns"] == results["data_returns"]
     assert list(again["returns"]) == ROWS[2:]
     for name, returns in again["returns"].items():

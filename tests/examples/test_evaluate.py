@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import os
 import re
 import socket
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -26,65 +22,30 @@ from torchrl_osr.report.files import read_suites
 
 ROOT = Path(__file__).parents[2]
 SUITES = sorted(path.stem for path in (ROOT / "conf" / "suite").glob("*.yaml"))
-TINY = [
-    "data=random",
-    "data.num_transitions=600",
-    "data.held_out=0.1",
-    "network.num_cells=[8]",
-    "trainer.batch_size=8",
-    "trainer.inverse_dynamics_steps=10",
-    "trainer.steps=30",
-    "trainer.log_interval=10",
-    "trainer.eval_interval=30",
-    "trainer.eval_episodes=2",
-    "trainer.checkpoint_interval=10",
-]
 
 
 @pytest.fixture(scope="module")
-def environment(tmp_path_factory):
-    cache = str(tmp_path_factory.mktemp("cache"))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TORCHRL_OSR_CACHE", cache)
-        patch.setenv("OMP_NUM_THREADS", "1")
-        yield dict(os.environ)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory, environment) -> Path:
+def folder(tmp_path_factory, run, tiny) -> Path:
     """A run with three checkpoints."""
     cwd = tmp_path_factory.mktemp("evaluate")
-    start(cwd, environment, "offline_osr.py", *TINY, "hydra.run.dir=run")
+    sizes = tiny(steps=30, eval_interval=30, eval_episodes=2)
+    code, output = run(cwd, "offline_osr.py", *sizes, "hydra.run.dir=run")
+    assert code == 0, output
     return cwd / "run"
 
 
-def start(cwd: Path, environment: dict[str, str], script: str, *arguments: str) -> str:
-    command = [sys.executable, str(ROOT / "examples" / script), *arguments]
-    process = subprocess.run(
-        command, cwd=cwd, env=environment, text=True, timeout=240,
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-    )  # fmt: skip
-    assert process.returncode == 0, process.stdout
-    return process.stdout
+@pytest.fixture(scope="module")
+def example(load_example):
+    return load_example("evaluate.py")
 
 
 @pytest.fixture(scope="module")
-def example():
-    """The script as a module: without the start of a process for each case."""
-    path = ROOT / "examples" / "evaluate.py"
-    spec = importlib.util.spec_from_file_location("evaluate_example", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture(scope="module")
-def evaluated(folder, environment) -> str:
+def evaluated(folder, run) -> str:
     """Run as a user would; the other tests take it from there."""
-    return start(
-        folder.parent, environment, "evaluate.py", "checkpoint=run", "episodes=2",
-        "last=2", "progress=false",
-    )  # fmt: skip
+    options = ["checkpoint=run", "episodes=2", "last=2", "progress=false"]
+    code, output = run(folder.parent, "evaluate.py", *options)
+    assert code == 0, output
+    return output
 
 
 def composed(*overrides: str):

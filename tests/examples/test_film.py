@@ -2,41 +2,23 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.errors import ConfigCompositionException
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
-TINY = [
-    "data=medium",
-    "data.num_transitions=600",
-    "network.num_cells=[8]",
-    "trainer.batch_size=8",
-    "trainer.inverse_dynamics_steps=10",
-    "trainer.steps=10",
-    "trainer.log_interval=10",
-    "trainer.eval_interval=10",
-    "trainer.eval_episodes=1",
-    "trainer.checkpoint_interval=10",
-    "hydra.run.dir=run",
-]
+CONF = Path(__file__).parents[2] / "conf"
 SHORT = ["checkpoint=run", "episodes=2", "window=[20,30]", "after=16"]
 
 
 @pytest.fixture(scope="module")
-def script():
+def script(load_example):
     """The script's functions."""
     before = os.environ.get("MUJOCO_GL")
-    spec = importlib.util.spec_from_file_location("film", EXAMPLES / "film.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = load_example("film.py")
     # Not for the other tests of this process.
     if before is None:
         os.environ.pop("MUJOCO_GL", None)
@@ -44,23 +26,15 @@ def script():
 
 
 def composed(*overrides: str):
-    with initialize_config_dir(str(EXAMPLES.parent / "conf"), version_base="1.3"):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
         return compose("film", overrides=["checkpoint=run", *overrides])
 
 
-def run(cwd: Path, *command: str) -> tuple[int, str]:
-    wanted = {"TORCHRL_OSR_CACHE": str(cwd / "cache"), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, *command], cwd=cwd, env=os.environ | wanted, text=True,
-        timeout=240, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False,
-    )  # fmt: skip
-    return done.returncode, done.stdout
-
-
-def test_film_leaves_pictures_numbers_and_a_table(tmp_path):
-    code, output = run(tmp_path, str(EXAMPLES / "offline_osr.py"), *TINY)
+def test_film_leaves_pictures_numbers_and_a_table(tmp_path, run, tiny):
+    sizes = [*tiny("medium"), "hydra.run.dir=run"]
+    code, output = run(tmp_path, "offline_osr.py", *sizes)
     assert code == 0, output
-    code, output = run(tmp_path, str(EXAMPLES / "film.py"), *SHORT)
+    code, output = run(tmp_path, "film.py", *SHORT)
     if code != 0 and "OpenGL did not start" in output:
         pytest.skip(f"no OpenGL to draw with here: {output.splitlines()[-1]}")
     assert code == 0, output

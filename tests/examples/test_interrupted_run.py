@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import random
 import signal
 import subprocess
-import sys
 import time
 import zipfile
 from pathlib import Path
@@ -16,43 +14,14 @@ from pathlib import Path
 import pytest
 import torch
 
-SCRIPT = Path(__file__).parents[2] / "examples" / "offline_osr.py"
-TINY = [
-    "data=random",
-    "data.num_transitions=600",
-    "data.held_out=0.1",
-    "network.num_cells=[8]",
-    "trainer.batch_size=8",
-    "trainer.inverse_dynamics_steps=30",
-    "trainer.steps=300",
-    "trainer.log_interval=10",
-    "trainer.eval_interval=150",
-    "trainer.eval_episodes=1",
-    "trainer.checkpoint_interval=50",
-]
+SCRIPT = "offline_osr.py"
 
 
 @pytest.fixture(scope="module")
-def environment(tmp_path_factory) -> dict[str, str]:
-    cache = str(tmp_path_factory.mktemp("cache"))
-    return os.environ | {"TORCHRL_OSR_CACHE": cache, "OMP_NUM_THREADS": "1"}
-
-
-def start(cwd: Path, environment: dict[str, str], *arguments: str) -> subprocess.Popen:
-    return subprocess.Popen(
-        [sys.executable, str(SCRIPT), *arguments, *TINY],
-        cwd=cwd,
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
+def sizes(tiny) -> list[str]:
+    return tiny(
+        inverse_dynamics_steps=30, steps=300, eval_interval=150, checkpoint_interval=50
     )
-
-
-def run(cwd: Path, environment: dict[str, str], *arguments: str) -> tuple[int, str]:
-    process = start(cwd, environment, *arguments)
-    output, _ = process.communicate(timeout=240)
-    return process.returncode, output
 
 
 def terminate_in_policy_phase(process: subprocess.Popen, cwd: Path) -> tuple[int, str]:
@@ -90,18 +59,18 @@ def tensors(folder: Path) -> dict[str, torch.Tensor]:
     return found
 
 
-def test_terminated_run_goes_on_to_the_same_bits(tmp_path, environment):
-    code, output = run(tmp_path, environment, "hydra.run.dir=undisturbed")
+def test_terminated_run_goes_on_to_the_same_bits(tmp_path, start, run, sizes):
+    code, output = run(tmp_path, SCRIPT, *sizes, "hydra.run.dir=undisturbed")
     assert code == 0, output
     (tmp_path / "here").mkdir()
-    process = start(tmp_path, environment, "hydra.run.dir=here/run")
+    process = start(tmp_path, SCRIPT, *sizes, "hydra.run.dir=here/run")
     code, output = terminate_in_policy_phase(process, tmp_path / "here")
     assert code == 75, output
     assert "stopped by SIGTERM at step" in output
     folder = tmp_path / "here" / "run"
     assert status(folder) == "preempted"
     # The same command, as a queue gives it again.
-    code, output = run(tmp_path, environment, "hydra.run.dir=here/run")
+    code, output = run(tmp_path, SCRIPT, *sizes, "hydra.run.dir=here/run")
     assert code == 0, output
     assert status(folder) == "done"
     mine, theirs = tensors(folder), tensors(tmp_path / "undisturbed")
@@ -112,20 +81,20 @@ def test_terminated_run_goes_on_to_the_same_bits(tmp_path, environment):
     assert returns == (tmp_path / "undisturbed" / "returns.json").read_text()
 
 
-def test_second_sweep_continues_what_is_not_done(tmp_path, environment):
-    arguments = ["-m", "loss=cql", "seed=0,1", "hydra.sweep.dir=sweep"]
-    process = start(tmp_path, environment, *arguments)
+def test_second_sweep_continues_what_is_not_done(tmp_path, start, run, sizes):
+    arguments = ["-m", *sizes, "loss=cql", "seed=0,1", "hydra.sweep.dir=sweep"]
+    process = start(tmp_path, SCRIPT, *arguments)
     code, output = terminate_in_policy_phase(process, tmp_path / "sweep")
     assert code == 75, output
     (folder,) = (each for each in (tmp_path / "sweep").iterdir() if each.is_dir())
     assert status(folder) == "preempted"
-    code, output = run(tmp_path, environment, *arguments)
+    code, output = run(tmp_path, SCRIPT, *arguments)
     assert code == 0, output
     pattern = "sweep/*/checkpoint/policy/checkpoint-*"
     written = {path: path.stat().st_mtime_ns for path in tmp_path.glob(pattern)}
     assert len(list(tmp_path.glob("sweep/*/returns.json"))) == 2
     # And once more, when all is done: nothing is trained.
-    code, output = run(tmp_path, environment, *arguments)
+    code, output = run(tmp_path, SCRIPT, *arguments)
     assert code == 0, output
     again = {path: path.stat().st_mtime_ns for path in tmp_path.glob(pattern)}
     assert again == written

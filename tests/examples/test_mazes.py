@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import os
-import subprocess
-import sys
 from contextlib import closing
 from pathlib import Path
 
@@ -25,51 +21,30 @@ pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:minari")
 ROOT = Path(__file__).parents[2]
 ANTS = "test/antmaze-v0"
 ANT_SEEDS = (0, 1, 6)  # the last of them starts at its goal
-TINY = [
-    "data.held_out=0.1",
-    "network.num_cells=[8]",
-    "trainer.batch_size=8",
-    "trainer.inverse_dynamics_steps=2",
-    "trainer.steps=2",
-    "trainer.log_interval=1",
-    "trainer.eval_interval=2",
-    "trainer.eval_episodes=2",
-    "trainer.checkpoint_interval=2",
-    "hydra.run.dir=run",
-]
 
 
-@pytest.fixture(scope="module")
-def environment(tmp_path_factory):
-    homes = {
-        "TORCHRL_OSR_CACHE": str(tmp_path_factory.mktemp("cache")),
-        "MINARI_DATASETS_PATH": str(tmp_path_factory.mktemp("minari")),
-        "OMP_NUM_THREADS": "1",
-    }
+@pytest.fixture(scope="module", autouse=True)
+def _minari(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
-        for name, home in homes.items():
-            patch.setenv(name, home)
-        yield dict(os.environ)
+        patch.setenv("MINARI_DATASETS_PATH", str(tmp_path_factory.mktemp("minari")))
+        yield
 
 
 @pytest.fixture(scope="module")
-def evaluation():
-    """The script as a module: without the start of a process for each case."""
-    path = ROOT / "examples" / "evaluate.py"
-    spec = importlib.util.spec_from_file_location("evaluate_example", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def train(run, tiny):
+    """Return a function that trains in ``<cwd>/run``: what was printed."""
 
+    def train(cwd: Path, data: str, *arguments: str) -> str:
+        sizes = tiny(
+            data, inverse_dynamics_steps=2, steps=2, log_interval=1, eval_interval=2,
+            eval_episodes=2, checkpoint_interval=2,
+        )  # fmt: skip
+        command = [*sizes, "hydra.run.dir=run", *arguments]
+        code, output = run(cwd, "offline_osr.py", *command)
+        assert code == 0, output
+        return output
 
-def train(cwd: Path, environment: dict[str, str], *arguments: str) -> str:
-    script = str(ROOT / "examples" / "offline_osr.py")
-    process = subprocess.run(
-        [sys.executable, script, *TINY, *arguments], cwd=cwd, env=environment,
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=240,
-    )  # fmt: skip
-    assert process.returncode == 0, process.stdout
-    return process.stdout
+    return train
 
 
 def play_ants(env):
@@ -113,7 +88,7 @@ def record_ants() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*AntMaze_UMaze-v4 is out of date")
-def test_recorded_ants_are_trained_on(environment, tmp_path):
+def test_recorded_ants_are_trained_on(train, tmp_path):
     with closing(make_environment("AntMaze_UMaze-v4")) as env:
         episodes = [[step[0] for step in steps] for steps in play_ants(env)]
     observations = np.concatenate([np.stack(rows[:-1]) for rows in episodes])
@@ -125,9 +100,8 @@ def test_recorded_ants_are_trained_on(environment, tmp_path):
         *(["achieved_goal", 2], ["desired_goal", 2], ["observation", 27])
     ]
     printed = train(
-        tmp_path, environment, "env=antmaze-umaze", "data=minari",
-        f"data.path={ANTS}", "preset=antmaze",
-    )  # fmt: skip
+        tmp_path, "minari", "env=antmaze-umaze", f"data.path={ANTS}", "preset=antmaze"
+    )
     assert "policy, last, success" in printed
     for word in ("Warning", "WARN", "Traceback", "Adroit"):
         assert word not in printed
@@ -137,12 +111,10 @@ def test_recorded_ants_are_trained_on(environment, tmp_path):
     assert max(last["lengths"]) <= 700
 
 
-def test_a_point_is_trained_and_disturbed(environment, tmp_path, evaluation):
-    train(
-        tmp_path, environment, "env=pointmaze-umaze", "data=diverse",
-        "preset=pointmaze", "data.num_transitions=600",
-    )  # fmt: skip
+def test_a_point_is_trained_and_disturbed(train, tmp_path, load_example):
+    train(tmp_path, "diverse", "env=pointmaze-umaze", "preset=pointmaze")
     folder = tmp_path / "run"
+    evaluation = load_example("evaluate.py")
 
     def evaluate(suite: str) -> None:
         with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):

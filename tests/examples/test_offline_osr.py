@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import signal
-import subprocess
-import sys
 import time
 import zipfile
 from pathlib import Path
@@ -15,50 +12,22 @@ from pathlib import Path
 import pytest
 import torch
 
-SCRIPT = Path(__file__).parents[2] / "examples" / "offline_osr.py"
-TINY = [
-    "data=random",
-    "data.num_transitions=600",
-    "data.held_out=0.1",
-    "network.num_cells=[8]",
-    "trainer.batch_size=8",
-    "trainer.inverse_dynamics_steps=30",
-    "trainer.steps=40",
-    "trainer.log_interval=10",
-    "trainer.eval_interval=20",
-    "trainer.eval_episodes=2",
-    "trainer.checkpoint_interval=5",
-]
+SCRIPT = "offline_osr.py"
 LAST = "checkpoint/policy/checkpoint-000000000040.torchrl"
 
 
 @pytest.fixture(scope="module")
-def environment(tmp_path_factory) -> dict[str, str]:
-    cache = str(tmp_path_factory.mktemp("cache"))
-    return os.environ | {"TORCHRL_OSR_CACHE": cache, "OMP_NUM_THREADS": "1"}
-
-
-def start(cwd: Path, environment: dict[str, str], *arguments: str) -> subprocess.Popen:
-    return subprocess.Popen(
-        [sys.executable, str(SCRIPT), *arguments],
-        cwd=cwd,
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-
-
-def run(cwd: Path, environment: dict[str, str], *arguments: str) -> tuple[int, str]:
-    process = start(cwd, environment, *arguments)
-    output, _ = process.communicate(timeout=240)
-    return process.returncode, output
+def sizes(tiny) -> list[str]:
+    return tiny(
+        inverse_dynamics_steps=30, steps=40, eval_interval=20, eval_episodes=2,
+        checkpoint_interval=5,
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory, environment) -> tuple[Path, str]:
+def finished(tmp_path_factory, run, sizes) -> tuple[Path, str]:
     cwd = tmp_path_factory.mktemp("finished")
-    code, output = run(cwd, environment, *TINY, "hydra.run.dir=run")
+    code, output = run(cwd, SCRIPT, *sizes, "hydra.run.dir=run")
     assert code == 0, output
     return cwd / "run", output
 
@@ -103,15 +72,17 @@ def test_run_leaves_table_figure_returns_and_checkpoints(finished):
     assert "Traceback" not in output
 
 
-def test_killed_three_times_ends_with_the_same_bits(tmp_path, environment, finished):
+def test_killed_three_times_ends_with_the_same_bits(
+    tmp_path, start, run, sizes, finished
+):
     phases = [
         "inverse_dynamics/checkpoint-000000000010",
         "policy/checkpoint-000000000005",
     ]
     phases.append("policy/checkpoint-000000000025")
-    arguments = [*TINY, "hydra.run.dir=run"]
+    arguments = [*sizes, "hydra.run.dir=run"]
     for checkpoint in phases:
-        process = start(tmp_path, environment, *arguments)
+        process = start(tmp_path, SCRIPT, *arguments)
         wanted = tmp_path / "run" / "checkpoint" / f"{checkpoint}.torchrl"
         while not wanted.exists():
             assert process.poll() is None, process.stdout.read()
@@ -123,7 +94,7 @@ def test_killed_three_times_ends_with_the_same_bits(tmp_path, environment, finis
     status = json.loads((tmp_path / "run" / "status.json").read_text())
     assert status["status"] == "running"
 
-    code, output = run(tmp_path, environment, "resume=run")
+    code, output = run(tmp_path, SCRIPT, "resume=run")
     assert code == 0, output
     folder, _ = finished
     mine, theirs = final_state(tmp_path / "run"), final_state(folder)
@@ -144,12 +115,12 @@ def test_killed_three_times_ends_with_the_same_bits(tmp_path, environment, finis
         (["trainer.stepz=3"], ["stepz", "TrainerConfig"]),
         (["resume=nowhere"], ["nowhere", "folder of a run"]),
         (["resume=run", "seed=3"], ["leave out seed=3"]),
-        (["hydra.run.dir=run", *TINY, "seed=3"], ["another configuration", "seed: 0"]),
+        (["hydra.run.dir=run", "seed=3"], ["another configuration", "seed: 0"]),
     ],
 )
-def test_bad_input_is_named(finished, environment, arguments, named):
+def test_bad_input_is_named(finished, run, arguments, named):
     folder, _ = finished
-    code, output = run(folder.parent, environment, *arguments)
+    code, output = run(folder.parent, SCRIPT, *arguments)
     assert code != 0
     for word in named:
         assert word in output
@@ -167,10 +138,10 @@ def test_bad_input_is_named(finished, environment, arguments, named):
     ],
 )
 def test_bad_input_is_named_before_data_are_made(
-    tmp_path, environment, override, named
+    tmp_path, monkeypatch, run, override, named
 ):
-    environment = environment | {"TORCHRL_OSR_CACHE": str(tmp_path / "cache")}
-    code, output = run(tmp_path, environment, override)
+    monkeypatch.setenv("TORCHRL_OSR_CACHE", str(tmp_path / "cache"))
+    code, output = run(tmp_path, SCRIPT, override)
     assert code != 0
     assert named in output
     assert not (tmp_path / "cache").exists()
@@ -178,22 +149,21 @@ def test_bad_input_is_named_before_data_are_made(
 
 @pytest.mark.parametrize(("chosen", "found"), [(None, "PASSIVE"), ("active", "ACTIVE")])
 def test_waiting_threads_do_not_spin_unless_asked_to(
-    tmp_path, environment, chosen, found
+    tmp_path, monkeypatch, run, chosen, found
 ):
     # GNU's OpenMP says what it has read, when torch is imported.
-    environment = {k: v for k, v in environment.items() if k != "OMP_WAIT_POLICY"}
-    environment |= {"OMP_DISPLAY_ENV": "true"}
+    monkeypatch.setenv("OMP_DISPLAY_ENV", "true")
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
     if chosen is not None:
-        environment["OMP_WAIT_POLICY"] = chosen
-    code, printed = run(tmp_path, environment, "--cfg", "job")
+        monkeypatch.setenv("OMP_WAIT_POLICY", chosen)
+    code, printed = run(tmp_path, SCRIPT, "--cfg", "job")
     assert code == 0
     assert f"OMP_WAIT_POLICY = '{found}'" in printed
 
 
-def test_multirun_names_the_failed_job(tmp_path, environment):
-    tiny = [each for each in TINY if not each.startswith("trainer.steps")]
-    arguments = [*tiny, "loss=cql", "trainer.steps=0,20", "hydra.sweep.dir=sweep"]
-    code, output = run(tmp_path, environment, "-m", *arguments)
+def test_multirun_names_the_failed_job(tmp_path, run, tiny):
+    arguments = [*tiny(steps="0,20"), "loss=cql", "hydra.sweep.dir=sweep"]
+    code, output = run(tmp_path, SCRIPT, "-m", *arguments)
     assert code != 0, output
     status = {
         path.parent.name: json.loads(path.read_text())
@@ -206,11 +176,11 @@ def test_multirun_names_the_failed_job(tmp_path, environment):
     assert done.startswith("1_")
 
 
-def test_every_other_loss_runs_to_its_end(tmp_path, environment):
+def test_every_other_loss_runs_to_its_end(tmp_path, run, sizes):
     """One sweep over them, warm start included; the main one has its own tests."""
     losses = "cql,osr_v,osr_10,sac_10,edac_10,osr_adversarial"
-    arguments = [*TINY, f"loss={losses}", "trainer.bc_steps=20"]
-    code, output = run(tmp_path, environment, "-m", *arguments, "hydra.sweep.dir=sweep")
+    arguments = [*sizes, f"loss={losses}", "trainer.bc_steps=20"]
+    code, output = run(tmp_path, SCRIPT, "-m", *arguments, "hydra.sweep.dir=sweep")
     assert code == 0, output
     assert "Warning" not in output
     folders = list((tmp_path / "sweep").glob("*/returns.json"))
@@ -219,9 +189,9 @@ def test_every_other_loss_runs_to_its_end(tmp_path, environment):
         assert json.loads(path.read_text())["last"]["step"] == 40
 
 
-def test_official_preset_with_its_model_runs_in_half_precision(tmp_path, environment):
-    arguments = [*TINY, "preset=official", "trainer.precision=bfloat16"]
-    code, output = run(tmp_path, environment, *arguments, "hydra.run.dir=run")
+def test_official_preset_with_its_model_runs_in_half_precision(tmp_path, run, tiny):
+    arguments = [*tiny(), "preset=official", "trainer.precision=bfloat16"]
+    code, output = run(tmp_path, SCRIPT, *arguments, "hydra.run.dir=run")
     if "has no bfloat16" in output:
         assert code != 0
         return

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
 import io
 import json
 import os
 import signal
 import subprocess
-import sys
 import zipfile
 from pathlib import Path
 
@@ -24,37 +22,12 @@ from torchrl_osr.trainers.members import launch, make_members
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "examples" / "offline_osr.py"
-TINY = [
-    "data=random",
-    "data.num_transitions=600",
-    "data.held_out=0.1",
-    "network.num_cells=[8]",
-    "trainer.batch_size=8",
-    "trainer.inverse_dynamics_steps=20",
-    "trainer.steps=20",
-    "trainer.log_interval=10",
-    "trainer.eval_interval=20",
-    "trainer.eval_episodes=1",
-    "trainer.checkpoint_interval=10",
-]
 LAST = "checkpoint/policy/checkpoint-000000000020.torchrl"
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TORCHRL_OSR_CACHE", str(tmp_path_factory.mktemp("cache")))
-        patch.setenv("OMP_NUM_THREADS", "1")
-        yield
-
-
 @pytest.fixture(scope="module")
-def script():
-    """Return the example as a module; its functions do in here what it does."""
-    spec = importlib.util.spec_from_file_location("offline_osr", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def sizes(tiny) -> list[str]:
+    return tiny(inverse_dynamics_steps=20, steps=20, eval_interval=20)
 
 
 def composed(*overrides: str) -> DictConfig:
@@ -63,16 +36,23 @@ def composed(*overrides: str) -> DictConfig:
         return compose("offline_osr", overrides=list(overrides))
 
 
-def train(script, folder: Path, *overrides: str) -> float:
-    cfg = composed(*TINY, *overrides)
-    return launch(cfg, folder, SCRIPT, overrides, script.prepare_data, script.run)
+@pytest.fixture(scope="module")
+def train(load_example, sizes):
+    """Return a function that does in here what the example does: the score."""
+    script = load_example("offline_osr.py")
+
+    def train(folder: Path, *overrides: str) -> float:
+        cfg = composed(*sizes, *overrides)
+        return launch(cfg, folder, SCRIPT, overrides, script.prepare_data, script.run)
+
+    return train
 
 
 @pytest.fixture(scope="module")
-def alone(tmp_path_factory, script) -> Path:
+def alone(tmp_path_factory, train) -> Path:
     """Return the folder of a single run: that of the first member below."""
     folder = tmp_path_factory.mktemp("alone")
-    train(script, folder, "seed=1", "loss.recovery_weight=1.0")
+    train(folder, "seed=1", "loss.recovery_weight=1.0")
     return folder
 
 
@@ -106,17 +86,10 @@ def assert_done(*folders: Path) -> None:
         assert json.loads(text) == {"status": "done"}
 
 
-def test_processes_end_with_the_bits_of_single_runs(tmp_path, alone):
-    arguments = [*TINY, MEMBERS, "hydra.run.dir=run"]
-    process = subprocess.run(
-        [sys.executable, str(SCRIPT), *arguments],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=240,
-    )
-    output = process.stdout + process.stderr
-    assert process.returncode == 0, output
+def test_processes_end_with_the_bits_of_single_runs(tmp_path, run, sizes, alone):
+    arguments = [*sizes, MEMBERS, "hydra.run.dir=run"]
+    code, output = run(tmp_path, SCRIPT.name, *arguments)
+    assert code == 0, output
     assert "Warning" not in output
     population = tmp_path / "run"
     folder, other = (population / name for name in NAMES)
@@ -128,7 +101,7 @@ def test_processes_end_with_the_bits_of_single_runs(tmp_path, alone):
         assert (folder / name).read_text() == (alone / name).read_text()
     assert files(folder) == files(alone) | {".hydra", ".hydra/overrides.yaml"}
     overrides = OmegaConf.load(folder / ".hydra" / "overrides.yaml")
-    assert set(overrides) == {*TINY, "seed=1", "loss.recovery_weight=1.0"}
+    assert set(overrides) == {*sizes, "seed=1", "loss.recovery_weight=1.0"}
     assert files(other) == files(folder)
     for each in (folder, other):
         assert "policy, best evaluation" in output.split(str(each))[1]
@@ -136,7 +109,7 @@ def test_processes_end_with_the_bits_of_single_runs(tmp_path, alone):
 
 
 def test_one_update_for_all_ends_with_the_numbers_of_single_runs(
-    tmp_path, monkeypatch, script, alone, capsys
+    tmp_path, monkeypatch, train, alone, capsys
 ):
     """Both phases; broken off in the second and continued."""
     monkeypatch.setattr(members, "_on_cpu", lambda cfg: False)
@@ -151,10 +124,10 @@ def test_one_update_for_all_ends_with_the_numbers_of_single_runs(
     with monkeypatch.context() as patch:
         patch.setattr(OfflineTrainer, "save_trainer", broken_off)
         with pytest.raises(KeyboardInterrupt):
-            train(script, tmp_path, MEMBERS)
+            train(tmp_path, MEMBERS)
     for each in (tmp_path, folder, other):
         assert "KeyboardInterrupt" in (each / "status.json").read_text()
-    score = train(script, tmp_path, MEMBERS)
+    score = train(tmp_path, MEMBERS)
     assert_done(tmp_path, folder, other)
     mine, theirs = tensors(folder), tensors(alone)
     assert mine.keys() == theirs.keys()
@@ -171,7 +144,8 @@ def test_one_update_for_all_ends_with_the_numbers_of_single_runs(
     assert str(other) in capsys.readouterr().out
 
 
-def test_run_from_before_there_were_populations_is_continued(script, alone):
+def test_run_from_before_there_were_populations_is_continued(load_example, alone):
+    script = load_example("offline_osr.py")
     cfg = OmegaConf.load(alone / "config.yaml")
     del cfg["population"]
     assert launch(cfg, alone, SCRIPT, [], script.prepare_data, script.run) >= 0

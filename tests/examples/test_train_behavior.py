@@ -1,8 +1,5 @@
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from contextlib import closing
 from pathlib import Path
 
@@ -15,11 +12,9 @@ from torchrl_osr.data import (
     make_environment,
 )
 
-ROOT = Path(__file__).parents[2]
-
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
+def folder(tmp_path_factory, run) -> Path:
     folder = tmp_path_factory.mktemp("policies")
     # A process of its own, as a user runs it: torchrl's collectors warn on import.
     arguments = {
@@ -33,16 +28,8 @@ def folder(tmp_path_factory) -> Path:
         "batch-size": 16,
     }
     options = [f"--{name}={value}" for name, value in arguments.items()]
-    script = str(ROOT / "examples" / "train_behavior.py")
-    completed = subprocess.run(
-        [sys.executable, script, *options],
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert completed.returncode == 0, completed.stderr
+    code, output = run(folder, "train_behavior.py", *options)
+    assert code == 0, output
     return folder
 
 
