@@ -101,7 +101,8 @@ def test_page_stands_alone(report):
 def test_figures_are_in_the_page_and_beside_it(report):
     pictures = {path.name: path.read_bytes() for path in report.folder.glob("*.png")}
     data = ("hopper-medium-replay", "walker2d-medium-expert")
-    assert pictures.keys() == {"curves.png", "profiles.png", "iqm.png"} | {
+    over_all = {"curves.png", "differences.png", "iqm.png", "profiles.png"}
+    assert pictures.keys() == over_all | {
         f"{kind}-oos-{each}.png" for kind in ("strength", "recovery") for each in data
     }
     embedded = [

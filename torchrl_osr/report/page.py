@@ -104,7 +104,7 @@ def write_report(
         ("Over all data sets", profile_section(runs, styles, folder)),
         ("Strength of the disturbance", strength_section(runs, styles, folder)),
         ("Recovery", recovery_section(runs, styles, folder)),
-        ("Differences", paired_section(runs, reference)),
+        ("Differences", paired_section(runs, reference, styles, folder)),
         ("Where it comes from", provenance_section(runs, left_out, command)),
     ]
     methods, data = ", ".join(methods_of(runs)), ", ".join(data_of(runs))

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 from torchrl_osr.report.checks import methods_of
+from torchrl_osr.report.figures import Styles
+from torchrl_osr.report.figures_paired import draw_differences
 from torchrl_osr.report.html import (
     Cell,
     Row,
     bullets,
     details,
+    figure,
     paragraph,
     side_by_side,
     table,
@@ -31,12 +35,16 @@ from torchrl_osr.report.scores import decimal
 MARKS = {"better": "▲", "worse": "▼", "not told apart": "=", "not paired": ""}
 
 
-def paired_section(runs: Sequence[Run], reference: str) -> str:
+def paired_section(
+    runs: Sequence[Run], reference: str, styles: Styles, folder: Path
+) -> str:
     """Return differences of every method from the reference.
 
     Args:
         runs: all of the report.
         reference: a method's name.
+        styles: of the methods.
+        folder: where the figure is written to.
     """
     if methods_of(runs) == [reference]:
         return paragraph(f"There is nothing to compare with {reference}.")
@@ -54,6 +62,7 @@ def paired_section(runs: Sequence[Run], reference: str) -> str:
             f"These are {len(found)} comparisons: of so many, one in twenty would find "
             "a difference where there is none, and with few seeds more.",
         ),
+        _picture(found, main, reference, styles, folder),
         _sentences(together or single, reference),
         details("Data set by data set", _sentences(single, reference))
         if together
@@ -74,6 +83,25 @@ def paired_section(runs: Sequence[Run], reference: str) -> str:
             for block in side_by_side(levels)
         ]
     return "".join(parts)
+
+
+def _picture(
+    found: Sequence[Comparison],
+    wanted: Sequence[Quantity],
+    reference: str,
+    styles: Styles,
+    folder: Path,
+) -> str:
+    """Return the figure; nothing if there is not one pair."""
+    if all(each.difference is None for each in found):
+        return ""
+    path = folder / "differences.png"
+    return figure(
+        draw_differences(found, wanted, styles, reference, path),
+        f"Differences from {reference} with their intervals, by data set",
+        f"Each method less {reference}. Filled: better or worse. Hollow: not told "
+        "apart.",
+    )
 
 
 def sentence(each: Comparison, reference: str) -> str:
