@@ -102,7 +102,8 @@ def test_data_sets_count_the_same_and_come_last_together(tmp_path):
         "hopper medium-replay", "walker2d medium-replay", ALL_DATA,
     ]  # fmt: skip
     assert [each.difference.mean for each in found] == pytest.approx([2, 8, 5])
-    assert found[0].difference.over == "episodes"
+    overs = [each.difference.over for each in found]
+    assert overs == ["episodes", "seeds", "episodes"], "one has a single seed"
     assert found[2].seeds == 4
 
 

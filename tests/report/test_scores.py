@@ -83,6 +83,13 @@ def test_profile_and_interquartile_mean_pool_data_sets(tmp_path):
     # Stratified: the middle two are at least 10 and 40, at most 20 and 90.
     low, high = interquartile_means(runs)["osr"][1:3]
     assert (10 + 40) / 2 <= low < 30 < high <= (20 + 90) / 2
+    assert interquartile_means(runs)["osr"].over == "seeds"
+    alone = interquartile_means(
+        [run for run in runs if run.seed == 0 or run.env[0] == "h"]
+    )
+    assert alone["osr"].mean == pytest.approx(70 / 3)
+    assert alone["osr"].over == "episodes", "walker2d has a single seed"
+    assert alone["osr"].low < 70 / 3 < alone["osr"].high
     tau = np.array([0.0, 15.0, 30.0, 87.0, 100.0])
     profile = run_profile(runs, "osr", tau)
     np.testing.assert_allclose(profile.mean, [1, 0.75, 0.5, 0.25, 0])

@@ -24,7 +24,8 @@ def draw_differences(
 ) -> Path:
     """Draw differences with their intervals, a panel a quantity.
 
-    Filled markers: the interval leaves out 0. Hollow ones: not told apart.
+    Filled markers: the interval leaves out 0. Hollow ones: not told apart. Pale: the
+    interval is over episodes, for want of seeds.
 
     Args:
         found: the comparisons; those that are not paired are not drawn.
@@ -34,24 +35,22 @@ def draw_differences(
         path: the PNG to write.
     """
     paired = [each for each in found if each.difference is not None]
-    data_sets = list(dict.fromkeys(each.data for each in paired))
-    methods = [name for name in styles if any(each.method == name for each in paired)]
-    # A line for each method, and one of air between data sets.
-    lines = len(methods) + 1
-    height = 0.7 + ROW * lines * len(data_sets)
+    lines = _lines(paired, list(styles))
+    height = 0.7 + ROW * (max(lines.values()) + 2)
     columns = min(3, len(wanted))
     figure, panels = grid(len(wanted), columns=columns, height=height, sharey=True)
     for axes, quantity in zip(panels, wanted, strict=True):
         axes.axvline(0, color=GREY, linewidth=1)
         for each in paired:
             if each.quantity.name == quantity.name and each.difference is not None:
-                mean, low, high, _ = each.difference
+                mean, low, high, over = each.difference
                 style = styles[each.method]
                 told = each.verdict != "not told apart"
-                y = data_sets.index(each.data) * lines + methods.index(each.method)
-                axes.hlines(y, low, high, color=style.color, linewidth=1.4)
+                y = lines[each.data, each.method]
+                pale = 0.45 if over == "episodes" else 1.0
+                axes.hlines(y, low, high, color=style.color, linewidth=1.4, alpha=pale)
                 axes.plot(
-                    mean, y, style.marker, color=style.color, markersize=5,
+                    mean, y, style.marker, color=style.color, markersize=5, alpha=pale,
                     markerfacecolor=style.color if told else "white",
                 )  # fmt: skip
         better = "less is better" if quantity.sign < 0 else "more is better"
@@ -59,9 +58,25 @@ def draw_differences(
         axes.set_xlabel(f"points, less {plain(reference)}", fontsize=9)
         axes.grid(axis="y", visible=False)
         axes.grid(axis="x", color="#DDDDDD", linewidth=0.6)
-    middle = np.arange(len(data_sets)) * lines + (len(methods) - 1) / 2
-    names = [plain(name.replace(" ", "\n", 1)) for name in data_sets]
-    panels[0].set_yticks(middle, names)
-    panels[0].set_ylim(lines * len(data_sets) - 1, -1)
-    legend(figure, {method: styles[method] for method in methods}, marker=True)
+    places = {}
+    for data in dict.fromkeys(each.data for each in paired):
+        places[data] = float(np.mean([y for (of, _), y in lines.items() if of == data]))
+    names = [plain(name.replace(" ", "\n", 1)) for name in places]
+    panels[0].set_yticks(list(places.values()), names)
+    panels[0].set_ylim(max(lines.values()) + 1, -1)
+    drawn = {method for _, method in lines}
+    legend(figure, {m: styles[m] for m in styles if m in drawn}, marker=True)
     return save(figure, path)
+
+
+def _lines(
+    paired: Sequence[Comparison], methods: Sequence[str]
+) -> dict[tuple[str, str], int]:
+    """Return the line of each data set and method, with one of air between data."""
+    there = {(each.data, each.method) for each in paired}
+    lines: dict[tuple[str, str], int] = {}
+    for air, data in enumerate(dict.fromkeys(each.data for each in paired)):
+        for method in methods:
+            if (data, method) in there:
+                lines[data, method] = len(lines) + air
+    return lines

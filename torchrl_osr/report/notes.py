@@ -6,7 +6,10 @@ FEW_SEEDS = (
     "nine of ten."
 )
 
-EPISODES_MARK = "ᵉ: one seed, so the interval is over the episodes of that training."
+EPISODES_MARK = (
+    "ᵉ: one seed, or one on some data set, so the interval is over the episodes of "
+    "these trainings and says nothing about another."
+)
 VERSIONS_MARK = "†: runs of different versions, or some do not say theirs."
 
 TABLE_NOTE = (

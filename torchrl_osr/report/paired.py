@@ -151,7 +151,7 @@ def difference(data_sets: Sequence[Sequence[Array]]) -> Estimate:
         for index, each in enumerate(data_sets)
     ]
     low, high = percentile_interval(np.mean(resamples, axis=0)[:, 0])
-    over = "seeds" if max(map(len, data_sets)) > 1 else "episodes"
+    over = "seeds" if min(map(len, data_sets)) > 1 else "episodes"
     return Estimate(float(point), float(low), float(high), over)
 
 

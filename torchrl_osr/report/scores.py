@@ -45,7 +45,7 @@ class Estimate(NamedTuple):
         mean: of the runs.
         low: lower end.
         high: upper end.
-        over: what was resampled: "seeds", or "episodes" where there is one seed.
+        over: what was resampled: "seeds", or "episodes" where a data set has one seed.
     """
 
     mean: float
@@ -140,18 +140,18 @@ def learning_curve(runs: Sequence[Run]) -> Curve:
 def interquartile_means(runs: Sequence[Run]) -> dict[str, Estimate]:
     """Return each method's IQM over data sets and seeds.
 
-    Runs are resampled within their data sets. Where no data set has a second seed that
-    is impossible, and the interval is over the data sets' episodes instead.
+    Runs are resampled within their data sets. Where one of these has no second seed
+    that is impossible, and the interval is over the runs' episodes instead.
     """
     found = {}
     for method in methods_of(runs):
         strata = _strata(runs, method)
         scores = [[recent_episodes(run).mean() for run in group] for group in strata]
         point = float(interquartile_mean(np.concatenate(scores)))
-        if max(map(len, strata)) > 1:
+        if min(map(len, strata)) > 1:
             resamples, over = stratified_resamples(scores), "seeds"
         else:
-            episodes = [recent_episodes(group[0]) for group in strata]
+            episodes = [recent_episodes(run) for group in strata for run in group]
             draws = [_of_run(each, seed) for seed, each in enumerate(episodes)]
             resamples, over = np.concatenate(draws, axis=1), "episodes"
         low, high = percentile_interval(interquartile_mean(resamples))
@@ -164,7 +164,7 @@ def run_profile(runs: Sequence[Run], method: str, thresholds: Array) -> Curve:
     strata = _strata(runs, method)
     scores = [[recent_episodes(run).mean() for run in group] for group in strata]
     mean = performance_profile(np.concatenate(scores), thresholds)
-    if max(map(len, strata)) == 1:
+    if min(map(len, strata)) == 1:
         return Curve(thresholds, mean, mean, mean, "")
     resamples = performance_profile(stratified_resamples(scores), thresholds)
     return Curve(thresholds, mean, *percentile_interval(resamples), "seeds")
@@ -183,7 +183,7 @@ def episode_profile(runs: Sequence[Run], method: str, thresholds: Array) -> Curv
     # A seed for each data set: with one, they would be drawn alike.
     resamples = [nested_resamples(each, seed=seed) for seed, each in enumerate(tables)]
     low, high = percentile_interval(np.mean(resamples, axis=0))
-    over = "seeds" if max(map(len, tables)) > 1 else "episodes"
+    over = "seeds" if min(map(len, tables)) > 1 else "episodes"
     return Curve(thresholds, mean, low, high, over)
 
 

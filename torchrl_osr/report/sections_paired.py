@@ -100,7 +100,7 @@ def _picture(
         draw_differences(found, wanted, styles, reference, path),
         f"Differences from {reference} with their intervals, by data set",
         f"Each method less {reference}. Filled: better or worse. Hollow: not told "
-        "apart.",
+        "apart. Pale: the interval is over episodes, for want of seeds.",
     )
 
 
