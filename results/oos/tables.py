@@ -5,58 +5,85 @@ python results/oos/tables.py
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
-from torchrl_osr.report.checks import cells, data_of, methods_of
+from torchrl_osr.report.checks import cells, data_of
 from torchrl_osr.report.page import collect
-from torchrl_osr.report.paired import ALL_DATA, Comparison, compare
-from torchrl_osr.report.quantities import quantities
+from torchrl_osr.report.paired import ALL_DATA, compare
+from torchrl_osr.report.quantities import Quantity, quantities
 from torchrl_osr.report.runs import Run
-from torchrl_osr.report.scores import recent_score
+from torchrl_osr.report.scores import decimal, recent_score
 
 REFERENCE = "cql_noisy_bc"
+OWN = ("osr", "osr_v")
+ABLATIONS = ("cql", "cql_bc", REFERENCE, "osr_shuffled")
+WIDE = ("osr_beta_1e-1", "osr_beta_1e-1_clean_model")
+WIDE_REFERENCE = "cql_noisy_bc_beta_1e-1"
 
 
-def cell(found: list[Comparison], data: str) -> str:
-    """Return a difference; bold if its interval over seeds leaves out 0."""
-    for each in found:
+def difference(
+    runs: Sequence[Run], data: str, method: str, reference: str, quantity: Quantity
+) -> str:
+    """Return method less reference; bold if the interval over seeds leaves out 0."""
+    for each in compare(runs, method, reference, quantity):
         if each.data == data and each.difference is not None:
             mean, low, high, over = each.difference
-            text = f"{mean:+.1f} [{low:.1f}, {high:.1f}]"
+            text = f"{decimal(mean, '+')} [{decimal(low)}, {decimal(high)}]"
             if over == "episodes":
                 return f"{text} ᵉ"
             return text if low <= 0 <= high else f"**{text}**"
     return ""
 
 
-def rows(runs: list[Run], data: str) -> list[str]:
-    """Return a data set's lines."""
-    groups, lines = cells(runs), []
-    for method in methods_of(runs):
-        group = groups.get((data, method), [])
-        if not group and data != ALL_DATA:
-            continue
-        differences = [
-            "0"
-            if method == REFERENCE
-            else cell(compare(runs, method, REFERENCE, q), data)
-            for q in quantities(runs)
-        ]
-        score = f" {recent_score(group)} |" if group else ""
-        lines.append(f"| `{method}` |{score} {' | '.join(differences)} |")
-    return lines
+def table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print Markdown."""
+    lines = [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows)]
+    print(f"\n{title}\n", *lines, sep="\n")
 
 
 def main() -> None:
-    """Print a table for each data set, and one over all."""
+    """Print a table for each data set, one over all, and one of the wide noise."""
     runs, _ = collect([Path(__file__).parent / "runs"])
-    names = [each.name for each in quantities(runs)]
-    data_sets = data_of(runs)
-    for data in [*data_sets, *([ALL_DATA] if len(data_sets) > 1 else [])]:
-        score = [] if data == ALL_DATA else ["mean of the last five"]
-        head = ["", *score, *(f"{name}, less `{REFERENCE}`" for name in names)]
-        print(f"\n### {data}\n\n| {' | '.join(head)} |\n{'|---' * len(head)}|")
-        print("\n".join(rows(runs, data)))
+    groups, wanted = cells(runs), quantities(runs)
+    names = [each.name for each in wanted]
+    for data in data_of(runs):
+        rows = [
+            [
+                f"`{method}`",
+                str(len(group)),
+                str(recent_score(group)),
+                *(difference(runs, data, method, REFERENCE, q) or "0" for q in wanted),
+            ]
+            for (of, method), group in groups.items()
+            if of == data
+        ]
+        table(data, ["", "seeds", "mean of the last five", *names], rows)
+    score, disturbed, _ = wanted
+    rows = [
+        [
+            f"`{ablation}`",
+            *(
+                difference(runs, ALL_DATA, method, ablation, quantity)
+                for method in OWN
+                for quantity in (score, disturbed)
+            ),
+        ]
+        for ablation in ABLATIONS
+    ]
+    head = [f"`{method}`, {q.name}" for method in OWN for q in (score, disturbed)]
+    table(ALL_DATA, ["less", *head], rows)
+    for data in data_of(runs):
+        rows = [
+            [
+                f"`{method}`",
+                *(difference(runs, data, method, WIDE_REFERENCE, q) for q in wanted),
+            ]
+            for method in WIDE
+            if (data, method) in groups
+        ]
+        if rows:
+            table(f"{data}, less `{WIDE_REFERENCE}`", ["", *names], rows)
 
 
 if __name__ == "__main__":
