@@ -26,6 +26,8 @@ def difference(
     runs: Sequence[Run], data: str, method: str, reference: str, quantity: Quantity
 ) -> str:
     """Return method less reference; bold if the interval over seeds leaves out 0."""
+    if method == reference:
+        return "0"
     for each in compare(runs, method, reference, quantity):
         if each.data == data and each.difference is not None:
             mean, low, high, over = each.difference
@@ -53,7 +55,7 @@ def main() -> None:
                 f"`{method}`",
                 str(len(group)),
                 str(recent_score(group)),
-                *(difference(runs, data, method, REFERENCE, q) or "0" for q in wanted),
+                *(difference(runs, data, method, REFERENCE, q) for q in wanted),
             ]
             for (of, method), group in groups.items()
             if of == data
