@@ -12,6 +12,11 @@ from types import ModuleType
 import pytest
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
+PRINTED = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+
+
+def command(script: str, *arguments: str) -> list[str]:
+    return [sys.executable, str(EXAMPLES / script), *arguments]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -49,25 +54,21 @@ def start() -> Callable[..., subprocess.Popen]:
     """Return a function that starts an example in a process, as a user does."""
 
     def start(cwd: Path, script: str, *arguments: str) -> subprocess.Popen:
-        return subprocess.Popen(
-            [sys.executable, str(EXAMPLES / script), *arguments],
-            cwd=cwd,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
+        return subprocess.Popen(command(script, *arguments), cwd=cwd, **PRINTED)
 
     return start
 
 
 @pytest.fixture(scope="session")
-def run(start) -> Callable[..., tuple[int, str]]:
-    """Return a function that waits for it: its exit code and what it printed."""
+def run() -> Callable[..., tuple[int, str]]:
+    """Return a function that runs one to its end: exit code and what it printed."""
 
     def run(cwd: Path, script: str, *arguments: str) -> tuple[int, str]:
-        process = start(cwd, script, *arguments)
-        output, _ = process.communicate(timeout=240)
-        return process.returncode, output
+        # On a timeout, unlike start's, the process is killed.
+        done = subprocess.run(
+            command(script, *arguments), cwd=cwd, timeout=240, check=False, **PRINTED
+        )
+        return done.returncode, done.stdout
 
     return run
 

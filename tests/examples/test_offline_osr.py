@@ -115,11 +115,20 @@ def test_killed_three_times_ends_with_the_same_bits(
         (["trainer.stepz=3"], ["stepz", "TrainerConfig"]),
         (["resume=nowhere"], ["nowhere", "folder of a run"]),
         (["resume=run", "seed=3"], ["leave out seed=3"]),
-        (["hydra.run.dir=run", "seed=3"], ["another configuration", "seed: 0"]),
     ],
 )
 def test_bad_input_is_named(finished, run, arguments, named):
     folder, _ = finished
+    refused(folder, run, arguments, named)
+
+
+def test_another_configuration_in_the_same_folder_is_refused(finished, run, sizes):
+    folder, _ = finished
+    arguments = ["hydra.run.dir=run", *sizes, "seed=3"]
+    refused(folder, run, arguments, ["another configuration", "seed: 0"])
+
+
+def refused(folder: Path, run, arguments: list[str], named: list[str]) -> None:
     code, output = run(folder.parent, SCRIPT, *arguments)
     assert code != 0
     for word in named:
@@ -189,8 +198,8 @@ def test_every_other_loss_runs_to_its_end(tmp_path, run, sizes):
         assert json.loads(path.read_text())["last"]["step"] == 40
 
 
-def test_official_preset_with_its_model_runs_in_half_precision(tmp_path, run, tiny):
-    arguments = [*tiny(), "preset=official", "trainer.precision=bfloat16"]
+def test_official_preset_with_its_model_runs_in_half_precision(tmp_path, run, sizes):
+    arguments = [*sizes, "preset=official", "trainer.precision=bfloat16"]
     code, output = run(tmp_path, SCRIPT, *arguments, "hydra.run.dir=run")
     if "has no bfloat16" in output:
         assert code != 0
