@@ -1,6 +1,8 @@
 """Print the tables of README.md from the raw results beside it.
 
-python results/oos/tables.py
+    python results/oos/tables.py
+
+Bold: the interval, over seeds, leaves out 0.
 """
 
 from __future__ import annotations
@@ -8,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from torchrl_osr.report.checks import cells, data_of
+from torchrl_osr.report.checks import cells, data_of, methods_of
 from torchrl_osr.report.page import collect
-from torchrl_osr.report.paired import ALL_DATA, compare
+from torchrl_osr.report.paired import ALL_DATA, Comparison, compare
 from torchrl_osr.report.quantities import Quantity, quantities
 from torchrl_osr.report.runs import Run
 from torchrl_osr.report.scores import decimal, recent_score
@@ -22,20 +24,23 @@ WIDE = ("osr_beta_1e-1", "osr_beta_1e-1_clean_model")
 WIDE_REFERENCE = "cql_noisy_bc_beta_1e-1"
 
 
-def difference(
-    runs: Sequence[Run], data: str, method: str, reference: str, quantity: Quantity
-) -> str:
-    """Return method less reference; bold if the interval over seeds leaves out 0."""
-    if method == reference:
-        return "0"
-    for each in compare(runs, method, reference, quantity):
-        if each.data == data and each.difference is not None:
-            mean, low, high, over = each.difference
-            text = f"{decimal(mean, '+')} [{decimal(low)}, {decimal(high)}]"
-            if over == "episodes":
-                return f"{text} ᵉ"
-            return text if low <= 0 <= high else f"**{text}**"
-    return ""
+def differences(
+    runs: Sequence[Run], method: str, reference: str, wanted: Sequence[Quantity]
+) -> list[dict[str, str]]:
+    """Return method less reference in each quantity, by data set."""
+    return [
+        {each.data: cell(each) for each in compare(runs, method, reference, quantity)}
+        for quantity in wanted
+    ]
+
+
+def cell(each: Comparison) -> str:
+    """Return a difference; bold if its interval over seeds leaves out 0."""
+    if each.difference is None:
+        return ""
+    text = f"{decimal(each.difference.mean, '+')} {each.difference.interval}"
+    told = each.verdict != "not told apart" and each.difference.over == "seeds"
+    return f"**{text}**" if told else text
 
 
 def table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
@@ -49,40 +54,40 @@ def main() -> None:
     runs, _ = collect([Path(__file__).parent / "runs"])
     groups, wanted = cells(runs), quantities(runs)
     names = [each.name for each in wanted]
+    found = {m: differences(runs, m, REFERENCE, wanted) for m in methods_of(runs)}
+    found[REFERENCE] = [dict.fromkeys(data_of(runs), "0") for _ in wanted]
     for data in data_of(runs):
         rows = [
             [
                 f"`{method}`",
                 str(len(group)),
                 str(recent_score(group)),
-                *(difference(runs, data, method, REFERENCE, q) for q in wanted),
+                *(column[data] for column in found[method]),
             ]
             for (of, method), group in groups.items()
             if of == data
         ]
         table(data, ["", "seeds", "mean of the last five", *names], rows)
-    score, disturbed, _ = wanted
+    scores = wanted[:2]
     rows = [
         [
             f"`{ablation}`",
             *(
-                difference(runs, ALL_DATA, method, ablation, quantity)
+                column[ALL_DATA]
                 for method in OWN
-                for quantity in (score, disturbed)
+                for column in differences(runs, method, ablation, scores)
             ),
         ]
         for ablation in ABLATIONS
     ]
-    head = [f"`{method}`, {q.name}" for method in OWN for q in (score, disturbed)]
+    head = [f"`{method}`, {q.name}" for method in OWN for q in scores]
     table(ALL_DATA, ["less", *head], rows)
+    wide = {m: differences(runs, m, WIDE_REFERENCE, wanted) for m in WIDE}
     for data in data_of(runs):
         rows = [
-            [
-                f"`{method}`",
-                *(difference(runs, data, method, WIDE_REFERENCE, q) for q in wanted),
-            ]
-            for method in WIDE
-            if (data, method) in groups
+            [f"`{method}`", *(column[data] for column in columns)]
+            for method, columns in wide.items()
+            if data in columns[0]
         ]
         if rows:
             table(f"{data}, less `{WIDE_REFERENCE}`", ["", *names], rows)

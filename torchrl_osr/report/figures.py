@@ -112,6 +112,12 @@ def grid(
     return figure, axes[:panels]
 
 
+def grid_sideways(axes: Axes) -> None:
+    """Turn a panel's lines: values go from left to right."""
+    axes.grid(axis="y", visible=False)
+    axes.grid(axis="x", color="#DDDDDD", linewidth=0.6)
+
+
 def legend(
     figure: Figure, styles: Styles, *, more: Sequence[Line2D] = (), marker: bool = False
 ) -> None:
@@ -194,8 +200,7 @@ def draw_means(means: Mapping[str, Estimate], styles: Styles, path: Path) -> Pat
         axes.plot(each.mean, place, style.marker, color=style.color, markersize=7)
     axes.set_yticks(np.arange(len(means)), [plain(method) for method in means])
     axes.set_ylim(len(means) - 0.5, -0.5)
-    axes.grid(axis="y", visible=False)
-    axes.grid(axis="x", color="#DDDDDD", linewidth=0.6)
+    grid_sideways(axes)
     axes.set_xlabel("interquartile mean of the normalised score")
     return save(figure, path)
 

@@ -4,12 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from torchrl_osr.report.figures import GREY, Styles, grid, legend, plain, save
+from torchrl_osr.report.figures import (
+    GREY,
+    Style,
+    Styles,
+    grid,
+    grid_sideways,
+    legend,
+    plain,
+    save,
+)
 from torchrl_osr.report.paired import Comparison
 from torchrl_osr.report.quantities import Quantity
+
+if TYPE_CHECKING:  # figures says what to install where there is no Matplotlib
+    from matplotlib.axes import Axes
 
 ROW = 0.17
 """Of a method on a data set, in inches."""
@@ -42,31 +55,33 @@ def draw_differences(
     for axes, quantity in zip(panels, wanted, strict=True):
         axes.axvline(0, color=GREY, linewidth=1)
         for each in paired:
-            if each.quantity.name == quantity.name and each.difference is not None:
-                mean, low, high, over = each.difference
-                style = styles[each.method]
-                told = each.verdict != "not told apart"
-                y = lines[each.data, each.method]
-                pale = 0.45 if over == "episodes" else 1.0
-                axes.hlines(y, low, high, color=style.color, linewidth=1.4, alpha=pale)
-                axes.plot(
-                    mean, y, style.marker, color=style.color, markersize=5, alpha=pale,
-                    markerfacecolor=style.color if told else "white",
-                )  # fmt: skip
+            if each.quantity.name == quantity.name:
+                _mark(axes, each, styles[each.method], lines[each.data, each.method])
         better = "less is better" if quantity.sign < 0 else "more is better"
         axes.set_title(f"{plain(quantity.name)}\n({better})", fontsize=10)
         axes.set_xlabel(f"points, less {plain(reference)}", fontsize=9)
-        axes.grid(axis="y", visible=False)
-        axes.grid(axis="x", color="#DDDDDD", linewidth=0.6)
-    places = {}
-    for data in dict.fromkeys(each.data for each in paired):
-        places[data] = float(np.mean([y for (of, _), y in lines.items() if of == data]))
-    names = [plain(name.replace(" ", "\n", 1)) for name in places]
-    panels[0].set_yticks(list(places.values()), names)
+        grid_sideways(axes)
+    data_sets = dict.fromkeys(data for data, _ in lines)
+    middle = [np.mean([lines[key] for key in lines if key[0] == d]) for d in data_sets]
+    names = [plain(data.replace(" ", "\n", 1)) for data in data_sets]
+    panels[0].set_yticks(middle, names)
     panels[0].set_ylim(max(lines.values()) + 1, -1)
     drawn = {method for _, method in lines}
     legend(figure, {m: styles[m] for m in styles if m in drawn}, marker=True)
     return save(figure, path)
+
+
+def _mark(axes: Axes, each: Comparison, style: Style, y: int) -> None:
+    """Draw one difference."""
+    assert each.difference is not None
+    mean, low, high, over = each.difference
+    pale = 0.45 if over == "episodes" else 1.0
+    face = "white" if each.verdict == "not told apart" else style.color
+    axes.hlines(y, low, high, color=style.color, linewidth=1.4, alpha=pale)
+    axes.plot(
+        mean, y, style.marker, color=style.color, markersize=5, alpha=pale,
+        markerfacecolor=face,
+    )  # fmt: skip
 
 
 def _lines(

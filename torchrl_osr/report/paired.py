@@ -18,7 +18,7 @@ from torchrl_osr.report.checks import cells, data_of
 from torchrl_osr.report.methods import METHOD, comparable
 from torchrl_osr.report.quantities import Episodes, Quantity
 from torchrl_osr.report.runs import Run
-from torchrl_osr.report.scores import Estimate
+from torchrl_osr.report.scores import Estimate, over_what
 
 Array = NDArray[np.float64]
 ALL_DATA = "all data sets"
@@ -151,8 +151,7 @@ def difference(data_sets: Sequence[Sequence[Array]]) -> Estimate:
         for index, each in enumerate(data_sets)
     ]
     low, high = percentile_interval(np.mean(resamples, axis=0)[:, 0])
-    over = "seeds" if min(map(len, data_sets)) > 1 else "episodes"
-    return Estimate(float(point), float(low), float(high), over)
+    return Estimate(float(point), float(low), float(high), over_what(data_sets))
 
 
 def _by_seed(

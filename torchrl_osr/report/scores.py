@@ -111,6 +111,15 @@ def estimate(runs: Sequence[Array]) -> Estimate:
     return Estimate(*mean_interval([run.mean() for run in runs]))
 
 
+def over_what(groups: Sequence[Sequence[object]]) -> str:
+    """Return what an interval over data sets is over: seeds, if each has several.
+
+    Args:
+        groups: something of each seed, data set by data set.
+    """
+    return "seeds" if min(map(len, groups)) > 1 else "episodes"
+
+
 def last_score(runs: Sequence[Run]) -> Estimate:
     """Return the score of the last evaluation."""
     return estimate([episode_scores(run, run.evaluations[-1:]) for run in runs])
@@ -148,12 +157,13 @@ def interquartile_means(runs: Sequence[Run]) -> dict[str, Estimate]:
         strata = _strata(runs, method)
         scores = [[recent_episodes(run).mean() for run in group] for group in strata]
         point = float(interquartile_mean(np.concatenate(scores)))
-        if min(map(len, strata)) > 1:
-            resamples, over = stratified_resamples(scores), "seeds"
+        over = over_what(strata)
+        if over == "seeds":
+            resamples = stratified_resamples(scores)
         else:
             episodes = [recent_episodes(run) for group in strata for run in group]
             draws = [_of_run(each, seed) for seed, each in enumerate(episodes)]
-            resamples, over = np.concatenate(draws, axis=1), "episodes"
+            resamples = np.concatenate(draws, axis=1)
         low, high = percentile_interval(interquartile_mean(resamples))
         found[method] = Estimate(point, float(low), float(high), over)
     return found
@@ -164,7 +174,7 @@ def run_profile(runs: Sequence[Run], method: str, thresholds: Array) -> Curve:
     strata = _strata(runs, method)
     scores = [[recent_episodes(run).mean() for run in group] for group in strata]
     mean = performance_profile(np.concatenate(scores), thresholds)
-    if min(map(len, strata)) == 1:
+    if over_what(strata) != "seeds":
         return Curve(thresholds, mean, mean, mean, "")
     resamples = performance_profile(stratified_resamples(scores), thresholds)
     return Curve(thresholds, mean, *percentile_interval(resamples), "seeds")
@@ -183,8 +193,7 @@ def episode_profile(runs: Sequence[Run], method: str, thresholds: Array) -> Curv
     # A seed for each data set: with one, they would be drawn alike.
     resamples = [nested_resamples(each, seed=seed) for seed, each in enumerate(tables)]
     low, high = percentile_interval(np.mean(resamples, axis=0))
-    over = "seeds" if min(map(len, tables)) > 1 else "episodes"
-    return Curve(thresholds, mean, low, high, over)
+    return Curve(thresholds, mean, low, high, over_what(tables))
 
 
 def thresholds_of(runs: Sequence[Run], number: int = 121) -> Array:
