@@ -111,8 +111,8 @@ def profile_section(runs: Sequence[Run], styles: Styles, folder: Path) -> str:
             "Interquartile mean of each method with its interval",
             f"Interquartile mean of all runs' means of the last {NUM_RECENT} "
             "evaluations with its 95 % interval by stratified bootstrap: runs are "
-            "resampled within their data set. A data set with one seed adds nothing to "
-            "that interval; where all have one, it is over episodes.",
+            "resampled within their data set, or, for methods with one seed on some "
+            "data set, the episodes of each run.",
         )
         + table(
             ["method", "data sets", "runs", "IQM"], [("", rows)],
