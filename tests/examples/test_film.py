@@ -40,6 +40,7 @@ def test_film_leaves_pictures_numbers_and_a_table(tmp_path, run, tiny):
     assert code == 0, output
     assert "Warning" not in output
     folder = tmp_path / "run"
+    assert not list(tmp_path.glob("*.log"))
     for name in ("film.png", "visited.png"):
         assert (folder / name).read_bytes().startswith(b"\x89PNG")
     film_gif = (folder / "film.gif").read_bytes()
