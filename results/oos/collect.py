@@ -2,8 +2,9 @@
 
     python results/oos/collect.py outputs/oos
 
-Writes below this folder ``runs/<data>/<method>/seed<k>/`` and ``report/``. Numbers of
-the JSON files keep five digits.
+Writes below this folder ``runs/<data>/<method>/seed<k>/`` and ``report/``. Seeds that
+are not of the grid go to ``more_seeds/``, which the report leaves alone. Numbers of the
+JSON files keep five digits.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import sys
 from pathlib import Path
 
 HERE = Path(__file__).parent
+GRID = ("seed0", "seed1", "seed2")
 REPORT = ("runs", "--reference", "cql_noisy_bc")
 RAW = ("returns.json", "inverse_dynamics.json", "robustness-oos.json", "status.json")
 
@@ -38,7 +40,8 @@ def main(folder: Path) -> None:
     """Gather and report."""
     for finished in sorted(folder.glob("*/*/seed*/robustness-oos.json")):
         run = finished.parent
-        gather(run, HERE / "runs" / run.relative_to(folder))
+        part = "runs" if run.name in GRID else "more_seeds"
+        gather(run, HERE / part / run.relative_to(folder))
     # From here, so that the page names the runs as they lie in the repository.
     subprocess.run(
         [sys.executable, "../../examples/report.py", *REPORT],

@@ -49,26 +49,28 @@ def table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> Non
     print(f"\n{title}\n", *lines, sep="\n")
 
 
-def main() -> None:
-    """Print a table for each data set, one over all, and one of the wide noise."""
-    runs, _ = collect([Path(__file__).parent / "runs"])
-    groups, wanted = cells(runs), quantities(runs)
-    names = [each.name for each in wanted]
+def tables_of_data(runs: Sequence[Run], wanted: Sequence[Quantity]) -> None:
+    """Print a table for each data set: every method, and less the reference."""
+    groups = cells(runs)
     found = {m: differences(runs, m, REFERENCE, wanted) for m in methods_of(runs)}
     found[REFERENCE] = [dict.fromkeys(data_of(runs), "0") for _ in wanted]
+    head = ["", "seeds", "mean of the last five", *(each.name for each in wanted)]
     for data in data_of(runs):
         rows = [
             [
                 f"`{method}`",
-                str(len(group)),
+                ", ".join(str(run.seed) for run in group),
                 str(recent_score(group)),
                 *(column[data] for column in found[method]),
             ]
             for (of, method), group in groups.items()
             if of == data
         ]
-        table(data, ["", "seeds", "mean of the last five", *names], rows)
-    scores = wanted[:2]
+        table(data, head, rows)
+
+
+def table_over_all(runs: Sequence[Run], scores: Sequence[Quantity]) -> None:
+    """Print both of our losses less each ablation, over all data sets."""
     rows = [
         [
             f"`{ablation}`",
@@ -82,6 +84,10 @@ def main() -> None:
     ]
     head = [f"`{method}`, {q.name}" for method in OWN for q in scores]
     table(ALL_DATA, ["less", *head], rows)
+
+
+def tables_of_wide_noise(runs: Sequence[Run], wanted: Sequence[Quantity]) -> None:
+    """Print wide noise less cloning with the same, for each data set that has it."""
     wide = {m: differences(runs, m, WIDE_REFERENCE, wanted) for m in WIDE}
     for data in data_of(runs):
         rows = [
@@ -90,7 +96,20 @@ def main() -> None:
             if data in columns[0]
         ]
         if rows:
-            table(f"{data}, less `{WIDE_REFERENCE}`", ["", *names], rows)
+            head = ["", *(each.name for each in wanted)]
+            table(f"{data}, less `{WIDE_REFERENCE}`", head, rows)
+
+
+def main() -> None:
+    """Print the tables of the grid, and that of the seeds beyond it."""
+    here = Path(__file__).parent
+    runs, _ = collect([here / "runs"])
+    wanted = quantities(runs)
+    tables_of_data(runs, wanted)
+    table_over_all(runs, wanted[:2])
+    tables_of_wide_noise(runs, wanted)
+    print("\nSeeds beyond the grid")
+    tables_of_data(collect([here / "more_seeds"])[0], wanted)
 
 
 if __name__ == "__main__":
