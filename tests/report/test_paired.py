@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import runpy
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,8 +10,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from torchrl_osr.report.figures import all_methods
 from torchrl_osr.report.paired import ALL_DATA, compare, difference, pair
 from torchrl_osr.report.quantities import level_quantities, quantities
+from torchrl_osr.report.sections_paired import paired_section
 
 fakes = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("fakes.py"))))
 write, level, suite, read = (
@@ -91,6 +94,17 @@ def test_an_interval_with_zero_tells_nothing_apart(tmp_path):
     (found,) = compare(runs, "osr", "cql", quantities(runs)[0])
     assert found.verdict == "not told apart"
     assert found.difference.low < 0 < found.difference.mean < found.difference.high
+
+
+@pytest.mark.parametrize(("seeds", "marked"), [((0,), True), ((0, 1), False)])
+def test_the_tables_mark_an_interval_of_one_seed(tmp_path, seeds, marked):
+    both(tmp_path, 2, seeds=seeds)
+    runs = read(tmp_path)
+    page = paired_section(runs, "cql", all_methods(runs), tmp_path)
+    # Three quantities, and the score under the one disturbance.
+    intervals = re.findall(r"<small>(\[.*?)</small>", page)
+    assert len(intervals) == 4
+    assert all(each.endswith("] ᵉ") == marked for each in intervals)
 
 
 def test_data_sets_count_the_same_and_come_last_together(tmp_path):

@@ -18,6 +18,7 @@ from torchrl_osr.report.html import (
     side_by_side,
     table,
 )
+from torchrl_osr.report.notes import EPISODES_MARK
 from torchrl_osr.report.paired import (
     ALL_DATA,
     Comparison,
@@ -68,7 +69,10 @@ def paired_section(
         if together
         else "",
         _table(
-            found, main, f"Points of score, method less {reference} [95 % interval]."
+            found,
+            main,
+            f"Points of score, method less {reference} [95 % interval]. "
+            f"{EPISODES_MARK}",
         ),
     ]
     for suite in suites_of(runs):
@@ -78,7 +82,7 @@ def paired_section(
                 _compare_all(runs, reference, block),
                 block,
                 f"Score under {suite}, disturbance by disturbance, method less "
-                f"{reference}.",
+                f"{reference}. {EPISODES_MARK}",
             )
             for block in side_by_side(levels)
         ]
@@ -162,12 +166,8 @@ def _cell(each: Comparison | None) -> Cell:
     """Return a difference with its mark."""
     if each is None or each.difference is None:
         return Cell("not paired" if each else "", kind="none")
-    mean, low, high, _ = each.difference
-    return Cell(
-        f"{MARKS[each.verdict]} {decimal(mean, '+')}",
-        f"[{decimal(low, '+')}, {decimal(high, '+')}]",
-        _kind(each),
-    )
+    value = f"{MARKS[each.verdict]} {decimal(each.difference.mean, '+')}"
+    return Cell(value, each.difference.interval, _kind(each))
 
 
 def _kind(each: Comparison) -> str:
