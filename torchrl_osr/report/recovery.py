@@ -20,7 +20,7 @@ from torchrl_osr.evaluation.statistics import (
 )
 from torchrl_osr.report.robustness import decrease, suite_levels
 from torchrl_osr.report.runs import Run
-from torchrl_osr.report.scores import Curve, Estimate
+from torchrl_osr.report.scores import Curve, Estimate, over_what
 
 Array = NDArray[np.float64]
 
@@ -86,7 +86,6 @@ def recovery(runs: Sequence[Run], suite: str, index: int) -> Recovery | None:
     rows = np.concatenate(tables)
     median = float(np.median(rows[:, 4]))
     scores = [table[:, :2] for table in tables]
-    over = "seeds" if len(tables) > 1 else "episodes"
     return Recovery(
         episodes,
         len(rows) / episodes,
@@ -98,7 +97,7 @@ def recovery(runs: Sequence[Run], suite: str, index: int) -> Recovery | None:
             np.mean([each.mean(0) for each in scores], axis=0),
             nested_resamples(scores),
             1,
-            over,
+            over_what([tables]),
         ),
         _recovered([table[:, 4] for table in tables], _horizon(runs, suite, index)),
         _distance(runs, suite, index, "mean", "count"),
@@ -154,7 +153,7 @@ def _recovered(steps: Sequence[Array], horizon: int) -> Curve:
     within = [each[:, None] <= x for each in steps]
     mean = np.mean([each.mean(0) for each in within], axis=0)
     low, high = percentile_interval(nested_resamples(within))
-    return Curve(x, mean, low, high, "seeds" if len(steps) > 1 else "episodes")
+    return Curve(x, mean, low, high, over_what([steps]))
 
 
 def _distance(

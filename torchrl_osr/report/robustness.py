@@ -19,7 +19,7 @@ from torchrl_osr.evaluation.statistics import nested_resamples, percentile_inter
 from torchrl_osr.report.files import levels_of
 from torchrl_osr.report.methods import distinctions
 from torchrl_osr.report.runs import Run
-from torchrl_osr.report.scores import Estimate
+from torchrl_osr.report.scores import Estimate, over_what
 
 Array = NDArray[np.float64]
 
@@ -147,7 +147,7 @@ def disturbed(runs: Sequence[Run], suite: str) -> Disturbed:
     resamples = nested_resamples(tables)
     means = np.mean([table.mean(0) for table in tables], axis=0)
     low, high = percentile_interval(resamples)
-    over = "seeds" if len(runs) > 1 else "episodes"
+    over = over_what([runs])
     clean, *scores = [
         Estimate(float(means[i]), float(low[i]), float(high[i]), over)
         for i in range(len(means))

@@ -112,7 +112,7 @@ def estimate(runs: Sequence[Array]) -> Estimate:
 
 
 def over_what(groups: Sequence[Sequence[object]]) -> str:
-    """Return what an interval over data sets is over: seeds, if each has several.
+    """Return what an interval is over: seeds, if each data set has several.
 
     Args:
         groups: something of each seed, data set by data set.
