@@ -24,8 +24,8 @@ from torchrl import torchrl_logger
 from tqdm.auto import tqdm
 
 from torchrl_osr import evaluate_config
+from torchrl_osr._files import parse_json, read_text
 from torchrl_osr.data import observation_statistics
-from torchrl_osr.data.limits import parse_json, read_text
 from torchrl_osr.data.manifest import SEAL, check_seal, sealed, sha256_of
 from torchrl_osr.evaluation.data_distance import DataDistance
 from torchrl_osr.evaluation.episodes import deterministic_policy
@@ -37,13 +37,13 @@ from torchrl_osr.evaluation.robustness_summary import (
 )
 from torchrl_osr.evaluation.robustness_table import robustness_table
 from torchrl_osr.evaluation.suite import make_levels
-from torchrl_osr.evaluation.trained_run import (
+from torchrl_osr.experiment import run_folder
+from torchrl_osr.experiment.build import load_data
+from torchrl_osr.experiment.trained_run import (
     checkpoints_of,
     load_trained,
     run_folder_of,
 )
-from torchrl_osr.from_config import load_data
-from torchrl_osr.trainers import run_folder
 
 JSON_FORMAT = 1
 SEED_STRIDE = 1000  # between checkpoints: no two of them play the same episodes

@@ -35,6 +35,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torchrl import torchrl_logger
 
+from torchrl_osr._checks import check_choice
 from torchrl_osr.data import load_behavior_policy, make_environment
 from torchrl_osr.data.levels import level_policies
 from torchrl_osr.data.on_disk import observations
@@ -48,11 +49,10 @@ from torchrl_osr.evaluation.inverse_dynamics_control import (
 )
 from torchrl_osr.evaluation.survival import Survival, survival_table
 from torchrl_osr.evaluation.takeover import BEHAVIOR, Controller, play_takeovers
-from torchrl_osr.evaluation.trained_run import TrainedRun, load_trained
 from torchrl_osr.evaluation.visited_states import visited_states
-from torchrl_osr.from_config import load_data
-from torchrl_osr.objectives.base import check_choice
-from torchrl_osr.trainers.run_folder import write_json
+from torchrl_osr.experiment.build import load_data
+from torchrl_osr.experiment.run_folder import write_json
+from torchrl_osr.experiment.trained_run import TrainedRun, load_trained
 
 PUSH_STEPS = 5
 STEPS_BEFORE = 10  # in the film

@@ -30,7 +30,7 @@ from tensordict import TensorDict
 from torchrl import torchrl_logger
 from torchrl.objectives import SoftUpdate
 
-from torchrl_osr import InverseDynamicsLoss, StatePerturbation, config
+from torchrl_osr import InverseDynamicsLoss, StatePerturbation
 from torchrl_osr.evaluation.episodes import (
     EpisodeEvaluator,
     deterministic_policy,
@@ -39,13 +39,15 @@ from torchrl_osr.evaluation.episodes import (
 from torchrl_osr.evaluation.figures import learning_curve, read_scalars
 from torchrl_osr.evaluation.inverse_dynamics import describe, inverse_dynamics_report
 from torchrl_osr.evaluation.summary import score_table
-from torchrl_osr.from_config import make_learner
-from torchrl_osr.trainers import OfflineTrainer, run_folder
+from torchrl_osr.experiment import run_folder
+from torchrl_osr.experiment import schema as config
+from torchrl_osr.experiment.build import make_learner
+from torchrl_osr.experiment.loggers import make_loggers
+from torchrl_osr.experiment.training_data import load_training_data
+from torchrl_osr.trainers import OfflineTrainer
 from torchrl_osr.trainers.hardware import check_hardware
-from torchrl_osr.trainers.loggers import make_loggers
 from torchrl_osr.trainers.members import Run, launch
 from torchrl_osr.trainers.value_bounds import largest_value
-from torchrl_osr.training_data import load_training_data
 
 EVALUATION_SEED = 10_000  # far from the seeds of the data's episodes
 # Of both phases:

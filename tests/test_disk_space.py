@@ -9,8 +9,8 @@ from collections import namedtuple
 import pytest
 import torch
 
+from torchrl_osr._files import check_disk_space
 from torchrl_osr.data import load_local_dataset, local, make_replay_buffer
-from torchrl_osr.disk_space import check_disk_space
 from torchrl_osr.modules import tanh_gaussian_inverse_dynamics
 from torchrl_osr.objectives import InverseDynamicsLoss
 from torchrl_osr.trainers import OfflineTrainer

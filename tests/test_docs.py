@@ -12,7 +12,7 @@ from hydra import compose, initialize_config_dir
 from mktestdocs import check_md_file, grab_code_blocks
 from omegaconf import OmegaConf
 
-from torchrl_osr import config
+from torchrl_osr.experiment import schema as config
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -131,7 +131,9 @@ def test_public_functions_and_configuration_are_in_the_reference():
     with_members = [
         name for name, rest in DESCRIBE_ALL.findall(text) if "members" in rest
     ]
-    assert {"torchrl_osr.functional", "torchrl_osr.config"} <= set(with_members)
+    assert {"torchrl_osr.functional", "torchrl_osr.experiment.schema"} <= set(
+        with_members
+    )
 
 
 def test_every_configuration_key_is_documented_with_its_values():

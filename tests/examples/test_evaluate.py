@@ -17,7 +17,7 @@ from torchrl_osr import evaluate_config
 from torchrl_osr.data import make_environment
 from torchrl_osr.evaluation.robustness import check_levels
 from torchrl_osr.evaluation.suite import make_levels
-from torchrl_osr.evaluation.trained_run import load_trained
+from torchrl_osr.experiment.trained_run import load_trained
 from torchrl_osr.report.files import read_suites
 
 ROOT = Path(__file__).parents[2]

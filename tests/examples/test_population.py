@@ -15,8 +15,8 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_osr import config
-from torchrl_osr.evaluation.trained_run import load_trained
+from torchrl_osr.experiment import schema as config
+from torchrl_osr.experiment.trained_run import load_trained
 from torchrl_osr.trainers import OfflineTrainer, members, processes
 from torchrl_osr.trainers.members import launch, make_members
 

@@ -14,7 +14,8 @@ import torch
 from torchrl.record.loggers import CSVLogger
 
 from torchrl_osr.evaluation.figures import read_scalars
-from torchrl_osr.trainers import run_folder, train_together
+from torchrl_osr.experiment import run_folder
+from torchrl_osr.trainers import train_together
 from torchrl_osr.trainers.preemption import Preempted, sigterm_noted
 from torchrl_osr.trainers.processes import train_in_processes
 

@@ -21,7 +21,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_osr.data.limits import read_arrays, read_json
+from torchrl_osr._files import read_arrays, read_json
 
 FloatArray = NDArray[np.float32]
 

@@ -24,12 +24,12 @@ from tensordict import TensorDict
 from torchrl import torchrl_logger
 from tqdm.auto import tqdm
 
+from torchrl_osr._files import check_disk_space
 from torchrl_osr.data.chunk_statistics import merged, statistics_of
 from torchrl_osr.data.manifest import sealed, unsealed
 from torchrl_osr.data.on_disk import FORMAT_VERSION, MANIFEST, ROWS, TransitionsOnDisk
 from torchrl_osr.data.records import RecordLayout
 from torchrl_osr.data.validation import REWARD_KEY, VECTOR_KEYS, check_rows
-from torchrl_osr.disk_space import check_disk_space
 
 Notes = dict[str, Any]
 """What a source says of a chunk, JSON-compatible."""

@@ -13,8 +13,8 @@ from numpy.lib.format import MAGIC_PREFIX
 from numpy.typing import NDArray
 from tensordict import TensorDict
 
+from torchrl_osr._files import read_arrays, refuse_size
 from torchrl_osr.data.columns import ActionBounds
-from torchrl_osr.data.limits import read_arrays, refuse_size
 from torchrl_osr.data.manifest import sha256_of
 from torchrl_osr.data.trajectories import transitions_from_rows
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from torchrl_osr.data.limits import refuse_size
+from torchrl_osr._files import refuse_size
 
 try:
     import h5py

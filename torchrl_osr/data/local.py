@@ -24,10 +24,16 @@ from filelock import FileLock
 from tensordict import TensorDict
 from torchrl import torchrl_logger
 
+from torchrl_osr._files import (
+    MAX_JSON_BYTES,
+    check_disk_space,
+    parse_json,
+    read_arrays,
+    read_text,
+)
 from torchrl_osr.data.collection import Collection
 from torchrl_osr.data.environment import MAZE_IDS, environment_id, make_environment
 from torchrl_osr.data.levels import behavior_of, collect_level
-from torchrl_osr.data.limits import MAX_JSON_BYTES, parse_json, read_arrays, read_text
 from torchrl_osr.data.manifest import (
     check_seal,
     describe_episodes,
@@ -37,7 +43,6 @@ from torchrl_osr.data.manifest import (
 from torchrl_osr.data.partial import PartialCollection
 from torchrl_osr.data.reference_scores import normalized_score
 from torchrl_osr.data.validation import DATASET_KEYS, check_dataset
-from torchrl_osr.disk_space import check_disk_space
 
 try:
     import platformdirs

@@ -13,7 +13,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from torchrl_osr.data.limits import parse_json
+from torchrl_osr._files import parse_json
 
 SEAL = "seal"
 """Where a record has the SHA-256 of all that is in it besides."""

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from torchrl.data import ReplayBuffer
 
+from torchrl_osr._files import read_json
 from torchrl_osr.data.columns import ActionBounds
 from torchrl_osr.data.episodes import transitions_from_episodes
-from torchrl_osr.data.limits import read_json
 from torchrl_osr.data.replay_buffer import make_replay_buffer
 
 try:

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
 
-from torchrl_osr.data.limits import read_text
+from torchrl_osr._files import read_text
 from torchrl_osr.data.manifest import unsealed
 from torchrl_osr.data.records import RecordLayout
 

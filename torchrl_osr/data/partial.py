@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torchrl import torchrl_logger
 
-from torchrl_osr.data.limits import read_arrays
+from torchrl_osr._files import read_arrays
 
 # Five to ten seconds of work, and six megabytes of hopper.
 SAVE_EVERY = 50_000

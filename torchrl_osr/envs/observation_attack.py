@@ -18,8 +18,8 @@ from torch import Tensor
 from torchrl.envs import ObservationNorm
 from torchrl.modules import TanhNormal
 
+from torchrl_osr._checks import check_choice
 from torchrl_osr.objectives.adversary import Adversary
-from torchrl_osr.objectives.base import check_choice
 from torchrl_osr.objectives.tanh_gaussian import TanhGaussianActorCritic
 
 Distribution = Callable[[TensorDictBase], TanhNormal]

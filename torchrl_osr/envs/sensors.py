@@ -7,9 +7,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from torchrl_osr._checks import check_choice
 from torchrl_osr.envs.base import Disturbance, Step, Vector, gymnasium
 from torchrl_osr.envs.checks import check_strength, vector_box
-from torchrl_osr.objectives.base import check_choice
 
 
 class ObservationNoise(Disturbance):

@@ -26,7 +26,7 @@ from torch import Tensor
 from torchrl.envs import ObservationNorm
 from torchrl.objectives import LossModule
 
-from torchrl_osr.objectives.base import check_choice
+from torchrl_osr._checks import check_choice
 
 TargetRule = Literal["time", "nearest"]
 """Which state of the reference is next, see :class:`InverseDynamicsController`."""
@@ -184,7 +184,7 @@ def frozen_model(loss: LossModule) -> ProbabilisticTensorDictSequential:
 
     Args:
         loss: of a trained policy, as
-            :func:`~torchrl_osr.evaluation.trained_run.load_trained` returns it.
+            :func:`~torchrl_osr.experiment.trained_run.load_trained` returns it.
 
     Raises:
         ValueError: if the loss has none, as CQL and SAC-N have not.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from torchrl_osr.envs.observation_attack import attacked_policy, networks_of
 from torchrl_osr.evaluation.robustness import Level
-from torchrl_osr.evaluation.trained_run import TrainedRun
+from torchrl_osr.experiment.trained_run import TrainedRun
 
 DATA_UNIT = "data"
 """As a wrapper's ``unit``: the data's standard deviations."""
@@ -28,7 +28,8 @@ def make_levels(
     """Instantiate the wrappers and attacks of a suite.
 
     Args:
-        levels: by name, see :class:`~torchrl_osr.evaluate_config.LevelConfig`.
+        levels: by name, see
+            :class:`~torchrl_osr.experiment.evaluate_schema.LevelConfig`.
         trained: whose networks an attack looks at.
         scale: standard deviation of each observation entry in the data, ``[S]``; takes
             the place of a wrapper's ``unit: data``.

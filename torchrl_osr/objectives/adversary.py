@@ -21,8 +21,8 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.modules import TanhNormal
 
+from torchrl_osr._checks import check_choice
 from torchrl_osr.functional import jeffreys_divergence
-from torchrl_osr.objectives.base import check_choice
 from torchrl_osr.objectives.mixed_states import entry
 
 Policy = Callable[[TensorDictBase], TanhNormal]

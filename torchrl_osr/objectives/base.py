@@ -5,30 +5,19 @@ Shapes: ``B`` batch (any leading dimensions).
 
 from __future__ import annotations
 
-import math
 import warnings
 from abc import abstractmethod
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from torchrl_osr._checks import check_choice
+
 Reduction = Literal["none", "mean", "sum"] | None
 ScalarOutputMode = Literal["exclude", "non_tensor"] | None
-
-
-def check_choice(name: str, value: str | None, choices: tuple[Any, ...]) -> None:
-    """Raise a ValueError that lists the ``choices`` unless ``value`` is among them."""
-    if value not in choices:
-        raise ValueError(f"{name} must be one of {choices}, got {value!r}.")
-
-
-def check_weight(name: str, weight: float) -> None:
-    """Raise a ValueError unless the weight of a term is finite and at least 0."""
-    if not 0 <= weight < math.inf:
-        raise ValueError(f"{name} must be at least 0, got {weight}.")
 
 
 class BaseLoss(LossModule):

@@ -17,8 +17,8 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives.utils import _vmap_func
 
 from torchrl_osr import functional
+from torchrl_osr._checks import check_weight
 from torchrl_osr.objectives import mlp_critics
-from torchrl_osr.objectives.base import check_weight
 from torchrl_osr.objectives.mlp_layers import PlainMLP
 from torchrl_osr.objectives.tanh_gaussian import TanhGaussianActorCritic
 

@@ -19,12 +19,8 @@ from tensordict.nn import (
 from torch import Tensor
 
 from torchrl_osr import functional
-from torchrl_osr.objectives.base import (
-    Reduction,
-    ScalarOutputMode,
-    check_choice,
-    check_weight,
-)
+from torchrl_osr._checks import check_choice, check_weight
+from torchrl_osr.objectives.base import Reduction, ScalarOutputMode
 from torchrl_osr.objectives.categorical import CategoricalActorCritic
 from torchrl_osr.objectives.distributions import check_num_actions
 

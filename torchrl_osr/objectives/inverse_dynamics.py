@@ -19,13 +19,9 @@ from tensordict.nn import (
 )
 from torch import Tensor
 
+from torchrl_osr._checks import check_choice, check_weight
 from torchrl_osr.functional import gaussian_kl
-from torchrl_osr.objectives.base import (
-    BaseLoss,
-    Reduction,
-    check_choice,
-    check_weight,
-)
+from torchrl_osr.objectives.base import BaseLoss, Reduction
 from torchrl_osr.objectives.distributions import action_bounds, check_action
 from torchrl_osr.objectives.frozen_model import full_precision
 from torchrl_osr.objectives.mixed_states import (

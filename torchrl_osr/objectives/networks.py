@@ -24,12 +24,8 @@ from torch import Tensor
 from torchrl.objectives import ValueEstimators
 from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
 
-from torchrl_osr.objectives.base import (
-    BaseLoss,
-    Reduction,
-    ScalarOutputMode,
-    check_choice,
-)
+from torchrl_osr._checks import check_choice
+from torchrl_osr.objectives.base import BaseLoss, Reduction, ScalarOutputMode
 from torchrl_osr.objectives.distributions import check_apart
 from torchrl_osr.objectives.frozen_model import (
     freeze,

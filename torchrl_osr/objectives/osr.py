@@ -20,13 +20,9 @@ from torch import Tensor
 from torchrl.modules import TanhNormal
 
 from torchrl_osr import functional
+from torchrl_osr._checks import check_choice, check_weight
 from torchrl_osr.objectives.adversary import Adversary
-from torchrl_osr.objectives.base import (
-    Reduction,
-    ScalarOutputMode,
-    check_choice,
-    check_weight,
-)
+from torchrl_osr.objectives.base import Reduction, ScalarOutputMode
 from torchrl_osr.objectives.conservative import ConservativeCritics
 
 

@@ -17,13 +17,9 @@ from torchrl.modules import TanhNormal
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 
 from torchrl_osr import functional
+from torchrl_osr._checks import check_choice, check_weight
 from torchrl_osr.objectives.adversary import Adversary
-from torchrl_osr.objectives.base import (
-    Reduction,
-    ScalarOutputMode,
-    check_choice,
-    check_weight,
-)
+from torchrl_osr.objectives.base import Reduction, ScalarOutputMode
 from torchrl_osr.objectives.tanh_gaussian import TanhGaussianActorCritic
 
 

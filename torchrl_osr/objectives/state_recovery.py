@@ -23,7 +23,8 @@ from torchrl.modules import TanhDelta, TanhNormal
 from torchrl.modules.distributions.utils import safeatanh_noeps
 
 from torchrl_osr import functional
-from torchrl_osr.objectives.base import BaseLoss, Reduction, check_choice, check_weight
+from torchrl_osr._checks import check_choice, check_weight
+from torchrl_osr.objectives.base import BaseLoss, Reduction
 from torchrl_osr.objectives.distributions import (
     action_bounds,
     check_num_actions,

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from torchrl_osr.data.limits import read_json
+from torchrl_osr._files import read_json
 
 ROBUSTNESS_FORMAT = 1
 

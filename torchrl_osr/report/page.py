@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from torchrl_osr._files import write_atomically
 from torchrl_osr.evaluation.statistics import NUM_RESAMPLES
 from torchrl_osr.report.checks import comparison_notes, data_of, methods_of
 from torchrl_osr.report.figures import all_methods
@@ -26,7 +27,6 @@ from torchrl_osr.report.sections_robustness import (
     strength_section,
     table_section,
 )
-from torchrl_osr.trainers.run_folder import write_atomically
 
 PAGE = "report.html"
 

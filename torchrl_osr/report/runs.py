@@ -14,11 +14,11 @@ from typing import Any
 from omegaconf import OmegaConf
 from yaml import YAMLError
 
+from torchrl_osr._files import read_json
 from torchrl_osr.data import normalized_score
-from torchrl_osr.data.limits import read_json
-from torchrl_osr.evaluation.run_config import read_config, read_yaml
+from torchrl_osr.experiment.run_config import read_config, read_yaml
+from torchrl_osr.experiment.run_folder import CONFIG, STATUS
 from torchrl_osr.report.files import LeftOut, check_evaluations, read_suites
-from torchrl_osr.trainers.run_folder import CONFIG, STATUS
 
 RETURNS = "returns.json"
 NOT_RECORDED = "not recorded"

@@ -25,8 +25,7 @@ from torchrl.checkpoint import (
     CheckpointRotation,
 )
 
-from torchrl_osr.data.limits import refuse_archive
-from torchrl_osr.disk_space import check_disk_space
+from torchrl_osr._files import check_disk_space, refuse_archive
 
 
 class WeightsOnlyAdapter(CheckpointAdapter):

@@ -17,10 +17,11 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from torchrl_osr.config import MAX_FOLDER_NAME
+from torchrl_osr._files import write_atomically
+from torchrl_osr.experiment.run_folder import claim, status
+from torchrl_osr.experiment.schema import MAX_FOLDER_NAME
 from torchrl_osr.trainers.offline import OfflineTrainer
 from torchrl_osr.trainers.processes import train_in_processes
-from torchrl_osr.trainers.run_folder import claim, status, write_atomically
 from torchrl_osr.trainers.together import train_together
 
 MAY_DIFFER = (

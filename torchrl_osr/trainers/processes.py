@@ -12,8 +12,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from torchrl_osr.experiment.run_folder import STATUS
 from torchrl_osr.trainers.preemption import EX_TEMPFAIL, Preempted, sigterm_noted
-from torchrl_osr.trainers.run_folder import STATUS
 
 LOG = "output.log"
 

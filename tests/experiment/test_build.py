@@ -6,7 +6,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from torchrl_osr.data import load_local_dataset
-from torchrl_osr.from_config import load_data
+from torchrl_osr.experiment.build import load_data
 
 
 @pytest.fixture(autouse=True)

@@ -10,13 +10,13 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
-from torchrl_osr import config
 from torchrl_osr.evaluation.data_distance import DataDistance
-from torchrl_osr.from_config import load_data
+from torchrl_osr.experiment import schema as config
+from torchrl_osr.experiment.build import load_data
+from torchrl_osr.experiment.training_data import load_training_data
 from torchrl_osr.trainers.members import launch
-from torchrl_osr.training_data import load_training_data
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "examples" / "offline_osr.py"
 CPU = torch.device("cpu")
 TINY = [
@@ -114,6 +114,6 @@ def test_distances_are_those_of_memory():
     ],
 )
 def test_what_cannot_be_had_is_refused_before_the_data(overrides, message, monkeypatch):
-    monkeypatch.setattr("torchrl_osr.from_config.load_dataset", None)
+    monkeypatch.setattr("torchrl_osr.experiment.build.load_dataset", None)
     with pytest.raises(ValueError, match=message):
         load_training_data(composed(*overrides), CPU)

@@ -14,7 +14,7 @@ from typing import Any
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_osr.data.limits import read_text
+from torchrl_osr._files import read_text
 
 # Those of our runs have 4 kB.
 MAX_CONFIG_BYTES = 2**20

@@ -1,4 +1,4 @@
-"""Data, networks and loss as a configuration has them, see :mod:`torchrl_osr.config`.
+"""Data, networks and loss as a configuration has them.
 
 The trainer's script builds them to be trained; whoever loads a trained run builds them
 once more and fills them from its checkpoint.
@@ -15,9 +15,9 @@ from tensordict import TensorDict
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torchrl.objectives import LossModule
 
+from torchrl_osr._checks import check_choice
 from torchrl_osr.data import TransitionsOnDisk, load_dataset
 from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
-from torchrl_osr.objectives.base import check_choice
 
 
 def load_data(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -11,37 +10,13 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_osr._files import write_atomically, write_json
 from torchrl_osr.trainers.preemption import Preempted
 
 CONFIG, STATUS = "config.yaml", "status.json"
 
 # May differ when a run is continued: they do not touch a single number.
 FREE_KEYS = ("resume", "trainer.progress")
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """Write ``text`` so that a reader finds the old file or the new one, never a part.
-
-    Raises:
-        OSError: naming ``path``, if it cannot be written.
-    """
-    beside = path.with_name(f".{path.name}.new")
-    try:
-        with beside.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(beside, path)
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        raise OSError(
-            error.errno, f"cannot write the run's file ({error.strerror})", str(path)
-        ) from error
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write ``value`` as JSON, atomically; refuse NaN, which is not JSON."""
-    write_atomically(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
 def claim(folder: Path, config: DictConfig) -> None:

@@ -20,6 +20,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays, scalar_dtypes
 from pyarrow import parquet
 
+from torchrl_osr._files import (
+    read_arrays,
+    read_json,
+    read_text,
+    refuse_archive,
+    refuse_size,
+)
 from torchrl_osr.data import (
     load_behavior_policy,
     load_d4rl,
@@ -27,13 +34,6 @@ from torchrl_osr.data import (
     load_file,
     load_local_dataset,
     local,
-)
-from torchrl_osr.data.limits import (
-    read_arrays,
-    read_json,
-    read_text,
-    refuse_archive,
-    refuse_size,
 )
 from torchrl_osr.data.manifest import sealed, sha256_of
 
@@ -249,7 +249,7 @@ def test_a_parquet_file_that_announces_too_much(tmp_path, monkeypatch):
     # A million equal numbers have 300 bytes; a billion would take this test too long.
     parquet.write_table(pyarrow.table({"reward": np.zeros(10**6)}), path)
     assert path.stat().st_size < 10_000
-    monkeypatch.setattr("torchrl_osr.data.limits.refuse_size.__defaults__", (10**6,))
+    monkeypatch.setattr("torchrl_osr._files.refuse_size.__defaults__", (10**6,))
     with pytest.raises(ValueError, match=r"no Parquet.*would unpack to 8,000,000"):
         load_file(path)
 

@@ -24,7 +24,7 @@ from torchrl_osr.data import (
     split_on_disk,
 )
 from torchrl_osr.data.replay_buffer import check_memory
-from torchrl_osr.from_config import check_storage, load_data
+from torchrl_osr.experiment.build import check_storage, load_data
 
 STATES = ("observation", ("next", "observation"))
 

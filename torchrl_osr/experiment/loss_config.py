@@ -1,4 +1,4 @@
-"""The typed schema of the losses' configuration: part of :mod:`torchrl_osr.config`.
+"""The typed schema of the losses' configuration.
 
 ``_target_`` names what Hydra's ``instantiate`` calls with the other entries.
 """

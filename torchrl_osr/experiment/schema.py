@@ -13,7 +13,7 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, OmegaConf
 
-from torchrl_osr.loss_config import (
+from torchrl_osr.experiment.loss_config import (
     InverseDynamicsConfig,
     OSRLossConfig,
     OSRVLossConfig,

@@ -14,10 +14,10 @@ from torchrl.envs import ObservationNorm
 from torchrl.objectives import LossModule
 
 from torchrl_osr.data import make_environment
-from torchrl_osr.evaluation.run_config import check_targets, read_config
-from torchrl_osr.from_config import make_learner
+from torchrl_osr.experiment.build import make_learner
+from torchrl_osr.experiment.run_config import check_targets, read_config
+from torchrl_osr.experiment.run_folder import CONFIG
 from torchrl_osr.trainers.checkpointing import find_damage, safe_checkpoint
-from torchrl_osr.trainers.run_folder import CONFIG
 
 CHECKPOINTS = Path("checkpoint") / "policy"
 """Where a run keeps the checkpoints of its policy."""
@@ -96,7 +96,7 @@ def load_trained(path: Path | str) -> TrainedRun:
         CheckpointError: if the file is damaged, or does not fit the run's
             configuration; tensors of another shape are named.
         ValueError: if the configuration has something built that is not of this
-            package, see :func:`~torchrl_osr.evaluation.run_config.check_targets`.
+            package, see :func:`~torchrl_osr.experiment.run_config.check_targets`.
     """
     folder = run_folder_of(path)
     path = checkpoints_of(path)[-1] if Path(path).is_dir() else Path(path)

@@ -13,15 +13,15 @@ from tensordict import TensorDict
 from torchrl.checkpoint import CheckpointError, CheckpointRotation
 from torchrl.envs import ObservationNorm
 
-from torchrl_osr import config
 from torchrl_osr.evaluation.episodes import deterministic_policy
-from torchrl_osr.evaluation.trained_run import (
+from torchrl_osr.experiment import schema as config
+from torchrl_osr.experiment.build import make_learner
+from torchrl_osr.experiment.trained_run import (
     CHECKPOINTS,
     checkpoints_of,
     load_trained,
     run_folder_of,
 )
-from torchrl_osr.from_config import make_learner
 from torchrl_osr.trainers.checkpointing import safe_checkpoint
 
 CONF = Path(__file__).parents[2] / "conf"

@@ -1,4 +1,4 @@
-"""The typed schema of ``examples/evaluate.py``; see :mod:`torchrl_osr.config`.
+"""The typed schema of ``examples/evaluate.py``.
 
 :func:`register` makes it known to Hydra, which then refuses a mistyped key or a value
 of the wrong type by name.

@@ -1,13 +1,11 @@
-"""Limits on files that somebody else made: how much they may unpack, what they hold.
-
-A file of a few megabytes can announce many gigabytes, and a name in an archive can
-point out of the folder that it is unpacked into. Both are looked at before anything is
-read.
-"""
+"""Files: written whole or not at all, read within bounds, room looked for first."""
 
 from __future__ import annotations
 
+import errno
 import json
+import os
+import shutil
 import stat
 import zipfile
 import zlib
@@ -163,3 +161,67 @@ def refuse_size(
             f"it has {packed:,} bytes and would unpack to {unpacked:,}; at most "
             f"{max(packed, max_bytes):,} are read, more only without compression"
         )
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Write ``text`` so that a reader finds the old file or the new one, never a part.
+
+    Raises:
+        OSError: naming ``path``, if it cannot be written.
+    """
+    beside = path.with_name(f".{path.name}.new")
+    try:
+        with beside.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(beside, path)
+    except OSError as error:
+        beside.unlink(missing_ok=True)
+        raise OSError(
+            error.errno, f"cannot write the run's file ({error.strerror})", str(path)
+        ) from error
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write ``value`` as JSON, atomically; refuse NaN, which is not JSON."""
+    write_atomically(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
+
+
+def check_disk_space(folder: Path | str, needed_bytes: int, what: str) -> None:
+    """Raise unless a folder's disk has room.
+
+    A disk that other programs fill later is not foreseen.
+
+    Args:
+        folder: need not be there yet.
+        needed_bytes: how much will be written.
+        what: shall be written, in words.
+
+    Raises:
+        OSError: ``ENOSPC``, with what is needed, what is free and what to do.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_osr._files import check_disk_space
+        >>> check_disk_space(tempfile.gettempdir(), 1, "one byte")
+    """
+    there = Path(folder).absolute()
+    while not there.exists():
+        there = there.parent
+    free = shutil.disk_usage(there).free
+    if free < needed_bytes:
+        raise OSError(
+            errno.ENOSPC,
+            f"not enough disk space: {_readable(needed_bytes)} are needed for {what}, "
+            f"{_readable(free)} are free. Free space or choose another disk",
+            str(folder),
+        )
+
+
+def _readable(size: int) -> str:
+    """Return a number of bytes in the unit that people use."""
+    for power, unit in ((3, "GB"), (2, "MB"), (1, "kB")):
+        if size >= 1000**power:
+            return f"{size / 1000**power:.1f} {unit}"
+    return f"{size} bytes"

@@ -7,7 +7,7 @@ import json
 import pytest
 from omegaconf import OmegaConf
 
-from torchrl_osr.trainers import run_folder
+from torchrl_osr.experiment import run_folder
 
 CONFIG = {"seed": 0, "resume": None, "trainer": {"steps": 5, "progress": True}}
 

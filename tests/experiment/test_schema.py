@@ -11,13 +11,15 @@ from hydra.errors import ConfigCompositionException, MissingConfigException
 from hydra.utils import get_class, instantiate
 from omegaconf import OmegaConf
 
-from torchrl_osr import Adversary, InverseDynamicsLoss, config, loss_config
+from torchrl_osr import Adversary, InverseDynamicsLoss
 from torchrl_osr.data import LEVELS, load_behavior_card
 from torchrl_osr.data.environment import MAZE_IDS
 from torchrl_osr.data.mazes import MAZE_LEVELS
 from torchrl_osr.data.sources import FILE_SOURCES
+from torchrl_osr.experiment import loss_config
+from torchrl_osr.experiment import schema as config
 
-CONF = Path(__file__).parents[1] / "conf"
+CONF = Path(__file__).parents[2] / "conf"
 GROUPS = ["env", "data", "inverse_dynamics", "loss", "logger", "preset"]
 
 

@@ -6,8 +6,8 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from torchrl_osr.evaluation.figures import read_scalars
-from torchrl_osr.trainers import loggers
-from torchrl_osr.trainers.loggers import make_loggers
+from torchrl_osr.experiment import loggers
+from torchrl_osr.experiment.loggers import make_loggers
 
 
 def test_csv_files_are_written_whatever_the_kind(tmp_path):

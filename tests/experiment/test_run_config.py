@@ -10,8 +10,8 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from torchrl_osr import config
-from torchrl_osr.evaluation.run_config import check_targets, read_config, read_yaml
+from torchrl_osr.experiment import schema as config
+from torchrl_osr.experiment.run_config import check_targets, read_config, read_yaml
 
 CONF = Path(__file__).parents[2] / "conf"
 OPTIONS = [

@@ -1,0 +1,18 @@
+"""Checks of arguments, with the messages that users see."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+
+def check_choice(name: str, value: str | None, choices: tuple[Any, ...]) -> None:
+    """Raise a ValueError that lists the ``choices`` unless ``value`` is among them."""
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {choices}, got {value!r}.")
+
+
+def check_weight(name: str, weight: float) -> None:
+    """Raise a ValueError unless the weight of a term is finite and at least 0."""
+    if not 0 <= weight < math.inf:
+        raise ValueError(f"{name} must be at least 0, got {weight}.")

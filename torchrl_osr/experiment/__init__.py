@@ -1,0 +1,1 @@
+"""An experiment: its configuration, what is built from it, and its folder."""
