@@ -6,10 +6,11 @@ once more and fills them from its checkpoint.
 
 from __future__ import annotations
 
+import inspect
 from typing import Any, NamedTuple
 
 import torch
-from hydra.utils import instantiate
+from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig
 from tensordict import TensorDict
 from tensordict.nn import ProbabilisticTensorDictSequential
@@ -17,7 +18,7 @@ from torchrl.objectives import LossModule
 
 from torchrl_osr._checks import check_choice
 from torchrl_osr.data import TransitionsOnDisk, load_dataset
-from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
+from torchrl_osr.modules import critic_ensemble
 
 
 def load_data(
@@ -94,7 +95,10 @@ def make_learner(
     action_size: int,
     device: torch.device | str = "cpu",
 ) -> Learner:
-    """Build networks and loss, drawn anew from torch's global generator.
+    """Networks and loss, drawn anew from torch's global generator.
+
+    A loss is given those networks that its constructor names: ``actor_network``,
+    ``qvalue_network``, ``inverse_dynamics_network``.
 
     Args:
         cfg: a whole configuration of ``examples/offline_osr.py``.
@@ -105,12 +109,21 @@ def make_learner(
         ValueError: if an option of the loss is out of its range.
     """
     sizes, cells = (observation_size, action_size), list(cfg.network.num_cells)
-    actor = tanh_gaussian_actor(*sizes, num_cells=cells).to(device)
+    actor = instantiate(cfg.network.actor, *sizes, num_cells=cells).to(device)
     critics = critic_ensemble(
-        *sizes, num_qvalue_nets=cfg.loss.num_qvalue_nets, **cfg.network
+        *sizes,
+        num_qvalue_nets=cfg.loss.num_qvalue_nets,
+        num_cells=cells,
+        layer_norm=cfg.network.layer_norm,
     )
     model = instantiate(cfg.inverse_dynamics.network, *sizes, num_cells=cells)
-    model = model.to(device)
-    loss = instantiate(cfg.loss, actor, critics, model).to(device)
+    networks = {
+        "actor_network": actor,
+        "qvalue_network": critics,
+        "inverse_dynamics_network": model.to(device),
+    }
+    wanted = inspect.signature(get_class(cfg.loss._target_)).parameters
+    given = {name: each for name, each in networks.items() if name in wanted}
+    loss = instantiate(cfg.loss, _partial_=True)(**given).to(device)
     loss.make_value_estimator(gamma=cfg.optim.gamma)
     return Learner(actor, model, loss)

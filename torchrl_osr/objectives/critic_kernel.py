@@ -6,6 +6,9 @@ operating system at every step. Here a few states at a time go forward and backw
 through buffers that stay in the cache, in place, and only the gradient is kept. What
 is left is the time of the matrix products, and of layer normalisations if there are.
 
+:func:`soft_maximum` replaces :func:`torchrl_osr.functional.soft_maximum` of the
+critics' values; :class:`~torchrl_osr.OSRLoss` chooses between the two in one place.
+
 Shapes: ``B`` states, ``b`` of them in a chunk, ``S`` observation, ``A`` action, ``M``
 sampled actions of a state, ``N`` critics, ``H`` cells of a hidden layer.
 """
@@ -16,11 +19,132 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
-from tensordict import TensorDictBase
-from torch import Tensor
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
 from torch.nn.functional import layer_norm
+from torchrl.modules import MLP
 
-from torchrl_osr.objectives.mlp_layers import Layer, PlainMLP
+
+class Layer(NamedTuple):
+    """A linear layer and the layer normalisation that follows it, if one does.
+
+    Attributes:
+        weight: ``[out, in]``, or ``[N, out, in]`` of all critics.
+        bias: ``[out]``.
+        norm: scale and shift of the layer normalisation, ``[out]``, or nothing.
+    """
+
+    weight: Tensor
+    bias: Tensor
+    norm: tuple[Tensor, ...] = ()
+
+    def to(self, dtype: torch.dtype) -> Layer:
+        """Return the layer as under autocast, which casts the linear layer alone."""
+        return Layer(self.weight.to(dtype), self.bias.to(dtype), self.norm)
+
+
+class PlainMLP(NamedTuple):
+    """The names of a plain MLP's layers.
+
+    Attributes:
+        linear: the linear layers.
+        norms: the layer normalisations, after every linear layer but the last; empty
+            where there are none.
+        eps: of each layer normalisation.
+    """
+
+    linear: list[str]
+    norms: list[str]
+    eps: list[float]
+
+    def parameters(self, params: TensorDictBase) -> list[Tensor]:
+        """Return the parameters in the order of computation: those of each layer.
+
+        Args:
+            params: of the MLP, or of all critics, stacked.
+        """
+        names = self.linear
+        if self.norms:
+            pairs = zip(self.linear[:-1], self.norms, strict=True)
+            names = [*(name for pair in pairs for name in pair), self.linear[-1]]
+        modules = [params.get(("module", name)) for name in names]
+        return [module.get(key) for module in modules for key in ("weight", "bias")]
+
+    def layers(self, parameters: Sequence[Tensor]) -> list[Layer]:
+        """Return the layers that parameters, or tensors like them, belong to."""
+        size = 4 if self.norms else 2
+        starts = range(0, len(parameters), size)
+        each = [parameters[start : start + size] for start in starts]
+        return [Layer(weight, bias, tuple(norm)) for weight, bias, *norm in each]
+
+    def critics(self, stacked: Sequence[Tensor]) -> list[list[Layer]]:
+        """Return the layers of each critic from those of all, which share memory."""
+        each = zip(*(tensor.unbind() for tensor in stacked), strict=True)
+        return [self.layers(parameters) for parameters in each]
+
+
+def plain_mlp(
+    network: TensorDictModuleBase, action_key: NestedKey, value_key: NestedKey
+) -> PlainMLP | None:
+    """Return the names of a plain MLP's layers, or ``None`` for another network.
+
+    Plain is a :class:`~torchrl.modules.MLP` with one output that reads observations and
+    then the action, of linear layers and ReLUs in between; before the ReLUs there may
+    be layer normalisations. All of them have a weight and a bias, and nobody has put a
+    hook on them.
+
+    It takes microseconds and is not kept: hooks and layers may come and go.
+    """
+    module: Any = getattr(network, "module", None)
+    if type(module) is not MLP or network.in_keys[-1] != action_key:
+        return None
+    if value_key not in network.out_keys:
+        return None
+    if any(_has_hook(each) for each in (network, module, *module)):
+        return None
+    named = module._modules.items()
+    linear = {name: each for name, each in named if type(each) is nn.Linear}
+    norms = {name: each for name, each in named if type(each) is nn.LayerNorm}
+    hidden = [nn.Linear, *[nn.LayerNorm] * bool(norms), nn.ReLU]
+    kinds = [*hidden * (len(linear) - 1), nn.Linear]
+    plain = len(linear) > 1 and [type(each) for each in module] == kinds
+    if not plain or module[-1].out_features != 1:
+        return None
+    affine = [*linear.values(), *norms.values()]
+    if any(each.weight is None or each.bias is None for each in affine):
+        return None
+    widths = [(each.out_features,) for each in linear.values()][: len(norms)]
+    if [norm.normalized_shape for norm in norms.values()] != widths:
+        return None
+    return PlainMLP(list(linear), list(norms), [norm.eps for norm in norms.values()])
+
+
+def _has_hook(module: nn.Module) -> bool:
+    """Return whether calling the module is more than calling its ``forward``."""
+    return bool(
+        module._forward_hooks
+        or module._forward_pre_hooks
+        or module._backward_hooks
+        or module._backward_pre_hooks
+    )
+
+
+def applicable(loss: Any, state: TensorDictBase, action: Tensor) -> PlainMLP | None:
+    """The layers of a loss's critics if :func:`soft_maximum` may run them, or ``None``.
+
+    It may on a CPU, outside of :func:`torch.compile`, for plain MLPs, where nobody
+    wants a gradient by the states.
+    """
+    if (
+        action.device.type != "cpu"
+        or not torch.is_grad_enabled()
+        or torch.compiler.is_compiling()
+        or any(value.requires_grad for value in state.values(True, True))
+    ):
+        return None
+    keys = loss.tensor_keys
+    return plain_mlp(loss.qvalue_network, keys.action, keys.state_action_value)
 
 
 def qvalue(
@@ -58,7 +182,7 @@ def soft_maximum(
     mlp: PlainMLP,
     state: Tensor,
     action: Tensor,
-    log_prob: Tensor | None,
+    log_prob: Tensor,
     *,
     temperature: float,
     chunk_size: int,
@@ -76,7 +200,7 @@ def soft_maximum(
         mlp: their layers.
         state: ``[B, S]``.
         action: ``[M, B, A]``.
-        log_prob: log-density of each action ``[M, B]``, or ``None`` for a plain sum.
+        log_prob: log-density of each action, ``[M, B]``.
         temperature: of the log-sum-exp.
         chunk_size: states that go through the critics at a time.
 
@@ -85,11 +209,13 @@ def soft_maximum(
     """
     autocast = torch.is_autocast_enabled("cpu")
     dtype = torch.get_autocast_dtype("cpu") if autocast else state.dtype
-    arguments = (state, action, log_prob, temperature, chunk_size, dtype, mlp)
+    # Any batch dimensions as one.
+    rows = state.flatten(0, -2), action.flatten(1, -2), log_prob.flatten(1)
+    arguments = (*rows, temperature, chunk_size, dtype, mlp)
     value: Tensor = _SoftMaximum.apply(  # type: ignore[no-untyped-call]
         *arguments, *mlp.parameters(params)
     )
-    return value
+    return value.reshape(-1, *state.shape[:-1])
 
 
 class _SoftMaximum(torch.autograd.Function):
@@ -154,7 +280,7 @@ def _evaluate(
     upstream: Tensor | None,
     state: Tensor,
     action: Tensor,
-    log_prob: Tensor | None,
+    log_prob: Tensor,
     temperature: float,
     chunk_size: int,
     dtype: torch.dtype,
@@ -168,12 +294,12 @@ def _evaluate(
     totals = mlp.critics(gradient)
     widths = [len(layer.bias) for layer in totals[0][:-1]]
     for chunk in _chunks(state.to(dtype), action.to(dtype), chunk_size, widths):
-        density = 0.0 if log_prob is None else log_prob[:, chunk.rows]
+        density = log_prob[:, chunk.rows]
         for index, layers in enumerate(critics):
             hidden = _forward(chunk, layers, mlp.eps)
             output = torch.mv(hidden[-1].output, layers[-1].weight[0])
             qvalue = output.to(value.dtype) + layers[-1].bias
-            logits = (qvalue.view(len(action), -1) - density) / temperature
+            logits = qvalue.view(len(action), -1) / temperature - density
             soft = logits.logsumexp(0)
             torch.mul(soft, temperature, out=value[index, chunk.rows])
             share = (logits - soft).exp_()
