@@ -30,7 +30,7 @@ COMMON = (
 HEAD = """# Settings
 
 Every key of `examples/offline_osr.py` with its value in two presets. The options of a
-loss are those of its class: this page has `loss=osr` ({py:class}`~torchrl_osr.OSRLoss`);
+loss are those of its class, here those of {py:class}`~torchrl_osr.OSRLoss`;
 `python examples/offline_osr.py loss=osr_v --cfg job` prints those of another. This page
 is written by `python docs/settings.py`.
 """
