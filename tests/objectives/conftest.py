@@ -484,6 +484,27 @@ def seeded():
 
 
 @pytest.fixture
+def terms(family, seeded):
+    """Return a function that lists the terms of the losses.
+
+    ``"recovery"`` is what ``recovery_weight`` scales, the losses are what is left.
+    """
+
+    def call(name: str, loss, batch: TensorDict) -> dict[str, Tensor]:
+        out = seeded(loss, batch)
+        found = {key: out[key] for key in family[name].groups}
+        for key in family[name].weights.get("recovery_weight", []):
+            weight = loss.recovery_weight.item()
+            loss.recovery_weight = 0.0
+            rest = seeded(loss, batch)[key]
+            loss.recovery_weight = weight
+            found |= {key: rest, "recovery": found[key] - rest}
+        return found
+
+    return call
+
+
+@pytest.fixture
 def record(seeded):
     """Return a function that lists losses and their gradients, one loss at a time."""
 
