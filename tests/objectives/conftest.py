@@ -396,7 +396,9 @@ FAMILY = {
 def losses(*names: str, having: str | None = None) -> list[str]:
     """The losses of these names, or all, that have a property."""
     found = names or tuple(FAMILY)
-    return [name for name in found if not having or PROPERTIES[having](FAMILY[name])]
+    if having:
+        return [name for name in found if PROPERTIES[having](FAMILY[name])]
+    return list(found)
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -413,6 +415,10 @@ class Family:
 
     def __getitem__(self, name: str) -> Member:
         return FAMILY[name]
+
+    def has(self, name: str, what: str) -> bool:
+        """Whether a loss has the property ``what``, see ``PROPERTIES``."""
+        return PROPERTIES[what](FAMILY[name])
 
     def networks(
         self, name: str, *, observation="observation", action="action", seed=0, **rest
@@ -439,7 +445,7 @@ class Family:
         """
         member = FAMILY[name]
         networks = networks or self.networks(name)
-        with_critics = PROPERTIES["critics"](member)
+        with_critics = self.has(name, "critics")
         if with_critics and options.get("reduction") == "none":
             options = {"scalar_output_mode": "exclude"} | options
         parts = [getattr(networks, part) for part in member.parts]
@@ -494,10 +500,11 @@ def terms(family, seeded):
         out = seeded(loss, batch)
         found = {key: out[key] for key in family[name].groups}
         for key in family[name].weights.get("recovery_weight", []):
-            weight = loss.recovery_weight.item()
-            loss.recovery_weight = 0.0
+            # Another buffer in its place, for the graph of the losses holds this one.
+            weight = loss.recovery_weight
+            loss._buffers["recovery_weight"] = torch.zeros_like(weight)
             rest = seeded(loss, batch)[key]
-            loss.recovery_weight = weight
+            loss._buffers["recovery_weight"] = weight
             found |= {key: rest, "recovery": found[key] - rest}
         return found
 

@@ -115,7 +115,7 @@ def test_batch_is_unchanged_but_for_the_priority(family, family_batch, name) -> 
     before = batch.clone()
     loss(batch)
     new = set(batch.keys(True, True)) - set(before.keys(True, True))
-    assert new == ({"td_error"} if "loss_qvalue" in family[name].groups else set())
+    assert new == ({"td_error"} if family.has(name, "critics") else set())
     assert (batch.select(*before.keys(True, True)) == before).all()
     for key, value in batch.items(True, True):
         assert not value.requires_grad, key
