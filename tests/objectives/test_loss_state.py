@@ -219,7 +219,9 @@ def test_reset_redraws_what_is_trained_and_keeps_a_frozen_model(family, name) ->
     for key, params in held(loss).items():
         trains = key.removeprefix("target_") in groups.values()
         (trained if trains else frozen)[key] = params
-    assert list(frozen) == ["inverse_dynamics_network_params"] * family.has(name, "model")
+    assert list(frozen) == ["inverse_dynamics_network_params"] * family.has(
+        name, "model"
+    )
     kept = [values(params) for params in frozen.values()]
     draws = []
     for _ in range(2):
