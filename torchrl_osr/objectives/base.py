@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
 
-from torchrl_osr._checks import check_literals
+from torchrl_osr._checks import check_literals, check_positive
 from torchrl_osr._entries import nested
 from torchrl_osr.objectives.distributions import (
     action_bounds,
@@ -200,6 +200,7 @@ class BaseLoss(LossModule):
         target_entropy: float | Literal["auto"],
     ) -> None:
         """Hold the logarithm of the entropy temperature, ``log_alpha``."""
+        check_positive("alpha_init", alpha_init)
         self.target_entropy = target_entropy
         log_alpha = torch.tensor(math.log(alpha_init))
         if fixed_alpha:
@@ -289,6 +290,14 @@ class BaseLoss(LossModule):
     @out_keys.setter
     def out_keys(self, values: list[NestedKey]) -> None:
         self._out_keys = values
+
+    def _check_not_empty(self, tensordict: TensorDictBase) -> None:
+        """Raise a ValueError unless the batch has a row."""
+        if not tensordict.numel():
+            raise ValueError(
+                f"The batch is empty (batch_size {tuple(tensordict.batch_size)}): the "
+                f"mean of {type(self).__name__} needs at least one transition."
+            )
 
     # -- reduction and output -----------------------------------------------------
 

@@ -25,6 +25,7 @@ from torchrl_osr import functional
 from torchrl_osr._checks import check_literals, check_positive, check_weight
 from torchrl_osr.objectives import critic_kernel
 from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
+from torchrl_osr.objectives.distributions import check_num_actions
 from torchrl_osr.objectives.mixed_states import States
 from torchrl_osr.objectives.step import (
     Step,
@@ -294,6 +295,8 @@ class OSRLoss(BaseLoss):
             log_prob: Tensor = pi.log_prob(step.data_action.expand_as(pi.loc))
             return -log_prob
         model = step.inverse_dynamics(self.recovery_states)
+        sizes = model.loc.shape[-1], pi.loc.shape[-1]
+        check_num_actions("inverse_dynamics_network", *sizes)
         return functional.state_recovery(
             pi.loc,
             pi.scale,

@@ -15,7 +15,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
 from torch import Tensor
 
 from torchrl_osr import functional
-from torchrl_osr._checks import check_literals, check_weight
+from torchrl_osr._checks import check_literals, check_positive, check_weight
 from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
 from torchrl_osr.objectives.step import Step, actor_critic_in_keys
 
@@ -94,6 +94,9 @@ class TD3BCLoss(BaseLoss):
         check_literals(TD3BCLoss.__init__, locals())
         check_weight("alpha", alpha)
         check_weight("policy_noise", policy_noise)
+        check_positive("noise_clip", noise_clip, minimum=0)
+        if not low < high:
+            raise ValueError(f"high must be above low={low}, got {high}.")
         super().__init__(**options)
         self._hold_actor_critic(
             actor_network,
