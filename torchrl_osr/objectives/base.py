@@ -290,6 +290,14 @@ class BaseLoss(LossModule):
     def out_keys(self, values: list[NestedKey]) -> None:
         self._out_keys = values
 
+    def _check_not_empty(self, tensordict: TensorDictBase) -> None:
+        """Raise a ValueError unless the batch has a row."""
+        if not tensordict.numel():
+            raise ValueError(
+                f"The batch is empty (batch_size {tuple(tensordict.batch_size)}): the "
+                f"mean of {type(self).__name__} needs at least one transition."
+            )
+
     # -- reduction and output -----------------------------------------------------
 
     def _weights(self, tensordict: TensorDictBase) -> Tensor | None:

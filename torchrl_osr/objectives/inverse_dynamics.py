@@ -136,7 +136,11 @@ class InverseDynamicsLoss(BaseLoss):
         check_literals(InverseDynamicsLoss.__init__, locals())
         check_weight("latent_weight", latent_weight)
         # A likelihood of data, not of what a sampler found important.
-        super().__init__(reduction=reduction, use_prioritized_weights=False)
+        super().__init__(
+            reduction=reduction,
+            use_prioritized_weights=False,
+            scalar_output_mode="exclude",
+        )
         self.is_discrete = is_categorical(inverse_dynamics_network)
         if not self.is_discrete:
             action_bounds(inverse_dynamics_network, "inverse_dynamics_network")
@@ -165,6 +169,7 @@ class InverseDynamicsLoss(BaseLoss):
         Args:
             tensordict: a batch ``[B]`` with the entries of :attr:`in_keys`.
         """
+        self._check_not_empty(tensordict)
         done = column(tensordict, nested("next", self.tensor_keys.done)).bool()
         batch = transitions(
             tensordict,

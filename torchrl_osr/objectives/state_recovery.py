@@ -70,7 +70,7 @@ class StateRecoveryLoss(BaseLoss):
         action_reduction: ``"sum"`` (default) over action dimensions, or ``"mean"``.
         recovery_states: ``"both"`` (default) for D_tot, ``"perturbed"``, or
             ``"clean"``, which needs no perturbed entry.
-        reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
+        reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``, without the metric.
         use_prioritized_weights: weigh rows by ``"priority_weight"``; ``"auto"``
             (default) does when the entry is there.
 
@@ -78,7 +78,7 @@ class StateRecoveryLoss(BaseLoss):
         TypeError: if a distribution is another one.
         ValueError: if bounds differ, the weight is negative, an option is unknown, or
             a deterministic actor is not given ``recovery_direction="reverse"``; in the
-            call, if the batch holds several steps a row.
+            call, if the batch is empty or holds several steps a row.
         KeyError: in the call, if the batch has no perturbed entry.
 
     Examples:
@@ -136,7 +136,9 @@ class StateRecoveryLoss(BaseLoss):
         check_literals(StateRecoveryLoss.__init__, locals())
         check_weight("recovery_weight", recovery_weight)
         super().__init__(
-            reduction=reduction, use_prioritized_weights=use_prioritized_weights
+            reduction=reduction,
+            use_prioritized_weights=use_prioritized_weights,
+            scalar_output_mode="exclude",
         )
         self.recovery_direction = recovery_direction
         self.recovery_states = recovery_states
@@ -192,6 +194,7 @@ class StateRecoveryLoss(BaseLoss):
         Args:
             tensordict: a batch ``[B]`` with the entries of :attr:`in_keys`.
         """
+        self._check_not_empty(tensordict)
         done = column(tensordict, nested("next", self.tensor_keys.done)).bool()
         states = self.recovery_states
         model: TanhNormal = frozen_distribution(

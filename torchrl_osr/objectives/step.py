@@ -179,11 +179,7 @@ class Step:
     def __init__(
         self, loss: BaseLoss, tensordict: TensorDictBase, *, perturbed: bool
     ) -> None:
-        if not tensordict.numel():
-            raise ValueError(
-                f"The batch is empty (batch_size {tuple(tensordict.batch_size)}): the "
-                f"mean of {type(loss).__name__} needs at least one transition."
-            )
+        loss._check_not_empty(tensordict)
         self.loss, self.tensordict = loss, tensordict
         self.done, self.terminated = (
             column(tensordict, key).bool()
