@@ -90,8 +90,9 @@ def deterministic_actor(
         low, high: action bounds, a number or ``[A]``.
 
     Returns:
-        An actor that writes ``"param"`` (before the tanh) and ``"action"``, each
-        ``[B, A]``.
+        An actor that writes ``"param"`` (before the tanh, which
+        :class:`~torchrl.modules.TanhDelta` takes of its sum with the center of the
+        bounds) and ``"action"``, each ``[B, A]``.
 
     Examples:
         >>> import torch

@@ -159,6 +159,18 @@ class BaseLoss(LossModule):
             self.num_qvalue_nets,
             create_target_params=self.delay_qvalue,
         )
+        if isinstance(qvalue_network, Sequence) and self.num_qvalue_nets == 1:
+            # TorchRL 0.14.1 keeps a list of one as expanded views of its parameters,
+            # which no optimizer finds in loss.parameters().
+            own = self.qvalue_network_params.apply(
+                lambda tensor: (
+                    nn.Parameter(tensor.detach().clone())
+                    if tensor.requires_grad
+                    else tensor.clone()
+                ),
+                filter_empty=False,
+            )
+            self.qvalue_network_params = TensorDictParams(own, no_convert=True)
         if inverse_dynamics_network is not None:
             self._hold_inverse_dynamics(inverse_dynamics_network)
         self._make_vmap()
