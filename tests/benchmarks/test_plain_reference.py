@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
-
 import pytest
 import torch
 from plain_reference import Batch, Noise, PlainOSR
@@ -32,7 +30,7 @@ def both() -> tuple[OSRLoss, SoftUpdate, PlainOSR]:
     plain = PlainOSR(S, A, CELLS, num_random=K)
     pairs = [
         (actor, [plain.actor]),
-        (model, [plain.model]),
+        (model, [plain.inverse_dynamics]),
         (critics[0], [plain.critic_1, plain.target_1]),
         (critics[1], [plain.critic_2, plain.target_2]),
     ]
@@ -76,8 +74,9 @@ def draw_as_ours(*_) -> Noise:
     uniform = 2 * torch.rand(K, B, A, **like) - 1
     proposals = torch.randn(K, 2, B, A, **like)
     target = torch.randn(B, A, **like)
-    current, following = swap(proposals[:, 0]), swap(proposals[:, 1])
-    return Noise(actor, target, swap(uniform), current, following)
+    return Noise(
+        actor, target, swap(uniform), swap(proposals[:, 0]), swap(proposals[:, 1])
+    )
 
 
 def test_losses_and_gradients_equal_ours(both, make_batch, check) -> None:
@@ -121,7 +120,7 @@ def test_update_moves_the_same_weights_as_ours(both, make_batch, check) -> None:
         optimizer.zero_grad()
         updater.step()
         torch.manual_seed(seed)
-        phases = list(plain.update(unpack(make_batch(B)), nullcontext))
+        phases = list(plain.update(unpack(make_batch(B))))
         assert phases == ["forward", *["backward", "optimizer"] * 3, "targets"]
     got = list(loss.actor_network_params.values(True, True))
     wanted = list(plain.actor.parameters())
