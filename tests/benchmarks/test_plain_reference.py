@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
-from plain_reference import Batch, Noise, PlainOSR
+from contenders import unpack
+from plain_reference import Noise, PlainOSR
 from torchrl.objectives import SoftUpdate
 
 from torchrl_osr import OSRLoss
@@ -49,18 +50,6 @@ def both() -> tuple[OSRLoss, SoftUpdate, PlainOSR]:
             parameter.data.mul_(0.8)
     plain.log_alpha.data = loss.log_alpha.data.clone()
     return loss, updater, plain
-
-
-def unpack(batch) -> Batch:
-    return Batch(
-        state=batch["observation"],
-        action=batch["action"],
-        reward=batch["next", "reward"].squeeze(-1),
-        next_state=batch["next", "observation"],
-        done=batch["next", "done"].squeeze(-1),
-        terminated=batch["next", "terminated"].squeeze(-1),
-        perturbed=batch["perturbed", "observation"],
-    )
 
 
 def draw_as_ours(*_) -> Noise:
