@@ -10,18 +10,14 @@ Shapes: ``B`` batch, ``S`` observation, ``A`` action, ``H`` hidden width. Weight
 
 from __future__ import annotations
 
-import json
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_osr._files import read_arrays, read_json
+from torchrl_osr._files import read_arrays, read_json, whole_file, write_json
 
 FloatArray = NDArray[np.float32]
 
@@ -31,9 +27,6 @@ BEHAVIOR_POLICIES_DIR = Path(__file__).parent / "behavior_policies"
 # The bounds the actors were trained with: outside them exp() gives a standard
 # deviation that is either zero in float32 or saturates the tanh.
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
-
-# Two layers of 256 units have 0.3 MB.
-MAX_POLICY_BYTES = 64 * 2**20
 
 
 class Affine(NamedTuple):
@@ -186,7 +179,7 @@ def load_behavior_policy(
 
     Raises:
         ValueError: unknown name (the message lists the known ones), or a file that
-            lacks an array, is damaged, or unpacks to more than 64 MiB.
+            lacks an array or is damaged.
 
     Examples:
         >>> from torchrl_osr.data import load_behavior_policy
@@ -194,12 +187,7 @@ def load_behavior_policy(
         3
     """
     path = behavior_policy_path(env_name, policy_name, folder)
-    layers = {}
-    try:
-        with path.open("rb") as file:
-            arrays = read_arrays(file, max_bytes=MAX_POLICY_BYTES)
-    except ValueError as error:
-        raise ValueError(f"{path} is no policy, or damaged: {error}.") from error
+    arrays, layers = read_arrays(path), {}
     for field in fields(BehaviorPolicy):
         names = (f"{field.name}.weight", f"{field.name}.bias")
         missing = [name for name in names if name not in arrays]
@@ -227,7 +215,9 @@ def save_behavior_policy(
         for field in fields(policy)
         for part, array in getattr(policy, field.name)._asdict().items()
     }
-    with _whole_file(Path(path)) as file:
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(path) as file:
         np.savez_compressed(file, **arrays)
 
 
@@ -245,20 +235,5 @@ def update_behavior_card(
     path = Path(folder) / "card.json"
     card = load_behavior_card(folder) if path.exists() else {}
     card[env_name] = {"env": env_id, "policies": policies}
-    with _whole_file(path) as file:
-        file.write(json.dumps(card, indent=1).encode())
-
-
-@contextmanager
-def _whole_file(path: Path) -> Iterator[BinaryIO]:
     path.parent.mkdir(parents=True, exist_ok=True)
-    # A file beside the target, so that the final rename stays on one file system.
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_json(path, card)

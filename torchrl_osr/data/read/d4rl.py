@@ -16,14 +16,11 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 
-from torchrl_osr.data.columns import ActionBounds
-from torchrl_osr.data.download import download_file
-from torchrl_osr.data.file_slices import open_hdf5
-from torchrl_osr.data.hdf5 import read_hdf5
-from torchrl_osr.data.local import cache_root
-from torchrl_osr.data.manifest import sha256_of
-from torchrl_osr.data.slices import Slices, whole_trajectories
-from torchrl_osr.data.trajectories import transitions_from_rows
+from torchrl_osr.data.read.column_checks import ActionBounds
+from torchrl_osr.data.read.download import download_file
+from torchrl_osr.data.read.hdf5 import open_hdf5
+from torchrl_osr.data.read.recording import Recording, whole_trajectories
+from torchrl_osr.data.store.cache import cache_root
 
 # D4RL's names of our columns; a file's other arrays and groups are not read.
 COLUMNS = {
@@ -93,16 +90,18 @@ def load_d4rl(
         >>> len(data), manifest["dropped_rows"]
         (3, 1)
     """
-    path = _locate(source, download, cache_dir, progress)
-    data, manifest = transitions_from_rows(
-        _columns(path, read_hdf5(path, COLUMNS), max_episode_steps),
+    return open_d4rl(
+        source,
+        download=download,
+        cache_dir=cache_dir,
+        max_episode_steps=max_episode_steps,
         action_bounds=action_bounds,
         clip_actions=clip_actions,
-    )
-    return data, {"source": str(source), "data_sha256": sha256_of(path)} | manifest
+        progress=progress,
+    ).load()
 
 
-def slices_of_d4rl(
+def open_d4rl(
     source: str | Path,
     *,
     download: bool = False,
@@ -111,18 +110,17 @@ def slices_of_d4rl(
     action_bounds: ActionBounds = (-1.0, 1.0),
     clip_actions: bool = False,
     progress: bool = True,
-) -> Slices:
-    """Open a D4RL data set for reading in slices, see :func:`load_d4rl`."""
+) -> Recording:
+    """Open a D4RL data set, see :func:`load_d4rl`."""
     path = _locate(source, download, cache_dir, progress)
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no file {path}.")
     total, read_arrays = open_hdf5(path, COLUMNS)
 
     def read(start: int, stop: int) -> dict[str, NDArray[Any]]:
         return _columns(path, read_arrays(start, stop), max_episode_steps)
 
-    return Slices(
-        {"source": str(source), "files": [str(path)]},
+    return Recording(
+        {"source": str(source)},
+        [path],
         total,
         partial(whole_trajectories, read, total),
         action_bounds,
@@ -133,7 +131,7 @@ def slices_of_d4rl(
 def _columns(
     path: Path, arrays: dict[str, NDArray[Any]], max_episode_steps: int | None
 ) -> dict[str, NDArray[Any]]:
-    """Return our columns of whole trajectories, the first of which begins in row 0."""
+    """Columns by our names, of rows that begin with a trajectory."""
     _check_arrays(path, arrays)
     if "timeouts" not in arrays:
         arrays["timeouts"] = _timeouts(path, arrays["terminals"], max_episode_steps)
@@ -164,7 +162,8 @@ def _locate(
 
 
 def _check_file(path: Path) -> None:
-    _check_arrays(path, read_hdf5(path, COLUMNS))
+    _, read = open_hdf5(path, COLUMNS)
+    _check_arrays(path, read(0, 0))
 
 
 def _check_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:

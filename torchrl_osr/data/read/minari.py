@@ -17,17 +17,19 @@ import numpy as np
 from numpy.typing import NDArray
 from tensordict import TensorDict
 from torchrl.data import ReplayBuffer
+from tqdm.auto import tqdm
 
 from torchrl_osr._files import read_json
-from torchrl_osr.data.columns import ActionBounds
-from torchrl_osr.data.episodes import transitions_from_episodes
-from torchrl_osr.data.replay_buffer import make_replay_buffer
+from torchrl_osr.data.read.column_checks import ActionBounds
+from torchrl_osr.data.read.recording import Columns, Recording
+from torchrl_osr.data.read.transitions import join_episodes
+from torchrl_osr.data.store.replay_buffer import make_replay_buffer
 
 try:
     import minari
     from minari.storage import get_dataset_path, hosting
 
-    from torchrl_osr.data.hdf5 import check_hdf5
+    from torchrl_osr.data.read.hdf5 import check_hdf5
 except ImportError as error:
     raise ImportError(
         f"Minari data sets need {error.name!r}: pip install torchrl-osr[minari]"
@@ -74,7 +76,7 @@ def load_minari(
 
     Returns:
         The transitions ``[N]``, and the manifest of
-        :func:`~torchrl_osr.data.transitions_from_episodes` with ``source``,
+        :func:`~torchrl_osr.data.transitions_from_rows` with ``source``,
         ``dataset_id``, ``env_id`` (or ``None``), ``minari_version``, ``action_bounds``
         and ``observation_layout``, a list of names and sizes.
 
@@ -96,26 +98,26 @@ def load_minari(
         FileNotFoundError: Minari set 'mujoco/hopper/medium-v0' is not on this ...
         >>> _ = os.environ.pop("MINARI_DATASETS_PATH")
     """
-    opened, leaves, bounds = open_minari(
-        dataset, download, observation_keys, action_bounds
-    )
-    data, manifest = transitions_from_episodes(
-        read_episodes(dataset, opened, leaves),
-        action_bounds=bounds,
+    return open_minari(
+        dataset,
+        download=download,
+        observation_keys=observation_keys,
+        action_bounds=action_bounds,
         clip_actions=clip_actions,
-        total=opened.total_episodes,
         progress=progress,
-    )
-    return data, about_minari(dataset, opened, leaves, bounds) | manifest
+    ).load()
 
 
 def open_minari(
     dataset: str | Path,
-    download: bool,
-    observation_keys: Sequence[str] | None,
-    action_bounds: ActionBounds | None,
-) -> tuple[minari.MinariDataset, Leaves, ActionBounds]:
-    """Return the set, what its observations are made of, and its actions' bounds."""
+    *,
+    download: bool = False,
+    observation_keys: Sequence[str] | None = None,
+    action_bounds: ActionBounds | None = None,
+    clip_actions: bool = False,
+    progress: bool = True,
+) -> Recording:
+    """Open a Minari data set, see :func:`load_minari`."""
     opened = _open(str(dataset), download)
     actions = opened.action_space
     if not isinstance(actions, gymnasium.spaces.Box):
@@ -124,18 +126,27 @@ def open_minari(
             "actions are not supported by this reader."
         )
     leaves = _chosen(_leaves(opened.observation_space), observation_keys)
-    return opened, leaves, action_bounds or (actions.low.ravel(), actions.high.ravel())
+    bounds = action_bounds or (actions.low.ravel(), actions.high.ravel())
 
+    def parts(rows: int) -> Iterator[Columns]:
+        waiting: list[tuple[int, Columns]] = []
+        steps = 0
+        for number, episode in enumerate(
+            _read_episodes(dataset, opened, leaves, progress)
+        ):
+            waiting.append((number, episode))
+            steps += len(episode["reward"])
+            if steps >= rows:
+                yield join_episodes(waiting)[0]
+                waiting, steps = [], 0
+        columns, empty = join_episodes(waiting)
+        if columns:
+            yield columns
+        elif empty == opened.total_episodes:
+            raise ValueError(f"none of the {empty} episodes of {dataset} has a step.")
 
-def about_minari(
-    dataset: str | Path,
-    opened: minari.MinariDataset,
-    leaves: Leaves,
-    bounds: ActionBounds,
-) -> dict[str, Any]:
-    """Return what the manifest says of the source."""
     spec = opened.env_spec
-    return {
+    about = {
         "source": str(dataset),
         "dataset_id": opened.id,
         "env_id": None if spec is None else spec.id,
@@ -145,6 +156,15 @@ def about_minari(
             ["/".join(name), int(np.prod(box.shape))] for name, box in leaves.items()
         ],
     }
+    files = sorted(Path(opened.storage.data_path).rglob("*"))
+    return Recording(
+        about,
+        [file for file in files if file.is_file()],
+        int(opened.total_steps),
+        parts,
+        bounds,
+        clip_actions,
+    )
 
 
 def minari_replay_buffer(
@@ -240,17 +260,21 @@ def _chosen(leaves: Leaves, keys: Sequence[str] | None) -> Leaves:
     return {named[key]: leaves[named[key]] for key in keys}
 
 
-def read_episodes(
-    dataset: str | Path, opened: minari.MinariDataset, leaves: Leaves, first: int = 0
+def _read_episodes(
+    dataset: str | Path, opened: minari.MinariDataset, leaves: Leaves, progress: bool
 ) -> Iterator[dict[str, NDArray[Any]]]:
-    """Read episode by episode; raise if some of what the set announces is missing.
-
-    From a later one than the first on, the caller has to count.
-    """
+    """Read episode by episode; raise if some of what the set announces is missing."""
     steps = episodes = 0
+    # disable=None: no bar where the output is not a terminal.
+    bar = tqdm(
+        opened.iterate_episodes(),
+        "read",
+        opened.total_episodes,
+        unit="episode",
+        disable=None if progress else True,
+    )
     try:
-        numbers = range(first, opened.total_episodes)
-        for number, episode in enumerate(opened.iterate_episodes(numbers), first):
+        for number, episode in enumerate(bar):
             steps, episodes = steps + len(episode), episodes + 1
             yield {
                 "observation": _flatten(number, episode.observations, leaves),
@@ -260,7 +284,7 @@ def read_episodes(
                 "truncated": np.asarray(episode.truncations),
             }
         announced = opened.total_episodes, opened.total_steps
-        if not first and (episodes, steps) != announced:
+        if (episodes, steps) != announced:
             raise ValueError(
                 f"it gave {episodes} episodes with {steps} steps; "
                 f"its metadata say {announced[0]} with {announced[1]}; from Arrow and "

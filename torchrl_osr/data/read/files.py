@@ -5,18 +5,21 @@ All three hold the same columns; nothing is unpickled.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.lib.format import MAGIC_PREFIX
 from numpy.typing import NDArray
 from tensordict import TensorDict
 
-from torchrl_osr._files import read_arrays, refuse_size
-from torchrl_osr.data.columns import ActionBounds
-from torchrl_osr.data.manifest import sha256_of
-from torchrl_osr.data.trajectories import transitions_from_rows
+from torchrl_osr._files import check_unpacked_size, read_arrays
+from torchrl_osr.data.read.column_checks import ActionBounds
+from torchrl_osr.data.read.recording import (
+    ReadRows,
+    Recording,
+    whole_trajectories,
+)
 
 
 def load_file(
@@ -65,43 +68,60 @@ def load_file(
         >>> len(data), manifest["dropped_rows"]
         (5, 1)
     """
+    return open_file(
+        path, action_bounds=action_bounds, clip_actions=clip_actions
+    ).load()
+
+
+def open_file(
+    path: str | Path,
+    *,
+    action_bounds: ActionBounds = (-1.0, 1.0),
+    clip_actions: bool = False,
+) -> Recording:
+    """Open a file of your own, see :func:`load_file`; an archive is read at once."""
     path = Path(path).expanduser()
-    readers = {
-        ".npz": _read_npz,
-        ".hdf5": _read_hdf5,
-        ".h5": _read_hdf5,
-        ".parquet": _read_parquet,
+    openers = {
+        ".npz": _open_npz,
+        ".hdf5": _open_hdf5,
+        ".h5": _open_hdf5,
+        ".parquet": _open_parquet,
     }
-    if path.suffix not in readers:
-        raise ValueError(f"{path} must end in one of {', '.join(readers)}.")
+    if path.suffix not in openers:
+        raise ValueError(f"{path} must end in one of {', '.join(openers)}.")
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}.")
-    rows = readers[path.suffix](path)
-    data, manifest = transitions_from_rows(
-        rows, action_bounds=action_bounds, clip_actions=clip_actions
+    total, read = openers[path.suffix](path)
+    return Recording(
+        {"source": str(path)},
+        [path],
+        total,
+        partial(whole_trajectories, read, total),
+        action_bounds,
+        clip_actions,
     )
-    return data, {"source": str(path), "data_sha256": sha256_of(path)} | manifest
 
 
-def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
-    try:
-        with path.open("rb") as file:
-            if file.read(len(MAGIC_PREFIX)) == MAGIC_PREFIX:
-                raise ValueError("it is a single array")
-            return read_arrays(file)
-    except (ValueError, OSError) as error:
-        raise ValueError(
-            f"{path} is no NumPy archive of plain arrays, or damaged: {error}"
-        ) from error
+def _open_npz(path: Path) -> tuple[int, ReadRows]:
+    arrays = read_arrays(path)
+    rows = max((len(array) for array in arrays.values() if array.ndim), default=0)
+
+    def read(start: int, stop: int) -> dict[str, NDArray[Any]]:
+        return {
+            name: array[start:stop] if array.ndim else array
+            for name, array in arrays.items()
+        }
+
+    return rows, read
 
 
-def _read_hdf5(path: Path) -> dict[str, NDArray[Any]]:
-    from torchrl_osr.data.hdf5 import read_hdf5
+def _open_hdf5(path: Path) -> tuple[int, ReadRows]:
+    from torchrl_osr.data.read.hdf5 import open_hdf5
 
-    return read_hdf5(path)
+    return open_hdf5(path)
 
 
-def _read_parquet(path: Path) -> dict[str, NDArray[Any]]:
+def _open_parquet(path: Path) -> tuple[int, ReadRows]:
     try:
         import pyarrow
         from pyarrow import parquet
@@ -109,25 +129,40 @@ def _read_parquet(path: Path) -> dict[str, NDArray[Any]]:
         raise ImportError(
             f"Parquet files need {error.name!r}: pip install torchrl-osr[minari]"
         ) from error
+
+    groups: dict[int, Any] = {}  # of the part before: the next may begin in its last
+
+    def read(start: int, stop: int) -> dict[str, NDArray[Any]]:
+        first = int(np.searchsorted(bounds, start, side="right")) - 1
+        last = int(np.searchsorted(bounds, stop, side="left"))
+        check_unpacked_size(path, sum(sizes[first:last]))
+        for number in [number for number in groups if number < first]:
+            del groups[number]
+        try:
+            for number in range(first, last):
+                if number not in groups:
+                    groups[number] = file.read_row_group(number)
+        except (pyarrow.ArrowException, OSError) as error:
+            raise ValueError(f"{path} is damaged: {error}") from error
+        table = pyarrow.concat_tables([groups[n] for n in range(first, last)])
+        table = table.slice(start - bounds[first], stop - start)
+        return {name: _as_numpy(name, table[name]) for name in table.column_names}
+
     try:
-        refuse_size(path.stat().st_size, 8 * _count_values(parquet.ParquetFile(path)))
-        # The file alone: not the columns that names of its folders might stand for.
-        table = parquet.read_table(path, partitioning=None)
+        file = parquet.ParquetFile(path)
+        metadata = [file.metadata.row_group(i) for i in range(file.num_row_groups)]
     except (pyarrow.ArrowException, OSError, ValueError) as error:
         raise ValueError(f"{path} is no Parquet file, or damaged: {error}") from error
-    return {name: as_numpy(name, table[name]) for name in table.column_names}
+    bounds = np.cumsum([0, *(group.num_rows for group in metadata)])
+    sizes = [
+        8 * sum(group.column(i).num_values for i in range(group.num_columns))
+        for group in metadata
+    ]
+    return int(bounds[-1]), read
 
 
-def _count_values(file: Any) -> int:
-    """Return how many values a Parquet file announces, in all columns together."""
-    groups = (file.metadata.row_group(i) for i in range(file.num_row_groups))
-    return sum(
-        group.column(i).num_values for group in groups for i in range(group.num_columns)
-    )
-
-
-def as_numpy(name: str, column: Any) -> NDArray[Any]:
-    """Return a Parquet column ``[N]``, or ``[N, D]`` if it holds lists."""
+def _as_numpy(name: str, column: Any) -> NDArray[Any]:
+    """Parquet column ``[N]``, or ``[N, D]`` if it holds lists."""
     import pyarrow
 
     if column.null_count:

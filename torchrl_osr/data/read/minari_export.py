@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from tensordict import TensorDict
 
-from torchrl_osr.data.environment import make_environment
-from torchrl_osr.data.validation import check_dataset
+from torchrl_osr.data.collect.environment import make_environment
+from torchrl_osr.data.store.validation import check_dataset
 
 try:
     import minari

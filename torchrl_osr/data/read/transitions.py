@@ -3,23 +3,26 @@
 What every reader has in common: which row ends a trajectory, which row has a true next
 state, what is dropped for want of one, and how well the recorded behaviour did.
 
-Shapes: ``N`` rows, ``S`` observation, ``A`` action.
+Shapes: ``N`` rows, ``T`` steps of an episode, ``S`` observation, ``A`` action.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 from tensordict import TensorDict
+from tqdm.auto import tqdm
 
-from torchrl_osr.data.collection import ACTION_LIMIT
-from torchrl_osr.data.columns import ActionBounds, checked_columns
-from torchrl_osr.data.manifest import describe_episodes
-from torchrl_osr.data.validation import check_dataset
+from torchrl_osr.data.read.column_checks import ActionBounds, checked_columns
+from torchrl_osr.data.store.statistics import describe_episodes
+from torchrl_osr.data.store.validation import (
+    ACTION_LIMIT,
+    as_transitions,
+    check_dataset,
+)
 
 Columns = dict[str, NDArray[Any]]
 
@@ -82,14 +85,74 @@ def transitions_from_rows(
         (1, [2.0, 2.0])
     """
     part = transitions_of(rows, action_bounds=action_bounds, clip_actions=clip_actions)
-    manifest = part.manifest()
     if not len(part.data):
-        raise ValueError(none_left(manifest["dropped_rows"]))
+        raise ValueError(none_left(part.counts["dropped_rows"]))
     check_dataset(part.data)
-    return part.data, manifest
+    return part.data, {
+        "num_transitions": len(part.data),
+        **part.counts,
+        "action_limit": ACTION_LIMIT,
+        **describe_episodes(part.returns, part.lengths),
+    }
 
 
-class Part(NamedTuple):
+def transitions_from_episodes(
+    episodes: Iterable[Mapping[str, ArrayLike]],
+    *,
+    action_bounds: ActionBounds = (-1.0, 1.0),
+    clip_actions: bool = False,
+    total: int | None = None,
+    progress: bool = True,
+) -> tuple[TensorDict, dict[str, Any]]:
+    """Turn recorded episodes into a data set; they are read once, one by one.
+
+    Args:
+        episodes: each with ``observation`` ``[T + 1, S]``, the last after the last
+            action, or ``[T, S]`` with ``next_observation`` ``[T, S]``; ``action``
+            ``[T, A]``; ``reward``, ``terminated`` and ``truncated`` ``[T]``. Episodes
+            without a step are skipped and counted.
+
+    Keyword Args:
+        action_bounds: see :func:`~torchrl_osr.data.transitions_from_rows`.
+        clip_actions: see there.
+        total: number of episodes, for the bar. Default: unknown.
+        progress: show a progress bar when on a terminal. Default: ``True``.
+
+    Returns:
+        What that function returns, and ``empty_episodes`` in the
+        manifest.
+
+    Raises:
+        ValueError: as there; about lengths and sizes the message names the episode.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_osr.data import transitions_from_episodes
+        >>> episode = {
+        ...     "observation": np.ones((4, 2)),
+        ...     "action": np.full((3, 1), 0.5),
+        ...     "reward": np.ones(3),
+        ...     "terminated": np.zeros(3, bool),
+        ...     "truncated": np.array([False, False, True]),
+        ... }
+        >>> data, manifest = transitions_from_episodes([episode, episode])
+        >>> len(data), manifest["episode_lengths"]
+        (6, [3, 3])
+    """
+    # disable=None: no bar where the output is not a terminal.
+    bar = tqdm(
+        episodes, "read", total, unit="episode", disable=None if progress else True
+    )
+    rows, empty = join_episodes(enumerate(bar))
+    if not rows:
+        raise ValueError(f"none of the {empty} episodes has a step.")
+    data, manifest = transitions_from_rows(
+        rows, action_bounds=action_bounds, clip_actions=clip_actions
+    )
+    return data, manifest | {"empty_episodes": empty}
+
+
+class Trajectories(NamedTuple):
     """Transitions of some whole trajectories, and what is known of them.
 
     Attributes:
@@ -103,18 +166,9 @@ class Part(NamedTuple):
     returns: list[float]
     lengths: list[int]
 
-    def manifest(self) -> dict[str, Any]:
-        """Return the manifest of a data set that has no other parts."""
-        return {
-            "num_transitions": len(self.data),
-            **self.counts,
-            "action_limit": ACTION_LIMIT,
-            **describe_episodes(np.asarray(self.returns), np.asarray(self.lengths)),
-        }
-
 
 def none_left(rows: int) -> str:
-    """Return what is wrong with data that have no next states."""
+    """Message about data that have no next states."""
     return (
         f"none of the {rows} rows has a true next state: each is the last of its "
         "episode. Give next_observation."
@@ -123,7 +177,7 @@ def none_left(rows: int) -> str:
 
 def transitions_of(
     rows: Mapping[str, ArrayLike], *, action_bounds: ActionBounds, clip_actions: bool
-) -> Part:
+) -> Trajectories:
     """Turn whole trajectories, of a data set or a part of one, into transitions.
 
     See :func:`transitions_from_rows`, which also looks for what only a whole set can
@@ -148,11 +202,13 @@ def transitions_of(
         "terminal_rows_filled": filled,
         "clipped_actions": clipped,
     }
-    return Part(_as_tensordict(columns), counts, returns.tolist(), lengths.tolist())
+    return Trajectories(
+        as_transitions(columns), counts, returns.tolist(), lengths.tolist()
+    )
 
 
 def _last_rows(episode: NDArray[Any] | None, count: int) -> NDArray[np.bool_]:
-    """Return which rows are followed by another episode, or by none."""
+    """Mask of the rows that are followed by another episode, or by none."""
     last = np.zeros(count, np.bool_)
     last[-1] = True
     if episode is not None:
@@ -177,7 +233,7 @@ def _episode_statistics(
     *,
     trusted: bool,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return returns and lengths of the episodes recorded to their end, all rows."""
+    """Returns and lengths of the episodes that were recorded to their end."""
     stops = np.flatnonzero(ends)
     starts = np.r_[0, stops[:-1] + 1]
     complete = flagged[stops]
@@ -199,9 +255,9 @@ def _fill_next_observations(
     if "next_observation" in columns:
         return np.ones(len(ends), np.bool_), 0
     observation, terminated = columns["observation"], columns["terminated"]
-    following = np.roll(observation, -1, axis=0)
-    following[terminated] = observation[terminated]
-    columns["next_observation"] = following
+    next_observation = np.roll(observation, -1, axis=0)
+    next_observation[terminated] = observation[terminated]
+    columns["next_observation"] = next_observation
     return ~ends | terminated, int(terminated.sum())
 
 
@@ -217,21 +273,46 @@ def _mark_cuts(
     return truncated
 
 
-def _as_tensordict(columns: Columns) -> TensorDict:
-    tensors = {name: torch.from_numpy(array) for name, array in columns.items()}
-    flags = {name: tensors[name][:, None] for name in ("terminated", "truncated")}
-    following = {
-        "observation": tensors["next_observation"],
-        "reward": tensors["reward"][:, None],
-        "done": flags["terminated"] | flags["truncated"],
-        **flags,
-    }
-    size = [len(tensors["reward"])]
-    return TensorDict(
-        {
-            "observation": tensors["observation"],
-            "action": tensors["action"],
-            "next": TensorDict(following, size),
-        },
-        size,
-    )
+def join_episodes(
+    episodes: Iterable[tuple[int, Mapping[str, ArrayLike]]],
+) -> tuple[dict[str, NDArray[Any]], int]:
+    """Columns of numbered episodes, and the number of those without a step."""
+    parts: dict[str, list[NDArray[Any]]] = {}
+    sizes: dict[str, tuple[int, ...]] = {}
+    empty = 0
+    for number, episode in episodes:
+        rows = _rows_of(number, episode)
+        if not len(rows["reward"]):
+            empty += 1
+            continue
+        for name, array in rows.items():
+            if sizes.setdefault(name, array.shape[1:]) != array.shape[1:]:
+                raise ValueError(
+                    f"episode {number}: a row of {name!r} has shape "
+                    f"{list(array.shape[1:])}; it was {list(sizes[name])} before."
+                )
+            parts.setdefault(name, []).append(array)
+    return {name: np.concatenate(arrays) for name, arrays in parts.items()}, empty
+
+
+def _rows_of(number: int, episode: Mapping[str, ArrayLike]) -> dict[str, NDArray[Any]]:
+    names = ("observation", "action", "reward", "terminated", "truncated")
+    if missing := [name for name in names if name not in episode]:
+        raise ValueError(f"episode {number} lacks {', '.join(missing)}.")
+    try:
+        rows = {name: np.asarray(values) for name, values in episode.items()}
+    except ValueError as error:
+        raise ValueError(f"episode {number} has rows of unequal length.") from error
+    steps = rows["reward"].shape[0] if rows["reward"].ndim else -1
+    if "next_observation" not in rows and len(rows["observation"]) == steps + 1:
+        rows["next_observation"] = rows["observation"][1:]
+        rows["observation"] = rows["observation"][:-1]
+    wrong = {name: a.shape for name, a in rows.items() if a.shape[:1] != (steps,)}
+    if wrong or "next_observation" not in rows:
+        raise ValueError(
+            f"episode {number} has shapes "
+            f"{ {name: list(array.shape) for name, array in rows.items()} }; expected "
+            "T rows each, and T + 1 observations or next_observation."
+        )
+    rows["episode"] = np.full(steps, number)
+    return rows

@@ -1,4 +1,4 @@
-"""Roll out complete episodes of given policies, to an exact number of transitions.
+"""Roll-outs of given policies, to an exact number of transitions.
 
 Gymnasium and a NumPy policy, one environment, one process: on one core that was faster
 than vectorised environments and than a torch policy.
@@ -13,12 +13,11 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict
 
-from torchrl_osr.data.behavior import BehaviorPolicy
-from torchrl_osr.data.partial import PartialCollection, Progress
+from torchrl_osr.data.collect.behavior import BehaviorPolicy
+from torchrl_osr.data.store.validation import ACTION_LIMIT, as_transitions
 
 try:
     import gymnasium
@@ -30,10 +29,6 @@ except ImportError as error:
 
 ActionSampler = Callable[[NDArray[Any], np.random.Generator], NDArray[np.float32]]
 """Draws an action ``[A]`` for an observation ``[S]``."""
-
-# A tanh-Gaussian density is needed at the data's actions, and atanh(1) is infinite;
-# float32 tanh reaches exactly 1. At 0.999 the pre-tanh action is 3.8.
-ACTION_LIMIT = 0.999
 
 
 class Collection(NamedTuple):
@@ -52,7 +47,7 @@ class Collection(NamedTuple):
 
 
 def uniform_sampler(env: gymnasium.Env[Any, Any]) -> ActionSampler:
-    """Return a sampler of uniform actions in ``[-ACTION_LIMIT, ACTION_LIMIT]``."""
+    """Sampler of uniform actions in ``[-ACTION_LIMIT, ACTION_LIMIT]``."""
     action_size = gymnasium.spaces.flatdim(env.action_space)
 
     def sample(_: NDArray[Any], rng: np.random.Generator) -> NDArray[np.float32]:
@@ -82,7 +77,6 @@ def collect_transitions(
     *,
     seed: int | Sequence[int] = 0,
     progress: bool = True,
-    partial: PartialCollection | None = None,
 ) -> Collection:
     """Roll out an exact number of transitions, in equal shares of several policies.
 
@@ -102,8 +96,6 @@ def collect_transitions(
         seed: non-negative seed or seeds; global generators are neither read nor
             touched. Default: 0.
         progress: show a progress bar when on a terminal. Default: ``True``.
-        partial: where to keep what there is so far, and to go on from. The data are
-            the same, bit for bit. Default: ``None``, nothing is kept.
 
     Returns:
         The transitions, ordered by policy and time, and the episode statistics.
@@ -119,11 +111,10 @@ def collect_transitions(
     columns = _allocate(num_transitions, env)
     bounds = [num_transitions * i // len(samplers) for i in range(len(samplers) + 1)]
     seeds = np.random.SeedSequence(seed).spawn(len(samplers))
-    saved = partial.restore(columns) if partial else None
-    done, generator, returns, lengths = saved or Progress(0, {}, [], [])
+    returns: list[float] = []
+    lengths: list[int] = []
     # disable=None: no bar where the output is not a terminal.
     with tqdm(
-        initial=done,
         total=num_transitions,
         desc="collect",
         unit="step",
@@ -133,8 +124,6 @@ def collect_transitions(
             samplers, seeds, pairwise(bounds), strict=True
         ):
             rng = np.random.default_rng(child)
-            if start < done:  # this share is begun, or full
-                start, rng.bit_generator.state = done, generator
             while start < stop:
                 rows = {name: column[start:stop] for name, column in columns.items()}
                 length, episode_return = _play_episode(env, sampler, rng, rows)
@@ -143,12 +132,8 @@ def collect_transitions(
                     lengths.append(length)
                 start += length
                 bar.update(length)
-                if partial:
-                    state = rng.bit_generator.state
-                    now = Progress(start, dict(state), returns, lengths)
-                    partial.save_if_due(columns, now)
     return Collection(
-        _as_tensordict(columns),
+        as_transitions(columns),
         np.asarray(returns, dtype=np.float64),
         np.asarray(lengths, dtype=np.int64),
     )
@@ -179,15 +164,6 @@ def _play_episode(
         observation = next_observation
     rows["truncated"][capacity - 1] = True
     return capacity, None
-
-
-def _as_tensordict(rows: dict[str, NDArray[Any]]) -> TensorDict:
-    columns = {name: torch.from_numpy(array) for name, array in rows.items()}
-    root = {name: columns.pop(name) for name in ("observation", "action")}
-    columns["observation"] = columns.pop("next_observation")
-    columns["done"] = columns["terminated"] | columns["truncated"]
-    size = [len(columns["done"])]
-    return TensorDict({**root, "next": TensorDict(columns, size)}, size)
 
 
 def measure_policy(

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_osr.data.behavior import load_behavior_card
+from torchrl_osr.data.collect.behavior import load_behavior_card
 
 try:
     import gymnasium

@@ -1,13 +1,19 @@
-"""A guard that every data set passes before training.
+"""What a transition data set is, and the check that every one passes before training.
 
-It exists because a broken data set does not crash a training run, it only spoils it.
-TorchRL 0.11 to 0.14.1, for instance, returns Minari sets whose fields are all zero.
+The check exists because a broken data set does not crash a training run, it only spoils
+it. TorchRL 0.11 to 0.14.1, for instance, returns Minari sets whose fields are all zero.
+
+Shapes: ``N`` transitions, ``S`` observation, ``A`` action.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
-from tensordict import NestedKey, TensorDictBase
+from numpy.typing import NDArray
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
 VECTOR_KEYS: tuple[NestedKey, ...] = ("observation", ("next", "observation"), "action")
@@ -17,6 +23,41 @@ FLAG_KEYS: tuple[NestedKey, ...] = tuple(
 REWARD_KEY: NestedKey = ("next", "reward")
 DATASET_KEYS: tuple[NestedKey, ...] = (*VECTOR_KEYS, REWARD_KEY, *FLAG_KEYS)
 """Keys that every transition data set of this package has."""
+
+# A tanh-Gaussian density is needed at the data's actions, and atanh(1) is infinite;
+# float32 tanh reaches exactly 1. At 0.999 the pre-tanh action is 3.8.
+ACTION_LIMIT = 0.999
+
+
+def as_transitions(columns: Mapping[str, NDArray[Any]]) -> TensorDict:
+    """Transitions ``[N]`` of arrays, which are not copied.
+
+    Args:
+        columns: ``observation`` and ``next_observation`` ``[N, S]``, ``action``
+            ``[N, A]``, ``reward``, ``terminated`` and ``truncated`` ``[N]`` or
+            ``[N, 1]``.
+    """
+    size = [len(columns["reward"])]
+    tensors = {name: torch.from_numpy(array) for name, array in columns.items()}
+    reward, terminated, truncated = (
+        tensors[name].reshape(*size, 1)
+        for name in ("reward", "terminated", "truncated")
+    )
+    following = {
+        "observation": tensors["next_observation"],
+        "reward": reward,
+        "done": terminated | truncated,
+        "terminated": terminated,
+        "truncated": truncated,
+    }
+    return TensorDict(
+        {
+            "observation": tensors["observation"],
+            "action": tensors["action"],
+            "next": TensorDict(following, size),
+        },
+        size,
+    )
 
 
 def check_dataset(data: TensorDictBase) -> None:
@@ -44,15 +85,13 @@ def check_dataset(data: TensorDictBase) -> None:
         ValueError: the data set lacks ('next', 'observation'), 'action', ...
     """
     check_rows(data)
-    for key in VECTOR_KEYS:
-        if not bool((data.get(key) != 0).any()):
-            raise zero_everywhere(key, data.shape[0])
+    check_filled(filled_keys(data), len(data))
 
 
 def check_rows(data: TensorDictBase) -> None:
     """Raise if rows cannot be those of a data set, see :func:`check_dataset`.
 
-    In a few rows of one, a field may well be zero.
+    In a few rows of a data set, a field may well be zero.
     """
     _check_keys(data)
     _check_shapes(data)
@@ -66,13 +105,28 @@ def check_rows(data: TensorDictBase) -> None:
         )
 
 
-def zero_everywhere(key: NestedKey, rows: int) -> ValueError:
-    """Return the error of a field that was never filled."""
-    return ValueError(
-        f"{key!r} is zero in all {rows} rows; expected real data. "
-        "TorchRL 0.11 to 0.14.1 is known to do this to Minari sets "
-        "(MinariExperienceReplay)."
-    )
+def filled_keys(data: TensorDictBase) -> set[NestedKey]:
+    """Those of ``VECTOR_KEYS`` that are not zero in all rows."""
+    return {key for key in VECTOR_KEYS if bool((data.get(key) != 0).any())}
+
+
+def check_filled(filled: set[NestedKey], rows: int) -> None:
+    """Raise if an observation, next observation or action was never filled.
+
+    Args:
+        filled: keys that are not zero everywhere.
+        rows: number of rows, for the message.
+
+    Raises:
+        ValueError: naming the key.
+    """
+    for key in VECTOR_KEYS:
+        if key not in filled:
+            raise ValueError(
+                f"{key!r} is zero in all {rows} rows; expected real data. "
+                "TorchRL 0.11 to 0.14.1 is known to do this to Minari sets "
+                "(MinariExperienceReplay)."
+            )
 
 
 def _check_keys(data: TensorDictBase) -> None:

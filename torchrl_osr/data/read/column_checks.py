@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torchrl_osr.data.collection import ACTION_LIMIT
+from torchrl_osr.data.store.validation import ACTION_LIMIT
 
 ActionBounds = tuple[ArrayLike, ArrayLike]
 """Lowest and highest action, numbers or ``[A]``."""
@@ -29,7 +29,7 @@ ROUNDING = 1e-5
 def checked_columns(
     rows: Mapping[str, ArrayLike], *, action_bounds: ActionBounds, clip_actions: bool
 ) -> tuple[dict[str, NDArray[Any]], int]:
-    """Return the columns in float32, bool and int64, and how many actions were clipped.
+    """Columns in float32, bool and int64, and the number of clipped actions.
 
     Args:
         rows: the columns, see :func:`~torchrl_osr.data.transitions_from_rows`.
