@@ -27,11 +27,11 @@ import torch
 from tensordict import TensorDict
 from torchrl import torchrl_logger
 from torchrl.objectives import SoftUpdate
+from torchrl_osr.data.levels import collect_level
+from torchrl_osr.data.partial import PartialCollection
 
 from torchrl_osr import OSRLoss, StatePerturbation
 from torchrl_osr.data import load_local_dataset, make_replay_buffer, write_on_disk
-from torchrl_osr.data.levels import collect_level
-from torchrl_osr.data.partial import PartialCollection
 from torchrl_osr.modules import (
     critic_ensemble,
     tanh_gaussian_actor,

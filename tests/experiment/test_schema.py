@@ -12,10 +12,13 @@ from hydra.utils import get_class, instantiate
 from omegaconf import OmegaConf
 
 from torchrl_osr import Adversary, InverseDynamicsLoss
-from torchrl_osr.data import LEVELS, load_behavior_card
-from torchrl_osr.data.environment import MAZE_IDS
-from torchrl_osr.data.mazes import MAZE_LEVELS
-from torchrl_osr.data.sources import FILE_SOURCES
+from torchrl_osr.data import (
+    MAZE_IDS,
+    MAZE_QUALITIES,
+    QUALITIES,
+    RECORDED,
+    load_behavior_card,
+)
 from torchrl_osr.experiment import loss_config
 from torchrl_osr.experiment import schema as config
 
@@ -59,7 +62,7 @@ def test_every_experiment_composes_and_sweeps_over_values_that_compose(name):
 
 
 def test_groups_name_what_the_package_has():
-    assert options("data") == sorted([*LEVELS, *MAZE_LEVELS, *FILE_SOURCES])
+    assert options("data") == sorted([*QUALITIES, *MAZE_QUALITIES, *RECORDED])
     assert options("env") == sorted([*load_behavior_card(), *MAZE_IDS])
     for name, env_id in MAZE_IDS.items():
         assert composed(f"env={name}").env == {"name": name, "id": env_id}

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gymnasium.spaces import flatdim
 from tensordict import TensorDict
 
 from torchrl_osr._files import check_disk_space
@@ -218,8 +217,10 @@ def request_of(
 def _check_room(folder: Path, request: dict[str, Any]) -> None:
     """Raise an OSError before the work unless the set fits on the disk."""
     with closing(make_environment(request["env_id"])) as env:
-        observation, action = flatdim(env.observation_space), flatdim(env.action_space)
-    numbers = 2 * observation + action + 1  # both states, action, reward
+        observation, action = env.observation_space.shape, env.action_space.shape
+    assert observation is not None
+    assert action is not None
+    numbers = 2 * observation[0] + action[0] + 1  # both states, action, reward
     row = numbers * np.dtype(np.float32).itemsize + 3  # and three flags
     what = f"the data set ({CACHE_VARIABLE}=/path chooses the folder)"
     check_disk_space(folder, request["num_transitions"] * row, what)

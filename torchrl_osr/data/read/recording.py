@@ -91,6 +91,7 @@ class Conversion:
         """
         done, kept = 0, 0
         seen: set[int] = set()
+        last: list[int] = []
         for columns in self.recording.parts(rows):
             try:
                 part = transitions_of(
@@ -98,7 +99,10 @@ class Conversion:
                     action_bounds=self.recording.action_bounds,
                     clip_actions=self.recording.clip_actions,
                 )
-                numbers = set(np.unique(columns.get("episode", [])).tolist())
+                episode = np.asarray(columns.get("episode", [])).ravel()
+                numbers = set(np.unique(episode).tolist())
+                if last == episode[:1].tolist():  # it goes on after a flag within it
+                    seen -= set(last)
                 if again := seen & numbers:
                     raise ValueError(
                         f"'episode' {min(again)} comes back; expected the rows of an "
@@ -108,6 +112,7 @@ class Conversion:
                 where = f"in the rows from {done:,} on: " if done else ""
                 raise ValueError(f"{where}{error}") from error
             seen |= numbers
+            last = episode[-1:].tolist()
             done += len(columns["reward"])
             kept += len(part.data)
             for name, count in part.counts.items():

@@ -110,11 +110,11 @@ def write_memmap(
         beside.rmdir()  # if it is empty: of a call that was killed before the manifest
     for place in (folder, beside):
         _refuse_other_folders(place)
-    with explained_write_errors(folder):
-        _remove(beside)
-        beside.mkdir(parents=True)
-        write_json(beside / MANIFEST, {"format": FORMAT})  # from now on it is ours
     try:
+        with explained_write_errors(folder):
+            _remove(beside)
+            beside.mkdir(parents=True)
+            write_json(beside / MANIFEST, {"format": FORMAT})  # from now on it is ours
         shapes = _write_columns(chunks, beside, folder, total, progress)
         manifest = dict(describe()) | shapes
         with explained_write_errors(folder):

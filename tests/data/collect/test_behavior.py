@@ -16,7 +16,7 @@ from torchrl_osr.data import (
     save_behavior_policy,
     update_behavior_card,
 )
-from torchrl_osr.data.behavior import behavior_policy_path
+from torchrl_osr.data.collect.behavior import behavior_policy_path
 
 CARD = load_behavior_card()
 ALL_POLICIES = [(env, name) for env in CARD for name in CARD[env]["policies"]]
@@ -127,7 +127,9 @@ def test_failed_save_leaves_the_old_file(tmp_path, monkeypatch) -> None:
     def full_disk(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("torchrl_osr.data.behavior.np.savez_compressed", full_disk)
+    monkeypatch.setattr(
+        "torchrl_osr.data.collect.behavior.np.savez_compressed", full_disk
+    )
     with pytest.raises(OSError, match="No space left"):
         save_behavior_policy(path, policy)
     assert hashlib.sha256(path.read_bytes()).hexdigest() == before

@@ -1,4 +1,4 @@
-"""Mixtures: exact shares, every row from where it says, the number fixed."""
+"""Held-out rows and mixtures: exact shares, every row once."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from torchrl_osr.data import load_local_dataset, load_mixture, mix_datasets
+from torchrl_osr.data import mix_datasets, split_held_out
 
 
 def numbered(rows: int, start: int = 0) -> TensorDict:
@@ -53,25 +53,20 @@ def test_too_few_random_rows_are_refused() -> None:
         mix_datasets(numbered(10), numbered(4), random_share=0.5, seed=0)
 
 
-def test_a_local_mixture_says_what_it_is_made_of(tmp_path) -> None:
-    request = {"num_transitions": 2000, "seed": 3, "cache_dir": tmp_path}
-    valuable, _ = load_local_dataset("hopper", "medium", **request)
-    random, _ = load_local_dataset("hopper", "random", **request)
-    data, manifest = load_mixture("hopper", "medium", random_share=0.9, **request)
-    assert manifest["rows"] == {"medium": 200, "random": 1800}
-    for rows, source in ((data[:200], valuable), (data[200:], random)):
-        known = {tuple(row.tolist()) for row in source["observation"]}
-        assert all(tuple(row.tolist()) in known for row in rows["observation"])
-    scores = {
-        name: source["normalized_score"] for name, source in manifest["sources"].items()
-    }
-    expected = 0.1 * scores["medium"] + 0.9 * scores["random"]
-    assert manifest["normalized_score"] == pytest.approx(expected)
+@pytest.mark.parametrize(("held_out", "expected"), [(7, 7), (0.2, 10)])
+def test_split_keeps_every_row_once(held_out: int | float, expected: int) -> None:
+    data = numbered(50)
+    train, rest = split_held_out(data, held_out, seed=1)
+    again, _ = split_held_out(data, held_out, seed=1)
+    other, _ = split_held_out(data, held_out, seed=2)
+    assert len(rest) == expected
+    both = torch.cat([train["row"], rest["row"]])
+    assert torch.equal(both.sort().values, torch.arange(50))
+    assert torch.equal(train["row"], again["row"])
+    assert not torch.equal(train["row"], other["row"])
 
 
-def test_without_random_rows_it_is_the_level_itself(tmp_path) -> None:
-    request = {"num_transitions": 50, "seed": 3, "cache_dir": tmp_path}
-    data, manifest = load_mixture("hopper", "random", random_share=0.0, **request)
-    level, wanted = load_local_dataset("hopper", "random", **request)
-    assert manifest == wanted
-    assert bool((data == level).all())
+@pytest.mark.parametrize("held_out", [0, 50, 0.0, 1.0, -1])
+def test_split_with_an_empty_side_is_refused(held_out: int | float) -> None:
+    with pytest.raises(ValueError, match="at least one row on each side"):
+        split_held_out(numbered(50), held_out, seed=0)

@@ -5,9 +5,10 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_osr.data import (
+    held_out_rows,
     make_replay_buffer,
-    observation_statistics,
     split_held_out,
+    write_memmap,
 )
 
 
@@ -71,37 +72,33 @@ def test_empty_or_unflat_data_are_refused() -> None:
         make_replay_buffer(TensorDict({}, [2, 3]), batch_size=1, seed=0)
 
 
-def test_statistics_by_hand() -> None:
-    rows = torch.tensor([[1.0, 7.0, 0.0], [3.0, 7.0, 1e-5]])
-    loc, scale = observation_statistics(TensorDict({"observation": rows}, [2]))
-    torch.testing.assert_close(loc, torch.tensor([2.0, 7.0, 5e-6]))
-    torch.testing.assert_close(scale, torch.tensor([1.0, 1e-3, 1e-3]))
+@pytest.fixture
+def both(make_transitions, tmp_path):
+    """The same rows in memory and memory-mapped."""
+    data = make_transitions(200)
+    return data, write_memmap([data], tmp_path / "set", progress=False)[0]
 
 
-def test_statistics_survive_a_large_offset() -> None:
-    # Sums in float32 would be off in the second digit.
-    rows = 1e4 + torch.tensor([-1.0, 1.0]).repeat(500_000)[:, None]
-    data = TensorDict({"observation": rows}, [len(rows)])
-    loc, scale = observation_statistics(data)
-    torch.testing.assert_close(loc, torch.tensor([1e4]))
-    torch.testing.assert_close(scale, torch.tensor([1.0]))
-    assert loc.dtype == torch.float32
+def test_the_same_seed_draws_the_same_rows_from_disk(both) -> None:
+    buffers = [make_replay_buffer(each, batch_size=32, seed=3) for each in both]
+    for _ in range(10):
+        here, there = (buffer.sample() for buffer in buffers)
+        assert (here == there).all()
+    assert len(buffers[1]) == 200
+    with pytest.raises(RuntimeError):
+        buffers[1].extend(both[0])
 
 
-@pytest.mark.parametrize(("held_out", "expected"), [(7, 7), (0.2, 10)])
-def test_split_keeps_every_row_once(held_out: int | float, expected: int) -> None:
-    data = numbered_rows(50)
+@pytest.mark.parametrize("held_out", [1, 7, 0.2, 199])
+def test_rows_on_disk_that_are_left_out(both, held_out) -> None:
+    data, stored = both
+    left_out = held_out_rows(200, held_out, seed=1).sort().values
     train, rest = split_held_out(data, held_out, seed=1)
-    again, _ = split_held_out(data, held_out, seed=1)
-    other, _ = split_held_out(data, held_out, seed=2)
-    assert len(rest) == expected
-    both = torch.cat([train["observation"], rest["observation"]])[:, 0]
-    assert torch.equal(both.sort().values, torch.arange(50.0))
-    assert torch.equal(train["observation"], again["observation"])
-    assert not torch.equal(train["observation"], other["observation"])
-
-
-@pytest.mark.parametrize("held_out", [0, 50, 0.0, 1.0, -1])
-def test_split_with_an_empty_side_is_refused(held_out: int | float) -> None:
-    with pytest.raises(ValueError, match="at least one row on each side"):
-        split_held_out(numbered_rows(50), held_out, seed=0)
+    assert (stored[left_out] == rest).all()
+    buffer = make_replay_buffer(stored, batch_size=32, seed=3, left_out=left_out)
+    same = make_replay_buffer(train, batch_size=32, seed=3)
+    assert len(buffer) == len(train)
+    for _ in range(20):
+        assert (buffer.sample() == same.sample()).all()
+    with pytest.raises(ValueError, match="left_out is for memory-mapped data"):
+        make_replay_buffer(data, batch_size=32, seed=3, left_out=left_out)

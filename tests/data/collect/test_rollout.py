@@ -8,16 +8,16 @@ import pytest
 import torch
 
 from torchrl_osr.data import (
-    LEVELS,
+    ACTION_LIMIT,
+    QUALITIES,
     check_dataset,
-    collect_level,
+    collect_quality,
     collect_transitions,
     load_behavior_card,
     load_behavior_policy,
     make_environment,
     measure_policy,
 )
-from torchrl_osr.data.collection import ACTION_LIMIT
 
 
 class CountingEnv(gymnasium.Env):
@@ -102,9 +102,9 @@ def test_tasks_without_vectors_are_refused() -> None:
 
 
 @pytest.mark.parametrize("env_name", load_behavior_card())
-@pytest.mark.parametrize("level", LEVELS)
-def test_named_sets_are_sound(env_name: str, level: str) -> None:
-    data, _, lengths = collect_level(env_name, level, 800, progress=False)
+@pytest.mark.parametrize("quality", QUALITIES)
+def test_named_sets_are_sound(env_name: str, quality: str) -> None:
+    data, _, lengths = collect_quality(env_name, quality, 800, progress=False)
     assert data.shape == (800,)
     check_dataset(data)
     assert data["action"].abs().max() <= torch.tensor(ACTION_LIMIT)
@@ -117,7 +117,7 @@ def test_named_sets_are_sound(env_name: str, level: str) -> None:
 
 
 def test_time_out_is_truncation() -> None:
-    data, returns, lengths = collect_level("halfcheetah", "random", 1500)
+    data, returns, lengths = collect_quality("halfcheetah", "random", 1500)
     assert not data["next", "terminated"].any()
     ends = data["next", "truncated"].flatten().nonzero().flatten()
     assert ends.tolist() == [999, 1499]
@@ -127,18 +127,18 @@ def test_time_out_is_truncation() -> None:
 
 
 def test_same_seed_same_data_whatever_the_global_generators() -> None:
-    first = collect_level("hopper", "medium-replay", 400, seed=5)
+    first = collect_quality("hopper", "medium-replay", 400, seed=5)
     np.random.seed(1)  # noqa: NPY002  the legacy global state is what is disturbed
     torch.manual_seed(1)
-    second = collect_level("hopper", "medium-replay", 400, seed=5)
-    other = collect_level("hopper", "medium-replay", 400, seed=6)
+    second = collect_quality("hopper", "medium-replay", 400, seed=5)
+    other = collect_quality("hopper", "medium-replay", 400, seed=6)
     assert (first.data == second.data).all()
     np.testing.assert_array_equal(first.episode_returns, second.episode_returns)
     assert not torch.equal(first.data["observation"], other.data["observation"])
 
 
 @pytest.mark.parametrize(
-    ("env_name", "level", "transitions"),
+    ("env_name", "quality", "transitions"),
     [
         ("hopper", "expert", 4000),
         ("hopper", "medium", 6000),
@@ -146,9 +146,11 @@ def test_same_seed_same_data_whatever_the_global_generators() -> None:
         ("halfcheetah", "expert", 3000),
     ],
 )
-def test_returns_are_near_the_card(env_name: str, level: str, transitions: int) -> None:
-    result = collect_level(env_name, level, transitions, progress=False)
-    card = load_behavior_card()[env_name]["policies"][level]
+def test_returns_are_near_the_card(
+    env_name: str, quality: str, transitions: int
+) -> None:
+    result = collect_quality(env_name, quality, transitions, progress=False)
+    card = load_behavior_card()[env_name]["policies"][quality]
     # Loose: few episodes of chaotic dynamics, of which a rare one falls early.
     assert np.median(result.episode_returns) == pytest.approx(
         card["stochastic_return"][0], rel=0.2
@@ -163,9 +165,9 @@ def test_nothing_is_left_in_the_working_folder(tmp_path, monkeypatch) -> None:
 
 def test_unknown_names_list_what_exists() -> None:
     with pytest.raises(ValueError, match=r"'ant'.*halfcheetah, hopper, walker2d"):
-        collect_level("ant", "medium", 10)
+        collect_quality("ant", "medium", 10)
     with pytest.raises(ValueError, match=r"'simple'.*random, medium, medium-replay"):
-        collect_level("hopper", "simple", 10)
+        collect_quality("hopper", "simple", 10)
 
 
 def test_measured_policy_matches_its_card() -> None:

@@ -9,21 +9,23 @@ from importlib.metadata import version
 import h5py
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
 
+from torchrl_osr._files import sha256_of
 from torchrl_osr.data import (
+    MAZE_IDS,
     check_dataset,
-    collect_level,
+    collect_quality,
     load_dataset,
     load_local_dataset,
-    local,
     make_environment,
 )
-from torchrl_osr.data.behavior import behavior_policy_path
-from torchrl_osr.data.environment import MAZE_IDS
-from torchrl_osr.data.levels import behavior_of
-from torchrl_osr.data.manifest import sha256_of
-from torchrl_osr.data.mazes import PLAY_CELLS, waypoint_sampler
-from torchrl_osr.data.partial import PartialCollection
+from torchrl_osr.data.collect.behavior import behavior_policy_path
+from torchrl_osr.data.collect.local import request_of
+from torchrl_osr.data.collect.mazes import PLAY_CELLS, shortest_path, waypoint_sampler
+from torchrl_osr.data.collect.qualities import behavior_of
 
 SETS = [
     ("pointmaze-umaze", "diverse"),
@@ -45,9 +47,9 @@ def starts_of(data):
     return data["observation"].numpy()[first]
 
 
-@pytest.mark.parametrize(("env_name", "level"), SETS)
-def test_nearly_every_episode_reaches_its_goal(env_name, level):
-    data, returns, lengths = collect_level(env_name, level, 6000, progress=False)
+@pytest.mark.parametrize(("env_name", "quality"), SETS)
+def test_nearly_every_episode_reaches_its_goal(env_name, quality):
+    data, returns, lengths = collect_quality(env_name, quality, 6000, progress=False)
     check_dataset(data)
     assert data.shape == (6000,)
     assert len(returns) >= 15
@@ -68,7 +70,7 @@ def test_nearly_every_episode_reaches_its_goal(env_name, level):
 
 @pytest.mark.parametrize("env_name", PLAY_CELLS)
 def test_play_has_its_pairs_of_cells_and_no_others(env_name):
-    starts = starts_of(collect_level(env_name, "play", 6000, progress=False).data)
+    starts = starts_of(collect_quality(env_name, "play", 6000, progress=False).data)
     pairs = zip(
         cells_of(MAZE_IDS[env_name], starts[:, :2]),
         cells_of(MAZE_IDS[env_name], starts[:, 2:4]),
@@ -81,32 +83,12 @@ def test_play_has_its_pairs_of_cells_and_no_others(env_name):
 
 
 def test_diverse_covers_the_free_cells():
-    data = collect_level("pointmaze-umaze", "diverse", 8000, progress=False).data
+    data = collect_quality("pointmaze-umaze", "diverse", 8000, progress=False).data
     starts = starts_of(data)
     for columns in (starts[:, :2], starts[:, 2:4]):
         # The seven cells of the U.
         assert len(set(cells_of("PointMaze_UMaze-v3", columns))) == 7
     assert (np.linalg.norm(starts[:, :2] - starts[:, 2:4], axis=-1) > 0.45).all()
-
-
-def test_a_collection_that_is_interrupted_goes_on_to_the_same_rows(tmp_path):
-    request = {"env": "pointmaze-medium", "level": "play"}
-
-    def collected(rows, partial=None):
-        return collect_level(
-            *request.values(), rows, seed=4, progress=False, partial=partial
-        )
-
-    whole = collected(3000)
-    first = PartialCollection(tmp_path / "parts", request, save_every=1)
-    collected(3000, first)
-    parts = sorted((tmp_path / "parts").glob("*.npz"))
-    for part in parts[len(parts) // 2 :]:
-        part.unlink()
-    rest = PartialCollection(tmp_path / "parts", request, save_every=1)
-    again = collected(3000, rest)
-    assert (whole.data == again.data).all()
-    assert whole.episode_lengths.tolist() == again.episode_lengths.tolist()
 
 
 def test_the_controller_by_hand():
@@ -134,13 +116,13 @@ def test_a_set_is_cached_and_says_what_it_is_made_of(tmp_path, monkeypatch):
     assert (data == again).all()
     assert manifest == same
     name = "pointmaze-medium-play-700-seed2"
-    written = json.loads((tmp_path / "local" / name / "manifest.json").read_text())
+    written = json.loads((tmp_path / "rolled-out" / name / "manifest.json").read_text())
     assert written == manifest
     assert manifest["env_id"] == "PointMaze_Medium-v3"
     assert manifest["versions"]["gymnasium-robotics"] == version("gymnasium-robotics")
     assert manifest["behavior"]["cells"][0] == [[1, 1], [6, 6]]
     assert manifest["normalized_score"] == 100 * manifest["return"]["mean"]
-    monkeypatch.setattr("torchrl_osr.data.mazes.ACTION_NOISE", 0.1)
+    monkeypatch.setattr("torchrl_osr.data.collect.mazes.ACTION_NOISE", 0.1)
     other, changed = load_local_dataset("pointmaze-medium", "play", **request)
     assert changed["behavior"]["action_noise"] == 0.1
     assert not (other["action"] == data["action"]).all()
@@ -152,29 +134,30 @@ def test_the_request_of_other_tasks_is_what_it_was():
         "behavior_sha256": {"medium": sha256_of(path)}
     }
     assert behavior_of("hopper", "random") == {"behavior_sha256": {}}
-    request = local.request_of("hopper", "medium", 500, 0)
+    request = request_of("hopper", "medium", 500, 0)
     assert list(request) == [
-        *["format_version", "env_name", "env_id", "level", "num_transitions", "seed"],
+        *["recipe_version", "env_name", "env_id", "quality", "num_transitions"],
+        "seed",
         *["behavior_sha256", "versions"],
     ]
     assert set(request["versions"]) == {"numpy", "gymnasium", "mujoco"}
 
 
 @pytest.mark.parametrize(
-    ("env_name", "level", "message"),
+    ("env_name", "quality", "message"),
     [
         ("pointmaze-umaze", "play", "'play' of pointmaze-umaze; there are: diverse"),
         ("pointmaze-large", "medium", "'medium' .* there are: diverse, play"),
         ("antmaze-umaze", "diverse", "data=minari.*D4RL/antmaze/umaze-v1"),
         ("antmaze-large", "play", "data=minari.*D4RL/antmaze/large-play-v1"),
-        ("hopper", "diverse", "unknown level 'diverse'; there are: random"),
+        ("hopper", "diverse", "unknown quality 'diverse'; there are: random"),
     ],
 )
-def test_levels_that_are_not_there_are_named(env_name, level, message, tmp_path):
+def test_qualities_that_are_not_there_are_named(env_name, quality, message, tmp_path):
     with pytest.raises(ValueError, match=message):
-        load_local_dataset(env_name, level, num_transitions=9, cache_dir=tmp_path)
+        load_local_dataset(env_name, quality, num_transitions=9, cache_dir=tmp_path)
     with pytest.raises(ValueError, match=message):
-        collect_level(env_name, level, 9)
+        collect_quality(env_name, quality, 9)
 
 
 def test_d4rls_own_files_of_the_ant_are_refused(tmp_path):
@@ -191,3 +174,68 @@ def test_d4rls_own_files_of_the_ant_are_refused(tmp_path):
     message = "29 observation .*AntMaze_UMaze-v4 has 31 and 8.*hold the goal.*mirrored"
     with pytest.raises(ValueError, match=message):
         load_dataset("antmaze-umaze", "d4rl", path=path, env_id="AntMaze_UMaze-v4")
+
+
+def maze(*rows: str):
+    return np.array([[cell == "." for cell in row] for row in rows])
+
+
+def test_the_shorter_of_two_ways_is_taken():
+    free = maze(".....", ".###.", ".###.", ".....")
+    left = [(0, 1), (0, 0), (1, 0), (2, 0), (3, 0)]
+    assert shortest_path(free, (0, 1), (3, 0)) == left
+    assert shortest_path(free, (0, 4), (3, 4)) == [(0, 4), (1, 4), (2, 4), (3, 4)]
+
+
+def test_dead_ends_are_left_out():
+    free = maze("..#.", "#.#.", "#...", "....")
+    assert shortest_path(free, (0, 0), (0, 3)) == [
+        *[(0, 0), (0, 1), (1, 1), (2, 1)],
+        *[(2, 2), (2, 3), (1, 3), (0, 3)],
+    ]
+
+
+def test_the_goal_may_be_the_start():
+    assert shortest_path(maze("."), (0, 0), (0, 0)) == [(0, 0)]
+
+
+@pytest.mark.parametrize(
+    ("start", "goal", "message"),
+    [
+        ((0, 1), (0, 0), r"start \(0, 1\) is a wall"),
+        ((0, 0), (-1, 0), r"goal \(-1, 0\) is a wall of the maze, or outside"),
+        ((0, 0), (0, 3), "goal .* outside"),
+        ((0, 0), (0, 2), r"no way leads from \(0, 0\) to \(0, 2\)"),
+    ],
+)
+def test_what_cannot_be_is_named(start, goal, message):
+    with pytest.raises(ValueError, match=message):
+        shortest_path(maze(".#."), start, goal)
+
+
+@given(
+    arrays(bool, array_shapes(min_dims=2, max_dims=2, max_side=5)),
+    st.randoms(use_true_random=False),
+)
+def test_ways_are_valid_and_as_short_as_a_matrix_says(free, random):
+    cells = [tuple(map(int, cell)) for cell in np.argwhere(free)]
+    if not cells:
+        return
+    beside = np.array(
+        [[abs(a - c) + abs(b - d) == 1 for c, d in cells] for a, b in cells]
+    )
+    start, goal = (random.randrange(len(cells)) for _ in range(2))
+    # Cells that can be reached within 0, 1, 2, ... steps.
+    reached, steps = np.arange(len(cells)) == start, 0
+    while not reached[goal] and steps <= len(cells):
+        reached, steps = reached | (beside @ reached), steps + 1
+    if not reached[goal]:
+        with pytest.raises(ValueError, match="no way"):
+            shortest_path(free, cells[start], cells[goal])
+        return
+    path = shortest_path(free, cells[start], cells[goal])
+    assert (path[0], path[-1]) == (cells[start], cells[goal])
+    assert len(path) == steps + 1
+    assert all(free[cell] for cell in path)
+    moves = np.abs(np.diff(path, axis=0)).sum(axis=-1)
+    assert (moves == 1).all()

@@ -11,8 +11,8 @@ import gymnasium
 import numpy as np
 import pytest
 
-from torchrl_osr.data import make_environment
-from torchrl_osr.data.environment import MAZE_IDS, environment_id
+from torchrl_osr.data import MAZE_IDS, make_environment
+from torchrl_osr.data.collect.environment import environment_id
 
 WIDTHS = {"pointmaze": 8, "antmaze": 31}  # goal reached, goal wanted, point or ant
 
