@@ -140,9 +140,9 @@ def _open(quality: str, path: str, download: bool, progress: bool) -> Recording:
 
         return open_minari(path, download=download, progress=progress)
     if quality == "d4rl":
-        from torchrl_osr.data.read.d4rl import open_d4rl
+        from torchrl_osr.data.read.d4rl import locate_d4rl, open_d4rl
 
-        return open_d4rl(path, download=download, progress=progress)
+        return open_d4rl(locate_d4rl(path, download, progress=progress))
     from torchrl_osr.data.read.files import open_file
 
     return open_file(path)

@@ -7,17 +7,21 @@ observation there. Neither is a state that any action led to.
 
 from __future__ import annotations
 
+import os
+import sys
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock
 from numpy.typing import NDArray
 from tensordict import TensorDict
+from torch.hub import download_url_to_file
+from torchrl import torchrl_logger
 from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 
 from torchrl_osr.data.read.column_checks import ActionBounds
-from torchrl_osr.data.read.download import download_file
 from torchrl_osr.data.read.hdf5 import open_hdf5
 from torchrl_osr.data.read.recording import Recording, whole_trajectories
 from torchrl_osr.data.store.cache import cache_root
@@ -90,42 +94,75 @@ def load_d4rl(
         >>> len(data), manifest["dropped_rows"]
         (3, 1)
     """
-    return open_d4rl(
-        source,
-        download=download,
-        cache_dir=cache_dir,
-        max_episode_steps=max_episode_steps,
-        action_bounds=action_bounds,
-        clip_actions=clip_actions,
-        progress=progress,
-    ).load()
+    path = locate_d4rl(source, download, cache_dir, progress)
+    return open_d4rl(path, max_episode_steps, action_bounds, clip_actions).load()
 
 
 def open_d4rl(
-    source: str | Path,
-    *,
-    download: bool = False,
-    cache_dir: Path | str | None = None,
+    path: Path,
     max_episode_steps: int | None = None,
     action_bounds: ActionBounds = (-1.0, 1.0),
     clip_actions: bool = False,
-    progress: bool = True,
 ) -> Recording:
-    """Open a D4RL data set, see :func:`load_d4rl`."""
-    path = _locate(source, download, cache_dir, progress)
+    """Open a D4RL file, see :func:`load_d4rl`."""
     total, read_arrays = open_hdf5(path, COLUMNS)
 
     def read(start: int, stop: int) -> dict[str, NDArray[Any]]:
         return _columns(path, read_arrays(start, stop), max_episode_steps)
 
     return Recording(
-        {"source": str(source)},
+        {"source": str(path)},
         [path],
         total,
         partial(whole_trajectories, read, total),
         action_bounds,
         clip_actions,
     )
+
+
+def locate_d4rl(
+    source: str | Path,
+    download: bool = False,
+    cache_dir: Path | str | None = None,
+    progress: bool = True,
+) -> Path:
+    """Path of a D4RL file, which is fetched if that was asked for."""
+    given = Path(source).expanduser()
+    if given.suffix in (".hdf5", ".h5"):
+        return given
+    if str(source) not in D4RL_DATASETS:
+        raise ValueError(
+            f"{str(source)!r} is neither a path that ends in .hdf5 or .h5 nor a D4RL "
+            "set, such as hopper-medium-v2; torchrl.data.datasets.d4rl_infos has all."
+        )
+    path = cache_root(cache_dir) / "d4rl" / f"{source}.hdf5"
+    if not path.exists():
+        if not download:
+            raise FileNotFoundError(
+                f"{source} is not at {path}: fetch it with download=True "
+                "(data.download=true), or give the path of the file."
+            )
+        _download(D4RL_DATASETS[str(source)], path, progress)
+    return path
+
+
+def _download(url: str, path: Path, progress: bool) -> None:
+    """Fetch a file unless it is there; it is renamed to its place once it is whole."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(f"{path}.lock"):
+        if path.exists():  # another process may have fetched it in the meantime
+            return
+        torchrl_logger.info(f"Downloading {url} to {path}.")
+        part = path.with_name(f".{path.name}.part")
+        try:
+            download_url_to_file(
+                url, str(part), progress=progress and sys.stderr.isatty()
+            )
+            _, read_arrays = open_hdf5(part, COLUMNS)
+            _check_arrays(part, read_arrays(0, 0))
+            os.replace(part, path)
+        finally:
+            part.unlink(missing_ok=True)
 
 
 def _columns(
@@ -136,34 +173,6 @@ def _columns(
     if "timeouts" not in arrays:
         arrays["timeouts"] = _timeouts(path, arrays["terminals"], max_episode_steps)
     return {COLUMNS[name]: array for name, array in arrays.items()}
-
-
-def _locate(
-    source: str | Path, download: bool, cache_dir: Path | str | None, progress: bool
-) -> Path:
-    given = Path(source).expanduser()
-    if given.suffix in (".hdf5", ".h5"):
-        return given
-    if str(source) not in D4RL_DATASETS:
-        raise ValueError(
-            f"{str(source)!r} is neither a path that ends in .hdf5 or .h5 nor a D4RL "
-            "set, such as hopper-medium-v2; torchrl.data.datasets.d4rl_infos has all."
-        )
-    url: str = D4RL_DATASETS[str(source)]
-    path = cache_root(cache_dir) / "d4rl" / f"{source}.hdf5"
-    if not path.exists():
-        if not download:
-            raise FileNotFoundError(
-                f"{source} is not at {path}: fetch it with download=True "
-                "(data.download=true), or give the path of the file."
-            )
-        download_file(url, path, check=_check_file, progress=progress)
-    return path
-
-
-def _check_file(path: Path) -> None:
-    _, read = open_hdf5(path, COLUMNS)
-    _check_arrays(path, read(0, 0))
 
 
 def _check_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:

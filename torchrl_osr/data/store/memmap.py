@@ -89,20 +89,15 @@ def write_memmap(
         OSError: the disk is full, or cannot be written.
 
     Examples:
-        >>> import tempfile, torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_osr.data import load_memmap, write_memmap
-        >>> def chunk(day):
-        ...     state, no = torch.rand(100, 3), torch.zeros(100, 1, dtype=torch.bool)
-        ...     after = {"observation": state, "reward": torch.ones(100, 1)}
-        ...     after |= {"done": no, "terminated": no, "truncated": no}
-        ...     before = {"observation": state - 0.1, "action": torch.rand(100, 2)}
-        ...     return TensorDict(before | {"next": TensorDict(after, [100])}, [100])
+        >>> import tempfile
+        >>> from torchrl_osr.data import load_local_dataset, write_memmap
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     _ = write_memmap((chunk(day) for day in range(5)), f"{folder}/set")
-        ...     data, manifest = load_memmap(f"{folder}/set")
-        ...     data[torch.tensor([3, 499])]["next", "reward"].tolist()
-        [[1.0], [1.0]]
+        ...     rows, _ = load_local_dataset(
+        ...         "hopper", "random", num_transitions=500, cache_dir=folder
+        ...     )
+        ...     data, manifest = write_memmap(rows.split(200), f"{folder}/set")
+        >>> bool((data == rows).all()), manifest["num_transitions"]
+        (True, 500)
     """
     folder = Path(folder).expanduser()
     beside = folder.with_name(f".{folder.name}.partial")
