@@ -44,7 +44,7 @@ from torchrl_osr.data.store.validation import ACTION_LIMIT, check_dataset
 
 if TYPE_CHECKING:
     from torchrl_osr.data.collect.environment import MAZE_IDS, make_environment
-    from torchrl_osr.data.collect.local import load_local_dataset, load_mixture
+    from torchrl_osr.data.collect.local import load_local_dataset
     from torchrl_osr.data.collect.mazes import MAZE_QUALITIES
     from torchrl_osr.data.collect.qualities import (
         QUALITIES,
@@ -82,7 +82,6 @@ _NEEDS_EXTRA = {
     "load_local_dataset": "collect.local",
     "load_memmap": "store.memmap",
     "load_minari": "read.minari",
-    "load_mixture": "collect.local",
     "make_environment": "collect.environment",
     "measure_policy": "collect.rollout",
     "minari_replay_buffer": "read.minari",
@@ -117,7 +116,6 @@ __all__ = [
     "load_local_dataset",
     "load_memmap",
     "load_minari",
-    "load_mixture",
     "make_environment",
     "make_replay_buffer",
     "measure_policy",

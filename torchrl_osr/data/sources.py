@@ -11,7 +11,7 @@ from gymnasium import spaces
 from tensordict import TensorDict
 
 from torchrl_osr.data.collect.environment import make_environment
-from torchrl_osr.data.collect.local import load_mixture
+from torchrl_osr.data.collect.local import load_local_dataset
 from torchrl_osr.data.collect.reference_scores import (
     REFERENCE_RETURNS,
     normalized_score,
@@ -33,7 +33,7 @@ def load_dataset(
     download: bool = False,
     progress: bool = True,
     on_disk: bool = False,
-    **mixture: Any,
+    **recipe: Any,
 ) -> tuple[TensorDict, dict[str, Any]]:
     """Load a rolled-out data set by its quality, or a recorded one by its path.
 
@@ -41,7 +41,7 @@ def load_dataset(
         env_name: short name of the task. A recorded set has a normalised score if
             there are reference returns for that name.
         quality: one of ``QUALITIES``, loaded by
-            :func:`~torchrl_osr.data.load_mixture`; or ``"minari"``, ``"d4rl"`` or
+            :func:`~torchrl_osr.data.load_local_dataset`; or ``"minari"``, ``"d4rl"`` or
             ``"file"``, read by :func:`~torchrl_osr.data.load_minari`,
             :func:`~torchrl_osr.data.load_d4rl` or
             :func:`~torchrl_osr.data.load_file`.
@@ -57,12 +57,11 @@ def load_dataset(
         on_disk: leave the rows memory-mapped. At first use they are written into the
             cache folder: recorded data in chunks, what is rolled out from memory.
             Default: ``False``.
-        **mixture: ``random_share``, ``num_transitions`` and ``seed``, of data that are
+        **recipe: ``random_share``, ``num_transitions`` and ``seed``, of data that are
             rolled out; with recorded data the share must be 0.
 
     Returns:
-        The transitions ``[N]`` and a manifest, as
-        :func:`~torchrl_osr.data.load_mixture` returns them; ``"normalized_score"`` is
+        The transitions ``[N]`` and their manifest; ``"normalized_score"`` in it is
         ``None`` without reference returns or without a complete episode.
 
     Raises:
@@ -82,14 +81,14 @@ def load_dataset(
                 f"data.path={path} has no use with data={quality}, which is rolled "
                 f"out; it goes with data={', '.join(RECORDED)}."
             )
-        return load_mixture(
-            env_name, quality, progress=progress, on_disk=on_disk, **mixture
+        return load_local_dataset(
+            env_name, quality, progress=progress, on_disk=on_disk, **recipe
         )
     if path is None:
         raise ValueError(f"data={quality} needs data.path=..., the name or path of it.")
-    if mixture.get("random_share"):
+    if recipe.get("random_share"):
         raise ValueError(
-            f"data.random_share={mixture['random_share']} is for data that are rolled "
+            f"data.random_share={recipe['random_share']} is for data that are rolled "
             f"out; with data={quality} it must be 0."
         )
     data, manifest = _load_recorded(quality, path, download, progress, on_disk)

@@ -14,7 +14,6 @@ from torchrl_osr.data import (
     check_dataset,
     is_memory_mapped,
     load_local_dataset,
-    load_mixture,
 )
 from torchrl_osr.data.collect import local
 
@@ -173,7 +172,7 @@ def test_a_mixture_says_what_it_is_made_of(tmp_path, on_disk):
     request = {"num_transitions": 2000, "seed": 3, "cache_dir": tmp_path}
     valuable, _ = load_local_dataset("hopper", "medium", **request)
     random, _ = load_local_dataset("hopper", "random", **request)
-    data, manifest = load_mixture(
+    data, manifest = load_local_dataset(
         "hopper", "medium", random_share=0.9, on_disk=on_disk, **request
     )
     assert is_memory_mapped(data) == on_disk
@@ -190,7 +189,7 @@ def test_a_mixture_says_what_it_is_made_of(tmp_path, on_disk):
 
 def test_without_random_rows_a_mixture_is_the_quality_itself(tmp_path):
     request = {"num_transitions": 50, "seed": 3, "cache_dir": tmp_path}
-    data, manifest = load_mixture("hopper", "random", random_share=0.0, **request)
+    data, manifest = load_local_dataset("hopper", "random", random_share=0.0, **request)
     alone, wanted = load_local_dataset("hopper", "random", **request)
     assert manifest == wanted
     assert (data == alone).all()

@@ -43,6 +43,7 @@ def load_local_dataset(
     quality: str,
     *,
     num_transitions: int,
+    random_share: float = 0.0,
     seed: int = 0,
     cache_dir: Path | str | None = None,
     progress: bool = True,
@@ -64,7 +65,10 @@ def load_local_dataset(
 
     Keyword Args:
         num_transitions: exact number of transitions ``N``.
-        seed: non-negative seed. Default: 0.
+        random_share: share of the rows that are of quality ``random`` instead, see
+            :func:`~torchrl_osr.data.mix_datasets`: limited valuable data, section 5.3
+            of the paper, which has 0.5 to 0.9 with quality ``"expert"``. Default: 0.
+        seed: non-negative seed of the data and of the choice of their rows. Default: 0.
         cache_dir: cache folder. Default: the environment variable
             ``TORCHRL_OSR_CACHE``, else the user's cache folder for ``torchrl-osr``.
         progress: show a progress bar when on a terminal. Default: ``True``.
@@ -74,7 +78,9 @@ def load_local_dataset(
 
     Returns:
         The transitions ``[N]``, see :func:`~torchrl_osr.data.check_dataset` for their
-        keys, and the manifest.
+        keys, and the manifest. That of a mixture has the ``"rows"`` of each quality,
+        the ``"sources"``' own manifests, and as ``"normalized_score"`` their scores'
+        mean over the rows.
 
     Raises:
         ValueError: unknown environment or quality.
@@ -90,9 +96,39 @@ def load_local_dataset(
         >>> len(data), manifest["env_id"]
         (500, 'Hopper-v5')
     """
+    root = cache_root(cache_dir)
+    recipe = {"num_transitions": num_transitions, "seed": seed}
+    data, manifest = _rolled_out(root, env_name, quality, progress=progress, **recipe)
+    if random_share:
+        other, random = _rolled_out(
+            root, env_name, "random", progress=progress, **recipe
+        )
+
+        def mixed() -> TensorDict:
+            return mix_datasets(data, other, random_share=random_share, seed=seed)
+
+        manifest = _mixture_manifest(manifest, random, random_share)
+        if not on_disk:
+            return mixed(), manifest
+        folder = root / "mixed" / f"{_name(**manifest)}-random{random_share}"
+        return load_or_write(
+            folder, manifest, lambda: mixed().split(CHUNK_ROWS), progress=False
+        )
+    return data if on_disk else data.clone(), manifest
+
+
+def _rolled_out(
+    root: Path,
+    env_name: str,
+    quality: str,
+    *,
+    num_transitions: int,
+    seed: int,
+    progress: bool,
+) -> tuple[TensorDict, dict[str, Any]]:
+    """Open one quality's own set, memory-mapped; collect it first if need be."""
     request = request_of(env_name, quality, num_transitions, seed)
-    folder = cache_root(cache_dir) / "rolled-out"
-    folder /= f"{env_name}-{quality}-{num_transitions}-seed{seed}"
+    folder = root / "rolled-out" / _name(**request)
     episodes: dict[str, Any] = {}
 
     def collect() -> Iterator[TensorDict]:
@@ -100,93 +136,43 @@ def load_local_dataset(
         data, returns, lengths = collect_quality(
             env_name, quality, num_transitions, seed=seed, progress=progress
         )
-        episodes.update(describe_episodes(returns, lengths))
-        score = (
-            normalized_score(env_name, float(np.mean(returns)))
-            if len(returns)
-            else None
-        )
-        episodes["normalized_score"] = score
+        episodes.update(describe_episodes(returns, lengths), normalized_score=None)
+        if len(returns):
+            mean = float(returns.mean())
+            episodes["normalized_score"] = normalized_score(env_name, mean)
         yield from data.split(CHUNK_ROWS)
 
-    data, manifest = load_or_write(
+    return load_or_write(
         folder,
         request,
         collect,
         describe=lambda: {"torchrl_osr_version": _own_version(), **episodes},
         progress=False,
     )
-    return data if on_disk else data.clone(), manifest
 
 
-def load_mixture(
-    env_name: str,
-    quality: str,
-    *,
-    random_share: float,
-    num_transitions: int,
-    seed: int = 0,
-    cache_dir: Path | str | None = None,
-    progress: bool = True,
-    on_disk: bool = False,
-) -> tuple[TensorDict, dict[str, Any]]:
-    """Load a local data set of which a share of the rows is of quality ``random``.
+def _name(
+    env_name: str, quality: str, num_transitions: int, seed: int, **_: Any
+) -> str:
+    return f"{env_name}-{quality}-{num_transitions}-seed{seed}"
 
-    Limited valuable data, section 5.3 of the paper. Both sets are those of
-    :func:`~torchrl_osr.data.load_local_dataset`, with its cache.
 
-    Args:
-        env_name: as there.
-        quality: of the valuable rows; the paper's is ``"expert"``.
-
-    Keyword Args:
-        random_share: the paper's are 0.5, 0.6, 0.7, 0.8 and 0.9. With 0 it is the
-            quality itself.
-        num_transitions: rows of the mixture.
-        seed: of both data sets and of the choice of their rows.
-        cache_dir: as there.
-        progress: as there.
-        on_disk: as there. To write the mixture takes its memory, once.
-
-    Returns:
-        The transitions, and a manifest: ``"rows"`` of each quality, the ``"sources"``'
-        own manifests, and as ``"normalized_score"`` their scores' mean over the rows.
-    """
-    recipe: dict[str, Any] = {"num_transitions": num_transitions, "seed": seed}
-
-    def load(quality: str) -> tuple[TensorDict, dict[str, Any]]:
-        return load_local_dataset(
-            env_name, quality, **recipe, cache_dir=cache_dir, progress=progress,
-            on_disk=on_disk,
-        )  # fmt: skip
-
-    if random_share == 0:
-        return load(quality)
-    (data, valuable), (other, random) = load(quality), load("random")
-    number = round(random_share * num_transitions)
-    rows = {quality: num_transitions - number, "random": number}
+def _mixture_manifest(
+    valuable: dict[str, Any], random: dict[str, Any], random_share: float
+) -> dict[str, Any]:
+    total, quality = valuable["num_transitions"], valuable["quality"]
+    number = round(random_share * total)
+    rows = {quality: total - number, "random": number}
     scores = [each["normalized_score"] for each in (valuable, random)]
     # A set without a complete episode has none.
     score = None if None in scores else np.average(scores, weights=[*rows.values()])
-    manifest = {
-        "env_name": env_name,
-        "quality": quality,
+    same = ("env_name", "quality", "num_transitions", "seed")
+    return {key: valuable[key] for key in same} | {
         "random_share": random_share,
-        **recipe,
         "rows": rows,
         "normalized_score": None if score is None else float(score),
         "sources": {quality: valuable, "random": random},
     }
-
-    def mixed() -> TensorDict:
-        return mix_datasets(data, other, random_share=random_share, seed=seed)
-
-    if not on_disk:
-        return mixed(), manifest
-    folder = cache_root(cache_dir) / "mixed"
-    folder /= f"{env_name}-{quality}-{num_transitions}-seed{seed}-random{random_share}"
-    chunks = lambda: mixed().split(CHUNK_ROWS)  # noqa: E731
-    return load_or_write(folder, manifest, chunks, progress=False)
 
 
 def request_of(

@@ -5,7 +5,7 @@ Shapes: ``N`` rows of the data set, ``B`` batch.
 
 from __future__ import annotations
 
-from typing import Any, NoReturn
+from typing import Any
 
 import torch
 from tensordict import MemoryMappedTensor, TensorDictBase
@@ -50,13 +50,6 @@ class MemmapStorage(Storage):
         index = index.cpu()
         batch = self.data[index + torch.searchsorted(self._shifts, index, right=True)]
         return batch if self.device.type == "cpu" else batch.to(self.device)
-
-    def set(self, *_: Any, **__: Any) -> NoReturn:
-        """Raise: the data set is what it is."""
-        raise RuntimeError("rows of a memory-mapped data set cannot be added or set.")
-
-    def _empty(self) -> NoReturn:
-        self.set()
 
     def state_dict(self) -> dict[str, Any]:
         """Nothing: the rows are in their files."""
