@@ -164,6 +164,9 @@ def test_a_manifest_of_a_gigabyte_is_not_read(tmp_path, monkeypatch):
     for read in (read_json, read_text):
         with pytest.raises(ValueError, match=r"manifest\.json has more than 256,000"):
             read(path, max_bytes=256_000)
+    path.write_bytes(b"\xff{}")
+    with pytest.raises(ValueError, match=r"manifest\.json is no text"):
+        read_json(path)
     path.write_text("[1]")
     with pytest.raises(ValueError, match=r"manifest\.json holds no object"):
         read_json(path)

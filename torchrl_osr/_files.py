@@ -89,7 +89,10 @@ def read_text(path: Path, *, max_bytes: int = MAX_JSON_BYTES) -> str:
         content = file.read(max_bytes + 1)
     if len(content) > max_bytes:
         raise ValueError(f"{path.name} has more than {max_bytes:,} bytes")
-    return content.decode("utf-8")
+    try:
+        return content.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path.name} is no text: {error}") from error
 
 
 def read_json(path: Path, *, max_bytes: int = MAX_JSON_BYTES) -> dict[str, Any]:
@@ -223,7 +226,7 @@ def check_disk_space(folder: Path | str, needed_bytes: int, what: str) -> None:
     Args:
         folder: need not be there yet.
         needed_bytes: how much will be written.
-        what: shall be written, in words.
+        what: will be written there, in words.
 
     Raises:
         OSError: ``ENOSPC``, with what is needed, what is free and what to do.

@@ -175,7 +175,7 @@ def test_episodes(recording):
     episodes, flaw = recording
     compare(
         "episodes",
-        lambda: transitions_from_episodes(episodes, progress=False),
+        lambda: transitions_from_episodes(episodes),
         episodes,
         flaw,
     )
@@ -301,7 +301,7 @@ def minari_folder():
 def test_export_and_back(recording, data_format):
     episodes, _ = recording
     try:
-        data, _ = transitions_from_episodes(episodes, progress=False)
+        data, _ = transitions_from_episodes(episodes)
     except ValueError:
         OUTCOMES["export: no data"] += 1
         return

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tensordict import TensorDict
-from tqdm.auto import tqdm
 
 from torchrl_osr.data.read.column_checks import ActionBounds, checked_columns
 from torchrl_osr.data.store.statistics import describe_episodes
@@ -101,8 +100,6 @@ def transitions_from_episodes(
     *,
     action_bounds: ActionBounds = (-1.0, 1.0),
     clip_actions: bool = False,
-    total: int | None = None,
-    progress: bool = True,
 ) -> tuple[TensorDict, dict[str, Any]]:
     """Turn recorded episodes into a data set; they are read once, one by one.
 
@@ -115,12 +112,9 @@ def transitions_from_episodes(
     Keyword Args:
         action_bounds: see :func:`~torchrl_osr.data.transitions_from_rows`.
         clip_actions: see there.
-        total: number of episodes, for the bar. Default: unknown.
-        progress: show a progress bar when on a terminal. Default: ``True``.
 
     Returns:
-        What that function returns, and ``empty_episodes`` in the
-        manifest.
+        What that function returns, and ``empty_episodes`` in the manifest.
 
     Raises:
         ValueError: as there; about lengths and sizes the message names the episode.
@@ -139,11 +133,7 @@ def transitions_from_episodes(
         >>> len(data), manifest["episode_lengths"]
         (6, [3, 3])
     """
-    # disable=None: no bar where the output is not a terminal.
-    bar = tqdm(
-        episodes, "read", total, unit="episode", disable=None if progress else True
-    )
-    rows, empty = join_episodes(enumerate(bar))
+    rows, empty = join_episodes(enumerate(episodes))
     if not rows:
         raise ValueError(f"none of the {empty} episodes has a step.")
     data, manifest = transitions_from_rows(

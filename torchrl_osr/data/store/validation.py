@@ -43,7 +43,7 @@ def as_transitions(columns: Mapping[str, NDArray[Any]]) -> TensorDict:
         tensors[name].reshape(*size, 1)
         for name in ("reward", "terminated", "truncated")
     )
-    following = {
+    after = {
         "observation": tensors["next_observation"],
         "reward": reward,
         "done": terminated | truncated,
@@ -54,7 +54,7 @@ def as_transitions(columns: Mapping[str, NDArray[Any]]) -> TensorDict:
         {
             "observation": tensors["observation"],
             "action": tensors["action"],
-            "next": TensorDict(following, size),
+            "next": TensorDict(after, size),
         },
         size,
     )
