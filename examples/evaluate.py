@@ -24,9 +24,14 @@ from torchrl import torchrl_logger
 from tqdm.auto import tqdm
 
 from torchrl_osr import evaluate_config
-from torchrl_osr._files import parse_json, read_text
+from torchrl_osr._files import (
+    CHECKSUM,
+    check_checksum,
+    checksummed,
+    read_json,
+    sha256_of,
+)
 from torchrl_osr.data import observation_statistics
-from torchrl_osr.data.manifest import SEAL, check_seal, sealed, sha256_of
 from torchrl_osr.evaluation.data_distance import DataDistance
 from torchrl_osr.evaluation.episodes import deterministic_policy
 from torchrl_osr.evaluation.robustness import evaluate_paired
@@ -107,10 +112,9 @@ def left_by(path: Path, request: dict[str, Any]) -> dict[str, Any] | None:
     if not path.exists():
         return None
     try:
-        text = read_text(path)
-        results = parse_json(text, path.name)
-        if SEAL in results:
-            check_seal(results, text, path.name)
+        results = read_json(path)
+        if CHECKSUM in results:
+            check_checksum(results, path.name)
     except ValueError as error:
         print(f"{path} is of no use: {error}.")
         return None
@@ -153,7 +157,7 @@ def evaluate(
                 advance=bar.update,
             )
             evaluations.append(evaluation_json(trained.step, paired, run.env.name))
-            begun = sealed(request | {"evaluations": evaluations})
+            begun = checksummed(request | {"evaluations": evaluations})
             run_folder.write_json(partial, begun)
     return {
         "env": run.env.name,

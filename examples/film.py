@@ -36,9 +36,12 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl import torchrl_logger
 
 from torchrl_osr._checks import check_choice
-from torchrl_osr.data import load_behavior_policy, make_environment
-from torchrl_osr.data.levels import level_policies
-from torchrl_osr.data.on_disk import observations
+from torchrl_osr.data import (
+    load_behavior_policy,
+    make_environment,
+    quality_policies,
+    sampled_observations,
+)
 from torchrl_osr.envs import ActionKnock, ExternalPush
 from torchrl_osr.evaluation.data_distance import DataDistance
 from torchrl_osr.evaluation.episodes import Policy, Wrap, deterministic_policy
@@ -92,7 +95,7 @@ def main(cfg: DictConfig) -> None:
     ]
     title = f"{run.env.name} {run.data.level}: {in_words(cfg, takes[0].force)}"
     one = f"one episode: seed {cfg.seed + episode}, {why}"
-    draw(cfg, takes, camera, observations(data), trained, results, title, one)
+    draw(cfg, takes, camera, sampled_observations(data), trained, results, title, one)
     write_json(
         trained.folder / "film.json",
         {
@@ -170,7 +173,7 @@ def in_words(cfg: DictConfig, force: float) -> str:
 def behavior_of(trained: TrainedRun) -> Policy:
     """Return the last, hence best, behaviour policy of the run's data."""
     run = trained.config
-    names = level_policies(run.data.level)
+    names = quality_policies(run.data.level)
     if not names:
         raise ValueError(f"{run.data.level} data have no behaviour policy to film.")
     policy = load_behavior_policy(run.env.name, names[-1])

@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = [
     ROOT / "README.md",
-    ROOT / "torchrl_osr" / "data" / "behavior_policies" / "MODEL_CARD.md",
+    ROOT / "torchrl_osr" / "data" / "collect" / "behavior_policies" / "MODEL_CARD.md",
     *sorted((ROOT / "docs").glob("*.md")),
 ]
 PACKAGES = [

@@ -36,7 +36,7 @@ def test_every_configuration_of_ours_is_let_through(tmp_path, option):
     "target",
     [
         "os.mkdir",
-        "torchrl_osr.data.behavior.os.mkdir",
+        "torchrl_osr._files.os.mkdir",
         "torchrl_osr.data.load_file",
         "torchrl_osr",
         "mine.Loss",

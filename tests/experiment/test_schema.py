@@ -13,7 +13,13 @@ from hydra.utils import get_class, instantiate
 from omegaconf import OmegaConf, ValidationError
 
 from torchrl_osr import Adversary, InverseDynamicsLoss, OSRLoss, objectives
-from torchrl_osr.data import load_behavior_card
+from torchrl_osr.data import (
+    MAZE_IDS,
+    MAZE_QUALITIES,
+    QUALITIES,
+    RECORDED,
+    load_behavior_card,
+)
 from torchrl_osr.experiment import schema as config
 from torchrl_osr.experiment.derived_schema import schema_of
 
@@ -58,13 +64,13 @@ def test_every_experiment_composes_and_sweeps_over_values_that_compose(name):
         assert len(found) == len(overrides)
 
 
-def test_environments_are_those_with_behaviour_policies_and_mazes():
-    tasks = load_behavior_card()
-    for name in options("env"):
-        env = composed(f"env={name}").env
-        assert env.name == name
-        assert "maze" in name or env.id == tasks[name]["env"]
-    assert tasks.keys() <= set(options("env"))
+def test_groups_name_what_the_package_has():
+    assert options("data") == sorted([*QUALITIES, *MAZE_QUALITIES, *RECORDED])
+    assert options("env") == sorted([*load_behavior_card(), *MAZE_IDS])
+    for name, env_id in MAZE_IDS.items():
+        assert composed(f"env={name}").env == {"name": name, "id": env_id}
+    for name, entry in load_behavior_card().items():
+        assert composed(f"env={name}").env == {"name": name, "id": entry["env"]}
 
 
 def test_presets_reach_the_values_and_the_command_line_wins():

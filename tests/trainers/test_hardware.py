@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_osr.data.replay_buffer import check_memory
+from torchrl_osr.data import check_memory
 from torchrl_osr.trainers import hardware
 from torchrl_osr.trainers.finite_guard import FiniteGuard
 from torchrl_osr.trainers.gradient_steps import SumOfLosses

@@ -10,8 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_osr.data.on_disk import TransitionsOnDisk
-from torchrl_osr.data.replay_buffer import observation_statistics
+from torchrl_osr.data import observation_statistics
 
 # More of them fall out of the processor's cache and are slower.
 ROWS_AT_A_TIME = 64
@@ -60,7 +59,7 @@ class DataDistance:
 
     def __init__(
         self,
-        data: TensorDictBase | TransitionsOnDisk,
+        data: TensorDictBase,
         *,
         num_neighbors: int = 10,
         max_reference: int = 20_000,

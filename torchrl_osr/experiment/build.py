@@ -17,53 +17,45 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torchrl.objectives import LossModule
 
 from torchrl_osr._checks import check_choice
-from torchrl_osr.data import TransitionsOnDisk, load_dataset
+from torchrl_osr.data import load_dataset
 from torchrl_osr.modules import critic_ensemble
 
 
 def load_data(
     cfg: DictConfig, *, progress: bool = True
-) -> tuple[TensorDict | TransitionsOnDisk, dict[str, Any]]:
+) -> tuple[TensorDict, dict[str, Any]]:
     """Load the run's data set, see :func:`~torchrl_osr.data.load_dataset`.
 
-    Its rewards become ``data.reward_scale * r + data.reward_shift``; the manifest has
-    the task's own, and so has a set on disk (``data.storage=disk``), of which the
-    batches are scaled.
+    Rewards are the task's own: what is trained on is scaled later, see
+    :func:`~torchrl_osr.experiment.training_data.load_training_data`.
 
     Args:
-        cfg: a whole configuration of ``examples/offline_osr.py``; that of an older run
-            may lack the newer keys.
+        cfg: a whole configuration of ``examples/offline_osr.py``.
 
     Keyword Args:
         progress: show a progress bar when on a terminal. Default: ``True``.
     """
-    data, manifest = load_dataset(
+    return load_dataset(
         cfg.env.name,
         cfg.data.level,
         env_id=cfg.env.id,
-        path=cfg.data.get("path"),
-        download=cfg.data.get("download", False),
-        random_share=cfg.data.get("random_share", 0.0),
+        path=cfg.data.path,
+        download=cfg.data.download,
+        random_share=cfg.data.random_share,
         num_transitions=cfg.data.num_transitions,
         seed=cfg.data.seed,
         progress=progress,
         on_disk=check_storage(cfg) == "disk",
     )
-    scale = cfg.data.get("reward_scale", 1.0)
-    shift = cfg.data.get("reward_shift", 0.0)
-    if (scale, shift) != (1.0, 0.0) and isinstance(data, TensorDict):
-        data["next", "reward"] = scale * data["next", "reward"] + shift
-    return data, manifest
 
 
 def check_storage(cfg: DictConfig) -> str:
-    """Return where the data shall be.
+    """Where the data are: ``"memory"`` or ``"disk"``.
 
     Raises:
         ValueError: it is no such place, or cannot be had with the other options.
     """
-    # The configuration of an older run has no such key.
-    storage = str(cfg.data.get("storage", "memory"))
+    storage = str(cfg.data.storage)
     check_choice("data.storage", storage, ("memory", "disk"))
     if storage == "disk" and cfg.trainer.cudagraph:
         raise ValueError(
