@@ -29,8 +29,8 @@ FREE_KEYS = ("resume", "trainer.progress")
 def check_keys(config: DictConfig) -> None:
     """Raise if a composed configuration has keys that its schema lacks.
 
-    Hydra refuses a mistyped ``key=value``; ``+key=value`` adds it even to a typed group,
-    where nothing would read it.
+    Hydra refuses a mistyped ``key=value``, but adds ``+key=value`` even to a typed
+    group, where nothing would read it.
 
     Args:
         config: composed with its schema.
