@@ -48,7 +48,7 @@ def check_keys(config: DictConfig) -> None:
 def _unknown_keys(node: DictConfig, prefix: str = "") -> Iterator[str]:
     kind = OmegaConf.get_type(node)
     known = {each.name for each in dataclasses.fields(kind)} if kind else set()
-    for key in node:
+    for key in map(str, node):
         # A _target_ alone may be any function, which has its own keywords.
         if known != {"_target_"} and key not in known:
             yield f"{prefix}{key}"
