@@ -28,7 +28,7 @@ from torchrl_osr.modules import (
     tanh_gaussian_actor,
     tanh_gaussian_inverse_dynamics,
 )
-from torchrl_osr.trainers.captured import CapturedUpdate, make_capturable
+from torchrl_osr.trainers.cudagraph import captured
 
 Casting = Callable[[], AbstractContextManager]
 Update = Callable[[Any, Casting], Iterator[str]]
@@ -96,13 +96,13 @@ def unpack(batch: TensorDictBase) -> Batch:
     )
 
 
-def our_update(loss: LossModule, *, captured: bool = False) -> Update:
+def our_update(loss: LossModule, *, capturable: bool = False) -> Update:
     """Return the update that the README shows: one backward, one optimizer."""
     loss.make_value_estimator(gamma=GAMMA)
     updater = SoftUpdate(loss, tau=TAU)
-    optimizer = torch.optim.Adam(loss.parameters(), lr=RATE, fused=True)
-    if captured:
-        make_capturable(loss, optimizer, loss.log_alpha.device)
+    optimizer = torch.optim.Adam(
+        loss.parameters(), lr=RATE, fused=True, capturable=capturable
+    )
 
     def update(batch: TensorDictBase, casting: Casting) -> Iterator[str]:
         with casting():
@@ -120,22 +120,21 @@ def our_update(loss: LossModule, *, captured: bool = False) -> Update:
     return update
 
 
-def graph_update(loss: LossModule, like: TensorDictBase) -> Update:
+def graph_update(loss: LossModule) -> Update:
     """Return :func:`our_update` as a CUDA graph, into whose batch others are copied."""
-    update, static = our_update(loss, captured=True), like.clone()
+    update = our_update(loss, capturable=True)
     castings: list[Casting] = []
 
-    def once() -> TensorDictBase:
-        for _ in update(static, castings[-1]):
+    def once(batch: TensorDictBase) -> TensorDictBase:
+        for _ in update(batch, castings[-1]):
             pass
         return TensorDict({"updates": torch.ones_like(loss.log_alpha)})
 
-    replayed = CapturedUpdate(once, list, loss.log_alpha.device)
+    replayed = captured(once, loss)
 
     def update_graph(batch: TensorDictBase, casting: Casting) -> Iterator[str]:
         castings[:] = [casting]
-        static.update_(batch)
-        replayed()
+        replayed(batch)
         yield "update"
 
     return update_graph
@@ -214,5 +213,5 @@ def make_contender(
     if name in (COMPILED, BOTH):
         loss.compile()
     if name in (GRAPH, BOTH):
-        return graph_update(loss, batches[0]), batches
+        return graph_update(loss), batches
     return our_update(loss), batches

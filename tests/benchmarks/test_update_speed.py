@@ -114,18 +114,8 @@ def test_tables_are_printed_and_put_into_the_readme(run) -> None:
     assert (folder / "speed.png").stat().st_size > 10_000
 
 
-class WithoutGraph:
-    """Stands for CapturedUpdate where there is no GPU."""
-
-    def __init__(self, update, generators, device) -> None:
-        self.update = update
-
-    def __call__(self) -> None:
-        self.update()
-
-
 def test_graph_reads_the_batch_and_moves_the_same_weights(monkeypatch) -> None:
-    monkeypatch.setattr(contenders, "CapturedUpdate", WithoutGraph)
+    monkeypatch.setattr(contenders, "captured", lambda update, loss: update)
     size, device, weights = Size.parse("hopper-1x8"), torch.device("cpu"), []
     for name in ("OSR", GRAPH):
         made, original = [], contenders.our_loss

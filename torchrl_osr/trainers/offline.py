@@ -7,6 +7,7 @@ loop, hooks and optimization stepper are used as they are.
 
 from __future__ import annotations
 
+import json
 import logging
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -392,7 +393,8 @@ class OfflineTrainer(Trainer):
                 f"the {name!r} that decides the best checkpoint: name one of its "
                 f"results, as in metric=('score', 'max')."
             )
-        results = finite_or_none(results)
+        # As a checkpoint restores them: sorted, lists for tuples.
+        results = json.loads(json.dumps(finite_or_none(results), sort_keys=True))
         self.history.append(results)
         numbers = {
             key: value for key, value in results.items()
