@@ -20,7 +20,6 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import hydra
 import torch
@@ -28,7 +27,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from tensordict import TensorDict
 from torchrl import torchrl_logger
-from torchrl.objectives import LossModule, SoftUpdate
+from torchrl.objectives import SoftUpdate
 
 from torchrl_osr import InverseDynamicsLoss, StatePerturbation
 from torchrl_osr.evaluation.episodes import (
@@ -43,7 +42,7 @@ from torchrl_osr.experiment import run_folder
 from torchrl_osr.experiment import schema as config
 from torchrl_osr.experiment.build import make_learner
 from torchrl_osr.experiment.loggers import make_loggers
-from torchrl_osr.experiment.training_data import TrainingData, load_training_data
+from torchrl_osr.experiment.training_data import load_training_data
 from torchrl_osr.trainers import OfflineTrainer, check_hardware, largest_value
 
 EVALUATION_SEED = 10_000  # far from the seeds of the data's episodes
@@ -66,7 +65,7 @@ def main(cfg: DictConfig) -> float:
 
 
 def run(cfg: DictConfig, folder: Path) -> float:
-    """Data, inverse dynamics model, policy, report."""
+    """Data, networks, inverse dynamics model, policy, report."""
     torchrl_logger.setLevel("WARNING")
     torch.set_num_threads(cfg.trainer.num_threads)
     torch.set_float32_matmul_precision(cfg.trainer.matmul_precision)
@@ -75,7 +74,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
     )
     make_learner(cfg, 1, 1)  # a wrong option of the loss stops here, not after the data
 
-    # Transitions with standardised states; each batch gets a perturbed state for every
+    # Transitions with standardised states. Each batch gets a perturbed state for every
     # state, which is the paper's mixed data set.
     data = load_training_data(cfg, device)
     torch.manual_seed(cfg.seed)
@@ -83,8 +82,12 @@ def run(cfg: DictConfig, folder: Path) -> float:
     buffer = data.buffer(cfg.trainer.batch_size)
     buffer.append_transform(perturbation)
 
-    # The policy's loss holds the inverse dynamics model, which is trained first.
+    # Networks, and the policy's loss, which holds the inverse dynamics model.
     actor, inverse_dynamics, loss = make_learner(cfg, *data.sizes, device)
+
+    # One step of a trainer: sample a batch, compute the losses, go backward on their
+    # sum, step the optimizer, move the target networks; log, evaluate and write a
+    # checkpoint at their intervals. Both phases have this in common:
     new_trainer = partial(
         OfflineTrainer,
         replay_buffer=buffer,
@@ -99,98 +102,61 @@ def run(cfg: DictConfig, folder: Path) -> float:
         compile=cfg.trainer.compile,
         cudagraph=cfg.trainer.cudagraph,
     )
-    new_adam = partial(torch.optim.Adam, fused=True, capturable=cfg.trainer.cudagraph)
+    adam = partial(torch.optim.Adam, fused=True, capturable=cfg.trainer.cudagraph)
 
+    # First phase: which action leads from the perturbed state to the next state?
     if hasattr(loss, "inverse_dynamics_network"):
-        train_inverse_dynamics(
-            cfg, folder, inverse_dynamics, data.held_out, new_trainer, new_adam
+        fit = InverseDynamicsLoss(inverse_dynamics, **cfg.inverse_dynamics.loss)
+        trainer = new_trainer(
+            fit,
+            adam(fit.parameters(), lr=cfg.optim.inverse_dynamics_lr),
+            total_steps=cfg.trainer.inverse_dynamics_steps,
+            folder=folder / "checkpoint" / "inverse_dynamics",
+            seed=cfg.seed,
+            evaluate=lambda: inverse_dynamics_report(inverse_dynamics, data.held_out),
+            metric=("nll", "min"),
+            eval_interval=cfg.trainer.inverse_dynamics_steps,
+            description="inverse_dynamics",
         )
-    trainer = train_policy(cfg, folder, actor, loss, data, new_trainer, new_adam)
-    return report(cfg, folder, data.score, trainer)
+        if cfg.inverse_dynamics.shuffle_next:
+            trainer.register_op("process_optim_batch", shuffle_next)
+        trainer.train()
+        run_folder.write_json(folder / "inverse_dynamics.json", trainer.history[-1])
+        print(describe(trainer.history[-1]))
 
-
-def train_inverse_dynamics(
-    cfg: DictConfig,
-    folder: Path,
-    network: torch.nn.Module,
-    held_out: TensorDict,
-    new_trainer: Any,
-    new_adam: Any,
-) -> None:
-    """First phase: which action leads from the perturbed state to the next state?"""
-    loss = InverseDynamicsLoss(network, **cfg.inverse_dynamics.loss)
-    trainer = new_trainer(
-        loss,
-        new_adam(loss.parameters(), lr=cfg.optim.inverse_dynamics_lr),
-        total_steps=cfg.trainer.inverse_dynamics_steps,
-        folder=folder / "checkpoint" / "inverse_dynamics",
-        seed=cfg.seed,
-        evaluate=lambda: inverse_dynamics_report(network, held_out),
-        metric=("nll", "min"),
-        eval_interval=cfg.trainer.inverse_dynamics_steps,
-        description="inverse_dynamics",
-    )
-    if cfg.inverse_dynamics.shuffle_next:
-        trainer.register_op("process_optim_batch", shuffle_next)
-    trainer.train()
-    run_folder.write_json(folder / "inverse_dynamics.json", trainer.history[-1])
-    print(describe(trainer.history[-1]))
-
-
-def shuffle_next(batch: TensorDict) -> TensorDict:
-    """Give every row the next state of another: an ablation of the model."""
-    key = ("next", "observation")
-    return batch.set(key, batch[key].roll(1, 0))  # the rows came in random order
-
-
-def train_policy(
-    cfg: DictConfig,
-    folder: Path,
-    actor: torch.nn.Module,
-    loss: LossModule,
-    data: TrainingData,
-    new_trainer: Any,
-    new_adam: Any,
-) -> OfflineTrainer:
-    """Second phase: the policy, taught by the critics and by the frozen model.
-
-    Each step of the trainer samples a batch, computes the losses, goes backward on
-    their sum, steps the optimizer and then the target networks. Every
-    ``trainer.eval_interval`` steps it plays the evaluation's episodes.
-    """
-    critics = list(loss.qvalue_network_params.parameters())
-    known = set(critics)
-    policy = [each for each in loss.parameters() if each not in known]
-    optimizer = new_adam(
-        [
-            {"params": critics, "lr": cfg.optim.qvalue_lr},
-            {"params": policy, "lr": cfg.optim.actor_lr},
-        ]
-    )
+    # Second phase: the policy, taught by the critics and by the frozen model.
+    critic_params = list(loss.qvalue_network_params.parameters())
+    known = set(critic_params)
+    policy_params = [each for each in loss.parameters() if each not in known]
+    groups = [
+        {"params": critic_params, "lr": cfg.optim.qvalue_lr},
+        {"params": policy_params, "lr": cfg.optim.actor_lr},
+    ]
     limit = largest_value(data.largest_reward, cfg.optim.gamma)
-    play = deterministic_policy(actor, data.norm)
-    evaluator = EpisodeEvaluator(
-        cfg.env.id,
-        num_episodes=cfg.trainer.eval_episodes,
-        seed=EVALUATION_SEED,
-        device=next(actor.parameters()).device,
-    )
-    with closing(evaluator):
+    episodes = {"num_episodes": cfg.trainer.eval_episodes, "seed": EVALUATION_SEED}
+    policy = deterministic_policy(actor, data.norm)
+    with closing(EpisodeEvaluator(cfg.env.id, **episodes, device=device)) as play:
         trainer = new_trainer(
             loss,
-            optimizer,
+            adam(groups),
             total_steps=cfg.trainer.steps,
             folder=folder / "checkpoint" / "policy",
             seed=cfg.seed + 1,
             target_net_updater=SoftUpdate(loss, tau=cfg.optim.tau),
-            evaluate=lambda: summarize(evaluator(play), cfg.env.name),
+            evaluate=lambda: summarize(play(policy), cfg.env.name),
             metric=("score", "max"),
             eval_interval=cfg.trainer.eval_interval,
             description="policy",
             value_limits={"pred_value": limit, "target_value": limit},
         )
         trainer.train()
-    return trainer
+    return report(cfg, folder, data.score, trainer)
+
+
+def shuffle_next(batch: TensorDict) -> TensorDict:
+    """Give every row the next state of another: an ablation of the model."""
+    key = ("next", "observation")
+    return batch.set(key, batch[key].roll(1, 0))  # the rows came in random order
 
 
 def report(
