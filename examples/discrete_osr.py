@@ -2,8 +2,7 @@
 
     python examples/discrete_osr.py --seed 1 --output cartpole.json
 
-The data are rolled out here: a rule that balances the pole, mixed with random
-actions.
+The data are rolled out here: a rule that balances the pole, mixed with random actions.
 Two policies are then learnt from them alone, by CQL and by OSR. Both play from the
 task's own starts, and from starts three times as far out.
 """

@@ -113,7 +113,7 @@ def test_best_checkpoint_is_of_the_best_evaluation(tmp_path, make, mode):
     best = {"max": 10, "min": 15}[mode]
     assert trainer.best()["step"] == best
     assert trainer.history[0] == {"step": 0, "score": None}
-    with zipfile.ZipFile(trainer.best_path) as archive:
+    with zipfile.ZipFile(trainer.checkpoints.best_path) as archive:
         manifest = json.loads(archive.read("manifest.json"))
     assert manifest["metadata"]["step"] == best
     assert set(manifest["components"]) == {"loss_module", "perturbation"}

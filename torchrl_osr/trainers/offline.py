@@ -286,11 +286,6 @@ class OfflineTrainer(Trainer):
         """Gradient steps since the run's beginning; the running one counts."""
         return int(self._optim_count)
 
-    @property
-    def best_path(self) -> Path:
-        """Path of the checkpoint with the best evaluation."""
-        return self.checkpoints.best_path
-
     def best(self) -> dict[str, Any] | None:
         """Best evaluation so far, the first of equals; one without a value is none."""
         rows = [row for row in self.history if row[self._metric] is not None]
