@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import math
 import os
 import shutil
 import stat
@@ -67,8 +68,33 @@ def write_atomically(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write ``value`` as JSON, atomically; refuse NaN, which is not JSON."""
-    write_atomically(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
+    """Write ``value`` as JSON, atomically; NaN and infinity, which JSON lacks, as null.
+
+    Raises:
+        OSError: naming ``path``, if it cannot be written.
+    """
+    text = json.dumps(finite_or_none(value), indent=1, allow_nan=False)
+    write_atomically(path, text + "\n")
+
+
+def finite_or_none(value: Any) -> Any:
+    """``value`` with ``None`` in place of every float that is not finite.
+
+    Args:
+        value: JSON-compatible: mappings and lists are copied, all else is kept.
+
+    Examples:
+        >>> from torchrl_osr._files import finite_or_none
+        >>> finite_or_none({"r2": [0.5, float("-inf")]})
+        {'r2': [0.5, None]}
+    """
+    if isinstance(value, Mapping):
+        return {key: finite_or_none(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite_or_none(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
 
 
 def read_text(path: Path, *, max_bytes: int = MAX_JSON_BYTES) -> str:

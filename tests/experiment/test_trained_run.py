@@ -22,7 +22,7 @@ from torchrl_osr.experiment.trained_run import (
     load_trained,
     run_folder_of,
 )
-from torchrl_osr.trainers.checkpointing import safe_checkpoint
+from torchrl_osr.trainers.checkpoints import safe_checkpoint
 
 CONF = Path(__file__).parents[2] / "conf"
 

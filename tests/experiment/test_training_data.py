@@ -14,7 +14,6 @@ from torchrl_osr.evaluation.data_distance import DataDistance
 from torchrl_osr.experiment import schema as config
 from torchrl_osr.experiment.build import load_data
 from torchrl_osr.experiment.training_data import load_training_data
-from torchrl_osr.trainers.members import launch
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "examples" / "offline_osr.py"
@@ -98,7 +97,7 @@ def test_the_same_seed_gives_the_same_training(tmp_path):
     results = []
     for storage in ("memory", "disk"):
         cfg, folder = composed(f"data.storage={storage}"), tmp_path / storage
-        launch(cfg, folder, SCRIPT, [], script.prepare_data, script.run)
+        script.run(cfg, folder)
         results.append(losses(folder))
     here, there = results
     assert len(here) > 5

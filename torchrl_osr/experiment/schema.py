@@ -146,7 +146,6 @@ class TrainerConfig:
         batch_size: rows of a gradient step.
         inverse_dynamics_steps: gradient steps of the first phase.
         steps: gradient steps of the policy phase.
-        bc_steps: how many of them the policy clones behaviour, for a warm start.
         log_interval: steps between log entries.
         eval_interval: steps between evaluations.
         eval_episodes: complete episodes of an evaluation.
@@ -165,7 +164,6 @@ class TrainerConfig:
     batch_size: int = MISSING
     inverse_dynamics_steps: int = MISSING
     steps: int = MISSING
-    bc_steps: int = MISSING
     log_interval: int = MISSING
     eval_interval: int = MISSING
     eval_episodes: int = MISSING
@@ -204,7 +202,6 @@ class OfflineOSRConfig:
         seed: of networks, sampling, noise and evaluation episodes.
         num_random: what ``loss.num_random`` is for the losses with CQL's term.
         resume: folder of a killed run to continue.
-        population: number of seeds, or a list of mappings, to be trained at once.
     """
 
     env: EnvConfig = field(default_factory=EnvConfig)
@@ -221,7 +218,6 @@ class OfflineOSRConfig:
     seed: int = MISSING
     num_random: int = MISSING
     resume: str | None = None
-    population: Any = None  # int | list[dict[str, Any]] | None
 
 
 def register() -> None:

@@ -17,7 +17,7 @@ from torchrl_osr.data import make_environment
 from torchrl_osr.experiment.build import make_learner
 from torchrl_osr.experiment.run_config import check_targets, read_config
 from torchrl_osr.experiment.run_folder import CONFIG
-from torchrl_osr.trainers.checkpointing import find_damage, safe_checkpoint
+from torchrl_osr.trainers.checkpoints import find_damage, safe_checkpoint
 
 CHECKPOINTS = Path("checkpoint") / "policy"
 """Where a run keeps the checkpoints of its policy."""

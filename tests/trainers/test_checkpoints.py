@@ -13,7 +13,7 @@ import pytest
 import torch
 from torchrl.checkpoint import CheckpointError
 
-from torchrl_osr.trainers.checkpointing import find_damage, safe_checkpoint
+from torchrl_osr.trainers.checkpoints import find_damage, safe_checkpoint
 
 
 def saved(path: Path) -> torch.nn.Linear:
