@@ -9,6 +9,8 @@ import shutil
 import stat
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import IO, Any
 
@@ -163,21 +165,35 @@ def refuse_size(
         )
 
 
+@contextmanager
+def write_beside(path: Path) -> Iterator[Path]:
+    """Yield a path beside ``path`` to write to; it becomes ``path`` at the end.
+
+    Nothing is left of what an error interrupts.
+
+    Args:
+        path: of the file.
+    """
+    beside = path.with_name(f".{path.name}.new")
+    try:
+        yield beside
+        with beside.open("rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
 def write_atomically(path: Path, text: str) -> None:
     """Write ``text`` so that a reader finds the old file or the new one, never a part.
 
     Raises:
         OSError: naming ``path``, if it cannot be written.
     """
-    beside = path.with_name(f".{path.name}.new")
     try:
-        with beside.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(beside, path)
+        with write_beside(path) as beside:
+            beside.write_text(text, encoding="utf-8")
     except OSError as error:
-        beside.unlink(missing_ok=True)
         raise OSError(
             error.errno, f"cannot write the run's file ({error.strerror})", str(path)
         ) from error

@@ -20,7 +20,7 @@ from torchrl_osr.envs import (
     StartStateNoise,
     StickyAction,
 )
-from torchrl_osr.evaluation.episodes import EpisodeEvaluator
+from torchrl_osr.evaluation import EpisodeEvaluator
 
 OFF = {
     "knock": lambda env: ActionKnock(env, 5, mode="torque", at=10**6),

@@ -7,7 +7,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_osr.evaluation.data_distance import DataDistance
+from torchrl_osr.evaluation import DataDistance
 
 
 def dataset(rows: torch.Tensor) -> TensorDict:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_osr.evaluation.recovery import (
+from torchrl_osr.evaluation import (
     STEPS_AFTER,
     STEPS_BEFORE,
     Recorder,

@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from torchrl.checkpoint import CheckpointError, CheckpointRotation
 from torchrl.envs import ObservationNorm
 
-from torchrl_osr.evaluation.episodes import deterministic_policy
+from torchrl_osr.evaluation import deterministic_policy
 from torchrl_osr.experiment import schema as config
 from torchrl_osr.experiment.build import make_learner
 from torchrl_osr.experiment.trained_run import (

@@ -17,7 +17,7 @@ from torchrl.record.loggers import CSVLogger
 
 from torchrl_osr import InverseDynamicsLoss, OSRLoss, StatePerturbation
 from torchrl_osr.data import make_replay_buffer
-from torchrl_osr.evaluation.figures import read_scalars
+from torchrl_osr.evaluation import read_scalars
 from torchrl_osr.modules import (
     critic_ensemble,
     tanh_gaussian_actor,

@@ -11,7 +11,7 @@ from torchrl.objectives import SoftUpdate
 from torchrl.record.loggers import CSVLogger
 
 from torchrl_osr import StatePerturbation
-from torchrl_osr.evaluation.figures import read_scalars
+from torchrl_osr.evaluation import read_scalars
 from torchrl_osr.trainers import OfflineTrainer, train_together
 from torchrl_osr.trainers.member_noise import MemberNoise
 

@@ -13,7 +13,7 @@ import pytest
 import torch
 from torchrl.record.loggers import CSVLogger
 
-from torchrl_osr.evaluation.figures import read_scalars
+from torchrl_osr.evaluation import read_scalars
 from torchrl_osr.experiment import run_folder
 from torchrl_osr.trainers import train_together
 from torchrl_osr.trainers.preemption import Preempted, sigterm_noted

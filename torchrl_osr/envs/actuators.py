@@ -7,16 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_osr.envs.base import Disturbance, Step, Vector, flag, gymnasium
-from torchrl_osr.envs.checks import (
+from torchrl_osr.envs.base import (
+    DisturbanceWrapper,
+    Step,
+    Vector,
     bounded_box,
     check_count,
     check_strength,
+    flag,
+    gymnasium,
     vector_box,
 )
 
 
-class ActionNoise(Disturbance):
+class ActionNoise(DisturbanceWrapper):
     """Add Gaussian noise to every action and clip it to the action box.
 
     The random perturbation of "Robust Gymnasium" (https://arxiv.org/abs/2502.19652) on
@@ -58,7 +62,7 @@ class ActionNoise(Disturbance):
         return super().step(action)
 
 
-class ActionDelay(Disturbance):
+class ActionDelay(DisturbanceWrapper):
     """Execute every action some steps late; zeros until the first one arrives.
 
     Constant delays of "Reinforcement Learning with Random Delays"
@@ -103,7 +107,7 @@ class ActionDelay(Disturbance):
         return super().step(action)
 
 
-class StickyAction(Disturbance):
+class StickyAction(DisturbanceWrapper):
     """Execute the previous action again, with some probability in each step.
 
     From "Revisiting the Arcade Learning Environment" (https://arxiv.org/abs/1709.06009),

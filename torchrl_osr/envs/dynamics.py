@@ -5,11 +5,16 @@ from __future__ import annotations
 import copy
 import math
 
-from torchrl_osr.envs.base import Disturbance, Vector, gymnasium, mujoco
-from torchrl_osr.envs.checks import owns_simulation
+from torchrl_osr.envs.base import (
+    DisturbanceWrapper,
+    Vector,
+    gymnasium,
+    mujoco,
+    owns_simulation,
+)
 
 
-class DynamicsChange(Disturbance):
+class DynamicsChange(DisturbanceWrapper):
     """Play on a robot and a ground that are heavier, rougher, ...
 
     The changes of SCPO (https://arxiv.org/abs/2112.10513: mass and friction over grids

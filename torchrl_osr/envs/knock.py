@@ -7,9 +7,17 @@ from typing import Any, Literal
 import numpy as np
 
 from torchrl_osr._checks import check_choice
-from torchrl_osr.envs.base import Step, Vector, flag, gymnasium
-from torchrl_osr.envs.checks import bounded_box, check_count, vector_box
-from torchrl_osr.envs.moments import At, TimedDisturbance
+from torchrl_osr.envs.base import (
+    At,
+    Step,
+    TimedDisturbance,
+    Vector,
+    bounded_box,
+    check_count,
+    flag,
+    gymnasium,
+    vector_box,
+)
 
 SMALL = 1e-3
 """Magnitude of the benchmark's random actions, in units of the action."""

@@ -7,9 +7,18 @@ from typing import Any, Literal
 import numpy as np
 
 from torchrl_osr._checks import check_choice
-from torchrl_osr.envs.base import Step, Vector, flag, gymnasium, mujoco
-from torchrl_osr.envs.checks import check_count, check_strength, simulated
-from torchrl_osr.envs.moments import At, TimedDisturbance
+from torchrl_osr.envs.base import (
+    At,
+    Step,
+    TimedDisturbance,
+    Vector,
+    check_count,
+    check_strength,
+    flag,
+    gymnasium,
+    mujoco,
+    simulated,
+)
 
 
 class ExternalPush(TimedDisturbance):

@@ -8,11 +8,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from torchrl_osr._checks import check_choice
-from torchrl_osr.envs.base import Disturbance, Step, Vector, gymnasium
-from torchrl_osr.envs.checks import check_strength, vector_box
+from torchrl_osr.envs.base import (
+    DisturbanceWrapper,
+    Step,
+    Vector,
+    check_strength,
+    gymnasium,
+    vector_box,
+)
 
 
-class ObservationNoise(Disturbance):
+class ObservationNoise(DisturbanceWrapper):
     r"""Add noise to every observation; the simulated state is left alone.
 
     The noise of "DMBP: Diffusion Model-Based Predictor for Robust Offline

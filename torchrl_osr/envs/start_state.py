@@ -6,11 +6,18 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_osr.envs.base import Disturbance, Vector, flag, gymnasium, mujoco
-from torchrl_osr.envs.checks import check_strength, owns_simulation
+from torchrl_osr.envs.base import (
+    DisturbanceWrapper,
+    Vector,
+    check_strength,
+    flag,
+    gymnasium,
+    mujoco,
+    owns_simulation,
+)
 
 
-class StartStateNoise(Disturbance):
+class StartStateNoise(DisturbanceWrapper):
     """Add Gaussian noise to the state that an episode starts from.
 
     It comes on top of the environment's own (uniform, half-width 5e-3 for hopper and

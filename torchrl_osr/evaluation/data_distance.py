@@ -1,7 +1,6 @@
-"""How far is a state from the data? The mean distance to its nearest neighbours there.
+"""Distance of a state to the data: the mean over its nearest neighbours there.
 
-Shapes: ``N`` rows of the data, ``M`` states that are asked about, ``S`` observation,
-``K`` neighbours.
+Shapes: ``N`` rows of the data, ``M`` states, ``S`` observation, ``K`` neighbours.
 """
 
 from __future__ import annotations
@@ -10,10 +9,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_osr.data.on_disk import TransitionsOnDisk
-from torchrl_osr.data.replay_buffer import observation_statistics
+from torchrl_osr.data import TransitionsOnDisk, observation_statistics
 
-# More of them fall out of the processor's cache and are slower.
+# More rows do not fit into the processor's cache and are slower.
 ROWS_AT_A_TIME = 64
 
 
@@ -25,8 +23,8 @@ class DataDistance:
 
     with :math:`s_{(k)}` the ``k``-th nearest of a random subset of the data's states
     and :math:`\sigma` their standard deviation in each dimension. A state counts as in
-    the data up to :attr:`threshold`, which 95 % of held-out states of the data are
-    within: states that are in no subset that they are compared with.
+    the data up to :attr:`threshold`: 95 % of the data's held-out states, which are not
+    in the subset, are within it.
 
     Args:
         data: transitions ``[N]`` with raw ``observation`` ``[N, S]``, in memory or on
@@ -50,7 +48,7 @@ class DataDistance:
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl_osr.evaluation.data_distance import DataDistance
+        >>> from torchrl_osr.evaluation import DataDistance
         >>> rows = torch.randn(1000, 3, generator=torch.Generator().manual_seed(0))
         >>> distance = DataDistance(TensorDict({"observation": rows}, [1000]))
         >>> far = torch.tensor([[0.0, 0.0, 0.0], [9.0, 9.0, 9.0]])
@@ -84,7 +82,7 @@ class DataDistance:
         self._loc, self._scale = loc.cpu().double(), scale.cpu().double()
         generator = torch.Generator().manual_seed(seed)
         order = torch.randperm(len(data), generator=generator)
-        # Read, of a set on disk, and not the rest.
+        # Of a set on disk, only these rows are read.
         states, others = (
             data[rows]["observation"].cpu()
             for rows in (order[held_out:][:reference], order[:held_out])
@@ -96,7 +94,7 @@ class DataDistance:
         self.threshold = float(torch.quantile(distances.double(), quantile))
 
     def __call__(self, observation: Tensor) -> Tensor:
-        """Return the distance of raw observations ``[M, S]``, float32 ``[M]``."""
+        """Distance of raw observations ``[M, S]``, float32 ``[M]``."""
         distances = [
             self._chunk(self._standard(rows))
             for rows in torch.split(observation.cpu(), ROWS_AT_A_TIME)
@@ -107,8 +105,8 @@ class DataDistance:
         return (observation.double() - self._loc) / self._scale
 
     def _chunk(self, states: Tensor) -> Tensor:
-        # |s - r|^2 = |s|^2 + |r|^2 - 2 s r cancels digits where s and r are near: in
-        # double precision there are enough of them, for a third of time more.
+        # |s - r|^2 = |s|^2 + |r|^2 - 2 s r cancels digits where s and r are near. Double
+        # precision has enough of them and takes a third longer.
         others = torch.addmm(self._squares, states, self._states.T, alpha=-2)
         # |s|^2 does not change which are near.
         near = others.topk(self.num_neighbors, largest=False, sorted=False).values

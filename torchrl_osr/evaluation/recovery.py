@@ -1,7 +1,7 @@
-"""What became of an episode after a disturbance: survival and the way back.
+"""Survival and return to the data after a transient disturbance.
 
-Moments: entry 0 of a trajectory is the reset, entry ``i + 1`` is step ``i``. Offsets
-count from the entry in which the disturbance acted last, offset 0.
+Entry 0 of a trajectory is the reset, entry ``i + 1`` is step ``i``. Offsets count from
+the last entry in which the disturbance acted, offset 0.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from numpy.typing import NDArray
 from torchrl_osr.evaluation.data_distance import DataDistance
 
 STEPS_BEFORE, STEPS_AFTER = 10, 100
-"""How far the distance is followed around the end of a disturbance.
+"""Steps around the end of a disturbance over which distances are averaged.
 
-Whoever has not fallen that many steps after it counts as alive.
+An episode without a fall until :data:`STEPS_AFTER` steps after it counts as alive.
 """
 
 
 @dataclass
 class Trajectory:
-    """One episode as it was played.
+    """One recorded episode.
 
     Attributes:
         observations: of the reset and of each step, float32 ``[S]`` each.
-        disturbed: whether the disturbance acted there, as ``info`` says.
+        disturbed: ``info["disturbed"]`` of each.
         terminated: whether the episode ended by a fall, neither by the time limit nor
             at a goal.
     """
@@ -45,10 +45,13 @@ class Trajectory:
 
 
 class Recorder:
-    """Keeps the trajectories of an evaluation; its ``watch``.
+    """Keeps the trajectories of an evaluation, as its ``watch``.
 
     Args:
         num_episodes: of the evaluation.
+
+    Attributes:
+        trajectories: one for each episode.
     """
 
     def __init__(self, num_episodes: int) -> None:
@@ -61,7 +64,7 @@ class Recorder:
         terminated: bool,
         info: dict[str, Any],
     ) -> None:
-        """Append what a reset or a step returned."""
+        """Append the results of a reset or a step."""
         trajectory = self.trajectories[episode]
         # astype copies: an environment may write into the same array again.
         trajectory.observations.append(observation.astype(np.float32))
@@ -90,25 +93,26 @@ class DistanceCurve:
         self.count[place] += 1
 
     def mean(self) -> list[float | None]:
-        """Return the mean at each offset, ``None`` where no episode has one."""
+        """Mean at each offset, ``None`` where no episode has one."""
         pairs = zip(self._total, self.count, strict=True)
         return [float(total / count) if count else None for total, count in pairs]
 
 
 @dataclass
 class Recovery:
-    """How the episodes took a transient disturbance, one entry an episode.
+    """Survival and recovery after a transient disturbance, one entry an episode.
+
+    All entries of an episode without the disturbance are ``None``.
 
     Attributes:
-        ended_at: last step that it acted in, ``None`` where there was none.
-        survived: had not fallen then; ``None`` where there was none.
-        alive_after: had not fallen :data:`STEPS_AFTER` steps later; ``None`` where
-            there was none, or the time limit came first.
+        ended_at: last step in which the disturbance acted.
+        survived: had not fallen by then.
+        alive_after: had not fallen :data:`STEPS_AFTER` steps later; ``None`` where the
+            time limit came first.
         clean_alive_after: the same for the undisturbed episodes of the pairs: some
             would have fallen anyway.
-        steps: from its end until the distance to the data is within the threshold,
-            0 if it is at once; ``None`` where there was none, and for those who fell or
-            were not back at the episode's end.
+        steps: from its end until the distance to the data is within the threshold, 0 if
+            it never left; ``None`` where the episode ended before.
         distance: in units of the threshold, as far as the episodes go.
         clean_distance: of the undisturbed episodes, at the same steps.
     """
@@ -123,7 +127,7 @@ class Recovery:
 
 
 def disturbed_at(trajectory: Trajectory) -> int | None:
-    """Return the step of the first disturbance, from 0; ``None`` if there was none.
+    """Step of the first disturbance, from 0; ``None`` if there was none.
 
     A disturbance of the start state counts as step 0.
     """
@@ -134,10 +138,10 @@ def disturbed_at(trajectory: Trajectory) -> int | None:
 def measure_recovery(
     disturbed: Sequence[Trajectory], clean: Sequence[Trajectory], distance: DataDistance
 ) -> Recovery:
-    """Return survival, recovery and the distance around the disturbance.
+    """Survival, recovery and distances of the episodes under one disturbance.
 
     Args:
-        disturbed: of one level's episodes.
+        disturbed: its episodes.
         clean: the undisturbed ones of the pairs.
         distance: to the data, with its threshold.
     """
@@ -166,14 +170,14 @@ def measure_recovery(
         if back is None:
             later = _relative(trajectory.observations[window.stop :], distance)
             back = _first_within(later, STEPS_AFTER + 1)
-        # The place where somebody lies is not one that they have come back to.
-        lies_there = trajectory.terminated and back == trajectory.last - end
-        recovery.steps.append(None if lies_there else back)
+        # The state of the fall itself does not count as recovered.
+        fell_there = trajectory.terminated and back == trajectory.last - end
+        recovery.steps.append(None if fell_there else back)
     return recovery
 
 
 def _alive_after(trajectory: Trajectory, end: int) -> bool | None:
-    """Return whether it has not fallen :data:`STEPS_AFTER` steps after ``end``."""
+    """Whether there is no fall until :data:`STEPS_AFTER` steps after ``end``."""
     fell_within = trajectory.terminated and trajectory.last <= end + STEPS_AFTER
     if fell_within:
         return False
@@ -181,7 +185,7 @@ def _alive_after(trajectory: Trajectory, end: int) -> bool | None:
 
 
 def _first_block(disturbed: Sequence[bool]) -> tuple[int, int] | None:
-    """Return first and last entry of the first disturbance."""
+    """First and last entry of the first disturbance."""
     if True not in disturbed:
         return None
     first = last = disturbed.index(True)
@@ -193,7 +197,7 @@ def _first_block(disturbed: Sequence[bool]) -> tuple[int, int] | None:
 def _relative(
     observations: Sequence[NDArray[np.float32]], distance: DataDistance
 ) -> NDArray[np.float64]:
-    """Return distances in units of the threshold."""
+    """Distances in units of the threshold."""
     if not observations:
         return np.empty(0)
     rows = torch.from_numpy(np.stack(observations))
@@ -202,6 +206,6 @@ def _relative(
 
 
 def _first_within(curve: NDArray[np.float64], offset: int = 0) -> int | None:
-    """Return where the curve is first within the threshold, counted from ``offset``."""
+    """First entry within the threshold, counted from ``offset``."""
     within = np.flatnonzero(curve <= 1)
     return offset + int(within[0]) if within.size else None

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchrl_osr.evaluation.figures import whole_picture
+from torchrl_osr._files import write_beside
 from torchrl_osr.report.checks import cells, data_of, methods_of
 from torchrl_osr.report.runs import Run
 from torchrl_osr.report.scores import (
@@ -150,7 +150,7 @@ def draw(axes: Axes, curve: Curve, style: Style) -> None:
 
 def save(figure: Figure, path: Path) -> Path:
     """Write a figure, all or nothing; return where."""
-    with whole_picture(path) as beside:
+    with write_beside(path) as beside:
         figure.savefig(beside, dpi=DPI, facecolor="white", format="png")
     return path
 

@@ -1,8 +1,8 @@
-"""A disturbance, and then: several controllers go on from the very same state.
+"""Several controllers that go on from the same state after a disturbance.
 
-The behaviour policy plays until the disturbance is over, whoever is tested plays from
-then on. What becomes of the episode is then up to them alone, and not to the state in
-which each would have met the disturbance.
+The behaviour policy plays until the disturbance is over; then the controller that is
+tested takes over. The rest of the episode depends on the controller alone, not on the
+state in which each would have met the disturbance.
 
 Shapes: ``E`` episodes, ``S`` observation, ``A`` action, ``Q`` joint positions.
 """
@@ -10,7 +10,8 @@ Shapes: ``E`` episodes, ``S`` observation, ``A`` action, ``Q`` joint positions.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeAlias
 
 import gymnasium
 import numpy as np
@@ -18,34 +19,91 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrl_osr.evaluation.data_distance import DataDistance
-from torchrl_osr.evaluation.episodes import EpisodeEvaluator, Policy, Wrap
-from torchrl_osr.evaluation.recovery import Recorder, disturbed_at, measure_recovery
-from torchrl_osr.evaluation.survival import Survival, steps_alive
+from torchrl_osr.evaluation import (
+    DataDistance,
+    EpisodeEvaluator,
+    Policy,
+    Recorder,
+    Trajectory,
+    Wrap,
+    disturbed_at,
+    measure_recovery,
+    wilson_interval,
+)
+from torchrl_osr.evaluation.robustness import aligned_columns
 
 NEVER = torch.iinfo(torch.int64).max
-"""When somebody takes over in an episode that meets no disturbance."""
+"""Moment of the takeover in an episode without a disturbance."""
 
 BEHAVIOR = "behaviour policy"
-"""Name of the controller that plays on when the disturbance is over."""
+"""Name of the behaviour policy among the controllers: it goes on playing."""
 
-Controller = Callable[[list[Tensor]], Policy]
+Controller: TypeAlias = Callable[[list[Tensor]], Policy]
 """Makes a policy for one evaluation.
 
-It is given the behaviour policy's undisturbed episodes, raw observations ``[T, S]`` of
-each from the reset on.
+Its argument is the behaviour policy's undisturbed episodes, raw observations ``[T, S]``
+of each from the reset on.
 """
 
 
+def steps_alive(trajectory: Trajectory, moment: int, steps: int) -> int:
+    """Steps of an episode without a fall after a moment, at most ``steps``.
+
+    Args:
+        trajectory: lasts ``steps`` steps after the moment, or ends in a fall.
+        moment: the entry to count from.
+        steps: to be counted at most.
+
+    Raises:
+        ValueError: if it ended before that without a fall.
+    """
+    later = trajectory.last - moment
+    if later < steps and not trajectory.terminated:
+        raise ValueError(f"broken off {later} steps after entry {moment}, not {steps}.")
+    # The last entry of a fallen one is the fall.
+    return max(min(later - trajectory.terminated, steps), 0)
+
+
+@dataclass(frozen=True)
+class Survival:
+    """Survival and recovery of one controller, one entry an episode.
+
+    Attributes:
+        horizons: numbers of steps after the disturbance at which survivors are counted,
+            ascending.
+        returns: sum of the rewards of all steps, ``[E]``.
+        alive: steps without a fall after it, at most the last horizon, ``[E]``.
+        alive_clean: the same in the undisturbed episode, after the same moment,
+            ``[E]``.
+        steps_back: steps until back in the data, ``None`` if never, ``[E]``.
+    """
+
+    horizons: tuple[int, ...]
+    returns: list[float]
+    alive: list[int]
+    alive_clean: list[int]
+    steps_back: list[int | None]
+
+    @property
+    def up(self) -> list[bool]:
+        """Whether it had not fallen at the last horizon, ``[E]``."""
+        return [steps >= self.horizons[-1] for steps in self.alive]
+
+    def count(self, horizon: int, *, clean: bool = False) -> int:
+        """Number of episodes without a fall until ``horizon`` steps later."""
+        alive = self.alive_clean if clean else self.alive
+        return sum(steps >= horizon for steps in alive)
+
+
 class PoseRecorder(Recorder):
-    """Keeps what a film needs beside the trajectories.
+    """Keeps trajectories and the poses of the robot.
 
     Args:
         environments: of the evaluation, MuJoCo's.
 
     Attributes:
         poses: joint positions at each entry of each episode, ``[Q]`` each.
-        forces: the push that each episode met, with its sign; 0 if none.
+        forces: of the push in each episode, with its sign; 0 if there was none.
         returns: sum of rewards of each episode.
     """
 
@@ -80,7 +138,7 @@ class Takeover(NamedTuple):
     clean: PoseRecorder
 
     def up_clean(self, moments: Tensor, steps: int) -> list[int]:
-        """Return which episodes meet a disturbance, and without it last that long.
+        """Numbers of the disturbed episodes that last that long without disturbance.
 
         Args:
             moments: when it was over, int64 ``[E]``, or :data:`NEVER`.
@@ -101,13 +159,13 @@ class Takeover(NamedTuple):
         distance: DataDistance,
         horizons: tuple[int, ...],
     ) -> Survival:
-        """Return what became of some of the episodes.
+        """Survival and recovery in some of the episodes.
 
         Args:
             episodes: their numbers; each met the disturbance.
             moments: when it was over, int64 ``[E]``.
             distance: to the data.
-            horizons: see :class:`~torchrl_osr.evaluation.survival.Survival`.
+            horizons: see :class:`Survival`.
         """
         disturbed, clean = (
             [recorder.trajectories[episode] for episode in episodes]
@@ -127,10 +185,11 @@ class Takeover(NamedTuple):
 
 
 def hand_over(before: Policy, after: Policy, moments: Tensor) -> Policy:
-    """Return a policy that is one until a moment and another from then on.
+    """One policy up to a moment, and another one from then on.
 
-    Both are asked in every step, so that a controller that counts its calls knows the
-    time. It counts itself, too: for one evaluation, with all rows in every call.
+    Both are called in every step, so that a controller that counts its calls knows the
+    time. The policy counts its own calls, too: it is for one evaluation with all rows
+    in every call.
 
     Args:
         before: acts first.
@@ -166,20 +225,20 @@ def play_takeovers(
     Args:
         env_id: a Gymnasium id of a MuJoCo task.
         behavior: plays first; the same observation gives the same action.
-        controllers: by name, who takes over.
+        controllers: by name.
         disturbance: wraps the environment, acts once an episode.
 
     Keyword Args:
         duration: of the disturbance, in steps.
-        latest: step that it has begun at.
-        after: steps that are played at least after its end.
+        latest: step at which it begins at the latest.
+        after: steps that are played after its end, at least.
         num_episodes: ``E``. Default 20.
         seed: the episodes are seeded ``seed, seed + 1, ...``. Default 0.
 
     Returns:
-        By name, the behaviour policy first as :data:`BEHAVIOR`; and the entry after
-        each episode's disturbance, which the controller takes over at, int64 ``[E]``,
-        :data:`NEVER` where the behaviour policy fell before.
+        Episodes by controller, the behaviour policy first as :data:`BEHAVIOR`; and the
+        entry after each episode's disturbance, at which the controller takes over,
+        int64 ``[E]``, :data:`NEVER` where the behaviour policy fell before.
     """
 
     def play(policy: Policy, wrap: Wrap) -> PoseRecorder:
@@ -202,7 +261,7 @@ def play_takeovers(
         for each in played[BEHAVIOR].clean.trajectories
     ]
     for name, make in controllers.items():
-        # A controller that counts its calls is for one evaluation: two are made.
+        # One policy for each evaluation: it may count its calls.
         played[name] = Takeover(
             *(
                 play(hand_over(behavior, make(references), moments), wrap)
@@ -210,3 +269,41 @@ def play_takeovers(
             )
         )
     return played, moments
+
+
+def discordant(ours: Sequence[bool], theirs: Sequence[bool]) -> tuple[int, int]:
+    """Numbers of pairs in which only the first is true, and only the second."""
+    pairs = list(zip(ours, theirs, strict=True))
+    return pairs.count((True, False)), pairs.count((False, True))
+
+
+def survival_table(controllers: Mapping[str, Survival]) -> str:
+    """Text table with one line for each controller, the first being the reference.
+
+    The last column counts pairs at the last horizon: those in which only this
+    controller was up, and those in which only the reference was.
+
+    Args:
+        controllers: by name; the same disturbed episodes each.
+    """
+    reference = next(iter(controllers.values()))
+    total, last = len(reference.alive), reference.horizons[-1]
+    titles = [f"up after {each}" for each in reference.horizons]
+    titles += ["95 % interval", f"undisturbed {last}", "back in data", "only it/first"]
+    rows = [["", *titles]]
+    for name, each in controllers.items():
+        low, high = wilson_interval(each.count(last), total)
+        back = [steps for steps in each.steps_back if steps is not None]
+        median = f" in {np.median(back):.0f}" if back else ""
+        only_it, only_reference = discordant(each.up, reference.up)
+        rows.append(
+            [
+                name,
+                *(str(each.count(horizon)) for horizon in each.horizons),
+                f"{100 * low:.0f}-{100 * high:.0f} %",
+                str(each.count(last, clean=True)),
+                f"{len(back)}{median}",
+                "" if each is reference else f"{only_it}/{only_reference}",
+            ]
+        )
+    return "\n".join(line.rstrip() for line in aligned_columns(rows))
