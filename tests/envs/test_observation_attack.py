@@ -57,7 +57,11 @@ def trained():
         torch.randn(11), torch.rand(11) + 0.5, ["observation"], standard_normal=True
     )
     return SimpleNamespace(
-        actor=actor, loss=loss, policy=actor.get_dist, qvalue=critics_of(loss), norm=norm
+        actor=actor,
+        loss=loss,
+        policy=actor.get_dist,
+        qvalue=critics_of(loss),
+        norm=norm,
     )
 
 

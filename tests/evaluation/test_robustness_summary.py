@@ -7,16 +7,19 @@ import json
 import numpy as np
 import pytest
 
-from torchrl_osr.evaluation.episodes import EpisodeResults
-from torchrl_osr.evaluation.recovery import Recovery
-from torchrl_osr.evaluation.robustness import Level, LevelResults, PairedResults
-from torchrl_osr.evaluation.robustness_figure import distance_curves, robustness_figure
-from torchrl_osr.evaluation.robustness_summary import (
+from torchrl_osr.evaluation import (
+    Disturbance,
+    DisturbanceResults,
+    EpisodeResults,
+    PairedResults,
+    Recovery,
     decrease_interval,
+    distance_curves,
     evaluation_json,
-    summarize_levels,
+    robustness_figure,
+    robustness_table,
+    summarize_disturbances,
 )
-from torchrl_osr.evaluation.robustness_table import robustness_table
 
 
 def test_decrease_by_hand():
@@ -55,7 +58,10 @@ def episodes(*scores: float) -> EpisodeResults:
 @pytest.fixture
 def evaluations():
     """Two checkpoints of three pairs, a knock and a change that does not end."""
-    knock, mass = Level("knock", "knock", 5.0), Level("mass", "dynamics", 1.5)
+    knock, mass = (
+        Disturbance("knock", "knock", 5.0),
+        Disturbance("mass", "dynamics", 1.5),
+    )
 
     def evaluation(step, clean, knocked, heavy, moments, steps, alive):
         recovery = Recovery(
@@ -64,11 +70,12 @@ def evaluations():
         )  # fmt: skip
         recovery.distance.add(np.array([1.0, 3.0, 1.0]), -1)
         recovery.clean_distance.add(np.array([0.5, 0.5, 0.5]), -1)
-        levels = [
-            LevelResults(knock, episodes(*knocked), moments, recovery),
-            LevelResults(mass, episodes(*heavy), [0, 0, 0], None),
+        disturbed = [
+            DisturbanceResults(knock, episodes(*knocked), moments, recovery),
+            DisturbanceResults(mass, episodes(*heavy), [0, 0, 0], None),
         ]
-        return evaluation_json(step, PairedResults(episodes(*clean), levels), "hopper")
+        paired = PairedResults(episodes(*clean), disturbed)
+        return evaluation_json(step, paired, "hopper")
 
     return [
         evaluation(
@@ -99,7 +106,7 @@ def test_json_has_every_entry_and_no_nan(evaluations):
 
 
 def test_summary_is_over_all_checkpoints(evaluations):
-    knock, mass = summarize_levels(evaluations)
+    knock, mass = summarize_disturbances(evaluations)
     assert knock["clean_score"] == pytest.approx(55)
     assert knock["score"] == pytest.approx(45)
     assert knock["decrease"] == pytest.approx(100 * 10 / 55)
@@ -122,7 +129,7 @@ def test_summary_is_over_all_checkpoints(evaluations):
 def test_median_of_mostly_never_is_no_number(evaluations):
     for each in evaluations:
         each["levels"][0]["recovery_steps"] = [5, None, None]
-    knock, _ = summarize_levels(evaluations)
+    knock, _ = summarize_disturbances(evaluations)
     assert knock["recovery_median"] is None
     assert knock["recovered_share"] == pytest.approx(2 / 4)
 
@@ -132,7 +139,7 @@ def test_nobody_met_it(evaluations):
         each["levels"][0]["disturbed_at"] = [None] * 3
         each["levels"][0]["recovery_steps"] = [None] * 3
         each["levels"][0]["alive_after"] = [None] * 3
-    knock, _ = summarize_levels(evaluations)
+    knock, _ = summarize_disturbances(evaluations)
     assert knock["disturbed_share"] == 0
     assert knock["survival"] is knock["recovered_share"] is None
     assert knock["score_disturbed"] is knock["decrease_disturbed"] is None
@@ -140,7 +147,7 @@ def test_nobody_met_it(evaluations):
 
 
 def test_table_names_every_level(evaluations):
-    lines = robustness_table("hopper", summarize_levels(evaluations)).splitlines()
+    lines = robustness_table("hopper", summarize_disturbances(evaluations)).splitlines()
     assert lines[0] == "hopper"
     assert len({len(line) for line in lines[1:]}) == 1, "columns are aligned"
     assert lines[2].split()[:4] == ["knock", "55.0", "45.0", "18.2"]
@@ -157,7 +164,7 @@ def test_curves_are_weighted_by_episodes(evaluations):
 
 @pytest.mark.parametrize("sweep", [False, True])
 def test_figure_is_drawn(evaluations, tmp_path, sweep):
-    summary = summarize_levels(evaluations)
+    summary = summarize_disturbances(evaluations)
     if sweep:  # every kind at several strengths
         summary = [row | {"strength": s} for row in summary for s in (1.0, 2.0)]
     path = tmp_path / "figure.png"

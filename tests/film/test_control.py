@@ -9,19 +9,8 @@ from torch import nn
 from torchrl.envs import ObservationNorm
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
-from torchrl_osr import OSRLoss
-from torchrl_osr.evaluation.inverse_dynamics_control import (
-    InverseDynamicsController,
-    frozen_model,
-    nearest_target,
-    time_target,
-)
-from torchrl_osr.modules import (
-    critic_ensemble,
-    cvae_inverse_dynamics,
-    tanh_gaussian_actor,
-    tanh_gaussian_inverse_dynamics,
-)
+from torchrl_osr.film import InverseDynamicsController, nearest_target, time_target
+from torchrl_osr.modules import cvae_inverse_dynamics
 
 # x' = A x + B a, and by hand B^-1: a = B^-1 (x' - A x).
 A = torch.tensor([[1.0, 0.5], [0.0, 1.0]])
@@ -36,10 +25,10 @@ class ExactInverse(nn.Module):
         super().__init__()
         self.loc, self.scale = loc, scale
 
-    def forward(self, present, following):
-        present = present * self.scale + self.loc
-        following = following * self.scale + self.loc
-        action = (following - present @ A.T) @ B_INVERSE.T
+    def forward(self, observation, next_observation):
+        observation = observation * self.scale + self.loc
+        next_observation = next_observation * self.scale + self.loc
+        action = (next_observation - observation @ A.T) @ B_INVERSE.T
         return torch.atanh(action), torch.full_like(action, 0.1)
 
 
@@ -155,24 +144,6 @@ def test_latent_is_at_its_mean():
         InverseDynamicsController(model, references)(state) for _ in range(2)
     )
     assert torch.equal(first, second)
-
-
-def test_frozen_model_is_the_one_that_the_loss_was_given():
-    model = tanh_gaussian_inverse_dynamics(2, 2, num_cells=[8])
-    actor = tanh_gaussian_actor(2, 2, num_cells=[8])
-    critics = critic_ensemble(2, 2, num_cells=[8])
-    loss = OSRLoss(actor, critics, model, recovery_weight=0.5)
-    references, state = [torch.randn(4, 2)], torch.randn(1, 2)
-    wanted = InverseDynamicsController(model, references)(state)
-    got = InverseDynamicsController(frozen_model(loss), references)(state)
-    assert torch.equal(got, wanted)
-
-
-def test_frozen_model_of_cql_is_an_error():
-    actor = tanh_gaussian_actor(2, 2, num_cells=[8])
-    loss = OSRLoss(actor, critic_ensemble(2, 2, num_cells=[8]), recovery_weight=0)
-    with pytest.raises(ValueError, match="OSRLoss holds no inverse dynamics model"):
-        frozen_model(loss)
 
 
 @pytest.mark.parametrize(

@@ -130,6 +130,4 @@ def load_trained(path: Path | str) -> TrainedRun:
     step = int(numbered[1]) if numbered else int(manifest["metadata"]["step"])
     # The loss's parameters of the model are the model's own tensors.
     inverse_dynamics = model if hasattr(loss, "inverse_dynamics_network") else None
-    return TrainedRun(
-        config, actor, inverse_dynamics, loss, norm, step, path, folder
-    )
+    return TrainedRun(config, actor, inverse_dynamics, loss, norm, step, path, folder)
