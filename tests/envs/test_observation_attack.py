@@ -15,7 +15,7 @@ from torchrl.objectives import SACLoss, SoftUpdate
 
 from torchrl_osr import OSRLoss
 from torchrl_osr.envs import attacked_policy, critics_of
-from torchrl_osr.evaluation import EpisodeEvaluator, deterministic_policy
+from torchrl_osr.evaluation import deterministic_policy
 from torchrl_osr.functional import jeffreys_divergence
 from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
 
@@ -249,19 +249,6 @@ def test_seeds_decide_and_the_global_generator_is_left_alone(trained, kind):
     assert not torch.equal(first, play(2))
     assert not torch.equal(first[0], first[1]), "draws go on from call to call"
     assert not first.requires_grad
-
-
-def test_attacks_in_the_batched_evaluator(trained):
-    evaluator = EpisodeEvaluator("Hopper-v5", num_episodes=3)
-
-    def play(epsilon):
-        arguments = {"kind": "min_Q", "epsilon": epsilon, "num_samples": 5}
-        policy = attacked_policy(trained.policy, trained.qvalue, **arguments)
-        return evaluator(policy).returns.tolist()
-
-    assert play(0.0) == evaluator(deterministic_policy(trained.actor)).returns.tolist()
-    assert play(0.3) == play(0.3) != play(0.0)
-    evaluator.close()
 
 
 @pytest.mark.parametrize(

@@ -67,7 +67,7 @@ def test_episodes_without_the_disturbance_say_nothing():
     for entry in (recovery.ended_at, recovery.survived, recovery.alive_after):
         assert entry == [None]
     assert recovery.steps == recovery.clean_alive_after == [None]
-    assert set(recovery.distance.mean()) == {None}
+    assert np.isnan(recovery.distance).all()
 
 
 @pytest.mark.parametrize(
@@ -90,23 +90,27 @@ def test_undisturbed_pairs_are_looked_at_at_the_same_step():
     ended = trajectory([1.0] * 50)
     recovery = measure_recovery([disturbed] * 3, [fallen, whole, ended], Distance())
     assert recovery.clean_alive_after == [False, True, None]
-    offset = STEPS_BEFORE + 60
-    assert recovery.clean_distance.count[STEPS_BEFORE] == 3
-    assert recovery.clean_distance.count[offset] == 1
+    there = ~np.isnan(recovery.clean_distance)
+    assert there[:, STEPS_BEFORE].tolist() == [True, True, True]
+    assert there[:, STEPS_BEFORE + 60].tolist() == [False, True, False]
 
 
-def test_curve_is_the_mean_of_those_who_are_there():
+def test_distances_are_around_the_end_of_the_disturbance():
     long = trajectory([1.0] * 20 + [6.0] + [2.0] * 200, {20})
     short = trajectory([1.0, 1.0, 4.0, 3.0], {2}, fell=True)
     recovery = measure(long, short)
-    mean, count = recovery.distance.mean(), recovery.distance.count
-    assert len(mean) == len(count) == STEPS_BEFORE + 1 + STEPS_AFTER
-    # In units of the threshold, 2: (6 + 4) / 2 / 2 and (2 + 3) / 2 / 2.
-    assert mean[STEPS_BEFORE : STEPS_BEFORE + 3] == [2.5, 1.25, 1.0]
-    assert count[STEPS_BEFORE : STEPS_BEFORE + 3].tolist() == [2, 2, 1]
-    assert count[:STEPS_BEFORE].tolist() == [1] * 8 + [2] * 2  # the reset is entry 0
-    assert count[-1] == 1
-    assert mean[0] == 0.5
+    size = STEPS_BEFORE + 1 + STEPS_AFTER
+    assert recovery.distance.shape == recovery.clean_distance.shape == (2, size)
+    # In units of the threshold, 2.
+    around = recovery.distance[:, STEPS_BEFORE - 3 : STEPS_BEFORE + 3]
+    nan = np.nan
+    np.testing.assert_array_equal(
+        around, [[0.5, 0.5, 0.5, 3.0, 1.0, 1.0], [nan, 0.5, 0.5, 2.0, 1.5, nan]]
+    )
+    there = ~np.isnan(recovery.distance)
+    assert there.sum(1).tolist() == [size, 4]
+    assert recovery.distance[0, 0] == 0.5
+    assert recovery.distance[0, -1] == 1.0
 
 
 def test_recorder_keeps_what_it_was_told():

@@ -182,19 +182,6 @@ def test_an_episode_depends_on_its_own_disturbance_alone():
     np.testing.assert_array_equal(same, ~met)
 
 
-def test_global_generators_are_left_alone():
-    wrap = partial(ActionKnock, steps=5, mode="paper", at="random", window=(5, 20))
-    before, state = np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
-    results = play(Disturbance("knock", "knock", 5, wrap))
-    assert torch.equal(state, torch.get_rng_state())
-    after = np.random.get_state()  # noqa: NPY002
-    assert all(map(np.array_equal, before, after))
-    again = play(Disturbance("knock", "knock", 5, wrap))
-    np.testing.assert_array_equal(
-        results.disturbed[0].results.returns, again.disturbed[0].results.returns
-    )
-
-
 @pytest.mark.parametrize(
     ("disturbances", "episodes", "named"),
     [

@@ -55,6 +55,14 @@ def episodes(*scores: float) -> EpisodeResults:
     return EpisodeResults(returns, np.full(size, 300), np.arange(size))
 
 
+def around(*curves: list[float]) -> np.ndarray:
+    """Distances from one step before the disturbance's end on."""
+    distances = np.full((len(curves), 111), np.nan)
+    for row, curve in zip(distances, curves, strict=True):
+        row[9 : 9 + len(curve)] = curve
+    return distances
+
+
 @pytest.fixture
 def evaluations():
     """Two checkpoints of three pairs, a knock and a change that does not end."""
@@ -67,9 +75,8 @@ def evaluations():
         recovery = Recovery(
             moments, [None if m is None else True for m in moments], alive,
             [True if m else None for m in moments], steps,
+            around([1.0, 3.0, 1.0], [], [2.0, 4.0]), around([0.5, 0.5, 0.5], [], []),
         )  # fmt: skip
-        recovery.distance.add(np.array([1.0, 3.0, 1.0]), -1)
-        recovery.clean_distance.add(np.array([0.5, 0.5, 0.5]), -1)
         disturbed = [
             DisturbanceResults(knock, episodes(*knocked), moments, recovery),
             DisturbanceResults(mass, episodes(*heavy), [0, 0, 0], None),
@@ -98,8 +105,9 @@ def test_json_has_every_entry_and_no_nan(evaluations):
     assert knock["alive_after"] == [True, False, None]
     assert knock["distance"]["offset"][0] == -10
     assert knock["distance"]["offset"][-1] == 100
-    assert knock["distance"]["mean"][9:13] == [1, 3, 1, None]
-    assert knock["distance"]["count"][9:13] == [1, 1, 1, 0]
+    assert knock["distance"]["mean"][9:13] == [1.5, 3.5, 1, None]
+    assert knock["distance"]["count"][9:13] == [2, 2, 1, 0]
+    assert knock["distance"]["clean_mean"][9:13] == [0.5, 0.5, 0.5, None]
     for entry in ("survived_knock", "alive_after", "recovery_steps", "distance"):
         assert mass[entry] is None
     assert mass["disturbed_at"] == [0, 0, 0]
@@ -146,7 +154,7 @@ def test_nobody_met_it(evaluations):
     assert "0 %" in robustness_table("title", [knock])
 
 
-def test_table_names_every_level(evaluations):
+def test_table_names_every_disturbance(evaluations):
     lines = robustness_table("hopper", summarize_disturbances(evaluations)).splitlines()
     assert lines[0] == "hopper"
     assert len({len(line) for line in lines[1:]}) == 1, "columns are aligned"
@@ -155,9 +163,11 @@ def test_table_names_every_level(evaluations):
 
 
 def test_curves_are_weighted_by_episodes(evaluations):
+    distance = evaluations[1]["levels"][0]["distance"]
+    distance["mean"][10], distance["count"][10] = 7.5, 6
     curves = distance_curves(evaluations)
     assert curves == {
-        "knock": ([-1, 0, 1], [1.0, 3.0, 1.0]),
+        "knock": ([-1, 0, 1], [1.5, 6.5, 1.0]),  # (2 * 3.5 + 6 * 7.5) / 8
         "undisturbed": ([-1, 0, 1], [0.5, 0.5, 0.5]),
     }
 

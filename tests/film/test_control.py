@@ -9,7 +9,7 @@ from torch import nn
 from torchrl.envs import ObservationNorm
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
-from torchrl_osr.film import InverseDynamicsController, nearest_target, time_target
+from torchrl_osr.film import InverseDynamicsController
 from torchrl_osr.modules import cvae_inverse_dynamics
 
 # x' = A x + B a, and by hand B^-1: a = B^-1 (x' - A x).
@@ -100,20 +100,26 @@ def test_nearest_is_measured_in_standard_deviations():
 
 
 def test_time_target_is_the_next_state_and_holds_at_the_end():
-    reference = torch.tensor([[0.0], [1.0], [2.0]])
-    assert [time_target(reference, t).item() for t in range(4)] == [1, 2, 2, 2]
+    reference = torch.tensor([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]])
+    controller = InverseDynamicsController(exact_model(), [reference])
+    targets = []
+    for controller.step in range(4):
+        targets.append(controller.targets(torch.zeros(1, 2))[0, 0].item())
+    assert targets == [1, 2, 2, 2]
 
 
 def test_nearest_target_is_the_successor_whatever_the_time():
     reference = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    controller = InverseDynamicsController(exact_model(), [reference], rule="nearest")
 
     def target(*state: float) -> list[float]:
-        return nearest_target(reference, torch.tensor(state)).tolist()
+        controller.step += 1
+        return controller.targets(torch.tensor([state]))[0].tolist()
 
     assert target(0.1, -0.2) == [1, 0]
     assert target(0.9, 0.2) == [1, 1]
     assert target(1.2, 0.9) == [0, 1]
-    assert target(0.0, 1.0) == [1, 0], "the last is nobody's nearest; (0, 0) is first"
+    assert target(0.0, 1.0) == [1, 0], "the last has no successor; (0, 0) is first"
 
 
 def test_late_by_two_steps_only_time_asks_for_a_jump():

@@ -134,8 +134,7 @@ class DisturbanceWrapper(gymnasium.Wrapper[Vector, Vector, Vector, Vector]):
 
     Args:
         env: the environment.
-        always: whether it acts in every step, and on the first observation. Default
-            ``False``.
+        always: whether it acts in every step and at the reset. Default ``False``.
     """
 
     def __init__(
@@ -166,10 +165,10 @@ class DisturbanceWrapper(gymnasium.Wrapper[Vector, Vector, Vector, Vector]):
 
 
 class TimedDisturbance(DisturbanceWrapper):
-    """Abstract base of what acts for ``duration`` steps, once an episode.
+    """Abstract base of the wrappers that act for some steps, once an episode.
 
-    At a fixed moment every episode is met in much the same phase of the gait, and the
-    result is a lottery of that phase; ``"random"`` averages over it.
+    At a fixed moment all episodes are in much the same phase of the gait, and the
+    result depends on that phase; ``"random"`` averages over it.
 
     Args:
         env: the environment.
@@ -207,10 +206,7 @@ class TimedDisturbance(DisturbanceWrapper):
         return observation, info
 
     def _count(self) -> int:
-        """Count a step of the agent and return its number from the moment on.
-
-        It is 0 for the first step that the disturbance may act in, negative before.
-        """
+        """Count a step of the agent; its number, 0 at the moment, negative before."""
         number = self._steps - self._start
         self._steps += 1
         return number

@@ -1,4 +1,4 @@
-"""Noise on the sensors: the agent sees a state that is not quite the true one."""
+"""Noise of the sensors: observations that differ from the true state."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from torchrl_osr.envs.base import (
 
 
 class ObservationNoise(DisturbanceWrapper):
-    r"""Add noise to every observation; the simulated state is left alone.
+    r"""Noise on every observation; the simulated state is unchanged.
 
     The noise of "DMBP: Diffusion Model-Based Predictor for Robust Offline
     Reinforcement Learning against State Observation Perturbations" (ICLR 2024), which
     is absolute; with ``unit`` it is relative to the data, as in RORL,
-    https://arxiv.org/abs/2206.02829. The first observation of an episode has it too.
+    https://arxiv.org/abs/2206.02829. The first observation of an episode is noisy, too.
     Bounds of the observation space are not enforced.
 
     Args:

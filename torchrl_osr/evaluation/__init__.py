@@ -24,7 +24,6 @@ from torchrl_osr.evaluation.inverse_dynamics import (
 from torchrl_osr.evaluation.recovery import (
     STEPS_AFTER,
     STEPS_BEFORE,
-    DistanceCurve,
     Recorder,
     Recovery,
     Trajectory,
@@ -67,7 +66,6 @@ __all__ = [
     "STEPS_AFTER",
     "STEPS_BEFORE",
     "DataDistance",
-    "DistanceCurve",
     "Disturbance",
     "DisturbanceResults",
     "EpisodeEvaluator",

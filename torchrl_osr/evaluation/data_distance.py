@@ -105,7 +105,7 @@ class DataDistance:
         return (observation.double() - self._loc) / self._scale
 
     def _chunk(self, states: Tensor) -> Tensor:
-        # |s - r|^2 = |s|^2 + |r|^2 - 2 s r cancels digits where s and r are near. Double
+        # |s - r|^2 = |s|^2 + |r|^2 - 2 s r cancels digits where s and r are near; double
         # precision has enough of them and takes a third longer.
         others = torch.addmm(self._squares, states, self._states.T, alpha=-2)
         # |s|^2 does not change which are near.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -72,37 +72,10 @@ class Recorder:
         trajectory.terminated = bool(terminated) and not info.get("success", False)
 
 
-class DistanceCurve:
-    """Mean distance to the data around the end of a disturbance.
-
-    Offsets go from :data:`STEPS_BEFORE` steps before to :data:`STEPS_AFTER` after it.
-
-    Attributes:
-        count: episodes behind each mean, those that have that step.
-    """
-
-    def __init__(self) -> None:
-        size = STEPS_BEFORE + 1 + STEPS_AFTER
-        self._total = np.zeros(size)
-        self.count = np.zeros(size, dtype=np.int64)
-
-    def add(self, curve: NDArray[np.float64], offset: int) -> None:
-        """Add an episode's distances from ``offset`` on."""
-        place = slice(offset + STEPS_BEFORE, offset + STEPS_BEFORE + len(curve))
-        self._total[place] += curve
-        self.count[place] += 1
-
-    def mean(self) -> list[float | None]:
-        """Mean at each offset, ``None`` where no episode has one."""
-        pairs = zip(self._total, self.count, strict=True)
-        return [float(total / count) if count else None for total, count in pairs]
-
-
-@dataclass
-class Recovery:
+class Recovery(NamedTuple):
     """Survival and recovery after a transient disturbance, one entry an episode.
 
-    All entries of an episode without the disturbance are ``None``.
+    All entries of an episode without the disturbance are ``None``, its distances NaN.
 
     Attributes:
         ended_at: last step in which the disturbance acted.
@@ -113,17 +86,19 @@ class Recovery:
             would have fallen anyway.
         steps: from its end until the distance to the data is within the threshold, 0 if
             it never left; ``None`` where the episode ended before.
-        distance: in units of the threshold, as far as the episodes go.
+        distance: in units of the threshold, from :data:`STEPS_BEFORE` steps before the
+            end of the disturbance to :data:`STEPS_AFTER` after it, ``[E, offsets]``;
+            NaN at steps that the episode does not have.
         clean_distance: of the undisturbed episodes, at the same steps.
     """
 
-    ended_at: list[int | None] = field(default_factory=list)
-    survived: list[bool | None] = field(default_factory=list)
-    alive_after: list[bool | None] = field(default_factory=list)
-    clean_alive_after: list[bool | None] = field(default_factory=list)
-    steps: list[int | None] = field(default_factory=list)
-    distance: DistanceCurve = field(default_factory=DistanceCurve)
-    clean_distance: DistanceCurve = field(default_factory=DistanceCurve)
+    ended_at: list[int | None]
+    survived: list[bool | None]
+    alive_after: list[bool | None]
+    clean_alive_after: list[bool | None]
+    steps: list[int | None]
+    distance: NDArray[np.float64]
+    clean_distance: NDArray[np.float64]
 
 
 def disturbed_at(trajectory: Trajectory) -> int | None:
@@ -145,35 +120,53 @@ def measure_recovery(
         clean: the undisturbed ones of the pairs.
         distance: to the data, with its threshold.
     """
-    recovery = Recovery()
-    for trajectory, pair in zip(disturbed, clean, strict=True):
-        block = _first_block(trajectory.disturbed)
-        if block is None:
-            for each in (recovery.ended_at, recovery.survived, recovery.steps):
-                each.append(None)
-            recovery.alive_after.append(None)
-            recovery.clean_alive_after.append(None)
-            continue
-        end = block[1]
-        recovery.ended_at.append(max(end - 1, 0))
-        fell_in_it = trajectory.terminated and trajectory.last == end
-        recovery.survived.append(not fell_in_it)
-        recovery.alive_after.append(_alive_after(trajectory, end))
-        recovery.clean_alive_after.append(_alive_after(pair, end))
-        start = max(end - STEPS_BEFORE, 0)
-        window = slice(start, end + STEPS_AFTER + 1)
-        curve = _relative(trajectory.observations[window], distance)
-        recovery.distance.add(curve, start - end)
-        clean_curve = _relative(pair.observations[window], distance)
-        recovery.clean_distance.add(clean_curve, start - end)
-        back = _first_within(curve[end - start :])
-        if back is None:
-            later = _relative(trajectory.observations[window.stop :], distance)
-            back = _first_within(later, STEPS_AFTER + 1)
-        # The state of the fall itself does not count as recovered.
-        fell_there = trajectory.terminated and back == trajectory.last - end
-        recovery.steps.append(None if fell_there else back)
-    return recovery
+    pairs = zip(disturbed, clean, strict=True)
+    *lists, near, clean_near = zip(
+        *(_recover(trajectory, pair, distance) for trajectory, pair in pairs),
+        strict=True,
+    )
+    return Recovery(*map(list, lists), np.stack(near), np.stack(clean_near))
+
+
+def _recover(
+    trajectory: Trajectory, pair: Trajectory, distance: DataDistance
+) -> tuple[Any, ...]:
+    """Entries of :class:`Recovery` for one episode."""
+    block = _first_block(trajectory.disturbed)
+    if block is None:
+        nowhere = np.full(STEPS_BEFORE + 1 + STEPS_AFTER, np.nan)
+        return None, None, None, None, None, nowhere, nowhere
+    end = block[1]
+    fell_in_it = trajectory.terminated and trajectory.last == end
+    curve = _around(trajectory, end, distance)
+    steps = _first_within(curve[STEPS_BEFORE:])
+    if steps is None:
+        later = _relative(trajectory.observations[end + STEPS_AFTER + 1 :], distance)
+        steps = _first_within(later, STEPS_AFTER + 1)
+    # The state of the fall itself does not count as recovered.
+    if trajectory.terminated and steps == trajectory.last - end:
+        steps = None
+    return (
+        max(end - 1, 0),
+        not fell_in_it,
+        _alive_after(trajectory, end),
+        _alive_after(pair, end),
+        steps,
+        curve,
+        _around(pair, end, distance),
+    )
+
+
+def _around(
+    trajectory: Trajectory, end: int, distance: DataDistance
+) -> NDArray[np.float64]:
+    """Distances around entry ``end``, NaN where there is no such entry."""
+    curve = np.full(STEPS_BEFORE + 1 + STEPS_AFTER, np.nan)
+    start = max(end - STEPS_BEFORE, 0)
+    there = trajectory.observations[start : end + STEPS_AFTER + 1]
+    first = start - end + STEPS_BEFORE
+    curve[first : first + len(there)] = _relative(there, distance)
+    return curve
 
 
 def _alive_after(trajectory: Trajectory, end: int) -> bool | None:

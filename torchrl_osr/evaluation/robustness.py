@@ -260,12 +260,17 @@ def _episodes_json(results: EpisodeResults, env_name: str) -> dict[str, Any]:
 
 def _disturbance_json(results: DisturbanceResults, env_name: str) -> dict[str, Any]:
     disturbance, recovery = results.disturbance, results.recovery
-    recovered: dict[str, Any] = dict.fromkeys(
-        ("ended_at", "survived_knock", "alive_after", "clean_alive_after")
-        + ("recovery_steps", "distance")
-    )
+    recovered: dict[str, Any] = {
+        "ended_at": None,
+        "survived_knock": None,
+        "alive_after": None,
+        "clean_alive_after": None,
+        "recovery_steps": None,
+        "distance": None,
+    }
     if recovery is not None:
-        distance, clean = recovery.distance, recovery.clean_distance
+        mean, count = _mean_curve(recovery.distance)
+        clean_mean, clean_count = _mean_curve(recovery.clean_distance)
         recovered = {
             "ended_at": recovery.ended_at,
             "survived_knock": recovery.survived,
@@ -274,10 +279,10 @@ def _disturbance_json(results: DisturbanceResults, env_name: str) -> dict[str, A
             "recovery_steps": recovery.steps,
             "distance": {
                 "offset": list(range(-STEPS_BEFORE, STEPS_AFTER + 1)),
-                "mean": distance.mean(),
-                "count": distance.count.tolist(),
-                "clean_mean": clean.mean(),
-                "clean_count": clean.count.tolist(),
+                "mean": mean,
+                "count": count,
+                "clean_mean": clean_mean,
+                "clean_count": clean_count,
             },
         }
     return {
@@ -288,6 +293,16 @@ def _disturbance_json(results: DisturbanceResults, env_name: str) -> dict[str, A
         "disturbed_at": results.disturbed_at,
         **recovered,
     }
+
+
+def _mean_curve(
+    distances: NDArray[np.float64],
+) -> tuple[list[float | None], list[int]]:
+    """Mean over the episodes that are there at each offset, and their number."""
+    count = (~np.isnan(distances)).sum(0)
+    total = np.nansum(distances, axis=0)
+    pairs = zip(total.tolist(), count.tolist(), strict=True)
+    return [sum_ / each if each else None for sum_, each in pairs], count.tolist()
 
 
 def summarize_disturbances(

@@ -49,7 +49,7 @@ def score_table(
     Args:
         title: what was trained on what.
         history: all evaluations with their ``"step"``, see
-            :func:`~torchrl_osr.evaluation.episodes.summarize`.
+            :func:`~torchrl_osr.evaluation.summarize`.
         best: the best of them; chosen by its own episodes, hence optimistic.
         data_score: mean normalised score of the data's episodes, if it is known.
         folder: where the run's files are.

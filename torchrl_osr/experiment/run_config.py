@@ -16,8 +16,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_osr._files import read_text
 
-# Those of our runs have 4 kB and four levels of nesting. PyYAML reads 64 kB in a second;
-# deep nesting exhausts Python's stack.
+# Those of our runs have 4 kB and four levels of nesting. PyYAML needs two seconds for
+# 64 kB, and deep nesting exhausts Python's stack.
 MAX_CONFIG_BYTES = 2**16
 MAX_CONFIG_DEPTH = 20
 

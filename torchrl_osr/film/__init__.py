@@ -7,12 +7,7 @@
 ``examples/film.py`` puts them together, ``docs/film.md`` has the meaning.
 """
 
-from torchrl_osr.film.control import (
-    InverseDynamicsController,
-    TargetRule,
-    nearest_target,
-    time_target,
-)
+from torchrl_osr.film.control import InverseDynamicsController, TargetRule
 from torchrl_osr.film.pictures import (
     GIF_STRIDE,
     Camera,
@@ -52,11 +47,9 @@ __all__ = [
     "film_gif",
     "film_strip",
     "hand_over",
-    "nearest_target",
     "play_takeovers",
     "principal_plane",
     "steps_alive",
     "survival_table",
-    "time_target",
     "visited_states",
 ]

@@ -30,32 +30,6 @@ TargetRule = Literal["time", "nearest"]
 """Choice of the target state, see :class:`InverseDynamicsController`."""
 
 
-def time_target(reference: Tensor, step: int) -> Tensor:
-    """State of the reference one step after ``step``, ``[S]``.
-
-    Past its end a reference stays at its last state.
-
-    Args:
-        reference: the states of an episode from its reset on, ``[T, S]``.
-        step: of the agent.
-    """
-    return reference[min(step + 1, len(reference) - 1)]
-
-
-def nearest_target(reference: Tensor, observation: Tensor) -> Tensor:
-    """Successor of the reference's nearest state, ``[S]``.
-
-    Of several that are equally near, the first is taken. The last state has no
-    successor and is left out.
-
-    Args:
-        reference: the states of an episode from its reset on, ``[T, S]``.
-        observation: the present state in the same unit, ``[S]``.
-    """
-    distances = (reference[:-1] - observation).square().sum(-1)
-    return reference[int(distances.argmin()) + 1]
-
-
 class InverseDynamicsController:
     r"""Drive agents along references by the inverse dynamics model.
 
@@ -70,8 +44,9 @@ class InverseDynamicsController:
     * ``"time"``: the reference's next state at the same time. After a delay the gait is
       out of phase: the target is then out of reach, and the pair of states unlike those
       that the model was trained on.
-    * ``"nearest"``: the successor of the reference's nearest state. Any phase of the
-      gait can be taken up again, and the pair is as close to the data as possible.
+    * ``"nearest"``: the successor of the reference's nearest state, the last one left
+      out. Any phase of the gait can be taken up again, and the pair is as close to the
+      data as possible.
 
     The paper only says "we set the target state of IDM to the corresponding state in
     the expert trajectory". That reads as ``"time"``; ``"nearest"`` is ours.
@@ -158,10 +133,15 @@ class InverseDynamicsController:
             observation: standardised, ``[E, S]``.
         """
         if self.rule == "time":
-            rows = [time_target(each, self.step) for each in self._references]
+            # Past its end a reference stays at its last state.
+            rows = [
+                each[min(self.step + 1, len(each) - 1)] for each in self._references
+            ]
         else:
-            pairs = zip(self._references, observation, strict=True)
-            rows = [nearest_target(reference, row) for reference, row in pairs]
+            rows = [
+                reference[int((reference[:-1] - row).square().sum(-1).argmin()) + 1]
+                for reference, row in zip(self._references, observation, strict=True)
+            ]
         return torch.stack(rows)
 
     def _standard(self, observation: Tensor) -> Tensor:
