@@ -19,7 +19,7 @@ Gymnasium and MuJoCo come with ``torchrl-osr[examples]``.
 """
 
 from torchrl_osr.envs.actuators import ActionDelay, ActionNoise, StickyAction
-from torchrl_osr.envs.base import DisturbanceWrapper, TimedDisturbance
+from torchrl_osr.envs.disturbance import DisturbanceWrapper, TimedDisturbance
 from torchrl_osr.envs.dynamics import DynamicsChange
 from torchrl_osr.envs.knock import ActionKnock
 from torchrl_osr.envs.observation_attack import attacked_policy, critics_of

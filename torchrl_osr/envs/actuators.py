@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_osr.envs.base import (
+from torchrl_osr.envs.disturbance import (
     DisturbanceWrapper,
     Step,
     Vector,

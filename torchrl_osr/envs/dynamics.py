@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 
-from torchrl_osr.envs.base import (
+from torchrl_osr.envs.disturbance import (
     DisturbanceWrapper,
     Vector,
     gymnasium,

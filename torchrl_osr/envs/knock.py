@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 
 from torchrl_osr._checks import check_choice
-from torchrl_osr.envs.base import (
+from torchrl_osr.envs.disturbance import (
     At,
     Step,
     TimedDisturbance,

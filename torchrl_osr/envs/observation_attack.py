@@ -42,19 +42,6 @@ def critics_of(loss: LossModule) -> CriticValues:
 
     Raises:
         TypeError: if the loss has no ``qvalue_network``.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_osr import OSRLoss
-        >>> from torchrl_osr.envs import attacked_policy, critics_of
-        >>> from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
-        >>> actor = tanh_gaussian_actor(11, 3)
-        >>> loss = OSRLoss(actor, critic_ensemble(11, 3), recovery_weight=0)
-        >>> policy = attacked_policy(
-        ...     actor.get_dist, critics_of(loss), kind="min_Q", epsilon=0.1
-        ... )
-        >>> policy(torch.zeros(4, 11)).shape
-        torch.Size([4, 3])
     """
     if not hasattr(loss, "qvalue_network"):
         raise TypeError(
@@ -129,10 +116,14 @@ def attacked_policy(
 
     Examples:
         >>> import torch
-        >>> from torchrl_osr.envs import attacked_policy
-        >>> from torchrl_osr.modules import tanh_gaussian_actor
+        >>> from torchrl_osr import OSRLoss
+        >>> from torchrl_osr.envs import attacked_policy, critics_of
+        >>> from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
         >>> actor = tanh_gaussian_actor(11, 3)
-        >>> policy = attacked_policy(actor.get_dist, kind="action_diff", epsilon=0.1)
+        >>> loss = OSRLoss(actor, critic_ensemble(11, 3), recovery_weight=0)
+        >>> policy = attacked_policy(
+        ...     actor.get_dist, critics_of(loss), kind="min_Q", epsilon=0.1
+        ... )
         >>> policy(torch.zeros(4, 11)).shape
         torch.Size([4, 3])
     """

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from torchrl_osr._checks import check_choice
-from torchrl_osr.envs.base import (
+from torchrl_osr.envs.disturbance import (
     DisturbanceWrapper,
     Step,
     Vector,

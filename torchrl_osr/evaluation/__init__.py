@@ -17,7 +17,7 @@ from torchrl_osr.evaluation.episodes import (
     deterministic_policy,
     summarize,
 )
-from torchrl_osr.evaluation.inverse_dynamics import (
+from torchrl_osr.evaluation.inverse_dynamics_fit import (
     describe_inverse_dynamics,
     inverse_dynamics_report,
 )

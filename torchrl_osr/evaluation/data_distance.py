@@ -11,6 +11,9 @@ from torch import Tensor
 
 from torchrl_osr.data import TransitionsOnDisk, observation_statistics
 
+# States that the threshold is computed from, and at most a fifth of the data.
+MAX_HELD_OUT = 2_000
+
 # More rows do not fit into the processor's cache and are slower.
 ROWS_AT_A_TIME = 64
 
@@ -32,18 +35,15 @@ class DataDistance:
 
     Keyword Args:
         num_neighbors: ``K``. Default 10.
-        max_reference: at most so many states are compared with. Default 20,000.
-        max_held_out: at most so many states make the threshold, and at most a fifth
-            of the data. Default 2,000.
-        quantile: share of the held-out states within the threshold. Default 0.95.
+        max_reference: size of the subset, at most. Default 20,000.
         seed: of the two random subsets, which have a generator of their own. Default 0.
 
     Attributes:
         threshold: see above, in the unit of the distance: standard deviations.
 
     Raises:
-        ValueError: if the data have too few rows for ``K`` neighbours and a held-out
-            state, or a number is out of its range.
+        ValueError: if ``num_neighbors`` is below 1, or the data have too few rows for
+            ``K`` neighbours and a held-out state.
 
     Examples:
         >>> import torch
@@ -62,16 +62,11 @@ class DataDistance:
         *,
         num_neighbors: int = 10,
         max_reference: int = 20_000,
-        max_held_out: int = 2_000,
-        quantile: float = 0.95,
         seed: int = 0,
     ) -> None:
-        if num_neighbors < 1 or max_held_out < 1 or not 0 < quantile <= 1:
-            raise ValueError(
-                "num_neighbors and max_held_out must be at least 1, quantile above 0 "
-                f"and at most 1, got {num_neighbors}, {max_held_out} and {quantile}."
-            )
-        held_out = min(max_held_out, len(data) // 5)
+        if num_neighbors < 1:
+            raise ValueError(f"num_neighbors must be at least 1, got {num_neighbors}.")
+        held_out = min(MAX_HELD_OUT, len(data) // 5)
         reference = min(max_reference, len(data) - held_out)
         if reference < num_neighbors or held_out < 1:
             raise ValueError(
@@ -91,7 +86,7 @@ class DataDistance:
         self._states = self._standard(states)
         self._squares = self._states.square().sum(-1)
         distances = self(others)
-        self.threshold = float(torch.quantile(distances.double(), quantile))
+        self.threshold = float(torch.quantile(distances.double(), 0.95))
 
     def __call__(self, observation: Tensor) -> Tensor:
         """Distance of raw observations ``[M, S]``, float32 ``[M]``."""
@@ -105,8 +100,8 @@ class DataDistance:
         return (observation.double() - self._loc) / self._scale
 
     def _chunk(self, states: Tensor) -> Tensor:
-        # |s - r|^2 = |s|^2 + |r|^2 - 2 s r cancels digits where s and r are near; double
-        # precision has enough of them and takes a third longer.
+        # |s - r|^2 = |s|^2 + |r|^2 - 2 s r cancels digits where s and r are near:
+        # double precision has enough of them, and takes a third longer.
         others = torch.addmm(self._squares, states, self._states.T, alpha=-2)
         # |s|^2 does not change which are near.
         near = others.topk(self.num_neighbors, largest=False, sorted=False).values

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 
 from torchrl_osr.data import normalized_score
@@ -32,7 +31,11 @@ from torchrl_osr.evaluation.recovery import (
     disturbed_at,
     measure_recovery,
 )
-from torchrl_osr.evaluation.statistics import NUM_RESAMPLES, mean_interval
+from torchrl_osr.evaluation.statistics import (
+    NUM_RESAMPLES,
+    mean_interval,
+    percentile_interval,
+)
 
 TRANSIENT = ("knock", "push", "start")
 """Kinds of disturbance that end, so that there is something to recover from."""
@@ -100,7 +103,6 @@ def evaluate_paired(
     *,
     num_episodes: int = 10,
     seed: int = 0,
-    device: torch.device | str = "cpu",
     advance: Callable[[], object] = lambda: None,
 ) -> PairedResults:
     """Play clean episodes once, and the same episodes under each disturbance.
@@ -111,7 +113,7 @@ def evaluate_paired(
     carried over to the next one.
 
     Args:
-        policy: to be evaluated.
+        policy: to be evaluated, on the CPU.
         env_id: a Gymnasium id, ``"Hopper-v5"`` for instance.
         disturbances: of one suite.
         distance: to the data that the policy was trained on.
@@ -119,7 +121,6 @@ def evaluate_paired(
     Keyword Args:
         num_episodes: ``E``, at least 2. Default 10.
         seed: the episodes are seeded ``seed, seed + 1, ...``. Default 0.
-        device: where the policy is. Default CPU.
         advance: called after the clean episodes and after each disturbance.
 
     Raises:
@@ -135,9 +136,8 @@ def evaluate_paired(
 
     def play(policy: Policy, wrap: Wrap | None) -> tuple[EpisodeResults, Recorder]:
         evaluator = EpisodeEvaluator(
-            env_id, num_episodes=num_episodes, seed=seed, device=device, wrap=wrap,
-            fixed_batch=True,
-        )  # fmt: skip
+            env_id, num_episodes=num_episodes, seed=seed, wrap=wrap, fixed_batch=True
+        )
         recorder = Recorder(num_episodes)
         try:
             results = evaluator(policy, recorder)
@@ -181,25 +181,15 @@ def check_disturbances(env_id: str, disturbances: Sequence[Disturbance]) -> None
 
 
 def decrease_interval(
-    clean: ArrayLike,
-    disturbed: ArrayLike,
-    *,
-    confidence: float = 0.95,
-    num_resamples: int = NUM_RESAMPLES,
-    seed: int = 0,
+    clean: ArrayLike, disturbed: ArrayLike
 ) -> tuple[float | None, float | None, float | None]:
-    """Decrease of the mean score in percent, with its paired-bootstrap interval.
+    """Decrease of the mean score in percent, with its 95 % paired-bootstrap interval.
 
     Pairs of episodes are resampled together, so that what both have in common does not
     widen the interval.
 
     Args:
         clean, disturbed: normalised scores of the pairs, ``[E]`` each.
-
-    Keyword Args:
-        confidence: coverage of the interval. Default 0.95.
-        num_resamples: bootstrap resamples. Default 2000.
-        seed: of the resampling. Default 0.
 
     Returns:
         ``100 (1 - mean(disturbed) / mean(clean))``, lower and upper end. All three are
@@ -218,19 +208,16 @@ def decrease_interval(
         raise ValueError(
             f"decrease_interval needs two finite pairs or more, got {pairs.tolist()}."
         )
-    means = pairs.mean(1)
-    if means[0] <= 0:
+    clean_mean, disturbed_mean = pairs.mean(1)
+    if clean_mean <= 0:
         return None, None, None
-    rng = np.random.default_rng(seed)
-    rows = rng.integers(pairs.shape[1], size=(num_resamples, pairs.shape[1]))
-    resampled = pairs[:, rows].mean(-1)
-    decrease = float(100 * (1 - means[1] / means[0]))
-    if (resampled[0] <= 0).any():
+    decrease = float(100 * (1 - disturbed_mean / clean_mean))
+    rng = np.random.default_rng(0)
+    rows = rng.integers(pairs.shape[1], size=(NUM_RESAMPLES, pairs.shape[1]))
+    resampled_clean, resampled = pairs[:, rows].mean(-1)
+    if (resampled_clean <= 0).any():
         return decrease, None, None
-    tail = 50 * (1 - confidence)
-    low, high = np.percentile(
-        100 * (1 - resampled[1] / resampled[0]), [tail, 100 - tail]
-    )
+    low, high = percentile_interval(100 * (1 - resampled / resampled_clean))
     return decrease, float(low), float(high)
 
 
@@ -259,40 +246,35 @@ def _episodes_json(results: EpisodeResults, env_name: str) -> dict[str, Any]:
 
 
 def _disturbance_json(results: DisturbanceResults, env_name: str) -> dict[str, Any]:
-    disturbance, recovery = results.disturbance, results.recovery
-    recovered: dict[str, Any] = {
-        "ended_at": None,
-        "survived_knock": None,
-        "alive_after": None,
-        "clean_alive_after": None,
-        "recovery_steps": None,
-        "distance": None,
-    }
-    if recovery is not None:
-        mean, count = _mean_curve(recovery.distance)
-        clean_mean, clean_count = _mean_curve(recovery.clean_distance)
-        recovered = {
-            "ended_at": recovery.ended_at,
-            "survived_knock": recovery.survived,
-            "alive_after": recovery.alive_after,
-            "clean_alive_after": recovery.clean_alive_after,
-            "recovery_steps": recovery.steps,
-            "distance": {
-                "offset": list(range(-STEPS_BEFORE, STEPS_AFTER + 1)),
-                "mean": mean,
-                "count": count,
-                "clean_mean": clean_mean,
-                "clean_count": clean_count,
-            },
-        }
+    disturbance = results.disturbance
     return {
         "name": disturbance.name,
         "kind": disturbance.kind,
         "strength": disturbance.strength,
         **_episodes_json(results.results, env_name),
         "disturbed_at": results.disturbed_at,
-        **recovered,
+        **_recovery_json(results.recovery),
     }
+
+
+def _recovery_json(recovery: Recovery | None) -> dict[str, Any]:
+    names = (
+        "ended_at", "survived_knock", "alive_after", "clean_alive_after",
+        "recovery_steps", "distance",
+    )  # fmt: skip
+    if recovery is None:
+        return dict.fromkeys(names)
+    *lists, distance, clean_distance = recovery
+    mean, count = _mean_curve(distance)
+    clean_mean, clean_count = _mean_curve(clean_distance)
+    curves = {
+        "offset": list(range(-STEPS_BEFORE, STEPS_AFTER + 1)),
+        "mean": mean,
+        "count": count,
+        "clean_mean": clean_mean,
+        "clean_count": clean_count,
+    }
+    return dict(zip(names, (*lists, curves), strict=True))
 
 
 def _mean_curve(

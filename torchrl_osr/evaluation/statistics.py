@@ -1,4 +1,4 @@
-"""Means of scores and their confidence intervals.
+"""Means of scores and their 95 % confidence intervals.
 
 Shapes: ``E`` episodes of a run, ``K`` numbers of an episode, ``R`` resamples, ``N``
 runs, ``T`` thresholds.
@@ -18,21 +18,19 @@ NUM_RESAMPLES = 2000
 NORMAL_QUANTILE_975 = 1.959963984540054
 """A normal variable is below this many standard deviations with probability 0.975."""
 
+TAIL = 50 * (1 - 0.95)
+"""Percent of the resamples below an interval, and above it."""
+
 
 def mean_interval(
-    values: ArrayLike,
-    *,
-    confidence: float = 0.95,
-    num_resamples: int = NUM_RESAMPLES,
-    seed: int = 0,
+    values: ArrayLike, *, num_resamples: int = NUM_RESAMPLES, seed: int = 0
 ) -> tuple[float, float, float]:
-    """Mean and its percentile-bootstrap confidence interval.
+    """Mean and its 95 % percentile-bootstrap interval.
 
     Args:
         values: independent results, returns of episodes for instance, ``[E]``.
 
     Keyword Args:
-        confidence: coverage of the interval. Default 0.95.
         num_resamples: bootstrap resamples. Default 2000.
         seed: of the resampling. Default 0.
 
@@ -52,8 +50,7 @@ def mean_interval(
         raise ValueError(f"mean_interval needs finite values, got {sample}.")
     rng = np.random.default_rng(seed)
     resamples = sample[rng.integers(sample.size, size=(num_resamples, sample.size))]
-    tail = 50 * (1 - confidence)
-    low, high = np.percentile(resamples.mean(1), [tail, 100 - tail])
+    low, high = percentile_interval(resamples.mean(1))
     return float(sample.mean()), float(low), float(high)
 
 
@@ -83,18 +80,14 @@ def wilson_interval(count: int, total: int) -> tuple[float, float]:
 
 
 def percentile_interval(
-    resamples: NDArray[np.float64], *, confidence: float = 0.95
+    resamples: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lower and upper end of the percentile interval, over the first axis.
+    """Lower and upper end of the 95 % percentile interval, over the first axis.
 
     Args:
         resamples: a statistic of each resample, ``[R, ...]``.
-
-    Keyword Args:
-        confidence: coverage of the interval. Default 0.95.
     """
-    tail = 50 * (1 - confidence)
-    low, high = np.percentile(resamples, [tail, 100 - tail], axis=0)
+    low, high = np.percentile(resamples, [TAIL, 100 - TAIL], axis=0)
     return low, high
 
 
