@@ -91,36 +91,40 @@ def line_results():
     return results.clean, {each.disturbance.name: each for each in results.disturbed}
 
 
+def of(results, name: str) -> list:
+    """One entry of the recovery of each episode."""
+    return [getattr(each, name) for each in results.recovery]
+
+
 def test_known_returns_and_recovery_steps(line_results):
     clean, disturbed = line_results
     six = disturbed["six"]
     assert clean.returns.tolist() == [LIMIT] * 3
     assert clean.seeds.tolist() == [4, 5, 6]
     # At 0.5, action 0: shoved to 6.5, then 5.5 ... 0.5, the sixth step is back.
-    assert six.recovery.steps == [6, 6, 6]
-    assert six.disturbed_at == six.recovery.ended_at == [5, 5, 5]
-    assert six.recovery.survived == [True] * 3
-    assert six.recovery.alive_after == [True] * 3
+    assert of(six, "steps") == [6, 6, 6]
+    assert six.disturbed_at == of(six, "ended_at") == [5, 5, 5]
+    assert of(six, "survived") == of(six, "alive_after") == [True] * 3
     assert six.results.returns.tolist() == [LIMIT] * 3
 
 
 def test_who_falls_is_not_back(line_results):
     deadly = line_results[1]["deadly"]
     assert deadly.results.lengths.tolist() == deadly.results.returns.tolist() == [6] * 3
-    assert deadly.recovery.survived == deadly.recovery.alive_after == [False] * 3
-    assert deadly.recovery.steps == [None] * 3
+    assert of(deadly, "survived") == of(deadly, "alive_after") == [False] * 3
+    assert of(deadly, "steps") == [None] * 3
 
 
 def test_the_time_limit_censors(line_results):
     late = line_results[1]["late"]
     assert late.disturbed_at == [LIMIT - 3] * 3
-    assert late.recovery.survived == [True] * 3
-    assert late.recovery.alive_after == late.recovery.steps == [None] * 3
+    assert of(late, "survived") == [True] * 3
+    assert of(late, "alive_after") == of(late, "steps") == [None] * 3
 
 
 def test_no_disturbance_no_entries(line_results):
     never, always = line_results[1]["never"], line_results[1]["always"]
-    assert never.disturbed_at == never.recovery.survived == [None] * 3
+    assert never.disturbed_at == of(never, "survived") == [None] * 3
     assert always.recovery is None
 
 

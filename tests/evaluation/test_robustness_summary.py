@@ -55,11 +55,10 @@ def episodes(*scores: float) -> EpisodeResults:
     return EpisodeResults(returns, np.full(size, 300), np.arange(size))
 
 
-def around(*curves: list[float]) -> np.ndarray:
+def around(*curve: float) -> np.ndarray:
     """Distances from one step before the disturbance's end on."""
-    distances = np.full((len(curves), 111), np.nan)
-    for row, curve in zip(distances, curves, strict=True):
-        row[9 : 9 + len(curve)] = curve
+    distances = np.full(111, np.nan)
+    distances[9 : 9 + len(curve)] = curve
     return distances
 
 
@@ -72,11 +71,14 @@ def evaluations():
     )
 
     def evaluation(step, clean, knocked, heavy, moments, steps, alive):
-        recovery = Recovery(
-            moments, [None if m is None else True for m in moments], alive,
-            [True if m else None for m in moments], steps,
-            around([1.0, 3.0, 1.0], [], [2.0, 4.0]), around([0.5, 0.5, 0.5], [], []),
-        )  # fmt: skip
+        curves = [around(1, 3, 1), around(), around(2, 4)]
+        recovery = [
+            Recovery(
+                at, None if at is None else True, up, True if at else None, late,
+                curve, around(0.5, 0.5, 0.5) if curve is curves[0] else around(),
+            )
+            for at, up, late, curve in zip(moments, alive, steps, curves, strict=True)
+        ]  # fmt: skip
         disturbed = [
             DisturbanceResults(knock, episodes(*knocked), moments, recovery),
             DisturbanceResults(mass, episodes(*heavy), [0, 0, 0], None),

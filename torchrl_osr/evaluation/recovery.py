@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -72,33 +72,38 @@ class Recorder:
         trajectory.terminated = bool(terminated) and not info.get("success", False)
 
 
-class Recovery(NamedTuple):
-    """Survival and recovery after a transient disturbance, one entry an episode.
+def _nowhere() -> NDArray[np.float64]:
+    return np.full(STEPS_BEFORE + 1 + STEPS_AFTER, np.nan)
 
-    All entries of an episode without the disturbance are ``None``, its distances NaN.
+
+@dataclass(frozen=True)
+class Recovery:
+    """Survival and recovery of one episode after a transient disturbance.
+
+    Everything is ``None``, and distances are NaN, if the disturbance never acted.
 
     Attributes:
         ended_at: last step in which the disturbance acted.
         survived: had not fallen by then.
-        alive_after: had not fallen :data:`STEPS_AFTER` steps later; ``None`` where the
+        alive_after: had not fallen :data:`STEPS_AFTER` steps later; ``None`` if the
             time limit came first.
-        clean_alive_after: the same for the undisturbed episodes of the pairs: some
-            would have fallen anyway.
+        clean_alive_after: the same for the undisturbed episode of the pair, which may
+            have fallen anyway.
         steps: from its end until the distance to the data is within the threshold, 0 if
-            it never left; ``None`` where the episode ended before.
+            it never left; ``None`` if the episode ended before.
         distance: in units of the threshold, from :data:`STEPS_BEFORE` steps before the
-            end of the disturbance to :data:`STEPS_AFTER` after it, ``[E, offsets]``;
-            NaN at steps that the episode does not have.
-        clean_distance: of the undisturbed episodes, at the same steps.
+            end of the disturbance to :data:`STEPS_AFTER` after it; NaN at steps that
+            the episode does not have.
+        clean_distance: of the undisturbed episode, at the same steps.
     """
 
-    ended_at: list[int | None]
-    survived: list[bool | None]
-    alive_after: list[bool | None]
-    clean_alive_after: list[bool | None]
-    steps: list[int | None]
-    distance: NDArray[np.float64]
-    clean_distance: NDArray[np.float64]
+    ended_at: int | None = None
+    survived: bool | None = None
+    alive_after: bool | None = None
+    clean_alive_after: bool | None = None
+    steps: int | None = None
+    distance: NDArray[np.float64] = field(default_factory=_nowhere)
+    clean_distance: NDArray[np.float64] = field(default_factory=_nowhere)
 
 
 def disturbed_at(trajectory: Trajectory) -> int | None:
@@ -111,49 +116,35 @@ def disturbed_at(trajectory: Trajectory) -> int | None:
 
 
 def measure_recovery(
-    disturbed: Sequence[Trajectory], clean: Sequence[Trajectory], distance: DataDistance
+    disturbed: Trajectory, clean: Trajectory, distance: DataDistance
 ) -> Recovery:
-    """Survival, recovery and distances of the episodes under one disturbance.
+    """Survival, recovery and distances of one pair of episodes.
 
     Args:
-        disturbed: its episodes.
-        clean: the undisturbed ones of the pairs.
+        disturbed: the episode with the disturbance.
+        clean: the one without.
         distance: to the data, with its threshold.
     """
-    pairs = zip(disturbed, clean, strict=True)
-    *lists, near, clean_near = zip(
-        *(_recover(trajectory, pair, distance) for trajectory, pair in pairs),
-        strict=True,
-    )
-    return Recovery(*map(list, lists), np.stack(near), np.stack(clean_near))
-
-
-def _recover(
-    trajectory: Trajectory, pair: Trajectory, distance: DataDistance
-) -> tuple[Any, ...]:
-    """Entries of :class:`Recovery` for one episode."""
-    block = _first_block(trajectory.disturbed)
+    block = _first_block(disturbed.disturbed)
     if block is None:
-        nowhere = np.full(STEPS_BEFORE + 1 + STEPS_AFTER, np.nan)
-        return None, None, None, None, None, nowhere, nowhere
+        return Recovery()
     end = block[1]
-    fell_in_it = trajectory.terminated and trajectory.last == end
-    curve = _around(trajectory, end, distance)
+    curve = _around(disturbed, end, distance)
     steps = _first_within(curve[STEPS_BEFORE:])
     if steps is None:
-        later = _relative(trajectory.observations[end + STEPS_AFTER + 1 :], distance)
+        later = _relative(disturbed.observations[end + STEPS_AFTER + 1 :], distance)
         steps = _first_within(later, STEPS_AFTER + 1)
     # The state of the fall itself does not count as recovered.
-    if trajectory.terminated and steps == trajectory.last - end:
+    if disturbed.terminated and steps == disturbed.last - end:
         steps = None
-    return (
-        max(end - 1, 0),
-        not fell_in_it,
-        _alive_after(trajectory, end),
-        _alive_after(pair, end),
-        steps,
-        curve,
-        _around(pair, end, distance),
+    return Recovery(
+        ended_at=max(end - 1, 0),
+        survived=not (disturbed.terminated and disturbed.last == end),
+        alive_after=_alive_after(disturbed, end),
+        clean_alive_after=_alive_after(clean, end),
+        steps=steps,
+        distance=curve,
+        clean_distance=_around(clean, end, distance),
     )
 
 
@@ -161,7 +152,7 @@ def _around(
     trajectory: Trajectory, end: int, distance: DataDistance
 ) -> NDArray[np.float64]:
     """Distances around entry ``end``, NaN where there is no such entry."""
-    curve = np.full(STEPS_BEFORE + 1 + STEPS_AFTER, np.nan)
+    curve = _nowhere()
     start = max(end - STEPS_BEFORE, 0)
     there = trajectory.observations[start : end + STEPS_AFTER + 1]
     first = start - end + STEPS_BEFORE

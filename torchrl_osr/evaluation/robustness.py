@@ -40,6 +40,12 @@ from torchrl_osr.evaluation.statistics import (
 TRANSIENT = ("knock", "push", "start")
 """Kinds of disturbance that end, so that there is something to recover from."""
 
+RECOVERY_ENTRIES = (
+    "ended_at", "survived_knock", "alive_after", "clean_alive_after", "recovery_steps",
+    "distance",
+)  # fmt: skip
+"""Of a disturbance's JSON; ``None`` if it does not end."""
+
 TABLE_HEADER = (
     "disturbance", "clean", "score", "loss %", "[95 %]", "met it",
     f"alive +{STEPS_AFTER}", "(clean)", "back", "steps back",
@@ -74,13 +80,13 @@ class DisturbanceResults(NamedTuple):
         results: returns, lengths and seeds, ``[E]`` each.
         disturbed_at: step of the first disturbance of each episode, from 0; ``None``
             where the episode ended before it, or there is none.
-        recovery: ``None`` for a disturbance that does not end.
+        recovery: of each episode, ``[E]``; ``None`` if the disturbance does not end.
     """
 
     disturbance: Disturbance
     results: EpisodeResults
     disturbed_at: list[int | None]
-    recovery: Recovery | None
+    recovery: list[Recovery] | None
 
 
 class PairedResults(NamedTuple):
@@ -155,9 +161,8 @@ def evaluate_paired(
             moments = [disturbed_at(episode) for episode in recorder.trajectories]
         recovery = None
         if each.kind in TRANSIENT:
-            recovery = measure_recovery(
-                recorder.trajectories, undisturbed.trajectories, distance
-            )
+            pairs = zip(recorder.trajectories, undisturbed.trajectories, strict=True)
+            recovery = [measure_recovery(*pair, distance) for pair in pairs]
         played.append(DisturbanceResults(each, results, moments, recovery))
     return PairedResults(clean, played)
 
@@ -257,34 +262,35 @@ def _disturbance_json(results: DisturbanceResults, env_name: str) -> dict[str, A
     }
 
 
-def _recovery_json(recovery: Recovery | None) -> dict[str, Any]:
-    names = (
-        "ended_at", "survived_knock", "alive_after", "clean_alive_after",
-        "recovery_steps", "distance",
-    )  # fmt: skip
+def _recovery_json(recovery: Sequence[Recovery] | None) -> dict[str, Any]:
     if recovery is None:
-        return dict.fromkeys(names)
-    *lists, distance, clean_distance = recovery
-    mean, count = _mean_curve(distance)
-    clean_mean, clean_count = _mean_curve(clean_distance)
-    curves = {
-        "offset": list(range(-STEPS_BEFORE, STEPS_AFTER + 1)),
-        "mean": mean,
-        "count": count,
-        "clean_mean": clean_mean,
-        "clean_count": clean_count,
+        return dict.fromkeys(RECOVERY_ENTRIES)
+    mean, count = _mean_curve([each.distance for each in recovery])
+    clean_mean, clean_count = _mean_curve([each.clean_distance for each in recovery])
+    return {
+        "ended_at": [each.ended_at for each in recovery],
+        "survived_knock": [each.survived for each in recovery],
+        "alive_after": [each.alive_after for each in recovery],
+        "clean_alive_after": [each.clean_alive_after for each in recovery],
+        "recovery_steps": [each.steps for each in recovery],
+        "distance": {
+            "offset": list(range(-STEPS_BEFORE, STEPS_AFTER + 1)),
+            "mean": mean,
+            "count": count,
+            "clean_mean": clean_mean,
+            "clean_count": clean_count,
+        },
     }
-    return dict(zip(names, (*lists, curves), strict=True))
 
 
 def _mean_curve(
-    distances: NDArray[np.float64],
+    curves: Sequence[NDArray[np.float64]],
 ) -> tuple[list[float | None], list[int]]:
-    """Mean over the episodes that are there at each offset, and their number."""
-    count = (~np.isnan(distances)).sum(0)
-    total = np.nansum(distances, axis=0)
-    pairs = zip(total.tolist(), count.tolist(), strict=True)
-    return [sum_ / each if each else None for sum_, each in pairs], count.tolist()
+    """Mean over the episodes that have a step at each offset, and their number."""
+    counts = (~np.isnan(curves)).sum(0).tolist()
+    totals = np.nansum(curves, axis=0).tolist()
+    pairs = zip(totals, counts, strict=True)
+    return [total / count if count else None for total, count in pairs], counts
 
 
 def summarize_disturbances(

@@ -179,7 +179,10 @@ class Takeover(NamedTuple):
             ]
             for some in (disturbed, clean)
         )
-        steps = measure_recovery(disturbed, clean, distance).steps
+        steps = [
+            measure_recovery(*pair, distance).steps
+            for pair in zip(disturbed, clean, strict=True)
+        ]
         returns = [self.disturbed.returns[episode] for episode in episodes]
         return Survival(horizons, returns, alive, alive_clean, steps)
 
