@@ -12,7 +12,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import IO, Any
+from typing import IO, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -166,20 +166,28 @@ def refuse_size(
 
 
 @contextmanager
-def write_beside(path: Path) -> Iterator[Path]:
-    """Yield a path beside ``path`` to write to; it becomes ``path`` at the end.
+def whole_file(path: Path) -> Iterator[BinaryIO]:
+    """Open a file for writing that readers find whole, or as it was before.
 
-    Nothing is left of what an error interrupts.
+    It is written beside its place, synced to the disk and renamed.
 
     Args:
-        path: of the file.
+        path: of the file, in a folder that exists.
+
+    Raises:
+        OSError: naming ``path``, if it cannot be written.
     """
     beside = path.with_name(f".{path.name}.new")
     try:
-        yield beside
-        with beside.open("rb+") as file:
+        with beside.open("wb") as file:
+            yield file
+            file.flush()
             os.fsync(file.fileno())
         os.replace(beside, path)
+    except OSError as error:
+        raise OSError(
+            error.errno, f"cannot write the file ({error.strerror})", str(path)
+        ) from error
     finally:
         beside.unlink(missing_ok=True)
 
@@ -190,13 +198,8 @@ def write_atomically(path: Path, text: str) -> None:
     Raises:
         OSError: naming ``path``, if it cannot be written.
     """
-    try:
-        with write_beside(path) as beside:
-            beside.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise OSError(
-            error.errno, f"cannot write the run's file ({error.strerror})", str(path)
-        ) from error
+    with whole_file(path) as file:
+        file.write(text.encode())
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -13,10 +13,10 @@ def test_a_figure_is_whole_or_the_one_before(tmp_path):
     figure = new_figure(2, 1)
     draw = figure.savefig
 
-    def fail(beside, **options):
-        beside.write_bytes(b"half a pict")
+    def fail(file, **options):
+        file.write(b"half a pict")
         assert path.read_bytes() == b"the one before"
-        raise OSError("the disk is full")
+        raise OSError(28, "the disk is full")
 
     figure.savefig = fail
     with pytest.raises(OSError, match="full"):

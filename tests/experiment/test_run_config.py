@@ -97,12 +97,12 @@ def test_deep_nesting_is_refused_at_once(tmp_path, opening, length):
     path.write_text(
         "a:\n " + opening * depth + {"[": "]", "{a: ": "}"}.get(opening, "") * depth
     )
-    start = time.perf_counter()
-    with pytest.raises(ValueError, match=r"config\.yaml has more than 20 levels"):
+    start = time.process_time()
+    with pytest.raises(ValueError, match=r"config\.yaml is nested more than 32 deep"):
         read_config(path)
-    assert time.perf_counter() - start < 1
+    assert time.process_time() - start < 1
     shallow = tmp_path / "shallow.yaml"
-    shallow.write_text("a: " + "[" * 19 + "]" * 19)
+    shallow.write_text("a: " + "[" * 31 + "]" * 31)
     read_config(shallow)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchrl_osr._files import write_beside
+from torchrl_osr._files import whole_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -46,5 +46,5 @@ def save_figure(figure: Figure, path: Path | str, *, dpi: int = 150) -> None:
     Keyword Args:
         dpi: dots per inch. Default 150.
     """
-    with write_beside(Path(path)) as beside:
-        figure.savefig(beside, dpi=dpi, format="png")
+    with whole_file(Path(path)) as file:
+        figure.savefig(file, dpi=dpi, format="png")

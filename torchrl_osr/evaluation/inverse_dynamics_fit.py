@@ -69,8 +69,8 @@ def inverse_dynamics_report(
 
 
 def describe_inverse_dynamics(report: Mapping[str, Any]) -> str:
-    """One line of text with the numbers of :func:`inverse_dynamics_report`."""
-    r2 = ", ".join(f"{value:.2f}" for value in report["r2"])
+    """One line of text with the numbers of a report; ``None`` is a dash."""
+    r2 = ", ".join("-" if each is None else f"{each:.2f}" for each in report["r2"])
     return (
         f"inverse dynamics, {report['rows']} held-out rows: NLL {report['nll']:.2f}, "
         f"R2 {r2}, 90 % interval covers {100 * report['coverage_90']:.0f} %"

@@ -19,7 +19,7 @@ from torchrl_osr._files import read_text
 # Those of our runs have 4 kB and four levels of nesting. PyYAML needs two seconds for
 # 64 kB, and deep nesting exhausts Python's stack.
 MAX_CONFIG_BYTES = 2**16
-MAX_CONFIG_DEPTH = 20
+MAX_CONFIG_DEPTH = 32
 
 TARGET_PACKAGES = ("torchrl_osr", "torchrl_osr.modules", "torchrl_osr.objectives")
 """Packages whose public names are allowed as ``_target_``."""
@@ -53,7 +53,7 @@ def read_yaml(path: Path) -> Any:
 
     Raises:
         OSError: if it cannot be read.
-        ValueError: if it has more than 64 KiB or 20 levels of nesting, or has aliases,
+        ValueError: if it has more than 64 KiB or 32 levels of nesting, or has aliases,
             which no run writes and a few of which can fill the memory.
         YAMLError: if it is no YAML.
     """
@@ -65,9 +65,7 @@ def read_yaml(path: Path) -> Any:
         depth += isinstance(event, yaml.CollectionStartEvent)
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if depth > MAX_CONFIG_DEPTH:
-            raise ValueError(
-                f"{path.name} has more than {MAX_CONFIG_DEPTH} levels of nesting"
-            )
+            raise ValueError(f"{path.name} is nested more than {MAX_CONFIG_DEPTH} deep")
     return OmegaConf.to_container(OmegaConf.create(text))
 
 

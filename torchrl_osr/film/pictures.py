@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_osr._files import write_beside
+from torchrl_osr._files import whole_file
 from torchrl_osr.evaluation.drawing import (
     BLUE,
     GREEN,
@@ -266,9 +266,9 @@ def film_gif(
     first, *others = [
         each.quantize(palette=palette, dither=Image.Dither.NONE) for each in pictures
     ]
-    with write_beside(Path(path)) as beside:
+    with whole_file(Path(path)) as file:
         first.save(
-            beside, format="GIF", save_all=True, append_images=others,
+            file, format="GIF", save_all=True, append_images=others,
             duration=GIF_MILLISECONDS, loop=0,
         )  # fmt: skip
 
