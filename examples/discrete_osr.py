@@ -34,7 +34,7 @@ from torchrl_osr.data import (
     observation_statistics,
     split_held_out,
 )
-from torchrl_osr.evaluation.statistics import mean_interval
+from torchrl_osr.evaluation import mean_interval
 from torchrl_osr.modules import (
     categorical_actor,
     categorical_inverse_dynamics,

@@ -30,14 +30,15 @@ from torchrl import torchrl_logger
 from torchrl.objectives import SoftUpdate
 
 from torchrl_osr import InverseDynamicsLoss, StatePerturbation
-from torchrl_osr.evaluation.episodes import (
+from torchrl_osr.evaluation import (
     EpisodeEvaluator,
     deterministic_policy,
+    inverse_dynamics_report,
+    learning_curve,
+    read_scalars,
+    score_table,
     summarize,
 )
-from torchrl_osr.evaluation.figures import learning_curve, read_scalars
-from torchrl_osr.evaluation.inverse_dynamics import describe, inverse_dynamics_report
-from torchrl_osr.evaluation.summary import score_table
 from torchrl_osr.experiment import run_folder
 from torchrl_osr.experiment import schema as config
 from torchrl_osr.experiment.build import make_learner

@@ -28,6 +28,7 @@ PACKAGES = [
         ".data",
         ".envs",
         ".evaluation",
+        ".film",
         ".modules",
         ".objectives",
         ".report",

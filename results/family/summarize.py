@@ -17,7 +17,6 @@ from typing import Any
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from omegaconf import OmegaConf
-
 from torchrl_osr.evaluation.summary import recent_score
 
 HERE = Path(__file__).parent

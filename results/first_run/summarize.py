@@ -19,10 +19,10 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from omegaconf import OmegaConf
-
-from torchrl_osr.evaluation import mean_interval
 from torchrl_osr.evaluation.figures import BLUE, ORANGE
 from torchrl_osr.evaluation.summary import recent_score
+
+from torchrl_osr.evaluation import mean_interval
 
 HERE = Path(__file__).parent
 

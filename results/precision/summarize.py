@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
+from torchrl_osr.evaluation.summary import recent_score
 
 from torchrl_osr.evaluation import mean_interval
-from torchrl_osr.evaluation.summary import recent_score
 
 HERE = Path(__file__).parent
 

@@ -7,7 +7,6 @@ from types import SimpleNamespace
 import pytest
 import torch
 from tensordict import TensorDict
-
 from torchrl_osr.data.replay_buffer import check_memory
 
 

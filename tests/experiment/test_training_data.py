@@ -10,7 +10,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
-from torchrl_osr.evaluation.data_distance import DataDistance
+from torchrl_osr.evaluation import DataDistance
 from torchrl_osr.experiment import schema as config
 from torchrl_osr.experiment.build import load_data
 from torchrl_osr.experiment.training_data import load_training_data

@@ -89,7 +89,7 @@ def test_what_is_far_too_large_is_left_out(tmp_path):
     assert runs == []
     assert [each.reason for each in left_out] == [
         "returns.json has more than 268,435,456 bytes",
-        "config.yaml has more than 1,048,576 bytes",
+        "config.yaml has more than 65,536 bytes",
     ]
 
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchrl_osr.evaluation.figures import whole_picture
+from torchrl_osr._files import whole_file
 from torchrl_osr.report.checks import cells, data_of, methods_of
 from torchrl_osr.report.runs import Run
 from torchrl_osr.report.scores import (
@@ -150,8 +150,8 @@ def draw(axes: Axes, curve: Curve, style: Style) -> None:
 
 def save(figure: Figure, path: Path) -> Path:
     """Write a figure, all or nothing; return where."""
-    with whole_picture(path) as beside:
-        figure.savefig(beside, dpi=DPI, facecolor="white", format="png")
+    with whole_file(path) as file:
+        figure.savefig(file, dpi=DPI, facecolor="white", format="png")
     return path
 
 

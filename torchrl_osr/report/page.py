@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from torchrl_osr._files import write_atomically
-from torchrl_osr.evaluation.statistics import NUM_RESAMPLES
+from torchrl_osr.evaluation import NUM_RESAMPLES
 from torchrl_osr.report.checks import comparison_notes, data_of, methods_of
 from torchrl_osr.report.figures import all_methods
 from torchrl_osr.report.files import LeftOut

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_osr.evaluation.statistics import nested_resamples, percentile_interval
+from torchrl_osr.evaluation import nested_resamples, percentile_interval
 from torchrl_osr.report.checks import cells, data_of
 from torchrl_osr.report.methods import METHOD, comparable
 from torchrl_osr.report.quantities import Episodes, Quantity

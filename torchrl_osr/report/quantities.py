@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from torchrl_osr.data import normalized_score
-from torchrl_osr.evaluation.summary import NUM_RECENT
+from torchrl_osr.evaluation import NUM_RECENT
 from torchrl_osr.report.robustness import suite_levels, suites_of
 from torchrl_osr.report.runs import Run
 

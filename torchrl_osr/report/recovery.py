@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_osr.evaluation.statistics import (
+from torchrl_osr.evaluation import (
     NUM_RESAMPLES,
     nested_resamples,
     percentile_interval,

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_osr.evaluation.statistics import nested_resamples, percentile_interval
+from torchrl_osr.evaluation import nested_resamples, percentile_interval
 from torchrl_osr.report.files import levels_of
 from torchrl_osr.report.methods import distinctions
 from torchrl_osr.report.runs import Run

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_osr.data import normalized_score
-from torchrl_osr.evaluation.statistics import (
+from torchrl_osr.evaluation import (
+    NUM_RECENT,
     interquartile_mean,
     mean_interval,
     nested_resamples,
@@ -20,7 +21,6 @@ from torchrl_osr.evaluation.statistics import (
     performance_profile,
     stratified_resamples,
 )
-from torchrl_osr.evaluation.summary import NUM_RECENT
 from torchrl_osr.report.checks import cells, data_of, methods_of
 from torchrl_osr.report.runs import Run
 

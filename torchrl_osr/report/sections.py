@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from torchrl_osr.evaluation.summary import NUM_RECENT
+from torchrl_osr.evaluation import NUM_RECENT
 from torchrl_osr.report.checks import (
     cells,
     data_of,

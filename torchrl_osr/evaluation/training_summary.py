@@ -1,50 +1,83 @@
-"""The figure of a run: its score and its losses over the gradient steps."""
+"""Summary of a training run at its end: table of scores and learning curve."""
 
 from __future__ import annotations
 
 import csv
-import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-try:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-except ImportError as error:
-    raise ImportError(
-        f"figures need {error.name!r}: pip install torchrl-osr[examples]"
-    ) from error
+import numpy as np
 
-# Okabe and Ito's palette, which colour-blind readers can tell apart.
-BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#666666"
+from torchrl_osr.evaluation.drawing import (
+    BLUE,
+    GREY,
+    ORANGE,
+    new_figure,
+    save_figure,
+)
+
+NUM_RECENT = 5
+"""Evaluations in the mean of the last ones.
+
+Scores of neighbouring evaluations swing by tens of points, so one of them says little.
+"""
 
 PANELS = {
     "loss_qvalue": "TD error (critics)",
     "loss_cql": "conservative term (critics)",
-    "loss_recovery": "state recovery (policy)",
+    "recovery_kl": "state recovery (policy)",
     "pred_value": "Q of the data's actions",
 }
-"""Logged numbers that the figure shows below the score, and what they are called."""
+"""Logged scalars below the score, and their titles."""
 
 
-@contextmanager
-def whole_picture(path: Path | str) -> Iterator[Path]:
-    """Yield a path beside ``path`` to write to; renamed once it is whole.
+def recent_score(history: Sequence[Mapping[str, Any]]) -> float:
+    """Return the mean score of the last :data:`NUM_RECENT` evaluations."""
+    return float(np.mean([row["score"] for row in history[-NUM_RECENT:]]))
+
+
+def score_table(
+    title: str,
+    history: Sequence[Mapping[str, Any]],
+    best: Mapping[str, Any],
+    data_score: float | None,
+    folder: Path,
+) -> str:
+    """Return the table of data's and policy's scores.
 
     Args:
-        path: where the picture shall be.
+        title: what was trained on what.
+        history: all evaluations with their ``"step"``, see
+            :func:`~torchrl_osr.evaluation.summarize`.
+        best: the best of them; chosen by its own episodes, hence optimistic.
+        data_score: mean normalised score of the data's episodes, if it is known.
+        folder: where the run's files are.
     """
-    path = Path(path)
-    beside = path.with_name(f".{path.name}.new")
-    try:
-        yield beside
-        with beside.open("rb+") as file:
-            os.fsync(file.fileno())
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
+
+    def with_interval(row: Mapping[str, Any]) -> str:
+        return f"{row['score']:6.1f}  [{row['score_low']:.1f}, {row['score_high']:.1f}]"
+
+    known = "unknown" if data_score is None else f"{data_score:6.1f}"
+    rows = [
+        ("data, mean episode", known),
+        ("policy, last", with_interval(history[-1])),
+        (
+            f"policy, mean of last {min(NUM_RECENT, len(history))}",
+            f"{recent_score(history):6.1f}",
+        ),
+        ("policy, best evaluation", f"{with_interval(best)}  at step {best['step']}"),
+    ]
+    if "success_rate" in history[-1]:
+        last = history[-1]
+        rate, low, high = (
+            100 * last[name] for name in ("success_rate", "success_low", "success_high")
+        )
+        said = f"{rate:6.1f}  [{low:.1f}, {high:.1f}]  % of {len(last['successes'])}"
+        rows.insert(2, ("policy, last, success", f"{said} episodes, Wilson interval"))
+    lines = [f"{title}: normalised score, 0 random and 100 expert [95 % interval]"]
+    lines += [f"  {label:<25}{value}" for label, value in rows]
+    return "\n".join([*lines, f"  {'files':<26}{folder}"])
 
 
 def read_scalars(folder: Path | str) -> dict[str, list[tuple[int, float]]]:
@@ -87,8 +120,7 @@ def learning_curve(
         data_score: mean normalised score of the data's episodes, if it is known.
     """
     panels = [name for name in PANELS if scalars.get(name)]
-    figure = Figure(figsize=(9, 6.4), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(9, 6.4, layout="constrained")
     grid = figure.add_gridspec(2, max(len(panels), 1), height_ratios=(2, 1))
     figure.suptitle(title)
 
@@ -114,5 +146,4 @@ def learning_curve(
         small.ticklabel_format(axis="x", style="sci", scilimits=(3, 3))
     for each in figure.axes:
         each.spines[["top", "right"]].set_visible(False)
-    with whole_picture(path) as beside:
-        figure.savefig(beside, dpi=150, format="png")
+    save_figure(figure, path)

@@ -9,19 +9,8 @@ from torch import nn
 from torchrl.envs import ObservationNorm
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
-from torchrl_osr import OSRLoss
-from torchrl_osr.evaluation.inverse_dynamics_control import (
-    InverseDynamicsController,
-    frozen_model,
-    nearest_target,
-    time_target,
-)
-from torchrl_osr.modules import (
-    critic_ensemble,
-    cvae_inverse_dynamics,
-    tanh_gaussian_actor,
-    tanh_gaussian_inverse_dynamics,
-)
+from torchrl_osr.film import InverseDynamicsController
+from torchrl_osr.modules import cvae_inverse_dynamics
 
 # x' = A x + B a, and by hand B^-1: a = B^-1 (x' - A x).
 A = torch.tensor([[1.0, 0.5], [0.0, 1.0]])
@@ -36,10 +25,10 @@ class ExactInverse(nn.Module):
         super().__init__()
         self.loc, self.scale = loc, scale
 
-    def forward(self, present, following):
-        present = present * self.scale + self.loc
-        following = following * self.scale + self.loc
-        action = (following - present @ A.T) @ B_INVERSE.T
+    def forward(self, observation, next_observation):
+        observation = observation * self.scale + self.loc
+        next_observation = next_observation * self.scale + self.loc
+        action = (next_observation - observation @ A.T) @ B_INVERSE.T
         return torch.atanh(action), torch.full_like(action, 0.1)
 
 
@@ -111,20 +100,26 @@ def test_nearest_is_measured_in_standard_deviations():
 
 
 def test_time_target_is_the_next_state_and_holds_at_the_end():
-    reference = torch.tensor([[0.0], [1.0], [2.0]])
-    assert [time_target(reference, t).item() for t in range(4)] == [1, 2, 2, 2]
+    reference = torch.tensor([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]])
+    controller = InverseDynamicsController(exact_model(), [reference])
+    targets = []
+    for controller.step in range(4):
+        targets.append(controller.targets(torch.zeros(1, 2))[0, 0].item())
+    assert targets == [1, 2, 2, 2]
 
 
 def test_nearest_target_is_the_successor_whatever_the_time():
     reference = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    controller = InverseDynamicsController(exact_model(), [reference], rule="nearest")
 
     def target(*state: float) -> list[float]:
-        return nearest_target(reference, torch.tensor(state)).tolist()
+        controller.step += 1
+        return controller.targets(torch.tensor([state]))[0].tolist()
 
     assert target(0.1, -0.2) == [1, 0]
     assert target(0.9, 0.2) == [1, 1]
     assert target(1.2, 0.9) == [0, 1]
-    assert target(0.0, 1.0) == [1, 0], "the last is nobody's nearest; (0, 0) is first"
+    assert target(0.0, 1.0) == [1, 0], "the last has no successor; (0, 0) is first"
 
 
 def test_late_by_two_steps_only_time_asks_for_a_jump():
@@ -155,24 +150,6 @@ def test_latent_is_at_its_mean():
         InverseDynamicsController(model, references)(state) for _ in range(2)
     )
     assert torch.equal(first, second)
-
-
-def test_frozen_model_is_the_one_that_the_loss_was_given():
-    model = tanh_gaussian_inverse_dynamics(2, 2, num_cells=[8])
-    actor = tanh_gaussian_actor(2, 2, num_cells=[8])
-    critics = critic_ensemble(2, 2, num_cells=[8])
-    loss = OSRLoss(actor, critics, model, recovery_weight=0.5)
-    references, state = [torch.randn(4, 2)], torch.randn(1, 2)
-    wanted = InverseDynamicsController(model, references)(state)
-    got = InverseDynamicsController(frozen_model(loss), references)(state)
-    assert torch.equal(got, wanted)
-
-
-def test_frozen_model_of_cql_is_an_error():
-    actor = tanh_gaussian_actor(2, 2, num_cells=[8])
-    loss = OSRLoss(actor, critic_ensemble(2, 2, num_cells=[8]), recovery_weight=0)
-    with pytest.raises(ValueError, match="OSRLoss holds no inverse dynamics model"):
-        frozen_model(loss)
 
 
 @pytest.mark.parametrize(

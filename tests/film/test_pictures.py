@@ -6,8 +6,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from torchrl_osr.evaluation.film_figures import GIF_STRIDE, Take, film_gif, film_strip
-from torchrl_osr.evaluation.visited_states import principal_plane, visited_states
+from torchrl_osr.film import (
+    GIF_STRIDE,
+    Take,
+    film_gif,
+    film_strip,
+    principal_plane,
+    visited_states,
+)
 
 
 class FakeCamera:

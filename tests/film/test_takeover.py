@@ -9,14 +9,17 @@ import pytest
 import torch
 
 from torchrl_osr.envs import ExternalPush
-from torchrl_osr.evaluation.recovery import Trajectory
-from torchrl_osr.evaluation.survival import (
+from torchrl_osr.evaluation import Trajectory
+from torchrl_osr.film import (
+    BEHAVIOR,
+    NEVER,
     Survival,
     discordant,
+    hand_over,
+    play_takeovers,
     steps_alive,
     survival_table,
 )
-from torchrl_osr.evaluation.takeover import BEHAVIOR, NEVER, hand_over, play_takeovers
 
 
 def trajectory(entries: int, *, terminated: bool) -> Trajectory:

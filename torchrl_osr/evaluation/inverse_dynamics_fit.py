@@ -1,4 +1,4 @@
-"""Is the inverse dynamics model fit to teach a policy? Held-out rows tell.
+"""Accuracy and calibration of an inverse dynamics model on held-out rows.
 
 Shapes: ``N`` rows, ``A`` action.
 """
@@ -24,12 +24,12 @@ NORMAL_QUANTILE_95 = 1.6448536269514722
 def inverse_dynamics_report(
     inverse_dynamics_network: ProbabilisticTensorDictSequential, data: TensorDictBase
 ) -> dict[str, Any]:
-    """Return held-out likelihood, explained variance and calibration.
+    """Held-out likelihood, explained variance and calibration.
 
     Args:
         inverse_dynamics_network: reads states and next states, ends in a
             :class:`~torchrl.modules.TanhNormal`.
-        data: rows that it was not trained on, ``[N]``; ``done`` rows are left out.
+        data: held-out rows, ``[N]``; ``done`` rows are left out.
 
     Returns:
         ``"nll"``, mean negative log-likelihood of the action in nats; ``"r2"``, share
@@ -44,7 +44,7 @@ def inverse_dynamics_report(
     data = data[~data.get(("next", "done")).squeeze(-1)]
     if not len(data):
         raise ValueError("No held-out row is a true transition: all are done.")
-    # A latent variable at its mean: as the policy's losses read the model.
+    # Latent variables at their mean, as the policy's losses use the model.
     with set_interaction_type(InteractionType.DETERMINISTIC):
         distribution = inverse_dynamics_network.get_dist(
             data.select(*inverse_dynamics_network.in_keys)
@@ -68,8 +68,8 @@ def inverse_dynamics_report(
     }
 
 
-def describe(report: Mapping[str, Any]) -> str:
-    """Return a report's line for the screen; an R2 that does not exist is a dash."""
+def describe_inverse_dynamics(report: Mapping[str, Any]) -> str:
+    """One line of text with the numbers of a report; ``None`` is a dash."""
     r2 = ", ".join("-" if each is None else f"{each:.2f}" for each in report["r2"])
     return (
         f"inverse dynamics, {report['rows']} held-out rows: NLL {report['nll']:.2f}, "

@@ -32,11 +32,11 @@ def make_data(rows: int = 20_000) -> TensorDict:
     state = torch.randn(rows, 2)
     loc = torch.randn(rows, 2)
     action = torch.tanh(loc + SCALE * torch.randn(rows, 2))
-    following = {
+    next_state = {
         "observation": state + loc,
         "done": torch.zeros(rows, 1, dtype=torch.bool),
     }
-    batch = {"observation": state, "action": action, "next": following}
+    batch = {"observation": state, "action": action, "next": next_state}
     return TensorDict(batch, [rows])
 
 

@@ -1,16 +1,15 @@
-"""The run's figure and the numbers that it is drawn from."""
+"""The table and the figure of a training run."""
 
 from __future__ import annotations
 
-import pytest
 from torchrl.record.loggers import CSVLogger
 
-from torchrl_osr.evaluation.figures import (
+from torchrl_osr.evaluation import (
     learning_curve,
     read_scalars,
-    whole_picture,
+    recent_score,
+    score_table,
 )
-from torchrl_osr.evaluation.summary import recent_score, score_table
 
 
 def evaluations(*scores: float) -> list[dict]:
@@ -34,25 +33,6 @@ def test_learning_curve_is_a_picture(tmp_path):
     scalars = {"loss_qvalue": [(0, 1.0), (10, 2.0)], "unknown": [(0, 1.0)]}
     learning_curve(evaluations(1, 2), scalars, path, title="t", data_score=1.5)
     assert path.read_bytes().startswith(b"\x89PNG")
-
-
-def test_a_picture_is_whole_or_the_one_before(tmp_path):
-    path = tmp_path / "curve.png"
-    path.write_bytes(b"the one before")
-
-    def fail():
-        with whole_picture(path) as beside:
-            beside.write_bytes(b"half a pict")
-            raise OSError("the disk is full")
-
-    with pytest.raises(OSError, match="full"):
-        fail()
-    assert [each.name for each in tmp_path.iterdir()] == ["curve.png"]
-    assert path.read_bytes() == b"the one before"
-    with whole_picture(path) as beside:
-        beside.write_bytes(b"a new one")
-        assert path.read_bytes() == b"the one before"
-    assert path.read_bytes() == b"a new one"
 
 
 def test_table_has_last_recent_and_best(tmp_path):
