@@ -24,14 +24,16 @@ from pathlib import Path
 import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
 from omegaconf import DictConfig
 from tensordict import TensorDict
 from torchrl import torchrl_logger
 from torchrl.objectives import SoftUpdate
 
-from torchrl_osr import InverseDynamicsLoss, StatePerturbation
+from torchrl_osr import StatePerturbation
 from torchrl_osr.evaluation import (
     EpisodeEvaluator,
+    describe_inverse_dynamics,
     deterministic_policy,
     inverse_dynamics_report,
     learning_curve,
@@ -39,8 +41,7 @@ from torchrl_osr.evaluation import (
     score_table,
     summarize,
 )
-from torchrl_osr.experiment import run_folder
-from torchrl_osr.experiment import schema as config
+from torchrl_osr.experiment import run_folder, schema
 from torchrl_osr.experiment.build import make_learner
 from torchrl_osr.experiment.loggers import make_loggers
 from torchrl_osr.experiment.training_data import load_training_data
@@ -48,7 +49,7 @@ from torchrl_osr.trainers import OfflineTrainer, check_hardware, largest_value
 
 EVALUATION_SEED = 10_000  # far from the seeds of the data's episodes
 
-config.register()
+schema.register()
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="offline_osr")
@@ -79,7 +80,8 @@ def run(cfg: DictConfig, folder: Path) -> float:
     # state, which is the paper's mixed data set.
     data = load_training_data(cfg, device)
     torch.manual_seed(cfg.seed)
-    perturbation = StatePerturbation(**cfg.perturbation, seed=cfg.seed)
+    noise = {"std": cfg.perturbation.std, "noise": cfg.perturbation.noise}
+    perturbation = StatePerturbation(**noise, seed=cfg.seed)
     buffer = data.buffer(cfg.trainer.batch_size)
     buffer.append_transform(perturbation)
 
@@ -107,7 +109,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
 
     # First phase: which action leads from the perturbed state to the next state?
     if hasattr(loss, "inverse_dynamics_network"):
-        fit = InverseDynamicsLoss(inverse_dynamics, **cfg.inverse_dynamics.loss)
+        fit = instantiate(cfg.inverse_dynamics.loss, _partial_=True)(inverse_dynamics)
         trainer = new_trainer(
             fit,
             adam(fit.parameters(), lr=cfg.optim.inverse_dynamics_lr),
@@ -123,7 +125,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
             trainer.register_op("process_optim_batch", shuffle_next)
         trainer.train()
         run_folder.write_json(folder / "inverse_dynamics.json", trainer.history[-1])
-        print(describe(trainer.history[-1]))
+        print(describe_inverse_dynamics(trainer.history[-1]))
 
     # Second phase: the policy, taught by the critics and by the frozen model.
     critic_params = list(loss.qvalue_network_params.parameters())
@@ -150,6 +152,9 @@ def run(cfg: DictConfig, folder: Path) -> float:
             description="policy",
             value_limits={"pred_value": limit, "target_value": limit},
         )
+        if cfg.perturbation.adversary is not None:
+            adversary = instantiate(cfg.perturbation.adversary)
+            trainer.register_op("process_optim_batch", partial(adversary, loss))
         trainer.train()
     return report(cfg, folder, data.score, trainer)
 
@@ -172,7 +177,7 @@ def report(
         history,
         read_scalars(folder / "csv" / "scalars" / "policy"),
         folder / "curve.png",
-        title=f"{name}, seed {cfg.seed}, recovery weight {cfg.loss.recovery_weight:g}",
+        title=f"{name}, {type(trainer.loss_module).__name__}, seed {cfg.seed}",
         data_score=data_score,
     )
     print("\n" + score_table(name, history, best, data_score, folder))
