@@ -35,7 +35,7 @@ def claim(folder: Path, config: DictConfig) -> None:
     if not path.exists():
         write_atomically(path, OmegaConf.to_yaml(config, resolve=True))
         return
-    here, there = (_flat(OmegaConf.to_container(each, resolve=True)) for each in (
+    here, there = (flatten(OmegaConf.to_container(each, resolve=True)) for each in (
         config, OmegaConf.load(path)
     ))  # fmt: skip
     differences = [
@@ -95,11 +95,11 @@ def status(folder: Path) -> Iterator[None]:
     write_json(folder / STATUS, {"status": "done"})
 
 
-def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
+def flatten(value: Any, prefix: str = "") -> dict[str, Any]:
     """Return nested mappings as one, with dotted keys."""
     if not isinstance(value, Mapping):
         return {prefix: value}
     flat: dict[str, Any] = {}
     for key, item in value.items():
-        flat |= _flat(item, f"{prefix}.{key}" if prefix else str(key))
+        flat |= flatten(item, f"{prefix}.{key}" if prefix else str(key))
     return flat

@@ -1,0 +1,282 @@
+"""The report's figures: lines with their bands, and intervals row by row.
+
+Up to :data:`MOST` methods share a panel, each with a colour of its own. More have a row
+of small panels each, on the others in grey.
+"""
+
+from __future__ import annotations
+
+import io
+import textwrap
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from torchrl_osr.report.comparisons import Difference
+from torchrl_osr.report.scores import Band, Estimate
+
+try:
+    from matplotlib.axes import Axes
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+except ImportError as error:
+    raise ImportError(
+        f"figures need {error.name!r}: pip install torchrl-osr[examples]"
+    ) from error
+
+# Okabe and Ito's palette, which colour-blind readers can tell apart, without its
+# yellow, too pale for a line.
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+MARKERS = ("o", "s", "^", "D", "v", "P")
+GREY, PALE = "#666666", "#C8C8C8"
+
+MOST = len(COLORS)
+"""Methods that share a panel."""
+
+WIDTH = 9.6
+"""Of every figure, in inches: fonts are then equally large on the page."""
+
+DOTTED = (0, (1, 2))
+
+
+class Panel(NamedTuple):
+    """What is drawn along one pair of axes.
+
+    Attributes:
+        title: above it.
+        bands: by method.
+        dotted: lines without a band, by method.
+        levels: horizontal lines that all methods are measured by.
+        ticks: labels of the places 0, 1, ...; with them, the places are points with
+            intervals. ``None``: a line along numbers.
+    """
+
+    title: str
+    bands: Mapping[str, Band]
+    dotted: Mapping[str, Band] = {}
+    levels: Sequence[float] = ()
+    ticks: Sequence[str] | None = None
+
+
+def draw_panels(
+    panels: Sequence[Panel],
+    methods: Sequence[str],
+    *,
+    xlabel: str,
+    ylabel: str,
+    per_row: int = 2,
+    sharey: bool = False,
+) -> Figure:
+    """Draw methods against each other, in small multiples if they are many.
+
+    Args:
+        panels: one for each data set or disturbance.
+        methods: in the order of their colours.
+
+    Keyword Args:
+        xlabel: of all panels.
+        ylabel: of all panels.
+        per_row: panels side by side; small multiples have all. Default 2.
+        sharey: whether all have one range of values. Default: no.
+    """
+    if len(methods) > MOST:
+        return _small_multiples(panels, methods, xlabel, ylabel, sharey)
+    columns = min(per_row, len(panels))
+    rows = -(-len(panels) // columns)
+    # Side by side where there are points, so that intervals can be told apart.
+    offsets = np.linspace(-0.3, 0.3, len(methods)) if len(methods) > 1 else [0.0]
+    figure, grid = _figure(rows, columns, 2.8 * rows + 0.6, sharey=sharey)
+    for axes, panel in zip(grid.flat, panels, strict=False):
+        _prepare(axes, panel, fontsize=10)
+        axes.set_title(plain(panel.title), fontsize=10)
+        for number, method in enumerate(methods):
+            _draw(axes, panel, method, number, offsets[number])
+    for axes in list(grid.flat)[len(panels) :]:
+        axes.set_visible(False)
+    figure.supxlabel(xlabel, fontsize=10)
+    figure.supylabel(ylabel, fontsize=10)
+    handles = [
+        Line2D([], [], color=COLORS[number], label=plain(method),
+               marker=MARKERS[number] if panels[0].ticks else "")
+        for number, method in enumerate(methods)
+    ]  # fmt: skip
+    widest = max(map(len, methods))
+    figure.legend(
+        handles=handles, loc="outside lower center", frameon=False,
+        ncols=max(1, min(len(handles), 110 // (widest + 8))),
+    )  # fmt: skip
+    return figure
+
+
+def draw_intervals(means: Mapping[str, Estimate], xlabel: str) -> Figure:
+    """Draw a mean with its interval in a row for each method."""
+    figure, grid = _figure(1, 1, 0.3 * len(means) + 0.9)
+    axes = grid[0, 0]
+    for place, each in enumerate(means.values()):
+        axes.hlines(place, each.low, each.high, color=COLORS[0], linewidth=2)
+        axes.plot(each.mean, place, "o", color=COLORS[0], markersize=6)
+    axes.set_yticks(np.arange(len(means)), [plain(method) for method in means])
+    axes.set_ylim(len(means) - 0.5, -0.5)
+    _sideways(axes)
+    axes.set_xlabel(xlabel)
+    return figure
+
+
+def draw_differences(differences: Sequence[Difference], reference: str) -> Figure:
+    """Draw differences with their intervals, a panel for each quantity.
+
+    Coloured: better or worse. Hollow: not told apart. Grey: there is no verdict.
+
+    Args:
+        differences: that are paired.
+        reference: the method that the others are compared with.
+    """
+    names = list(dict.fromkeys(each.quantity.name for each in differences))
+    data_sets = list(dict.fromkeys(each.data for each in differences))
+    there = dict.fromkeys((each.data, each.method) for each in differences)
+    keys = sorted(there, key=lambda key: data_sets.index(key[0]))  # stable
+    # One line of air above each data set, for its name.
+    lines = {
+        key: place + 1.3 * (data_sets.index(key[0]) + 1) for place, key in enumerate(keys)
+    }
+    columns = min(3, len(names))
+    rows = -(-len(names) // columns)
+    height = 0.17 * (max(lines.values()) + 2) + 1.1
+    figure, grid = _figure(rows, columns, rows * height, sharey=True)
+    for axes in list(grid.flat)[len(names) :]:
+        axes.set_visible(False)
+    for axes, name in zip(grid.flat, names, strict=False):
+        found = [each for each in differences if each.quantity.name == name]
+        axes.axvline(0, color=GREY, linewidth=1)
+        for each in found:
+            _mark(axes, each, lines[each.data, each.method])
+        better = "more is better" if found[0].quantity.sign > 0 else "less is better"
+        axes.set_title(f"{plain(name)}\n({better})", fontsize=9)
+        axes.set_xlabel(f"points, less {plain(reference)}", fontsize=8)
+        _sideways(axes)
+    first = grid[0, 0]
+    first.set_yticks(
+        list(lines.values()), [plain(method) for _, method in lines], fontsize=7.5
+    )
+    for axes in grid[:, 0]:
+        for data in data_sets:
+            top = min(line for key, line in lines.items() if key[0] == data)
+            axes.annotate(
+                plain(data), (0, top - 1.1), xycoords=("axes fraction", "data"),
+                xytext=(-4, 0), textcoords="offset points", ha="right", va="center",
+                fontsize=8, fontweight="bold", annotation_clip=False,
+            )  # fmt: skip
+    first.set_ylim(max(lines.values()) + 1, -0.5)
+    return figure
+
+
+def png(figure: Figure) -> bytes:
+    """Return a figure as a PNG file."""
+    file = io.BytesIO()
+    figure.savefig(file, dpi=130, facecolor="white", format="png")
+    return file.getvalue()
+
+
+def plain(text: str) -> str:
+    """Return text that Matplotlib does not take for a formula."""
+    return text.replace("$", r"\$")
+
+
+def _small_multiples(
+    panels: Sequence[Panel],
+    methods: Sequence[str],
+    xlabel: str,
+    ylabel: str,
+    sharey: bool,
+) -> Figure:
+    """Draw a row for each method and a column for each panel, the others in grey."""
+    figure, grid = _figure(
+        len(methods), len(panels), 1.05 * len(methods) + 0.8,
+        sharex="col", sharey=True if sharey else "col",
+    )  # fmt: skip
+    for row, method in zip(grid, methods, strict=True):
+        for axes, panel in zip(row, panels, strict=True):
+            _prepare(axes, panel, fontsize=7)
+            for other in methods:
+                if other != method:
+                    _draw(axes, panel, other, None, 0.0)
+            _draw(axes, panel, method, 0, 0.0)
+        row[0].set_ylabel(
+            textwrap.fill(plain(method), 15), rotation=0, ha="right", va="center",
+            fontsize=7.5,
+        )  # fmt: skip
+    for axes, panel in zip(grid[0], panels, strict=True):
+        axes.set_title(textwrap.fill(plain(panel.title), 120 // len(panels)), fontsize=8)
+    figure.supxlabel(xlabel, fontsize=9)
+    figure.supylabel(ylabel, fontsize=9)
+    return figure
+
+
+def _figure(rows: int, columns: int, height: float, **options: Any) -> tuple[Figure, Any]:
+    """Return a figure and its panels, ``[rows, columns]``."""
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(rows, columns, squeeze=False, **options)
+    for axes in grid.flat:
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(axis="y", color="#DDDDDD", linewidth=0.6)
+        axes.set_axisbelow(True)
+    return figure, grid
+
+
+def _prepare(axes: Axes, panel: Panel, fontsize: float) -> None:
+    """Draw what is not a method's own."""
+    for level in panel.levels:
+        axes.axhline(level, color=GREY, linewidth=1, linestyle=DOTTED)
+    axes.tick_params(labelsize=fontsize - 1)
+    if panel.ticks is not None:
+        axes.set_xticks(np.arange(len(panel.ticks)), panel.ticks)
+        axes.set_xlim(-0.6, len(panel.ticks) - 0.4)
+
+
+def _draw(
+    axes: Axes, panel: Panel, method: str, number: int | None, offset: float
+) -> None:
+    """Draw a method's line, its interval and what is dotted; in grey without a number."""
+    band = panel.bands.get(method)
+    if band is None:
+        return
+    color = PALE if number is None else COLORS[number]
+    if panel.ticks is None:
+        axes.plot(band.x, band.mean, color=color, linewidth=0.7 if number is None else 1.6)
+        if number is None:
+            return
+        if band.over:
+            axes.fill_between(
+                band.x, band.low, band.high, color=color, alpha=0.15, linewidth=0
+            )
+        dotted = panel.dotted.get(method)
+        if dotted is not None:
+            axes.plot(dotted.x, dotted.mean, ":", color=color, linewidth=0.9)
+        return
+    x = band.x + offset
+    marker = "" if number is None else MARKERS[number]
+    axes.plot(x, band.mean, color=color, marker=marker, linewidth=0.8, markersize=4.5)
+    if number is not None:
+        axes.vlines(x, band.low, band.high, color=color, linewidth=1.4)
+
+
+def _mark(axes: Axes, each: Difference, y: float) -> None:
+    """Draw one difference."""
+    assert each.estimate is not None
+    mean, low, high, _ = each.estimate
+    known = {"better": COLORS[0], "worse": COLORS[1], "not told apart": "black"}
+    color = known.get(each.verdict, GREY)
+    axes.hlines(y, low, high, color=color, linewidth=1.4)
+    axes.plot(
+        mean, y, "o", color=color, markersize=4.5,
+        markerfacecolor=color if each.told or color == GREY else "white",
+    )  # fmt: skip
+
+
+def _sideways(axes: Axes) -> None:
+    """Turn a panel's lines: values go from left to right."""
+    axes.grid(axis="y", visible=False)
+    axes.grid(axis="x", color="#DDDDDD", linewidth=0.6)
