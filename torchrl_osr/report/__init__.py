@@ -1,4 +1,4 @@
-"""One page about any number of runs: verdict, tables, figures and paired comparisons."""
+"""One page about any number of runs: verdict, tables, figures, differences."""
 
 from torchrl_osr.report.comparisons import compare, quantities
 from torchrl_osr.report.methods import comparison_notes, read_runs

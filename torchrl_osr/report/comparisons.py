@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 from torchrl_osr.evaluation.statistics import nested_resamples, percentile_interval
 from torchrl_osr.report.methods import METHOD, comparable, entry
 from torchrl_osr.report.runs import Run, RunTables
-from torchrl_osr.report.scores import Estimate, disturbances, over_what, recent
+from torchrl_osr.report.scores import (
+    Estimate,
+    decimal,
+    disturbances,
+    over_what,
+    recent,
+)
 
 Array = NDArray[np.float64]
 
@@ -241,29 +247,35 @@ def verdict(differences: Sequence[Difference], reference: str) -> list[str]:
         reference: the method that they are compared with.
 
     Returns:
-        Over all data sets, if there are several: what is told, what is not told apart,
-        and what cannot be told.
+        What is told, what is not told apart and what cannot be told; over all data
+        sets, of a method that has only one on that.
     """
-    together = [each for each in differences if each.data == ALL_DATA]
-    found = together or differences
+    everywhere = {each.method for each in differences if each.data == ALL_DATA}
+    found = [
+        each
+        for each in differences
+        if each.data == ALL_DATA or each.method not in everywhere
+    ]
     sentences = [
         f"{each.method} is {each.verdict} than {reference} in {each.quantity.name} on "
-        f"{each.data}: {each.estimate.mean:+.1f} points {each.estimate.interval('+')}, "
-        f"{each.seeds} pairs of runs a data set."
+        f"{each.data}: {decimal(each.estimate.mean, '+')} points "
+        f"{each.estimate.interval('+')}, {each.seeds} pairs of runs a data set."
         for each in found
         if each.told and each.estimate is not None
     ]
     rest: dict[str, dict[str, list[str]]] = {}
     for each in found:
         if not each.told:
-            names = rest.setdefault(each.verdict, {})
-            names.setdefault(each.quantity.name, []).append(each.method)
-    for why, quantities_of in rest.items():
-        merged: dict[str, list[str]] = {}
-        for name, methods in quantities_of.items():
-            merged.setdefault(", ".join(dict.fromkeys(methods)), []).append(name)
-        parts = [f"{methods} in {', '.join(names)}" for methods, names in merged.items()]
-        sentences.append(f"{why[0].upper()}{why[1:]} against {reference}: {'; '.join(parts)}.")
+            names = rest.setdefault(each.verdict, {}).setdefault(each.method, [])
+            names.append(each.quantity.name)
+    for why, methods in rest.items():
+        alike: dict[str, list[str]] = {}
+        for method, names in methods.items():
+            alike.setdefault(", ".join(dict.fromkeys(names)), []).append(method)
+        sentences += [
+            f"{', '.join(each)} against {reference} in {names}: {why}."
+            for names, each in alike.items()
+        ]
     if any(each.verdict.startswith("cannot") for each in found):
         sentences.append(
             f"A verdict needs {MIN_SEEDS} pairs of runs on every data set: over fewer "

@@ -21,6 +21,7 @@ try:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
+    from PIL import Image  # Matplotlib needs it, too
 except ImportError as error:
     raise ImportError(
         f"figures need {error.name!r}: pip install torchrl-osr[examples]"
@@ -37,6 +38,8 @@ MOST = len(COLORS)
 
 WIDTH = 9.6
 """Of every figure, in inches: fonts are then equally large on the page."""
+
+DPI = 130
 
 DOTTED = (0, (1, 2))
 
@@ -104,7 +107,7 @@ def draw_panels(
     ]  # fmt: skip
     widest = max(map(len, methods))
     figure.legend(
-        handles=handles, loc="outside lower center", frameon=False,
+        handles=handles, loc="outside upper center", frameon=False,
         ncols=max(1, min(len(handles), 110 // (widest + 8))),
     )  # fmt: skip
     return figure
@@ -139,7 +142,8 @@ def draw_differences(differences: Sequence[Difference], reference: str) -> Figur
     keys = sorted(there, key=lambda key: data_sets.index(key[0]))  # stable
     # One line of air above each data set, for its name.
     lines = {
-        key: place + 1.3 * (data_sets.index(key[0]) + 1) for place, key in enumerate(keys)
+        key: place + 1.3 * (data_sets.index(key[0]) + 1)
+        for place, key in enumerate(keys)
     }
     columns = min(3, len(names))
     rows = -(-len(names) // columns)
@@ -175,13 +179,24 @@ def draw_differences(differences: Sequence[Difference], reference: str) -> Figur
 def png(figure: Figure) -> bytes:
     """Return a figure as a PNG file."""
     file = io.BytesIO()
-    figure.savefig(file, dpi=130, facecolor="white", format="png")
+    FigureCanvasAgg(figure)
+    figure.savefig(file, dpi=DPI, facecolor="white", format="png")
+    picture = Image.open(file).convert("RGB")
+    file = io.BytesIO()
+    # 256 colours: a third of the bytes, and nobody sees it.
+    picture.quantize(256, dither=Image.Dither.NONE).save(file, "png", optimize=True)
     return file.getvalue()
 
 
 def plain(text: str) -> str:
     """Return text that Matplotlib does not take for a formula."""
     return text.replace("$", r"\$")
+
+
+def _broken(text: str, width: int) -> str:
+    """Return a name on several lines, broken behind spaces and underscores."""
+    lines = textwrap.wrap(plain(text).replace("_", "_ "), max(width, 8))
+    return "\n".join(lines).replace("_ ", "_")
 
 
 def _small_multiples(
@@ -204,20 +219,21 @@ def _small_multiples(
                     _draw(axes, panel, other, None, 0.0)
             _draw(axes, panel, method, 0, 0.0)
         row[0].set_ylabel(
-            textwrap.fill(plain(method), 15), rotation=0, ha="right", va="center",
+            _broken(method, 18), rotation=0, ha="right", va="center",
             fontsize=7.5,
         )  # fmt: skip
     for axes, panel in zip(grid[0], panels, strict=True):
-        axes.set_title(textwrap.fill(plain(panel.title), 120 // len(panels)), fontsize=8)
+        axes.set_title(_broken(panel.title, 120 // len(panels)), fontsize=8)
     figure.supxlabel(xlabel, fontsize=9)
     figure.supylabel(ylabel, fontsize=9)
     return figure
 
 
-def _figure(rows: int, columns: int, height: float, **options: Any) -> tuple[Figure, Any]:
+def _figure(
+    rows: int, columns: int, height: float, **options: Any
+) -> tuple[Figure, Any]:
     """Return a figure and its panels, ``[rows, columns]``."""
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
-    FigureCanvasAgg(figure)
     grid = figure.subplots(rows, columns, squeeze=False, **options)
     for axes in grid.flat:
         axes.spines[["top", "right"]].set_visible(False)
@@ -239,13 +255,15 @@ def _prepare(axes: Axes, panel: Panel, fontsize: float) -> None:
 def _draw(
     axes: Axes, panel: Panel, method: str, number: int | None, offset: float
 ) -> None:
-    """Draw a method's line, its interval and what is dotted; in grey without a number."""
+    """Draw a method's line and interval; without a number, a grey line."""
     band = panel.bands.get(method)
     if band is None:
         return
     color = PALE if number is None else COLORS[number]
     if panel.ticks is None:
-        axes.plot(band.x, band.mean, color=color, linewidth=0.7 if number is None else 1.6)
+        axes.plot(
+            band.x, band.mean, color=color, linewidth=0.7 if number is None else 1.6
+        )
         if number is None:
             return
         if band.over:
@@ -257,7 +275,7 @@ def _draw(
             axes.plot(dotted.x, dotted.mean, ":", color=color, linewidth=0.9)
         return
     x = band.x + offset
-    marker = "" if number is None else MARKERS[number]
+    marker = "_" if number is None else MARKERS[number]
     axes.plot(x, band.mean, color=color, marker=marker, linewidth=0.8, markersize=4.5)
     if number is not None:
         axes.vlines(x, band.low, band.high, color=color, linewidth=1.4)

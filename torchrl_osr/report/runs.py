@@ -155,7 +155,9 @@ class RunTables:
     @property
     def suites(self) -> list[str]:
         """The suites, in the order of their first runs."""
-        return list(dict.fromkeys(suite for run in self.runs for suite in run.protocols))
+        return list(
+            dict.fromkeys(suite for run in self.runs for suite in run.protocols)
+        )
 
     def cells(self) -> dict[tuple[str, str], list[Run]]:
         """The runs of each data set and method: those that may be averaged."""
@@ -297,7 +299,9 @@ def check_status(status: Mapping[str, Any]) -> None:
         ValueError: saying how it stands.
     """
     if status["status"] != "done":
-        why = "".join(f": {status[key]}" for key in ("error", "reason") if key in status)
+        why = "".join(
+            f": {status[key]}" for key in ("error", "reason") if key in status
+        )
         raise ValueError(f"not finished, its status is {status['status']}{why}")
 
 
@@ -390,7 +394,9 @@ def _parse(content: Path | str | Exception, name: str) -> dict[str, Any]:
     """Return the record of a folder or a line."""
     if isinstance(content, Exception):
         raise content
-    return read_record(content) if isinstance(content, Path) else parse_json(content, name)
+    return (
+        read_record(content) if isinstance(content, Path) else parse_json(content, name)
+    )
 
 
 def _lines(table: Path) -> Iterator[str]:
@@ -454,7 +460,9 @@ def _training_episodes(
         if row["seeds"] != evaluations[0]["seeds"]:
             raise ValueError(f"episodes of {where} have other seeds")
         returns = _numbers(row["returns"], row["seeds"], where)
-        parts.append(_rows("", row["step"], row["seeds"], normalized_score(env, returns)))
+        parts.append(
+            _rows("", row["step"], row["seeds"], normalized_score(env, returns))
+        )
     return _stack(parts)
 
 
@@ -483,8 +491,16 @@ def _parse_suite(content: Any) -> tuple[str, pd.DataFrame, pd.DataFrame]:
             scores = _numbers(level["scores"], seeds, f"step {step}, {name}")
             ends = level["recovery_steps"] is not None
             episodes.append(
-                _rows(suite, step, seeds, scores, name, kind, strength,
-                      level if ends else None)
+                _rows(
+                    suite,
+                    step,
+                    seeds,
+                    scores,
+                    name,
+                    kind,
+                    strength,
+                    level if ends else None,
+                )
             )
             if ends:
                 where = {"suite": suite, "disturbance": name, "step": int(step)}

@@ -254,8 +254,8 @@ def episode_profile(episodes: pd.DataFrame, thresholds: Array) -> Band:
         ]
         for _, group in recent(episodes).groupby("data", sort=False)
     ]
-    mean = np.mean([np.mean([run.mean(0) for run in group], axis=0) for group in tables],
-                   axis=0)  # fmt: skip
+    means = [np.mean([run.mean(0) for run in group], axis=0) for group in tables]
+    mean = np.mean(means, axis=0)
     # A seed for each data set: with one, they would be drawn alike.
     resamples = [nested_resamples(each, seed=seed) for seed, each in enumerate(tables)]
     low, high = percentile_interval(np.mean(resamples, axis=0))
@@ -302,7 +302,9 @@ def disturbed(episodes: pd.DataFrame, suite: str) -> Disturbed:
     """
     rows = episodes[episodes["suite"] == suite]
     names = ["", *disturbances(rows, suite).index]
-    runs = [_table(run, "disturbance")[names] for _, run in rows.groupby("run", sort=False)]
+    runs = [
+        _table(run, "disturbance")[names] for _, run in rows.groupby("run", sort=False)
+    ]
     resamples = pd.DataFrame(nested_resamples(runs), columns=names)
     means = pd.DataFrame([run.mean() for run in runs]).mean()
     over = over_what([runs])
@@ -350,7 +352,9 @@ def area(found: Disturbed, strengths: pd.Series) -> Estimate | None:
     """
     if strengths.nunique() < 2 or found.shares is None:
         return None
-    points = [100 * found.scores[name].mean / found.clean.mean for name in strengths.index]
+    points = [
+        100 * found.scores[name].mean / found.clean.mean for name in strengths.index
+    ]
     # Each strength's share of the range: half the way to its neighbours.
     steps = np.diff(strengths) / (strengths.iloc[-1] - strengths.iloc[0])
     weights = (np.append(steps, 0) + np.append(0, steps)) / 2
