@@ -2,12 +2,13 @@
 
     python examples/report.py outputs/oos
     python examples/report.py multirun/*/ outputs/ --reference cql --output report
-    python examples/report.py results/oos/runs.jsonl.gz
+    python examples/report.py outputs/oos --pack runs.jsonl.gz
+    python examples/report.py runs.jsonl.gz
 
 Looks in and below the folders for what ``examples/offline_osr.py`` and
-``examples/evaluate.py`` left there; a table of runs is read as it is. ``report.html``
-needs no other file; the figures are beside it as PNG files, too. How to read it:
-docs/report.md.
+``examples/evaluate.py`` left there. ``report.html`` needs no other file; the figures
+are beside it as PNG files, too. ``--pack`` writes no page, but all that a page is made
+of into one table of runs. How to read the page: docs/report.md.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import shlex
 import sys
 from pathlib import Path
 
-from torchrl_osr.report import comparison_notes, read_runs, write_report
+from torchrl_osr.report import comparison_notes, pack_runs, read_runs, write_report
 
 
 def main() -> None:
@@ -28,10 +29,15 @@ def main() -> None:
     )
     parser.add_argument("--output", type=Path, default=Path("report"), help="a folder")
     parser.add_argument("--reference", help="method to compare with; default the first")
+    parser.add_argument("--pack", type=Path, metavar="TABLE", help="a .jsonl.gz file")
     options = parser.parse_args()
 
     command = shlex.join(["python", *sys.argv])
     try:
+        if options.pack:
+            number = pack_runs(options.runs, options.pack)
+            print(f"{number} runs in {options.pack}")
+            return
         tables = read_runs(options.runs)
         for path, reason in tables.left_out:
             print(f"left out: {path}: {reason}")

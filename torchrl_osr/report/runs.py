@@ -10,6 +10,7 @@ from __future__ import annotations
 import gzip
 import json
 import math
+import os
 import re
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -221,17 +222,21 @@ def pack_runs(folders: Iterable[Path], table: Path) -> int:
 
     Raises:
         OSError: if a file cannot be read or written.
-        ValueError: if a run is not finished or makes no sense, naming it.
+        ValueError: if there is no run, or one that is not finished or makes no sense,
+            naming it.
     """
+    found = [folder for top in folders for folder in _folders(top)]
+    if not found:
+        raise ValueError("there is no run in the folders.")
+    above = os.path.commonpath([folder.absolute().parent for folder in found])
     records = []
-    for top in folders:
-        for folder in _folders(top):
-            record = read_record(folder)
-            record["folder"] = folder.relative_to(top).as_posix()
-            _, unusable = parse_run(record)
-            if unusable:
-                raise ValueError(f"{folder}: {'; '.join(map(': '.join, unusable))}")
-            records.append(record)
+    for folder in found:
+        record = read_record(folder)
+        _, unusable = parse_run(record)
+        if unusable:
+            raise ValueError(f"{folder}: {'; '.join(map(': '.join, unusable))}")
+        name = folder.absolute().relative_to(above).as_posix()
+        records.append(record | {"folder": name})
     write_records(records, table)
     return len(records)
 
