@@ -27,7 +27,9 @@ def row(episodes: pd.DataFrame, record: dict[str, Any]) -> dict[str, Any]:
     low, high = mean_interval(scores.get_group(last["step"]))[1:]
     if "successes" in last:
         total = len(last["successes"])
-        low, high = (100 * end for end in wilson_interval(sum(last["successes"]), total))
+        low, high = (
+            100 * end for end in wilson_interval(sum(last["successes"]), total)
+        )
     model = record["inverse_dynamics"] or {}
     return {
         "data's own": record["returns"]["data_score"],

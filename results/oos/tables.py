@@ -1,6 +1,6 @@
 """Print the tables of README.md from the tables of runs beside it.
 
-    python results/oos/tables.py
+python results/oos/tables.py
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ WIDE = ("osr_beta_1e-1", "osr_beta_1e-1_clean_model")
 WIDE_REFERENCE = "cql_noisy_bc_beta_1e-1"
 
 
-def differences(tables: RunTables, methods: Sequence[str], reference: str) -> pd.DataFrame:
+def differences(
+    tables: RunTables, methods: Sequence[str], reference: str
+) -> pd.DataFrame:
     """Return each method less the reference, a column for each quantity.
 
     Returns:
@@ -54,7 +56,9 @@ def by_data(tables: RunTables) -> None:
             "seeds": ", ".join(str(seed) for seed in group["seed"].unique()),
             "mean of the last five": str(estimate(by_run(group))),
         }
-        for key, group in recent(tables.episodes).groupby(["data", "method"], sort=False)
+        for key, group in recent(tables.episodes).groupby(
+            ["data", "method"], sort=False
+        )
     }
     scores = pd.DataFrame.from_dict(rows, orient="index")
     frame = scores.join(differences(tables, tables.methods, REFERENCE)).fillna("0")
@@ -66,9 +70,13 @@ def main() -> None:
     """Print the tables of the grid, and those of the seeds beyond it."""
     tables = read_runs([HERE / "runs.jsonl.gz"])
     by_data(tables)
-    less = {each: differences(tables, OWN, each).loc["all data sets"] for each in ABLATIONS}
+    less = {
+        each: differences(tables, OWN, each).loc["all data sets"] for each in ABLATIONS
+    }
     frame = pd.concat(less).unstack(sort=False).swaplevel(axis=1)
-    frame = frame[[(own, name) for own in OWN for name in less["cql"] if "lost" not in name]]
+    frame = frame[
+        [(own, name) for own in OWN for name in less["cql"] if "lost" not in name]
+    ]
     frame.columns = [f"`{own}`, {name}" for own, name in frame.columns]
     show("All data sets", frame, "less")
     wide = differences(tables, WIDE, WIDE_REFERENCE)

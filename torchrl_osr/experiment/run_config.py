@@ -19,6 +19,9 @@ from torchrl_osr._files import read_text
 # Those of our runs have 4 kB.
 MAX_CONFIG_BYTES = 2**20
 
+# Those of our runs have 4 levels; a few hundred would exhaust the parser's stack.
+MAX_CONFIG_DEPTH = 32
+
 TARGET_PACKAGES = ("torchrl_osr", "torchrl_osr.modules", "torchrl_osr.objectives")
 """Whose public names a configuration may have called."""
 
@@ -51,13 +54,19 @@ def read_yaml(path: Path) -> Any:
 
     Raises:
         OSError: if it cannot be read.
-        ValueError: if it is too large, or has aliases, which no run writes and a few
-            of which can fill the memory.
+        ValueError: if it is too large or nested too deep, or has aliases, which no run
+            writes and a few of which can fill the memory.
         YAMLError: if it is no YAML.
     """
     text = read_text(path, max_bytes=MAX_CONFIG_BYTES)
-    if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
-        raise ValueError(f"{path.name} has YAML aliases, which no run writes")
+    depth = 0
+    for event in yaml.parse(text):
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if depth > MAX_CONFIG_DEPTH:
+            raise ValueError(f"{path.name} is nested more than {MAX_CONFIG_DEPTH} deep")
+        if isinstance(event, yaml.AliasEvent):
+            raise ValueError(f"{path.name} has YAML aliases, which no run writes")
     return OmegaConf.to_container(OmegaConf.create(text))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,9 @@ from torchrl_osr._files import write_atomically, write_json
 from torchrl_osr.trainers.preemption import Preempted
 
 CONFIG, STATUS = "config.yaml", "status.json"
+
+PACKAGES = ("torchrl-osr", "torch", "torchrl", "tensordict", "gymnasium", "mujoco")
+"""Packages whose versions decide a run's numbers."""
 
 # May differ when a run is continued: they do not touch a single number.
 FREE_KEYS = ("resume", "trainer.progress")
@@ -93,6 +97,11 @@ def status(folder: Path) -> Iterator[None]:
             write_json(folder / STATUS, {"status": "failed", "error": reason})
         raise
     write_json(folder / STATUS, {"status": "done"})
+
+
+def package_versions() -> dict[str, str]:
+    """Versions of :data:`PACKAGES`, by name with underscores."""
+    return {package.replace("-", "_"): version(package) for package in PACKAGES}
 
 
 def flatten(value: Any, prefix: str = "") -> dict[str, Any]:

@@ -268,7 +268,7 @@ def verdict(differences: Sequence[Difference], reference: str) -> list[str]:
         if not each.told:
             names = rest.setdefault(each.verdict, {}).setdefault(each.method, [])
             names.append(each.quantity.name)
-    for why, methods in rest.items():
+    for why, methods in sorted(rest.items(), key=lambda each: each[0] == "not paired"):
         alike: dict[str, list[str]] = {}
         for method, names in methods.items():
             alike.setdefault(", ".join(dict.fromkeys(names)), []).append(method)

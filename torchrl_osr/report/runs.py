@@ -24,7 +24,7 @@ import pandas as pd
 
 from torchrl_osr._files import MAX_JSON_BYTES, parse_json, read_json, write_atomically
 from torchrl_osr.data import REFERENCE_RETURNS, normalized_score
-from torchrl_osr.experiment.run_config import read_yaml
+from torchrl_osr.experiment.run_config import MAX_CONFIG_DEPTH, read_yaml
 from torchrl_osr.experiment.run_folder import CONFIG, STATUS, flatten
 
 RETURNS = "returns.json"
@@ -34,9 +34,6 @@ MAX_TABLE_BYTES = 4 * MAX_JSON_BYTES
 
 MAX_REASON = 300
 """Characters of the reason why a run is left out."""
-
-MAX_DEPTH = 32
-"""Of a configuration's nesting; ours have 4 levels."""
 
 MAX_OFFSET = 100_000
 """Steps from a disturbance to the end of its distance curve."""
@@ -99,7 +96,7 @@ class Run:
         share, path = self.config["data.random_share"], self.config["data.path"]
         mixed = f", {100 * share:g} % random" if share else ""
         recorded = f" {path}" if path else ""
-        return _encodable(f"{self.env} {self.config['data.level']}{recorded}{mixed}")
+        return f"{self.env} {self.config['data.level']}{recorded}{mixed}"
 
     @property
     def seed(self) -> int:
@@ -203,10 +200,12 @@ def read_each(paths: Iterable[Path]) -> tuple[list[Run], list[LeftOut]]:
             run, unusable = parse_run(record)
         # A foreign file may hold anything; no run but its own may suffer from it.
         except Exception as error:
-            left_out.append(LeftOut(path, _reason(error)))
+            left_out.append(LeftOut(*_encodable([path, _reason(error)])))
         else:
             runs.append(run)
-            left_out += [LeftOut(f"{path}/{name}", why) for name, why in unusable]
+            left_out += [
+                LeftOut(*_encodable([f"{path}/{name}", why])) for name, why in unusable
+            ]
     return runs, left_out
 
 
@@ -324,14 +323,17 @@ def parse_run(record: Mapping[str, Any]) -> tuple[Run, list[tuple[str, str]]]:
         KeyError: if an entry is missing.
     """
     check_status(record["status"])
-    if _depth(record["config"]) > MAX_DEPTH:
-        raise ValueError(f"the configuration is nested more than {MAX_DEPTH} deep")
-    config = flatten(record["config"])
+    if _depth(record["config"]) > MAX_CONFIG_DEPTH:
+        raise ValueError(
+            f"the configuration is nested more than {MAX_CONFIG_DEPTH} deep"
+        )
+    names = ("folder", "method", "config", "overrides")
+    folder, method, config, overrides = _encodable([record[name] for name in names])
+    config = flatten(config)
     returns = record["returns"]
     steps = int(config["trainer.steps"])
     parts = [_training_episodes(returns["evaluations"], config["env.name"], steps)]
-    distances = [pd.DataFrame(columns=["suite", "disturbance", "step", "offset",
-                                       *DISTANCES.values()])]  # fmt: skip
+    distances = [_stack([NO_CURVE])]
     versions = [returns["versions"]]
     protocols: dict[str, dict[str, Any]] = {}
     unusable = []
@@ -347,16 +349,16 @@ def parse_run(record: Mapping[str, Any]) -> tuple[Run, list[tuple[str, str]]]:
             parts.append(episodes)
             distances.append(curves)
             versions.append(content["versions"])
-    overrides, score = record["overrides"], returns["data_score"]
+    score = returns["data_score"]
     run = Run(
-        folder=_encodable(record["folder"]),
-        method=_encodable(record["method"]),
+        folder=str(folder),
+        method=str(method),
         config=config,
         overrides=None if overrides is None else tuple(map(str, overrides)),
         data_score=None if score is None else float(_finite([score], "data_score")[0]),
         versions=_merge_versions(versions),
         episodes=pd.concat(parts, ignore_index=True),
-        distances=pd.concat([each for each in distances if len(each)] or distances),
+        distances=pd.concat(distances, ignore_index=True),
         protocols=protocols,
     )
     # What the report asks of a run later is asked here, where it can be refused.
@@ -481,11 +483,11 @@ def _parse_suite(content: Any) -> tuple[str, pd.DataFrame, pd.DataFrame]:
         )
     if not content["evaluations"]:
         raise ValueError("it has no evaluations")
-    suite = _encodable(content["suite"])
+    suite = _encodable(str(content["suite"]))
     first = [_level(each) for each in content["evaluations"][0]["levels"]]
     if not suite or not first or len({name for name, *_ in first}) < len(first):
         raise ValueError("suite and levels need one name each")
-    episodes, curves = [], []
+    episodes, curves = [], [NO_CURVE]
     for row in content["evaluations"]:
         step, seeds = row["step"], row["clean"]["seeds"]
         if [_level(each) for each in row["levels"]] != first:
@@ -510,7 +512,7 @@ def _parse_suite(content: Any) -> tuple[str, pd.DataFrame, pd.DataFrame]:
             if ends:
                 where = {"suite": suite, "disturbance": name, "step": int(step)}
                 curves.append(_curve(level["distance"], where))
-    return suite, _stack(episodes), _stack(curves) if curves else pd.DataFrame()
+    return suite, _stack(episodes), _stack(curves)
 
 
 def _rows(
@@ -564,10 +566,10 @@ def _rows(
 
 def _broadcast(columns: Mapping[str, Any], rows: int) -> dict[str, Any]:
     """Return every column with a value for each row."""
-    return {
-        name: np.broadcast_to(np.asarray(value), rows)
-        for name, value in columns.items()
-    }
+    for name, column in columns.items():
+        if np.ndim(column) and np.shape(column) != (rows,):
+            raise ValueError(f"{name} has not {rows} entries")
+    return {name: np.broadcast_to(each, rows) for name, each in columns.items()}
 
 
 def _stack(parts: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
@@ -592,7 +594,8 @@ def _curve(distance: Mapping[str, Any], where: Mapping[str, Any]) -> dict[str, A
 def _level(level: Mapping[str, Any]) -> tuple[str, str, float]:
     """Return name, kind and strength of a disturbance."""
     (strength,) = _finite([level["strength"]], "strength")
-    return _encodable(level["name"]), _encodable(level["kind"]), float(strength)
+    name, kind = _encodable([str(level["name"]), str(level["kind"])])
+    return name, kind, float(strength)
 
 
 def _protocol(episodes: pd.DataFrame, steps: int) -> dict[str, Any]:
@@ -632,13 +635,14 @@ def _merge_versions(sources: Iterable[Mapping[str, str] | None]) -> dict[str, st
     found: dict[str, list[str]] = {}
     for source in sources:
         for package, version in (source or {}).items():
-            versions = found.setdefault(_encodable(package), [])
-            if str(version) not in versions:
-                versions.append(str(version))
+            package, version = _encodable([str(package), str(version)])
+            versions = found.setdefault(package, [])
+            if version not in versions:
+                versions.append(version)
     return {package: " and ".join(each) for package, each in found.items()}
 
 
-def _depth(value: Any, most: int = MAX_DEPTH) -> int:
+def _depth(value: Any, most: int = MAX_CONFIG_DEPTH) -> int:
     """Levels of nesting; one more than ``most`` if there are more."""
     inner = value.values() if isinstance(value, dict) else value
     if not isinstance(value, (dict, list)) or most < 0:
@@ -646,15 +650,21 @@ def _depth(value: Any, most: int = MAX_DEPTH) -> int:
     return 1 + max((_depth(each, most - 1) for each in inner), default=0)
 
 
-def _encodable(text: Any) -> str:
-    """Return a name that can be written as UTF-8, whatever a file escaped."""
-    return str(text).encode("utf-8", "replace").decode("utf-8")
+def _encodable(value: Any) -> Any:
+    """Return texts that can be written as UTF-8, whatever a file escaped."""
+    return json.loads(json.dumps(value, ensure_ascii=False).encode("utf-8", "replace"))
 
 
 def _reason(error: Exception) -> str:
     """Return why something could not be used, on one line."""
     if isinstance(error, KeyError):
-        return _encodable(f"there is no entry {error}")[:MAX_REASON]
+        return f"there is no entry {error}"[:MAX_REASON]
     named = isinstance(error, (OSError, ValueError))
     text = str(error) if named else f"{type(error).__name__}: {error}"
-    return _encodable(text).split("\n")[0][:MAX_REASON] or type(error).__name__
+    return text.split("\n")[0][:MAX_REASON] or type(error).__name__
+
+
+NO_CURVE = _curve(
+    {"offset": [], **{key: [] for key in DISTANCES}},
+    {"suite": "", "disturbance": "", "step": 0},
+)
