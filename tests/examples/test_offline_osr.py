@@ -7,6 +7,7 @@ import json
 import signal
 import time
 import zipfile
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -62,6 +63,7 @@ def test_run_leaves_table_figure_returns_and_checkpoints(finished):
     assert str(folder) in output
     assert json.loads((folder / "status.json").read_text()) == {"status": "done"}
     returns = json.loads((folder / "returns.json").read_text())
+    assert returns["versions"]["torchrl"] == version("torchrl")
     assert [row["step"] for row in returns["evaluations"]] == [20, 40]
     assert len(returns["last"]["returns"]) == 2
     assert returns["last"] == returns["evaluations"][-1]

@@ -206,24 +206,33 @@ def _small_multiples(
     ylabel: str,
     sharey: bool,
 ) -> Figure:
-    """Draw a row for each method and a column for each panel, the others in grey."""
+    """Draw a row for each method, the others in grey; one panel alone: side by side."""
+    alone = len(panels) == 1
+    columns = 4 if alone else len(panels)
+    rows = -(-len(methods) * len(panels) // columns)
     figure, grid = _figure(
-        len(methods), len(panels), 1.05 * len(methods) + 0.8,
-        sharex="col", sharey=True if sharey else "col",
+        rows, columns, (1.6 if alone else 1.05) * rows + 0.8,
+        sharex="col", sharey=True if sharey or alone else "col",
     )  # fmt: skip
-    for row, method in zip(grid, methods, strict=True):
-        for axes, panel in zip(row, panels, strict=True):
-            _prepare(axes, panel, fontsize=7)
-            for other in methods:
-                if other != method:
-                    _draw(axes, panel, other, None, 0.0)
-            _draw(axes, panel, method, 0, 0.0)
-        row[0].set_ylabel(
-            _broken(method, 18), rotation=0, ha="right", va="center",
-            fontsize=7.5,
-        )  # fmt: skip
-    for axes, panel in zip(grid[0], panels, strict=True):
-        axes.set_title(_broken(panel.title, 120 // len(panels)), fontsize=8)
+    cells = [(method, panel) for method in methods for panel in panels]
+    for axes, (method, panel) in zip(grid.flat, cells, strict=False):
+        _prepare(axes, panel, fontsize=7)
+        for other in methods:
+            if other != method:
+                _draw(axes, panel, other, None, 0.0)
+        _draw(axes, panel, method, 0, 0.0)
+        if alone:
+            axes.set_title(_broken(method, 30), fontsize=8)
+        elif panel is panels[0]:
+            name = _broken(method, 18)
+            axes.set_ylabel(name, rotation=0, ha="right", va="center", fontsize=7.5)
+    for axes in list(grid.flat)[len(cells) :]:
+        axes.set_visible(False)
+    if alone:
+        figure.suptitle(plain(panels[0].title), fontsize=10)
+    else:
+        for axes, panel in zip(grid[0], panels, strict=True):
+            axes.set_title(_broken(panel.title, 120 // columns), fontsize=8)
     figure.supxlabel(xlabel, fontsize=9)
     figure.supylabel(ylabel, fontsize=9)
     return figure

@@ -13,11 +13,12 @@ import math
 import os
 import re
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 import pandas as pd
@@ -194,10 +195,9 @@ def read_each(paths: Iterable[Path]) -> tuple[list[Run], list[LeftOut]]:
     """
     runs: list[Run] = []
     left_out: list[LeftOut] = []
-    for path, content in _records(paths):
+    for path, load in _sources(paths):
         try:
-            record = content if isinstance(content, dict) else _parse(content, path)
-            run, unusable = parse_run(record)
+            run, unusable = parse_run(load())
         # A foreign file may hold anything; no run but its own may suffer from it.
         except Exception as error:
             left_out.append(LeftOut(*_encodable([path, _reason(error)])))
@@ -253,8 +253,8 @@ def read_records(table: Path) -> Iterator[dict[str, Any]]:
         OSError: if it cannot be read.
         ValueError: if it is damaged or too large, naming the line.
     """
-    for number, line in enumerate(_lines(table), 1):
-        yield _parse(line, f"{table}, line {number}")
+    for name, line in _lines(table):
+        yield parse_json(line, name)
 
 
 def read_record(folder: Path) -> dict[str, Any]:
@@ -379,48 +379,44 @@ def _folders(top: Path) -> list[Path]:
     ]
 
 
-def _records(paths: Iterable[Path]) -> Iterator[tuple[str, Any]]:
-    """Yield where each record is, and the record, a line of a table or an error."""
+def _sources(
+    paths: Iterable[Path],
+) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
+    """Yield where each record is, and what reads it."""
     seen = set()
     for top in paths:
         if top.is_file():
-            number = 0
             try:
-                for number, line in enumerate(_lines(top), 1):
-                    yield f"{top}, line {number}", line
+                for name, line in _lines(top):
+                    yield name, partial(parse_json, line, name)
             except (OSError, ValueError) as error:
-                yield f"{top}, after line {number}", error
+                yield str(top), partial(_refuse, error)
             continue
         for folder in _folders(top):
             if folder.resolve() not in seen:
                 seen.add(folder.resolve())
-                yield str(folder), folder
+                yield str(folder), partial(read_record, folder)
 
 
-def _parse(content: Path | str | Exception, name: str) -> dict[str, Any]:
-    """Return the record of a folder or a line."""
-    if isinstance(content, Exception):
-        raise content
-    return (
-        read_record(content) if isinstance(content, Path) else parse_json(content, name)
-    )
+def _refuse(error: Exception) -> NoReturn:
+    raise error
 
 
-def _lines(table: Path) -> Iterator[str]:
-    """Yield the lines of a packed table, within bounds."""
-    left = MAX_TABLE_BYTES
+def _lines(table: Path) -> Iterator[tuple[str, str]]:
+    """Yield the lines of a packed table with their names, within bounds."""
+    left, number = MAX_TABLE_BYTES, 0
     try:
         with gzip.open(table, "rb") as file:
             while line := file.readline(min(left, MAX_JSON_BYTES) + 1):
-                left -= len(line)
+                left, number = left - len(line), number + 1
                 if left < 0 or len(line) > MAX_JSON_BYTES:
                     raise ValueError(
                         f"it unpacks to more than {MAX_TABLE_BYTES:,} bytes, or to "
                         f"{MAX_JSON_BYTES:,} in one line"
                     )
-                yield line.decode("utf-8")
+                yield f"{table}, line {number}", line.decode("utf-8", "replace")
     except (EOFError, zlib.error) as error:
-        raise ValueError(f"it is damaged: {error}") from error
+        raise ValueError(f"it is damaged behind line {number}: {error}") from error
 
 
 def _method(folder: Path, record: Mapping[str, Any]) -> str:
