@@ -170,7 +170,12 @@ def report(
 ) -> float:
     """Write raw returns and the figure, print the table; return the last score."""
     history, best = trainer.history, trainer.best()
-    results = {"data_score": data_score, "last": history[-1], "best": best}
+    results = {
+        "versions": run_folder.package_versions(),
+        "data_score": data_score,
+        "last": history[-1],
+        "best": best,
+    }
     run_folder.write_json(folder / "returns.json", results | {"evaluations": history})
     name = f"{cfg.env.name} {cfg.data.level}"
     learning_curve(

@@ -1,11 +1,14 @@
-"""Write one page about any number of finished runs: tables, figures, differences.
+"""Write one page about any number of finished runs: verdict, tables, figures.
 
     python examples/report.py outputs/oos
     python examples/report.py multirun/*/ outputs/ --reference cql --output report
+    python examples/report.py outputs/oos --pack runs.jsonl.gz
+    python examples/report.py runs.jsonl.gz
 
 Looks in and below the folders for what ``examples/offline_osr.py`` and
 ``examples/evaluate.py`` left there. ``report.html`` needs no other file; the figures
-lie beside it as PNG files, too. How to read it: docs/report.md.
+are beside it as PNG files, too. ``--pack`` writes no page, but all that a page is made
+of into one table of runs. How to read the page: docs/report.md.
 """
 
 from __future__ import annotations
@@ -15,33 +18,37 @@ import shlex
 import sys
 from pathlib import Path
 
-from torchrl_osr.report.checks import comparison_notes
-from torchrl_osr.report.page import choose_reference, collect, write_report
+from torchrl_osr.report import comparison_notes, pack_runs, read_runs, write_report
 
 
 def main() -> None:
     """Read, report, and say what could not be."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("folders", nargs="+", type=Path, help="of runs, or above them")
+    parser.add_argument(
+        "runs", nargs="+", type=Path, help="folders of runs, or above them, or tables"
+    )
     parser.add_argument("--output", type=Path, default=Path("report"), help="a folder")
     parser.add_argument("--reference", help="method to compare with; default the first")
+    parser.add_argument("--pack", type=Path, metavar="TABLE", help="a .jsonl.gz file")
     options = parser.parse_args()
 
-    try:
-        runs, left_out = collect(options.folders)
-        reference = choose_reference(runs, options.reference)
-    except (FileNotFoundError, ValueError) as error:
-        parser.exit(1, f"{error}\n")
-
-    for each in left_out:
-        print(f"left out: {each.path}: {each.reason}")
-    for note in comparison_notes(runs):
-        print(f"mind: {note}")
     command = shlex.join(["python", *sys.argv])
-    page = write_report(
-        runs, left_out, options.output, reference=reference, command=command
-    )
-    print(f"{len(runs)} runs in {page}")
+    try:
+        if options.pack:
+            number = pack_runs(options.runs, options.pack)
+            print(f"{number} runs in {options.pack}")
+            return
+        tables = read_runs(options.runs)
+        for path, reason in tables.left_out:
+            print(f"left out: {path}: {reason}")
+        for note in comparison_notes(tables):
+            print(f"mind: {note}")
+        page = write_report(
+            tables, options.output, reference=options.reference, command=command
+        )
+    except (OSError, ValueError) as error:
+        parser.exit(1, f"{error}\n")
+    print(f"{len(tables.runs)} runs in {page}")
 
 
 if __name__ == "__main__":

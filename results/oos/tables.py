@@ -1,8 +1,6 @@
-"""Print the tables of README.md from the raw results beside it.
+"""Print the tables of README.md from the tables of runs beside it.
 
-    python results/oos/tables.py
-
-Bold: the interval, over seeds, leaves out 0.
+python results/oos/tables.py
 """
 
 from __future__ import annotations
@@ -10,13 +8,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from torchrl_osr.report.checks import cells, data_of, methods_of
-from torchrl_osr.report.page import collect
-from torchrl_osr.report.paired import ALL_DATA, Comparison, compare
-from torchrl_osr.report.quantities import Quantity, quantities
-from torchrl_osr.report.runs import Run
-from torchrl_osr.report.scores import decimal, recent_score
+import pandas as pd
 
+from torchrl_osr.report import RunTables, compare, quantities, read_runs
+from torchrl_osr.report.scores import by_run, decimal, estimate, recent
+
+HERE = Path(__file__).parent
 REFERENCE = "cql_noisy_bc"
 OWN = ("osr", "osr_v")
 ABLATIONS = ("cql", "cql_bc", REFERENCE, "osr_shuffled")
@@ -25,91 +22,67 @@ WIDE_REFERENCE = "cql_noisy_bc_beta_1e-1"
 
 
 def differences(
-    runs: Sequence[Run], method: str, reference: str, wanted: Sequence[Quantity]
-) -> list[dict[str, str]]:
-    """Return method less reference in each quantity, by data set."""
-    return [
-        {each.data: cell(each) for each in compare(runs, method, reference, quantity)}
-        for quantity in wanted
-    ]
+    tables: RunTables, methods: Sequence[str], reference: str
+) -> pd.DataFrame:
+    """Return each method less the reference, a column for each quantity.
+
+    Returns:
+        Texts by data set and method.
+    """
+    cells = {
+        (each.data, method, quantity.name): f"{decimal(each.estimate.mean, '+')} "
+        f"{each.estimate.interval()}"
+        for quantity in quantities(tables)
+        for method in methods
+        if method != reference
+        for each in compare(tables, method, reference, quantity)
+        if each.estimate is not None
+    }
+    return pd.Series(cells).unstack(sort=False)
 
 
-def cell(each: Comparison) -> str:
-    """Return a difference; bold if its interval over seeds leaves out 0."""
-    if each.difference is None:
-        return ""
-    text = f"{decimal(each.difference.mean, '+')} {each.difference.interval}"
-    told = each.verdict != "not told apart" and each.difference.over == "seeds"
-    return f"**{text}**" if told else text
-
-
-def table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print Markdown."""
+def show(title: str, frame: pd.DataFrame, corner: str = "") -> None:
+    """Print a table as Markdown."""
+    head = [corner, *frame.columns]
+    rows = [[f"`{name}`", *cells] for name, *cells in frame.itertuples()]
     lines = [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows)]
     print(f"\n{title}\n", *lines, sep="\n")
 
 
-def tables_of_data(runs: Sequence[Run], wanted: Sequence[Quantity]) -> None:
-    """Print a table for each data set: every method, and less the reference."""
-    groups = cells(runs)
-    found = {m: differences(runs, m, REFERENCE, wanted) for m in methods_of(runs)}
-    found[REFERENCE] = [dict.fromkeys(data_of(runs), "0") for _ in wanted]
-    head = ["", "seeds", "mean of the last five", *(each.name for each in wanted)]
-    for data in data_of(runs):
-        rows = [
-            [
-                f"`{method}`",
-                ", ".join(str(run.seed) for run in group),
-                str(recent_score(group)),
-                *(column[data] for column in found[method]),
-            ]
-            for (of, method), group in groups.items()
-            if of == data
-        ]
-        table(data, head, rows)
-
-
-def table_over_all(runs: Sequence[Run], scores: Sequence[Quantity]) -> None:
-    """Print both of our losses less each ablation, over all data sets."""
-    rows = [
-        [
-            f"`{ablation}`",
-            *(
-                column[ALL_DATA]
-                for method in OWN
-                for column in differences(runs, method, ablation, scores)
-            ),
-        ]
-        for ablation in ABLATIONS
-    ]
-    head = [f"`{method}`, {q.name}" for method in OWN for q in scores]
-    table(ALL_DATA, ["less", *head], rows)
-
-
-def tables_of_wide_noise(runs: Sequence[Run], wanted: Sequence[Quantity]) -> None:
-    """Print wide noise less cloning with the same, for each data set that has it."""
-    wide = {m: differences(runs, m, WIDE_REFERENCE, wanted) for m in WIDE}
-    for data in data_of(runs):
-        rows = [
-            [f"`{method}`", *(column[data] for column in columns)]
-            for method, columns in wide.items()
-            if data in columns[0]
-        ]
-        if rows:
-            head = ["", *(each.name for each in wanted)]
-            table(f"{data}, less `{WIDE_REFERENCE}`", head, rows)
+def by_data(tables: RunTables) -> None:
+    """Print every method's scores, and those less the reference, by data set."""
+    rows = {
+        key: {
+            "seeds": ", ".join(str(seed) for seed in group["seed"].unique()),
+            "mean of the last five": str(estimate(by_run(group))),
+        }
+        for key, group in recent(tables.episodes).groupby(
+            ["data", "method"], sort=False
+        )
+    }
+    scores = pd.DataFrame.from_dict(rows, orient="index")
+    frame = scores.join(differences(tables, tables.methods, REFERENCE)).fillna("0")
+    for data in tables.data:
+        show(data, frame.loc[data])
 
 
 def main() -> None:
-    """Print the tables of the grid, and that of the seeds beyond it."""
-    here = Path(__file__).parent
-    runs, _ = collect([here / "runs"])
-    wanted = quantities(runs)
-    tables_of_data(runs, wanted)
-    table_over_all(runs, wanted[:2])
-    tables_of_wide_noise(runs, wanted)
+    """Print the tables of the grid, and those of the seeds beyond it."""
+    tables = read_runs([HERE / "runs.jsonl.gz"])
+    by_data(tables)
+    less = {
+        each: differences(tables, OWN, each).loc["all data sets"] for each in ABLATIONS
+    }
+    frame = pd.concat(less).unstack(sort=False).swaplevel(axis=1)
+    frame = frame[
+        [(own, name) for own in OWN for name in less["cql"] if "lost" not in name]
+    ]
+    frame.columns = [f"`{own}`, {name}" for own, name in frame.columns]
+    show("All data sets", frame, "less")
+    wide = differences(tables, WIDE, WIDE_REFERENCE)
+    show(f"Hopper medium-replay, less `{WIDE_REFERENCE}`", wide.droplevel(0))
     print("\nSeeds beyond the grid")
-    tables_of_data(collect([here / "more_seeds"])[0], wanted)
+    by_data(read_runs([HERE / "more_seeds.jsonl.gz"]))
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from torchrl_osr.data import make_environment
 from torchrl_osr.evaluation import check_disturbances
 from torchrl_osr.experiment.suite import make_disturbances, register
 from torchrl_osr.experiment.trained_run import load_trained
-from torchrl_osr.report.files import read_suites
+from torchrl_osr.report import read_runs
 
 ROOT = Path(__file__).parents[2]
 CONF = ROOT / "conf_evaluate"
@@ -123,7 +123,7 @@ def test_killed_evaluation_goes_on_to_the_same_bytes(
         example.main(same)
     assert not path.exists()
     assert len(json.loads(partial.read_text())["evaluations"]) == 2
-    assert "start" not in read_suites(folder)[0], "a part is no result"
+    assert "start" not in read_runs([folder]).suites, "a part is no result"
     example.main(same)
     assert played == [20_000, 21_000, 22_000, 22_000]
     assert "has 2 of 3 checkpoints already" in capsys.readouterr().out

@@ -8,6 +8,7 @@ import re
 import signal
 import time
 import zipfile
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -55,11 +56,12 @@ def test_run_leaves_table_figure_returns_and_checkpoints(finished):
     assert str(folder) in output
     assert json.loads((folder / "status.json").read_text()) == {"status": "done"}
     returns = json.loads((folder / "returns.json").read_text())
+    assert returns["versions"]["torchrl"] == version("torchrl")
     assert [row["step"] for row in returns["evaluations"]] == [0, 20, 40]
     assert len(returns["last"]["returns"]) == 2
     assert returns["last"] == returns["evaluations"][-1]
     assert (folder / "curve.png").read_bytes().startswith(b"\x89PNG")
-    assert (folder / "csv" / "scalars" / "policy" / "loss_recovery.csv").exists()
+    assert (folder / "csv" / "scalars" / "policy" / "recovery_kl.csv").exists()
     assert (folder / "checkpoint" / "policy" / "best.torchrl").exists()
     assert "Warning" not in output
     assert "Traceback" not in output

@@ -10,7 +10,7 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from torchrl_osr.data import REFERENCE_RETURNS
-from torchrl_osr.report.page import collect
+from torchrl_osr.report import RunTables, read_runs
 
 IDS = {
     "hopper": "Hopper-v5",
@@ -42,7 +42,8 @@ LEVELS = [
 ]
 CONFIG = {
     "env": {"name": "hopper", "id": "Hopper-v5"},
-    "data": {"level": "medium-replay", "num_transitions": 1000, "random_share": 0.0},
+    "data": {"level": "medium-replay", "num_transitions": 1000, "random_share": 0.0,
+             "path": None},
     "network": {"num_cells": [128, 128], "layer_norm": True},
     "perturbation": {"std": 0.001, "noise": "gaussian"},
     "inverse_dynamics": {"shuffle_next": False},
@@ -58,6 +59,9 @@ CONFIG = {
     },
     "seed": 0,
 }  # fmt: skip
+TRANSIENT = (
+    "survived_knock", "alive_after", "clean_alive_after", "recovery_steps", "distance",
+)  # fmt: skip
 VERSIONS = {"torchrl_osr": "0.1.0", "torch": "2.13.0", "mujoco": "4.0.0"}
 
 
@@ -75,6 +79,7 @@ def write_run(
     loss: dict | None = None,
     changes: dict | None = None,
     overrides: list[str] | None = None,
+    choice: str = "",
     versions: dict | None = None,
     data_score: float = 20.0,
     status: str = "done",
@@ -94,6 +99,9 @@ def write_run(
         (folder / ".hydra").mkdir(exist_ok=True)
         OmegaConf.save(overrides, folder / ".hydra" / "overrides.yaml")
         OmegaConf.save(config, folder / ".hydra" / "config.yaml")
+        if choice:
+            hydra = {"hydra": {"runtime": {"choices": {"loss": choice}}}}
+            OmegaConf.save(hydra, folder / ".hydra" / "hydra.yaml")
     low, high = REFERENCE_RETURNS[env]
     evaluations = [
         {
@@ -105,9 +113,11 @@ def write_run(
         }
         for step, row in scores.items()
     ]
-    content = {"data_score": data_score, "evaluations": evaluations}
-    if versions:
-        content["versions"] = versions
+    content = {
+        "versions": VERSIONS if versions is None else versions,
+        "data_score": data_score,
+        "evaluations": evaluations,
+    }
     write_json(folder / "returns.json", content)
     return folder
 
@@ -151,9 +161,8 @@ def robustness(
 
 def recovery(rng, kind: str, hit, size: float, back: float) -> dict:
     """Return the way back after a knock or a push, nulls after others."""
-    names = ("survived_knock", "alive_after", "recovery_steps", "distance")
     if kind not in ("knock", "push"):
-        return {"disturbed_at": [0] * 10} | dict.fromkeys(names)
+        return {"disturbed_at": [0] * 10} | dict.fromkeys(TRANSIENT)
     reached = rng.random(10) < 0.9
     recovered = reached & (rng.random(10) < back)
     steps = rng.geometric(0.06, 10)
@@ -165,6 +174,7 @@ def recovery(rng, kind: str, hit, size: float, back: float) -> dict:
         "alive_after": [
             not bool(h) if r else None for r, h in zip(reached, hit, strict=True)
         ],
+        "clean_alive_after": [True if each else None for each in reached],
         "recovery_steps": [
             int(s) if r else None for r, s in zip(recovered, steps, strict=True)
         ],
@@ -172,6 +182,8 @@ def recovery(rng, kind: str, hit, size: float, back: float) -> dict:
             "offset": offset.tolist(),
             "mean": curve.clip(max=0.8 + 3 * size).tolist(),
             "count": np.linspace(reached.sum(), hit.sum(), 111).astype(int).tolist(),
+            "clean_mean": [0.8] * 111,
+            "clean_count": [int(reached.sum())] * 111,
         },
     }
 
@@ -215,9 +227,10 @@ def write_hand(folder: Path, curve: dict, *, suite: dict | None = None, **option
 
 
 def hand_level(name, scores, kind="dynamics", strength=1.0, **entries) -> dict:
-    nulls = ("survived_knock", "alive_after", "recovery_steps", "distance")
     base = {"name": name, "kind": kind, "strength": strength, "scores": scores}
-    return base | {"disturbed_at": [0] * len(scores)} | dict.fromkeys(nulls) | entries
+    return (
+        base | {"disturbed_at": [0] * len(scores)} | dict.fromkeys(TRANSIENT) | entries
+    )
 
 
 def hand_suite(*evaluations: tuple) -> dict:
@@ -226,11 +239,11 @@ def hand_suite(*evaluations: tuple) -> dict:
         {"step": step, "clean": {"scores": clean, "seeds": seeds}, "levels": levels}
         for step, seeds, clean, levels in evaluations
     ]
-    return {"format": 1, "suite": "hand", "evaluations": rows}
+    return {"format": 1, "versions": VERSIONS, "suite": "hand", "evaluations": rows}
 
 
-def read_all(folder: Path) -> list:
+def read_all(folder: Path) -> RunTables:
     """Return the runs below a folder, none of them left out."""
-    runs, left_out = collect([folder])
-    assert not left_out
-    return runs
+    tables = read_runs([folder])
+    assert not tables.left_out
+    return tables

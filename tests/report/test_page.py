@@ -6,22 +6,16 @@ import base64
 import json
 import re
 import runpy
+from html import escape
 from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from torchrl_osr.report.figures import method_styles
-from torchrl_osr.report.html import (
-    Cell,
-    page,
-    side_by_side,
-    slug,
-    table,
-    text,
-)
-from torchrl_osr.report.page import collect, write_report
+from torchrl_osr.report import read_runs, write_report
+from torchrl_osr.report.page import slug
+from torchrl_osr.report.plots import MOST
 
 fakes = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("fakes.py"))))
 EVIL = '<script>alert("$x_{$")<'
@@ -65,13 +59,15 @@ def report(tmp_path_factory) -> SimpleNamespace:
     fakes.write_run(hopper / EVIL / "seed0", curve, overrides=["x=</td>"],
                     versions={"torch": "<b>2</b>"})  # fmt: skip
     fakes.write_run(hopper / "osr" / "seed2", curve | {9000: [1.0, 2.0]}, seed=2)
+    (fakes.write_run(hopper / "\udcff" / "seed0", curve) / "config.yaml").write_text(
+        "[" * 200 + "]" * 200
+    )
     path = hopper / "cql" / "seed0" / "robustness-oos.json"
     content = json.loads(path.read_text())
     content["versions"]["torch"] = "2.12.0"
     fakes.write_json(path, content)
-    runs, left_out = collect([top])
     folder = tmp_path_factory.mktemp("report") / "new"
-    path = write_report(runs, left_out, folder, reference="cql", command="made <so>")
+    path = write_report(read_runs([top]), folder, reference="cql", command="made <so>")
     markup = path.read_text(encoding="utf-8")
     return SimpleNamespace(markup=markup, outline=Outline(markup), folder=folder)
 
@@ -82,18 +78,22 @@ def section(report, key: str) -> str:
 
 
 def cells(markup: str) -> list[str]:
-    """Texts of the cells of a table, without what stands small below."""
-    return re.findall(r"<t[hd](?: [^>]*)?>([^<]*)", markup)
+    """Texts of the cells of a table, with what stands small below behind a space."""
+    found = re.findall(r"<t[hd](?: [^>]*)?>(.*?)</t[hd]>", markup)
+    return [re.sub(r"</?small>", " ", each).strip() for each in found]
+
+
+def items(markup: str) -> list[str]:
+    return re.findall(r"<li>(.*?)</li>", markup)
 
 
 def test_page_stands_alone(report):
-    assert report.markup.startswith("<!DOCTYPE html>")
+    assert report.markup.lstrip().startswith("<!DOCTYPE html>")
     assert not {"script", "link", "iframe", "object"} & set(report.outline.tags)
     for source in report.outline.sources:
         assert source.startswith(("data:image/png;base64,", "#"))
-    assert {s[1:] for s in report.outline.sources if s[0] == "#"} == set(
-        report.outline.ids
-    )
+    linked = {each[1:] for each in report.outline.sources if each[0] == "#"}
+    assert linked == set(report.outline.ids)
     assert "url(" not in report.markup
     assert "@import" not in report.markup
 
@@ -103,7 +103,9 @@ def test_figures_are_in_the_page_and_beside_it(report):
     data = ("hopper-medium-replay", "walker2d-medium-expert")
     over_all = {"curves.png", "differences.png", "iqm.png", "profiles.png"}
     assert pictures.keys() == over_all | {
-        f"{kind}-oos-{each}.png" for kind in ("strength", "recovery") for each in data
+        f"{kind}-{each}-suite-oos.png"
+        for kind in ("strength", "distance", "recovered")
+        for each in data
     }
     embedded = [
         base64.b64decode(source.split(",")[1])
@@ -116,36 +118,38 @@ def test_figures_are_in_the_page_and_beside_it(report):
 
 
 def test_names_cannot_break_the_page(report):
-    assert text(EVIL) in report.markup
+    assert str(escape(EVIL)).replace("&quot;", "&#34;") in report.markup
     assert EVIL not in report.markup
     assert "<b>" not in report.markup
-    assert text("x=</td>") in report.markup
-    assert text("made <so>") in report.markup
+    assert "x=&lt;/td&gt;" in report.markup
+    assert "made &lt;so&gt;" in report.markup
 
 
-def test_what_is_not_alike_is_said_before_anything_else(report):
-    head = report.markup[: report.markup.index("<section")]
-    assert "Before you compare" in head
-    assert "Mixed versions of torch" in head
-    assert "osr (9,000 steps)" in head
-    assert "1 folders or files" in head
-    assert "not finished, its status is running" in section(
-        report, "where-it-comes-from"
-    )
+def test_the_verdict_comes_first_and_few_seeds_have_none(report):
+    first = report.markup[: report.markup.index('<section id="learning-curves">')]
+    found = items(section(report, "verdict"))
+    assert found[0].endswith("cannot be told: 2 seeds.")
+    assert "A verdict needs 5 pairs of runs" in first
+    assert first.index("cannot be told") < first.index("Before you compare")
+    assert not re.search(r'class="(better|worse)"', report.markup), "no colour, either"
+    assert "▲ " not in "".join(cells(report.markup))
+    assert any("Mixed versions of torch" in each for each in found)
+    assert "osr (9,000 steps)" in first
+    assert "2 runs or files" in first
+
+
+def test_what_is_left_out_is_named_with_the_reason(report):
+    found = items(section(report, "where-it-comes-from"))
+    assert "not finished, its status is running" in found[0] + found[1]
+    assert "config.yaml is nested more than 32 deep" in found[0] + found[1]
 
 
 def test_clean_table_has_each_method_once_with_its_seeds(report):
     found = cells(section(report, "undisturbed-scores"))
-    assert found[:6] == [
-        "method",
-        "seeds",
-        "steps",
-        "last",
-        "mean of the last 5",
-        "data",
-    ]
-    start = found.index("cql †")
-    assert found[start : start + 3] == ["cql †", "2 (0, 1)", "8,000"]
+    head = ["method", "seeds", "steps", "last", "mean of the last 5", "data"]
+    assert found[: len(head)] == head
+    start = found.index("cql")
+    assert found[start : start + 3] == ["cql", "2 (0, 1)", "8,000"]
     assert re.fullmatch(r"\d+\.\d \[\d+\.\d, \d+\.\d\]", found[start + 3])
     start = found.index("osr (9,000 steps)")
     assert found[start + 1 : start + 4] == ["1 (2)", "9,000", "1.5 [1.0, 2.0] ᵉ"]
@@ -153,8 +157,7 @@ def test_clean_table_has_each_method_once_with_its_seeds(report):
 
 
 def test_disturbed_table_has_the_papers_numbers_in_a_frame_of_their_own(report):
-    markup = section(report, "out-of-sample")
-    own, paper = markup.split('<div class="paper">')
+    own, paper = section(report, "out-of-sample").split('<div class="paper">')
     names = [name for name, *_ in fakes.LEVELS]
     assert [name for name in cells(own) if name in names] == names
     assert len(re.findall(r"<small>\d+\.\d % \[.*?\]", own)) == len(names) * 4 * 2
@@ -164,18 +167,18 @@ def test_disturbed_table_has_the_papers_numbers_in_a_frame_of_their_own(report):
     assert "halfcheetah" not in paper  # no run of it
 
 
-def test_differences_are_plain_sentences(report):
+def test_differences_are_in_a_table_and_refusals_in_words(report):
     markup = section(report, "differences")
-    lines = re.findall(r"<li[^>]*>(.*?)</li>", markup)
-    words = r"(?:is better than|is worse than|is not told apart from) cql: [+\u2212]\d"
-    told = [line for line in lines if re.search(words, line)]
-    refused = [line for line in lines if "are not paired" in line]
-    assert len(told) + len(refused) == len(lines)
-    # Three methods on two data sets and on both in three quantities. Of the other two
-    # one has a seed of its own, and one other episodes.
-    assert len(told) == 3 * 3 * 3
-    assert len(refused) == 2
-    assert any(line.startswith("all data sets, score under oos: osr") for line in told)
+    table, by_disturbance = markup.split("Disturbance by disturbance")
+    numbers = r"[+\u2212]\d+\.\d \[[+\u2212]\d+\.\d, [+\u2212]\d+\.\d\]"
+    # Three methods on two data sets in three quantities. Of the other two one has a
+    # seed of its own, and one other episodes.
+    found = [each for each in cells(table) if re.fullmatch(numbers, each)]
+    assert len(found) == 3 * 2 * 3
+    assert sum("are not paired" in each for each in items(table)) == 2
+    assert cells(table).count("not paired") == 2
+    found = [each for each in cells(by_disturbance) if re.fullmatch(numbers, each)]
+    assert len(found) == 3 * (2 + 1) * len(fakes.LEVELS)
 
 
 def test_recovery_table_counts_episodes(report):
@@ -185,42 +188,38 @@ def test_recovery_table_counts_episodes(report):
 
 
 def test_the_same_runs_give_the_same_page(tmp_path):
-    curve = {1: [1.0, 2.0]}
-    fakes.write_run(tmp_path / "runs" / "a", curve, overrides=[])
-    runs, left_out = collect([tmp_path / "runs"])
-    first, second = (
-        write_report(runs, left_out, tmp_path / name, reference="osr", command="c")
-        for name in ("one", "two")
-    )
+    curve = {step: [1.0, 2.0] for step in range(1, 5)}
+    fakes.write_run(tmp_path / "runs" / "a", curve)
+    tables = read_runs([tmp_path / "runs"])
+    first, second = (write_report(tables, tmp_path / name) for name in ("one", "two"))
     assert first.read_bytes() == second.read_bytes()
-    markup = first.read_text()
+    markup = first.read_text(encoding="utf-8")
     Outline(markup)
+    assert "mean of the last 4<" in markup, "there are no five"
     assert "No run has been disturbed" in markup
     assert "There is nothing to compare with osr" in markup
+    assert "No run was disturbed by anything that ends" in markup
+    with pytest.raises(ValueError, match="no method 'iql'; there are: osr"):
+        write_report(tables, tmp_path, reference="iql")
 
 
-def test_tables_are_whole():
-    assert "<td><small>" not in table(["a"], [("", [["b"]])])
-    with pytest.raises(ValueError, match="a row of 1 cells in a table of 2"):
-        table(["a", "b"], [("", [["c"]])])
-    markup = table(["a", "b"], [("<g>", [["c", Cell("d&", "<e>", "none")]])], "f")
+def test_five_seeds_have_a_verdict_and_many_methods_small_panels(tmp_path):
+    for shift in range(MOST + 1):
+        for seed in range(5):
+            scores = [10.0 * shift + seed, 10.0 * shift + 2 * seed]
+            fakes.write_run(
+                tmp_path / "runs" / f"{shift}-{seed}", {4: scores, 5: scores},
+                seed=seed, overrides=[f"loss=m{shift}"],
+            )  # fmt: skip
+    path = write_report(read_runs([tmp_path / "runs"]), tmp_path / "page")
+    markup = path.read_text(encoding="utf-8")
     Outline(markup)
-    assert "&lt;g&gt;" in markup
-    assert '<td class="none">d&amp;<small>&lt;e&gt;</small></td>' in markup
-    Outline(page("t", "", [("A b", "")]))
+    found = items(section(SimpleNamespace(markup=markup), "verdict"))
+    assert found[0].startswith("m1 is better than m0 in undisturbed score on hopper")
+    assert len(found) == MOST
+    assert markup.count('<td class="better">') == MOST
 
 
 def test_names_of_files_are_safe():
     assert slug("../Hopper medium-replay, 50 %") == "hopper-medium-replay-50"
     assert slug("$$$") == "unnamed"
-
-
-def test_columns_are_shared_out_evenly():
-    assert [list(each) for each in side_by_side(range(7))] == [[0, 1, 2], [3, 4, 5, 6]]
-    assert [len(each) for each in side_by_side(range(12))] == [4, 4, 4]
-    assert side_by_side([]) == []
-
-
-def test_methods_can_be_told_apart():
-    styles = method_styles([str(number) for number in range(20)])
-    assert len({(style.color, str(style.line)) for style in styles.values()}) == 20

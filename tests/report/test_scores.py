@@ -1,4 +1,4 @@
-"""Undisturbed and disturbed scores, against numbers made by hand."""
+"""Undisturbed and disturbed scores and the way back, against numbers made by hand."""
 
 from __future__ import annotations
 
@@ -7,102 +7,91 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 
-from torchrl_osr.report.published import TABLE
-from torchrl_osr.report.robustness import (
-    Level,
-    area,
-    disturbed,
-    episode_table,
-    series_of,
-)
+from torchrl_osr.report import read_runs
+from torchrl_osr.report.published import DISTURBANCES, TABLE
 from torchrl_osr.report.scores import (
     Estimate,
+    area,
+    by_run,
+    disturbances,
+    disturbed,
     episode_profile,
     estimate,
-    interquartile_means,
-    last_score,
-    learning_curve,
-    recent_score,
+    iqm,
+    recent,
     run_profile,
+    score_curve,
+    series_name,
     thresholds_of,
+    way_back,
 )
 
 fakes = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("fakes.py"))))
-write, level, suite, read = (
-    fakes.write_hand,
-    fakes.hand_level,
-    fakes.hand_suite,
-    fakes.read_all,
-)
+write, level, suite = fakes.write_hand, fakes.hand_level, fakes.hand_suite
 MINUS = "\N{MINUS SIGN}"
+
+
+def episodes(folder) -> pd.DataFrame:
+    return fakes.read_all(folder).episodes
 
 
 def test_scores_are_means_of_the_last_evaluations(tmp_path):
     curve = {step: [10.0 * step, 20.0 * step] for step in range(1, 8)}
     write(tmp_path / "a", curve)
     write(tmp_path / "b", {s: [2 * v for v in row] for s, row in curve.items()}, seed=1)
-    runs = read(tmp_path)
+    found = episodes(tmp_path)
     # Of run a: 15 a step; the last five steps are 3 to 7, on average 5.
-    assert last_score(runs).mean == pytest.approx(7 * (15 + 30) / 2)
-    assert recent_score(runs).mean == pytest.approx(5 * (15 + 30) / 2)
+    last = estimate(by_run(recent(found, 1)))
+    assert last.mean == pytest.approx(7 * (15 + 30) / 2)
+    assert estimate(by_run(recent(found))).mean == pytest.approx(5 * (15 + 30) / 2)
     # Two seeds: resamples are both, or one of them twice with chance 1/4 each.
-    assert last_score(runs)[1:3] == pytest.approx((7 * 15, 7 * 30))
-    assert last_score(runs).over == "seeds"
-    curve = learning_curve(runs)
-    np.testing.assert_allclose(curve.mean, 22.5 * np.arange(1, 8))
-    assert curve.over == "seeds"
+    assert last[1:3] == pytest.approx((7 * 15, 7 * 30))
+    assert last.over == "seeds"
+    band = score_curve(found)
+    np.testing.assert_allclose(band.mean, 22.5 * np.arange(1, 8))
+    assert band.over == "seeds"
+    assert score_curve(found[found["seed"] == 0]).over == "", "the band is over seeds"
 
 
 def test_one_seed_gives_an_interval_over_episodes_that_says_so():
     found = estimate([np.array([1.0, 1.0, 4.0])])
-    assert found.mean == 2
-    assert found.low == 1
+    assert (found.mean, found.low) == (2, 1)
     assert found.high in (3, 4)
     assert str(found).endswith("ᵉ")
     assert str(Estimate(-1.25, -2.0, 3.0)) == "-1.2 [-2.0, 3.0]".replace("-", MINUS)
 
 
 def test_profile_and_interquartile_mean_pool_data_sets(tmp_path):
-    scores = {
-        ("hopper", 0): 10,
-        ("hopper", 1): 20,
-        ("walker2d", 0): 40,
-        ("walker2d", 1): 90,
-    }
+    scores = {("hopper", 0): 10, ("hopper", 1): 20, ("walker2d", 0): 40,
+              ("walker2d", 1): 90}  # fmt: skip
     for (env, seed), score in scores.items():
-        write(
-            tmp_path / f"{env}{seed}",
-            {1: [score - 5.0, score + 5.0]},
-            env=env,
-            seed=seed,
-        )
-    runs = read(tmp_path)
-    assert interquartile_means(runs)["osr"].mean == pytest.approx((20 + 40) / 2)
+        curve = {1: [score - 5.0, score + 5.0]}
+        write(tmp_path / f"{env}{seed}", curve, env=env, seed=seed)
+    found = episodes(tmp_path)
+    mean = iqm(found)
+    assert (mean.mean, mean.over) == (pytest.approx((20 + 40) / 2), "seeds")
     # Stratified: the middle two are at least 10 and 40, at most 20 and 90.
-    low, high = interquartile_means(runs)["osr"][1:3]
-    assert (10 + 40) / 2 <= low < 30 < high <= (20 + 90) / 2
-    assert interquartile_means(runs)["osr"].over == "seeds"
-    alone = interquartile_means(
-        [run for run in runs if run.seed == 0 or run.env[0] == "h"]
-    )
-    assert alone["osr"].mean == pytest.approx(70 / 3)
-    assert alone["osr"].over == "episodes", "walker2d has a single seed"
-    assert alone["osr"].low < 70 / 3 < alone["osr"].high
-    tau = np.array([0.0, 15.0, 30.0, 87.0, 100.0])
-    profile = run_profile(runs, "osr", tau)
+    assert (10 + 40) / 2 <= mean.low < 30 < mean.high <= (20 + 90) / 2
+    alone = iqm(found[(found["seed"] == 0) | (found["data"] == "hopper medium-replay")])
+    assert alone.mean == pytest.approx(70 / 3)
+    assert alone.over == "episodes", "walker2d has a single seed"
+    assert alone.low < 70 / 3 < alone.high
+    profile = run_profile(found, np.array([0.0, 15.0, 30.0, 87.0, 100.0]))
     np.testing.assert_allclose(profile.mean, [1, 0.75, 0.5, 0.25, 0])
     assert (profile.low <= profile.mean).all()
     assert (profile.mean <= profile.high).all()
     # Episodes: 5 and 15, 15 and 25, 35 and 45, 85 and 95; 15 is not above 15.
-    profile = episode_profile(runs, "osr", np.array([0.0, 15.1, 30.0, 87.0, 100.0]))
+    profile = episode_profile(found, np.array([0.0, 15.1, 30.0, 87.0, 100.0]))
     np.testing.assert_allclose(profile.mean, [1, 5 / 8, 0.5, 1 / 8, 0])
-    assert thresholds_of(runs)[-1] == pytest.approx(95)
+    assert thresholds_of(found)[-1] == pytest.approx(95)
 
 
-def test_kinds_are_the_names_without_their_sizes():
-    for name, kind, wanted in (
+@pytest.mark.parametrize(
+    ("name", "kind", "series"),
+    [
         ("torque-20", "knock", "knock: torque"),
         ("knock-official-15", "knock", "knock-official"),
         ("push-small", "push", "push"),
@@ -111,61 +100,147 @@ def test_kinds_are_the_names_without_their_sizes():
         ("action_diff-0.05", "action_diff attack", "action_diff attack"),
         ("sticky-action-0.1", "sticky action", "sticky-action"),
         ("mass", "dynamics", "dynamics: mass"),
-    ):
-        assert Level(name, kind, 1.0).series == wanted
-    levels = [Level("a-3", "a", 3), Level("b", "b", 1), Level("a-1", "a", 1)]
-    assert series_of(levels) == {"a": [2, 0], "b": [1]}
+    ],
+)
+def test_a_series_is_the_name_without_its_size(name, kind, series):
+    assert series_name(name, kind) == series
 
 
 def test_decrease_is_that_of_the_means(tmp_path):
     def loses(clean, *shares):
         levels = [
             level(f"x-{strength}", [share * each for each in clean], strength=strength)
-            for strength, share in zip((1, 3), shares, strict=True)
+            for strength, share in zip((3, 1), shares, strict=True)
         ]
-        return suite((5, [1, 2], clean, levels))
+        return suite((5, [1, 2], clean, [level("a", clean, kind="a"), *levels]))
 
-    first, other = (loses(clean, 0.75, 0.5) for clean in ([40.0, 60.0], [100.0] * 2))
+    first, other = (loses(clean, 0.5, 0.75) for clean in ([40.0, 60.0], [100.0] * 2))
     write(tmp_path / "a", {5: [1.0]}, suite=first)
     write(tmp_path / "b", {5: [1.0]}, suite=other, seed=1)
-    found = disturbed(read(tmp_path), "hand")
+    rows = episodes(tmp_path)
+    levels = disturbances(rows, "hand")
+    assert list(levels.index) == ["a", "x-1", "x-3"], "by series, then by strength"
+    found = disturbed(rows, "hand")
     assert found.clean.mean == 75
-    assert [each.mean for each in found.scores] == [56.25, 37.5]
+    assert [each.mean for each in found.scores.values()] == [75, 56.25, 37.5]
     # Every pair of episodes loses the same share: the interval has no width.
-    for each, lost in zip(found.decreases, (25, 50), strict=True):
+    for each, lost in zip(found.decreases.values(), (0, 25, 50), strict=True):
         assert each[:3] == pytest.approx((lost, lost, lost))
     assert found.clean.low < 75 < found.clean.high
     # Trapezoid over 1 to 3: half of each end.
-    assert area(found, [0, 1])[:3] == pytest.approx((62.5,) * 3)
-    assert area(found, [0]) is None
+    wide = levels["strength"][["x-1", "x-3"]]
+    assert area(found, wide)[:3] == pytest.approx((62.5,) * 3)
+    assert area(found, wide[:1]) is None
 
 
 def test_there_is_no_percentage_of_nothing(tmp_path):
     content = suite((5, [1, 2], [-1.0, 2.0], [level("x", [1.0, 1.0])]))
     write(tmp_path / "a", {5: [1.0]}, suite=content)
-    assert disturbed(read(tmp_path), "hand").decreases == [None]
+    assert disturbed(episodes(tmp_path), "hand").decreases == {"x": None}
 
 
 def test_a_start_state_that_comes_again_is_no_new_episode(tmp_path):
-    def rows(*evaluations):
-        write(tmp_path / "a", {9: [1.0]}, suite=suite(*evaluations))
-        return episode_table(read(tmp_path)[0], "hand").tolist()
-
     once, again = [level("x", [1.0, 2.0])], [level("x", [3.0, 6.0])]
-    same = rows((8, [1, 2], [10.0, 20.0], once), (9, [1, 2], [30.0, 40.0], again))
-    assert same == [[20, 2], [30, 4]]
-    other = rows((8, [1, 2], [10.0, 20.0], once), (9, [3, 4], [30.0, 40.0], again))
-    assert other == [[10, 1], [20, 2], [30, 3], [40, 6]]
+    for name, seeds, wanted in (("same", [1, 2], 2), ("other", [3, 4], 4)):
+        content = suite(
+            (8, [1, 2], [10.0, 20.0], once), (9, seeds, [30.0, 40.0], again)
+        )
+        write(tmp_path / name, {9: [1.0]}, suite=content)
+        rows = episodes(tmp_path / name)
+        (scores,) = by_run(rows[rows["disturbance"] == "x"])
+        assert len(scores) == wanted
+        assert scores[0] == ((1 + 3) / 2 if name == "same" else 1)
+        assert disturbed(rows, "hand").clean.mean == 25
+
+
+def transient(**entries):
+    """Return a level of four episodes, of which the last ended before it."""
+    base = {
+        "disturbed_at": [7, 7, 7, None],
+        "survived_knock": [True, True, False, None],
+        "alive_after": [True, None, False, None],
+        "clean_alive_after": [None] * 4,
+        "recovery_steps": [0, 2, None, None],
+        "distance": {
+            "offset": [-1, 0, 1, 2], "mean": [0.5, 2.0, 1.5, None],
+            "count": [3, 3, 1, 0], "clean_mean": [None] * 4, "clean_count": [0] * 4,
+        },
+    }  # fmt: skip
+    return level("knock", [30.0, 40.0, 5.0, 9.0], kind="knock", **(base | entries))
+
+
+def came_back(folder, name="knock"):
+    tables = read_runs([folder])
+    return way_back(tables.episodes, tables.distances, "hand", name)
+
+
+def test_recovery_counts_those_that_the_disturbance_came_to(tmp_path):
+    content = suite((5, [1, 2, 3, 4], [50.0, 50.0, 50.0, 9.0],
+                     [level("mass", [1.0] * 4), transient()]))  # fmt: skip
+    write(tmp_path / "a", {5: [1.0]}, suite=content)
+    levels = disturbances(episodes(tmp_path), "hand")
+    assert levels["transient"].to_dict() == {"mass": False, "knock": True}
+    found = came_back(tmp_path)
+    assert (found.episodes, found.reached) == (4, 0.75)
+    assert found.stood == pytest.approx(2 / 3)
+    assert found.alive_after == 0.5  # the second ran out of time: not known
+    assert found.undisturbed_alive is None
+    assert found.undisturbed_distance is None
+    assert found.median == 2
+    assert found.decrease.mean == pytest.approx(50)
+    # Of three, one is back at once, one after two steps, and one never.
+    np.testing.assert_array_equal(found.recovered.x, [0, 1, 2])
+    np.testing.assert_allclose(found.recovered.mean, [1 / 3, 1 / 3, 2 / 3])
+    np.testing.assert_array_equal(found.distance.mean, [0.5, 2, 1.5, np.nan])
+    assert found.distance.over == ""
+
+
+def test_distances_are_weighted_by_episodes_then_by_seeds(tmp_path):
+    def curve(mean, count):
+        clean = {"clean_mean": [0.5, 0.25], "clean_count": [4, 4]}
+        return {"distance": {"offset": [0, 1], "mean": mean, "count": count} | clean}
+
+    for seed, parts in enumerate([
+        (curve([1.0, 2.0], [3, 1]), curve([5.0, 4.0], [1, 1])),
+        (curve([4.0, None], [2, 0]), curve([4.0, None], [2, 0])),
+    ]):  # fmt: skip
+        rows = [
+            (step, [1, 2, 3, 4], [9.0] * 4, [transient(**part)])
+            for step, part in zip((8, 9), parts, strict=True)
+        ]
+        write(tmp_path / str(seed), {9: [1.0]}, suite=suite(*rows), seed=seed)
+    found = came_back(tmp_path)
+    # First seed: (3 * 1 + 1 * 5) / 4 = 2, then (2 + 4) / 2 = 3, the other has none.
+    np.testing.assert_allclose(found.distance.mean, [(2 + 4) / 2, 3])
+    np.testing.assert_allclose(found.distance.low, [2, 3])
+    np.testing.assert_allclose(found.distance.high, [4, 3])
+    np.testing.assert_allclose(found.undisturbed_distance.mean, [0.5, 0.25])
+
+
+def test_nobody_disturbed_and_nobody_recovered_are_no_numbers(tmp_path):
+    none = {"disturbed_at": [None] * 4}
+    never = {
+        "recovery_steps": [None] * 4,
+        "clean_alive_after": [True, False, None, None],
+    }
+    content = suite((5, [1, 2, 3, 4], [9.0] * 4, [
+        transient(**none) | {"name": "late"}, transient(**never)]))  # fmt: skip
+    write(tmp_path / "a", {5: [1.0]}, suite=content)
+    assert came_back(tmp_path, "late") is None
+    found = came_back(tmp_path)
+    assert found.median is None
+    assert found.undisturbed_alive == 0.5
+    assert not found.recovered.mean.any()
 
 
 def test_paper_is_quoted_as_printed():
-    assert TABLE["halfcheetah"]["SDC"][2] == (83.3, 17.8)
-    assert TABLE["hopper"]["OSR"][2] == (106.1, 6.2)
+    assert tuple(TABLE.loc[("halfcheetah", "SDC"), DISTURBANCES[2]]) == (83.3, 17.8)
+    assert tuple(TABLE.loc[("hopper", "OSR"), DISTURBANCES[2]]) == (106.1, 6.2)
     # All rows but the misprint imply one clean score each: Table 1's.
-    for env, methods in TABLE.items():
-        for method, row in methods.items():
-            implied = [c.score / (1 - c.decrease / 100) for c in row]
-            if (env, method) == ("walker2d", "CQL"):
-                assert implied.pop(0) == pytest.approx(153.9, abs=0.1)
-                assert implied[0] * (1 - 0.178) == pytest.approx(81.1, abs=0.1)
-            assert max(implied) - min(implied) < 0.7, (env, method)
+    for key, row in TABLE.iterrows():
+        cells = [row[name] for name in DISTURBANCES]
+        implied = [each["score"] / (1 - each["decrease"] / 100) for each in cells]
+        if key == ("walker2d", "CQL"):
+            assert implied.pop(0) == pytest.approx(153.9, abs=0.1)
+            assert implied[0] * (1 - 0.178) == pytest.approx(81.1, abs=0.1)
+        assert max(implied) - min(implied) < 0.7, key

@@ -10,6 +10,7 @@ import shlex
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,9 @@ from torchrl_osr.trainers import Interrupted
 log = logging.getLogger(__name__)
 
 CONFIG, STATUS = "config.yaml", "status.json"
+
+PACKAGES = ("torchrl-osr", "torch", "torchrl", "tensordict", "gymnasium", "mujoco")
+"""Packages whose versions decide a run's numbers."""
 
 FREE_KEYS = ("resume", "trainer.progress")
 """Keys that may differ when a run is continued: no number depends on them."""
@@ -72,8 +76,8 @@ def claim(folder: Path, config: DictConfig) -> None:
     if not path.exists():
         write_atomically(path, OmegaConf.to_yaml(config, resolve=True))
         return
-    here = _flat(OmegaConf.to_container(config, resolve=True))
-    there = _flat(OmegaConf.to_container(OmegaConf.load(path), resolve=True))
+    here = flatten(OmegaConf.to_container(config, resolve=True))
+    there = flatten(OmegaConf.to_container(OmegaConf.load(path), resolve=True))
     absent = "nothing"
     differences = [
         f"{key}: {there.get(key, absent)!r} there, {here.get(key, absent)!r} now"
@@ -145,11 +149,16 @@ def _resume(folder: Path) -> str:
     return shlex.quote(f"resume='{quoted}'")
 
 
-def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
+def package_versions() -> dict[str, str]:
+    """Versions of :data:`PACKAGES`, by name with underscores."""
+    return {package.replace("-", "_"): version(package) for package in PACKAGES}
+
+
+def flatten(value: Any, prefix: str = "") -> dict[str, Any]:
     """Nested mappings as one, with dotted keys."""
     if not isinstance(value, Mapping):
         return {prefix: value}
     flat: dict[str, Any] = {}
     for key, item in value.items():
-        flat |= _flat(item, f"{prefix}.{key}" if prefix else str(key))
+        flat |= flatten(item, f"{prefix}.{key}" if prefix else str(key))
     return flat

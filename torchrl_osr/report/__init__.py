@@ -1,5 +1,17 @@
-"""One page about any number of runs: tables, figures and paired comparisons."""
+"""One page about any number of runs: verdict, tables, figures, differences."""
 
+from torchrl_osr.report.comparisons import compare, quantities
+from torchrl_osr.report.methods import comparison_notes, read_runs
 from torchrl_osr.report.page import write_report
+from torchrl_osr.report.runs import RunTables, pack_runs, read_records
 
-__all__ = ["write_report"]
+__all__ = [
+    "RunTables",
+    "compare",
+    "comparison_notes",
+    "pack_runs",
+    "quantities",
+    "read_records",
+    "read_runs",
+    "write_report",
+]

@@ -1,4 +1,4 @@
-"""What a run is called, and which runs may stand together.
+"""Methods: which runs may be averaged, what they are called, how fair comparisons are.
 
 Runs are averaged only if their configurations differ in nothing but the seed (and, over
 data sets, the data set). Of runs with one name that differ in more, each kind becomes a
@@ -7,22 +7,28 @@ method of its own, with the difference in its name.
 
 from __future__ import annotations
 
-import re
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
-from torchrl_osr.data import REFERENCE_RETURNS
-from torchrl_osr.report.files import LeftOut
-from torchrl_osr.report.runs import Run
+from torchrl_osr.report.runs import (
+    LeftOut,
+    Run,
+    RunTables,
+    read_each,
+    tables_of,
+)
 
 IGNORED = (
     "resume",
+    "population",
     "logger.",
     "trainer.progress",
     "trainer.num_threads",
     "trainer.nonfinite",
+    "trainer.compile",
     "trainer.cudagraph",
     "trainer.log_interval",
     "trainer.checkpoint_interval",
@@ -30,148 +36,124 @@ IGNORED = (
     "loss.chunk_size",
     "loss.deactivate_vmap",
 )
-"""Keys of the configuration that decide how a number is computed, not which."""
+"""Settings that decide how a number is computed, not which."""
 
-LATER = {
-    "data.path": None,
-    "data.download": False,
-    "data.storage": "memory",
-    "data.reward_scale": 1.0,
-    "data.reward_shift": 0.0,
-    "trainer.compile": False,
-    "population": None,
-}
-"""Keys that the configurations of older runs lack, and what those runs did."""
-
-IDENTITY = ("seed", "env.", "data.level", "data.random_share")
-"""Keys that the report sorts runs by."""
+IDENTITY = ("seed", "env.", "data.level", "data.random_share", "data.path")
+"""Settings that the report sorts runs by."""
 
 METHOD = ("loss.", "perturbation.", "inverse_dynamics.", "num_random")
-"""Keys in which methods differ by intent; all others should be those of the rivals."""
+"""Settings in which methods differ by intent; all others should be equal."""
 
 NUM_NAMED = 3
-"""At most so many differences stand in a name."""
+"""At most so many differences are in a name."""
 
 
-def loss_name(config: Mapping[str, Any]) -> str:
-    """Return which option of ``loss=`` a configuration is, as its values tell.
+def read_runs(paths: Sequence[Path]) -> RunTables:
+    """Read all runs in or below the folders and in the tables, and name their methods.
 
     Args:
-        config: with dotted keys.
-    """
-    loss = {
-        key.removeprefix("loss."): value
-        for key, value in config.items()
-        if key.startswith("loss.")
-    }
-    target = str(loss.get("_target_", "unknown")).rpartition(".")[2]
-    if target != "OSRLoss":
-        return {"OSRVLoss": "osr_v"}.get(target, target)
-    weight = loss.get("recovery_weight")
-    if loss.get("min_q_weight") == 0:
-        family = "sac" if weight == 0 else "osr"
-        family = "edac" if loss.get("diversity_weight") else family
-        return f"{family}_{loss.get('num_qvalue_nets')}"
-    if weight == 0:
-        return "cql"
-    if loss.get("recovery_target") == "data":
-        return "cql_bc" if loss.get("recovery_states") == "clean" else "cql_noisy_bc"
-    if loss.get("recovery_direction") == "reverse":
-        return "osr_official"
-    return "osr_adversarial" if "adversary.objective" in loss else "osr"
-
-
-def method_name(run: Run) -> str:
-    """Return a run's method: of its folder's name, command line or configuration.
-
-    Folders that are laid out as ``<env>-<level>/<method>/seed<k>`` say it themselves.
-    Else it is what stood behind ``loss=``, or what the configuration's values tell.
-
-    Raises:
-        ValueError: if such a folder contradicts the run's configuration.
-    """
-    data, method, seed = ("", "", *run.folder.resolve().parts)[-3:]
-    if re.fullmatch(r"seed\d+", seed) and data.split("-")[0] in REFERENCE_RETURNS:
-        start = f"{run.env}-{run.config['data.level']}"
-        if not data.startswith(start) or seed != f"seed{run.seed}":
-            raise ValueError(
-                f"the folder says {data} and {seed}, its configuration {start} and "
-                f"seed{run.seed}"
-            )
-        return method
-    for override in run.overrides or ():
-        if override.startswith("loss="):
-            return override.removeprefix("loss=")
-    return loss_name(run.config)
-
-
-def name_methods(runs: Iterable[Run]) -> tuple[list[Run], list[LeftOut]]:
-    """Give every run its method's name; keep one run of each method, data and seed.
+        paths: folders of runs, or above them, and tables of runs (``.jsonl.gz``).
 
     Returns:
-        The runs in their order, and what was left out.
+        Runs of one method's name may be averaged. What cannot be read, is not finished
+        or is there twice is listed as left out.
+
+    Raises:
+        FileNotFoundError: if a path does not exist.
+        ValueError: if there is no finished run, saying what was left out and why.
     """
-    left_out = []
+    runs, unread = read_each(paths)
+    runs, repeated = name_methods(runs)
+    left_out = [*unread, *repeated]
+    if not runs:
+        reasons = "".join(f"\n  {each.path}: {each.reason}" for each in left_out)
+        raise ValueError(
+            f"no finished run in {', '.join(map(str, paths))}.{reasons}\n"
+            "Give folders of examples/offline_osr.py, or a table of such runs."
+        )
+    return tables_of(name_suites(runs), left_out)
+
+
+def name_methods(runs: Sequence[Run]) -> tuple[list[Run], list[LeftOut]]:
+    """Give methods of one name that differ different names; drop repeated runs.
+
+    Returns:
+        One run of each method, data set and seed; the others.
+    """
     named: dict[str, list[Run]] = defaultdict(list)
     for run in runs:
-        try:
-            named[method_name(run)].append(run)
-        except ValueError as error:
-            left_out.append(LeftOut(run.folder, str(error)))
+        named[run.method].append(run)
     kept: dict[tuple[str, str, int], Run] = {}
+    left_out = []
     for method, group in named.items():
-        for run, more in zip(group, kinds_of(group), strict=True):
-            run = replace(run, method=f"{method} ({more})" if more else method)
-            first = kept.setdefault((run.method, run.data, run.seed), run)
-            if first is not run:
+        kinds = distinctions([comparable(run) for run in group])
+        for run, kind in zip(group, kinds, strict=True):
+            name = f"{method} ({kind})" if kind else method
+            first = kept.setdefault(
+                (name, run.data, run.seed), replace(run, method=name)
+            )
+            if first.folder != run.folder:
                 reason = f"the same run as {first.folder}, which is in the report"
                 left_out.append(LeftOut(run.folder, reason))
     return list(kept.values()), left_out
+
+
+def name_suites(runs: Sequence[Run]) -> list[Run]:
+    """Give suites of one name that were played differently different names."""
+    named: dict[str, list[int]] = defaultdict(list)
+    for index, run in enumerate(runs):
+        for suite in run.protocols:
+            named[suite].append(index)
+    names: list[dict[str, str]] = [{} for _ in runs]
+    for suite, places in named.items():
+        texts = distinctions([runs[index].protocols[suite] for index in places])
+        for index, text in zip(places, texts, strict=True):
+            names[index][suite] = f"{suite} ({text})" if text else suite
+    return [
+        replace(
+            run,
+            protocols={name[suite]: each for suite, each in run.protocols.items()},
+            **{
+                table: frame.assign(suite=frame["suite"].map({"": ""} | name))
+                for table, frame in (("episodes", run.episodes),
+                                     ("distances", run.distances))
+            },
+        )
+        for run, name in zip(runs, names, strict=True)
+    ]  # fmt: skip
 
 
 def comparable(run: Run) -> dict[str, Any]:
     """Return what must be equal for two runs to be averaged."""
     facts = {
         key: value
-        for key, value in (LATER | dict(run.config)).items()
+        for key, value in run.config.items()
         if not key.startswith((*IGNORED, *IDENTITY))
     }
-    return facts | {"evaluated at": [row["step"] for row in run.evaluations]}
+    return facts | {"evaluated at": run.evaluated_at}
 
 
-def kinds_of(runs: Sequence[Run]) -> list[str]:
-    """Return in few words what is special about each run; "" where all are alike."""
-    facts = [comparable(run) for run in runs]
-    texts = distinctions(facts)
-    presets = [preset(run) for run in runs]
-    # A preset says it all if it goes with the differences one to one.
-    pairs = set(zip(presets, texts, strict=True))
-    one_to_one = len(set(presets)) == len(set(texts)) == len(pairs) > 1
-    if not one_to_one or any(run.overrides is None for run in runs):
-        return texts
-    by_steps = len({run.steps for run in runs}) > 1
-    return [
-        f"preset {name}, {run.steps:,} steps" if by_steps else f"preset {name}"
-        for name, run in zip(presets, runs, strict=True)
-    ]
+def differing(facts: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the entries in which they are not all equal."""
+    keys = dict.fromkeys(key for each in facts for key in each)
+    return [key for key in keys if len({entry(key, each) for each in facts}) > 1]
+
+
+def entry(key: str, facts: Mapping[str, Any]) -> str:
+    """Return an entry in full, as a text to compare."""
+    return repr(facts[key]) if key in facts else "none"
 
 
 def distinctions(facts: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return in few words in which entries each differs from the others.
 
-    Args:
-        facts: entries by name.
-
     Returns:
         A text for each; equal for equal entries, else different. All "" if all are
         equal.
     """
-    keys = list(dict.fromkeys(key for each in facts for key in each))
-    differing = [
-        key for key in keys if any(each.get(key) != facts[0].get(key) for each in facts)
-    ]
-    kinds = [repr([each.get(key) for key in differing]) for each in facts]
-    shown = sorted(differing, key=lambda key: (key != "trainer.steps", keys.index(key)))
+    keys = differing(facts)
+    kinds = ["; ".join(entry(key, each) for key in keys) for each in facts]
+    shown = sorted(keys, key=lambda key: (key != "trainer.steps", keys.index(key)))
     if "trainer.steps" in shown and "evaluated at" in shown:
         shown.remove("evaluated at")  # the one brings the other with it
     rest = len(shown) - NUM_NAMED
@@ -189,22 +171,123 @@ def distinctions(facts: Sequence[Mapping[str, Any]]) -> list[str]:
     return texts
 
 
-def preset(run: Run) -> str:
-    """Return the preset that stood on the command line."""
-    for override in run.overrides or ():
-        if override.startswith("preset="):
-            return override.removeprefix("preset=")
-    return "of the defaults"
-
-
 def describe(key: str, facts: Mapping[str, Any]) -> str:
     """Return an entry in words."""
+    # What is built is known by its name; where it is imported from is no setting.
+    name = key.removesuffix("._target_")
     if key not in facts:
-        return f"no {key}"
+        return f"no {name}"
     if key == "trainer.steps":
         return f"{facts[key]:,} steps"
     if key == "evaluated at":
         return f"evaluated {len(facts[key])} times"
     if key in ("levels", "episode seeds"):
         return f"other {key}"
-    return f"{key}={facts[key]}"
+    value = str(facts[key])
+    return f"{name}={value.rpartition('.')[2] if name != key else value}"
+
+
+def comparison_notes(tables: RunTables) -> list[str]:
+    """Return a sentence for everything that makes a comparison less than fair."""
+    return [
+        *_version_notes(tables.runs),
+        *_setting_notes(tables),
+        *_seed_notes(tables),
+        *_coverage_notes(tables),
+    ]
+
+
+def _version_notes(runs: Sequence[Run]) -> list[str]:
+    """Say which package came in which versions, and of which runs that is unknown."""
+    notes = []
+    for package in sorted({package for run in runs for package in run.versions}):
+        known = [run for run in runs if package in run.versions]
+        found = _by_value(known, [run.versions[package] for run in known])
+        if len(found) > 1:
+            parts = [f"{version}: {_names(each)}" for version, each in found]
+            notes.append(f"Mixed versions of {package}. {'; '.join(parts)}.")
+    silent = [run for run in runs if not run.versions]
+    if silent:
+        notes.append(f"No versions are recorded of {_names(silent)}.")
+    return notes
+
+
+def _setting_notes(tables: RunTables) -> list[str]:
+    """Say where rivals on one data set differ in more than their method."""
+    notes = []
+    for data in tables.data:
+        rivals = [run for run in tables.runs if run.data == data]
+        facts = [
+            comparable(run) | {"the data's own score": _known_score(run)}
+            for run in rivals
+        ]
+        # A preset changes many entries along the same line between runs: one sentence.
+        lines: dict[tuple[str, ...], list[list[str]]] = defaultdict(list)
+        for key in differing(facts):
+            if not key.startswith(METHOD):
+                texts = [describe(key, each) for each in facts]
+                lines[tuple(entry(key, each) for each in facts)].append(texts)
+        merged: dict[tuple[int, ...], list[list[str]]] = defaultdict(list)
+        for line, keys in lines.items():
+            merged[tuple(line.index(each) for each in line)] += keys
+        for order, keys in merged.items():
+            parts = [
+                f"{_names(each)}: {', '.join(texts[first] for texts in keys)}"
+                for first, each in _by_value(rivals, order)
+            ]
+            notes.append(f"{data}: different settings. {'; '.join(parts)}.")
+    return notes
+
+
+def _seed_notes(tables: RunTables) -> list[str]:
+    """Say where rivals have different seeds, or only one."""
+    notes = []
+    cells = tables.cells()
+    for data in tables.data:
+        seeds = {
+            method: ", ".join(str(seed) for seed in sorted(run.seed for run in group))
+            for (where, method), group in cells.items()
+            if where == data
+        }
+        found = _by_value(list(seeds), list(seeds.values()))
+        if len(found) > 1:
+            parts = [f"{each} ({', '.join(names)})" for each, names in found]
+            notes.append(f"{data}: methods have different seeds: {'; '.join(parts)}.")
+    if max(map(len, cells.values())) == 1:
+        notes.append(
+            "Every method has one seed a data set: intervals are over the episodes of "
+            "that one training and say nothing about another."
+        )
+    return notes
+
+
+def _coverage_notes(tables: RunTables) -> list[str]:
+    """Say which methods have no run on a data set."""
+    cells, notes = tables.cells(), []
+    for method in tables.methods:
+        missing = [data for data in tables.data if (data, method) not in cells]
+        if missing:
+            notes.append(
+                f"{method} has no run on {', '.join(missing)}: its mean over data sets "
+                "is of fewer."
+            )
+    return notes
+
+
+def _known_score(run: Run) -> str:
+    return "unknown" if run.data_score is None else f"{run.data_score:.1f}"
+
+
+def _by_value(items: Sequence[Any], values: Sequence[Any]) -> list[Any]:
+    """Return pairs of a value and the items that have it."""
+    found: dict[Any, list[Any]] = defaultdict(list)
+    for item, value in zip(items, values, strict=True):
+        found[value].append(item)
+    return list(found.items())
+
+
+def _names(runs: Sequence[Run]) -> str:
+    """Return which runs these are: their methods, and how many."""
+    names = list(dict.fromkeys(run.method for run in runs))
+    few = ", ".join(names) if len(names) <= 3 else f"{len(names)} methods"
+    return f"{few} ({len(runs)} run{'s' if len(runs) > 1 else ''})"

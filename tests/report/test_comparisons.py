@@ -1,0 +1,152 @@
+"""Differences between methods: of pairs, or refused; and a verdict, or none."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from torchrl_osr.report import compare, quantities
+from torchrl_osr.report.comparisons import (
+    ALL_DATA,
+    MIN_SEEDS,
+    compare_all,
+    mean_difference,
+    pair,
+    suite_quantities,
+    verdict,
+)
+
+fakes = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("fakes.py"))))
+SEEDS = range(MIN_SEEDS)
+
+
+def series(values: dict) -> pd.Series:
+    index = pd.MultiIndex.from_tuples(values, names=["step", "episode"])
+    return pd.Series(list(values.values()), index=index)
+
+
+def test_pairs_are_of_one_checkpoint_and_episode():
+    own = series({(1, 10): 5.0, (1, 11): 7.0, (2, 10): 1.0, (2, 11): 2.0})
+    reference = series({(2, 11): 0.0, (1, 10): 4.0, (1, 11): 4.0, (2, 10): 0.0})
+    np.testing.assert_array_equal(pair(own, reference), [(1 + 1) / 2, (3 + 2) / 2])
+    with pytest.raises(ValueError, match=r"1 episodes .* step 2 with episode seed 11"):
+        pair(own, reference.iloc[1:])
+
+
+def test_interval_of_a_known_shift_contains_it_as_often_as_it_says():
+    # 8 seeds of 10 episodes, shifted by 3. The percentile bootstrap over 8 values holds
+    # the truth in about 0.88 of the cases, a little more for the resampled episodes;
+    # 80 cases: standard error 0.04.
+    rng = np.random.default_rng(0)
+    hits = 0
+    for _ in range(80):
+        runs = [3 + rng.normal() + rng.normal(size=10) for _ in range(8)]
+        found = mean_difference([runs])
+        hits += found.low <= 3 <= found.high
+    assert 0.78 <= hits / 80 <= 0.98
+
+
+def both(folder, shift, *, seeds=SEEDS, env="hopper", **options):
+    """Write two methods that differ by a shift in every episode, and lose 10 and 4."""
+    for seed in seeds:
+        for name, more, lost in (("cql", 0, 10), ("osr", shift, 4)):
+            scores = [20.0 + seed + more, 60.0 + more]
+            low = fakes.hand_level("x", [each - lost for each in scores])
+            fakes.write_hand(
+                folder / f"{env}-{name}{seed}", {5: scores}, seed=seed, env=env,
+                suite=fakes.hand_suite((5, [1, 2], scores, [low])),
+                loss=fakes.LOSSES[name], overrides=[f"loss={name}"], **options,
+            )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("shift", "seeds", "told"),
+    [
+        (2, SEEDS, "better"),
+        (-2, SEEDS, "worse"),
+        (0, SEEDS, "not told apart"),
+        (2, SEEDS[1:], f"cannot be told: {MIN_SEEDS - 1} seeds"),
+        (2, [0], "cannot be told: 1 seed"),
+    ],
+)
+def test_a_known_shift_is_found_without_the_spread_of_seeds(
+    tmp_path, shift, seeds, told
+):
+    both(tmp_path, shift, seeds=seeds)
+    tables = fakes.read_all(tmp_path)
+    score, under, lost = quantities(tables)
+    (found,) = compare(tables, "osr", "cql", score)
+    assert found.estimate[:3] == pytest.approx((shift,) * 3, abs=1e-9)
+    assert (found.verdict, found.seeds, found.note) == (told, len(seeds), "")
+    (found,) = compare(tables, "osr", "cql", under)
+    assert found.estimate.mean == pytest.approx(shift + 6)
+    (found,) = compare(tables, "osr", "cql", lost)
+    assert found.estimate.mean == pytest.approx(-6)
+    assert found.verdict == ("better" if len(seeds) == MIN_SEEDS else told)  # fewer are
+    (each,) = suite_quantities(tables, "hand")
+    (found,) = compare(tables, "osr", "cql", each)
+    assert found.estimate.mean == pytest.approx(shift + 6)
+    sentences = verdict(compare_all(tables, "cql", [score]), "cql")
+    first = "osr is {} than cql in undisturbed score on hopper medium-replay: {}"
+    if told in ("better", "worse"):
+        number = f"{shift:+.1f} points [".replace("-", "\N{MINUS SIGN}")
+        assert sentences[0].startswith(first.format(told, number))
+    else:
+        assert sentences[0] == f"osr against cql in undisturbed score: {told}."
+    assert ("A verdict needs" in sentences[-1]) == told.startswith("cannot")
+
+
+def test_an_interval_with_zero_tells_nothing_apart(tmp_path):
+    for seed, more in enumerate((-4.0, 0.0, 5.0, -3.0, 4.0)):
+        fakes.write_run(tmp_path / f"cql{seed}", {5: [1.0, 2.0]}, seed=seed,
+                        overrides=["loss=cql"])  # fmt: skip
+        fakes.write_run(tmp_path / f"osr{seed}", {5: [1 + more, 2 + more]}, seed=seed)
+    tables = fakes.read_all(tmp_path)
+    (found,) = compare(tables, "osr", "cql", quantities(tables)[0])
+    assert found.verdict == "not told apart"
+    assert found.estimate.low < 0 < found.estimate.mean < found.estimate.high
+
+
+def test_data_sets_count_the_same_and_come_last_together(tmp_path):
+    both(tmp_path, 2, seeds=(0,))
+    both(tmp_path, 8, seeds=(0, 1, 2), env="walker2d")
+    tables = fakes.read_all(tmp_path)
+    found = compare(tables, "osr", "cql", quantities(tables)[0])
+    assert [each.data for each in found] == [
+        "hopper medium-replay", "walker2d medium-replay", ALL_DATA,
+    ]  # fmt: skip
+    assert [each.estimate.mean for each in found] == pytest.approx([2, 8, 5])
+    overs = [each.estimate.over for each in found]
+    assert overs == ["episodes", "seeds", "episodes"], "one has a single seed"
+    assert [each.seeds for each in found] == [1, 3, 1]
+
+
+def test_what_does_not_match_is_refused_or_said(tmp_path):
+    both(tmp_path, 2, seeds=(0, 1))
+
+    def more(name, scores, **options):
+        fakes.write_run(tmp_path / name, scores, overrides=[f"loss={name}"], **options)
+
+    fakes.write_run(tmp_path / "alone", {5: [1.0, 2.0]}, seed=7)
+    more("later", {9: [1.0, 2.0]})
+    more("unlike", {5: [1.0, 2.0]}, changes={"network.layer_norm": False},
+         versions={"torch": "1"})  # fmt: skip
+    more("seedless", {5: [1.0, 2.0]}, seed=8)
+    tables = fakes.read_all(tmp_path)
+    score, under, _ = quantities(tables)
+    (found,) = compare(tables, "osr", "cql", score)
+    assert (found.seeds, found.note) == (2, "only seeds that both have")
+    (found,) = compare(tables, "later", "cql", score)
+    assert found.verdict == "not paired"
+    assert "4 episodes have no partner, the first at step 5" in found.note
+    (found,) = compare(tables, "seedless", "cql", score)
+    assert found.note == "they have no seed in common"
+    (found,) = compare(tables, "unlike", "cql", score)
+    assert found.estimate is not None
+    assert "they differ in network.layer_norm, versions" in found.note
+    assert compare(tables, "unlike", "cql", under) == []
