@@ -134,13 +134,25 @@ def read_json(path: Path, *, max_bytes: int = MAX_JSON_BYTES) -> dict[str, Any]:
         OSError: it cannot be read.
         ValueError: it holds something else or is too large, naming the file.
     """
-    text = read_text(path, max_bytes=max_bytes)
+    return parse_json(read_text(path, max_bytes=max_bytes), path.name)
+
+
+def parse_json(text: str, name: str) -> dict[str, Any]:
+    """JSON object in a text.
+
+    Args:
+        text: of the file, or of a line of it.
+        name: of the file, for the message.
+
+    Raises:
+        ValueError: it holds something else, naming the file.
+    """
     try:
         value = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path.name} is no JSON: {error}") from error
+        raise ValueError(f"{name} is no JSON: {error}") from error
     if not isinstance(value, dict):
-        raise ValueError(f"{path.name} holds no object")
+        raise ValueError(f"{name} holds no object")
     return value
 
 
