@@ -56,7 +56,7 @@ PACKAGES = ("torchrl-osr", "torch", "torchrl", "tensordict", "gymnasium", "mujoc
 register()
 
 
-@hydra.main(version_base="1.3", config_path="../conf_evaluate", config_name="evaluate")
+@hydra.main("../conf/evaluation", "evaluate", version_base="1.3")
 def main(cfg: DictConfig) -> None:
     """Evaluate, unless the result is there already, and print the table."""
     torchrl_logger.setLevel("WARNING")

@@ -66,7 +66,7 @@ STEPS_BEFORE = 10  # in the film
 MODEL, RULES = "inverse dynamics, ", ("time", "nearest")
 
 
-@hydra.main(version_base="1.3", config_path="../conf_evaluate", config_name="film")
+@hydra.main(version_base="1.3", config_path="../conf/evaluation", config_name="film")
 def main(cfg: DictConfig) -> None:
     """Play all episodes with every controller, print the table, film one of them."""
     torchrl_logger.setLevel("WARNING")

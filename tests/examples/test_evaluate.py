@@ -20,7 +20,7 @@ from torchrl_osr.experiment.trained_run import load_trained
 from torchrl_osr.report import read_runs
 
 ROOT = Path(__file__).parents[2]
-CONF = ROOT / "conf_evaluate"
+CONF = ROOT / "conf/evaluation"
 SUITES = sorted(path.stem for path in (CONF / "suite").glob("*.yaml"))
 
 
