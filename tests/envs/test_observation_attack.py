@@ -29,8 +29,8 @@ def trained():
     """A loss after a few gradient steps, and its networks."""
     torch.manual_seed(0)
     actor = tanh_gaussian_actor(11, 3, num_cells=[16])
-    critics = critic_ensemble(11, 3, num_cells=[16])
-    loss = OSRLoss(actor, critics, recovery_weight=0, num_random=2)
+    critic, _ = critic_ensemble(11, 3, num_cells=[16])
+    loss = SACLoss(actor, critic, num_qvalue_nets=2, target_entropy=-3.0)
     updater = SoftUpdate(loss, tau=0.1)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
     flag = torch.zeros(32, 1, dtype=torch.bool)

@@ -9,9 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hydra import compose, initialize_config_dir
 from hydra.errors import ConfigCompositionException, MissingConfigException
 from omegaconf import OmegaConf
+from tensordict.nn import TensorDictModule
+from torchrl.modules import ProbabilisticActor, TanhDelta
 
 from torchrl_osr.data import make_environment
 from torchrl_osr.evaluation import check_disturbances
@@ -190,9 +193,18 @@ def test_a_disturbance_needs_one_of_wrapper_and_attack(folder):
         make_disturbances(suite.disturbances, load_trained(folder), np.full(11, 0.5))
 
 
-def test_attacks_need_standardised_networks(folder):
+def test_attacks_need_standardised_networks_and_a_stochastic_policy(folder):
     suite = composed("suite=observation_attack", "checkpoint=none").suite
     trained = load_trained(folder)
+    deterministic = ProbabilisticActor(
+        TensorDictModule(torch.nn.Linear(11, 3), ["observation"], ["param"]),
+        in_keys=["param"],
+        distribution_class=TanhDelta,
+    )
+    with pytest.raises(ValueError, match=r"'action_diff-0.05' .* is a TanhDelta"):
+        make_disturbances(
+            suite.disturbances, trained._replace(actor=deterministic), np.full(11, 0.5)
+        )
     trained.config.data.standardize = False
     with pytest.raises(ValueError, match="data.standardize=false"):
         make_disturbances(suite.disturbances, trained, np.full(11, 0.5))

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torchrl.checkpoint import CheckpointError, CheckpointRotation
@@ -142,12 +143,13 @@ def test_a_run_of_somebody_else_calls_nothing_of_theirs(tmp_path):
     make_run(folder)
     cfg = OmegaConf.load(folder / "config.yaml")
     crafted = {"_target_": "os.mkdir", "path": str(marker)}
-    OmegaConf.update(cfg, "loss.adversary", crafted, force_add=True)
+    OmegaConf.update(cfg, "inverse_dynamics.network.more", crafted, force_add=True)
     OmegaConf.save(cfg, folder / "config.yaml")
     with pytest.raises(ValueError, match=r"'os\.mkdir' called, which is none of"):
         load_trained(folder)
     assert not marker.exists()
-    make_learner(cfg, 11, 3)
+    with pytest.raises(InstantiationException):
+        make_learner(cfg, 11, 3)
     assert marker.exists(), "the crafted configuration works"
 
 

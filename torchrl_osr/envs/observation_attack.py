@@ -29,6 +29,8 @@ PolicyDistribution: TypeAlias = Callable[[TensorDictBase], TanhNormal]
 CriticValues: TypeAlias = Callable[[TensorDictBase, Tensor], Tensor]
 """Maps states ``[M, E]`` and actions ``[M, E, A]`` to all critics' ``[N, M, E]``."""
 
+Objective: TypeAlias = Literal["action_diff", "min_Q"]
+
 
 def critics_of(loss: LossModule) -> CriticValues:
     """Values of all critics of a loss, as a function of states and actions.
@@ -84,14 +86,13 @@ def attacked_policy(
     * ``"min_Q"``: the one that leads the policy to the action of lowest value at the
       true state, averaged over the critics.
 
-    The last two are searched by :class:`~torchrl_osr.Adversary`: the best of 50 draws
-    by default; ``method="gradient"`` with ``num_samples=1`` is RORL's first order, with
-    20 its mixed order. ``epsilon=0`` is the unperturbed policy.
+    :class:`~torchrl_osr.Adversary` searches for the last two: the best of 50 draws by
+    default; ``method="gradient"`` with ``num_samples=1`` is RORL's first order, with 20
+    its mixed order. ``epsilon=0`` is the unperturbed policy.
 
     Args:
         policy_distribution: the actor's ``get_dist``, for instance.
-        qvalue: values of the critics, see :func:`critics_of`; only ``"min_Q"`` needs
-            them.
+        qvalue: the critics, see :func:`critics_of`; only ``"min_Q"`` needs them.
         observation_norm: how the training data were standardised
             (``standard_normal=True``). Default: not at all, and ``epsilon`` is in the
             observation's own units.
@@ -101,9 +102,8 @@ def attacked_policy(
         epsilon: half-width of the box, in standard deviations; RORL's go from 0 to 0.3.
         method: ``"sample"`` (default) or ``"gradient"``.
         num_samples: draws, or starts of the gradient steps. Default 50.
-        seed: of the draws' own generator, which continues from call to call and draws
-            for the whole batch: only a new policy and the same episodes give the same
-            numbers again. Default 0.
+        seed: of the draws' own generator, which continues from call to call: the same
+            numbers again take a new policy and the same episodes. Default 0.
         device: where the policy is. Default CPU.
 
     Returns:
@@ -133,12 +133,9 @@ def attacked_policy(
             "kind='min_Q' needs qvalue, the critics whose value it lowers; got None. "
             "critics_of(loss) returns those of a trained loss."
         )
-    objective: Literal["action_diff", "min_Q"] = (
-        "min_Q" if kind == "min_Q" else "action_diff"
-    )
     # Checks the other arguments, also for "random".
+    objective: Objective = "min_Q" if kind == "min_Q" else "action_diff"
     adversary = Adversary(objective, method, epsilon, num_samples)
-    critics = cast(CriticValues, qvalue)  # only "min_Q" calls it
     generator = torch.Generator(device).manual_seed(seed)
 
     @torch.no_grad()
@@ -149,6 +146,7 @@ def attacked_policy(
         if epsilon > 0 and kind == "random":
             states["observation"] = _uniform_in_box(observation, epsilon, generator)
         elif epsilon > 0:
+            critics = cast(CriticValues, qvalue)  # only "min_Q" calls it
             states = adversary.perturb(
                 states, ["observation"], policy_distribution, critics, generator
             )

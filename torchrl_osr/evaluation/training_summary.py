@@ -27,6 +27,7 @@ PANELS = {
     "loss_qvalue": "TD error (critics)",
     "loss_cql": "conservative term (critics)",
     "recovery_kl": "state recovery (policy)",
+    "recovery_nll": "recovery to the data's actions (policy)",
     "pred_value": "Q of the data's actions",
 }
 """Logged scalars below the score, and their titles."""

@@ -13,10 +13,13 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import torch
 from hydra.core.config_store import ConfigStore
 from hydra.utils import instantiate
 from numpy.typing import NDArray
 from omegaconf import MISSING
+from tensordict import TensorDict
+from torchrl.modules import TanhNormal
 
 from torchrl_osr.envs import attacked_policy, critics_of
 from torchrl_osr.evaluation import Disturbance
@@ -106,9 +109,10 @@ def make_disturbances(
         seed: of the attacks' draws. Default 0.
 
     Raises:
-        ValueError: if a disturbance has both wrapper and attack, or neither, or if
-            there is an attack, whose unit is the data's standard deviation, but the
-            networks were trained on raw observations.
+        ValueError: if a disturbance has both wrapper and attack, or neither, or an
+            attack is not possible: its unit is the data's standard deviation, but the
+            networks were trained on raw observations, or it compares distributions of a
+            deterministic policy.
     """
     made = []
     for name, config in configs.items():
@@ -120,11 +124,11 @@ def make_disturbances(
             if wrap.keywords.get("unit") == DATA_UNIT:
                 wrap = partial(wrap, unit=scale)
         else:
-            if not trained.config.data.standardize:
+            obstacle = _obstacle(config.attack.kind, trained)
+            if obstacle:
                 raise ValueError(
                     f"disturbance {name!r} is not possible for {trained.folder}: "
-                    "attacks are in standard deviations of the data, and the run has "
-                    "data.standardize=false."
+                    f"{obstacle}."
                 )
             policy = attacked_policy(
                 trained.actor.get_dist,
@@ -135,3 +139,20 @@ def make_disturbances(
             )
         made.append(Disturbance(name, config.kind, config.strength, wrap, policy))
     return made
+
+
+def _obstacle(kind: str, trained: TrainedRun) -> str:
+    """Reason why a run's policy cannot be attacked, or nothing."""
+    if not trained.config.data.standardize:
+        return (
+            "attacks are in standard deviations of the data, and the run has "
+            "data.standardize=false"
+        )
+    observation = torch.zeros_like(trained.observation_norm.loc)
+    distribution = trained.actor.get_dist(TensorDict({"observation": observation}))
+    if kind == "action_diff" and not isinstance(distribution, TanhNormal):
+        return (
+            "action_diff compares tanh-Gaussian distributions, and the policy's is a "
+            f"{type(distribution).__name__}; leave it out by ~suite.disturbances.<name>"
+        )
+    return ""
