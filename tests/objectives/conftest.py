@@ -249,6 +249,10 @@ PROPERTIES: dict[str, Callable[[Member], bool]] = {
         "recovery_weight" in member.weights
         and member.options.get("recovery_target") != "data"
     ),
+    # Reads the next state as the one that the action leads to.
+    "inverse dynamics": lambda member: (
+        PROPERTIES["model"](member) or member.loss_class is InverseDynamicsLoss
+    ),
     "cql": lambda member: "loss_cql" in member.groups,
     "perturbed": lambda member: PERTURBED in member.in_keys,
     "priority weight": lambda member: "priority_weight" in member.keys,

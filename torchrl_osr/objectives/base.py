@@ -305,7 +305,8 @@ class BaseLoss(LossModule):
 
     def _check_not_empty(self, tensordict: TensorDictBase) -> None:
         """Raise a ValueError unless the batch has a row."""
-        if not tensordict.numel():
+        # Not tensordict.numel(), which is at least 1.
+        if not tensordict.batch_size.numel():
             raise ValueError(
                 f"The batch is empty (batch_size {tuple(tensordict.batch_size)}): the "
                 f"mean of {type(self).__name__} needs at least one transition."

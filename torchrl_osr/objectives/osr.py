@@ -25,7 +25,7 @@ from torchrl_osr import functional
 from torchrl_osr._checks import check_literals, check_positive, check_weight
 from torchrl_osr.objectives import critic_kernel
 from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
-from torchrl_osr.objectives.distributions import check_num_actions
+from torchrl_osr.objectives.distributions import check_action, check_num_actions
 from torchrl_osr.objectives.mixed_states import States
 from torchrl_osr.objectives.step import (
     Step,
@@ -275,6 +275,7 @@ class OSRLoss(BaseLoss):
         """
         pi = step.policy(self.actor_states)
         action, log_prob = rsample_and_log_prob(pi)
+        check_action(step.data_action, action.shape[-1], self.tensor_keys.action)
         # Detached: the policy's objective shall not train the critics.
         params = self.qvalue_network_params.detach()
         qvalue = step.qvalue(step.at(self.actor_states), action, params)

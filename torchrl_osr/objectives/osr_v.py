@@ -22,7 +22,7 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl_osr import functional
 from torchrl_osr._checks import check_literals, check_positive, check_weight
 from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
-from torchrl_osr.objectives.distributions import check_num_actions
+from torchrl_osr.objectives.distributions import check_action, check_num_actions
 from torchrl_osr.objectives.step import Step, actor_critic_in_keys, uniform_actions
 
 
@@ -173,6 +173,7 @@ class OSRVLoss(BaseLoss):
     def actor_loss(self, step: Step) -> tuple[Tensor, Tensor]:
         r""":math:`L_\pi` on D_tot, and the log-density of the policy's own actions."""
         action, log_prob = rsample_and_log_prob(step.policy("both"))
+        check_action(step.data_action, action.shape[-1], self.tensor_keys.action)
         # Detached: the policy's objective shall not train the critics.
         params = self.qvalue_network_params.detach()
         qvalue = step.qvalue(step.at("both"), action, params)

@@ -17,6 +17,7 @@ from torch import Tensor
 from torchrl_osr import functional
 from torchrl_osr._checks import check_literals, check_positive, check_weight
 from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
+from torchrl_osr.objectives.distributions import check_action
 from torchrl_osr.objectives.step import Step, actor_critic_in_keys
 
 
@@ -143,6 +144,7 @@ class TD3BCLoss(BaseLoss):
     def actor_loss(self, step: Step) -> tuple[Tensor, Tensor]:
         r""":math:`L_\pi`, and the squared distance to the data's action, ``[B]``."""
         action = step.action(step.states[0], self.actor_network_params)
+        check_action(step.data_action, action.shape[-1], self.tensor_keys.action)
         # Detached: the policy's objective shall not train the critics.
         params = self.qvalue_network_params.detach()
         qvalue = step.qvalue(step.states[0], action, params)[0]
