@@ -249,6 +249,10 @@ PROPERTIES: dict[str, Callable[[Member], bool]] = {
         "recovery_weight" in member.weights
         and member.options.get("recovery_target") != "data"
     ),
+    # Reads the next state as the one that the action leads to.
+    "inverse dynamics": lambda member: (
+        PROPERTIES["model"](member) or member.loss_class is InverseDynamicsLoss
+    ),
     "cql": lambda member: "loss_cql" in member.groups,
     "perturbed": lambda member: PERTURBED in member.in_keys,
     "priority weight": lambda member: "priority_weight" in member.keys,
@@ -396,7 +400,9 @@ FAMILY = {
 def losses(*names: str, having: str | None = None) -> list[str]:
     """The losses of these names, or all, that have a property."""
     found = names or tuple(FAMILY)
-    return [name for name in found if not having or PROPERTIES[having](FAMILY[name])]
+    if having:
+        return [name for name in found if PROPERTIES[having](FAMILY[name])]
+    return list(found)
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -413,6 +419,10 @@ class Family:
 
     def __getitem__(self, name: str) -> Member:
         return FAMILY[name]
+
+    def has(self, name: str, what: str) -> bool:
+        """Whether a loss has the property ``what``, see ``PROPERTIES``."""
+        return PROPERTIES[what](FAMILY[name])
 
     def networks(
         self, name: str, *, observation="observation", action="action", seed=0, **rest
@@ -439,7 +449,7 @@ class Family:
         """
         member = FAMILY[name]
         networks = networks or self.networks(name)
-        with_critics = PROPERTIES["critics"](member)
+        with_critics = self.has(name, "critics")
         if with_critics and options.get("reduction") == "none":
             options = {"scalar_output_mode": "exclude"} | options
         parts = [getattr(networks, part) for part in member.parts]
@@ -479,6 +489,28 @@ def seeded():
     def call(loss, *args, **kwargs):
         torch.manual_seed(2)
         return loss(*args, **kwargs)
+
+    return call
+
+
+@pytest.fixture
+def terms(family, seeded):
+    """Return a function that lists the terms of the losses.
+
+    ``"recovery"`` is what ``recovery_weight`` scales, the losses are what is left.
+    """
+
+    def call(name: str, loss, batch: TensorDict) -> dict[str, Tensor]:
+        out = seeded(loss, batch)
+        found = {key: out[key] for key in family[name].groups}
+        for key in family[name].weights.get("recovery_weight", []):
+            # Another buffer in its place, for the graph of the losses holds this one.
+            weight = loss.recovery_weight
+            loss._buffers["recovery_weight"] = torch.zeros_like(weight)
+            rest = seeded(loss, batch)[key]
+            loss._buffers["recovery_weight"] = weight
+            found |= {key: rest, "recovery": found[key] - rest}
+        return found
 
     return call
 

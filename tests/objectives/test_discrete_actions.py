@@ -15,31 +15,31 @@ FORMS = {
     "uint8 [B]": lambda index: index.byte(),
 }
 
-both_losses = pytest.mark.parametrize("choosing", ["discrete", "discrete-idm"])
+both_losses = pytest.mark.losses("discrete", "discrete-idm")
 
 
 @both_losses
 @pytest.mark.parametrize("form", FORMS)
 def test_indices_and_one_hot_vectors_give_the_same_numbers(
-    family, family_batch, record, assert_same_bits, choosing, form
+    family, family_batch, record, assert_same_bits, name, form
 ) -> None:
-    batch = family_batch(choosing, 2, 5)
-    wanted = record(family(choosing), batch)
-    networks = family.networks(choosing, distribution_class=Categorical)
+    batch = family_batch(name, 2, 5)
+    wanted = record(family(name), batch)
+    networks = family.networks(name, distribution_class=Categorical)
     batch["action"] = FORMS[form](batch["action"].argmax(-1))
-    assert_same_bits(record(family(choosing, networks), batch), wanted)
+    assert_same_bits(record(family(name, networks), batch), wanted)
 
 
 @both_losses
 @pytest.mark.parametrize("dtype", [torch.bool, torch.uint8, torch.int64, torch.float32])
 @pytest.mark.parametrize("torchs", [False, True], ids=["torchrl", "torch"])
 def test_one_hot_vectors_may_be_of_any_type(
-    family, family_batch, record, assert_same_bits, choosing, dtype, torchs
+    family, family_batch, record, assert_same_bits, name, dtype, torchs
 ) -> None:
-    batch = family_batch(choosing, 10)
-    wanted = record(family(choosing), batch)
+    batch = family_batch(name, 10)
+    wanted = record(family(name), batch)
     kwargs = {"distribution_class": TorchOneHotCategorical} if torchs else {}
-    loss = family(choosing, family.networks(choosing, **kwargs))
+    loss = family(name, family.networks(name, **kwargs))
     batch["action"] = batch["action"].to(dtype)
     assert_same_bits(record(loss, batch), wanted)
 

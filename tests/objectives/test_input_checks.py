@@ -5,25 +5,29 @@ from __future__ import annotations
 import pytest
 import torch
 from torch.distributions import Categorical
+from torchrl.data.postprocs import MultiStep
 
 
+@pytest.mark.losses(having="perturbed")
 @pytest.mark.parametrize("prefix", ["perturbed", "noisy"])
-def test_missing_twin_is_named_with_the_cure(
-    family, family_batch, twin_reading, prefix
+def test_missing_perturbed_state_is_named_with_the_cure(
+    family, family_batch, name, prefix
 ) -> None:
-    loss = family(twin_reading)
+    loss = family(name)
     loss.set_keys(perturbed=prefix)
     with pytest.raises(KeyError, match=f"{prefix}.*observation.*StatePerturbation"):
-        loss(family_batch(twin_reading, 10, twin=False))
+        loss(family_batch(name, 10, perturbed=False))
 
 
-def test_twin_of_another_shape_is_named(family, family_batch, twin_reading) -> None:
-    batch = family_batch(twin_reading, 10)
+@pytest.mark.losses(having="perturbed")
+def test_perturbed_state_of_another_shape_is_named(family, family_batch, name) -> None:
+    batch = family_batch(name, 10)
     batch["perturbed", "observation"] = torch.zeros(10, 4)
     with pytest.raises(ValueError, match=r"'perturbed', 'observation'.*4.*10, 3"):
-        family(twin_reading)(batch)
+        family(name)(batch)
 
 
+@pytest.mark.losses
 def test_next_state_of_another_shape_is_named(family, family_batch, name) -> None:
     batch = family_batch(name, 10)
     batch["next", "observation"] = torch.zeros(10, 1)
@@ -31,6 +35,7 @@ def test_next_state_of_another_shape_is_named(family, family_batch, name) -> Non
         family(name)(batch)
 
 
+@pytest.mark.losses
 def test_missing_entry_is_named(family, family_batch, name) -> None:
     loss, batch = family(name), family_batch(name, 10)
     for key in family[name].in_keys:
@@ -39,6 +44,15 @@ def test_missing_entry_is_named(family, family_batch, name) -> None:
             loss(batch.exclude(key))
 
 
+@pytest.mark.losses
+@pytest.mark.parametrize("size", [(0,), (4, 0)])
+def test_empty_batch_is_named(family, family_batch, name, size) -> None:
+    expected = rf"batch is empty \(batch_size \({size[0]},.*at least one transition"
+    with pytest.raises(ValueError, match=expected):
+        family(name)(family_batch(name, *size))
+
+
+@pytest.mark.losses
 def test_flags_and_rewards_need_a_last_dimension_of_one(
     family, family_batch, name
 ) -> None:
@@ -51,12 +65,60 @@ def test_flags_and_rewards_need_a_last_dimension_of_one(
             family(name)(batch)
 
 
-@pytest.mark.parametrize("acting", ["osr", "cql", "osrv", "idm", "idm-mse", "cvae"])
-def test_action_of_another_size_is_named(family, family_batch, acting) -> None:
-    batch = family_batch(acting, 10)
-    batch["action"] = torch.zeros(10, 5, dtype=torch.float64)
-    with pytest.raises(ValueError, match=r"'action' has shape \(10, 5\).* 2 dim"):
-        family(acting)(batch)
+@pytest.mark.losses(having="priority weight")
+@pytest.mark.parametrize("shape", [(10, 2), (10, 1, 1)])
+def test_priority_weights_of_another_shape_are_named(
+    family, family_batch, name, shape
+) -> None:
+    batch = family_batch(name, 10)
+    batch["priority_weight"] = torch.ones(shape)
+    with pytest.raises(ValueError, match=r"'priority_weight' has shape .*one weight a"):
+        family(name)(batch)
+
+
+def several_steps(batch):
+    """The batch as TorchRL's MultiStep makes it: next states up to two steps away."""
+    return MultiStep(0.5, 2).double()(batch)
+
+
+@pytest.mark.losses(having="inverse dynamics")
+def test_multi_step_batches_are_refused_by_the_model(
+    family, family_batch, name
+) -> None:
+    batch = several_steps(family_batch(name, 2, 5))
+    expected = r"steps_to_next_obs up to 2\).*leave MultiStep out.*recovery_weight=0"
+    with pytest.raises(ValueError, match=expected):
+        family(name)(batch)
+    # One step at a time may be written, too.
+    batch["steps_to_next_obs"].fill_(1)
+    assert all(value.isfinite() for value in family(name)(batch).values())
+
+
+# The target is r + gamma^n V(s').
+@pytest.mark.losses(
+    "cql", "cql-perturbed", "cloning", "noisy-cloning", "edac", "td3bc", "discrete-cql"
+)
+def test_multi_step_batches_are_taken_without_a_model(
+    family, family_batch, record, assert_same, name
+) -> None:
+    batch = several_steps(family_batch(name, 2, 5))
+    two = batch[batch["steps_to_next_obs"] == 2]
+    assert len(two) == 4
+    found, expected = family(name), family(name)
+    found.make_value_estimator(gamma=0.5)
+    expected.make_value_estimator(gamma=0.25)
+    one = two.exclude("steps_to_next_obs", "gamma")
+    assert_same(record(found, two), record(expected, one))
+
+
+@pytest.mark.losses("osr", "cql", "osrv", "edac", "td3bc", "idm", "idm-mse", "cvae")
+@pytest.mark.parametrize("size", [1, 5])
+def test_action_of_another_size_is_named(family, family_batch, name, size) -> None:
+    batch = family_batch(name, 10)
+    batch["action"] = torch.zeros(10, size, dtype=torch.float64)
+    expected = rf"'action' has shape \(10, {size}\).* 2 dim"
+    with pytest.raises(ValueError, match=expected):
+        family(name)(batch)
 
 
 SEEN = r"'action' has shape \({}\) and type torch.{}; expected "
@@ -64,7 +126,7 @@ ONE_HOT = SEEN + r"one-hot actions \(2, 5, 4\), .* OneHotCategorical"
 INDEX = SEEN + r"integer indices \(2, 5\) or \(2, 5, 1\), .* Categorical"
 
 
-@pytest.mark.parametrize("choosing", ["discrete", "discrete-idm"])
+@pytest.mark.losses("discrete", "discrete-idm")
 @pytest.mark.parametrize(
     ("one_hot", "action", "expected"),
     [
@@ -77,11 +139,11 @@ INDEX = SEEN + r"integer indices \(2, 5\) or \(2, 5, 1\), .* Categorical"
     ],
 )
 def test_actions_of_another_kind_are_named(
-    family, family_batch, choosing, one_hot, action, expected
+    family, family_batch, name, one_hot, action, expected
 ) -> None:
     kwargs = {} if one_hot else {"distribution_class": Categorical}
-    loss = family(choosing, family.networks(choosing, **kwargs))
-    batch = family_batch(choosing, 2, 5)
+    loss = family(name, family.networks(name, **kwargs))
+    batch = family_batch(name, 2, 5)
     batch["action"] = action
     with pytest.raises(ValueError, match=expected):
         loss(batch)
@@ -112,12 +174,20 @@ def test_continuous_critics_are_refused(family, family_batch) -> None:
         family("discrete", networks)(family_batch("discrete", 10))
 
 
-def test_critics_that_write_another_entry_are_named(
-    family, family_batch, critic_loss
-) -> None:
-    networks = family.networks(critic_loss)
+@pytest.mark.losses(having="critics")
+def test_critics_that_write_another_entry_are_named(family, family_batch, name) -> None:
+    networks = family.networks(name)
     (key,) = networks.critics[0].out_keys
     for critic in networks.critics:
         critic.out_keys = ["values"]
     with pytest.raises(KeyError, match=rf"write \['values'\], not '{key}'"):
-        family(critic_loss, networks)(family_batch(critic_loss, 10))
+        family(name, networks)(family_batch(name, 10))
+
+
+def test_an_actor_that_writes_another_entry_is_named(
+    family, family_batch, make_deterministic_actor
+) -> None:
+    networks = family.networks("td3bc")
+    networks.actor = make_deterministic_actor("module", action="torque")
+    with pytest.raises(KeyError, match=r"actor writes no 'action'.*set_keys\(action="):
+        family("td3bc", networks)(family_batch("td3bc", 10))

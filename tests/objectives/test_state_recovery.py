@@ -17,7 +17,8 @@ from torchrl.objectives import IQLLoss, SACLoss, SoftUpdate, TD3BCLoss
 from torchrl_osr import OSRLoss, StateRecoveryLoss
 
 KEY, METRIC, ACTOR = "loss_recovery", "recovery_kl", "actor_network_params"
-NEXT, TWIN = ("next", "observation"), ("perturbed", "observation")
+NEXT, PERTURBED = ("next", "observation"), ("perturbed", "observation")
+REVERSE = {"recovery_direction": "reverse"}
 STATES = ["both", "clean", "perturbed"]
 BOUNDS = [([-1.0, -1.0], [1.0, 1.0]), ([-1.0, -0.5], [2.0, 1.5])]
 
@@ -31,9 +32,11 @@ def make_loss(networks, **kwargs) -> StateRecoveryLoss:
     return StateRecoveryLoss(networks.actor, model, **kwargs).double()
 
 
-def value_and_gradients(loss, batch) -> list[Tensor]:
-    value = loss(batch)[KEY]
-    return [value.detach(), *torch.autograd.grad(value.sum(), list(loss.parameters()))]
+def value_and_gradients(loss, batch, key: str = KEY) -> list[Tensor]:
+    torch.manual_seed(2)
+    value = loss(batch)[key]
+    actor = list(loss.actor_network_params.parameters())
+    return [value.detach(), *torch.autograd.grad(value.sum(), actor)]
 
 
 class Restatement:
@@ -41,7 +44,7 @@ class Restatement:
 
     def __init__(self, batch, states: str) -> None:
         kept = ~batch["next", "done"].squeeze(-1)
-        sets = {"clean": batch["observation"], "perturbed": batch[TWIN]}
+        sets = {"clean": batch["observation"], "perturbed": batch[PERTURBED]}
         names = ["clean", "perturbed"] if states == "both" else [states]
         self.states = torch.stack([sets[name][kept] for name in names])
         self.following = batch[NEXT][kept].expand_as(self.states)
@@ -59,7 +62,11 @@ def test_value_and_gradients_equal_the_divergence_of_torch(
     make_networks, make_batch, check, direction, reduction, states
 ) -> None:
     networks, batch = make_networks(**double(*BOUNDS[1])), make_batch(10)
-    options = {"direction": direction, "action_reduction": reduction, "states": states}
+    options = {
+        "recovery_direction": direction,
+        "action_reduction": reduction,
+        "recovery_states": states,
+    }
     loss = make_loss(copy.deepcopy(networks), recovery_weight=0.75, **options)
     restated = Restatement(batch, states)
     model = restated.model(networks.inverse_dynamics)
@@ -90,7 +97,7 @@ def test_deterministic_actors_are_measured_before_the_tanh(
     bounds, batch = double(low, high), make_batch(10)
     model_network = make_networks(**bounds).inverse_dynamics
     actor, plain = (make_deterministic_actor(kind, **bounds) for _ in range(2))
-    options = {"direction": "reverse", "states": states, "recovery_weight": 0.75}
+    options = {"recovery_states": states, "recovery_weight": 0.75} | REVERSE
     loss = StateRecoveryLoss(actor, model_network, **options).double()
     restated = Restatement(batch, states)
     model = restated.model(model_network)
@@ -121,7 +128,7 @@ def test_gradient_is_finite_where_the_action_has_saturated(
     last = list(actor.parameters())[-1]
     last.data.fill_(40.0)
     model = make_networks().inverse_dynamics.to(dtype)
-    loss = StateRecoveryLoss(actor, model, direction="reverse").to(dtype)
+    loss = StateRecoveryLoss(actor, model, **REVERSE).to(dtype)
     batch = make_batch(10).apply(lambda t: t.to(dtype) if t.is_floating_point() else t)
     gradients = value_and_gradients(loss, batch)
     assert all(gradient.isfinite().all() for gradient in gradients)
@@ -140,12 +147,15 @@ def test_term_is_that_of_osr(
     ours = make_loss(make_networks())
     osr = OSRLoss(networks.actor, networks.critics, networks.inverse_dynamics).double()
     SoftUpdate(osr, tau=0.1)
-    out, expected = ours(batch), osr(batch)
-    for key in (KEY, METRIC):
-        torch.testing.assert_close(out[key], expected[key], rtol=1e-12, atol=1e-12)
-    params = [list(x.actor_network_params.parameters()) for x in (ours, osr)]
-    gradients = torch.autograd.grad(out[KEY], params[0])
-    assert_same(gradients, torch.autograd.grad(expected[KEY], params[1]))
+    out, metric = ours(batch), osr(batch)[METRIC]
+    torch.testing.assert_close(out[METRIC], metric, rtol=1e-12, atol=1e-12)
+    # The actor's loss holds the term; without its weight, all but the term.
+    gradients = []
+    for weight in (0.5, 0.0):
+        osr.recovery_weight = weight
+        gradients.append(value_and_gradients(osr, batch, "loss_actor"))
+    term = [whole - rest for whole, rest in zip(*gradients, strict=True)]
+    assert_same(value_and_gradients(ours, batch), term)
 
 
 def other_loss(other: str, networks, make_deterministic_actor):
@@ -185,7 +195,7 @@ def test_one_summed_backward_gives_the_actor_both_gradients_and_others_one(
     other, actor = other_loss(kind, networks, make_deterministic_actor)
     direction = "reverse" if kind.startswith("td3") else "forward"
     model = networks.inverse_dynamics
-    recovery = StateRecoveryLoss(actor, model, direction=direction).double()
+    recovery = StateRecoveryLoss(actor, model, recovery_direction=direction).double()
     assert set(recovery.parameters()) == set(actor.parameters())
     assert set(recovery.parameters()) <= set(other.parameters())
 
@@ -228,9 +238,9 @@ def test_sharing_survives_a_cast_and_a_step(
 
 @pytest.mark.parametrize("states", STATES)
 def test_states_decide_what_is_read(make_networks, make_batch, states) -> None:
-    loss, batch = make_loss(make_networks(), states=states), make_batch(10)
-    twins = [] if states == "clean" else [TWIN]
-    assert loss.in_keys == ["observation", NEXT, ("next", "done"), *twins]
+    loss, batch = make_loss(make_networks(), recovery_states=states), make_batch(10)
+    perturbed = [] if states == "clean" else [PERTURBED]
+    assert loss.in_keys == ["observation", NEXT, ("next", "done"), *perturbed]
     assert loss.out_keys == [KEY, METRIC]
     out = loss(batch.select(*loss.in_keys))
     assert list(out.keys()) == loss.out_keys
@@ -265,8 +275,7 @@ def test_action_of_a_plain_actor_can_have_another_name(
         for key in ("action", ("agent", "action"))
     )
     loss, expected = (
-        StateRecoveryLoss(each, model, direction="reverse").double()
-        for each in (actor, same)
+        StateRecoveryLoss(each, model, **REVERSE).double() for each in (actor, same)
     )
     with pytest.raises(KeyError, match=r"writes no 'action': call set_keys\(action="):
         loss(batch)
@@ -279,5 +288,7 @@ def test_deterministic_actor_is_told_to_take_the_reverse_direction(
     make_networks, make_deterministic_actor, kind
 ) -> None:
     model = make_networks().inverse_dynamics
-    with pytest.raises(ValueError, match="deterministic.*Pass direction='reverse'"):
+    with pytest.raises(
+        ValueError, match="deterministic.*Pass recovery_direction='reverse'"
+    ):
         StateRecoveryLoss(make_deterministic_actor(kind), model)

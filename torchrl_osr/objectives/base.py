@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
 
-from torchrl_osr._checks import check_literals
+from torchrl_osr._checks import check_literals, check_positive
 from torchrl_osr._entries import nested
 from torchrl_osr.objectives.distributions import (
     action_bounds,
@@ -212,6 +212,7 @@ class BaseLoss(LossModule):
         target_entropy: float | Literal["auto"],
     ) -> None:
         """Hold the logarithm of the entropy temperature, ``log_alpha``."""
+        check_positive("alpha_init", alpha_init)
         self.target_entropy = target_entropy
         log_alpha = torch.tensor(math.log(alpha_init))
         if fixed_alpha:
@@ -304,7 +305,8 @@ class BaseLoss(LossModule):
 
     def _check_not_empty(self, tensordict: TensorDictBase) -> None:
         """Raise a ValueError unless the batch has a row."""
-        if not tensordict.numel():
+        # Not tensordict.numel(), which is at least 1.
+        if not tensordict.batch_size.numel():
             raise ValueError(
                 f"The batch is empty (batch_size {tuple(tensordict.batch_size)}): the "
                 f"mean of {type(self).__name__} needs at least one transition."

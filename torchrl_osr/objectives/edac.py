@@ -23,6 +23,7 @@ from torchrl.objectives.utils import _vmap_func
 from torchrl_osr import functional
 from torchrl_osr._checks import check_literals, check_weight
 from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
+from torchrl_osr.objectives.distributions import check_action
 from torchrl_osr.objectives.step import Step, actor_critic_in_keys, critic_inputs
 
 
@@ -164,6 +165,7 @@ class EDACLoss(BaseLoss):
     def actor_loss(self, step: Step) -> tuple[Tensor, Tensor]:
         r""":math:`L_\pi`, and the log-density of the policy's own actions."""
         action, log_prob = rsample_and_log_prob(step.policy("clean"))
+        check_action(step.data_action, action.shape[-1], self.tensor_keys.action)
         params = self.qvalue_network_params.detach()
         qvalue = step.qvalue(step.at("clean"), action, params)
         alpha = self.log_alpha.detach().exp()

@@ -25,6 +25,7 @@ from torchrl_osr import functional
 from torchrl_osr._checks import check_literals, check_positive, check_weight
 from torchrl_osr.objectives import critic_kernel
 from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
+from torchrl_osr.objectives.distributions import check_action, check_num_actions
 from torchrl_osr.objectives.mixed_states import States
 from torchrl_osr.objectives.step import (
     Step,
@@ -274,6 +275,7 @@ class OSRLoss(BaseLoss):
         """
         pi = step.policy(self.actor_states)
         action, log_prob = rsample_and_log_prob(pi)
+        check_action(step.data_action, action.shape[-1], self.tensor_keys.action)
         # Detached: the policy's objective shall not train the critics.
         params = self.qvalue_network_params.detach()
         qvalue = step.qvalue(step.at(self.actor_states), action, params)
@@ -294,6 +296,8 @@ class OSRLoss(BaseLoss):
             log_prob: Tensor = pi.log_prob(step.data_action.expand_as(pi.loc))
             return -log_prob
         model = step.inverse_dynamics(self.recovery_states)
+        sizes = model.loc.shape[-1], pi.loc.shape[-1]
+        check_num_actions("inverse_dynamics_network", *sizes)
         return functional.state_recovery(
             pi.loc,
             pi.scale,

@@ -22,6 +22,7 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl_osr import functional
 from torchrl_osr._checks import check_literals, check_positive, check_weight
 from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
+from torchrl_osr.objectives.distributions import check_action, check_num_actions
 from torchrl_osr.objectives.step import Step, actor_critic_in_keys, uniform_actions
 
 
@@ -172,6 +173,7 @@ class OSRVLoss(BaseLoss):
     def actor_loss(self, step: Step) -> tuple[Tensor, Tensor]:
         r""":math:`L_\pi` on D_tot, and the log-density of the policy's own actions."""
         action, log_prob = rsample_and_log_prob(step.policy("both"))
+        check_action(step.data_action, action.shape[-1], self.tensor_keys.action)
         # Detached: the policy's objective shall not train the critics.
         params = self.qvalue_network_params.detach()
         qvalue = step.qvalue(step.at("both"), action, params)
@@ -198,7 +200,10 @@ class OSRVLoss(BaseLoss):
         """
         number, pi = (self.num_random,), step.policy("both")
         action, log_prob = rsample_and_log_prob(pi, number)
-        target, _ = rsample_and_log_prob(step.inverse_dynamics("both"), number)
+        model = step.inverse_dynamics("both")
+        sizes = model.loc.shape[-1], pi.loc.shape[-1]
+        check_num_actions("inverse_dynamics_network", *sizes)
+        target, _ = rsample_and_log_prob(model, number)
         if self.policy_values == "mean":
             return torch.cat([action, target]), None
         bounds = self.action_low, self.action_high

@@ -223,7 +223,11 @@ class Step:
         """The action that a deterministic policy writes, ``[..., A]``."""
         network, key = self.loss.actor_network, self.loss.tensor_keys.action
         with params.to_module(network, preserve_module_state=False):
-            return entry(full_precision(network(states.copy())), key)
+            output = full_precision(network(states.copy()))
+        action: Tensor | None = output.get(key, None)
+        if action is None:
+            raise KeyError(f"The actor writes no {key!r}: call set_keys(action=...).")
+        return action
 
     def inverse_dynamics(self, states: States) -> Any:
         """The frozen model ``I(a | s~, s')`` at these states, ``[D, B]``."""

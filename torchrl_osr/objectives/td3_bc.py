@@ -15,8 +15,9 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
 from torch import Tensor
 
 from torchrl_osr import functional
-from torchrl_osr._checks import check_literals, check_weight
+from torchrl_osr._checks import check_literals, check_positive, check_weight
 from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
+from torchrl_osr.objectives.distributions import check_action
 from torchrl_osr.objectives.step import Step, actor_critic_in_keys
 
 
@@ -94,6 +95,9 @@ class TD3BCLoss(BaseLoss):
         check_literals(TD3BCLoss.__init__, locals())
         check_weight("alpha", alpha)
         check_weight("policy_noise", policy_noise)
+        check_positive("noise_clip", noise_clip, minimum=0)
+        if not low < high:
+            raise ValueError(f"high must be above low={low}, got {high}.")
         super().__init__(**options)
         self._hold_actor_critic(
             actor_network,
@@ -140,6 +144,7 @@ class TD3BCLoss(BaseLoss):
     def actor_loss(self, step: Step) -> tuple[Tensor, Tensor]:
         r""":math:`L_\pi`, and the squared distance to the data's action, ``[B]``."""
         action = step.action(step.states[0], self.actor_network_params)
+        check_action(step.data_action, action.shape[-1], self.tensor_keys.action)
         # Detached: the policy's objective shall not train the critics.
         params = self.qvalue_network_params.detach()
         qvalue = step.qvalue(step.states[0], action, params)[0]
