@@ -161,11 +161,11 @@ class PlainOSR:
         kept = (~batch.done).to(divergence).repeat(2)
         recovery = (divergence * kept).sum() / kept.sum()
         alpha = self.log_alpha.detach().exp()
+        objective = (alpha * log_prob - value).mean()
         temperature = self.log_alpha * (log_prob.detach() + self.target_entropy)
         return {
-            "loss_actor": (alpha * log_prob - value).mean(),
+            "loss_actor": objective + self.recovery_weight * recovery,
             "loss_alpha": -temperature.mean(),
-            "loss_recovery": self.recovery_weight * recovery,
         }
 
     def critic_losses(self, batch: Batch, noise: Noise) -> dict[str, Tensor]:
@@ -202,14 +202,13 @@ class PlainOSR:
         """Do one update; name each part when it is done."""
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.autocast):
             losses = self.losses(batch, self.draw(batch.action))
-            policy = losses["loss_actor"] + losses["loss_recovery"]
             critics = losses["loss_qvalue"] + losses["loss_cql"]
         yield "forward"
         # The policy's backward leaves gradients in the critics, as it does in such
         # libraries: theirs comes last, and clears them first.
         for optimizer, loss in (
             (self.alpha_optimizer, losses["loss_alpha"]),
-            (self.actor_optimizer, policy),
+            (self.actor_optimizer, losses["loss_actor"]),
             (self.critic_optimizer, critics),
         ):
             optimizer.zero_grad()

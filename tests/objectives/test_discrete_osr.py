@@ -18,7 +18,6 @@ from torchrl_osr import DiscreteOSRLoss
 
 GAMMA, TEMPERATURE, ALPHA = 0.875, 1.7, 0.3
 MIN_Q_WEIGHT, TARGET_ENTROPY, TARGET_SCALE = 2.5, 0.4, 0.8
-LOSSES = ["loss_actor", "loss_alpha", "loss_qvalue", "loss_cql", "loss_recovery"]
 
 
 def make_loss(networks, **kwargs) -> DiscreteOSRLoss:
@@ -59,9 +58,12 @@ class Restatement:
         for target in self.targets:
             for parameter in target.parameters():
                 parameter.data.mul_(TARGET_SCALE)
+        # As the constructor takes the logarithm, in float32.
         self.log_alpha = torch.tensor(math.log(ALPHA)).double().requires_grad_()
         self.weight, self.forward = recovery_weight, recovery_direction == "forward"
-        self.recovery_states, self.actor_states = recovery_states, actor_states
+        # Of the clean and the perturbed states, those that count.
+        rows = {"clean": slice(0, 1), "perturbed": slice(1, 2), "both": slice(0, 2)}
+        self.recovery_rows, self.actor_rows = rows[recovery_states], rows[actor_states]
 
     def policy(self, state: Tensor) -> Categorical:
         return Categorical(logits=self.policy_net(state))
@@ -81,9 +83,8 @@ class Restatement:
         terminated = batch["next", "terminated"]
         # Rows without a next state never reach a network; any finite stand-in will do.
         s_next = torch.where(terminated, s, batch["next", "observation"])
-        noisy = batch["perturbed", "observation"]
-        s_tot = torch.stack([s, noisy])
-        s_actor = s_tot if self.actor_states == "both" and self.weight else s[None]
+        s_tot = torch.stack([s, batch["perturbed", "observation"]])
+        s_actor = s_tot[self.actor_rows]
 
         pi, alpha = self.policy(s_actor), self.log_alpha.detach().exp()
         log_prob = [pi.logits[..., a] for a in range(pi.logits.shape[-1])]
@@ -106,22 +107,24 @@ class Restatement:
             gap = gap + TEMPERATURE * (values / TEMPERATURE).exp().sum(-1).log() - pred
         losses |= {"loss_qvalue": td.mean(), "loss_cql": MIN_Q_WEIGHT * gap.mean()}
         if self.weight:
-            s_kl = s_tot if self.recovery_states == "both" else noisy[None]
+            s_kl = s_tot[self.recovery_rows]
             with torch.no_grad():
                 pair = torch.cat([s_kl, s_next.expand_as(s_kl)], -1)
                 model = Categorical(logits=self.model_net(pair))
             ours = self.policy(s_kl)
             order = (model, ours) if self.forward else (ours, model)
             kl = kl_divergence(*order).mean(0)
-            losses["loss_recovery"] = self.weight * kl[~done].mean()
+            losses["loss_actor"] += self.weight * kl[~done].mean()
         return losses
 
 
 OPTIONS = [
     {},
+    {"recovery_weight": 0.0, "actor_states": "clean"},
     {"recovery_weight": 0.0},
     {"recovery_direction": "reverse"},
     {"recovery_states": "perturbed"},
+    {"recovery_states": "clean", "actor_states": "perturbed"},
     {"actor_states": "clean"},
 ]
 
@@ -133,18 +136,16 @@ def test_losses_and_gradients_equal_the_restatement(
     networks, batch = make_discrete_networks(), make_discrete_batch(10)
     restatement = Restatement(networks, **options)
     loss = make_loss(networks, **options)
-    losses = {k: v for k, v in loss(batch).items() if k in LOSSES}
+    losses = {k: v for k, v in loss(batch).items() if k.startswith("loss_")}
     expected = restatement.losses(batch)
     assert set(losses) == set(expected)
-    label = "Discrete OSR" if loss.recovers else "Discrete CQL(H)"
+    label = "Discrete OSR" if restatement.weight else "Discrete CQL(H)"
     values = [losses[key] for key in expected]
     check(label, values, expected.values(), tolerance=1e-12)
 
     # The sum of ours is correct training; the plain one needs each group by itself.
-    policy_part = expected["loss_actor"] + expected.get("loss_recovery", 0)
-    wanted = list(
-        torch.autograd.grad(policy_part, list(restatement.policy_net.parameters()))
-    )
+    actor = list(restatement.policy_net.parameters())
+    wanted = list(torch.autograd.grad(expected["loss_actor"], actor))
     critic_part = expected["loss_qvalue"] + expected["loss_cql"]
     pairs = zip(*(critic.parameters() for critic in restatement.critics), strict=True)
     for pair in pairs:
@@ -166,7 +167,10 @@ def test_metrics_and_priority(
     loss, batch = make_loss(networks), make_discrete_batch(10)
     out = loss(batch)
     assert out["alpha"].item() == pytest.approx(ALPHA)
-    torch.testing.assert_close(out["loss_recovery"], 0.75 * out["recovery_kl"])
+    # What the recovery term adds to the policy's loss.
+    loss.recovery_weight = 0.0
+    added = out["loss_actor"] - loss(batch)["loss_actor"]
+    torch.testing.assert_close(added.detach(), 0.75 * out["recovery_kl"])
     states = torch.stack([batch["observation"], batch["perturbed", "observation"]])
     policy = Categorical(logits=networks.actor[0].module(states))
     torch.testing.assert_close(out["entropy"], policy.entropy().mean())
@@ -202,9 +206,14 @@ def test_two_states_and_two_actions_by_hand() -> None:
         table_of_values([[0.0, 5.0], [4.0, 2.0]]),
     ]
     loss = DiscreteOSRLoss(
-        actor, critics, recovery_weight=0.0, min_q_weight=2.0, alpha_init=0.5,
+        actor,
+        critics,
+        recovery_weight=0.0,
+        actor_states="clean",
+        min_q_weight=2.0,
+        alpha_init=0.5,
         delay_qvalue=False,
-    )  # fmt: skip
+    )
     loss.make_value_estimator(gamma=0.5)
     s0, s1 = torch.eye(2)
     # s0 -a1-> s1 with reward 1; s1 -a0-> the end with reward 1/2.

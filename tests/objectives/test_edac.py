@@ -118,7 +118,7 @@ def test_losses_and_gradients_equal_the_restatement(
     make_networks, make_batch, check, way, weight
 ) -> None:
     bounds, critics, options = WAYS[way]
-    networks, batch = make_networks(**bounds, **critics), make_batch(10, twin=False)
+    networks, batch = make_networks(**bounds, **critics), make_batch(10)
     reference = copy.deepcopy(networks)
     log_alpha = torch.tensor(math.log(ALPHA), dtype=torch.float64).requires_grad_()
     loss = make_loss(EDACLoss, networks, diversity_weight=weight, **options)
@@ -144,7 +144,7 @@ def test_losses_and_gradients_equal_the_restatement(
 
 
 def test_metric_is_what_the_diversity_adds(make_networks, make_batch) -> None:
-    networks, batch = make_networks(num_critics=3), make_batch(10, twin=False)
+    networks, batch = make_networks(num_critics=3), make_batch(10)
     loss = make_loss(EDACLoss, networks, diversity_weight=0.75)
     torch.manual_seed(5)
     out = loss(batch)
@@ -158,7 +158,7 @@ def test_metric_is_what_the_diversity_adds(make_networks, make_batch) -> None:
 
 
 def test_weight_zero_is_sac_n_as_osr_has_it(make_networks, make_batch) -> None:
-    networks, batch = make_networks(num_critics=3), make_batch(10, twin=False)
+    networks, batch = make_networks(num_critics=3), make_batch(10)
     sac_n = {
         "recovery_weight": 0.0,
         "min_q_weight": 0.0,
@@ -173,7 +173,7 @@ def test_weight_zero_is_sac_n_as_osr_has_it(make_networks, make_batch) -> None:
 
 
 def test_an_update_lowers_the_similarity(make_networks, make_batch) -> None:
-    networks, batch = make_networks(num_critics=3), make_batch(10, twin=False)
+    networks, batch = make_networks(num_critics=3), make_batch(10)
     loss = make_loss(EDACLoss, networks, diversity_weight=1e3)
     params = list(loss.qvalue_network_params.parameters())
     optimizer, seen = torch.optim.SGD(params, lr=1e-5), []

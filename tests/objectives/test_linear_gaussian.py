@@ -8,21 +8,13 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
-from torchrl.modules import (
-    MLP,
-    NormalParamExtractor,
-    ProbabilisticActor,
-    TanhNormal,
-    ValueOperator,
-)
+from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal
 
-from torchrl_osr import InverseDynamicsLoss, OSRLoss
+from torchrl_osr import InverseDynamicsLoss, StateRecoveryLoss
 
 A, B, GAIN, BEHAVIOR_STD, NOISE_STD = 0.9, 0.5, -0.3, 0.4, 0.1
 # So wide that the tanh is a straight line where the actions are, to 1 %.
@@ -63,26 +55,24 @@ def transitions(
 ) -> TensorDict:
     """Behaviour and dynamics at the given states ``[B, 1]``, with draws ``[B, 2]``."""
     action = GAIN * state + behavior_std * draws[:, :1]
-    following = A * state + B * action + NOISE_STD * draws[:, 1:]
+    next_state = A * state + B * action + NOISE_STD * draws[:, 1:]
     no = torch.zeros_like(state, dtype=torch.bool)
     return TensorDict(
         {
             "observation": state,
             "action": action,
             "next": {
-                "observation": following,
-                "reward": torch.zeros_like(state),
+                "observation": next_state,
                 "done": no,
-                "terminated": no,
             },
         },
         [len(state)],
     )
 
 
-def minimize(loss, key: str, parameters, batch: TensorDict) -> None:
+def minimize(loss, key: str, batch: TensorDict) -> None:
     optimizer = torch.optim.LBFGS(
-        list(parameters), max_iter=200, line_search_fn="strong_wolfe"
+        list(loss.parameters()), max_iter=200, line_search_fn="strong_wolfe"
     )
 
     def closure() -> torch.Tensor:
@@ -94,22 +84,16 @@ def minimize(loss, key: str, parameters, batch: TensorDict) -> None:
     optimizer.step(closure)
 
 
-@pytest.mark.filterwarnings("ignore:No target network updater")
 @pytest.mark.parametrize("behavior_std", [BEHAVIOR_STD, 0.04])
 def test_what_is_left_of_a_push_is_the_closed_form(behavior_std) -> None:
     variance = NOISE_STD**2 + B**2 * behavior_std**2
-    networks = SimpleNamespace(
-        actor=linear_gaussian("observation"),
-        model=linear_gaussian("observation", ("next", "observation")),
-        critic=ValueOperator(
-            MLP(2, 1, num_cells=[4]), in_keys=["observation", "action"]
-        ).double(),
-    )
+    actor = linear_gaussian("observation")
+    model = linear_gaussian("observation", ("next", "observation"))
     draws = exact_draws(2_000, 3)
     data = transitions(draws[:, :1], draws[:, 1:], behavior_std)
-    model_loss = InverseDynamicsLoss(networks.model, states="clean")
-    minimize(model_loss, "loss_inverse_dynamics", model_loss.parameters(), data)
-    by_state, by_next = BOUND * networks.model[0][0].module[0].weight[0]
+    model_loss = InverseDynamicsLoss(model, states="clean")
+    minimize(model_loss, "loss_inverse_dynamics", data)
+    by_state, by_next = BOUND * model[0][0].module[0].weight[0]
     gain = B * behavior_std**2 / variance
     assert by_next.item() == pytest.approx(gain, rel=0.02)
     assert by_state.item() == pytest.approx(GAIN - gain * (A + B * GAIN), abs=0.02)
@@ -118,17 +102,11 @@ def test_what_is_left_of_a_push_is_the_closed_form(behavior_std) -> None:
     state = torch.full((2_000, 1), STATE, dtype=torch.float64)
     batch = transitions(state, exact_draws(2_000, 2), behavior_std)
     batch["perturbed", "observation"] = torch.full_like(batch["observation"], PUSHED)
-    loss = OSRLoss(
-        networks.actor,
-        networks.critic,
-        networks.model,
-        recovery_weight=1.0,
-        recovery_states="perturbed",
-        num_random=1,
-    ).double()
-    actor = loss.actor_network_params.values(True, True)
-    minimize(loss, "loss_recovery", actor, batch)
-    policy = networks.actor.get_dist(batch["perturbed"].auto_batch_size_(1))
+    loss = StateRecoveryLoss(
+        actor, model, recovery_weight=1.0, recovery_states="perturbed"
+    )
+    minimize(loss.double(), "loss_recovery", batch)
+    policy = actor.get_dist(batch["perturbed"].auto_batch_size_(1))
     action, std = BOUND * policy.loc[0].item(), BOUND * policy.scale[0].item()
     pushed = A * PUSHED + B * action
     undisturbed = (A + B * GAIN) * STATE

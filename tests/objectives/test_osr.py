@@ -429,8 +429,8 @@ def test_cql_is_the_same_to_the_bit_whatever_else_is_given(
     make_networks, make_batch, with_model, perturb
 ) -> None:
     reference = make_osr(make_networks(), **CQL)
-    expected = train(reference, make_batch(10, twin=False), 10)
-    networks, batch = make_networks(), make_batch(10, twin=False)
+    expected = train(reference, make_batch(10).exclude("perturbed"), 10)
+    networks, batch = make_networks(), make_batch(10).exclude("perturbed")
     if not with_model:
         networks.inverse_dynamics = None
     loss = make_osr(networks, **CQL)

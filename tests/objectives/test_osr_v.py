@@ -17,7 +17,6 @@ from torchrl_osr import OSRLoss, OSRVLoss
 
 GAMMA, TEMPERATURE, ALPHA, WEIGHT = 0.875, 1.7, 0.3, 2.5
 TARGET_ENTROPY, TARGET_SCALE = -1.5, 0.8
-LOSSES = ["loss_actor", "loss_alpha", "loss_qvalue", "loss_recovery"]
 
 
 def make_osr_v(networks, **kwargs) -> OSRVLoss:
@@ -34,6 +33,8 @@ def make_osr_v(networks, **kwargs) -> OSRVLoss:
     loss.make_value_estimator(gamma=GAMMA)
     SoftUpdate(loss, tau=0.1)
     loss.target_qvalue_network_params.apply_(lambda tensor: tensor.mul_(TARGET_SCALE))
+    # The constructor takes the logarithm in float32.
+    loss.log_alpha.data.fill_(math.log(ALPHA))
     return loss
 
 
@@ -53,7 +54,8 @@ class Restatement:
         for target in self.targets:
             for parameter in target.parameters():
                 parameter.data.mul_(TARGET_SCALE)
-        self.log_alpha = torch.tensor(math.log(ALPHA)).double().requires_grad_()
+        log_alpha = torch.tensor(math.log(ALPHA), dtype=torch.float64)
+        self.log_alpha = log_alpha.requires_grad_()
         self.low, self.half = low, (high - low) / 2
 
     def act(self, network, inputs, noise: Tensor) -> tuple[Tensor, Tensor]:
@@ -79,11 +81,12 @@ class Restatement:
                 plain = plain + value / number
                 target = target + critic(state, theirs).squeeze(-1) / number
                 if log_sum_exp:
-                    logits.append((value - ours[1]) / TEMPERATURE)
+                    # Importance weights 1 / p, whatever the temperature.
+                    logits.append(value / TEMPERATURE - ours[1])
                     uniform = self.low + 2 * self.half * draws["uniform"][k, i]
                     value = critic(state, uniform).squeeze(-1)
                     box = -torch.log(2 * self.half).sum()
-                    logits.append((value - box) / TEMPERATURE)
+                    logits.append(value / TEMPERATURE - box)
             if log_sum_exp:
                 plain = TEMPERATURE * sum(logit.exp() for logit in logits).log()
             total = total + (plain - target) / 2
@@ -122,8 +125,7 @@ class Restatement:
         return {
             "loss_actor": (alpha * log_prob - lowest.squeeze(-1)).mean(),
             "loss_alpha": (-self.log_alpha * entropy_gap).mean(),
-            "loss_qvalue": td,
-            "loss_recovery": WEIGHT * gap,
+            "loss_qvalue": td + WEIGHT * gap,
         }
 
 
@@ -145,32 +147,35 @@ def test_losses_and_gradients_equal_the_restatement(
     out = seeded(loss, batch)
     losses = {key: value for key, value in out.items() if key.startswith("loss_")}
     expected = restated.losses(batch, 5, number, policy_values == "logsumexp")
-    assert list(losses) == LOSSES
-    check("OSR-v", losses.values(), expected.values(), tolerance=1e-9)
+    assert list(losses) == list(expected)
+    check("OSR-v", losses.values(), expected.values(), tolerance=1e-12)
 
     # The sum of ours is correct training; the plain one needs each group by itself.
     actor = list(restated.policy_net.parameters())
     each = [list(critic.parameters()) for critic in restated.critics]
     wanted = list(torch.autograd.grad(expected["loss_actor"], actor))
-    critic_part = expected["loss_qvalue"] + expected["loss_recovery"]
     for pair in zip(*each, strict=True):
-        wanted.append(
-            torch.stack(torch.autograd.grad(critic_part, pair, retain_graph=True))
+        gradients = torch.autograd.grad(
+            expected["loss_qvalue"], pair, retain_graph=True
         )
+        wanted.append(torch.stack(gradients))
     wanted += torch.autograd.grad(expected["loss_alpha"], restated.log_alpha)
     sum(losses.values()).backward()
     ours = [p.grad for p in loss.actor_network_params.values(True, True)]
     ours += [p.grad for p in loss.qvalue_network_params.values(True, True)]
     ours.append(loss.log_alpha.grad)
-    check("OSR-v", ours, wanted, tolerance=1e-9)
+    check("OSR-v", ours, wanted, tolerance=1e-12)
 
 
 def test_metrics_say_what_they_are_called(make_networks, make_batch) -> None:
-    out = seeded(make_osr_v(make_networks()), make_batch(10))
+    loss, batch = make_osr_v(make_networks()), make_batch(10)
+    out = seeded(loss, batch)
     assert out["alpha"].item() == pytest.approx(ALPHA)
-    gap = WEIGHT * out["recovery_gap"]
-    assert out["loss_recovery"].item() == pytest.approx(gap.item())
     assert not out["recovery_gap"].requires_grad
+    # What the constraint adds to the critics' loss.
+    loss.recovery_weight = 0.0
+    added = out["loss_qvalue"] - seeded(loss, batch)["loss_qvalue"]
+    assert added.item() == pytest.approx(WEIGHT * out["recovery_gap"].item())
     entropy = TARGET_ENTROPY + out["loss_alpha"] / math.log(ALPHA)
     assert out["entropy"].item() == pytest.approx(entropy.item())
 
@@ -196,10 +201,10 @@ class Displacement(nn.Module):
 
 
 def known_actions(networks, batch):
-    """A model that knows the data's actions, and twins that are the clean states."""
-    following = batch["observation"].clone()
-    following[..., :2] += batch["action"]
-    batch["next", "observation"] = following
+    """A model that knows the data's actions, and no perturbation."""
+    next_observation = batch["observation"].clone()
+    next_observation[..., :2] += batch["action"]
+    batch["next", "observation"] = next_observation
     batch["perturbed", "observation"] = batch["observation"].clone()
     networks.inverse_dynamics = ProbabilisticActor(
         TensorDictModule(
@@ -220,8 +225,7 @@ def test_without_noise_the_gap_is_cqls_plain_one_and_not_its_log_sum_exp(
     than CQL(H), which the authors' code and ``OSRLoss`` compute.
     """
     networks, batch = known_actions(make_networks(), make_batch(10))
-    loss = make_osr_v(networks, num_random=4, recovery_weight=1.0)
-    gap = seeded(loss, batch)["loss_recovery"]
+    gap = seeded(make_osr_v(networks, num_random=4), batch)["recovery_gap"]
 
     pairs = torch.stack([batch.select("observation")] * 2)
     torch.manual_seed(5)
@@ -240,6 +244,7 @@ def test_without_noise_the_gap_is_cqls_plain_one_and_not_its_log_sum_exp(
         networks.actor,
         networks.critics,
         recovery_weight=0.0,
+        actor_states="clean",
         min_q_weight=1.0,
         num_random=4,
     ).double()
@@ -255,19 +260,21 @@ def test_constant_values_cancel_and_the_critics_output_bias_stays(
     for critic in moved.critics:
         critic.module[-1].bias.data += 10.0
     before, after = (
-        seeded(make_osr_v(each), make_batch(10))["loss_recovery"]
+        seeded(make_osr_v(each), make_batch(10))["recovery_gap"]
         for each in (networks, moved)
     )
     torch.testing.assert_close(after, before, rtol=0, atol=1e-10)
 
 
-def test_model_is_called_once_and_twins_matter(make_networks, make_batch) -> None:
+def test_model_is_called_once_and_perturbed_states_matter(
+    make_networks, make_batch
+) -> None:
     networks, called = make_networks(), []
     networks.inverse_dynamics[0][0].register_forward_pre_hook(
         lambda *_: called.append(1)
     )
     loss, batch = make_osr_v(networks), make_batch(10)
-    before = seeded(loss, batch)["loss_recovery"]
+    before = seeded(loss, batch)["recovery_gap"]
     assert len(called) == 1
     batch["perturbed", "observation"] += 1.0
-    assert seeded(loss, batch)["loss_recovery"] != before
+    assert seeded(loss, batch)["recovery_gap"] != before

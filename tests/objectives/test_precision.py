@@ -6,14 +6,13 @@ import pytest
 import torch
 from torch import nn
 
-from torchrl_osr import OSRLoss
+from torchrl_osr import InverseDynamicsLoss, OSRLoss
 from torchrl_osr.modules import (
     critic_ensemble,
     cvae_inverse_dynamics,
     tanh_gaussian_actor,
     tanh_gaussian_inverse_dynamics,
 )
-from torchrl_osr.objectives.inverse_dynamics import InverseDynamicsLoss
 
 # Eight bits of mantissa; the losses are means over a batch.
 RELATIVE = 2e-2
@@ -32,6 +31,7 @@ def losses_and_gradients(loss, batch, *, autocast: bool):
     return out, losses, torch.autograd.grad(sum(losses.values()), params)
 
 
+@pytest.mark.losses
 def test_every_output_is_float32_and_close(family, family_batch, name) -> None:
     loss, batch = family(name).float(), single(family_batch(name, 64))
     _, wanted, _ = losses_and_gradients(loss, batch.copy(), autocast=False)

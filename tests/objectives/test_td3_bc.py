@@ -77,7 +77,7 @@ def test_losses_and_gradients_equal_the_restatement(
     make_networks, make_batch, check, activation, deactivate_vmap
 ) -> None:
     networks = make_networks(critic_activation=activation)
-    batch, reference = make_batch(10, twin=False), copy.deepcopy(networks)
+    batch, reference = make_batch(10), copy.deepcopy(networks)
     loss = make_loss(networks, deactivate_vmap=deactivate_vmap)
     torch.manual_seed(5)
     out = loss(batch)
@@ -100,7 +100,7 @@ def test_losses_and_gradients_equal_the_restatement(
 
 
 def test_smoothing_noise_and_bounds_matter(make_networks, make_batch) -> None:
-    networks, batch, targets = make_networks(), make_batch(10, twin=False), {}
+    networks, batch, targets = make_networks(), make_batch(10), {}
     settings = {
         "plain": {},
         "no noise": {"policy_noise": 0.0},
@@ -118,7 +118,7 @@ def test_smoothing_noise_and_bounds_matter(make_networks, make_batch) -> None:
 def test_rows_are_each_ones_own_and_masks_reach_the_cloning_term(
     make_networks, make_batch
 ) -> None:
-    networks, batch = make_networks(), make_batch(10, twin=False)
+    networks, batch = make_networks(), make_batch(10)
     loss = make_loss(networks, reduction="none", scalar_output_mode="exclude")
     rows = loss(batch)["loss_actor"]
     policy = networks.actor.module(batch["observation"])
@@ -134,7 +134,7 @@ def test_rows_are_each_ones_own_and_masks_reach_the_cloning_term(
 
 
 def test_metrics_say_what_they_are_called(make_networks, make_batch) -> None:
-    networks, batch = make_networks(), make_batch(10, twin=False)
+    networks, batch = make_networks(), make_batch(10)
     loss = make_loss(networks, alpha=0.0)
     out = loss(batch)
     # Without values the policy's loss is the cloning error.

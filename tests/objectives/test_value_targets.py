@@ -10,6 +10,8 @@ from torchrl.data.postprocs import MultiStep
 from torchrl.objectives import ValueEstimators
 from torchrl.objectives.value import TD0Estimator
 
+from torchrl_osr.objectives.step import Step
+
 
 def target_value(family, seeded, name: str, batch, *args, **kwargs) -> torch.Tensor:
     loss = family(name)
@@ -17,11 +19,22 @@ def target_value(family, seeded, name: str, batch, *args, **kwargs) -> torch.Ten
     return seeded(loss, batch)["target_value"]
 
 
+def test_td_target_is_the_reward_and_the_discounted_value(family, make_batch) -> None:
+    loss, batch = family("cql"), make_batch(5)
+    loss.make_value_estimator(gamma=0.5)
+    batch["next", "reward"] = torch.arange(1.0, 6.0).double().unsqueeze(-1)
+    step = Step(loss, batch, perturbed=False)
+    target = step.td_target(10 * torch.arange(1.0, 6.0).double())
+    # By hand: 1 + 5, 2 (terminated), 3 + 15 (cut by a time limit), 4 + 20, 5 + 25.
+    assert target.tolist() == [6, 2, 18, 24, 30]
+
+
+@pytest.mark.losses(having="critics")
 def test_the_kinds_of_target_agree_where_they_must(
-    family, family_batch, seeded, critic_loss
+    family, family_batch, seeded, name
 ) -> None:
-    batch = family_batch(critic_loss, 2, 5)
-    target = partial(target_value, family, seeded, critic_loss, batch)
+    batch = family_batch(name, 2, 5)
+    target = partial(target_value, family, seeded, name, batch)
     td0 = target()
     assert td0 == target("td0", gamma=0.99)
     assert td0 == target(ValueEstimators.TD0)
@@ -35,17 +48,17 @@ def test_the_kinds_of_target_agree_where_they_must(
         torch.testing.assert_close(found, wanted)
 
 
+@pytest.mark.losses(having="critics")
 @pytest.mark.parametrize("kind", ["gae", ValueEstimators.GAE, ValueEstimators.VTrace])
-def test_estimators_without_an_action_value_are_refused(
-    family, critic_loss, kind
-) -> None:
+def test_estimators_without_an_action_value_are_refused(family, name, kind) -> None:
     with pytest.raises(NotImplementedError):
-        family(critic_loss).make_value_estimator(kind)
+        family(name).make_value_estimator(kind)
 
 
-def test_gamma_scales_the_bootstrap(family, family_batch, seeded, critic_loss) -> None:
-    batch = family_batch(critic_loss, 10)
-    target = partial(target_value, family, seeded, critic_loss, batch)
+@pytest.mark.losses(having="critics")
+def test_gamma_scales_the_bootstrap(family, family_batch, seeded, name) -> None:
+    batch = family_batch(name, 10)
+    target = partial(target_value, family, seeded, name, batch)
     zero, half, one = (target(gamma=gamma) for gamma in (0.0, 0.5, 1.0))
     torch.testing.assert_close(zero, batch["next", "reward"].mean())
     assert one != zero
@@ -85,18 +98,18 @@ def pred_values(networks, batch) -> list[torch.Tensor]:
 def multi_step_loss(networks, batch, discrete: bool) -> torch.Tensor:
     """``loss_qvalue`` of n-step returns, row by row."""
     total = 0.0
-    pred, following = pred_values(networks, batch), batch["next"]
+    pred, next_rows = pred_values(networks, batch), batch["next"]
     for trajectory in range(2):
         for first in range(5):
             target, discount = 0.0, 1.0
             for step in range(first, min(first + STEPS, 5)):
-                row = following[trajectory, step]
+                row = next_rows[trajectory, step]
                 target = target + discount * row["reward"].squeeze()
                 discount *= GAMMA
                 if row["done"]:
                     break
             # The flag of the first step, which is the one that MultiStep leaves.
-            if not following["terminated"][trajectory, first]:
+            if not next_rows["terminated"][trajectory, first]:
                 value = next_values(networks, discrete, row["observation"])
                 target = target + discount * value
             for values in pred:
@@ -104,16 +117,23 @@ def multi_step_loss(networks, batch, discrete: bool) -> torch.Tensor:
     return total
 
 
+# Those without an inverse dynamics model, to which several steps mean nothing.
+MODEL_FREE = ["cql", "cql-perturbed", "cql-options", "cloning", "noisy-cloning"]
+MODEL_FREE += ["edac", "td3bc", "discrete-cql"]
+
+
+@pytest.mark.losses(*MODEL_FREE)
 def test_multi_step_returns_are_discounted_by_their_steps(
-    family, family_batch, critic_loss
+    family, family_batch, name
 ) -> None:
-    discrete = family[critic_loss].discrete
-    networks = state_only(family.networks(critic_loss), discrete)
-    batch = family_batch(critic_loss, 2, 5)
+    discrete = family[name].discrete
+    networks = state_only(family.networks(name), discrete)
+    batch = family_batch(name, 2, 5)
     with torch.no_grad():
         expected = multi_step_loss(networks, batch, discrete)
     # The temperature is next to nothing for those with the entropy in the target.
-    loss = family(critic_loss, networks, alpha_init=1e-15)
+    tiny = {"alpha_init": 1e-15} if "loss_alpha" in family[name].groups else {}
+    loss = family(name, networks, **tiny)
     loss.make_value_estimator(gamma=GAMMA)
     batch = MultiStep(GAMMA, STEPS)(batch)
     out = loss(batch.copy())["loss_qvalue"].detach()
@@ -125,9 +145,19 @@ def test_multi_step_returns_are_discounted_by_their_steps(
     assert (one_step - expected).abs() > 1e-3
 
 
-def test_multi_step_of_one_step_changes_nothing(
-    family, family_batch, record, assert_same, critic_loss
+@pytest.mark.losses(having="model")
+def test_several_steps_are_refused_where_a_model_is_asked_for_one(
+    family, family_batch, name
 ) -> None:
-    loss, batch = family(critic_loss), family_batch(critic_loss, 2, 5)
+    batch = MultiStep(GAMMA, STEPS)(family_batch(name, 2, 5))
+    with pytest.raises(ValueError, match="multi-step transitions .* up to 2"):
+        family(name)(batch)
+
+
+@pytest.mark.losses(having="critics")
+def test_multi_step_of_one_step_changes_nothing(
+    family, family_batch, record, assert_same, name
+) -> None:
+    loss, batch = family(name), family_batch(name, 2, 5)
     shifted = MultiStep(GAMMA, 1)(batch.clone())
     assert_same(record(loss, shifted), record(loss, batch))

@@ -1,4 +1,4 @@
-"""The perturbed twin: its noise, what it leaves alone, and where it may be used."""
+"""The perturbed state: its noise, what it leaves alone, and where it may be used."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_osr import StatePerturbation
 
-TWIN = ("perturbed", "observation")
+PERTURBED = ("perturbed", "observation")
 
 
 def observations(*size: int, value: float = 0.0) -> TensorDict:
@@ -23,7 +23,7 @@ def observations(*size: int, value: float = 0.0) -> TensorDict:
 
 
 def noise(transform: StatePerturbation, *size: int) -> torch.Tensor:
-    return transform(observations(*size))[TWIN]
+    return transform(observations(*size))[PERTURBED]
 
 
 @pytest.mark.parametrize("kind", ["gaussian", "uniform"])
@@ -48,20 +48,20 @@ def test_relative_noise_scales_each_dimension(kind) -> None:
 
 
 def test_all_else_is_untouched_and_nothing_happens_in_place(make_batch) -> None:
-    batch = make_batch(10, twin=False)
+    batch = make_batch(10).exclude("perturbed")
     before, pointer = batch.clone(), batch["observation"].data_ptr()
     out = StatePerturbation(0.1)(batch)
-    assert set(out.keys(True, True)) - set(before.keys(True, True)) == {TWIN}
+    assert set(out.keys(True, True)) - set(before.keys(True, True)) == {PERTURBED}
     assert (out.select(*before.keys(True, True)) == before).all()
-    assert out["observation"].data_ptr() == pointer != out[TWIN].data_ptr()
-    assert not torch.equal(out[TWIN], out["observation"])
+    assert out["observation"].data_ptr() == pointer != out[PERTURBED].data_ptr()
+    assert not torch.equal(out[PERTURBED], out["observation"])
 
 
 def test_zero_noise_gives_identical_values() -> None:
     batch = observations(7, value=0.1)
-    twin = StatePerturbation(0.0)(batch)[TWIN]
-    assert torch.equal(twin, batch["observation"])
-    assert twin is not batch["observation"]
+    perturbed = StatePerturbation(0.0)(batch)[PERTURBED]
+    assert torch.equal(perturbed, batch["observation"])
+    assert perturbed is not batch["observation"]
 
 
 def test_seed_decides_the_noise() -> None:
@@ -116,16 +116,16 @@ def test_copies_continue_the_noise_to_the_bit(copied, used) -> None:
 
 
 @pytest.mark.parametrize("kind", [ReplayBuffer, TensorDictReplayBuffer])
-def test_buffers_sample_twins_and_keep_their_storage(kind) -> None:
+def test_buffers_sample_perturbed_states_and_keep_their_storage(kind) -> None:
     transform = StatePerturbation(0.1, seed=0)
     buffer = kind(storage=LazyTensorStorage(20), batch_size=6, transform=transform)
     buffer.extend(observations(20, value=1.0).float())
     first, second = buffer.sample(), buffer.sample()
-    assert first[TWIN].shape == (6, 11)
+    assert first[PERTURBED].shape == (6, 11)
     assert (first["observation"] == 1).all()
-    assert not torch.equal(first[TWIN], second[TWIN])
+    assert not torch.equal(first[PERTURBED], second[PERTURBED])
     head = buffer[:5]  # a view of the storage
-    assert ((head[TWIN] - 1).abs() > 0).any()
+    assert ((head[PERTURBED] - 1).abs() > 0).any()
     stored = buffer.storage[:]
     assert (stored["observation"] == 1).all()
     assert "perturbed" not in stored.keys()  # noqa: SIM118
@@ -140,17 +140,17 @@ def test_nested_and_several_keys_draw_apart() -> None:
         1.0,
         in_keys=keys,
         relative_to=[torch.tensor(1.0), torch.tensor(0.0)],
-        perturbed=("noisy", "twins"),
+        perturbed=("noisy", "states"),
     )
     out = transform(batch)
     assert transform.out_keys == [
-        ("noisy", "twins", "observation"),
-        ("noisy", "twins", "agent", "pixels"),
+        ("noisy", "states", "observation"),
+        ("noisy", "states", "agent", "pixels"),
     ]
-    assert not torch.equal(out["noisy", "twins", "observation"], torch.ones(4, 3))
-    assert torch.equal(out["noisy", "twins", "agent", "pixels"], torch.ones(4, 3))
+    assert not torch.equal(out["noisy", "states", "observation"], torch.ones(4, 3))
+    assert torch.equal(out["noisy", "states", "agent", "pixels"], torch.ones(4, 3))
     both = StatePerturbation(1.0, in_keys=keys)(batch)
-    assert not torch.equal(both[TWIN], both["perturbed", "agent", "pixels"])
+    assert not torch.equal(both[PERTURBED], both["perturbed", "agent", "pixels"])
 
 
 def test_every_row_of_any_batch_shape_has_its_own_noise() -> None:
@@ -162,23 +162,26 @@ def test_every_row_of_any_batch_shape_has_its_own_noise() -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_dtype_is_kept(dtype) -> None:
     batch = observations(4).to(dtype)
-    assert StatePerturbation(0.1)(batch)[TWIN].dtype == dtype
+    assert StatePerturbation(0.1)(batch)[PERTURBED].dtype == dtype
 
 
-def test_environment_specs_hold_the_twin() -> None:
+def test_environment_specs_hold_the_perturbed_state() -> None:
     env = TransformedEnv(GymEnv("Pendulum-v1"), StatePerturbation(0.1))
     env.set_seed(0)
     check_env_specs(env)
-    assert env.observation_spec[TWIN].shape == env.observation_spec["observation"].shape
+    assert (
+        env.observation_spec[PERTURBED].shape
+        == env.observation_spec["observation"].shape
+    )
     rollout = env.rollout(3)
     for entry in (rollout, rollout["next"]):
-        gap = entry[TWIN] - entry["observation"]
+        gap = entry[PERTURBED] - entry["observation"]
         assert (gap != 0).all()
         assert gap.abs().max() < 1
-    # Pendulum's observation is bounded; its twin may leave the bounds.
+    # Pendulum's observation is bounded; its perturbed state may leave the bounds.
     far = torch.full((3,), 100.0)
     assert not env.observation_spec["observation"].is_in(far)
-    assert env.observation_spec[TWIN].is_in(far)
+    assert env.observation_spec[PERTURBED].is_in(far)
 
 
 @pytest.mark.parametrize(
@@ -211,4 +214,4 @@ def test_compiled_transform_draws_the_same_noise() -> None:
     traced(observations(4))  # the generator is made in the first call
     noise(eager, 4)
     compiled = torch.compile(traced, backend="eager")
-    assert torch.equal(compiled(observations(4))[TWIN], noise(eager, 4))
+    assert torch.equal(compiled(observations(4))[PERTURBED], noise(eager, 4))
