@@ -14,7 +14,6 @@ import hashlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
-from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -148,11 +147,14 @@ def load_memmap(folder: Path | str) -> tuple[TensorDict, dict[str, Any]]:
     try:
         manifest = read_json(folder / MANIFEST)
         check_checksum(manifest, MANIFEST)
-        rows, sizes = _sizes(manifest)
-        data = TensorDict({}, [rows])
+        version = manifest.get("format"), manifest.get("format_version")
+        if version != (FORMAT, FORMAT_VERSION):
+            ours = FORMAT, FORMAT_VERSION
+            raise ValueError(f"its format is {version}; this version reads {ours}")
+        data = TensorDict({}, [manifest["num_transitions"]])
         for name, key in FILES.items():
-            data.set(key, _open_column(folder / name, key, rows, sizes, manifest))
-    except ValueError as error:
+            data.set(key, _open_column(folder / name, key, manifest))
+    except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
             f"{folder}: {error}. Delete the folder and write it again."
         ) from error
@@ -250,42 +252,22 @@ def _check_types(data: TensorDict) -> None:
             )
 
 
-def _sizes(manifest: Mapping[str, Any]) -> tuple[int, tuple[int, int]]:
-    """Return ``N``, and ``S`` and ``A``, of a manifest of this format."""
-    version = manifest.get("format"), manifest.get("format_version")
-    if version != (FORMAT, FORMAT_VERSION):
-        raise ValueError(
-            f"its format is {version}; this version reads {(FORMAT, FORMAT_VERSION)}"
-        )
-    numbers = []
-    for name in ("num_transitions", "observation_size", "action_size"):
-        value = manifest.get(name)
-        if type(value) is not int or not 0 < value < 2**48:
-            raise ValueError(
-                f"{name} of its {MANIFEST} is {value!r}; expected a number from 1 on"
-            )
-        numbers.append(value)
-    return numbers[0], (numbers[1], numbers[2])
-
-
 def _open_column(
-    path: Path,
-    key: NestedKey,
-    rows: int,
-    sizes: tuple[int, int],
-    manifest: Mapping[str, Any],
+    path: Path, key: NestedKey, manifest: Mapping[str, Any]
 ) -> MemoryMappedTensor:
-    name = key if isinstance(key, str) else key[-1]
-    width = {"observation": sizes[0], "action": sizes[1]}.get(str(name), 1)
+    """Memory-map a column; raise if its file is not the one that was written."""
+    last = key if isinstance(key, str) else key[-1]
+    size = f"{last}_size"  # of observations and actions; of other columns 1
+    shape = torch.Size([manifest["num_transitions"], manifest.get(size, 1)])
     dtype = torch.bool if key in FLAG_KEYS else torch.float32
-    shape = torch.Size([rows, width])
-    expected = prod(shape) * dtype.itemsize
-    if not path.is_file() or (size := path.stat().st_size) != expected:
-        found = f"has {size:,} bytes" if path.is_file() else "is missing"
-        raise ValueError(f"{path.name} {found}; {rows:,} rows have {expected:,}")
-    checksums = manifest.get("sha256")
-    wanted = checksums.get(path.name) if isinstance(checksums, dict) else None
-    if sha256_of(path) != wanted:
+    expected = shape.numel() * dtype.itemsize
+    if not path.is_file():
+        raise ValueError(f"{path.name} is missing")
+    if (found := path.stat().st_size) != expected:
+        raise ValueError(
+            f"{path.name} has {found:,} bytes; {shape[0]:,} rows have {expected:,}"
+        )
+    if sha256_of(path) != manifest["sha256"][path.name]:
         raise ValueError(f"the checksum of {path.name} is wrong")
     return MemoryMappedTensor.from_filename(path, dtype=dtype, shape=shape)
 
