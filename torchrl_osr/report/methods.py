@@ -89,10 +89,9 @@ def name_methods(runs: Sequence[Run]) -> tuple[list[Run], list[LeftOut]]:
         kinds = distinctions([comparable(run) for run in group])
         for run, kind in zip(group, kinds, strict=True):
             name = f"{method} ({kind})" if kind else method
-            first = kept.setdefault(
-                (name, run.data, run.seed), replace(run, method=name)
-            )
-            if first.folder != run.folder:
+            run = replace(run, method=name)
+            first = kept.setdefault((name, run.data, run.seed), run)
+            if first is not run:
                 reason = f"the same run as {first.folder}, which is in the report"
                 left_out.append(LeftOut(run.folder, reason))
     return list(kept.values()), left_out

@@ -277,6 +277,7 @@ def _suite(tables: RunTables, suite: str, reference: str) -> dict[str, Any]:
     """Return tables and figures of one suite; those of a data set by its title."""
     rows = tables.episodes[tables.episodes["suite"] == suite]
     distances = dict(iter(tables.distances.groupby(["data", "method"])))
+    none = tables.distances[:0]
     levels = disturbances(rows, suite)
     scores = {key: disturbed(group, suite) for key, group in _cells(rows)}
     ends = levels.index[levels["transient"]]
@@ -289,7 +290,7 @@ def _suite(tables: RunTables, suite: str, reference: str) -> dict[str, Any]:
         back = {
             name: {
                 m: way_back(rows[(rows["data"] == data) & (rows["method"] == m)],
-                            distances[data, m], suite, name)
+                            distances.get((data, m), none), suite, name)
                 for m in here
             }
             for name in ends
