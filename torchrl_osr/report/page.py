@@ -108,10 +108,11 @@ def write_report(
     if reference not in methods:
         raise ValueError(f"no method {reference!r}; there are: {'; '.join(methods)}")
     main = compare_all(tables, reference, quantities(tables))
+    paired = [each for each in main if each.estimate is not None]
     means = {method: iqm(rows) for method, rows in _by_method(tables.episodes)}
     suites = [_suite(tables, suite, reference) for suite in tables.suites]
     figures = {
-        "differences": _differences(main, reference),
+        "differences": draw_differences(paired, reference) if paired else None,
         "curves": _curves(tables),
         "profiles": _profiles(tables),
         "iqm": draw_intervals(means, "interquartile mean of the normalised score"),
@@ -137,7 +138,6 @@ def write_report(
         "suites": suites,
         "published": _published(tables.runs),
         "paper": published,
-        "coverage": _coverage(tables),
         "every_run": _every_run(tables.runs),
     }
     environment = Environment(
@@ -408,12 +408,6 @@ def _way_row(each: WayBack | None) -> dict[str, Any]:
     }
 
 
-def _differences(found: Sequence[Difference], reference: str) -> Figure | None:
-    """Draw all differences; nothing if there is not one pair."""
-    paired = [each for each in found if each.estimate is not None]
-    return draw_differences(paired, reference) if paired else None
-
-
 def _difference_table(found: Sequence[Difference]) -> pd.DataFrame | None:
     """Return differences by data set and method; nothing if there are none."""
     rows: dict[tuple[str, str], dict[str, Cell]] = {}
@@ -458,15 +452,6 @@ def _published(runs: Sequence[Run]) -> pd.DataFrame | None:
         if env in envs
     }
     return _frame(rows) if rows else None
-
-
-def _coverage(tables: RunTables) -> pd.DataFrame:
-    """Return the seeds of each method on each data set."""
-    rows = {method: dict.fromkeys(tables.data, "none") for method in tables.methods}
-    for (data, method), runs in tables.cells().items():
-        seeds = ", ".join(str(run.seed) for run in runs)
-        rows[method][data] = f"{seeds} ({runs[0].steps:,})"
-    return _frame(rows)
 
 
 def _every_run(runs: Sequence[Run]) -> pd.DataFrame:

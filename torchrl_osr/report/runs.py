@@ -528,18 +528,7 @@ def _rows(
     strength: float = math.nan,
     level: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Return the columns of one checkpoint's episodes under one disturbance.
-
-    Args:
-        suite: or "".
-        step: of the checkpoint.
-        seeds: of the episodes.
-        scores: of the episodes.
-        disturbance: its name; "" is none.
-        kind: what is disturbed.
-        strength: in the unit of its kind.
-        level: the file's entry of a disturbance that ends.
-    """
+    """Return the columns of one checkpoint's episodes; ``level`` is one that ends."""
     columns = {
         "suite": suite,
         "disturbance": disturbance,
