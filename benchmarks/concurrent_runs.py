@@ -79,7 +79,7 @@ def make_at_once(cache: Path, number: int, kill_after: float | None) -> str:
     codes = [process.wait() for process in processes]
     if any(codes):
         raise SystemExit(f"processes ended with {codes}")
-    (file,) = cache.glob("local/*/data.npz")
+    (file,) = cache.glob("rolled-out/*/manifest.json")  # has all checksums
     left = [each.name for each in file.parents[1].glob(".*")]
     if left:
         raise SystemExit(f"left behind: {left}")

@@ -1,22 +1,21 @@
 """The updates that ``update_speed.py`` times: ours, TorchRL's CQL, the plain reference.
 
 Each is a generator that does one update and names each part of it when it is done, so
-that one clock outside can tell the parts apart.
+that one clock outside can tell the parts apart. Losses are computed under bfloat16
+autocast where ``autocast`` says so.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import torch
-from diagnostics import count_flops
-from matmul_bound import Pass, Products, osr_passes, total_flops
+from matmul_bound import Pass, Products, count_flops, osr_passes, total_flops
 from plain_reference import Batch, PlainOSR
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import CudaGraphModule
 from torchrl.data import ReplayBuffer
 from torchrl.objectives import LossModule, SoftUpdate
 from torchrl_cql import cql_loss, cql_update
@@ -28,19 +27,20 @@ from torchrl_osr.modules import (
     tanh_gaussian_actor,
     tanh_gaussian_inverse_dynamics,
 )
-from torchrl_osr.trainers.captured import CapturedUpdate, make_capturable
 
-Casting = Callable[[], AbstractContextManager]
-Update = Callable[[Any, Casting], Iterator[str]]
+Update = Callable[[Any], Iterator[str]]
 
 GAMMA, TAU, RATE, BATCH, NUM_RANDOM, ROWS = 0.99, 5e-3, 3e-4, 256, 10, 100_000
 OURS = ("OSR", "CQL(H)", "OSR-v", "OSR-10")
-TORCHRL, PLAIN, SAMPLING = "TorchRL CQL", "plain OSR", "sampling"
-PRODUCTS, PRODUCTS_BF16 = "products", "products in bfloat16"
+TORCHRL, PLAIN, PRODUCTS, SAMPLING = (
+    "TorchRL CQL",
+    "plain OSR",
+    "products",
+    "sampling",
+)
 COMPILED, GRAPH, BOTH = "OSR, compiled", "OSR, graph", "OSR, graph and compiled"
-# Beside plain OSR, and only there. Operations and host reads are counted in Python: of
-# a compiled loss as if it were not compiled, of a graph none at all.
 ON_GPU = (COMPILED, GRAPH, BOTH)
+"""Those that take part on a GPU only."""
 DIMENSIONS = {"hopper": (11, 3), "walker2d": (17, 6), "halfcheetah": (17, 6)}
 
 
@@ -54,16 +54,16 @@ class Size:
 
     @classmethod
     def parse(cls, name: str) -> Size:
-        """Return the size of a name such as ``hopper-2x256``."""
+        """Size of a name such as ``hopper-2x256``."""
         task, _, layers = name.partition("-")
         depth, width = (int(number) for number in layers.split("x"))
         return cls(*DIMENSIONS[task], (width,) * depth)
 
 
 def make_buffer(size: Size, device: torch.device) -> ReplayBuffer:
-    """Return the package's buffer, of random transitions with perturbed twins."""
+    """Replay buffer of the package, with random transitions and perturbed states."""
     ends = torch.rand(ROWS, 1) < 2e-3
-    following = {
+    next_step = {
         "observation": torch.randn(ROWS, size.observations),
         "reward": torch.randn(ROWS, 1),
         "done": ends,
@@ -72,7 +72,7 @@ def make_buffer(size: Size, device: torch.device) -> ReplayBuffer:
     data = {
         "observation": torch.randn(ROWS, size.observations),
         "action": torch.rand(ROWS, size.actions) * 1.8 - 0.9,
-        "next": following,
+        "next": next_step,
     }
     return make_replay_buffer(
         TensorDict(data, [ROWS]),
@@ -84,7 +84,7 @@ def make_buffer(size: Size, device: torch.device) -> ReplayBuffer:
 
 
 def unpack(batch: TensorDictBase) -> Batch:
-    """Return a batch as the plain reference reads it."""
+    """Batch as the plain reference reads it."""
     return Batch(
         state=batch["observation"],
         action=batch["action"],
@@ -96,16 +96,53 @@ def unpack(batch: TensorDictBase) -> Batch:
     )
 
 
-def our_update(loss: LossModule, *, captured: bool = False) -> Update:
-    """Return the update that the README shows: one backward, one optimizer."""
+def our_loss(name: str, size: Size, device: torch.device) -> LossModule:
+    """One of the package's losses, with its defaults otherwise."""
+    options: dict[str, Any] = {"num_cells": list(size.cells)}
+    critics = critic_ensemble(
+        size.observations,
+        size.actions,
+        num_qvalue_nets=10 if name == "OSR-10" else 2,
+        **options,
+    )
+    if device.type == "cuda":
+        # TorchRL copies bounds that are numbers from the host at every call, which a
+        # CUDA graph cannot repeat.
+        high = torch.ones(size.actions, device=device)
+        options |= {"low": -high, "high": high}
+    actor = tanh_gaussian_actor(size.observations, size.actions, **options)
+    inverse_dynamics = tanh_gaussian_inverse_dynamics(
+        size.observations, size.actions, **options
+    )
+    if name == "OSR-v":
+        loss = OSRVLoss(actor, critics, inverse_dynamics)
+    elif name == "CQL(H)":
+        loss = OSRLoss(actor, critics, recovery_weight=0)
+    elif name == "OSR-10":
+        loss = OSRLoss(
+            actor,
+            critics,
+            inverse_dynamics,
+            min_q_weight=0,
+            deterministic_backup=False,
+        )
+    else:
+        loss = OSRLoss(actor, critics, inverse_dynamics)
+    return loss.to(device)
+
+
+def our_update(
+    loss: LossModule, device: torch.device, *, autocast: bool, capturable: bool = False
+) -> Update:
+    """The update that the README shows: one backward, one optimizer."""
     loss.make_value_estimator(gamma=GAMMA)
     updater = SoftUpdate(loss, tau=TAU)
-    optimizer = torch.optim.Adam(loss.parameters(), lr=RATE, fused=True)
-    if captured:
-        make_capturable(loss, optimizer, loss.log_alpha.device)
+    optimizer = torch.optim.Adam(
+        loss.parameters(), lr=RATE, fused=True, capturable=capturable
+    )
 
-    def update(batch: TensorDictBase, casting: Casting) -> Iterator[str]:
-        with casting():
+    def update(batch: TensorDictBase) -> Iterator[str]:
+        with torch.autocast(device.type, torch.bfloat16, enabled=autocast):
             losses = loss(batch.copy())
         yield "forward"
         terms = [value for key, value in losses.items() if key.startswith("loss_")]
@@ -120,59 +157,34 @@ def our_update(loss: LossModule, *, captured: bool = False) -> Update:
     return update
 
 
-def graph_update(loss: LossModule, like: TensorDictBase) -> Update:
-    """Return :func:`our_update` as a CUDA graph, into whose batch others are copied."""
-    update, static = our_update(loss, captured=True), like.clone()
-    castings: list[Casting] = []
+def graph_update(loss: LossModule, device: torch.device, *, autocast: bool) -> Update:
+    """:func:`our_update` as a CUDA graph, after five updates without."""
+    update = our_update(loss, device, autocast=autocast, capturable=True)
 
-    def once() -> TensorDictBase:
-        for _ in update(static, castings[-1]):
+    def whole(batch: TensorDictBase) -> None:
+        for _ in update(batch):
             pass
-        return TensorDict({"updates": torch.ones_like(loss.log_alpha)})
 
-    replayed = CapturedUpdate(once, list, loss.log_alpha.device)
+    graph = CudaGraphModule(whole, warmup=5, in_keys=[], out_keys=[], device=device)
 
-    def update_graph(batch: TensorDictBase, casting: Casting) -> Iterator[str]:
-        castings[:] = [casting]
-        static.update_(batch)
-        replayed()
+    def replay(batch: TensorDictBase) -> Iterator[str]:
+        graph(batch)
         yield "update"
 
-    return update_graph
-
-
-def our_loss(name: str, size: Size) -> LossModule:
-    """Return one of the package's losses, with its defaults otherwise."""
-    sizes = (size.observations, size.actions)
-    cells = list(size.cells)
-    actor = tanh_gaussian_actor(*sizes, num_cells=cells)
-    model = tanh_gaussian_inverse_dynamics(*sizes, num_cells=cells)
-    number = 10 if name == "OSR-10" else 2
-    critics = critic_ensemble(*sizes, num_cells=cells, num_qvalue_nets=number)
-    if name == "OSR-v":
-        return OSRVLoss(actor, critics, model)
-    if name == "CQL(H)":
-        return OSRLoss(actor, critics, recovery_weight=0)
-    if name == "OSR-10":
-        return OSRLoss(
-            actor, critics, model, min_q_weight=0, deterministic_backup=False
-        )
-    return OSRLoss(actor, critics, model)
+    return replay
 
 
 def osr_products(
-    size: Size, dtype: torch.dtype, device: torch.device
+    size: Size, device: torch.device, *, autocast: bool
 ) -> tuple[list[Pass], int]:
-    """Return OSR's matrix products, and how many operations they were counted to be.
+    """Matrix products of OSR's update, and the floating point operations counted in it.
 
     ``OSRLoss`` has two ways for many sampled actions, by network and device; the one
     that it takes is the one that has as many operations.
     """
-    loss, batch = our_loss("OSR", size).to(device), make_buffer(size, device).sample()
-    autocast = partial(torch.autocast, device.type, dtype=dtype)
-    casting = nullcontext if dtype == torch.float32 else autocast
-    update = our_update(loss)
-    counted = count_flops(lambda: update(batch, casting))
+    loss, batch = our_loss("OSR", size, device), make_buffer(size, device).sample()
+    update = our_update(loss, device, autocast=autocast)
+    counted = count_flops(lambda: update(batch))
     sizes = (size.observations, size.actions, size.cells)
     ways = [
         osr_passes(*sizes, batch=BATCH, num_random=NUM_RANDOM, chunk=chunk)
@@ -182,37 +194,38 @@ def osr_products(
 
 
 def make_contender(
-    name: str, size: Size, device: torch.device
+    name: str, size: Size, device: torch.device, *, autocast: bool
 ) -> tuple[Update, list[Any]]:
-    """Return an update and the batches that it reads, the same for every name."""
+    """An update and the batches that it reads, the same for every name."""
     buffer = make_buffer(size, device)
     batches = [buffer.sample() for _ in range(8)]
+    sizes = (size.observations, size.actions, size.cells)
     if name == SAMPLING:
 
-        def sample(*_: object) -> Iterator[str]:
+        def sample(_: object) -> Iterator[str]:
             buffer.sample()
             yield "sampling"
 
         return sample, batches
     if name == PLAIN:
-        sizes = (size.observations, size.actions, size.cells)
-        plain = PlainOSR(*sizes, num_random=NUM_RANDOM, device=device)
+        plain = PlainOSR(
+            *sizes, num_random=NUM_RANDOM, device=device, autocast=autocast
+        )
         return plain.update, [unpack(batch) for batch in batches]
-    if name in (PRODUCTS, PRODUCTS_BF16):
-        dtype = torch.float32 if name == PRODUCTS else torch.bfloat16
-        passes, _ = osr_products(size, dtype, device)
+    if name == PRODUCTS:
+        passes, _ = osr_products(size, device, autocast=autocast)
+        dtype = torch.bfloat16 if autocast else torch.float32
         return Products(passes, dtype, device).update, batches
-    # CQL has no use for perturbed states, and needs not carry them.
     if name == TORCHRL:
+        loss = cql_loss(*sizes, num_random=NUM_RANDOM, device=device)
+        update = cql_update(loss, autocast=autocast)
+    else:
+        loss = our_loss(name, size, device)
+        if name in (COMPILED, BOTH):
+            loss.compile()
+        make_update = graph_update if name in (GRAPH, BOTH) else our_update
+        update = make_update(loss, device, autocast=autocast)
+    # What a loss does not read, it need not carry.
+    if ("perturbed", "observation") not in loss.in_keys:
         batches = [batch.exclude("perturbed") for batch in batches]
-        sizes = (size.observations, size.actions, size.cells)
-        update = cql_update(cql_loss(*sizes, num_random=NUM_RANDOM, device=device))
-        return update, batches
-    loss = our_loss(name, size).to(device)
-    if not loss.recovers:
-        batches = [batch.exclude("perturbed") for batch in batches]
-    if name in (COMPILED, BOTH):
-        loss.compile()
-    if name in (GRAPH, BOTH):
-        return graph_update(loss, batches[0]), batches
-    return our_update(loss), batches
+    return update, batches

@@ -2,12 +2,11 @@
 
     python benchmarks/damaged_files.py --damages 100 --folder /tmp/damage
 
-Five kinds of file (a run's newest checkpoint, a cached data set, the parts of one that
-is being collected, a data set on disk, one that is being written) are damaged in five
-ways: cut off, one bit flipped, a block zeroed, a block of random bytes, emptied. Each
-time the package is asked to go on as if nothing had happened. It must say what is
-wrong, by the file's name, and must end with what it would have had without the file, or
-not at all. Writes ``results/reliability/damaged_files.json``.
+Three kinds of file (a run's newest checkpoint, a cached data set, a data set on disk)
+are damaged in five ways: cut off, one bit flipped, a block zeroed, a block of random
+bytes, emptied. Each time the package is asked to go on as if nothing had happened. It
+must say what is wrong, by the file's name, and must end with what it would have had
+without the file, or not at all. Writes ``results/reliability/damaged_files.json``.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ import random
 import shutil
 from collections import Counter
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 from unittest.mock import patch
@@ -29,9 +27,12 @@ from torchrl import torchrl_logger
 from torchrl.objectives import SoftUpdate
 
 from torchrl_osr import OSRLoss, StatePerturbation
-from torchrl_osr.data import load_local_dataset, make_replay_buffer, write_on_disk
-from torchrl_osr.data.levels import collect_level
-from torchrl_osr.data.partial import PartialCollection
+from torchrl_osr.data import (
+    load_local_dataset,
+    load_memmap,
+    make_replay_buffer,
+    write_memmap,
+)
 from torchrl_osr.modules import (
     critic_ensemble,
     tanh_gaussian_actor,
@@ -101,19 +102,7 @@ def cached_set() -> Subject:
         )
         return data, manifest
 
-    return Subject("cached data set", use, "local/*/*.*", use)
-
-
-def collected_parts() -> Subject:
-    """Parts of a collection that was killed: it must begin anew."""
-
-    def use(folder: Path) -> Any:
-        partial = PartialCollection(folder / "parts", {"of": "hopper"}, save_every=500)
-        return collect_level(
-            "hopper", "random", ROWS, progress=False, partial=partial
-        ).data
-
-    return Subject("parts of a killed collection", use, "parts/*", use)
+    return Subject("cached data set", use, "rolled-out/*/*.*", use)
 
 
 def rows(number: int) -> TensorDict:
@@ -130,28 +119,17 @@ def rows(number: int) -> TensorDict:
     return TensorDict(before | {"next": TensorDict(after, [100])}, [100])
 
 
-def on_disk(killed: bool) -> Subject:
-    """A data set on disk, or what is left of one whose writer was killed."""
-
-    def chunks(done: list[Any]) -> Any:
-        for number in range(len(done), 10):
-            yield rows(number), {}
-
-    def killed_chunks(done: list[Any]) -> Any:
-        yield from (each for each, _ in zip(chunks(done), range(6), strict=False))
-        raise KeyboardInterrupt
+def memory_mapped() -> Subject:
+    """A data set on disk that was written by hand: it must be refused."""
 
     def make(folder: Path) -> None:
-        with suppress(KeyboardInterrupt):
-            source = killed_chunks if killed else chunks
-            write_on_disk(source, folder / "set", progress=False)
+        write_memmap(map(rows, range(10)), folder / "set", progress=False)
 
     def use(folder: Path) -> Any:
-        stored = write_on_disk(chunks, folder / "set", progress=False)
-        return stored[torch.arange(len(stored))], stored.manifest
+        data, manifest = load_memmap(folder / "set")
+        return data.clone(), manifest
 
-    name = "data set being written to disk" if killed else "data set on disk"
-    return Subject(name, make, ".set.partial/*" if killed else "set/*", use)
+    return Subject("data set on disk", make, "set/*", use)
 
 
 def damage(path: Path, rng: random.Random) -> str:
@@ -211,10 +189,7 @@ def main() -> None:
     torchrl_logger.setLevel("WARNING")
     rng = random.Random(options.seed)
     counts: dict[str, dict[str, int]] = {}
-    subjects = (
-        checkpoints(), cached_set(), collected_parts(), on_disk(False), on_disk(True)
-    )  # fmt: skip
-    for subject in subjects:
+    for subject in (checkpoints(), cached_set(), memory_mapped()):
         whole = options.folder / subject.name.replace(" ", "_")
         subject.make(whole)
         right = subject.use(shutil.copytree(whole, options.folder / "right"))

@@ -2,8 +2,8 @@
 
     python benchmarks/data_properties.py --examples 2000
 
-Runs the property tests of ``tests/data/test_data_properties.py`` with more examples
-than the suite has time for, counts what came of them and writes
+Runs the tests of ``tests/data/read/test_data_properties.py`` with more examples than
+the suite has time for, counts what came of them and writes
 ``results/reliability/data_properties.json``. An example that gives a wrong number ends
 the run with that example.
 """
@@ -27,7 +27,7 @@ TESTS = ("test_episodes", "test_rows_and_files", "test_minari", "test_export_and
 def property_tests(examples: int) -> ModuleType:
     """Import the tests, which read the number of examples when they are imported."""
     os.environ["TORCHRL_OSR_PROPERTY_EXAMPLES"] = str(examples)
-    path = ROOT / "tests" / "data" / "test_data_properties.py"
+    path = ROOT / "tests" / "data" / "read" / "test_data_properties.py"
     spec = importlib.util.spec_from_file_location("data_properties_tests", path)
     assert spec is not None
     assert spec.loader is not None

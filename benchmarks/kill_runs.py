@@ -84,7 +84,7 @@ class Run:
         """Return what is being worked on, as the files tell."""
         if self.trained:
             return "evaluation"
-        if not list(self.cache.glob("local/*/manifest.json")):
+        if not list(self.cache.glob("rolled-out/*/manifest.json")):
             return "start" if not self.cache.exists() else "collection"
         policy = (self.folder / "checkpoint" / "policy").exists()
         return PHASES[policy]

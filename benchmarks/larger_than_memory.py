@@ -2,11 +2,13 @@
 
     python benchmarks/larger_than_memory.py
 
-Writes a set of synthetic rows of hopper's sizes with ``write_on_disk``, then draws the
-same batches from disk and from memory, each in a process of its own, in turns: what
+Writes a set of synthetic rows of hopper's sizes with ``write_memmap``, then draws the
+same batches from memory and from disk, each in a process of its own, in turns: what
 else runs on the machine slows both. ``disk_for_training`` is what training draws: rows
 without the held-out ones, standardised. At the end ``examples/offline_osr.py`` trains
-on the set. Writes ``results/reliability/larger_than_memory.json``; the set is deleted.
+on the set. Memory is a process's anonymous memory (``RssAnon``), its own; pages of the
+mapped files are the system's, which takes them back when memory is short. Linux only.
+Writes ``results/reliability/larger_than_memory.json``; the set is deleted.
 """
 
 from __future__ import annotations
@@ -36,18 +38,17 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import ObservationNorm
 
 from torchrl_osr.data import (
-    TransitionsOnDisk,
+    held_out_rows,
+    load_memmap,
     make_replay_buffer,
     observation_statistics,
-    split_on_disk,
-    write_on_disk,
+    write_memmap,
 )
 
 ROOT = Path(__file__).parents[1]
 OUTPUT = ROOT / "results" / "reliability" / "larger_than_memory.json"
 OBSERVATION, ACTION = 11, 3  # hopper's
-CHUNK = 200_000
-BATCH = 256
+CHUNK, BATCH = 200_000, 256
 SPAWN = multiprocessing.get_context("spawn")  # a fork would begin with our memory
 PACKAGES = ("torchrl-osr", "torch", "torchrl", "tensordict", "numpy")
 CONTENDERS = ("memory", "disk", "disk_for_training")
@@ -59,102 +60,79 @@ TRAINING = (
 )
 
 
-def synthetic_rows(number: int, count: int) -> TensorDict:
-    """Return a chunk of random transitions, the same for the same number."""
-    generator = torch.Generator().manual_seed(number)
+def chunks(rows: int) -> Iterator[TensorDict]:
+    """Yield random transitions, the same for the same number of rows."""
+    generator = torch.Generator().manual_seed(0)
     sizes = [OBSERVATION, ACTION, OBSERVATION, 1]
-    numbers = torch.randn(count, sum(sizes), generator=generator)
-    state, action, after, reward = map(torch.clone, torch.split(numbers, sizes, dim=1))
-    ended = torch.rand(count, 1, generator=generator) < 0.002
-    following = {
-        "observation": after,
-        "reward": reward,
-        "done": ended,
-        "terminated": ended,
-        "truncated": torch.zeros_like(ended),
-    }
-    root = {"observation": state, "action": action.tanh() * 0.999}
-    return TensorDict(root | {"next": TensorDict(following, [count])}, [count])
-
-
-def chunks(rows: int, first: int = 0) -> Iterator[TensorDict]:
-    """Yield the chunks of a set from one of them on."""
-    for start in range(first * CHUNK, rows, CHUNK):
-        yield synthetic_rows(start // CHUNK, min(CHUNK, rows - start))
+    for start in range(0, rows, CHUNK):
+        count = min(CHUNK, rows - start)
+        numbers = torch.randn(count, sum(sizes), generator=generator)
+        state, action, after, reward = numbers.split(sizes, dim=1)
+        ended = torch.rand(count, 1, generator=generator) < 0.002
+        following = {"observation": after, "reward": reward, "done": ended}
+        following |= {"terminated": ended, "truncated": torch.zeros_like(ended)}
+        root = {"observation": state, "action": action.tanh() * 0.999}
+        yield TensorDict(root | {"next": TensorDict(following, [count])}, [count])
 
 
 def memory(pid: int | str = "self") -> dict[str, float]:
-    """Return a process's resident memory in MiB: all, its own, of files, the peak."""
+    """Return a process's anonymous memory and its pages of files, in MiB."""
     text = Path(f"/proc/{pid}/status").read_text(encoding="utf-8")
-    names = ("VmRSS", "RssAnon", "RssFile", "VmHWM")
-    found = {name: re.search(rf"{name}:\s+(\d+) kB", text) for name in names}
-    return {name: round(int(hit[1]) / 1024, 1) for name, hit in found.items() if hit}
+    found = {
+        name: re.search(rf"{name}:\s+(\d+)", text) for name in ("RssAnon", "RssFile")
+    }
+    return {name: round(int(hit[1]) / 1024) for name, hit in found.items() if hit}
 
 
-def in_memory(rows: int) -> TensorDict:
-    """Return the whole set; chunks go into their place, so that there is one copy."""
-    data: TensorDict | None = None
-    for number, chunk in enumerate(chunks(rows)):
-        if data is None:
-            data = chunk.new_empty(rows)
-        data[number * CHUNK : number * CHUNK + len(chunk)] = chunk
-    assert data is not None
-    return data
-
-
-def make_buffer(name: str, rows: int, folder: Path) -> ReplayBuffer:
+def make_buffer(name: str, folder: Path) -> ReplayBuffer:
     """Return the buffer of one contender."""
+    data, _ = load_memmap(folder)
     if name == "memory":
-        return make_replay_buffer(in_memory(rows), batch_size=BATCH, seed=0)
-    data = TransitionsOnDisk(folder)
-    norm = None
+        data = data.clone()
+    options: dict[str, Any] = {"batch_size": BATCH, "seed": 0}
     if name == "disk_for_training":
         keys = ["observation", ("next", "observation")]
-        norm = ObservationNorm(
+        options["transform"] = ObservationNorm(
             *observation_statistics(data), in_keys=keys, standard_normal=True
         )
-        data, _ = split_on_disk(data, 0.02, seed=0)
-    return make_replay_buffer(data, batch_size=BATCH, seed=0, transform=norm)
+        options["left_out"] = held_out_rows(len(data), 0.02, seed=0).sort().values
+    return make_replay_buffer(data, **options)
 
 
-def serve(connection: Connection, name: str, rows: int, folder: Path) -> None:
+def serve(connection: Connection, name: str, folder: Path) -> None:
     """Draw as many batches as each request says; in a process of its own."""
     torch.set_num_threads(1)
-    buffer = make_buffer(name, rows, folder)
+    start = time.perf_counter()
+    buffer = make_buffer(name, folder)
+    opening = time.perf_counter() - start
     columns = sorted(buffer.sample().flatten_keys().items())
     content = b"".join(column.numpy().tobytes() for _, column in columns)
-    first = hashlib.sha256(content).hexdigest()
-    connection.send(first)
+    connection.send((hashlib.sha256(content).hexdigest(), opening))
     while batches := connection.recv():
-        wall, cpu = time.perf_counter(), time.process_time()
+        start = time.perf_counter()
         for _ in range(batches):
             buffer.sample()
-        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-        times = {"wall_ms": wall / batches * 1e3, "cpu_ms": cpu / batches * 1e3}
-        connection.send(times | memory())
+        seconds = time.perf_counter() - start
+        connection.send({"ms_per_batch": seconds / batches * 1e3} | memory())
 
 
 def convert(connection: Connection, rows: int, folder: Path) -> None:
     """Write the set and say how long it took; in a process of its own."""
     torch.set_num_threads(1)
+    largest = 0.0
+
+    def watched() -> Iterator[TensorDict]:
+        nonlocal largest
+        for chunk in chunks(rows):
+            largest = max(largest, memory()["RssAnon"])
+            yield chunk
+
     start = time.perf_counter()
-    write_on_disk(
-        lambda done: ((chunk, {}) for chunk in chunks(rows, len(done))),
-        folder,
-        total=rows,
-    )
+    write_memmap(watched(), folder, total=rows)
     seconds = time.perf_counter() - start
-    start = time.perf_counter()
-    for _ in chunks(rows):
-        pass
-    generation = time.perf_counter() - start
-    connection.send({
-        "seconds": seconds,
-        "seconds_to_generate_alone": generation,
-        "rows_per_second": rows / seconds,
-        "bytes": (folder / "rows.bin").stat().st_size,
-        "peak_mib": memory()["VmHWM"],
-    })  # fmt: skip
+    size = sum(path.stat().st_size for path in folder.iterdir())
+    rate = {"seconds": seconds, "rows_per_second": rows / seconds, "bytes": size}
+    connection.send(rate | {"largest_RssAnon_mib": largest})
 
 
 def start(target: Any, *args: Any) -> tuple[Any, Connection]:
@@ -166,11 +144,11 @@ def start(target: Any, *args: Any) -> tuple[Any, Connection]:
     return process, ours
 
 
-def compare(rows: int, folder: Path, rounds: int, batches: int) -> dict[str, Any]:
-    """Draw in turns; return each contender's rounds and the ratios to memory."""
-    running = {name: start(serve, name, rows, folder) for name in CONTENDERS}
-    firsts = {name: connection.recv() for name, (_, connection) in running.items()}
-    assert firsts["memory"] == firsts["disk"], "the same seed gave other rows"
+def compare(folder: Path, rounds: int, batches: int) -> dict[str, Any]:
+    """Draw in turns; return each contender's medians and its rates to memory's."""
+    running = {name: start(serve, name, folder) for name in CONTENDERS}
+    first = {name: connection.recv() for name, (_, connection) in running.items()}
+    assert first["memory"][0] == first["disk"][0], "the same seed gave other rows"
     played: dict[str, list[dict[str, float]]] = {name: [] for name in CONTENDERS}
     for number in range(rounds + 1):
         for name, (_, connection) in running.items():
@@ -181,44 +159,38 @@ def compare(rows: int, folder: Path, rounds: int, batches: int) -> dict[str, Any
     for process, connection in running.values():
         connection.send(0)
         process.join()
-    return {name: summary(played[name], played["memory"]) for name in CONTENDERS}
-
-
-def summary(
-    played: list[dict[str, float]], reference: list[dict[str, float]]
-) -> dict[str, Any]:
-    """Return medians, the ratios of the rates round by round, and the memory."""
-    result: dict[str, Any] = {}
-    for kind in ("wall_ms", "cpu_ms"):
-        pairs = zip(played, reference, strict=True)
-        ratios = [theirs[kind] / ours[kind] for ours, theirs in pairs]
-        result[kind] = round(statistics.median(each[kind] for each in played), 4)
-        result[f"rate_to_memory_by_{kind[:-3]}"] = {
-            "median": round(statistics.median(ratios), 3),
-            "range": [round(min(ratios), 3), round(max(ratios), 3)],
+    result = {}
+    for name, own in played.items():
+        ratios = [
+            theirs["ms_per_batch"] / ours["ms_per_batch"]
+            for ours, theirs in zip(own, played["memory"], strict=True)
+        ]
+        result[name] = {
+            "seconds_to_open": round(first[name][1], 2),
+            "ms_per_batch": statistics.median(each["ms_per_batch"] for each in own),
+            "rate_to_memory": {
+                "median": round(statistics.median(ratios), 3),
+                "range": [round(min(ratios), 3), round(max(ratios), 3)],
+            },
+            "largest_mib": {
+                kind: max(each[kind] for each in own) for kind in ("RssAnon", "RssFile")
+            },
         }
-    result["memory_mib_by_round"] = {
-        name: [each[name] for each in played]
-        for name in ("VmRSS", "RssAnon", "RssFile", "VmHWM")
-    }
     return result
 
 
 def cold(folder: Path, batches: int) -> dict[str, float]:
-    """Return what opening and a batch take with nothing in the page cache."""
-    with (folder / "rows.bin").open("rb") as file:
-        os.fsync(file.fileno())
-        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+    """Return what a batch takes with nothing in the page cache."""
+    buffer = make_buffer("disk", folder)
+    os.sync()
+    for path in folder.glob("*.memmap"):
+        with path.open("rb") as file:
+            os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
     begin = time.perf_counter()
-    buffer = make_buffer("disk", 0, folder)
-    opened = time.perf_counter()
     for _ in range(batches):
         buffer.sample()
-    return {
-        "seconds_to_open": opened - begin,
-        "batches": batches,
-        "ms_per_batch": (time.perf_counter() - opened) / batches * 1e3,
-    }
+    seconds = time.perf_counter() - begin
+    return {"batches": batches, "ms_per_batch": seconds / batches * 1e3}
 
 
 def train(folder: Path) -> dict[str, Any]:
@@ -235,13 +207,13 @@ def train(folder: Path) -> dict[str, Any]:
         time.sleep(0.2)
     if process.wait():
         raise RuntimeError("the training run failed; see above.")
-    names = ("VmRSS", "RssAnon", "RssFile", "VmHWM")
-    seen = [each for each in seen if len(each) == len(names)]
+    whole = [each for each in seen if len(each) == 2]
     return {
         "overrides": [*TRAINING, "data.path=<the set>"],
         "seconds": time.perf_counter() - begin,
-        "largest_mib": {name: max(each[name] for each in seen) for name in names},
-        "VmRSS_mib_over_time": [each["VmRSS"] for each in seen][:: len(seen) // 20],
+        "largest_mib": {
+            kind: max(each[kind] for each in whole) for kind in ("RssAnon", "RssFile")
+        },
     }
 
 
@@ -249,8 +221,8 @@ def machine() -> str:
     """Return processor, cores and memory."""
     text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
     model = re.findall(r"model name\t: (.*)", text) or [platform.machine()]
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    return f"{model[0]}, {os.cpu_count()} cores, {memory:.0f} GiB"
+    size = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    return f"{model[0]}, {os.cpu_count()} cores, {size:.0f} GiB"
 
 
 def main() -> None:
@@ -269,12 +241,8 @@ def main() -> None:
         process, connection = start(convert, arguments.rows, folder)
         result: dict[str, Any] = {"conversion": connection.recv()}
         process.join()
+        result["sampling"] = compare(folder, arguments.rounds, arguments.batches)
         result["cold"] = cold(folder, 40)
-        with (folder / "rows.bin").open("rb") as file:  # into the page cache
-            while file.read(2**24):
-                pass
-        counts = (arguments.rounds, arguments.batches)
-        result["sampling"] = compare(arguments.rows, folder, *counts)
         result["training"] = train(folder)
     finally:
         shutil.rmtree(place)

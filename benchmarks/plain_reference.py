@@ -16,8 +16,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -50,20 +49,20 @@ class Noise(NamedTuple):
     target: Tensor  # [B, A]
     uniform: Tensor  # [BK, A]
     current: Tensor  # [BK, A]
-    following: Tensor  # [BK, A]
+    next: Tensor  # [BK, A]
 
 
 def mlp(inputs: int, outputs: int, cells: Sequence[int]) -> nn.Sequential:
-    """Return linear layers with ReLU between them."""
+    """Linear layers with ReLU between them."""
     widths = [inputs, *cells, outputs]
     layers: list[nn.Module] = []
-    for width, following in pairwise(widths):
-        layers += [nn.Linear(width, following), nn.ReLU()]
+    for before, after in pairwise(widths):
+        layers += [nn.Linear(before, after), nn.ReLU()]
     return nn.Sequential(*layers[:-1])
 
 
 class Gaussian(nn.Module):
-    """The normal distribution before the tanh, of the policy or of the model."""
+    """Normal distribution before the tanh, of policy or inverse dynamics model."""
 
     def __init__(self, inputs: int, actions: int, cells: Sequence[int]) -> None:
         super().__init__()
@@ -86,7 +85,7 @@ class Critic(nn.Module):
 
 
 def act(gaussian: Normal, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the tanh-Gaussian action and its log-density, ``[rows]``."""
+    """Tanh-Gaussian action ``[rows, A]`` and its log-density ``[rows]``."""
     x = gaussian.loc + gaussian.scale * noise
     log_slope = 2 * (math.log(2) - x - softplus(-2 * x))
     return torch.tanh(x), (gaussian.log_prob(x) - log_slope).sum(-1)
@@ -99,7 +98,8 @@ class PlainOSR:
         observations, actions: sizes of a state and of an action.
         cells: widths of the hidden layers of all networks.
         num_random: ``K``, actions drawn of each kind.
-        device: where all of it lies.
+        device: of all of it.
+        autocast: whether losses are computed under bfloat16 autocast.
     """
 
     recovery_weight, min_q_weight, gamma, tau, rate = 0.5, 5.0, 0.99, 5e-3, 3e-4
@@ -112,10 +112,12 @@ class PlainOSR:
         *,
         num_random: int = 10,
         device: torch.device | str = "cpu",
+        autocast: bool = False,
     ) -> None:
+        self.device, self.autocast = torch.device(device), autocast
         self.num_random, self.target_entropy = num_random, -float(actions)
         self.actor = Gaussian(observations, actions, cells).to(device)
-        self.model = Gaussian(2 * observations, actions, cells).to(device)
+        self.inverse_dynamics = Gaussian(2 * observations, actions, cells).to(device)
         self.critic_1 = Critic(observations, actions, cells).to(device)
         self.critic_2 = Critic(observations, actions, cells).to(device)
         self.target_1 = copy.deepcopy(self.critic_1).requires_grad_(False)
@@ -135,11 +137,11 @@ class PlainOSR:
             target=action.new_empty(rows, size).normal_(),
             uniform=action.new_empty(many, size).uniform_(-1, 1),
             current=action.new_empty(many, size).normal_(),
-            following=action.new_empty(many, size).normal_(),
+            next=action.new_empty(many, size).normal_(),
         )
 
     def losses(self, batch: Batch, noise: Noise) -> dict[str, Tensor]:
-        """Return the terms under the names that ``OSRLoss`` gives them."""
+        """All terms, under the names that ``OSRLoss`` gives them."""
         # A terminated row's next state is not one; any finite stand-in does.
         ended = batch.terminated.unsqueeze(-1)
         batch = batch._replace(
@@ -148,14 +150,14 @@ class PlainOSR:
         return self.actor_losses(batch, noise) | self.critic_losses(batch, noise)
 
     def actor_losses(self, batch: Batch, noise: Noise) -> dict[str, Tensor]:
-        """Return the terms of the policy, on clean and perturbed states."""
+        """Terms of the policy, on clean and perturbed states."""
         states = torch.cat([batch.state, batch.perturbed])
         policy = self.actor(states)
         action, log_prob = act(policy, noise.actor)
         value = torch.min(self.critic_1(states, action), self.critic_2(states, action))
         with torch.no_grad():
-            model = self.model(states, batch.next_state.repeat(2, 1))
-        divergence = kl_divergence(model, policy).sum(-1)
+            target = self.inverse_dynamics(states, batch.next_state.repeat(2, 1))
+        divergence = kl_divergence(target, policy).sum(-1)
         kept = (~batch.done).to(divergence).repeat(2)
         recovery = (divergence * kept).sum() / kept.sum()
         alpha = self.log_alpha.detach().exp()
@@ -167,22 +169,22 @@ class PlainOSR:
         }
 
     def critic_losses(self, batch: Batch, noise: Noise) -> dict[str, Tensor]:
-        """Return the terms of the critics: the TD error and CQL's."""
+        """Terms of the critics: the TD error and CQL's."""
         repeated = batch.state.repeat_interleave(self.num_random, 0)
         with torch.no_grad():
-            following, _ = act(self.actor(batch.next_state), noise.target)
+            next_action, _ = act(self.actor(batch.next_state), noise.target)
             next_value = torch.min(
-                self.target_1(batch.next_state, following),
-                self.target_2(batch.next_state, following),
+                self.target_1(batch.next_state, next_action),
+                self.target_2(batch.next_state, next_action),
             )
-            going_on = (~batch.terminated).to(next_value)
-            target = batch.reward + self.gamma * going_on * next_value
+            alive = (~batch.terminated).to(next_value)
+            target = batch.reward + self.gamma * alive * next_value
             uniform_density = -noise.uniform.shape[-1] * math.log(2)
             next_repeated = batch.next_state.repeat_interleave(self.num_random, 0)
             proposals = [
                 (noise.uniform, uniform_density),
                 act(self.actor(repeated), noise.current),
-                act(self.actor(next_repeated), noise.following),
+                act(self.actor(next_repeated), noise.next),
             ]
         td_error, gap = 0.0, 0.0
         for critic in (self.critic_1, self.critic_2):
@@ -196,16 +198,9 @@ class PlainOSR:
             gap = gap + (soft_maximum - value).mean()
         return {"loss_qvalue": td_error, "loss_cql": self.min_q_weight * gap}
 
-    def update(
-        self, batch: Batch, casting: Callable[[], AbstractContextManager]
-    ) -> Iterator[str]:
-        """Do one update; name each part when it is done.
-
-        Args:
-            batch: transitions.
-            casting: makes the context in which the losses are computed.
-        """
-        with casting():
+    def update(self, batch: Batch) -> Iterator[str]:
+        """Do one update; name each part when it is done."""
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.autocast):
             losses = self.losses(batch, self.draw(batch.action))
             policy = losses["loss_actor"] + losses["loss_recovery"]
             critics = losses["loss_qvalue"] + losses["loss_cql"]

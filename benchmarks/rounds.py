@@ -1,68 +1,60 @@
-"""Processes that each run one implementation in one precision, a round at a time.
+"""Processes that each run one update in one precision, a round at a time.
 
-An implementation has a process of its own because memory is a part of its time: how
-often large tensors are given back to the system, and cost page faults when they come
-again, depends on everything that a process has allocated before.
+Each has a process of its own because memory is a part of its time: how often large
+tensors are given back to the system, and cost page faults when they come again, depends
+on everything that a process has allocated before.
 """
 
 from __future__ import annotations
 
-import ctypes
 import multiprocessing
-import resource
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from itertools import cycle
 from multiprocessing.connection import Connection
 from typing import Any
 
 import torch
 from contenders import Size, make_contender
-from diagnostics import count_operations, profile_update
 
 # A fork shares the imports: a process is there in no time, and small.
 FORK = multiprocessing.get_context("fork")
 
 
 class Timer:
-    """Runs an update and says what it took; lives in a process of its own.
+    """Times an update, in the process that is this contender's own.
 
     Args:
+        name: of the contender.
         precision: ``"float32"``, ``"medium"`` (products of float32 matrices may be
             less exact) or ``"bfloat16"`` (autocast, of the losses alone).
-        update: does one update and names its parts.
-        batches: what it reads, in turn.
+        size: of task and networks.
         device: where it runs.
-        seconds: how long a round shall take, roughly.
+        threads: of torch.
+        seconds: how long a round takes, roughly.
     """
 
     def __init__(
         self,
+        name: str,
         precision: str,
-        update: Callable[..., Iterator[str]],
-        batches: Sequence[Any],
-        device: torch.device,
+        size: Size,
+        device: str,
+        threads: int,
         seconds: float,
     ) -> None:
+        torch.set_num_threads(threads)
+        torch.manual_seed(0)
         medium = precision == "medium"
         torch.set_float32_matmul_precision("medium" if medium else "highest")
-        self.precision, self.device = precision, device
-        self.update, self.batches = update, cycle(batches)
-        self.steps = 5
+        self.device = torch.device(device)
+        self.update, batches = make_contender(
+            name, size, self.device, autocast=precision == "bfloat16"
+        )
+        self.batches = cycle(batches)
+        self.steps = 6
         self.round()  # warm-up, with the capture of a CUDA graph
         self.steps = max(1, round(seconds / self.round()["wall_seconds"]))
-
-    def casting(self) -> AbstractContextManager:
-        """Return the context in which the losses are computed."""
-        if self.precision == "bfloat16":
-            return torch.autocast(self.device.type, dtype=torch.bfloat16)
-        return nullcontext()
-
-    def once(self) -> Iterator[str]:
-        """Do one update."""
-        return self.update(next(self.batches), self.casting)
 
     def synchronize(self) -> None:
         """Wait until a GPU has done what it was given."""
@@ -70,115 +62,71 @@ class Timer:
             torch.cuda.synchronize(self.device)
 
     def round(self) -> dict[str, Any]:
-        """Do a round of updates; return seconds and page faults of one update."""
+        """Do a round of updates; seconds of one update, and of each of its parts."""
         parts: Counter[str] = Counter()
         self.synchronize()
-        faults = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
         wall, cpu = time.perf_counter(), time.process_time()
         before = cpu
         for _ in range(self.steps):
-            for part in self.once():
+            for part in self.update(next(self.batches)):
                 now = time.process_time()
                 parts[part] += now - before
                 before = now
         self.synchronize()
-        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-        faults = resource.getrusage(resource.RUSAGE_SELF).ru_minflt - faults
         return {
             "updates": self.steps,
-            "wall_seconds": wall / self.steps,
-            "cpu_seconds": cpu / self.steps,
+            "wall_seconds": (time.perf_counter() - wall) / self.steps,
+            "cpu_seconds": (time.process_time() - cpu) / self.steps,
             "cpu_seconds_by_part": {
                 part: seconds / self.steps for part, seconds in parts.items()
             },
-            "page_faults": faults / self.steps,
         }
 
-    def diagnose(self) -> dict[str, Any]:
-        """Count and profile, apart from the rounds."""
-        steps = min(self.steps, 5)
-        counts = count_operations(self.once)
-        return counts | profile_update(self.once, self.device, steps)
 
-
-def keep_memory() -> None:
-    """Let glibc keep the memory that is freed, for the next time it is asked for."""
-    trim_threshold, mmap_max = -1, -4  # of malloc.h
-    libc = ctypes.CDLL(None)
-    if not libc.mallopt(trim_threshold, 2**31 - 1) or not libc.mallopt(mmap_max, 0):
-        raise OSError("This system's malloc cannot be told to keep memory.")
-
-
-def serve(
-    connection: Connection,
-    name: str,
-    precision: str,
-    size: Size,
-    device: str,
-    threads: int,
-    seconds: float,
-    keep: bool,
-) -> None:
-    """Answer each request with what it asks for, or with what went wrong."""
-    if keep:
-        keep_memory()
-    torch.set_num_threads(threads)
-    torch.manual_seed(0)
+def serve(connection: Connection, *arguments: Any) -> None:
+    """Answer each request with a round, or with what went wrong."""
     timer = None
-    while (request := connection.recv()) is not None:
+    while connection.recv():
         try:
-            if timer is None:
-                where = torch.device(device)
-                update, batches = make_contender(name, size, where)
-                timer = Timer(precision, update, batches, where, seconds)
-            connection.send(getattr(timer, request)())
+            timer = timer or Timer(*arguments)
+            connection.send(timer.round())
         except Exception as error:
             # One that does not run in this precision must not end all the others.
             connection.send(f"{type(error).__name__}: {error}")
 
 
 class Contender:
-    """One implementation in one precision, seen from outside its process.
+    """One update in one precision, seen from outside its process.
+
+    Args:
+        arguments: of :class:`Timer`.
 
     Attributes:
         rounds: what each round took.
-        diagnosis: what was counted and profiled.
         failure: what went wrong, if something did; it takes part no more then.
     """
 
-    def __init__(self, name: str, precision: str, **settings: Any) -> None:
+    def __init__(self, *arguments: Any) -> None:
         self.rounds: list[dict[str, Any]] = []
-        self.diagnosis: dict[str, Any] = {}
         self.failure: str | None = None
         self._connection, theirs = FORK.Pipe()
         self._process = FORK.Process(
-            target=serve,
-            args=(theirs, name, precision),
-            kwargs=settings,
-            daemon=True,
+            target=serve, args=(theirs, *arguments), daemon=True
         )
         self._process.start()
         theirs.close()
 
-    def _ask(self, request: str) -> dict[str, Any]:
-        if self.failure is None:
-            self._connection.send(request)
-            answer = self._connection.recv()
-            if not isinstance(answer, str):
-                return answer
-            self.failure = answer
-        return {}
-
     def round(self) -> None:
         """Do a round of updates."""
-        if answer := self._ask("round"):
-            self.rounds.append(answer)
-
-    def diagnose(self) -> None:
-        """Count and profile an update."""
-        self.diagnosis = self._ask("diagnose")
+        if self.failure is None:
+            self._connection.send(True)
+            answer = self._connection.recv()
+            if isinstance(answer, str):
+                self.failure = answer
+            else:
+                self.rounds.append(answer)
 
     def close(self) -> None:
         """End the process."""
-        self._connection.send(None)
+        self._connection.send(False)
         self._process.join()

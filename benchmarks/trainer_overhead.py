@@ -27,8 +27,9 @@ from torchrl import torchrl_logger
 from torchrl.objectives import SoftUpdate
 from torchrl.record.loggers import CSVLogger
 
-from torchrl_osr import StatePerturbation, config
+from torchrl_osr import StatePerturbation
 from torchrl_osr.data import make_replay_buffer
+from torchrl_osr.experiment import schema as config
 from torchrl_osr.modules import (
     critic_ensemble,
     tanh_gaussian_actor,

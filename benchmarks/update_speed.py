@@ -30,38 +30,29 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from contenders import (
-    ON_GPU,
-    OURS,
-    PLAIN,
-    PRODUCTS,
-    PRODUCTS_BF16,
-    SAMPLING,
-    TORCHRL,
-    Size,
-)
+from contenders import ON_GPU, OURS, PLAIN, PRODUCTS, SAMPLING, TORCHRL, Size
 from rounds import Contender
 from speed_report import draw, tables, write_tables
 from torchrl import torchrl_logger
 
 SIZES = "hopper-2x256,hopper-3x256,halfcheetah-2x256,halfcheetah-3x256"
-# Who takes part in which precision.
 PRECISIONS = {
     "float32": (*OURS, TORCHRL, PLAIN, PRODUCTS, SAMPLING),
     "medium": (*OURS, TORCHRL, PLAIN, PRODUCTS),
-    "bfloat16": (*OURS, PLAIN, PRODUCTS_BF16),
+    "bfloat16": (*OURS, PLAIN, PRODUCTS),
 }
+"""Who takes part in which precision."""
 
 
 def summarize(
     contender: Contender, reference: Contender, products: Contender, clock: str
 ) -> dict[str, Any]:
-    """Return the medians, and everything that they were made of.
+    """Medians of a contender, and the rounds that they were made of.
 
     Args:
         contender: whose.
         reference: what ``ratio`` compares with, round by round.
-        products: the matrix products whose share of an update is told.
+        products: the matrix products whose share of an update is given.
         clock: which seconds the ratios are of.
     """
     rounds = contender.rounds
@@ -75,10 +66,6 @@ def summarize(
 
     ratios = relative(reference)
     parts = rounds[0]["cpu_seconds_by_part"] if rounds else {}
-    by_part = {
-        part: median([each["cpu_seconds_by_part"][part] for each in rounds])
-        for part in parts
-    }
     return {
         "failure": contender.failure,
         "updates_per_cpu_second": median([1 / each["cpu_seconds"] for each in rounds]),
@@ -87,52 +74,60 @@ def summarize(
         "ratio_lowest": min(ratios, default=None),
         "ratio_highest": max(ratios, default=None),
         "products_share": median(relative(products)),
-        "cpu_seconds_by_part": by_part,
-        "page_faults": median([each["page_faults"] for each in rounds]),
-        **contender.diagnosis,
+        "cpu_seconds_by_part": {
+            part: median([each["cpu_seconds_by_part"][part] for each in rounds])
+            for part in parts
+        },
         "rounds": rounds,
     }
 
 
 def measure(
-    name: str, *, precisions: Sequence[str], rounds: int, device: str, **settings: Any
+    name: str,
+    *,
+    precisions: Sequence[str],
+    rounds: int,
+    device: str,
+    threads: int = 1,
+    seconds: float = 1.0,
 ) -> dict[str, dict[str, Any]]:
-    """Return the results of one size, by precision and contender.
+    """Results of one size, by precision and contender.
 
     Args:
         name: of the size.
         precisions: some of :data:`PRECISIONS`.
         rounds: how many.
-        device: where.
-        settings: what :func:`rounds.serve` takes besides.
+        device, threads, seconds: see :class:`rounds.Timer`.
     """
-    common = {"size": Size.parse(name), "device": device, **settings}
+    on_gpu = device == "cuda"
     contenders = {
-        (precision, who): Contender(who, precision, **common)
+        (precision, who): Contender(
+            who, precision, Size.parse(name), device, threads, seconds
+        )
         for precision in precisions
-        for who in (*PRECISIONS[precision], *(ON_GPU if device == "cuda" else ()))
+        for who in (*PRECISIONS[precision], *(ON_GPU if on_gpu else ()))
     }
     for number in range(rounds):
         print(f"{name}: round {number + 1} of {rounds}", file=sys.stderr, flush=True)
         for contender in contenders.values():
             contender.round()
     for contender in contenders.values():
-        contender.diagnose()
         contender.close()
-    clock = "wall_seconds" if device == "cuda" else "cpu_seconds"
     results: dict[str, dict[str, Any]] = {precision: {} for precision in precisions}
     for (precision, who), contender in contenders.items():
         # Autocast is compared with the plain reference without it.
         exact = "float32" if precision == "bfloat16" else precision
-        bound = PRODUCTS_BF16 if precision == "bfloat16" else PRODUCTS
         results[precision][who] = summarize(
-            contender, contenders[exact, PLAIN], contenders[precision, bound], clock
+            contender,
+            reference=contenders[exact, PLAIN],
+            products=contenders[precision, PRODUCTS],
+            clock="wall_seconds" if on_gpu else "cpu_seconds",
         )
     return results
 
 
 def machine() -> dict[str, Any]:
-    """Return what the numbers depend on."""
+    """What the numbers depend on."""
     path = Path("/proc/cpuinfo")
     text = path.read_text() if path.exists() else ""
     models = re.findall("model name\t: (.*)", text)
@@ -159,7 +154,7 @@ def machine() -> dict[str, Any]:
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Return the options of the command line."""
+    """Options of the command line."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--sizes", default=SIZES, help="task-layersxwidth, by commas")
     parser.add_argument(
@@ -169,9 +164,6 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--seconds", type=float, default=1.0, help="of each round")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
-    parser.add_argument(
-        "--keep", action="store_true", help="let glibc keep freed memory, for all alike"
-    )
     parser.add_argument("--output", type=Path, default=Path("results/speed"))
     options = parser.parse_args(arguments)
     options.precisions = options.precisions.split(",")
@@ -186,7 +178,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     torchrl_logger.setLevel("WARNING")
     settings = {
         name: getattr(options, name)
-        for name in ("precisions", "rounds", "seconds", "threads", "device", "keep")
+        for name in ("precisions", "rounds", "seconds", "threads", "device")
     }
     given = sys.argv[1:] if arguments is None else arguments
     results = {

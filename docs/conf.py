@@ -2,6 +2,7 @@
 
 import inspect
 import os
+import re
 
 from sphinx.util.inspect import stringify_signature
 from torchrl.objectives import LossModule
@@ -19,11 +20,15 @@ extensions = [
     "sphinx.ext.mathjax",
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
+    # MathJax itself, so that formulas need no network either.
+    "sphinx-mathjax-offline",
 ]
 exclude_patterns = ["_build"]
 html_theme = "furo"
 html_title = "torchrl-osr"
 html_copy_source = False
+html_static_path = ["_static"]
+html_css_files = ["tables.css"]
 
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 2
@@ -60,5 +65,20 @@ def constructor_signature(app, what, name, obj, options, signature, returns):
     return None
 
 
+SEVERAL_NAMES = re.compile(r"(?m)^:(keyword|ivar) (\w+(?:, \w+)+): (.*(?:\n+ +.*)*)")
+
+
+def one_field_each(app, what, name, obj, options, lines):
+    """Make of ``:ivar low, high:`` one field for each name; Napoleon does for Args."""
+
+    def split(match):
+        role, names, meaning = match.groups()
+        return "\n".join(f":{role} {each}: {meaning}" for each in names.split(", "))
+
+    lines[:] = SEVERAL_NAMES.sub(split, "\n".join(lines)).split("\n")
+
+
 def setup(app):
     app.connect("autodoc-process-signature", constructor_signature)
+    # After Napoleon, whose priority is 500.
+    app.connect("autodoc-process-docstring", one_field_each, priority=600)

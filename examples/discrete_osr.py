@@ -2,7 +2,7 @@
 
     python examples/discrete_osr.py --seed 1 --output cartpole.json
 
-The data are rolled out here: a rule that balances the pole, spoilt by random actions.
+The data are rolled out here: a rule that balances the pole, mixed with random actions.
 Two policies are then learnt from them alone, by CQL and by OSR. Both play from the
 task's own starts, and from starts three times as far out.
 """
@@ -34,7 +34,7 @@ from torchrl_osr.data import (
     observation_statistics,
     split_held_out,
 )
-from torchrl_osr.evaluation.statistics import mean_interval
+from torchrl_osr.evaluation import mean_interval
 from torchrl_osr.modules import (
     categorical_actor,
     categorical_inverse_dynamics,
@@ -80,25 +80,25 @@ def play(policy: Policy, seeds: NDArray[np.int64], start: float = STARTS["own"])
     steps = []
     while running.any():
         action = policy(observation)
-        following, reward, terminated, truncated, _ = envs.step(action)
-        columns = episode, observation, action, following, reward, terminated, truncated
-        steps.append([column[running] for column in columns])
+        next_observation, reward, terminated, truncated, _ = envs.step(action)
+        row = episode, observation, action, next_observation, reward, terminated
+        steps.append([column[running] for column in (*row, truncated)])
         # The environments start anew on their own; a seed's first episode counts.
         running &= ~(terminated | truncated)
-        observation = following
+        observation = next_observation
     envs.close()
     joined = [np.concatenate(column) for column in zip(*steps, strict=True)]
-    observation, action, following, *rest = map(torch.from_numpy, joined[1:])
+    observation, action, next_observation, *rest = map(torch.from_numpy, joined[1:])
     reward, terminated, truncated = (column.unsqueeze(-1) for column in rest)
     data = TensorDict({"observation": observation}, [len(action)])
     data["action"] = torch.nn.functional.one_hot(action, SIZES[1])
-    data["next"] = {"observation": following, "reward": reward.float()}
+    data["next"] = {"observation": next_observation, "reward": reward.float()}
     data["next"].update({"terminated": terminated, "truncated": truncated})
     data["next", "done"] = terminated | truncated
     return data, np.bincount(joined[0], weights=joined[4])
 
 
-def spoilt_rule(num_episodes: int, rng: np.random.Generator) -> Policy:
+def noisy_rule(num_episodes: int, rng: np.random.Generator) -> Policy:
     """Push the cart to where the pole falls, but at random with probability epsilon."""
     epsilon = np.resize(EPSILONS, num_episodes)
 
@@ -138,7 +138,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     """Data, inverse dynamics model, policies; return everything that was measured."""
     rng = np.random.default_rng(args.seed)
     seeds = rng.integers(EVALUATION_SEED, size=args.data_episodes)
-    data, returns = play(spoilt_rule(args.data_episodes, rng), seeds)
+    data, returns = play(noisy_rule(args.data_episodes, rng), seeds)
     check_dataset(data)
     results: dict[str, Any] = {"rows": len(data), "data_returns": returns.tolist()}
     loc, scale = observation_statistics(data)
@@ -147,20 +147,20 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     data, held_out = split_held_out(data, 0.1, seed=args.seed)
 
     def buffer() -> ReplayBuffer:
-        twin = StatePerturbation(std=PERTURBATION, seed=args.seed)
-        return make_replay_buffer(data, batch_size=128, seed=args.seed, transform=twin)
+        noise = StatePerturbation(std=PERTURBATION, seed=args.seed)
+        return make_replay_buffer(data, batch_size=128, seed=args.seed, transform=noise)
 
     torch.manual_seed(args.seed)
-    model = categorical_inverse_dynamics(*SIZES, num_cells=CELLS)
-    train(DiscreteInverseDynamicsLoss(model), buffer(), args.model_steps, None)
-    (nll,) = DiscreteInverseDynamicsLoss(model, states="clean")(held_out).values()
+    network = categorical_inverse_dynamics(*SIZES, num_cells=CELLS)
+    train(DiscreteInverseDynamicsLoss(network), buffer(), args.model_steps, None)
+    (nll,) = DiscreteInverseDynamicsLoss(network, states="clean")(held_out).values()
     seeds = EVALUATION_SEED + np.arange(args.episodes)
     results |= {"model_nll": nll.item(), "episode_seeds": seeds.tolist(), "returns": {}}
     for name in args.loss:
         torch.manual_seed(args.seed)  # the same networks to begin with
         actor = categorical_actor(*SIZES, num_cells=CELLS)
         critics = discrete_critic_ensemble(*SIZES, num_cells=CELLS)
-        loss = DiscreteOSRLoss(actor, critics, model, recovery_weight=WEIGHTS[name])
+        loss = DiscreteOSRLoss(actor, critics, network, recovery_weight=WEIGHTS[name])
         train(loss, buffer(), args.steps, SoftUpdate(loss, tau=5e-3))
         for starts, bound in STARTS.items():
             _, returns = play(greedy(actor, loc, scale), seeds, bound)

@@ -19,13 +19,13 @@ from torchrl_osr.modules import tanh_gaussian_inverse_dynamics
 
 # Your transitions: here 1,000 steps of s' = 0.9 s + a, rewarded near the origin.
 state, action = torch.randn(1000, 3), torch.rand(1000, 3) * 1.8 - 0.9
-following, no = 0.9 * state + action, torch.zeros(1000, 1, dtype=torch.bool)
-reward = -following.norm(dim=-1, keepdim=True)
+next_state, no = 0.9 * state + action, torch.zeros(1000, 1, dtype=torch.bool)
+reward = -next_state.norm(dim=-1, keepdim=True)
 data = TensorDict({"observation": state, "action": action}, [1000])
-data["next"] = {"observation": following, "reward": reward, "done": no}
+data["next"] = {"observation": next_state, "reward": reward, "done": no}
 data["next", "terminated"] = no.clone()
 
-# Your buffer, with one line more: the perturbed twin of every state.
+# Your buffer, with one line more: a perturbed state beside every state.
 buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1000), batch_size=64)
 buffer.append_transform(StatePerturbation(std=1e-2))
 buffer.extend(data)
@@ -39,16 +39,15 @@ actor = ProbabilisticActor(
     return_log_prob=True,
 )
 qvalue = ValueOperator(MLP(in_features=6, out_features=1), ["observation", "action"])
-model = tanh_gaussian_inverse_dynamics(3, 3, num_cells=[64, 64])
-
-model_loss = InverseDynamicsLoss(model)
-model_optimizer = torch.optim.Adam(model_loss.parameters(), lr=3e-3)
+inverse_dynamics = tanh_gaussian_inverse_dynamics(3, 3, num_cells=[64, 64])
+inverse_dynamics_loss = InverseDynamicsLoss(inverse_dynamics)
+optimizer = torch.optim.Adam(inverse_dynamics_loss.parameters(), lr=3e-3)
 for _ in range(200):
-    model_loss(buffer.sample())["loss_inverse_dynamics"].backward()
-    model_optimizer.step()
-    model_optimizer.zero_grad()
+    inverse_dynamics_loss(buffer.sample())["loss_inverse_dynamics"].backward()
+    optimizer.step()
+    optimizer.zero_grad()
 
-loss = OSRLoss(actor, qvalue, model, recovery_weight=0.5)  # was: CQLLoss(actor, qvalue)
+loss = OSRLoss(actor, qvalue, inverse_dynamics)  # was: CQLLoss(actor, qvalue)
 loss.make_value_estimator(gamma=0.99)
 updater = SoftUpdate(loss, tau=5e-3)
 optimizer = torch.optim.Adam(loss.parameters(), lr=3e-4)

@@ -1,17 +1,18 @@
-"""Disturb a trained policy: what does it lose, and does it come back to its data?
+"""Disturb a trained policy: score lost, survival, and time back to the data.
 
     python examples/evaluate.py checkpoint=outputs/hopper-medium-replay/seed0-...
     python examples/evaluate.py checkpoint=<run's folder> suite=torque episodes=20
     python examples/evaluate.py checkpoint=<run's folder>/checkpoint/policy/best.torchrl
 
 Each of the run's last checkpoints plays pairs of episodes, one of each pair disturbed.
-The run's folder gets ``robustness-<suite>.json``, all raw results, and a figure of the
-same name. A killed evaluation goes on after the last checkpoint that was done. What is
-measured is in ``docs/robustness.md``.
+The run's folder gets ``robustness-<suite>.json`` with all raw results, and a figure of
+the same name. A killed evaluation continues after its last finished checkpoint. See
+``docs/robustness.md``.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 from importlib.metadata import version
 from pathlib import Path
@@ -23,22 +24,25 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl import torchrl_logger
 from tqdm.auto import tqdm
 
-from torchrl_osr import evaluate_config
-from torchrl_osr._files import parse_json, read_text
-from torchrl_osr.data import observation_statistics
-from torchrl_osr.data.manifest import SEAL, check_seal, sealed, sha256_of
-from torchrl_osr.evaluation.data_distance import DataDistance
-from torchrl_osr.evaluation.episodes import deterministic_policy
-from torchrl_osr.evaluation.robustness import evaluate_paired
-from torchrl_osr.evaluation.robustness_figure import robustness_figure
-from torchrl_osr.evaluation.robustness_summary import (
-    evaluation_json,
-    summarize_levels,
+from torchrl_osr._files import (
+    CHECKSUM,
+    check_checksum,
+    checksummed,
+    read_json,
+    write_json,
 )
-from torchrl_osr.evaluation.robustness_table import robustness_table
-from torchrl_osr.evaluation.suite import make_levels
-from torchrl_osr.experiment import run_folder
+from torchrl_osr.data import observation_statistics
+from torchrl_osr.evaluation import (
+    DataDistance,
+    deterministic_policy,
+    evaluate_paired,
+    evaluation_json,
+    robustness_figure,
+    robustness_table,
+    summarize_disturbances,
+)
 from torchrl_osr.experiment.build import load_data
+from torchrl_osr.experiment.suite import make_disturbances, register
 from torchrl_osr.experiment.trained_run import (
     checkpoints_of,
     load_trained,
@@ -49,12 +53,12 @@ JSON_FORMAT = 1
 SEED_STRIDE = 1000  # between checkpoints: no two of them play the same episodes
 PACKAGES = ("torchrl-osr", "torch", "torchrl", "tensordict", "gymnasium", "mujoco")
 
-evaluate_config.register()
+register()
 
 
-@hydra.main(version_base="1.3", config_path="../conf", config_name="evaluate")
+@hydra.main(version_base="1.3", config_path="../conf_evaluate", config_name="evaluate")
 def main(cfg: DictConfig) -> None:
-    """Evaluate, unless it is done already, and print the table."""
+    """Evaluate, unless the result is there already, and print the table."""
     torchrl_logger.setLevel("WARNING")
     torch.set_num_threads(cfg.num_threads)
     if min(cfg.last, cfg.episodes - 1) < 1:
@@ -70,14 +74,14 @@ def main(cfg: DictConfig) -> None:
         name = f"{files[0].stem}-{name}"  # beside the one of the whole run
     path = folder / f"{name}.json"
     request = requested(cfg, files)
-    results = left_by(path, request)
-    # Hidden from those who look for results.
+    results = results_in(path, request)
+    # Hidden: a part is no result.
     partial = path.with_name(f".{name}.partial.json")
     if cfg.force or results is None:
         results = request | evaluate(cfg, files, partial, request)
-        run_folder.write_json(path, results)
+        write_json(path, results)
     else:
-        print(f"{path} is there already; force=true does it again.")
+        print(f"{path} is there already; force=true repeats it.")
     partial.unlink(missing_ok=True)
     figure = path.with_suffix(".png")
     title = (
@@ -90,31 +94,32 @@ def main(cfg: DictConfig) -> None:
 
 
 def requested(cfg: DictConfig, files: list[Path]) -> dict[str, Any]:
-    """Return what decides the results: settings, the checkpoints' bits, versions."""
+    """Everything that decides the results: settings, checkpoints' digests, versions."""
     return {
         "format": JSON_FORMAT,
         "versions": {each.replace("-", "_"): version(each) for each in PACKAGES},
         "suite": cfg.suite.name,
-        "levels": OmegaConf.to_container(cfg.suite.levels, resolve=True),
+        "levels": OmegaConf.to_container(cfg.suite.disturbances, resolve=True),
         "episodes": cfg.episodes,
         "seed": cfg.seed,
-        "checkpoints": {file.name: sha256_of(file) for file in files},
+        "checkpoints": {
+            file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files
+        },
     }
 
 
-def left_by(path: Path, request: dict[str, Any]) -> dict[str, Any] | None:
-    """Return what an evaluation of the same request has left, if there was one."""
+def results_in(path: Path, request: dict[str, Any]) -> dict[str, Any] | None:
+    """Results of an earlier evaluation with the same request, if there are any."""
     if not path.exists():
         return None
     try:
-        text = read_text(path)
-        results = parse_json(text, path.name)
-        if SEAL in results:
-            check_seal(results, text, path.name)
+        results = read_json(path)
+        if CHECKSUM in results:
+            check_checksum(results, path.name)
     except ValueError as error:
-        print(f"{path} is of no use: {error}.")
+        print(f"{path} is ignored: {error}.")
         return None
-    # Through JSON, as the file's: it knows no tuples.
+    # Through JSON, like the file: it has no tuples.
     same = json.loads(json.dumps(request)).items() <= results.items()
     return results if same else None
 
@@ -122,21 +127,21 @@ def left_by(path: Path, request: dict[str, Any]) -> dict[str, Any] | None:
 def evaluate(
     cfg: DictConfig, files: list[Path], partial: Path, request: dict[str, Any]
 ) -> dict[str, Any]:
-    """Play all checkpoints of one run, but those that ``partial`` has already."""
+    """Play all checkpoints of one run, except those that ``partial`` has already."""
     run = load_trained(files[0]).config
     data, _ = load_data(run, progress=cfg.progress)
     distance = DataDistance(data, seed=run.data.seed)
     _, scale = observation_statistics(data)
-    begun = left_by(partial, request) or {"evaluations": []}
+    begun = results_in(partial, request) or {"evaluations": []}
     evaluations = begun["evaluations"]
     if evaluations:
         print(f"{partial} has {len(evaluations)} of {len(files)} checkpoints already.")
-    levels = len(cfg.suite.levels) + 1  # the clean episodes are one
+    plays = 1 + len(cfg.suite.disturbances)  # the clean episodes first
     bar = tqdm(
-        initial=len(evaluations) * levels,
-        total=len(files) * levels,
+        initial=len(evaluations) * plays,
+        total=len(files) * plays,
         desc=cfg.suite.name,
-        unit="level",
+        unit="play",
         disable=None if cfg.progress else True,  # None: silent off a terminal
     )
     with bar:
@@ -146,21 +151,23 @@ def evaluate(
             paired = evaluate_paired(
                 deterministic_policy(trained.actor, trained.observation_norm),
                 run.env.id,
-                make_levels(cfg.suite.levels, trained, scale.numpy(), seed=seed),
+                make_disturbances(
+                    cfg.suite.disturbances, trained, scale.numpy(), seed=seed
+                ),
                 distance,
                 num_episodes=cfg.episodes,
                 seed=seed,
                 advance=bar.update,
             )
             evaluations.append(evaluation_json(trained.step, paired, run.env.name))
-            begun = sealed(request | {"evaluations": evaluations})
-            run_folder.write_json(partial, begun)
+            begun = checksummed(request | {"evaluations": evaluations})
+            write_json(partial, begun)
     return {
         "env": run.env.name,
         "data": run.data.level,
         "threshold": distance.threshold,
         "evaluations": evaluations,
-        "summary": summarize_levels(evaluations),
+        "summary": summarize_disturbances(evaluations),
     }
 
 

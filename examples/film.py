@@ -1,13 +1,13 @@
-"""Film a recovery: who comes back after a push, and where did they go?
+"""Film a recovery: who survives a push, and which states do they visit?
 
     python examples/film.py checkpoint=outputs/hopper-medium-replay/seed0-...
     python examples/film.py checkpoint=<run's folder> knock=5 rule=time
     python examples/film.py checkpoint=<run's folder> push=1 film_seed=30004
 
 Figure 3 of the paper: after a push, the behaviour policy, the inverse dynamics model as
-a controller and the trained policy go on from the very same state. The run's folder
-gets ``film.png``, ``film.gif``, ``visited.png`` and ``film.json``; the table says how
-many of all episodes survive. How to read them is in ``docs/film.md``.
+a controller and the trained policy go on from the same state. The run's folder gets
+``film.png``, ``film.gif``, ``visited.png`` and ``film.json``; the table counts all
+episodes that survive. See ``docs/film.md``.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import Any
 if sys.platform == "linux":  # before MuJoCo is imported; egl needs no display
     os.environ.setdefault("MUJOCO_GL", "egl")
 try:
-    import_module("mujoco")  # loads OpenGL, whose libraries fail in all sorts of ways
+    import_module("mujoco")  # loads OpenGL, whose libraries fail in many ways
 except ModuleNotFoundError:
     raise
 except Exception as error:
@@ -36,30 +36,37 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl import torchrl_logger
 
 from torchrl_osr._checks import check_choice
-from torchrl_osr.data import load_behavior_policy, make_environment
-from torchrl_osr.data.levels import level_policies
-from torchrl_osr.data.on_disk import observations
-from torchrl_osr.envs import ActionKnock, ExternalPush
-from torchrl_osr.evaluation.data_distance import DataDistance
-from torchrl_osr.evaluation.episodes import Policy, Wrap, deterministic_policy
-from torchrl_osr.evaluation.film_figures import Camera, Take, film_gif, film_strip
-from torchrl_osr.evaluation.inverse_dynamics_control import (
-    InverseDynamicsController,
-    frozen_model,
+from torchrl_osr._files import write_json
+from torchrl_osr.data import (
+    load_behavior_policy,
+    make_environment,
+    quality_policies,
+    sampled_observations,
 )
-from torchrl_osr.evaluation.survival import Survival, survival_table
-from torchrl_osr.evaluation.takeover import BEHAVIOR, Controller, play_takeovers
-from torchrl_osr.evaluation.visited_states import visited_states
+from torchrl_osr.envs import ActionKnock, ExternalPush
+from torchrl_osr.evaluation import DataDistance, Policy, Wrap, deterministic_policy
 from torchrl_osr.experiment.build import load_data
-from torchrl_osr.experiment.run_folder import write_json
 from torchrl_osr.experiment.trained_run import TrainedRun, load_trained
+from torchrl_osr.film import (
+    BEHAVIOR,
+    Camera,
+    Controller,
+    InverseDynamicsController,
+    Survival,
+    Take,
+    film_gif,
+    film_strip,
+    play_takeovers,
+    survival_table,
+    visited_states,
+)
 
 PUSH_STEPS = 5
 STEPS_BEFORE = 10  # in the film
 MODEL, RULES = "inverse dynamics, ", ("time", "nearest")
 
 
-@hydra.main(version_base="1.3", config_path="../conf", config_name="film")
+@hydra.main(version_base="1.3", config_path="../conf_evaluate", config_name="film")
 def main(cfg: DictConfig) -> None:
     """Play all episodes with every controller, print the table, film one of them."""
     torchrl_logger.setLevel("WARNING")
@@ -74,7 +81,7 @@ def main(cfg: DictConfig) -> None:
         latest=cfg.window[1], after=cfg.after, num_episodes=cfg.episodes, seed=cfg.seed,
     )  # fmt: skip
 
-    # Who falls without a push cannot be said to have fallen by it.
+    # An episode that ends without the push says nothing about it.
     kept = played[BEHAVIOR].up_clean(ends, cfg.after)
     if not kept:
         raise ValueError(
@@ -92,7 +99,7 @@ def main(cfg: DictConfig) -> None:
     ]
     title = f"{run.env.name} {run.data.level}: {in_words(cfg, takes[0].force)}"
     one = f"one episode: seed {cfg.seed + episode}, {why}"
-    draw(cfg, takes, camera, observations(data), trained, results, title, one)
+    draw(cfg, takes, camera, sampled_observations(data), trained, results, title, one)
     write_json(
         trained.folder / "film.json",
         {
@@ -143,7 +150,7 @@ def draw(
 
 
 def disturbance(cfg: DictConfig) -> tuple[str, int, Wrap]:
-    """Return what it is called, how many steps it lasts, and its wrapper."""
+    """Name of the disturbance, its duration in steps, and its wrapper."""
     check_choice("rule", cfg.rule, RULES)
     if cfg.window[0] < STEPS_BEFORE or cfg.after < 2:
         raise ValueError(
@@ -160,7 +167,7 @@ def disturbance(cfg: DictConfig) -> tuple[str, int, Wrap]:
 
 
 def in_words(cfg: DictConfig, force: float) -> str:
-    """Return the filmed disturbance in words."""
+    """The filmed disturbance in words."""
     if cfg.knock is not None:
         return f"{cfg.knock} steps of random full-strength actions"
     way = "forwards" if force > 0 else "backwards"
@@ -168,9 +175,9 @@ def in_words(cfg: DictConfig, force: float) -> str:
 
 
 def behavior_of(trained: TrainedRun) -> Policy:
-    """Return the last, hence best, behaviour policy of the run's data."""
+    """The last, hence best, behaviour policy of the run's data."""
     run = trained.config
-    names = level_policies(run.data.level)
+    names = quality_policies(run.data.level)
     if not names:
         raise ValueError(f"{run.data.level} data have no behaviour policy to film.")
     policy = load_behavior_policy(run.env.name, names[-1])
@@ -178,21 +185,26 @@ def behavior_of(trained: TrainedRun) -> Policy:
 
 
 def controllers(trained: TrainedRun) -> dict[str, Controller]:
-    """Return who takes over from the behaviour policy; the trained policy is last."""
+    """Controllers that take over from the behaviour policy, the trained policy last."""
+    name = type(trained.loss).__name__.removesuffix("Loss")
+    if trained.inverse_dynamics is None:
+        raise ValueError(
+            f"the {name}Loss of {trained.folder} holds no inverse dynamics model, as "
+            "losses with recovery_weight=0 do not; take a run with loss=osr."
+        )
     norm = trained.observation_norm
     driven = partial(
-        InverseDynamicsController, frozen_model(trained.loss), observation_norm=norm
+        InverseDynamicsController, trained.inverse_dynamics, observation_norm=norm
     )
     named: dict[str, Controller] = {
         MODEL + rule: partial(driven, rule=rule) for rule in RULES
     }
     policy = deterministic_policy(trained.actor, norm)
-    name = type(trained.loss).__name__.removesuffix("Loss")
     return named | {f"{name} policy": lambda references: policy}
 
 
 def choose(cfg: DictConfig, kept: list[int], up: list[list[bool]]) -> tuple[int, str]:
-    """Return which episode to film, and why that."""
+    """Number of the episode to film, and the reason."""
     if cfg.film_seed is not None:
         if cfg.film_seed - cfg.seed not in kept:
             raise ValueError(

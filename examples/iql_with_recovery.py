@@ -1,8 +1,8 @@
 """State recovery added to a loss that knows nothing of it: TorchRL's IQLLoss.
 
 A point mass with data near the origin. The policy is trained with and without the
-recovery term; then its state is pushed out of the data, and its next state measured
-against the s' that followed in the data. ``python iql_with_recovery.py [steps]``
+recovery term; then its state is pushed out of the data, and its next state is
+compared with the s' in the data. ``python iql_with_recovery.py [steps]``
 """
 
 import sys
@@ -37,31 +37,31 @@ def transitions(number):
     """Start all over [-1, 1]^3; a noisy controller is rewarded near the origin."""
     state = 2 * torch.rand(number, 3) - 1
     action = (-0.3 * state + 0.3 * torch.randn(number, 3)).clamp(-0.95, 0.95)
-    following, no = move(state, action), torch.zeros(number, 1, dtype=torch.bool)
-    reward = -following.norm(dim=-1, keepdim=True)
+    next_state, no = move(state, action), torch.zeros(number, 1, dtype=torch.bool)
+    reward = -next_state.norm(dim=-1, keepdim=True)
     data = TensorDict({"observation": state, "action": action}, [number])
-    data["next"] = {"observation": following, "reward": reward, "done": no}
+    data["next"] = {"observation": next_state, "reward": reward, "done": no}
     data["next", "terminated"] = no.clone()
     return data
 
 
-def train_model(buffer):
+def train_inverse_dynamics(buffer):
     """Learn which action leads from s to s', from the true states alone.
 
     The default takes the perturbed ones too, as if the data's action led from there to
     the same s'. Of a push as wide as this one that is far from true.
     """
-    model = tanh_gaussian_inverse_dynamics(3, 3, num_cells=CELLS)
-    loss = InverseDynamicsLoss(model, states="clean")
+    network = tanh_gaussian_inverse_dynamics(3, 3, num_cells=CELLS)
+    loss = InverseDynamicsLoss(network, states="clean")
     optimizer = torch.optim.Adam(loss.parameters(), lr=3e-3)
     for _ in range(STEPS):
         loss(buffer.sample())["loss_inverse_dynamics"].backward()
         optimizer.step()
         optimizer.zero_grad()
-    return model
+    return network
 
 
-def train_policy(buffer, model, recovery_weight):
+def train_policy(buffer, inverse_dynamics, recovery_weight):
     """Train by IQL plus the recovery term, which is nothing at weight 0."""
     head = nn.Sequential(MLP(3, 6, num_cells=CELLS), NormalParamExtractor())
     actor = ProbabilisticActor(
@@ -74,7 +74,9 @@ def train_policy(buffer, model, recovery_weight):
     iql = IQLLoss(actor, qvalue, value, expectile=0.7, temperature=3.0)
     iql.make_value_estimator(gamma=0.9)
     updater = SoftUpdate(iql, tau=5e-3)
-    recovery = StateRecoveryLoss(actor, model, recovery_weight=recovery_weight)
+    recovery = StateRecoveryLoss(
+        actor, inverse_dynamics, recovery_weight=recovery_weight
+    )
 
     # Both losses hold the same actor: its parameters are among those of IQL.
     optimizer = torch.optim.Adam(iql.parameters(), lr=1e-3)
@@ -91,7 +93,7 @@ def train_policy(buffer, model, recovery_weight):
 
 @torch.no_grad()
 def distance(actor, data, push):
-    """Return how far from the data's s' the policy gets from the pushed state."""
+    """Mean distance between the policy's next state from a pushed state and s'."""
     state = data["observation"] + push
     policy = actor.get_dist(TensorDict({"observation": state}, data.batch_size))
     error = move(state, policy.deterministic_sample) - data["next", "observation"]
@@ -105,10 +107,10 @@ for seed in SEEDS:
     buffer.append_transform(StatePerturbation(std=PUSH))
     buffer.extend(transitions(2000))
     fresh, push = transitions(2000), PUSH * torch.randn(2000, 3)
-    model = train_model(buffer)
+    inverse_dynamics = train_inverse_dynamics(buffer)
     for weight, rows in results.items():
         torch.manual_seed(seed)
-        actor = train_policy(buffer, model, weight)
+        actor = train_policy(buffer, inverse_dynamics, weight)
         rows.append([distance(actor, fresh, 0.0), distance(actor, fresh, push)])
 
 print(f"Distance of the policy's next state from the data's, mean of seeds {SEEDS}")

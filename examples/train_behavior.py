@@ -38,7 +38,7 @@ from torchrl_osr.data import (
     save_behavior_policy,
     update_behavior_card,
 )
-from torchrl_osr.data.behavior import LOG_STD_MAX, LOG_STD_MIN, Affine
+from torchrl_osr.data.collect.behavior import LOG_STD_MAX, LOG_STD_MIN, Affine
 
 WIDTH = 256
 FRAMES = 32  # environment steps between equally many gradient steps

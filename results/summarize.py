@@ -14,8 +14,7 @@ from typing import Any
 
 import pandas as pd
 
-from torchrl_osr.evaluation import mean_interval
-from torchrl_osr.evaluation.statistics import wilson_interval
+from torchrl_osr.evaluation import mean_interval, wilson_interval
 from torchrl_osr.report import read_records, read_runs
 from torchrl_osr.report.scores import by_run, estimate, recent, undisturbed
 

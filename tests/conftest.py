@@ -34,39 +34,59 @@ def _seeded() -> None:
     torch.manual_seed(0)
 
 
-@pytest.fixture
-def make_batch():
-    """Return a factory of random transitions, float64, any batch size.
+@pytest.fixture(scope="session")
+def transitions():
+    """Return a factory of random transitions, flat or of any batch size.
 
-    Of every five rows one is terminated and one is cut by a time limit. The numbers
-    come from a generator of their own: equal sizes give equal batches.
+    ``transitions(64, observation=11, action=3)``. Of every five rows one is terminated
+    and one is cut by a time limit. The numbers come from a generator of their own:
+    equal sizes and seeds give equal transitions.
     """
 
-    def make(*size: int, twin: bool = True) -> TensorDict:
-        generator = torch.Generator().manual_seed(7)
+    def make(
+        *size: int,
+        observation: int = OBSERVATION_DIM,
+        action: int = ACTION_DIM,
+        dtype: torch.dtype = torch.float32,
+        seed: int = 7,
+    ) -> TensorDict:
+        generator = torch.Generator().manual_seed(seed)
 
         def normal(dim: int) -> torch.Tensor:
-            return torch.randn(*size, dim, generator=generator, dtype=torch.float64)
+            return torch.randn(*size, dim, generator=generator, dtype=dtype)
 
         row = torch.arange(torch.Size(size).numel()).reshape(*size, 1) % 5
-        observation = normal(OBSERVATION_DIM)
-        batch = TensorDict(
+        state = normal(observation)
+        return TensorDict(
             {
-                "observation": observation,
-                "action": 0.9 * torch.tanh(normal(ACTION_DIM)),
+                "observation": state,
+                "action": 0.9 * torch.tanh(normal(action)),
                 "next": {
-                    "observation": observation + 0.5 * normal(OBSERVATION_DIM),
+                    "observation": state + 0.5 * normal(observation),
                     "reward": normal(1),
                     "done": (row == 1) | (row == 2),
                     "terminated": row == 1,
+                    "truncated": row == 2,
                 },
             },
             size,
         )
+
+    return make
+
+
+@pytest.fixture
+def make_batch(transitions):
+    """Return a factory of what losses read: float64, perturbed states if ``twin``."""
+
+    def make(*size: int, twin: bool = True) -> TensorDict:
+        batch = transitions(*size, dtype=torch.float64).exclude(("next", "truncated"))
         if twin:
-            batch["perturbed", "observation"] = observation + 0.1 * normal(
-                OBSERVATION_DIM
+            generator = torch.Generator().manual_seed(8)
+            noise = torch.randn(
+                batch["observation"].shape, generator=generator, dtype=torch.float64
             )
+            batch["perturbed", "observation"] = batch["observation"] + 0.1 * noise
         return batch
 
     return make

@@ -8,10 +8,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tensordict import TensorDict
 from torch.distributions import Categorical, Normal, kl_divergence
 from torchrl.modules import TanhNormal
-from torchrl.objectives.value import TD0Estimator
 
 from torchrl_osr import functional
 
@@ -302,12 +300,56 @@ def test_discrete_policy_value_of_an_action_that_is_never_taken(alpha) -> None:
     assert logits.grad[1] == 0
 
 
-def test_conservative_gap_over_all_actions_is_the_exact_one() -> None:
+# Actions (log 2, log 6) over densities (1/2, 2): log(4 + 3), and at temperature 2 the
+# values by square roots and the densities as they are, 2 log(2 sqrt 2 + sqrt(6) / 2).
+SOFT_MAXIMUM = [(1.0, 1.945910), (2.0, 2.799000)]
+
+
+@pytest.mark.parametrize(("temperature", "expected"), SOFT_MAXIMUM)
+def test_soft_maximum_divides_by_densities_at_every_temperature(
+    temperature, expected
+) -> None:
+    qvalue, log_prob = torch.tensor([[2.0, 6.0], [0.5, 2.0]]).double().log()
+    value = functional.soft_maximum(qvalue, log_prob, temperature=temperature)
+    assert value.item() == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize("temperature", [0.5, 1.0, 3.0])
+def test_soft_maximum_of_draws_estimates_an_integral(temperature) -> None:
+    # Q(a) = 2 a on [-1, 1], drawn with density (2 + a) / 4, whose quantiles are
+    # sqrt(1 + 8 u) - 2. The integral of e^{Q / tau} is tau sinh(2 / tau).
+    number = 100_000
+    share = (torch.arange(number, dtype=torch.float64) + 0.5) / number
+    action = (1 + 8 * share).sqrt() - 2
+    density = ((2 + action) / 4).log()
+    value = functional.soft_maximum(2 * action, density, temperature=temperature)
+    estimate = value.item() - temperature * math.log(number)
+    integral = temperature * math.sinh(2 / temperature)
+    assert estimate == pytest.approx(temperature * math.log(integral), abs=1e-8)
+
+
+def test_soft_maximum_of_certain_actions_is_the_plain_log_sum_exp() -> None:
+    # As discrete CQL has it: every action once, and for certain.
     qvalue = torch.tensor([[1.0, 2.0, -3.0]], dtype=torch.float64)
-    zero = torch.zeros_like(qvalue)
-    gap = functional.conservative_gap(qvalue, zero, qvalue[:, 1], temperature=2.0)
-    total = sum(math.exp(value / 2) for value in (1, 2, -3))
-    assert gap.item() == pytest.approx(2 * math.log(total) - 2)
+    value = functional.soft_maximum(qvalue, torch.zeros(3), temperature=2.0)
+    total = sum(math.exp(each / 2) for each in (1, 2, -3))
+    assert value.item() == pytest.approx(2 * math.log(total), abs=1e-12)
+
+
+@pytest.mark.parametrize("temperature", [0.5, 1.0, 3.0])
+def test_soft_maximum_of_zero_values_is_a_constant(temperature) -> None:
+    # K = 10, A = 3: all 30 densities those of the cube of side 2, tau log(30 * 8).
+    log_prob = torch.full((4, 30), -3 * math.log(2), dtype=torch.float64)
+    zero = torch.zeros_like(log_prob)
+    value = functional.soft_maximum(zero, log_prob, temperature=temperature)
+    expected = temperature * math.log(240)
+    torch.testing.assert_close(value, torch.full_like(value, expected))
+
+
+def test_conservative_gap_is_what_samples_are_valued_above_the_data() -> None:
+    soft_maximum, data = torch.tensor([[3.0, -1.0], [0.5, 2.0]])
+    gap = functional.conservative_gap(soft_maximum, data)
+    torch.testing.assert_close(gap, torch.tensor([2.5, -3.0]))
 
 
 def test_temperature_rises_when_the_policy_has_too_little_entropy() -> None:
@@ -320,30 +362,6 @@ def test_temperature_rises_when_the_policy_has_too_little_entropy() -> None:
     assert log_prob.grad is None
 
 
-@pytest.mark.parametrize("temperature", [0.5, 1.0, 3.0])
-def test_conservative_gap_at_zero_values_is_a_constant(temperature) -> None:
-    # K = 10, A = 3, all 30 densities those of the cube of side 2: tau log(30 8^1/tau).
-    log_prob = torch.full((4, 30), -3 * math.log(2), dtype=torch.float64)
-    zero = torch.zeros_like(log_prob)
-    gap = functional.conservative_gap(
-        zero, log_prob, zero[:, 0], temperature=temperature
-    )
-    expected = temperature * math.log(30) + 3 * math.log(2)
-    torch.testing.assert_close(gap, torch.full_like(gap, expected))
-
-
-def test_conservative_gap_matches_a_plain_sum() -> None:
-    sampled, log_prob = torch.randn(2, 5, 6, dtype=torch.float64)
-    data = torch.randn(5, dtype=torch.float64)
-    gap = functional.conservative_gap(sampled, log_prob, data, temperature=2.0)
-    for i in range(5):
-        total = sum(
-            math.exp((q - p) / 2)
-            for q, p in zip(sampled[i].tolist(), log_prob[i].tolist(), strict=True)
-        )
-        assert gap[i].item() == pytest.approx(2 * math.log(total) - data[i].item())
-
-
 def test_value_constraint_is_a_difference_of_means() -> None:
     policy = torch.tensor([[1.0, 4.0], [-1.0, 3.0]])
     model = torch.tensor([[2.0, 0.0, 1.0], [3.0, 3.0, 3.0]])
@@ -352,36 +370,74 @@ def test_value_constraint_is_a_difference_of_means() -> None:
     torch.testing.assert_close(value, torch.tensor([1.5, -2.0]))
 
 
-# Values (log 2, log 6) over densities (1/2, 2) are weights (4, 3), the model's mean is
-# 1: log 7 - 1, and at temperature 2 by square roots 2 log(2 + sqrt 3) - 1.
-@pytest.mark.parametrize(("temperature", "expected"), [(1, 0.945910), (2, 1.633916)])
+# The actions of SOFT_MAXIMUM, and a mean of 1 of the model's.
+@pytest.mark.parametrize(("temperature", "expected"), SOFT_MAXIMUM)
 def test_value_constraint_weighs_actions_by_density(temperature, expected) -> None:
     policy, log_prob = torch.tensor([[2.0, 6.0], [0.5, 2.0]]).double().log()
     model = torch.tensor([2.0, 0.0, 1.0]).double()
     value = functional.value_constraint(
         policy, model, log_prob=log_prob, temperature=temperature
     )
-    assert value.item() == pytest.approx(expected, abs=1e-6)
+    assert value.item() == pytest.approx(expected - 1, abs=1e-6)
 
 
-def test_target_ignores_the_value_of_a_terminated_state_even_nan() -> None:
-    reward = torch.tensor([1.0, 2.0], requires_grad=True)
-    next_qvalue = torch.tensor([[10.0, math.nan], [8.0, math.inf]])
-    terminated = torch.tensor([False, True])
-    target = functional.td_target(reward, terminated, next_qvalue, 0.5)
-    torch.testing.assert_close(target, torch.tensor([5.0, 2.0]))
-    target.sum().backward()
-    assert reward.grad.tolist() == [1.0, 1.0]
-
-
-def test_target_equals_torchrls_one_step_estimator(make_batch) -> None:
-    batch = make_batch(10)
-    next_qvalue = torch.randn(3, 10, dtype=torch.float64)
-    flat = batch["next"].apply(lambda tensor: tensor.squeeze(-1))
-    target = functional.td_target(flat["reward"], flat["terminated"], next_qvalue, 0.97)
-    next_value = next_qvalue.min(0).values.unsqueeze(-1)
-    batch["next", "state_value"] = next_value
-    witness = TD0Estimator(gamma=0.97, value_network=None).value_estimate(
-        TensorDict(batch, [10])
+def test_bootstrap_value_is_the_lowest_critics_with_or_without_entropy() -> None:
+    qvalue = torch.tensor([[1.0, 5.0], [2.0, -3.0]])
+    torch.testing.assert_close(
+        functional.bootstrap_value(qvalue), torch.tensor([1.0, -3.0])
     )
-    torch.testing.assert_close(target, witness.squeeze(-1), rtol=1e-7, atol=1e-7)
+    # By hand: 1 - .2 * .5 and -3 - .2 * -1.
+    value = functional.bootstrap_value(qvalue, torch.tensor([0.5, -1.0]), 0.2)
+    torch.testing.assert_close(value, torch.tensor([0.9, -2.8]))
+
+
+def test_cloning_error_is_a_mean_over_the_actions_dimensions() -> None:
+    action = torch.tensor([[0.5, -1.0], [0.2, 0.2]], requires_grad=True)
+    value = functional.cloning_error(action, torch.tensor([[0.0, 1.0], [0.2, 0.2]]))
+    # By hand: (.25 + 4) / 2 and 0; its gradient 2 (pi - a) / A.
+    torch.testing.assert_close(value, torch.tensor([2.125, 0.0]))
+    value.sum().backward()
+    torch.testing.assert_close(action.grad, torch.tensor([[0.5, -2.0], [0.0, 0.0]]))
+
+
+def test_td3_bc_objective_weighs_values_by_their_magnitude() -> None:
+    qvalue = torch.tensor([3.0, -1.0], requires_grad=True)
+    error = torch.tensor([0.25, 2.0], requires_grad=True)
+    # By hand: E|Q| = 2 and alpha / 2 = 1.25; .25 - 3.75 and 2 + 1.25.
+    value = functional.td3_bc_objective(qvalue, error, torch.tensor(2.0), 2.5)
+    torch.testing.assert_close(value, torch.tensor([-3.5, 3.25]))
+    value.sum().backward()
+    assert qvalue.grad.tolist() == [-1.25, -1.25]
+    assert error.grad.tolist() == [1.0, 1.0]
+
+
+def test_lagrange_terms_by_hand() -> None:
+    gap = torch.tensor([1.0, 4.0], requires_grad=True)
+    log_multiplier = torch.tensor(math.log(3.0), requires_grad=True)
+    critic, dual = functional.lagrange_terms(gap, log_multiplier, 2.0)
+    torch.testing.assert_close(critic, torch.tensor([-3.0, 6.0]))
+    torch.testing.assert_close(dual, torch.tensor([3.0, -6.0]))
+    (critic.sum() + dual.sum()).backward()
+    torch.testing.assert_close(gap.grad, torch.tensor([3.0, 3.0]))
+    torch.testing.assert_close(log_multiplier.grad, torch.tensor(-3.0))
+
+
+# Three critics: (0, 90, 180) degrees have the pairs 0, 0, -1 twice each.
+@pytest.mark.parametrize(
+    ("gradients", "expected"),
+    [
+        ([[2.0, 0.0], [0.5, 0.0]], 2.0),
+        ([[2.0, 0.0], [-1.0, 0.0]], -2.0),
+        ([[1.0, 0.0], [0.0, 3.0], [-2.0, 0.0]], -1.0),
+        ([[1.0, 1.0], [1.0, 1.0], [1.0, 1.0]], 3.0),
+    ],
+)
+def test_diversity_by_hand(gradients, expected) -> None:
+    value = functional.gradient_diversity(torch.tensor(gradients).unsqueeze(1))
+    torch.testing.assert_close(value, torch.tensor([expected]))
+
+
+def test_diversity_of_a_dead_critic_is_finite() -> None:
+    gradients = torch.zeros(2, 1, 3, requires_grad=True)
+    functional.gradient_diversity(gradients).sum().backward()
+    assert gradients.grad.isfinite().all()

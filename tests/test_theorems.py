@@ -27,7 +27,7 @@ def simplex(*shape: int) -> Tensor:
     return draw / draw.sum(-1, keepdim=True)
 
 
-def following(policy: Tensor, dynamics: Tensor) -> Tensor:
+def next_states(policy: Tensor, dynamics: Tensor) -> Tensor:
     """``P(s' | s, pi)``: ``[n, A]`` and ``[n, A, S]`` to ``[n, S]``."""
     return torch.einsum("na,nas->ns", policy, dynamics)
 
@@ -35,7 +35,7 @@ def following(policy: Tensor, dynamics: Tensor) -> Tensor:
 def averaged_model(next_state: Tensor, policy: Tensor, dynamics: Tensor) -> Tensor:
     """Mean over ``s'`` of the inverse dynamics model, equation (6), ``[n, A]``."""
     joint = policy.unsqueeze(-1) * dynamics
-    model = joint / following(policy, dynamics).unsqueeze(1)
+    model = joint / next_states(policy, dynamics).unsqueeze(1)
     return torch.einsum("ns,nas->na", next_state, model)
 
 
@@ -58,7 +58,7 @@ def problems(shift: float = 0.3) -> SimpleNamespace:
     behaviour, off_behaviour, policy = (simplex(*shape) for _ in range(3))
     dynamics = simplex(*shape, STATES)
     off_dynamics = (1 - shift) * dynamics + shift * simplex(*shape, STATES)
-    next_state = following(behaviour, dynamics)
+    next_state = next_states(behaviour, dynamics)
     return SimpleNamespace(
         behaviour=behaviour,
         off_behaviour=off_behaviour,
@@ -92,7 +92,7 @@ def test_theorem_1_is_one_step_towards_the_minimiser_and_not_the_minimiser() -> 
     dynamics, target = mdp.off_dynamics, mdp.target
     again = averaged_model(mdp.next_state, target, dynamics)
     start, once, twice = (
-        divergence(mdp.next_state, following(policy, dynamics))
+        divergence(mdp.next_state, next_states(policy, dynamics))
         for policy in (mdp.off_behaviour, target, again)
     )
     assert (once <= start).sum() == PROBLEMS
@@ -100,7 +100,7 @@ def test_theorem_1_is_one_step_towards_the_minimiser_and_not_the_minimiser() -> 
     assert ((again - target).abs().sum(-1) < 1e-6).sum() == 0
     for _ in range(300):
         again = averaged_model(mdp.next_state, again, dynamics)
-    best = divergence(mdp.next_state, following(again, dynamics))
+    best = divergence(mdp.next_state, next_states(again, dynamics))
     # Far from it, too: most of the way is left, and the policies are not alike.
     assert ((once - best) / (start - best)).median() > 0.5
     assert (again - target).abs().sum(-1).median() > 0.5
@@ -113,9 +113,9 @@ def test_theorem_1_is_exact_where_every_action_has_its_own_next_state() -> None:
         torch.eye(STATES, dtype=torch.float64)[torch.rand(*shape).argsort(-1)]
         for _ in range(2)
     )
-    next_state = following(behaviour, dynamics)
+    next_state = next_states(behaviour, dynamics)
     target = averaged_model(next_state, off_behaviour, off_dynamics)
-    reached = following(target, off_dynamics)
+    reached = next_states(target, off_dynamics)
     torch.testing.assert_close(reached, next_state, rtol=0, atol=1e-12)
 
 
@@ -126,7 +126,7 @@ def test_theorem_1_what_is_left_falls_with_the_square_of_the_distance() -> None:
         mdp = problems(shift)
         # One behaviour policy: s^ differs from s by its dynamics alone.
         target = averaged_model(mdp.next_state, mdp.behaviour, mdp.off_dynamics)
-        reached = following(target, mdp.off_dynamics)
+        reached = next_states(target, mdp.off_dynamics)
         left.append(divergence(mdp.next_state, reached).mean().item())
     assert left[0] / left[1] == pytest.approx(100, rel=0.2)
     assert left[1] / left[2] == pytest.approx(100, rel=0.03)
@@ -142,7 +142,7 @@ def test_theorem_2_bounds_the_gap_to_the_behaviour_policy_for_positive_values() 
     in all with ``|Q|`` on the right.
     """
     mdp = problems()
-    off_next = following(mdp.off_behaviour, mdp.off_dynamics)
+    off_next = next_states(mdp.off_behaviour, mdp.off_dynamics)
     delta = (mdp.next_state / off_next - 1).abs().amax(-1)
 
     def gap(qvalue: Tensor) -> Tensor:

@@ -6,12 +6,13 @@ Learning" (Jiang et al., NeurIPS 2023), https://openreview.net/forum?id=4gLWjSaw
 
 from torchrl_osr.objectives import (
     Adversary,
-    DiscreteInverseDynamicsLoss,
     DiscreteOSRLoss,
+    EDACLoss,
     InverseDynamicsLoss,
     OSRLoss,
     OSRVLoss,
     StateRecoveryLoss,
+    TD3BCLoss,
 )
 from torchrl_osr.transforms import StatePerturbation
 
@@ -19,12 +20,13 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Adversary",
-    "DiscreteInverseDynamicsLoss",
     "DiscreteOSRLoss",
+    "EDACLoss",
     "InverseDynamicsLoss",
     "OSRLoss",
     "OSRVLoss",
     "StatePerturbation",
     "StateRecoveryLoss",
+    "TD3BCLoss",
     "__version__",
 ]

@@ -1,29 +1,104 @@
-"""Files: written whole or not at all, read within bounds, room looked for first."""
+"""Files: written whole or not at all, read within bounds, told apart by checksums."""
 
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
+import math
 import os
 import shutil
 import stat
 import zipfile
 import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import IO, Any
+from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.lib.format import MAGIC_PREFIX
 from numpy.typing import NDArray
 
 # Results of 10,000 pairs of episodes at ten levels have 40 MB.
 MAX_JSON_BYTES = 256 * 2**20
 
-# What a small archive may become in memory; a million rows of humanoid have 3 GB.
+# What a small file may become in memory; a million rows of humanoid have 3 GB.
 MAX_UNPACKED_BYTES = 4 * 2**30
+
+CHECKSUM = "checksum"
+"""Where a record has the SHA-256 of everything else in it."""
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[BinaryIO]:
+    """Open a file for writing that readers find whole, or as it was before.
+
+    It is written beside its place, synced to the disk and renamed.
+
+    Args:
+        path: of the file, in a folder that exists.
+
+    Raises:
+        OSError: naming ``path``, if it cannot be written.
+    """
+    beside = path.with_name(f".{path.name}.new")
+    try:
+        with beside.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(beside, path)
+    except OSError as error:
+        raise OSError(
+            error.errno, f"cannot write the file ({error.strerror})", str(path)
+        ) from error
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Write a file so that a reader finds the old one or the new one, never a part.
+
+    Raises:
+        OSError: naming ``path``, if it cannot be written.
+    """
+    with whole_file(path) as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write ``value`` as JSON, atomically; NaN and infinity, which JSON lacks, as null.
+
+    Raises:
+        OSError: naming ``path``, if it cannot be written.
+    """
+    text = json.dumps(finite_or_none(value), indent=1, allow_nan=False)
+    write_atomically(path, text + "\n")
+
+
+def finite_or_none(value: Any) -> Any:
+    """``value`` with ``None`` in place of every float that is not finite.
+
+    Args:
+        value: JSON-compatible: mappings and lists are copied, all else is kept.
+
+    Examples:
+        >>> from torchrl_osr._files import finite_or_none
+        >>> finite_or_none({"r2": [0.5, float("-inf")]})
+        {'r2': [0.5, None]}
+    """
+    if isinstance(value, Mapping):
+        return {key: finite_or_none(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite_or_none(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
 
 
 def read_text(path: Path, *, max_bytes: int = MAX_JSON_BYTES) -> str:
-    """Read a small text file, and not more of it than that.
+    """Text of a small file.
 
     Args:
         path: the file.
@@ -33,21 +108,21 @@ def read_text(path: Path, *, max_bytes: int = MAX_JSON_BYTES) -> str:
 
     Raises:
         OSError: it cannot be read.
-        ValueError: it is too large, or no UTF-8.
+        ValueError: it is too large, or not UTF-8.
     """
-    size = path.stat().st_size
-    if size <= max_bytes:
-        with path.open("rb") as file:
-            # A pipe or a file that grows has more than its size says.
-            content = file.read(max_bytes + 1)
-        size = len(content)
-    if size > max_bytes:
+    with path.open("rb") as file:
+        # Not its size: a pipe has none, and a file may grow.
+        content = file.read(max_bytes + 1)
+    if len(content) > max_bytes:
         raise ValueError(f"{path.name} has more than {max_bytes:,} bytes")
-    return content.decode("utf-8")
+    try:
+        return content.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path.name} is no text: {error}") from error
 
 
 def read_json(path: Path, *, max_bytes: int = MAX_JSON_BYTES) -> dict[str, Any]:
-    """Read a JSON object.
+    """JSON object that a file holds.
 
     Args:
         path: the file.
@@ -63,10 +138,10 @@ def read_json(path: Path, *, max_bytes: int = MAX_JSON_BYTES) -> dict[str, Any]:
 
 
 def parse_json(text: str, name: str) -> dict[str, Any]:
-    """Return the JSON object that a file holds.
+    """JSON object in a text.
 
     Args:
-        text: of the file.
+        text: of the file, or of a line of it.
         name: of the file, for the message.
 
     Raises:
@@ -81,111 +156,104 @@ def parse_json(text: str, name: str) -> dict[str, Any]:
     return value
 
 
-def read_arrays(
-    file: IO[bytes], *, max_bytes: int = MAX_UNPACKED_BYTES
-) -> dict[str, NDArray[Any]]:
-    """Return the plain arrays of a NumPy archive; nothing is unpickled.
-
-    Args:
-        file: the archive, opened.
-
-    Keyword Args:
-        max_bytes: see :func:`refuse_archive`.
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Plain arrays of a NumPy archive (``.npz``), by name; nothing is unpickled.
 
     Raises:
         OSError: it cannot be read.
-        ValueError: no archive, a damaged one, one that would unpack to too much, or an
-            array of objects.
+        ValueError: it is no archive, damaged, holds objects, or would unpack to more
+            than :func:`check_unpacked_size` allows; the message names the file.
     """
     try:
-        with zipfile.ZipFile(file) as archive:
-            refuse_archive(archive, max_bytes=max_bytes)
-            return {
-                name.removesuffix(".npy"): _read_array(archive, name)
-                for name in archive.namelist()
-            }
-    except (MemoryError, OverflowError) as error:
-        raise ValueError("an array announces more rows than there are") from error
-    except (EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(str(error)) from error
+        with path.open("rb") as file:
+            if file.read(len(MAGIC_PREFIX)) == MAGIC_PREFIX:
+                raise ValueError("it is a single array")
+        with zipfile.ZipFile(path) as archive:
+            sizes = [member.file_size for member in archive.infolist()]
+        check_unpacked_size(path, sum(sizes))
+        with np.load(path, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays}
+    except (
+        *(EOFError, MemoryError, NotImplementedError, OverflowError),
+        *(ValueError, zipfile.BadZipFile, zlib.error),
+    ) as error:
+        raise ValueError(
+            f"{path} is no NumPy archive of plain arrays, or damaged: {error}"
+        ) from error
 
 
-def _read_array(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
-    with archive.open(name) as member:
-        array: NDArray[Any] = np.lib.format.read_array(member, allow_pickle=False)
-        return array
-
-
-def refuse_archive(archive: zipfile.ZipFile, *, max_bytes: int = 0) -> None:
-    """Raise if a ZIP archive unpacks to more than it may, or to another place.
+def check_unpacked_size(path: Path, unpacked: int) -> None:
+    """Raise if a file announces more than fits in memory.
 
     Args:
-        archive: opened; nothing but its table of contents is looked at. No more than
-            the sizes in there is ever unpacked.
-
-    Keyword Args:
-        max_bytes: that all members may have together, however well they are packed.
-            What is stored unpacked always may: those bytes are in the file. Default:
-            0, only what is stored so.
+        path: the file; as many bytes as it has are always allowed.
+        unpacked: bytes that its contents would have in memory.
 
     Raises:
-        ValueError: naming the member, or both sizes.
+        ValueError: more than both 4 GiB and the file's own size.
     """
-    members = archive.infolist()
-    for member in members:
+    most = max(path.stat().st_size, MAX_UNPACKED_BYTES)
+    if unpacked > most:
+        raise ValueError(
+            f"{path.name} would unpack to {unpacked:,} bytes; at most {most:,} are "
+            "read, more only without compression"
+        )
+
+
+def refuse_archive(archive: zipfile.ZipFile) -> None:
+    """Raise if a member of a ZIP archive would be unpacked to another place.
+
+    Raises:
+        ValueError: naming the member: its path leads out, or it is a symbolic link.
+    """
+    for member in archive.infolist():
         names = PurePosixPath(member.filename), PureWindowsPath(member.filename)
         if any(".." in name.parts or name.anchor for name in names):
             raise ValueError(f"the path {member.filename!r} leads out of the archive")
         if stat.S_ISLNK(member.external_attr >> 16):
             raise ValueError(f"{member.filename!r} is a symbolic link")
-    assert archive.fp is not None
-    packed = archive.fp.seek(0, 2)
-    refuse_size(packed, sum(member.file_size for member in members), max_bytes)
 
 
-def refuse_size(
-    packed: int, unpacked: int, max_bytes: int = MAX_UNPACKED_BYTES
-) -> None:
-    """Raise if a file would unpack to more than it may.
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def checksummed(record: Mapping[str, Any]) -> dict[str, Any]:
+    """JSON-compatible record with the checksum of its contents in it.
+
+    Examples:
+        >>> from torchrl_osr._files import check_checksum, checksummed
+        >>> record = checksummed({"rows": 7})
+        >>> check_checksum(record, "card.json")
+        >>> check_checksum(record | {"rows": 8}, "card.json")
+        Traceback (most recent call last):
+            ...
+        ValueError: the checksum of card.json is wrong
+    """
+    return dict(record) | {CHECKSUM: _checksum(record)}
+
+
+def check_checksum(record: Mapping[str, Any], name: str) -> None:
+    """Raise unless a record is as :func:`checksummed` made it.
 
     Args:
-        packed: bytes of the file; as many always may.
-        unpacked: what its contents announce.
-        max_bytes: that are allowed, however well they are packed. Default: 4 GiB.
+        record: as it was read.
+        name: of its file, for the message.
 
     Raises:
-        ValueError: naming both sizes.
+        ValueError: it was changed, or has no checksum.
     """
-    if unpacked > max(packed, max_bytes):
-        raise ValueError(
-            f"it has {packed:,} bytes and would unpack to {unpacked:,}; at most "
-            f"{max(packed, max_bytes):,} are read, more only without compression"
-        )
+    if record.get(CHECKSUM) != _checksum(record):
+        flaw = "wrong" if CHECKSUM in record else "missing"
+        raise ValueError(f"the checksum of {name} is {flaw}")
 
 
-def write_atomically(path: Path, content: str | bytes) -> None:
-    """Write a file so that a reader finds the old one or the new one, never a part.
-
-    Raises:
-        OSError: naming ``path``, if it cannot be written.
-    """
-    beside = path.with_name(f".{path.name}.new")
-    try:
-        with beside.open("wb") as file:
-            file.write(content.encode() if isinstance(content, str) else content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(beside, path)
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        raise OSError(
-            error.errno, f"cannot write the run's file ({error.strerror})", str(path)
-        ) from error
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write ``value`` as JSON, atomically; refuse NaN, which is not JSON."""
-    write_atomically(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
+def _checksum(record: Mapping[str, Any]) -> str:
+    # Sorted: the order of a JSON object's keys says nothing.
+    rest = {key: value for key, value in record.items() if key != CHECKSUM}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
 
 def check_disk_space(folder: Path | str, needed_bytes: int, what: str) -> None:
@@ -196,7 +264,7 @@ def check_disk_space(folder: Path | str, needed_bytes: int, what: str) -> None:
     Args:
         folder: need not be there yet.
         needed_bytes: how much will be written.
-        what: shall be written, in words.
+        what: will be written there, in words.
 
     Raises:
         OSError: ``ENOSPC``, with what is needed, what is free and what to do.
@@ -220,7 +288,7 @@ def check_disk_space(folder: Path | str, needed_bytes: int, what: str) -> None:
 
 
 def _readable(size: int) -> str:
-    """Return a number of bytes in the unit that people use."""
+    """Number of bytes in the unit that people use."""
     for power, unit in ((3, "GB"), (2, "MB"), (1, "kB")):
         if size >= 1000**power:
             return f"{size / 1000**power:.1f} {unit}"

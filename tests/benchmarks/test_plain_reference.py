@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
-
 import pytest
 import torch
-from plain_reference import Batch, Noise, PlainOSR
+from contenders import unpack
+from plain_reference import Noise, PlainOSR
 from torchrl.objectives import SoftUpdate
 
 from torchrl_osr import OSRLoss
@@ -32,7 +31,7 @@ def both() -> tuple[OSRLoss, SoftUpdate, PlainOSR]:
     plain = PlainOSR(S, A, CELLS, num_random=K)
     pairs = [
         (actor, [plain.actor]),
-        (model, [plain.model]),
+        (model, [plain.inverse_dynamics]),
         (critics[0], [plain.critic_1, plain.target_1]),
         (critics[1], [plain.critic_2, plain.target_2]),
     ]
@@ -53,18 +52,6 @@ def both() -> tuple[OSRLoss, SoftUpdate, PlainOSR]:
     return loss, updater, plain
 
 
-def unpack(batch) -> Batch:
-    return Batch(
-        state=batch["observation"],
-        action=batch["action"],
-        reward=batch["next", "reward"].squeeze(-1),
-        next_state=batch["next", "observation"],
-        done=batch["next", "done"].squeeze(-1),
-        terminated=batch["next", "terminated"].squeeze(-1),
-        perturbed=batch["perturbed", "observation"],
-    )
-
-
 def draw_as_ours(*_) -> Noise:
     """Torch's draws in the order in which OSRLoss makes them, K before B there."""
 
@@ -76,8 +63,9 @@ def draw_as_ours(*_) -> Noise:
     uniform = 2 * torch.rand(K, B, A, **like) - 1
     proposals = torch.randn(K, 2, B, A, **like)
     target = torch.randn(B, A, **like)
-    current, following = swap(proposals[:, 0]), swap(proposals[:, 1])
-    return Noise(actor, target, swap(uniform), current, following)
+    return Noise(
+        actor, target, swap(uniform), swap(proposals[:, 0]), swap(proposals[:, 1])
+    )
 
 
 def test_losses_and_gradients_equal_ours(both, make_batch, check) -> None:
@@ -121,7 +109,7 @@ def test_update_moves_the_same_weights_as_ours(both, make_batch, check) -> None:
         optimizer.zero_grad()
         updater.step()
         torch.manual_seed(seed)
-        phases = list(plain.update(unpack(make_batch(B)), nullcontext))
+        phases = list(plain.update(unpack(make_batch(B))))
         assert phases == ["forward", *["backward", "optimizer"] * 3, "targets"]
     got = list(loss.actor_network_params.values(True, True))
     wanted = list(plain.actor.parameters())

@@ -7,7 +7,6 @@ import json
 import os
 import subprocess
 import sys
-from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,23 +15,22 @@ import pytest
 import torch
 import update_speed
 from contenders import GRAPH, ON_GPU, OURS, Size, make_contender, osr_products
-from diagnostics import count_flops
-from matmul_bound import Products, osr_passes, total_flops
+from matmul_bound import Products, count_flops, osr_passes, total_flops
 from speed_report import tables
 from update_speed import PRECISIONS, summarize
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "update_speed.py"
 NUMBERS = [
     "updates_per_cpu_second", "updates_per_second", "ratio", "ratio_lowest",
-    "ratio_highest", "products_share", "page_faults", "peak_memory_bytes",
-    "operations", "kernels", "host_reads", "flops",
+    "ratio_highest", "products_share",
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
+@pytest.mark.parametrize("autocast", [False, True])
 @pytest.mark.parametrize("name", ["hopper-2x64", "halfcheetah-3x32"])
-def test_products_are_those_of_our_update(name, dtype) -> None:
-    passes, counted = osr_products(Size.parse(name), dtype, torch.device("cpu"))
+def test_products_are_those_of_our_update(name, autocast) -> None:
+    cpu = torch.device("cpu")
+    passes, counted = osr_products(Size.parse(name), cpu, autocast=autocast)
     assert total_flops(passes) == pytest.approx(counted, rel=0.03)
 
 
@@ -77,7 +75,6 @@ def test_file_has_every_contender_and_round(run) -> None:
             assert row["failure"] is None
             assert all(row[number] >= 0 for number in NUMBERS)
             assert len(row["rounds"]) == 2
-            assert sum(row["time_by_kind"].values()) == pytest.approx(1)
             # Round by round, and their medians, which of two rounds are their means:
             # the mean of seconds is not one over the mean of rates.
             cpu = [each["cpu_seconds"] for each in row["rounds"]]
@@ -93,7 +90,7 @@ def test_a_failure_is_told_and_ends_nothing_else(run) -> None:
     _, results, _ = run
     sizes = copy.deepcopy(results["sizes"])
     rows = sizes["hopper-1x8"]["bfloat16"]
-    failed = SimpleNamespace(rounds=[], diagnosis={}, failure="RuntimeError: dtypes")
+    failed = SimpleNamespace(rounds=[], failure="RuntimeError: dtypes")
     rows["OSR"] = summarize(failed, failed, failed, "cpu_seconds")
     assert rows["OSR"]["ratio"] is rows["OSR"]["updates_per_second"] is None
     text = tables({**results, "sizes": sizes})
@@ -114,45 +111,34 @@ def test_tables_are_printed_and_put_into_the_readme(run) -> None:
     assert (folder / "speed.png").stat().st_size > 10_000
 
 
-class WithoutGraph:
-    """Stands for CapturedUpdate where there is no GPU."""
-
-    def __init__(self, update, generators, device) -> None:
-        self.update = update
-
-    def __call__(self) -> None:
-        self.update()
-
-
+# Without a GPU, CudaGraphModule runs the update as it is.
+@pytest.mark.filterwarnings("ignore:This module is instantiated on a machine without")
+@pytest.mark.filterwarnings("ignore:Tensordict is registered in PyTree")
 def test_graph_reads_the_batch_and_moves_the_same_weights(monkeypatch) -> None:
-    monkeypatch.setattr(contenders, "CapturedUpdate", WithoutGraph)
-    size, device, weights = Size.parse("hopper-1x8"), torch.device("cpu"), []
+    size, device = Size.parse("hopper-1x8"), torch.device("cpu")
+    made, original = [], contenders.our_loss
+
+    def our_loss(*arguments):
+        made.append(original(*arguments))
+        return made[-1]
+
+    monkeypatch.setattr(contenders, "our_loss", our_loss)
     for name in ("OSR", GRAPH):
-        made, original = [], contenders.our_loss
-        monkeypatch.setattr(
-            contenders,
-            "our_loss",
-            lambda *arguments, made=made, original=original: (
-                made.append(original(*arguments)) or made[-1]
-            ),
-        )
         torch.manual_seed(0)
-        update, batches = make_contender(name, size, device)
+        update, batches = make_contender(name, size, device, autocast=False)
         for batch in batches[:3]:
-            list(update(batch, nullcontext))
-        weights.append(list(made[-1].state_dict().values()))
-    assert all(torch.equal(a, b) for a, b in zip(*weights, strict=True))
+            list(update(batch))
+    plain, graph = (loss.state_dict().values() for loss in made)
+    assert all(torch.equal(a, b) for a, b in zip(plain, graph, strict=True))
 
 
 @pytest.mark.parametrize(("device", "number"), [("cpu", 0), ("cuda", len(ON_GPU))])
 def test_graphs_and_compilation_take_part_on_a_gpu(monkeypatch, device, number) -> None:
     asked = []
 
-    def contender(name, precision, **_):
+    def contender(name, *_):
         asked.append(name)
-        return SimpleNamespace(
-            rounds=[], diagnosis={}, failure="", diagnose=list, close=list
-        )
+        return SimpleNamespace(rounds=[], failure="", close=list)
 
     monkeypatch.setattr(update_speed, "Contender", contender)
     update_speed.measure("hopper-1x8", precisions=["float32"], rounds=0, device=device)

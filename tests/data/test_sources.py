@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
+import os
+
 import h5py
 import numpy as np
 import pytest
 
 from torchrl_osr.data import (
+    RECORDED,
     export_minari,
+    is_memory_mapped,
     load_dataset,
     load_file,
     load_local_dataset,
     normalized_score,
+    write_memmap,
 )
+from torchrl_osr.data.read.recording import Conversion
 
 MIXTURE = {"random_share": 0.0, "num_transitions": 500, "seed": 0}
 
 
-@pytest.fixture(autouse=True)
-def _folders(tmp_path, monkeypatch):
-    monkeypatch.setenv("TORCHRL_OSR_CACHE", str(tmp_path))
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+pytestmark = pytest.mark.usefixtures("cache")
 
 
 @pytest.fixture
@@ -50,35 +53,37 @@ def write(path, data):
     )
 
 
-def test_levels_are_rolled_out(hopper):
+def test_qualities_are_rolled_out(hopper):
     data, manifest = load_dataset("hopper", "medium", env_id="Hopper-v5", **MIXTURE)
     assert (data == hopper[0]).all()
     assert manifest == hopper[1]
 
 
-@pytest.mark.parametrize("level", ["minari", "d4rl", "file"])
-def test_recorded_data_are_read(hopper, level, tmp_path):
-    path = {
-        "minari": "mine/hopper-v0",
-        "d4rl": str(tmp_path / "hopper.hdf5"),
-        "file": str(tmp_path / "hopper.npz"),
-    }[level]
-    if level == "minari":
-        export_minari(hopper[0], path)
-    else:
-        write(tmp_path / path, hopper[0])
+def write_recording(quality, folder, data):
+    """Write data as a source of that kind; return its path."""
+    if quality == "minari":
+        export_minari(data, "mine/hopper-v0")
+        return "mine/hopper-v0"
+    path = folder / {"d4rl": "hopper.hdf5", "file": "hopper.npz"}[quality]
+    write(path, data)
+    return str(path)
+
+
+@pytest.mark.parametrize("quality", RECORDED)
+def test_recorded_data_are_read(hopper, quality, tmp_path):
+    path = write_recording(quality, tmp_path, hopper[0])
     data, manifest = load_dataset(
-        "hopper", level, path=path, env_id="Hopper-v5", **MIXTURE
+        "hopper", quality, path=path, env_id="Hopper-v5", **MIXTURE
     )
     assert (data == hopper[0]).all()
-    assert manifest["level"] == level
+    assert manifest["quality"] == quality
     score = normalized_score("hopper", manifest["return"]["mean"])
     assert manifest["normalized_score"] == score
-    _, other = load_dataset("another", level, path=path)
+    _, other = load_dataset("another", quality, path=path)
     assert other["normalized_score"] is None
     assert other["return"] == manifest["return"]
     with pytest.raises(ValueError, match=r"11 observation and 3 .*Walker2d-v5 has 17"):
-        load_dataset("walker2d", level, path=path, env_id="Walker2d-v5")
+        load_dataset("walker2d", quality, path=path, env_id="Walker2d-v5")
 
 
 def test_a_set_without_a_complete_episode_has_no_score(tmp_path):
@@ -100,5 +105,58 @@ def test_settings_that_do_not_go_together_are_refused():
         load_dataset("hopper", "medium", path="x", **MIXTURE)
     with pytest.raises(ValueError, match=r"random_share=0\.5 .*it must be 0"):
         load_dataset("hopper", "file", path="x.npz", random_share=0.5)
-    with pytest.raises(ValueError, match="unknown level 'simple'"):
+    with pytest.raises(ValueError, match="unknown quality 'simple'"):
         load_dataset("hopper", "simple", **MIXTURE)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_rolled_out_data_on_disk_are_those_in_memory(share):
+    recipe = MIXTURE | {"random_share": share}
+    data, manifest = load_dataset("hopper", "medium", **recipe)
+    stored, described = load_dataset("hopper", "medium", **recipe, on_disk=True)
+    assert is_memory_mapped(stored)
+    assert (stored == data).all()
+    assert described["normalized_score"] == manifest["normalized_score"]
+
+
+@pytest.mark.parametrize("quality", RECORDED)
+@pytest.mark.parametrize("chunk", [130, 10_000])
+def test_recorded_data_on_disk_are_those_in_memory(
+    hopper, quality, chunk, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(Conversion.chunks, "__defaults__", (chunk,))
+    path = write_recording(quality, tmp_path, hopper[0])
+    options = {"env_id": "Hopper-v5", "path": path}
+    data, manifest = load_dataset("hopper", quality, **options)
+    stored, described = load_dataset("hopper", quality, **options, on_disk=True)
+    assert is_memory_mapped(stored)
+    assert (stored == data).all()
+    assert manifest.items() <= described.items()
+    with pytest.raises(ValueError, match="has 11 observation and 3 action entries"):
+        load_dataset("walker2d", quality, path=path, env_id="Walker2d-v5", on_disk=True)
+
+
+def test_a_source_that_has_changed_is_converted_anew(hopper, cache, tmp_path):
+    path = tmp_path / "hopper.hdf5"
+    write(path, hopper[0])
+    options = {"path": str(path), "on_disk": True}
+    for _ in range(2):
+        stored, _ = load_dataset("hopper", "d4rl", **options)
+        assert len(stored) == 500
+        assert len(list((cache / "recorded").glob("d4rl-*/"))) == 1
+    path.unlink()
+    write(path, hopper[0][:400])
+    os.utime(path, ns=(0, 0))  # clocks may be coarse
+    stored, _ = load_dataset("hopper", "d4rl", **options)
+    assert len(stored) == 400
+
+
+def test_a_set_that_was_written_by_hand(hopper, tmp_path):
+    write_memmap([hopper[0]], tmp_path / "mine", progress=False)
+    for on_disk in (False, True):
+        data, manifest = load_dataset(
+            "hopper", "file", path=str(tmp_path / "mine"), on_disk=on_disk
+        )
+        assert is_memory_mapped(data) == on_disk
+        assert (data == hopper[0]).all()
+        assert manifest["normalized_score"] is None

@@ -20,7 +20,6 @@ from torchrl_osr.envs import (
     StartStateNoise,
     StickyAction,
 )
-from torchrl_osr.evaluation.episodes import EpisodeEvaluator
 
 OFF = {
     "knock": lambda env: ActionKnock(env, 5, mode="torque", at=10**6),
@@ -192,21 +191,6 @@ def test_torchrl_reads_the_flags():
     rollout = env.rollout(6)
     assert rollout["next", "disturbed"].flatten().tolist() == [0, 0, 0, 1, 0, 0]
     assert rollout["next", "knock_steps"].flatten().tolist() == [0, 0, 0, 3, 0, 0]
-
-
-def test_the_batched_evaluator_pairs_clean_and_disturbed_episodes():
-    def policy(observation):
-        return torch.tanh(observation[:, :3] * 3)
-
-    evaluator = EpisodeEvaluator("Hopper-v5", num_episodes=3)
-    clean = evaluator(policy)
-    bare = evaluator.environments
-    for force, same in ((0.0, True), (300.0, False)):
-        evaluator.environments = [
-            ExternalPush(env, force, duration=10, at=2) for env in bare
-        ]
-        assert (evaluator(policy).returns == clean.returns).all() == same
-    evaluator.close()
 
 
 def test_no_mujoco_model_is_an_error():

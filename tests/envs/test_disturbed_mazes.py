@@ -16,7 +16,7 @@ from torchrl_osr.envs import (
     ObservationNoise,
     StartStateNoise,
 )
-from torchrl_osr.evaluation.recovery import Recorder
+from torchrl_osr.evaluation import Recorder
 
 ENV = "PointMaze_UMaze-v3"
 

@@ -10,11 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 from torchrl.envs import ObservationNorm
-from torchrl.objectives import SoftUpdate
+from torchrl.modules import MLP, ValueOperator
+from torchrl.objectives import SACLoss, SoftUpdate
 
 from torchrl_osr import OSRLoss
-from torchrl_osr.envs import attacked_policy, networks_of
-from torchrl_osr.evaluation.episodes import EpisodeEvaluator, deterministic_policy
+from torchrl_osr.envs import attacked_policy, critics_of
+from torchrl_osr.evaluation import deterministic_policy
 from torchrl_osr.functional import jeffreys_divergence
 from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
 
@@ -52,12 +53,15 @@ def trained():
         sum(losses[key] for key in loss.out_keys if key.startswith("loss_")).backward()
         optimizer.step()
         updater.step()
-    policy, qvalue = networks_of(loss)
     norm = ObservationNorm(
         torch.randn(11), torch.rand(11) + 0.5, ["observation"], standard_normal=True
     )
     return SimpleNamespace(
-        actor=actor, loss=loss, policy=policy, qvalue=qvalue, norm=norm
+        actor=actor,
+        loss=loss,
+        policy=actor.get_dist,
+        qvalue=critics_of(loss),
+        norm=norm,
     )
 
 
@@ -193,18 +197,38 @@ def test_gradients_find_more_than_a_random_draw(trained, kind, score):
     assert (better > 0).float().mean() > 0.9
 
 
-def test_networks_of_a_loss_are_its_trained_ones(trained):
-    states = states_of(torch.randn(8, 11))
-    ours, theirs = trained.policy(states), trained.actor.get_dist(states.copy())
-    assert torch.equal(ours.deterministic_sample, theirs.deterministic_sample)
-    action = ours.deterministic_sample
-    values = trained.qvalue(states, action)
-    batch = states.copy().set("action", action)
-    for index in range(2):
-        params = trained.loss.qvalue_network_params[index]
-        with params.to_module(trained.loss.qvalue_network):
-            expected = trained.loss.qvalue_network(batch.copy())["state_action_value"]
-        torch.testing.assert_close(values[index], expected.squeeze(-1))
+@pytest.mark.parametrize("keys", [{}, {"action": "a", "state_action_value": "q"}])
+@pytest.mark.parametrize("loss_class", [OSRLoss, SACLoss])
+def test_critics_of_a_loss_are_its_trained_ones(loss_class, keys):
+    head = MLP(14, 1, num_cells=[16])
+    critic = ValueOperator(
+        head,
+        ["observation", keys.get("action", "action")],
+        [keys.get("state_action_value", "state_action_value")],
+    )
+    actor = tanh_gaussian_actor(11, 3, num_cells=[16])
+    options = {"recovery_weight": 0} if loss_class is OSRLoss else {}
+    loss = loss_class(actor, critic, num_qvalue_nets=3, **options)
+    if keys:
+        loss.set_keys(**keys)
+    values = critics_of(loss)
+    states, action = states_of(torch.randn(4, 8, 11)), torch.rand(4, 8, 3)
+    before = values(states, action)
+    with torch.no_grad():  # as an optimizer changes them
+        for parameter in loss.qvalue_network_params.parameters():
+            parameter.mul_(1.5)
+    after = values(states, action)
+    assert before.shape == after.shape == (3, 4, 8)
+    assert not after.requires_grad
+    assert not torch.allclose(before, after)
+    for index in range(3):
+        head = MLP(14, 1, num_cells=[16])
+        for name, parameter in head.named_parameters():
+            key = ("module", *name.split("."))
+            parameter.data = loss.qvalue_network_params.get(key)[index].detach()
+        expected = head(torch.cat([states["observation"], action], -1)).squeeze(-1)
+        torch.testing.assert_close(after[index], expected)
+    assert list(states.keys()) == ["observation"]
 
 
 @each_kind
@@ -227,19 +251,6 @@ def test_seeds_decide_and_the_global_generator_is_left_alone(trained, kind):
     assert not first.requires_grad
 
 
-def test_attacks_in_the_batched_evaluator(trained):
-    evaluator = EpisodeEvaluator("Hopper-v5", num_episodes=3)
-
-    def play(epsilon):
-        arguments = {"kind": "min_Q", "epsilon": epsilon, "num_samples": 5}
-        policy = attacked_policy(trained.policy, trained.qvalue, **arguments)
-        return evaluator(policy).returns.tolist()
-
-    assert play(0.0) == evaluator(deterministic_policy(trained.actor)).returns.tolist()
-    assert play(0.3) == play(0.3) != play(0.0)
-    evaluator.close()
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -256,6 +267,6 @@ def test_wrong_arguments(trained, arguments, message):
         attacked_policy(trained.policy, **arguments)
 
 
-def test_networks_of_something_else_is_an_error():
-    with pytest.raises(TypeError, match="Expected an OSRLoss or OSRVLoss, got Linear"):
-        networks_of(torch.nn.Linear(2, 2))
+def test_a_loss_without_critics_is_an_error():
+    with pytest.raises(TypeError, match="Linear has no qvalue_network"):
+        critics_of(torch.nn.Linear(2, 2))

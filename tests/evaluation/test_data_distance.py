@@ -7,7 +7,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_osr.evaluation.data_distance import DataDistance
+from torchrl_osr.evaluation import DataDistance
 
 
 def dataset(rows: torch.Tensor) -> TensorDict:
@@ -57,7 +57,7 @@ def test_small_distances_keep_their_digits(offset):
 def test_threshold_is_the_quantile_of_states_that_were_left_out():
     generator = torch.Generator().manual_seed(1)
     rows = torch.randn(5000, 4, generator=generator)
-    distance = DataDistance(dataset(rows), max_held_out=800, max_reference=2000)
+    distance = DataDistance(dataset(rows), max_reference=2000)
     assert distance._states.shape == (2000, 4)
     fresh = torch.randn(4000, 4, generator=generator)
     assert (distance(fresh) <= distance.threshold).float().mean() == pytest.approx(
@@ -82,8 +82,6 @@ def test_the_subset_depends_on_the_seed_alone():
     ("options", "named"),
     [
         ({"num_neighbors": 0}, "num_neighbors"),
-        ({"quantile": 0.0}, "quantile"),
-        ({"max_held_out": 0}, "max_held_out"),
         ({"num_neighbors": 9}, "10 rows"),
         ({"max_reference": 4, "num_neighbors": 5}, "max_reference=4"),
     ],

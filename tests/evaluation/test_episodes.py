@@ -10,13 +10,13 @@ import pytest
 import torch
 from torchrl.envs import ObservationNorm
 
-from torchrl_osr.evaluation.episodes import (
+from torchrl_osr.evaluation import (
     EpisodeEvaluator,
     EpisodeResults,
     deterministic_policy,
+    score_table,
     summarize,
 )
-from torchrl_osr.evaluation.summary import score_table
 from torchrl_osr.modules import tanh_gaussian_actor
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_osr.evaluation.recovery import (
+from torchrl_osr.evaluation import (
     STEPS_AFTER,
     STEPS_BEFORE,
     Recorder,
@@ -31,9 +31,8 @@ def trajectory(distances, disturbed=(), *, fell=False) -> Trajectory:
     return Trajectory(rows, [i in disturbed for i in range(len(rows))], fell)
 
 
-def measure(*disturbed: Trajectory, clean: Trajectory | None = None):
-    clean = clean or trajectory([1.0] * 200)
-    return measure_recovery(disturbed, [clean] * len(disturbed), Distance())
+def measure(disturbed: Trajectory, clean: Trajectory | None = None):
+    return measure_recovery(disturbed, clean or trajectory([1.0] * 200), Distance())
 
 
 @pytest.mark.parametrize(
@@ -56,18 +55,17 @@ def measure(*disturbed: Trajectory, clean: Trajectory | None = None):
 def test_one_episode(after, fell, survived, alive, steps):
     before = [1.0, 1.0, 4.0]
     recovery = measure(trajectory([*before, *after], {2, 3}, fell=fell))
-    assert recovery.ended_at == [2]
-    assert recovery.survived == [survived]
-    assert recovery.alive_after == [alive]
-    assert recovery.steps == [steps]
+    assert recovery.ended_at == 2
+    assert recovery.survived == survived
+    assert recovery.alive_after == alive
+    assert recovery.steps == steps
 
 
 def test_episodes_without_the_disturbance_say_nothing():
     recovery = measure(trajectory([1.0, 9.0, 9.0], fell=True))
-    for entry in (recovery.ended_at, recovery.survived, recovery.alive_after):
-        assert entry == [None]
-    assert recovery.steps == recovery.clean_alive_after == [None]
-    assert set(recovery.distance.mean()) == {None}
+    *entries, distance, clean_distance = vars(recovery).values()
+    assert set(entries) == {None}
+    assert np.isnan([distance, clean_distance]).all()
 
 
 @pytest.mark.parametrize(
@@ -79,34 +77,36 @@ def test_moment_counts_steps_from_zero(disturbed, step):
 
 def test_the_first_of_two_disturbances_counts():
     recovery = measure(trajectory([1, 1, 4, 3, 1, 1, 8, 8], {2, 6}))
-    assert recovery.ended_at == [1]
-    assert recovery.steps == [2]
+    assert recovery.ended_at == 1
+    assert recovery.steps == 2
 
 
-def test_undisturbed_pairs_are_looked_at_at_the_same_step():
-    disturbed = trajectory([1.0, 4.0, 1.0, 1.0], {1})
-    fallen = trajectory([1.0] * 50, fell=True)
-    whole = trajectory([1.0] * 150, fell=True)
-    ended = trajectory([1.0] * 50)
-    recovery = measure_recovery([disturbed] * 3, [fallen, whole, ended], Distance())
-    assert recovery.clean_alive_after == [False, True, None]
-    offset = STEPS_BEFORE + 60
-    assert recovery.clean_distance.count[STEPS_BEFORE] == 3
-    assert recovery.clean_distance.count[offset] == 1
+@pytest.mark.parametrize(
+    ("entries", "fell", "alive", "there_later"),
+    [(50, True, False, False), (150, True, True, True), (50, False, None, False)],
+)
+def test_the_undisturbed_episode_is_looked_at_at_the_same_step(
+    entries, fell, alive, there_later
+):
+    clean = trajectory([1.0] * entries, fell=fell)
+    recovery = measure(trajectory([1.0, 4.0, 1.0, 1.0], {1}), clean)
+    assert recovery.clean_alive_after == alive
+    there = ~np.isnan(recovery.clean_distance)
+    assert there[STEPS_BEFORE]
+    assert there[STEPS_BEFORE + 60] == there_later
 
 
-def test_curve_is_the_mean_of_those_who_are_there():
-    long = trajectory([1.0] * 20 + [6.0] + [2.0] * 200, {20})
-    short = trajectory([1.0, 1.0, 4.0, 3.0], {2}, fell=True)
-    recovery = measure(long, short)
-    mean, count = recovery.distance.mean(), recovery.distance.count
-    assert len(mean) == len(count) == STEPS_BEFORE + 1 + STEPS_AFTER
-    # In units of the threshold, 2: (6 + 4) / 2 / 2 and (2 + 3) / 2 / 2.
-    assert mean[STEPS_BEFORE : STEPS_BEFORE + 3] == [2.5, 1.25, 1.0]
-    assert count[STEPS_BEFORE : STEPS_BEFORE + 3].tolist() == [2, 2, 1]
-    assert count[:STEPS_BEFORE].tolist() == [1] * 8 + [2] * 2  # the reset is entry 0
-    assert count[-1] == 1
-    assert mean[0] == 0.5
+def test_distances_are_around_the_end_of_the_disturbance():
+    size, nan = STEPS_BEFORE + 1 + STEPS_AFTER, np.nan
+    around = slice(STEPS_BEFORE - 3, STEPS_BEFORE + 3)
+    # In units of the threshold, 2.
+    long = measure(trajectory([1.0] * 20 + [6.0] + [2.0] * 200, {20})).distance
+    np.testing.assert_array_equal(long[around], [0.5, 0.5, 0.5, 3.0, 1.0, 1.0])
+    assert len(long) == (~np.isnan(long)).sum() == size
+    short = measure(trajectory([1.0, 1.0, 4.0, 3.0], {2}, fell=True)).distance
+    np.testing.assert_array_equal(short[around], [nan, 0.5, 0.5, 2.0, 1.5, nan])
+    assert len(short) == size
+    assert (~np.isnan(short)).sum() == 4
 
 
 def test_recorder_keeps_what_it_was_told():

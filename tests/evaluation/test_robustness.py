@@ -18,8 +18,7 @@ from torchrl_osr.envs import (
     ObservationNoise,
     attacked_policy,
 )
-from torchrl_osr.evaluation.data_distance import DataDistance
-from torchrl_osr.evaluation.robustness import Level, evaluate_paired
+from torchrl_osr.evaluation import DataDistance, Disturbance, evaluate_paired
 from torchrl_osr.modules import tanh_gaussian_actor
 
 LINE = "Line-v0"
@@ -66,8 +65,8 @@ def to_a_half(observation: torch.Tensor) -> torch.Tensor:
     return (0.5 - observation).clamp(-1, 1)
 
 
-def shove(name: str, size: float, at: int) -> Level:
-    return Level(name, "push", size, partial(Shove, size=size, at=at))
+def shove(name: str, size: float, at: int) -> Disturbance:
+    return Disturbance(name, "push", size, partial(Shove, size=size, at=at))
 
 
 @pytest.fixture(scope="module")
@@ -75,52 +74,57 @@ def line_results():
     gymnasium.register(LINE, Line, max_episode_steps=LIMIT)
     rows = torch.linspace(-1, 1, 1000)[:, None]
     distance = DataDistance(TensorDict({"observation": rows}, [1000]))
-    levels = [
+    disturbances = [
         shove("six", 6.0, 5),
         shove("deadly", 20.0, 5),
         shove("late", 9.0, LIMIT - 3),
         shove("never", 6.0, LIMIT),
-        Level("always", "observation", 0.0),
+        Disturbance("always", "observation", 0.0),
     ]
     calls = []
     results = evaluate_paired(
-        to_a_half, LINE, levels, distance, num_episodes=3, seed=4,
+        to_a_half, LINE, disturbances, distance, num_episodes=3, seed=4,
         advance=lambda: calls.append(1),
     )  # fmt: skip
     gymnasium.registry.pop(LINE)
-    assert len(calls) == 1 + len(levels)
-    return results.clean, {each.level.name: each for each in results.levels}
+    assert len(calls) == 1 + len(disturbances)
+    return results.clean, {each.disturbance.name: each for each in results.disturbed}
+
+
+def of(results, name: str) -> list:
+    """One entry of the recovery of each episode."""
+    return [getattr(each, name) for each in results.recovery]
 
 
 def test_known_returns_and_recovery_steps(line_results):
-    clean, levels = line_results
+    clean, disturbed = line_results
+    six = disturbed["six"]
     assert clean.returns.tolist() == [LIMIT] * 3
     assert clean.seeds.tolist() == [4, 5, 6]
     # At 0.5, action 0: shoved to 6.5, then 5.5 ... 0.5, the sixth step is back.
-    assert levels["six"].recovery.steps == [6, 6, 6]
-    assert levels["six"].disturbed_at == levels["six"].recovery.ended_at == [5, 5, 5]
-    assert levels["six"].recovery.survived == [True] * 3
-    assert levels["six"].recovery.alive_after == [True] * 3
-    assert levels["six"].results.returns.tolist() == [LIMIT] * 3
+    assert of(six, "steps") == [6, 6, 6]
+    assert six.disturbed_at == of(six, "ended_at") == [5, 5, 5]
+    assert of(six, "survived") == of(six, "alive_after") == [True] * 3
+    assert six.results.returns.tolist() == [LIMIT] * 3
 
 
 def test_who_falls_is_not_back(line_results):
     deadly = line_results[1]["deadly"]
     assert deadly.results.lengths.tolist() == deadly.results.returns.tolist() == [6] * 3
-    assert deadly.recovery.survived == deadly.recovery.alive_after == [False] * 3
-    assert deadly.recovery.steps == [None] * 3
+    assert of(deadly, "survived") == of(deadly, "alive_after") == [False] * 3
+    assert of(deadly, "steps") == [None] * 3
 
 
 def test_the_time_limit_censors(line_results):
     late = line_results[1]["late"]
     assert late.disturbed_at == [LIMIT - 3] * 3
-    assert late.recovery.survived == [True] * 3
-    assert late.recovery.alive_after == late.recovery.steps == [None] * 3
+    assert of(late, "survived") == [True] * 3
+    assert of(late, "alive_after") == of(late, "steps") == [None] * 3
 
 
 def test_no_disturbance_no_entries(line_results):
     never, always = line_results[1]["never"], line_results[1]["always"]
-    assert never.disturbed_at == never.recovery.survived == [None] * 3
+    assert never.disturbed_at == of(never, "survived") == [None] * 3
     assert always.recovery is None
 
 
@@ -134,9 +138,10 @@ def hopper_distance() -> DataDistance:
     return DataDistance(TensorDict({"observation": rows}, [500]))
 
 
-def play(*levels: Level, policy=linear_policy, episodes: int = 4):
+def play(*disturbances: Disturbance, policy=linear_policy, episodes: int = 4):
+    distance = hopper_distance()
     return evaluate_paired(
-        policy, "Hopper-v5", levels, hopper_distance(), num_episodes=episodes, seed=7
+        policy, "Hopper-v5", disturbances, distance, num_episodes=episodes, seed=7
     )
 
 
@@ -145,20 +150,21 @@ def test_strength_zero_is_the_clean_episodes_bit_for_bit():
     attack = partial(attacked_policy, actor.get_dist, kind="action_diff")
     bare = attack(epsilon=0.0)
     results = play(
-        Level("push", "push", 0.0, partial(ExternalPush, force=0.0, duration=5)),
-        Level("noise", "observation", 0.0, partial(ObservationNoise, std=0.0)),
-        Level("heavy", "dynamics", 2.0, partial(DynamicsChange, mass=2.0)),
+        Disturbance("push", "push", 0.0, partial(ExternalPush, force=0.0, duration=5)),
+        Disturbance("noise", "observation", 0.0, partial(ObservationNoise, std=0.0)),
+        Disturbance("heavy", "dynamics", 2.0, partial(DynamicsChange, mass=2.0)),
         # After the heavy one: nothing of it may be left.
-        Level("mass", "dynamics", 1.0, partial(DynamicsChange, mass=1.0)),
-        Level("attack", "attack", 0.0, policy=attack(epsilon=0.0)),
-        Level("attacked", "attack", 0.5, policy=attack(epsilon=0.5)),
+        Disturbance("mass", "dynamics", 1.0, partial(DynamicsChange, mass=1.0)),
+        Disturbance("attack", "attack", 0.0, policy=attack(epsilon=0.0)),
+        Disturbance("attacked", "attack", 0.5, policy=attack(epsilon=0.5)),
         policy=bare,
     )
-    for level in results.levels:
-        same = np.array_equal(level.results.returns, results.clean.returns)
-        assert same == (level.level.strength in (0.0, 1.0)), level.level.name
-        assert level.results.seeds.tolist() == results.clean.seeds.tolist()
-    moments = {each.level.name: each.disturbed_at for each in results.levels}
+    for each in results.disturbed:
+        same = np.array_equal(each.results.returns, results.clean.returns)
+        disturbance = each.disturbance
+        assert same == (disturbance.strength in (0.0, 1.0)), disturbance.name
+        assert each.results.seeds.tolist() == results.clean.seeds.tolist()
+    moments = {each.disturbance.name: each.disturbed_at for each in results.disturbed}
     assert moments["attacked"] == moments["heavy"] == [0] * 4
     assert moments["push"] == moments["noise"] == [None] * 4
 
@@ -172,48 +178,44 @@ def test_an_episode_depends_on_its_own_disturbance_alone():
 
     # Who is knocked early falls while the others, some never knocked, walk on.
     wrap = partial(ActionKnock, steps=20, mode="torque", at="random", window=(9, 900))
-    results = play(Level("knock", "knock", 20, wrap), policy=policy, episodes=8)
-    (level,) = results.levels
-    met = np.array([moment is not None for moment in level.disturbed_at])
+    results = play(Disturbance("knock", "knock", 20, wrap), policy=policy, episodes=8)
+    (knocked,) = results.disturbed
+    met = np.array([moment is not None for moment in knocked.disturbed_at])
     assert 0 < met.sum() < 8, "the test needs both kinds of episodes"
-    same = level.results.returns == results.clean.returns
+    same = knocked.results.returns == results.clean.returns
     np.testing.assert_array_equal(same, ~met)
 
 
-def test_global_generators_are_left_alone():
-    wrap = partial(ActionKnock, steps=5, mode="paper", at="random", window=(5, 20))
-    before, state = np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
-    results = play(Level("knock", "knock", 5, wrap))
-    assert torch.equal(state, torch.get_rng_state())
-    after = np.random.get_state()  # noqa: NPY002
-    assert all(map(np.array_equal, before, after))
-    again = play(Level("knock", "knock", 5, wrap))
-    np.testing.assert_array_equal(
-        results.levels[0].results.returns, again.levels[0].results.returns
-    )
-
-
 @pytest.mark.parametrize(
-    ("levels", "episodes", "named"),
+    ("disturbances", "episodes", "named"),
     [
-        ([Level("a", "push", 1.0)], 1, "at least 2, got 1"),
-        ([Level("a", "push", 1.0), Level("a", "push", 2.0)], 2, r"\['a', 'a'\]"),
-        ([], 2, "levels need one name each"),
+        ([Disturbance("a", "push", 1.0)], 1, "at least 2, got 1"),
         (
-            [Level("b", "push", 1.0, partial(ExternalPush, force=1.0, duration=0))],
+            [Disturbance("a", "push", 1.0), Disturbance("a", "push", 2.0)],
+            2,
+            r"\['a', 'a'\]",
+        ),
+        ([], 2, "disturbances need one name each"),
+        (
+            [
+                Disturbance(
+                    "b", "push", 1.0, partial(ExternalPush, force=1.0, duration=0)
+                )
+            ],
             2,
             "'b' is not possible for Hopper-v5: duration",
         ),
     ],
 )
-def test_bad_input_is_named(levels, episodes, named):
+def test_bad_input_is_named(disturbances, episodes, named):
     with pytest.raises(ValueError, match=named):
-        play(*levels, episodes=episodes)
+        play(*disturbances, episodes=episodes)
 
 
 def test_what_needs_a_simulation_is_not_possible_without():
-    level = Level("push", "push", 1.0, partial(ExternalPush, force=1.0, duration=5))
+    wrap = partial(ExternalPush, force=1.0, duration=5)
+    push = Disturbance("push", "push", 1.0, wrap)
     with pytest.raises(ValueError, match="'push' is not possible for Pendulum-v1"):
         evaluate_paired(
-            linear_policy, "Pendulum-v1", [level], hopper_distance(), num_episodes=2
+            linear_policy, "Pendulum-v1", [push], hopper_distance(), num_episodes=2
         )

@@ -7,16 +7,19 @@ import json
 import numpy as np
 import pytest
 
-from torchrl_osr.evaluation.episodes import EpisodeResults
-from torchrl_osr.evaluation.recovery import Recovery
-from torchrl_osr.evaluation.robustness import Level, LevelResults, PairedResults
-from torchrl_osr.evaluation.robustness_figure import distance_curves, robustness_figure
-from torchrl_osr.evaluation.robustness_summary import (
+from torchrl_osr.evaluation import (
+    Disturbance,
+    DisturbanceResults,
+    EpisodeResults,
+    PairedResults,
+    Recovery,
     decrease_interval,
+    distance_curves,
     evaluation_json,
-    summarize_levels,
+    robustness_figure,
+    robustness_table,
+    summarize_disturbances,
 )
-from torchrl_osr.evaluation.robustness_table import robustness_table
 
 
 def test_decrease_by_hand():
@@ -52,23 +55,36 @@ def episodes(*scores: float) -> EpisodeResults:
     return EpisodeResults(returns, np.full(size, 300), np.arange(size))
 
 
+def around(*curve: float) -> np.ndarray:
+    """Distances from one step before the disturbance's end on."""
+    distances = np.full(111, np.nan)
+    distances[9 : 9 + len(curve)] = curve
+    return distances
+
+
 @pytest.fixture
 def evaluations():
     """Two checkpoints of three pairs, a knock and a change that does not end."""
-    knock, mass = Level("knock", "knock", 5.0), Level("mass", "dynamics", 1.5)
+    knock, mass = (
+        Disturbance("knock", "knock", 5.0),
+        Disturbance("mass", "dynamics", 1.5),
+    )
 
     def evaluation(step, clean, knocked, heavy, moments, steps, alive):
-        recovery = Recovery(
-            moments, [None if m is None else True for m in moments], alive,
-            [True if m else None for m in moments], steps,
-        )  # fmt: skip
-        recovery.distance.add(np.array([1.0, 3.0, 1.0]), -1)
-        recovery.clean_distance.add(np.array([0.5, 0.5, 0.5]), -1)
-        levels = [
-            LevelResults(knock, episodes(*knocked), moments, recovery),
-            LevelResults(mass, episodes(*heavy), [0, 0, 0], None),
+        curves = [around(1, 3, 1), around(), around(2, 4)]
+        recovery = [
+            Recovery(
+                at, None if at is None else True, up, True if at else None, late,
+                curve, around(0.5, 0.5, 0.5) if curve is curves[0] else around(),
+            )
+            for at, up, late, curve in zip(moments, alive, steps, curves, strict=True)
+        ]  # fmt: skip
+        disturbed = [
+            DisturbanceResults(knock, episodes(*knocked), moments, recovery),
+            DisturbanceResults(mass, episodes(*heavy), [0, 0, 0], None),
         ]
-        return evaluation_json(step, PairedResults(episodes(*clean), levels), "hopper")
+        paired = PairedResults(episodes(*clean), disturbed)
+        return evaluation_json(step, paired, "hopper")
 
     return [
         evaluation(
@@ -91,15 +107,16 @@ def test_json_has_every_entry_and_no_nan(evaluations):
     assert knock["alive_after"] == [True, False, None]
     assert knock["distance"]["offset"][0] == -10
     assert knock["distance"]["offset"][-1] == 100
-    assert knock["distance"]["mean"][9:13] == [1, 3, 1, None]
-    assert knock["distance"]["count"][9:13] == [1, 1, 1, 0]
+    assert knock["distance"]["mean"][9:13] == [1.5, 3.5, 1, None]
+    assert knock["distance"]["count"][9:13] == [2, 2, 1, 0]
+    assert knock["distance"]["clean_mean"][9:13] == [0.5, 0.5, 0.5, None]
     for entry in ("survived_knock", "alive_after", "recovery_steps", "distance"):
         assert mass[entry] is None
     assert mass["disturbed_at"] == [0, 0, 0]
 
 
 def test_summary_is_over_all_checkpoints(evaluations):
-    knock, mass = summarize_levels(evaluations)
+    knock, mass = summarize_disturbances(evaluations)
     assert knock["clean_score"] == pytest.approx(55)
     assert knock["score"] == pytest.approx(45)
     assert knock["decrease"] == pytest.approx(100 * 10 / 55)
@@ -122,7 +139,7 @@ def test_summary_is_over_all_checkpoints(evaluations):
 def test_median_of_mostly_never_is_no_number(evaluations):
     for each in evaluations:
         each["levels"][0]["recovery_steps"] = [5, None, None]
-    knock, _ = summarize_levels(evaluations)
+    knock, _ = summarize_disturbances(evaluations)
     assert knock["recovery_median"] is None
     assert knock["recovered_share"] == pytest.approx(2 / 4)
 
@@ -132,15 +149,15 @@ def test_nobody_met_it(evaluations):
         each["levels"][0]["disturbed_at"] = [None] * 3
         each["levels"][0]["recovery_steps"] = [None] * 3
         each["levels"][0]["alive_after"] = [None] * 3
-    knock, _ = summarize_levels(evaluations)
+    knock, _ = summarize_disturbances(evaluations)
     assert knock["disturbed_share"] == 0
     assert knock["survival"] is knock["recovered_share"] is None
     assert knock["score_disturbed"] is knock["decrease_disturbed"] is None
     assert "0 %" in robustness_table("title", [knock])
 
 
-def test_table_names_every_level(evaluations):
-    lines = robustness_table("hopper", summarize_levels(evaluations)).splitlines()
+def test_table_names_every_disturbance(evaluations):
+    lines = robustness_table("hopper", summarize_disturbances(evaluations)).splitlines()
     assert lines[0] == "hopper"
     assert len({len(line) for line in lines[1:]}) == 1, "columns are aligned"
     assert lines[2].split()[:4] == ["knock", "55.0", "45.0", "18.2"]
@@ -148,16 +165,18 @@ def test_table_names_every_level(evaluations):
 
 
 def test_curves_are_weighted_by_episodes(evaluations):
+    distance = evaluations[1]["levels"][0]["distance"]
+    distance["mean"][10], distance["count"][10] = 7.5, 6
     curves = distance_curves(evaluations)
     assert curves == {
-        "knock": ([-1, 0, 1], [1.0, 3.0, 1.0]),
+        "knock": ([-1, 0, 1], [1.5, 6.5, 1.0]),  # (2 * 3.5 + 6 * 7.5) / 8
         "undisturbed": ([-1, 0, 1], [0.5, 0.5, 0.5]),
     }
 
 
 @pytest.mark.parametrize("sweep", [False, True])
 def test_figure_is_drawn(evaluations, tmp_path, sweep):
-    summary = summarize_levels(evaluations)
+    summary = summarize_disturbances(evaluations)
     if sweep:  # every kind at several strengths
         summary = [row | {"strength": s} for row in summary for s in (1.0, 2.0)]
     path = tmp_path / "figure.png"

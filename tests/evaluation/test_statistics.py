@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchrl_osr.evaluation import mean_interval
-from torchrl_osr.evaluation.statistics import (
+from torchrl_osr.evaluation import (
     interquartile_mean,
+    mean_interval,
     nested_resamples,
     percentile_interval,
     performance_profile,

@@ -13,15 +13,15 @@ from hydra import compose, initialize_config_dir
 from hydra.errors import ConfigCompositionException, MissingConfigException
 from omegaconf import OmegaConf
 
-from torchrl_osr import evaluate_config
 from torchrl_osr.data import make_environment
-from torchrl_osr.evaluation.robustness import check_levels
-from torchrl_osr.evaluation.suite import make_levels
+from torchrl_osr.evaluation import check_disturbances
+from torchrl_osr.experiment.suite import make_disturbances, register
 from torchrl_osr.experiment.trained_run import load_trained
 from torchrl_osr.report import read_runs
 
 ROOT = Path(__file__).parents[2]
-SUITES = sorted(path.stem for path in (ROOT / "conf" / "suite").glob("*.yaml"))
+CONF = ROOT / "conf_evaluate"
+SUITES = sorted(path.stem for path in (CONF / "suite").glob("*.yaml"))
 
 
 @pytest.fixture(scope="module")
@@ -49,13 +49,13 @@ def evaluated(folder, run) -> str:
 
 
 def composed(*overrides: str):
-    evaluate_config.register()
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+    register()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
         return compose("evaluate", ["progress=false", *overrides])
 
 
 def test_table_json_and_figure_are_left_in_the_runs_folder(folder, evaluated):
-    levels = composed("checkpoint=run").suite.levels
+    names = list(composed("checkpoint=run").suite.disturbances)
     results = json.loads((folder / "robustness-oos.json").read_text())
     assert results["format"] == 1
     assert results["suite"] == "oos"
@@ -66,13 +66,13 @@ def test_table_json_and_figure_are_left_in_the_runs_folder(folder, evaluated):
     seeds = [each["clean"]["seeds"] for each in results["evaluations"]]
     assert seeds == [[20_000, 20_001], [21_000, 21_001]]
     for each in results["evaluations"]:
-        assert [level["name"] for level in each["levels"]] == list(levels)
+        assert [level["name"] for level in each["levels"]] == names
         for level in each["levels"]:
             assert level["seeds"] == each["clean"]["seeds"]
             assert len(level["returns"]) == len(level["scores"]) == 2
-    assert [row["name"] for row in results["summary"]] == list(levels)
+    assert [row["name"] for row in results["summary"]] == names
     assert (folder / "robustness-oos.png").read_bytes().startswith(b"\x89PNG")
-    for name in levels:
+    for name in names:
         assert name in evaluated
     assert str(folder / "robustness-oos.json") in evaluated or "run/" in evaluated
     for word in ("Warning", "Traceback"):
@@ -139,7 +139,7 @@ def test_killed_evaluation_goes_on_to_the_same_bytes(
         assert path.read_bytes() == continued
         assert not partial.exists()
         path.unlink()
-    assert f"{partial} is of no use" in capsys.readouterr().out
+    assert f"{partial} is ignored" in capsys.readouterr().out
 
 
 def test_one_checkpoint_has_a_file_of_its_own(folder, example):
@@ -159,9 +159,9 @@ def test_every_suite_is_possible_for_other_environments(folder, env_id):
     for name in SUITES:
         suite = composed(f"suite={name}", "checkpoint=none").suite
         assert suite.name == name
-        levels = make_levels(suite.levels, trained, scale)
-        assert len(levels) >= 3
-        check_levels(env_id, [each for each in levels if each.wrap] or levels)
+        made = make_disturbances(suite.disturbances, trained, scale)
+        assert len(made) >= 3
+        check_disturbances(env_id, [each for each in made if each.wrap] or made)
 
 
 @pytest.mark.parametrize(
@@ -173,7 +173,7 @@ def test_every_suite_is_possible_for_other_environments(folder, env_id):
         (["checkpoint=/"], FileNotFoundError, r"config\.yaml"),
         (["suite=out"], MissingConfigException, "torque"),
         (["episode=2"], ConfigCompositionException, "episode"),
-        (["suite.levels.mass.kindd=a"], ConfigCompositionException, "kindd"),
+        (["suite.disturbances.mass.kindd=a"], ConfigCompositionException, "kindd"),
         (["episodes=many"], ConfigCompositionException, "many"),
     ],
 )
@@ -182,12 +182,12 @@ def test_bad_input_is_named(example, folder, overrides, error, named):
         example.main(composed(f"checkpoint={folder}", *overrides))
 
 
-def test_level_needs_one_of_wrapper_and_attack(folder):
+def test_a_disturbance_needs_one_of_wrapper_and_attack(folder):
     suite = composed("suite=start", "checkpoint=none").suite
-    name = next(iter(suite.levels))
-    suite.levels[name].wrap = None
+    name = next(iter(suite.disturbances))
+    suite.disturbances[name].wrap = None
     with pytest.raises(ValueError, match=f"{name}' needs either"):
-        make_levels(suite.levels, load_trained(folder), np.full(11, 0.5))
+        make_disturbances(suite.disturbances, load_trained(folder), np.full(11, 0.5))
 
 
 def test_attacks_need_standardised_networks(folder):
@@ -195,7 +195,19 @@ def test_attacks_need_standardised_networks(folder):
     trained = load_trained(folder)
     trained.config.data.standardize = False
     with pytest.raises(ValueError, match="data.standardize=false"):
-        make_levels(suite.levels, trained, np.full(11, 0.5))
+        make_disturbances(suite.disturbances, trained, np.full(11, 0.5))
+
+
+@pytest.mark.parametrize(
+    ("script", "groups"), [("evaluate.py", ["suite"]), ("film.py", [])]
+)
+def test_help_offers_the_scripts_own_groups_alone(tmp_path, run, script, groups):
+    code, output = run(tmp_path, script, "--help")
+    assert code == 0, output
+    offered = output.split("== Config ==")[0]
+    assert re.findall(r"(?m)^([\w/]+): \w", offered) == groups
+    assert "schema" not in output
+    assert "checkpoint: ???" in output
 
 
 def test_every_key_and_suite_is_documented():

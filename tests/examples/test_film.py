@@ -10,7 +10,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from hydra.errors import ConfigCompositionException
 
-CONF = Path(__file__).parents[2] / "conf"
+CONF = Path(__file__).parents[2] / "conf_evaluate"
 SHORT = ["checkpoint=run", "episodes=2", "window=[20,30]", "after=16"]
 
 

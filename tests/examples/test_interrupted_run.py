@@ -1,4 +1,4 @@
-"""The main example, stopped by SIGTERM and started again, in processes of its own."""
+"""The main example, stopped by a signal and started again, in processes of its own."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch.utils._pytree import tree_leaves
 
 SCRIPT = "offline_osr.py"
 
@@ -24,14 +25,16 @@ def sizes(tiny) -> list[str]:
     )
 
 
-def terminate_in_policy_phase(process: subprocess.Popen, cwd: Path) -> tuple[int, str]:
-    """Send SIGTERM somewhere in the second phase of the run in a folder's folder."""
+def stop_in_policy_phase(
+    process: subprocess.Popen, cwd: Path, number: int = signal.SIGTERM
+) -> tuple[int, str]:
+    """Send a signal somewhere in the second phase of the run in a folder's folder."""
     pattern = "*/checkpoint/policy/checkpoint-000000000050.torchrl"
     while not list(cwd.glob(pattern)):
         assert process.poll() is None, process.stdout.read()
         time.sleep(0.001)
     time.sleep(random.uniform(0.0, 0.3))
-    process.send_signal(signal.SIGTERM)
+    process.send_signal(number)
     output, _ = process.communicate(timeout=60)
     return process.returncode, output
 
@@ -40,43 +43,36 @@ def status(folder: Path) -> str:
     return json.loads((folder / "status.json").read_text())["status"]
 
 
-def tensors(folder: Path) -> dict[str, torch.Tensor]:
-    """Return all tensors of the last checkpoint, but for the process's generators."""
-    found = {}
+def tensors(folder: Path) -> list[torch.Tensor]:
+    """All tensors of the last checkpoint, but for the process's generators."""
+    found = []
     path = folder / "checkpoint/policy/checkpoint-000000000300.torchrl"
     with zipfile.ZipFile(path) as archive:
-        for name in archive.namelist():
+        for name in sorted(archive.namelist()):
             if name.endswith("state.pt") and "global_rng" not in name:
                 content = io.BytesIO(archive.read(name))
                 state = torch.load(content, weights_only=True)
-                rows = state.get("state", {}) if "optimizer" in name else {name: state}
-                found |= {
-                    f"{name} {row} {key}": value
-                    for row, each in rows.items()
-                    for key, value in each.items()
-                    if torch.is_tensor(value)
-                }
+                found += filter(torch.is_tensor, tree_leaves(state))
     return found
 
 
-def test_terminated_run_goes_on_to_the_same_bits(tmp_path, start, run, sizes):
+def test_stopped_run_goes_on_to_the_same_bits(tmp_path, start, run, sizes):
     code, output = run(tmp_path, SCRIPT, *sizes, "hydra.run.dir=undisturbed")
     assert code == 0, output
     (tmp_path / "here").mkdir()
-    process = start(tmp_path, SCRIPT, *sizes, "hydra.run.dir=here/run")
-    code, output = terminate_in_policy_phase(process, tmp_path / "here")
-    assert code == 75, output
-    assert "stopped by SIGTERM at step" in output
     folder = tmp_path / "here" / "run"
+    process = start(tmp_path, SCRIPT, *sizes, "hydra.run.dir=here/run")
+    code, output = stop_in_policy_phase(process, tmp_path / "here", signal.SIGINT)
+    assert code == 130, output
+    assert "stopped by SIGINT at step" in output
+    assert f"resume={folder}" in output
     assert status(folder) == "preempted"
-    # The same command, as a queue gives it again.
-    code, output = run(tmp_path, SCRIPT, *sizes, "hydra.run.dir=here/run")
+    code, output = run(tmp_path, SCRIPT, f"resume={folder}")
     assert code == 0, output
     assert status(folder) == "done"
     mine, theirs = tensors(folder), tensors(tmp_path / "undisturbed")
     assert len(mine) > 20
-    assert mine.keys() == theirs.keys()
-    assert all(torch.equal(mine[key], theirs[key]) for key in theirs)
+    assert all(torch.equal(a, b) for a, b in zip(mine, theirs, strict=True))
     returns = (folder / "returns.json").read_text()
     assert returns == (tmp_path / "undisturbed" / "returns.json").read_text()
 
@@ -84,7 +80,7 @@ def test_terminated_run_goes_on_to_the_same_bits(tmp_path, start, run, sizes):
 def test_second_sweep_continues_what_is_not_done(tmp_path, start, run, sizes):
     arguments = ["-m", *sizes, "loss=cql", "seed=0,1", "hydra.sweep.dir=sweep"]
     process = start(tmp_path, SCRIPT, *arguments)
-    code, output = terminate_in_policy_phase(process, tmp_path / "sweep")
+    code, output = stop_in_policy_phase(process, tmp_path / "sweep")
     assert code == 75, output
     (folder,) = (each for each in (tmp_path / "sweep").iterdir() if each.is_dir())
     assert status(folder) == "preempted"

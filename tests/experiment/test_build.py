@@ -1,41 +1,72 @@
-"""What a configuration says of the data is what is trained on."""
+"""What a configuration says of networks and loss is what is trained."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
-from omegaconf import OmegaConf
+from hydra import compose, initialize_config_dir
+from hydra.utils import get_class
+from torchrl.modules import TanhDelta, TanhNormal
+from torchrl.objectives import SoftUpdate
 
-from torchrl_osr.data import load_local_dataset
-from torchrl_osr.experiment.build import load_data
+from torchrl_osr import TD3BCLoss
+from torchrl_osr.experiment import schema
+from torchrl_osr.experiment.build import make_learner
 
-
-@pytest.fixture(autouse=True)
-def _cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("TORCHRL_OSR_CACHE", str(tmp_path))
-
-
-def loaded(**data):
-    """Of a configuration as an older run has it, without the newer keys."""
-    given = {"level": "diverse", "num_transitions": 500, "seed": 0} | data
-    env = {"name": "pointmaze-umaze", "id": "PointMaze_UMaze-v3"}
-    return load_data(OmegaConf.create({"env": env, "data": given}))
+CONF = Path(__file__).parents[2] / "conf"
+LOSSES = sorted(path.stem for path in (CONF / "loss").glob("*.yaml"))
 
 
-def test_rewards_are_scaled_then_shifted():
-    data, manifest = load_local_dataset(
-        "pointmaze-umaze", "diverse", num_transitions=500
-    )
-    shifted, same = loaded(reward_scale=10.0, reward_shift=-5.0)
-    assert same == manifest, "the data's own score stays"
-    assert sorted(data["next", "reward"].unique().tolist()) == [0, 1]
-    reached = data["next", "reward"] == 1
-    assert (shifted["next", "reward"][reached] == 5).all()
-    assert (shifted["next", "reward"][~reached] == -5).all()
-    shifted["next", "reward"] = data["next", "reward"]
-    assert (shifted == data).all(), "nothing else is touched"
+def learner_of(*overrides: str):
+    """The networks and loss of a composed configuration, for make_batch's sizes."""
+    schema.register()
+    overrides = ("network.num_cells=[8]", "optim.gamma=0.5", *overrides)
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        cfg = compose("offline_osr", overrides=list(overrides))
+    return cfg, make_learner(cfg, 3, 2)
 
 
-def test_older_configurations_have_the_tasks_rewards():
-    data, _ = load_local_dataset("pointmaze-umaze", "diverse", num_transitions=500)
-    assert (loaded()[0] == data).all()
-    assert (loaded(reward_scale=1.0, reward_shift=0.0)[0] == data).all()
+@pytest.mark.parametrize("name", LOSSES)
+def test_every_loss_is_built_and_trains_its_networks(name, make_batch) -> None:
+    cfg, (actor, _, loss) = learner_of(f"loss={name}")
+    assert type(loss) is get_class(cfg.loss._target_)
+    assert loss.num_qvalue_nets == (10 if name.endswith("_10") else 2)
+    assert loss.value_estimator.gamma == 0.5
+    SoftUpdate(loss, tau=0.1)
+    batch = make_batch(10).apply(lambda x: x.float() if x.is_floating_point() else x)
+    losses = [value for key, value in loss(batch).items() if key.startswith("loss_")]
+    sum(losses).backward()
+    # The actor is the loss's own: what is evaluated is what was trained.
+    for parameter in actor.parameters():
+        assert parameter.grad.isfinite().all()
+        assert parameter.grad.abs().max() > 0
+
+
+def test_actor_is_of_the_kind_that_the_loss_trains() -> None:
+    kinds = {}
+    for name in ("osr", "td3_bc"):
+        _, (actor, _, loss) = learner_of(f"loss={name}")
+        kinds[name] = actor[-1].distribution_class
+    assert kinds == {"osr": TanhNormal, "td3_bc": TanhDelta}
+    assert type(loss) is TD3BCLoss
+
+
+def test_a_loss_is_given_a_model_where_it_uses_one() -> None:
+    for name, used in {"osr": True, "cql": False, "edac_10": False}.items():
+        _, (_, model, loss) = learner_of(f"loss={name}")
+        assert any(True for _ in model.parameters()), "it is trained in any case"
+        assert ("inverse_dynamics_network" in loss.__dict__) == used
+        held = {each.data_ptr() for each in loss.state_dict().values()}
+        assert {each.data_ptr() for each in model.parameters()} <= held or not used
+
+
+def test_a_model_with_a_latent_is_built() -> None:
+    _, learner = learner_of("inverse_dynamics=cvae", "loss=osr_official")
+    assert "latent_loc" in learner.model.out_keys
+    assert learner.loss.inverse_dynamics_network.out_keys == learner.model.out_keys
+
+
+def test_option_out_of_its_range_is_refused_by_name() -> None:
+    with pytest.raises(ValueError, match="recovery_direction must be one of"):
+        learner_of("loss.recovery_direction=sideways")

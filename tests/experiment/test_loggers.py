@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from torchrl_osr.evaluation.figures import read_scalars
+from torchrl_osr.evaluation import read_scalars
 from torchrl_osr.experiment import loggers
 from torchrl_osr.experiment.loggers import make_loggers
 

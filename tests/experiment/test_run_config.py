@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from pathlib import Path
 
 import pytest
@@ -36,7 +37,7 @@ def test_every_configuration_of_ours_is_let_through(tmp_path, option):
     "target",
     [
         "os.mkdir",
-        "torchrl_osr.data.behavior.os.mkdir",
+        "torchrl_osr._files.os.mkdir",
         "torchrl_osr.data.load_file",
         "torchrl_osr",
         "mine.Loss",
@@ -78,7 +79,7 @@ def test_the_crafted_configuration_would_work(tmp_path):
         ("loss: '${oc.create:\"{_target_: os.mkdir}\"}'", "has the interpolation"),
         ('loss: "\\x24{oc.env:HOME}"', "has the interpolation"),
         ("- a\n", "holds no mapping"),
-        ("# " + "a" * 2**20, "more than 1,048,576 bytes"),
+        ("# " + "a" * 2**16, "more than 65,536 bytes"),
     ],
 )
 def test_what_no_run_writes_is_refused(tmp_path, text, reason):
@@ -86,6 +87,23 @@ def test_what_no_run_writes_is_refused(tmp_path, text, reason):
     path.write_text(text)
     with pytest.raises(ValueError, match=reason):
         read_config(path)
+
+
+@pytest.mark.parametrize("length", [400, 40_000])
+@pytest.mark.parametrize("opening", ["[", "{a: ", "- "])
+def test_deep_nesting_is_refused_at_once(tmp_path, opening, length):
+    path = tmp_path / "config.yaml"
+    depth = length // 2 // len(opening)
+    path.write_text(
+        "a:\n " + opening * depth + {"[": "]", "{a: ": "}"}.get(opening, "") * depth
+    )
+    start = time.process_time()
+    with pytest.raises(ValueError, match=r"config\.yaml is nested more than 32 deep"):
+        read_config(path)
+    assert time.process_time() - start < 1
+    shallow = tmp_path / "shallow.yaml"
+    shallow.write_text("a: " + "[" * 31 + "]" * 31)
+    read_config(shallow)
 
 
 def test_overrides_are_read_as_they_were_typed(tmp_path):

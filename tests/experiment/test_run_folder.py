@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
+from pathlib import Path
 
 import pytest
+from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from torchrl_osr.experiment import run_folder
+from torchrl_osr.experiment import run_folder, schema
+from torchrl_osr.trainers import Interrupted
 
 CONFIG = {"seed": 0, "resume": None, "trainer": {"steps": 5, "progress": True}}
 
@@ -67,6 +71,16 @@ def test_status_says_failed_and_why(tmp_path, error):
     }
 
 
+def test_interrupted_run_is_preempted_and_says_how_to_continue(tmp_path, caplog):
+    folder = tmp_path / "0_loss=cql,seed=1"
+    folder.mkdir()
+    with pytest.raises(Interrupted), run_folder.status(folder):
+        raise Interrupted("saved at step 3", 75)
+    assert read_status(folder) == {"status": "preempted", "reason": "saved at step 3"}
+    # Quoted for Hydra, and then for the shell.
+    assert f"""resume='"'"'{folder}'"'"''""" in caplog.text
+
+
 def test_failed_write_keeps_the_old_file_and_names_it(tmp_path, monkeypatch):
     path = tmp_path / "file.json"
     run_folder.write_json(path, [1])
@@ -74,14 +88,37 @@ def test_failed_write_keeps_the_old_file_and_names_it(tmp_path, monkeypatch):
     def full(_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(run_folder.os, "fsync", full)
+    monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match=r"No space left.*file\.json"):
         run_folder.write_json(path, [2])
     assert json.loads(path.read_text()) == [1]
     assert [each.name for each in tmp_path.iterdir()] == ["file.json"]
 
 
-def test_nan_is_not_json(tmp_path):
-    with pytest.raises(ValueError, match="not JSON compliant"):
-        run_folder.write_json(tmp_path / "file.json", float("nan"))
-    assert not list(tmp_path.iterdir())
+def test_figures_that_do_not_exist_are_null(tmp_path):
+    path = tmp_path / "file.json"
+    run_folder.write_json(path, {"a": [float("nan"), 1.5], "b": -float("inf")})
+    assert json.loads(path.read_text()) == {"a": [None, 1.5], "b": None}
+
+
+@pytest.fixture
+def composed():
+    schema.register()
+    conf = Path(__file__).parents[2] / "conf"
+    with initialize_config_dir(str(conf), version_base="1.3"):
+        yield lambda *overrides: compose("offline_osr", overrides=list(overrides))
+
+
+@pytest.mark.parametrize(
+    "key", ["trainer.foo", "foo", "loss.recovery_wieght", "inverse_dynamics.loss.foo"]
+)
+def test_keys_that_were_added_are_refused(composed, key):
+    with pytest.raises(ValueError, match=f"there is no key {key}: docs"):
+        run_folder.check_keys(composed(f"+{key}=1"))
+
+
+@pytest.mark.parametrize(
+    "override", ["loss=osr_adversarial", "+inverse_dynamics.network.low=-2.0"]
+)
+def test_keys_of_the_schema_and_of_a_function_pass(composed, override):
+    run_folder.check_keys(composed(override))

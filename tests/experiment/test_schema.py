@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import inspect
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.errors import ConfigCompositionException, MissingConfigException
 from hydra.utils import get_class, instantiate
-from omegaconf import OmegaConf
+from omegaconf import OmegaConf, ValidationError
 
-from torchrl_osr import Adversary, InverseDynamicsLoss
-from torchrl_osr.data import LEVELS, load_behavior_card
-from torchrl_osr.data.environment import MAZE_IDS
-from torchrl_osr.data.mazes import MAZE_LEVELS
-from torchrl_osr.data.sources import FILE_SOURCES
-from torchrl_osr.experiment import loss_config
+from torchrl_osr import Adversary, InverseDynamicsLoss, OSRLoss, objectives
+from torchrl_osr.data import (
+    MAZE_IDS,
+    MAZE_QUALITIES,
+    QUALITIES,
+    RECORDED,
+    load_behavior_card,
+)
 from torchrl_osr.experiment import schema as config
+from torchrl_osr.experiment.derived_schema import schema_of
 
 CONF = Path(__file__).parents[2] / "conf"
-GROUPS = ["env", "data", "inverse_dynamics", "loss", "logger", "preset"]
+GROUPS = ["env", "data", "inverse_dynamics", "loss", "logger", "perturbation", "preset"]
+OBJECTIVES = sorted(set(objectives.__all__) - {"BaseLoss"})
+NETWORKS = {"actor_network", "qvalue_network", "inverse_dynamics_network"}
 
 
 @pytest.fixture(autouse=True)
@@ -59,7 +65,7 @@ def test_every_experiment_composes_and_sweeps_over_values_that_compose(name):
 
 
 def test_groups_name_what_the_package_has():
-    assert options("data") == sorted([*LEVELS, *MAZE_LEVELS, *FILE_SOURCES])
+    assert options("data") == sorted([*QUALITIES, *MAZE_QUALITIES, *RECORDED])
     assert options("env") == sorted([*load_behavior_card(), *MAZE_IDS])
     for name, env_id in MAZE_IDS.items():
         assert composed(f"env={name}").env == {"name": name, "id": env_id}
@@ -72,29 +78,7 @@ def test_presets_reach_the_values_and_the_command_line_wins():
     cfg = composed("preset=paper", "trainer.steps=7", "data=expert")
     assert cfg.trainer.steps == 7
     assert cfg.trainer.batch_size == 256
-    assert cfg.data.level == "expert"
-
-
-def test_cql_is_osr_without_recovery():
-    osr, cql = composed().loss, composed("loss=cql").loss
-    assert {key for key in osr if osr[key] != cql[key]} == {"recovery_weight"}
-    assert cql.recovery_weight == 0
-
-
-@pytest.mark.parametrize(
-    ("override", "named"),
-    [
-        ("loss.recovery_wieght=1", "recovery_wieght"),
-        ("trainer.steps=many", "many"),
-        ("seed=first", "first"),
-        ("network.num_cells=[wide]", "wide"),
-        ("loss.fixed_alpha=perhaps", "perhaps"),
-    ],
-)
-def test_mistyped_key_or_type_stops_by_name(override, named):
-    with pytest.raises(ConfigCompositionException) as error:
-        composed(override)
-    assert named in f"{error.value} {error.value.__cause__}"
+    assert "expert" in cfg.data.values()
 
 
 @pytest.mark.parametrize("group", GROUPS)
@@ -105,30 +89,172 @@ def test_unknown_option_lists_what_exists(group):
         assert name in str(error.value)
 
 
+# -- the schemas of the losses, derived from their signatures ----------------------
+
+
+def keyword_parameters(name: str) -> dict[str, inspect.Parameter]:
+    """What a user can give to a class besides networks, read from its signature."""
+    target = getattr(objectives, name)
+    found = dict(inspect.signature(target).parameters)
+    if found.pop("options", None):
+        base = inspect.signature(objectives.BaseLoss).parameters
+        found |= {key: each for key, each in base.items() if key not in found}
+    return {key: each for key, each in found.items() if key not in NETWORKS}
+
+
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_schema_has_the_names_and_defaults_of_the_signature(name):
+    schema = schema_of(getattr(objectives, name))
+    defaults = {field.name: field.default for field in fields(schema)}
+    assert get_class(defaults.pop("_target_")) is getattr(objectives, name)
+    parameters = keyword_parameters(name)
+    assert len(parameters) > 3
+    assert defaults == {key: each.default for key, each in parameters.items()}
+    # OmegaConf takes every default for a value of its field's type, and keeps it.
+    structured = OmegaConf.structured(schema)
+    assert {key: structured[key] for key in defaults} == defaults
+
+
+WRONG = {"float": "many", "int": 1.5, "bool": "perhaps"}
+
+
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_schema_has_the_types_of_the_signature(name):
+    structured = OmegaConf.structured(schema_of(getattr(objectives, name)))
+    for key, parameter in keyword_parameters(name).items():
+        # Annotations are strings: "float", "int | None", "Literal['a', 'b']", ...
+        parts = {part.strip() for part in parameter.annotation.split("|")}
+        wrong = [WRONG[part] for part in parts & WRONG.keys()]
+        if any(part.startswith(("Literal", "States")) for part in parts):
+            structured[key], wrong = "text", [[1]]
+        if "None" in parts:
+            structured[key] = None
+        else:
+            wrong.append(None)
+        assert wrong, key
+        for value in wrong:
+            with pytest.raises(ValidationError, match=key):
+                structured[key] = value
+
+
+def test_types_of_unions_and_literals():
+    types = {field.name: field.type for field in fields(schema_of(OSRLoss))}
+    assert types["recovery_weight"] is float
+    assert types["recovery_states"] is types["recovery_direction"] is str
+    assert types["fixed_alpha"] is bool
+    assert types["chunk_size"] == int | None
+    assert types["reduction"] == str | None
+    assert types["use_prioritized_weights"] == bool | str
+    assert types["target_entropy"] == float | str | int
+
+
+MISTYPED = [
+    ("trainer.steps=many", "many"),
+    ("seed=first", "first"),
+    ("network.num_cells=[wide]", "wide"),
+    ("perturbation.stdd=1", "stdd"),
+    ("inverse_dynamics.loss.latent_wieght=1", "latent_wieght"),
+    ("loss.fixed_alpha=perhaps", "perhaps"),
+    ("loss.target_entropy=[1]", "target_entropy"),
+]
+
+
+@pytest.mark.parametrize(("override", "named"), MISTYPED)
+def test_mistyped_key_or_type_stops_by_name(override, named):
+    with pytest.raises(ConfigCompositionException) as error:
+        composed(override)
+    assert named in f"{error.value} {error.value.__cause__}"
+
+
 @pytest.mark.parametrize("name", options("loss"))
-def test_loss_config_is_the_loss_modules_vocabulary(name):
-    cfg = OmegaConf.to_container(composed("preset=paper", f"loss={name}"), resolve=True)
-    loss = cfg["loss"]
-    keywords = inspect.signature(get_class(loss.pop("_target_")).__init__).parameters
-    assert loss.keys() <= keywords.keys()
-    if name in ("osr", "osr_v"):
-        # The paper preset is the default of the class too: one set of numbers.
-        assert loss == {key: keywords[key].default for key in loss}
+def test_mistyped_option_of_a_loss_stops_by_name(name):
+    for option, named in (
+        ("recovery_wieght=1", "wieght"),
+        ("num_qvalue_nets=two", "two"),
+    ):
+        with pytest.raises(ConfigCompositionException) as error:
+            composed(f"loss={name}", f"loss.{option}")
+        assert named in f"{error.value} {error.value.__cause__}"
+
+
+def changed(cfg) -> dict:
+    """The options of a composed loss that are not its class's defaults."""
+    container = OmegaConf.to_container(cfg, resolve=True)
+    target = get_class(container.pop("_target_"))
+    parameters = keyword_parameters(target.__name__)
+    assert container.keys() == parameters.keys()
+    return {k: v for k, v in container.items() if v != parameters[k].default}
+
+
+CQL = {"recovery_weight": 0.0, "actor_states": "clean"}
+OSR_10 = {"min_q_weight": 0.0, "deterministic_backup": False, "num_qvalue_nets": 10}
+DATA = {"recovery_target": "data"}
+OFFICIAL = {
+    "recovery_direction": "reverse",
+    "action_reduction": "mean",
+    "recovery_states": "perturbed",
+    "actor_states": "clean",
+}
+# The class of each configuration, and what it changes of the class's defaults, which
+# are the paper's sizes.
+LOSSES = {
+    "osr": ("OSRLoss", {}),
+    "cql": ("OSRLoss", CQL),
+    "cql_bc": ("OSRLoss", DATA | {"recovery_states": "clean", "actor_states": "clean"}),
+    "cql_noisy_bc": ("OSRLoss", DATA),
+    "osr_official": ("OSRLoss", OFFICIAL),
+    "osr_10": ("OSRLoss", OSR_10),
+    "sac_10": ("OSRLoss", OSR_10 | CQL),
+    "edac_10": ("EDACLoss", {"num_qvalue_nets": 10}),
+    "osr_v": ("OSRVLoss", {}),
+    "td3_bc": ("TD3BCLoss", {}),
+}
+
+
+def test_every_loss_configuration_is_listed():
+    assert sorted(LOSSES) == options("loss")
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_loss_is_the_class_with_these_options(name):
+    target, expected = LOSSES[name]
+    loss = composed("preset=paper", f"loss={name}").loss
+    assert get_class(loss._target_) is getattr(objectives, target)
+    assert changed(loss) == expected
+
+
+@pytest.mark.parametrize(("name", "number"), [("cql", 6), ("osr_10", 6), ("osr_v", 1)])
+def test_number_of_sampled_actions_is_one_for_all_losses_with_cqls_term(name, number):
+    assert composed(f"loss={name}", "num_random=6").loss.num_random == number
 
 
 @pytest.mark.parametrize("name", options("inverse_dynamics"))
 def test_model_config_is_the_model_loss_modules_vocabulary(name):
     cfg = composed(f"inverse_dynamics={name}").inverse_dynamics
     model = instantiate(cfg.network, 3, 2, num_cells=[4])
-    loss = InverseDynamicsLoss(model, **cfg.loss)
-    assert (loss.states, loss.loss_function) == (
+    loss = instantiate(cfg.loss, model)
+    assert type(loss) is InverseDynamicsLoss
+    assert (loss.states, loss.action_error, loss.latent_weight) == (
         cfg.loss.states,
         cfg.loss.loss_function,
+        cfg.loss.latent_weight,
     )
 
 
-def test_adversary_of_the_configuration_is_the_class_default():
-    assert instantiate(composed("loss=osr_adversarial").loss.adversary) == Adversary()
+def test_adversarial_perturbation_is_the_noise_and_the_class_default():
+    adversarial, gaussian = (
+        composed(f"perturbation={name}").perturbation
+        for name in ("adversarial", "gaussian")
+    )
+    assert instantiate(adversarial.adversary) == Adversary()
+    assert gaussian.adversary is None
+    assert adversarial.std == gaussian.std
+    options = [f"perturbation.adversary.{x}" for x in ("objective=min_Q", "epsilon=1")]
+    tried = composed("perturbation=adversarial", *options).perturbation
+    assert instantiate(tried.adversary) == Adversary("min_Q", epsilon=1.0)
+    with pytest.raises(ConfigCompositionException) as error:
+        composed("perturbation=adversarial", "perturbation.adversary.epsilonn=1")
+    assert "epsilonn" in f"{error.value} {error.value.__cause__}"
 
 
 def test_official_preset_reaches_every_group_and_quick_sizes_stay_possible():
@@ -153,27 +279,20 @@ def test_antmaze_preset_is_corls_cql():
     assert (cfg.optim.gamma, cfg.optim.tau) == (0.99, 5e-3)
     assert (cfg.trainer.eval_episodes, cfg.trainer.steps) == (100, 1_000_000)
     assert (cfg.trainer.eval_interval, cfg.trainer.batch_size) == (50_000, 256)
-    assert (cfg.trainer.bc_steps, cfg.loss.clip_diff_max) == (0, float("inf"))
     assert cfg.optim == paper.optim
 
 
-def test_number_of_sampled_actions_is_the_presets_where_cqls_term_is():
-    for name in options("loss"):
-        number = composed(f"loss={name}").loss.num_random
-        assert number == (1 if name == "osr_v" else composed().num_random)
-
-
 def test_schema_documents_every_field():
-    modules = (config, loss_config)
-    schemas = {
+    schemas = [
         schema
-        for module in modules
-        for schema in vars(module).values()
-        if inspect.isclass(schema) and schema.__module__ == module.__name__
-    }
+        for schema in vars(config).values()
+        if is_dataclass(schema) and schema.__module__ == config.__name__
+    ]
+    assert config.OfflineOSRConfig in schemas
     for schema in schemas:
-        own = set(schema.__annotations__) - {"_target_"}
+        own = fields(schema)
         if schema is config.OfflineOSRConfig:
-            own = {"seed", "num_random", "resume"}
-        for name in own:
+            # The groups have classes of their own.
+            own = [each for each in own if each.default_factory is MISSING]
+        for name in {each.name for each in own} - {"_target_", "loss"}:
             assert f"{name}:" in schema.__doc__, f"{schema.__name__}.{name}"

@@ -13,7 +13,8 @@ from tensordict import TensorDict
 from torchrl.checkpoint import CheckpointError, CheckpointRotation
 from torchrl.envs import ObservationNorm
 
-from torchrl_osr.evaluation.episodes import deterministic_policy
+from torchrl_osr.envs import critics_of
+from torchrl_osr.evaluation import deterministic_policy
 from torchrl_osr.experiment import schema as config
 from torchrl_osr.experiment.build import make_learner
 from torchrl_osr.experiment.trained_run import (
@@ -22,7 +23,7 @@ from torchrl_osr.experiment.trained_run import (
     load_trained,
     run_folder_of,
 )
-from torchrl_osr.trainers.checkpointing import safe_checkpoint
+from torchrl_osr.trainers.checkpoints import safe_checkpoint
 
 CONF = Path(__file__).parents[2] / "conf"
 
@@ -70,12 +71,27 @@ def test_the_policy_and_the_critics_are_those_that_were_saved(run, rows):
     assert trained.config.network.num_cells == [8]
     assert trained.folder == folder
     states = TensorDict({"observation": rows}, [6])
-    action = policy(rows)[None]
     there, here = (
-        each._qvalue(states[None], action, each.qvalue_network_params)
-        for each in (loss, trained.loss)
+        critics_of(each)(states, policy(rows)) for each in (loss, trained.loss)
     )
     assert torch.equal(there, here)
+
+
+def test_the_inverse_dynamics_model_is_the_one_that_was_saved(run, rows):
+    folder, _, loss = run
+    states = {"observation": rows, "next": {"observation": rows + 1}}
+    batch = TensorDict(states, [6])
+    with loss.inverse_dynamics_network_params.to_module(
+        loss.inverse_dynamics_network, preserve_module_state=False
+    ):
+        saved = loss.inverse_dynamics_network.get_dist(batch.copy())
+    loaded = load_trained(folder).inverse_dynamics.get_dist(batch)
+    assert torch.equal(saved.deterministic_sample, loaded.deterministic_sample)
+
+
+def test_runs_without_recovery_have_no_inverse_dynamics_model(tmp_path):
+    make_run(tmp_path / "run", "loss=cql")
+    assert load_trained(tmp_path / "run").inverse_dynamics is None
 
 
 def test_kept_checkpoints_come_oldest_first(run):

@@ -8,11 +8,14 @@ from tensordict import TensorDict
 from tensordict.nn import InteractionType, set_interaction_type
 from torchrl.modules import TanhNormal
 
-from torchrl_osr import InverseDynamicsLoss, StatePerturbation
+from torchrl_osr import InverseDynamicsLoss, StateRecoveryLoss
 from torchrl_osr.evaluation import inverse_dynamics_report
-from torchrl_osr.functional import gaussian_kl
-from torchrl_osr.modules import cvae_inverse_dynamics, tanh_gaussian_inverse_dynamics
-from torchrl_osr.objectives.frozen_model import frozen_distribution
+from torchrl_osr.functional import gaussian_kl, state_recovery
+from torchrl_osr.modules import (
+    cvae_inverse_dynamics,
+    tanh_gaussian_actor,
+    tanh_gaussian_inverse_dynamics,
+)
 
 LATENT_KEYS = ["latent_loc", "latent_scale"]
 OUT_KEYS = ["loc", "scale", "action", "action_log_prob"]
@@ -25,9 +28,9 @@ def make_model(**kwargs):
 
 
 def make_states(*size: int, scale: float = 1.0) -> TensorDict:
-    observation = scale * torch.randn(*size, 3)
-    following = {"observation": scale * torch.randn(*size, 3)}
-    return TensorDict({"observation": observation, "next": following}, size)
+    observation, next_observation = scale * torch.randn(2, *size, 3)
+    next_states = {"observation": next_observation}
+    return TensorDict({"observation": observation, "next": next_states}, size)
 
 
 def correlation(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
@@ -127,29 +130,20 @@ def test_draws_send_gradient_to_the_encoder() -> None:
         assert half.count_nonzero() == 4
 
 
-def test_the_frozen_model_and_the_report_never_draw() -> None:
+def test_the_policys_losses_and_the_report_never_draw() -> None:
     model, data = make_model(), make_states(7)
     data["action"] = torch.rand(7, 2)
     data["next", "done"] = torch.zeros(7, 1, dtype=torch.bool)
-    model_loss = InverseDynamicsLoss(model)
-    batch = StatePerturbation(std=0.1)(data.clone())
-
-    def frozen() -> torch.Tensor:
-        return frozen_distribution(
-            model_loss.inverse_dynamics_network,
-            model_loss.inverse_dynamics_network_params,
-            batch,
-            done=torch.zeros(7, dtype=torch.bool),
-            perturbed="perturbed",
-        ).loc
-
-    loc, report = frozen(), inverse_dynamics_report(model, data)
-    assert loc.shape == (2, 7, 2)
-    torch.testing.assert_close(loc[0], model.get_dist(data).loc)
+    actor = tanh_gaussian_actor(3, 2, num_cells=[8])
+    loss = StateRecoveryLoss(actor, model, recovery_states="clean")
+    recovery, report = loss(data)["recovery_kl"], inverse_dynamics_report(model, data)
+    pi, still = actor.get_dist(data), model.get_dist(data)
+    wanted = state_recovery(pi.loc, pi.scale, still.loc, still.scale).mean()
+    torch.testing.assert_close(recovery, wanted.detach())
     with set_interaction_type(RANDOM):
-        assert torch.equal(frozen(), loc)
+        assert torch.equal(loss(data)["recovery_kl"], recovery)
         assert inverse_dynamics_report(model, data) == report
-        assert not torch.equal(model.get_dist(data).loc, loc[0])
+        assert not torch.equal(model.get_dist(data).loc, still.loc)
 
 
 @pytest.mark.filterwarnings("ignore:.*autograd.function.Function:DeprecationWarning")

@@ -18,8 +18,9 @@ BUILDERS = [categorical_actor, categorical_inverse_dynamics]
 
 
 def states(*size: int) -> TensorDict:
-    following = {"observation": torch.randn(*size, 5)}
-    return TensorDict({"observation": torch.randn(*size, 5), "next": following}, size)
+    observation, next_observation = torch.randn(2, *size, 5)
+    next_states = {"observation": next_observation}
+    return TensorDict({"observation": observation, "next": next_states}, size)
 
 
 @pytest.mark.parametrize("build", BUILDERS)

@@ -5,22 +5,29 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import InteractionType, set_interaction_type
 from torchrl.modules import TanhNormal
 
 from torchrl_osr import OSRLoss
 from torchrl_osr.modules import (
     critic_ensemble,
+    deterministic_actor,
     tanh_gaussian_actor,
     tanh_gaussian_inverse_dynamics,
 )
 
 BUILDERS = [tanh_gaussian_actor, tanh_gaussian_inverse_dynamics]
+BOUNDS = [
+    (-1.0, 1.0),
+    (-0.4, 0.4),
+    (torch.tensor([-1.0, 0.0]), torch.tensor([2.0, 3.0])),
+]
 
 
 def states(*size: int, scale: float = 1.0) -> TensorDict:
-    observation = scale * torch.randn(*size, 5)
-    following = {"observation": scale * torch.randn(*size, 5)}
-    return TensorDict({"observation": observation, "next": following}, size)
+    observation, next_observation = scale * torch.randn(2, *size, 5)
+    next_states = {"observation": next_observation}
+    return TensorDict({"observation": observation, "next": next_states}, size)
 
 
 @pytest.mark.parametrize("build", BUILDERS)
@@ -32,11 +39,8 @@ def test_outputs_have_one_entry_an_action_dimension(build, size) -> None:
     assert out["action_log_prob"].shape == size
 
 
-@pytest.mark.parametrize("build", BUILDERS)
-@pytest.mark.parametrize(
-    ("low", "high"),
-    [(-1.0, 1.0), (-0.4, 0.4), (torch.tensor([-1.0, 0.0]), torch.tensor([2.0, 3.0]))],
-)
+@pytest.mark.parametrize("build", [*BUILDERS, deterministic_actor])
+@pytest.mark.parametrize(("low", "high"), BOUNDS)
 def test_actions_fill_their_bounds_and_never_leave_them(build, low, high) -> None:
     # Inputs of this size saturate the tanh at both ends.
     action = build(5, 2, num_cells=[8], low=low, high=high)(states(500, scale=300))
@@ -47,6 +51,35 @@ def test_actions_fill_their_bounds_and_never_leave_them(build, low, high) -> Non
     width = high - low
     assert (action.amin(0) < low + 0.1 * width).all()
     assert (action.amax(0) > high - 0.1 * width).all()
+
+
+@pytest.mark.parametrize("size", [(7,), (2, 3)])
+@pytest.mark.parametrize(("low", "high"), BOUNDS)
+def test_deterministic_action_is_the_squashed_output(size, low, high) -> None:
+    actor = deterministic_actor(5, 2, num_cells=[8], low=low, high=high)
+    batch = states(*size)
+    out = actor(batch.clone())
+    assert set(out.keys(True, True)) - set(batch.keys(True, True)) == {
+        "param",
+        "action",
+    }
+    # By hand: the network's output, moved by the interval's center as TorchRL's
+    # TanhDelta does, a tanh, and the interval.
+    param = actor.module[0].module(batch["observation"])
+    low, high = torch.as_tensor(low), torch.as_tensor(high)
+    center, half = (low + high) / 2, (high - low) / 2
+    wanted = center + half * (param + center).tanh()
+    torch.testing.assert_close(out["action"], wanted)
+    # Nothing is drawn, whatever is asked for.
+    with set_interaction_type(InteractionType.RANDOM):
+        assert torch.equal(actor(batch.clone())["action"], out["action"])
+
+
+def test_deterministic_action_passes_the_gradient_of_its_tanh() -> None:
+    actor = deterministic_actor(5, 2, num_cells=[8])
+    out = actor(states(4))
+    (slope,) = torch.autograd.grad(out["action"].sum(), out["param"])
+    torch.testing.assert_close(slope, 1 - out["param"].tanh().square())
 
 
 @pytest.mark.parametrize("build", BUILDERS)
@@ -114,7 +147,7 @@ def test_critics_keep_torchs_default_initialisation_in_the_loss() -> None:
         assert torch.equal(kept, critic.module[2].weight)
 
 
-@pytest.mark.parametrize("build", [*BUILDERS, critic_ensemble])
+@pytest.mark.parametrize("build", [*BUILDERS, deterministic_actor, critic_ensemble])
 def test_width_depth_and_activation_are_as_asked(build) -> None:
     network = build(5, 2, num_cells=[6, 4], activation_class=torch.nn.Tanh)
     network = network[0] if isinstance(network, list) else network

@@ -1,7 +1,9 @@
 """The family of losses: how each is built, and what its contract says.
 
-A test with an argument ``name`` runs once for every loss; the arguments in ``PARTS``
-stand for some of them. ``family`` and ``family_batch`` build what the name says.
+A test marked ``losses`` runs once for every loss, with its name as the argument
+``name``; ``losses("osr", "cql")`` runs for these, and ``losses(having="critics")``
+for those with a property in ``PROPERTIES``. ``family`` and ``family_batch`` build what
+the name says.
 """
 
 from __future__ import annotations
@@ -27,13 +29,13 @@ from torchrl.modules import (
 from torchrl.objectives import LossModule, SoftUpdate
 
 from torchrl_osr import (
-    Adversary,
-    DiscreteInverseDynamicsLoss,
     DiscreteOSRLoss,
+    EDACLoss,
     InverseDynamicsLoss,
     OSRLoss,
     OSRVLoss,
     StateRecoveryLoss,
+    TD3BCLoss,
 )
 from torchrl_osr.modules import cvae_inverse_dynamics
 
@@ -156,7 +158,7 @@ def latent_model(*, observation, action, seed: int):
 ACTOR, CRITICS, MODEL = (
     f"{network}_network_params" for network in ("actor", "qvalue", "inverse_dynamics")
 )
-NEXT, TWIN = ("next", "observation"), ("perturbed", "observation")
+NEXT, PERTURBED = ("next", "observation"), ("perturbed", "observation")
 TRANSITION = ["observation", "action", NEXT]
 TRANSITION += [("next", key) for key in ("reward", "done", "terminated")]
 MODEL_KEYS = {key: key for key in ("action", "done", "perturbed")}
@@ -166,11 +168,7 @@ CRITIC_KEYS = RECOVERY_KEYS | {
     "reward": "reward",
     "terminated": "terminated",
     "priority": "td_error",
-}
-WEIGHTS = {
-    "recovery_weight": ["loss_recovery"],
-    "min_q_weight": ["loss_cql", "loss_alpha_prime"],
-    "diversity_weight": ["loss_diversity"],
+    "state_action_value": "state_action_value",
 }
 
 
@@ -187,6 +185,7 @@ class Member:
         options: keywords of the loss.
         networks: keywords of the networks' factory.
         replace: factories of networks that stand in the place of the usual ones.
+        discrete: whether actions are.
     """
 
     loss_class: type[LossModule]
@@ -197,28 +196,21 @@ class Member:
     options: dict[str, object] = field(default_factory=dict)
     networks: dict[str, object] = field(default_factory=dict)
     replace: dict[str, Callable] = field(default_factory=dict)
+    discrete: bool = False
 
     @property
     def out_keys(self) -> list[str]:
         return [*self.groups, *self.metrics]
 
     @property
-    def reads_twin(self) -> bool:
-        return TWIN in self.in_keys
-
-    @property
-    def has_critics(self) -> bool:
-        return CRITICS in self.groups.values()
-
-    @property
-    def modelled(self) -> bool:
-        """Whether it holds a model that somebody else has trained."""
-        cloning = self.options.get("recovery_target") == "data"
-        return "loss_recovery" in self.groups and not cloning
-
-    @property
-    def discrete(self) -> bool:
-        return self.loss_class in (DiscreteOSRLoss, DiscreteInverseDynamicsLoss)
+    def parts(self) -> list[str]:
+        """The networks that the loss is given, in this order."""
+        if self.loss_class is InverseDynamicsLoss:
+            return ["inverse_dynamics"]
+        if self.loss_class is StateRecoveryLoss:
+            return ["actor", "inverse_dynamics"]
+        with_model = self.loss_class not in (EDACLoss, TD3BCLoss)
+        return ["actor", "critics", *["inverse_dynamics"] * with_model]
 
     @property
     def index(self) -> bool:
@@ -226,73 +218,93 @@ class Member:
         return self.networks.get("distribution_class") is Categorical
 
     @property
-    def parts(self) -> list[str]:
-        """The networks that the loss is given, in this order."""
-        if MODEL in self.groups.values():
-            return ["inverse_dynamics"]
-        return ["actor", *["critics"] * self.has_critics, "inverse_dynamics"]
+    def recovery_metric(self) -> str | None:
+        """The metric that is the unweighted recovery term, if there is one."""
+        return next((key for key in self.metrics if key.startswith("recovery_")), None)
 
     @property
     def weights(self) -> dict[str, list[str]]:
-        """The coefficients that may be assigned, and the losses that they scale."""
-        scaled = {
-            weight: [key for key in losses if key in self.groups]
-            for weight, losses in WEIGHTS.items()
-        }
-        return {weight: losses for weight, losses in scaled.items() if losses}
+        """The coefficients that may be assigned, and the losses that hold their terms.
+
+        ``loss_cql`` and ``loss_alpha_prime`` are such terms and nothing else.
+        """
+        found = {}
+        if self.recovery_metric:
+            holder = {OSRVLoss: "loss_qvalue", StateRecoveryLoss: "loss_recovery"}
+            found["recovery_weight"] = [holder.get(self.loss_class, "loss_actor")]
+        if "loss_cql" in self.groups:
+            keys = ("loss_cql", "loss_alpha_prime")
+            found["min_q_weight"] = [key for key in keys if key in self.groups]
+        if self.loss_class is EDACLoss:
+            found["diversity_weight"] = ["loss_qvalue"]
+        return found
+
+
+PROPERTIES: dict[str, Callable[[Member], bool]] = {
+    "critics": lambda member: "loss_qvalue" in member.groups,
+    "temperature": lambda member: "loss_alpha" in member.groups,
+    "recovery": lambda member: "recovery_weight" in member.weights,
+    # An inverse dynamics model that was trained before and is frozen.
+    "model": lambda member: (
+        "recovery_weight" in member.weights
+        and member.options.get("recovery_target") != "data"
+    ),
+    "cql": lambda member: "loss_cql" in member.groups,
+    "perturbed": lambda member: PERTURBED in member.in_keys,
+    "priority weight": lambda member: "priority_weight" in member.keys,
+    "weights": lambda member: member.weights != {},
+}
 
 
 def actor_critic(
     loss_class: type[LossModule],
     groups: dict[str, str],
     *metrics: str,
-    twin: bool = True,
+    perturbed: bool = True,
     networks: dict[str, object] | None = None,
     **options: object,
 ) -> Member:
-    """A loss with critics: its own terms, metrics and options."""
-    value = "action_value" if loss_class is DiscreteOSRLoss else "state_action_value"
-    draws = {} if loss_class is DiscreteOSRLoss else {"num_random": 3}
+    """A soft actor-critic loss: its own terms, metrics and options."""
+    discrete, draws = loss_class is DiscreteOSRLoss, loss_class in (OSRLoss, OSRVLoss)
     return Member(
         loss_class,
-        SOFT_ACTOR_CRITIC | groups,
+        SAC | groups,
         ["alpha", "entropy", "pred_value", "target_value", *metrics],
-        [*TRANSITION, *[TWIN] * twin],
-        CRITIC_KEYS | {value: value},
-        {"alpha_init": 0.5, "recovery_weight": 0.5} | draws | options,
+        [*TRANSITION, *[PERTURBED] * perturbed],
+        CRITIC_KEYS | ({"action_value": "action_value"} if discrete else {}),
+        {"alpha_init": 0.5} | ({"num_random": 3} if draws else {}) | options,
         networks or {},
+        discrete=discrete,
     )
 
 
-SOFT_ACTOR_CRITIC = {
-    "loss_actor": ACTOR,
-    "loss_alpha": "log_alpha",
-    "loss_qvalue": CRITICS,
-}
-CQL, RECOVERY = {"loss_cql": CRITICS}, {"loss_recovery": ACTOR}
+SAC = {"loss_actor": ACTOR, "loss_alpha": "log_alpha", "loss_qvalue": CRITICS}
+CQL = {"loss_cql": CRITICS}
 # Critics that are plain MLPs with ReLUs have a path of their own, others are vmapped.
 RELU = {"critic_activation": nn.ReLU}
+NO_RECOVERY = {"recovery_weight": 0.0, "actor_states": "clean", "perturbed": False}
 recovery_loss = partial(
     Member,
     StateRecoveryLoss,
-    RECOVERY,
+    {"loss_recovery": ACTOR},
     ["recovery_kl"],
-    ["observation", NEXT, ("next", "done"), TWIN],
+    ["observation", NEXT, ("next", "done"), PERTURBED],
     RECOVERY_KEYS,
 )
-
-
-def model_loss(loss_class: type[LossModule] = InverseDynamicsLoss, **rest) -> Member:
-    in_keys = ["observation", NEXT, "action", ("next", "done"), TWIN]
-    groups = {"loss_inverse_dynamics": MODEL}
-    return Member(loss_class, groups, [], in_keys, MODEL_KEYS, **rest)
-
+model_loss = partial(
+    Member,
+    InverseDynamicsLoss,
+    {"loss_inverse_dynamics": MODEL},
+    [],
+    ["observation", NEXT, "action", ("next", "done"), PERTURBED],
+    MODEL_KEYS,
+)
 
 FAMILY = {
-    "osr": actor_critic(OSRLoss, CQL | RECOVERY, "recovery_kl", networks=RELU),
+    "osr": actor_critic(OSRLoss, CQL, "recovery_kl", networks=RELU),
     "official": actor_critic(
         OSRLoss,
-        CQL | RECOVERY,
+        CQL,
         "recovery_kl",
         networks=RELU,
         recovery_direction="reverse",
@@ -300,114 +312,99 @@ FAMILY = {
         recovery_states="perturbed",
         actor_states="clean",
     ),
-    "adversarial": actor_critic(
-        OSRLoss,
-        CQL | RECOVERY,
-        "recovery_kl",
-        twin=False,
-        networks=RELU,
-        adversary=Adversary(epsilon=0.1, num_samples=3),
-    ),
     "osr-10": actor_critic(
         OSRLoss,
-        RECOVERY,
+        {},
         "recovery_kl",
         networks={"num_critics": 3} | RELU,
         min_q_weight=0.0,
         deterministic_backup=False,
     ),
-    "cql": actor_critic(OSRLoss, CQL, twin=False, recovery_weight=0.0),
-    "cloning": actor_critic(
-        OSRLoss,
-        CQL | RECOVERY,
-        "recovery_nll",
-        twin=False,
-        recovery_target="data",
-        recovery_states="clean",
-    ),
-    "noisy-cloning": actor_critic(
-        OSRLoss, CQL | RECOVERY, "recovery_nll", recovery_target="data"
-    ),
+    "cql": actor_critic(OSRLoss, CQL, **NO_RECOVERY),
+    # CQL on D_tot, to tell the recovery term from the perturbed states.
+    "cql-perturbed": actor_critic(OSRLoss, CQL, recovery_weight=0.0),
     "cql-options": actor_critic(
         OSRLoss,
         CQL | {"loss_alpha_prime": "log_alpha_prime"},
         "alpha_prime",
-        twin=False,
         networks=RELU,
-        recovery_weight=0.0,
         with_lagrange=True,
         lagrange_thresh=1.0,
         max_q_backup=True,
-        deterministic_backup=False,
-        importance_sample=False,
         temperature=1.5,
+        **NO_RECOVERY,
     ),
-    "edac": actor_critic(
+    "cloning": actor_critic(
         OSRLoss,
-        {"loss_diversity": CRITICS},
-        twin=False,
-        networks={"num_critics": 3},
-        recovery_weight=0.0,
-        min_q_weight=0.0,
-        deterministic_backup=False,
-        diversity_weight=0.75,
+        CQL,
+        "recovery_nll",
+        perturbed=False,
+        recovery_target="data",
+        recovery_states="clean",
+        actor_states="clean",
     ),
-    "osrv": actor_critic(OSRVLoss, {"loss_recovery": CRITICS}, "recovery_gap"),
+    "noisy-cloning": actor_critic(OSRLoss, CQL, "recovery_nll", recovery_target="data"),
+    "osrv": actor_critic(OSRVLoss, {}, "recovery_gap", recovery_weight=0.5),
     "osrv-logsumexp": actor_critic(
         OSRVLoss,
-        {"loss_recovery": CRITICS},
+        {},
         "recovery_gap",
         networks=RELU,
         policy_values="logsumexp",
+        recovery_weight=0.5,
     ),
-    "discrete": actor_critic(DiscreteOSRLoss, CQL | RECOVERY, "recovery_kl"),
+    "edac": actor_critic(
+        EDACLoss,
+        {},
+        "diversity",
+        perturbed=False,
+        networks={"num_critics": 3},
+        diversity_weight=0.75,
+    ),
+    "td3bc": Member(
+        TD3BCLoss,
+        {"loss_actor": ACTOR, "loss_qvalue": CRITICS},
+        ["cloning_error", "pred_value", "target_value"],
+        TRANSITION,
+        CRITIC_KEYS,
+        replace={"actor": partial(deterministic_actor, "module")},
+    ),
+    "discrete": actor_critic(DiscreteOSRLoss, CQL, "recovery_kl"),
     "discrete-cql": actor_critic(
         DiscreteOSRLoss,
         CQL,
-        twin=False,
         networks={"distribution_class": Categorical},
-        recovery_weight=0.0,
+        **NO_RECOVERY,
     ),
     "recovery": recovery_loss(),
     # With safe=True TorchRL 0.14.1 refuses to compile a TanhDelta, on any torch.
     "recovery-delta": recovery_loss(
-        options={"direction": "reverse"},
+        options={"recovery_direction": "reverse"},
         replace={"actor": partial(deterministic_actor, "delta", safe=False)},
     ),
     "recovery-plain": recovery_loss(
-        options={"direction": "reverse"},
+        options={"recovery_direction": "reverse"},
         replace={"actor": partial(deterministic_actor, "actor")},
     ),
     "idm": model_loss(),
     "idm-mse": model_loss(options={"loss_function": "mse"}),
     "cvae": model_loss(replace={"inverse_dynamics": latent_model}),
-    "discrete-idm": model_loss(DiscreteInverseDynamicsLoss),
+    "discrete-idm": model_loss(discrete=True),
 }
 
 
-def those(condition: Callable[[Member], bool]) -> list[str]:
-    return [name for name, member in FAMILY.items() if condition(member)]
-
-
-PARTS = {
-    "name": list(FAMILY),
-    "critic_loss": those(lambda member: member.has_critics),
-    "recovering": those(lambda member: "loss_recovery" in member.groups),
-    "modelled": those(lambda member: member.modelled),
-    "conservative": those(lambda member: "loss_cql" in member.groups),
-    # Without a recovery term for good: no model and no perturbed state.
-    "unrecovering": those(lambda member: member.options.get("recovery_weight") == 0.0),
-    "twin_reading": those(lambda member: member.reads_twin),
-    "prioritized": those(lambda member: "priority_weight" in member.keys),
-    "scheduled": those(lambda member: member.weights != {}),
-}
+def losses(*names: str, having: str | None = None) -> list[str]:
+    """The losses of these names, or all, that have a property."""
+    found = names or tuple(FAMILY)
+    if having:
+        return [name for name in found if PROPERTIES[having](FAMILY[name])]
+    return list(found)
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Run a test for every loss that its argument stands for."""
-    for argument, names in PARTS.items():
-        if argument in metafunc.fixturenames:
-            metafunc.parametrize(argument, names)
+    """Run a test for every loss that its mark asks for."""
+    for mark in metafunc.definition.iter_markers("losses"):
+        metafunc.parametrize("name", losses(*mark.args, **mark.kwargs))
 
 
 class Family:
@@ -418,6 +415,10 @@ class Family:
 
     def __getitem__(self, name: str) -> Member:
         return FAMILY[name]
+
+    def has(self, name: str, what: str) -> bool:
+        """Whether a loss has the property ``what``, see ``PROPERTIES``."""
+        return PROPERTIES[what](FAMILY[name])
 
     def networks(
         self, name: str, *, observation="observation", action="action", seed=0, **rest
@@ -444,11 +445,12 @@ class Family:
         """
         member = FAMILY[name]
         networks = networks or self.networks(name)
-        if member.has_critics and options.get("reduction") == "none":
+        with_critics = self.has(name, "critics")
+        if with_critics and options.get("reduction") == "none":
             options = {"scalar_output_mode": "exclude"} | options
         parts = [getattr(networks, part) for part in member.parts]
         loss = member.loss_class(*parts, **(member.options | options)).double()
-        if member.has_critics and updated:
+        if with_critics and updated:
             SoftUpdate(loss, tau=0.1)
         return loss
 
@@ -461,14 +463,14 @@ def family(make_networks, make_discrete_networks) -> Family:
 
 @pytest.fixture
 def family_batch(make_batch, make_discrete_batch):
-    """Return a factory of a loss's batch, with a twin if the loss reads one."""
+    """Return a factory of a loss's batch, by default with the states that it reads."""
 
-    def make(name: str, *size: int, twin: bool | None = None) -> TensorDict:
+    def make(name: str, *size: int, perturbed: bool | None = None) -> TensorDict:
         member = FAMILY[name]
-        twin = member.reads_twin if twin is None else twin
-        batch = (make_discrete_batch if member.discrete else make_batch)(
-            *size, twin=twin
-        )
+        if perturbed is None:
+            perturbed = PERTURBED in member.in_keys
+        make = make_discrete_batch if member.discrete else make_batch
+        batch = make(*size, twin=perturbed)
         if member.index:
             batch["action"] = batch["action"].argmax(-1)
         return batch
@@ -483,6 +485,28 @@ def seeded():
     def call(loss, *args, **kwargs):
         torch.manual_seed(2)
         return loss(*args, **kwargs)
+
+    return call
+
+
+@pytest.fixture
+def terms(family, seeded):
+    """Return a function that lists the terms of the losses.
+
+    ``"recovery"`` is what ``recovery_weight`` scales, the losses are what is left.
+    """
+
+    def call(name: str, loss, batch: TensorDict) -> dict[str, Tensor]:
+        out = seeded(loss, batch)
+        found = {key: out[key] for key in family[name].groups}
+        for key in family[name].weights.get("recovery_weight", []):
+            # Another buffer in its place, for the graph of the losses holds this one.
+            weight = loss.recovery_weight
+            loss._buffers["recovery_weight"] = torch.zeros_like(weight)
+            rest = seeded(loss, batch)[key]
+            loss._buffers["recovery_weight"] = weight
+            found |= {key: rest, "recovery": found[key] - rest}
+        return found
 
     return call
 

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import inspect
+
 import pytest
 import torch
 from tensordict import TensorDict, unravel_key
 
+from torchrl_osr import EDACLoss
+
 REDUCTIONS = ["mean", "sum", "none"]
 
 
+@pytest.mark.losses
 def test_in_keys_are_stable_and_enough(
     family, family_batch, seeded, assert_same, name
 ) -> None:
-    loss, batch = family(name), family_batch(name, 10, twin=True)
+    loss, batch = family(name), family_batch(name, 10, perturbed=True)
     assert loss.in_keys == family[name].in_keys
     everything, enough = seeded(loss, batch), batch.select(*loss.in_keys)
     out = seeded(loss, enough)
@@ -21,6 +26,7 @@ def test_in_keys_are_stable_and_enough(
     assert loss.in_keys == family[name].in_keys
 
 
+@pytest.mark.losses
 @pytest.mark.parametrize("reduction", [None, *REDUCTIONS])
 def test_out_keys_are_what_forward_returns(
     family, family_batch, name, reduction
@@ -31,25 +37,44 @@ def test_out_keys_are_what_forward_returns(
     assert list(loss(family_batch(name, 10)).keys()) == expected
 
 
+@pytest.mark.losses(having="critics")
 def test_metrics_can_be_kept_where_nothing_is_reduced(
-    family, family_batch, seeded, critic_loss
+    family, family_batch, seeded, name
 ) -> None:
-    batch, expected = family_batch(critic_loss, 10), family[critic_loss].out_keys
-    loss = family(critic_loss, reduction="none", scalar_output_mode="non_tensor")
+    batch, expected = family_batch(name, 10), family[name].out_keys
+    loss = family(name, reduction="none", scalar_output_mode="non_tensor")
     out = seeded(loss, batch)
     assert set(out.keys()) == set(expected)
     assert loss.out_keys == expected
-    mean = seeded(family(critic_loss), batch)
-    for key in family[critic_loss].metrics:
+    mean = seeded(family(name), batch)
+    for key in family[name].metrics:
         assert torch.equal(out[key], mean[key]), key
 
 
-def test_reduction_none_warns_about_the_metrics_it_drops(family, critic_loss) -> None:
-    with pytest.warns(UserWarning, match="leaves its scalar metrics out"):
-        loss = family(critic_loss, reduction="none", scalar_output_mode=None)
-    assert loss.out_keys == list(family[critic_loss].groups)
+@pytest.mark.losses(having="critics")
+def test_reduction_none_warns_about_the_metrics_it_drops(family, name) -> None:
+    networks, member = family.networks(name), family[name]
+    parts = [getattr(networks, part) for part in member.parts]
+    line = inspect.currentframe().f_lineno + 2
+    with pytest.warns(UserWarning, match="leaves its scalar metrics out") as caught:
+        loss = member.loss_class(*parts, **member.options, reduction="none")
+    assert loss.out_keys == list(member.groups)
+    assert [(each.filename, each.lineno) for each in caught] == [(__file__, line)]
 
 
+def test_a_derived_loss_warns_of_its_own_line(make_networks) -> None:
+    class Derived(EDACLoss):
+        def __init__(self, *networks) -> None:
+            super().__init__(*networks, reduction="none")
+
+    networks = make_networks()
+    with pytest.warns(UserWarning, match="Derived with reduction='none'") as caught:
+        Derived(networks.actor, networks.critics)
+    line = Derived.__init__.__code__.co_firstlineno + 1
+    assert [(each.filename, each.lineno) for each in caught] == [(__file__, line)]
+
+
+@pytest.mark.losses
 def test_keys_have_defaults_can_be_renamed_and_restored(family, name) -> None:
     loss, member = family(name), family[name]
     assert vars(loss.tensor_keys) == member.keys
@@ -126,6 +151,7 @@ def weighted(batch: TensorDict) -> TensorDict:
     return batch
 
 
+@pytest.mark.losses
 def test_nested_and_renamed_keys_give_the_same_numbers(
     family, family_batch, seeded, assert_same, name
 ) -> None:
@@ -138,18 +164,20 @@ def test_nested_and_renamed_keys_give_the_same_numbers(
     check_renamed(loss, enough, expected, assert_same)
 
 
+@pytest.mark.losses(having="critics")
 @pytest.mark.parametrize("estimator", ["before", "after", "never"])
 def test_value_estimator_follows_the_renamed_keys(
-    family, family_batch, seeded, assert_same, critic_loss, estimator
+    family, family_batch, seeded, assert_same, name, estimator
 ) -> None:
-    batch = weighted(family_batch(critic_loss, 10))
+    batch = weighted(family_batch(name, 10))
     other = renamed(batch)
-    expected = seeded(family(critic_loss), batch)
-    loss = renamed_loss(family, critic_loss, estimator)
+    expected = seeded(family(name), batch)
+    loss = renamed_loss(family, name, estimator)
     check_renamed(loss, other, expected, assert_same)
     assert torch.equal(other["agent", "priority"], batch["td_error"])
 
 
+@pytest.mark.losses
 @pytest.mark.parametrize("reduction", REDUCTIONS)
 def test_keyword_call_equals_tensordict_call(
     family, family_batch, seeded, assert_same, name, reduction
@@ -176,6 +204,7 @@ def test_nested_keywords_are_joined(family, family_batch, seeded, assert_same) -
     )
 
 
+@pytest.mark.losses
 def test_selected_out_keys_are_all_that_comes_back(
     family, family_batch, seeded, assert_same, name
 ) -> None:
@@ -191,29 +220,32 @@ def test_selected_out_keys_are_all_that_comes_back(
     assert set(seeded(loss, batch).keys()) == set(loss.out_keys)
 
 
-def test_losses_without_recovery_need_no_model_and_no_twin(
-    family, family_batch, seeded, unrecovering
+NO_MODEL = ["cql", "cql-perturbed", "cql-options", "discrete-cql"]
+NO_MODEL += ["cloning", "noisy-cloning"]
+
+
+@pytest.mark.losses(*NO_MODEL)
+def test_losses_without_the_model_are_built_without_it(
+    family, family_batch, seeded, assert_same_bits, name
 ) -> None:
-    expected = seeded(family(unrecovering), family_batch(unrecovering, 10, twin=True))
-    networks = family.networks(unrecovering)
+    batch, networks = family_batch(name, 10), family.networks(name)
+    expected = seeded(family(name), batch)
     networks.inverse_dynamics = None
-    loss = family(unrecovering, networks)
-    out = seeded(loss, family_batch(unrecovering, 10, twin=False))
+    out = seeded(family(name, networks), batch)
     assert list(out.keys()) == list(expected.keys())
-    assert all(
-        torch.equal(out[key], expected[key]) for key in family[unrecovering].out_keys
-    )
+    assert_same_bits(list(out.values()), list(expected.values()))
 
 
+@pytest.mark.losses(having="cql")
 def test_losses_without_the_conservative_term_read_the_same(
-    family, family_batch, conservative
+    family, family_batch, name
 ) -> None:
-    member = family[conservative]
-    loss = family(conservative, min_q_weight=0.0, **NOT_LAGRANGE.get(conservative, {}))
+    member = family[name]
+    loss = family(name, min_q_weight=0.0, **NOT_LAGRANGE.get(name, {}))
     gone = ("loss_cql", "loss_alpha_prime", "alpha_prime")
     expected = [key for key in member.out_keys if key not in gone]
     assert loss.in_keys == member.in_keys
-    assert list(loss(family_batch(conservative, 10)).keys()) == expected
+    assert list(loss(family_batch(name, 10)).keys()) == expected
     assert loss.out_keys == expected
 
 
@@ -221,13 +253,17 @@ def test_losses_without_the_conservative_term_read_the_same(
 NOT_LAGRANGE = {"cql-options": {"with_lagrange": False}}
 
 
-@pytest.mark.parametrize(
-    "model", ["recovery", "recovery-delta", "recovery-plain", "idm", "discrete-idm"]
+@pytest.mark.losses(
+    "recovery", "recovery-delta", "recovery-plain", "idm", "discrete-idm"
 )
-def test_clean_states_need_no_twin(family, family_batch, seeded, model) -> None:
-    loss = family(model, states="clean")
+def test_clean_states_need_no_perturbed_ones(
+    family, family_batch, seeded, assert_same_bits, name
+) -> None:
+    option = "recovery_states" if name.startswith("recovery") else "states"
+    loss = family(name, **{option: "clean"})
     assert all(key[0] != "perturbed" for key in loss.in_keys)
-    with_twin, without = (
-        seeded(loss, family_batch(model, 10, twin=twin)) for twin in (True, False)
+    found, expected = (
+        seeded(loss, family_batch(name, 10, perturbed=perturbed))
+        for perturbed in (True, False)
     )
-    assert all(torch.equal(with_twin[key], without[key]) for key in loss.out_keys)
+    assert_same_bits(list(found.values()), list(expected.values()))

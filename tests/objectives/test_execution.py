@@ -8,20 +8,20 @@ import pytest
 import torch
 
 
+@pytest.mark.losses(having="critics")
 @pytest.mark.parametrize("count", [1, 3])
 def test_a_loop_over_critics_equals_vmap(
-    family, family_batch, record, assert_same, critic_loss, count
+    family, family_batch, record, assert_same, name, count
 ) -> None:
-    if count == 1 and critic_loss == "edac":
-        count = 2  # whose critics are compared with each other
+    count = max(count, 2) if name == "edac" else count
     looped, mapped = (
         record(
             family(
-                critic_loss,
-                family.networks(critic_loss, num_critics=count),
+                name,
+                family.networks(name, num_critics=count),
                 deactivate_vmap=deactivate,
             ),
-            family_batch(critic_loss, 10),
+            family_batch(name, 10),
         )
         for deactivate in (True, False)
     )
@@ -32,6 +32,7 @@ def test_a_loop_over_critics_equals_vmap(
 @pytest.mark.filterwarnings("ignore:.*autograd.function.Function:DeprecationWarning")
 @pytest.mark.filterwarnings("ignore:.*inline_inbuilt_nn_modules:FutureWarning")
 @pytest.mark.filterwarnings("ignore:Using lock_.. inside a compiled:UserWarning")
+@pytest.mark.losses
 def test_compiled_loss_equals_eager_without_graph_breaks(
     family, family_batch, seeded, record, assert_same, name
 ) -> None:
@@ -65,22 +66,23 @@ def rows_scored(family, name: str, batch, *, critics: int = 2, **options) -> flo
 # the next action, and with K = 3 the proposals: 3K at the state of the data, or those
 # of policy and model (and uniform ones) at both states.
 @pytest.mark.parametrize(
-    ("counted", "rows"),
+    ("name", "rows"),
     [
         ("cql", 1 + 1 + 1 + 9),
         ("osr", 1 + 2 + 1 + 9),
         ("osrv", 1 + 2 + 1 + 2 * 6),
         ("osrv-logsumexp", 1 + 2 + 1 + 2 * 9),
+        ("td3bc", 1 + 1 + 1),
         ("discrete", 1 + 2 + 1),
         ("discrete-cql", 1 + 1 + 1),
     ],
 )
 @pytest.mark.parametrize("count", [1, 2])
 def test_critics_score_no_more_rows_than_the_equations_ask(
-    family, family_batch, counted, rows, count
+    family, family_batch, name, rows, count
 ) -> None:
-    batch = family_batch(counted, 10)
-    assert rows_scored(family, counted, batch, critics=count) == count * rows
+    batch = family_batch(name, 10)
+    assert rows_scored(family, name, batch, critics=count) == count * rows
 
 
 ENSEMBLE = {"min_q_weight": 0.0, "deterministic_backup": False}
@@ -88,7 +90,7 @@ ENSEMBLE = {"min_q_weight": 0.0, "deterministic_backup": False}
 
 # What the documentation says that a row costs; K is the loss's default.
 @pytest.mark.parametrize(
-    ("label", "counted", "critics", "options", "rows"),
+    ("label", "name", "critics", "options", "rows"),
     [
         ("CQL(H)", "cql", 2, {}, 66),
         ("OSR", "osr", 2, {}, 68),
@@ -98,21 +100,22 @@ ENSEMBLE = {"min_q_weight": 0.0, "deterministic_backup": False}
         (None, "osr", 2, {"max_q_backup": True}, 86),
         ("OSR-v", "osrv", 2, {}, 16),
         ("SAC-N", "cql", 10, ENSEMBLE, 30),
-        ("EDAC", "cql", 10, ENSEMBLE | {"diversity_weight": 1.0}, 40),
+        ("EDAC", "edac", 10, {}, 40),
         ("OSR-10", "osr", 10, ENSEMBLE, 40),
         (None, "osr", 10, ENSEMBLE | {"actor_states": "clean"}, 30),
+        ("TD3+BC", "td3bc", 2, {}, 6),
         ("Discrete OSR", "discrete", 2, {}, 8),
         ("Discrete CQL(H)", "discrete-cql", 2, {}, 6),
     ],
 )
 def test_rows_scored_with_the_defaults(
-    family, family_batch, record_property, label, counted, critics, options, rows
+    family, family_batch, record_property, label, name, critics, options, rows
 ) -> None:
-    defaults = inspect.signature(family[counted].loss_class).parameters
+    defaults = inspect.signature(family[name].loss_class).parameters
     if "num_random" in defaults:
         options = {"num_random": defaults["num_random"].default} | options
-    batch = family_batch(counted, 10)
-    scored = rows_scored(family, counted, batch, critics=critics, **options)
+    batch = family_batch(name, 10)
+    scored = rows_scored(family, name, batch, critics=critics, **options)
     if label:
         record_property("rows", (label, scored))
     assert scored == rows

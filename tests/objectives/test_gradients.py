@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import math
 
 import pytest
 import torch
 
 REDUCTIONS = ["mean", "sum", "none"]
-OF_TRANSITIONS = ("loss_recovery", "loss_inverse_dynamics")
-# A constant added to Q is in both halves of a gap and cancels; no gradient by the
-# action knows of it.
-CANCELS = ("loss_cql", "loss_recovery", "loss_diversity")
 OUTPUT_BIAS = "qvalue_network_params.module.2.bias"
 
 
@@ -21,22 +18,31 @@ def gradients(loss, value: torch.Tensor) -> dict[str, torch.Tensor | None]:
     return dict(zip(names, found, strict=True))
 
 
+@pytest.mark.losses
 @pytest.mark.parametrize("reduction", REDUCTIONS)
-def test_each_loss_reaches_its_own_parameters_only(
-    family, family_batch, name, reduction
+def test_each_term_reaches_its_own_parameters_only(
+    family, family_batch, terms, name, reduction
 ) -> None:
     loss, member = family(name, reduction=reduction), family[name]
-    out = loss(family_batch(name, 10))
-    for key, group in member.groups.items():
-        for parameter, gradient in gradients(loss, out[key].sum()).items():
+    groups = member.groups.copy()
+    for key in member.weights.get("recovery_weight", []):
+        groups["recovery"] = groups[key]
+    # All of this loss is the recovery term.
+    groups.pop("loss_recovery", None)
+    found = terms(name, loss, family_batch(name, 10))
+    for key, group in groups.items():
+        # A constant added to Q is in both halves of a gap and cancels.
+        is_gap = key in ("loss_cql", "recovery") and not member.discrete
+        for parameter, gradient in gradients(loss, found[key].sum()).items():
             if parameter.split(".")[0] != group:
                 assert gradient is None, (key, parameter)
-            elif key in CANCELS and parameter == OUTPUT_BIAS and not member.discrete:
-                assert gradient is None or gradient.abs().max() < 1e-12, key
+            elif is_gap and parameter == OUTPUT_BIAS:
+                assert gradient.abs().max() < 1e-12, key
             else:
                 assert gradient.abs().max() > 1e-9, (key, parameter)
 
 
+@pytest.mark.losses
 def test_nothing_else_can_be_trained(family, family_batch, name) -> None:
     networks, member = family.networks(name), family[name]
     loss = family(name, networks)
@@ -52,10 +58,11 @@ def test_nothing_else_can_be_trained(family, family_batch, name) -> None:
     assert not any(buffer.requires_grad for buffer in loss.buffers())
 
 
-def test_fixed_alpha_is_no_parameter(family, family_batch, critic_loss) -> None:
-    loss = family(critic_loss, fixed_alpha=True, alpha_init=0.25)
+@pytest.mark.losses(having="temperature")
+def test_fixed_alpha_is_no_parameter(family, family_batch, name) -> None:
+    loss = family(name, fixed_alpha=True, alpha_init=0.25)
     assert "log_alpha" not in dict(loss.named_parameters())
-    out = loss(family_batch(critic_loss, 10))
+    out = loss(family_batch(name, 10))
     assert not out["loss_alpha"].requires_grad
     # float32: the constructor takes the logarithm before .double().
     assert out["alpha"].item() == pytest.approx(0.25, rel=1e-6)
@@ -67,82 +74,65 @@ def spoil(batch, flag: torch.Tensor, value: float):
     return batch
 
 
+@pytest.mark.losses
 @pytest.mark.parametrize("garbage", [math.nan, math.inf, 1e6])
 def test_next_state_of_ended_rows_changes_no_bit_of_any_loss(
     family, family_batch, record, assert_same_bits, name, garbage
 ) -> None:
     loss, batch = family(name), family_batch(name, 10)
     # A row cut by a time limit has a next state for the critics, and for them alone.
-    flag = "terminated" if family[name].has_critics else "done"
+    flag = "terminated" if family.has(name, "critics") else "done"
     spoiled = spoil(batch, batch["next", flag], garbage)
     assert_same_bits(record(loss, spoiled), record(loss, batch))
 
 
-# Finite where the gradient passes through the actor, which does see s' here.
-@pytest.mark.parametrize(
-    ("cut", "garbage"),
-    [
-        ("osr", 1e6),
-        ("official", 1e6),
-        ("osr-10", 1e6),
-        ("adversarial", 1e6),
-        ("discrete", 1e6),
-        ("osrv", 1e6),
-        ("osrv", math.nan),
-        ("osrv-logsumexp", math.nan),
-    ],
-)
+# A finite state, which the policy's only pass over all states sees, too.
+@pytest.mark.losses("osr", "official", "osr-10", "discrete", "osrv", "osrv-logsumexp")
 def test_next_state_of_cut_rows_is_bootstrapped_from_but_never_recovered_to(
-    family, family_batch, seeded, record, assert_same_bits, cut, garbage
+    family, family_batch, seeded, record, assert_same_bits, name
 ) -> None:
-    loss, batch = family(cut), family_batch(cut, 10)
+    loss, batch = family(name), family_batch(name, 10)
     at_the_limit = batch["next", "done"] & ~batch["next", "terminated"]
-    spoiled = spoil(batch, at_the_limit, garbage)
-    keys = ["loss_recovery"]
-    assert_same_bits(record(loss, spoiled, keys), record(loss, batch, keys))
+    spoiled = spoil(batch, at_the_limit, 1e6)
     for key in ("loss_qvalue", "target_value"):
         assert seeded(loss, spoiled)[key] != seeded(loss, batch)[key]
+    # Without discount there is no bootstrap, but still the recovery term.
+    loss.make_value_estimator(gamma=0.0)
+    (key,) = family[name].weights["recovery_weight"]
+    assert_same_bits(record(loss, spoiled, [key]), record(loss, batch, [key]))
+    metric = family[name].recovery_metric
+    assert torch.equal(seeded(loss, spoiled)[metric], seeded(loss, batch)[metric])
 
 
 @pytest.mark.parametrize(
-    ("model", "states"),
+    ("name", "options"),
     [
-        ("idm", "clean"),
-        ("recovery", "clean"),
-        ("recovery", "perturbed"),
-        ("recovery-delta", "clean"),
-        ("recovery-plain", "perturbed"),
+        ("idm", {"states": "clean"}),
+        ("recovery", {"recovery_states": "clean"}),
+        ("recovery", {"recovery_states": "perturbed"}),
+        ("recovery-delta", {"recovery_states": "clean"}),
+        ("recovery-plain", {"recovery_states": "perturbed"}),
     ],
 )
 @pytest.mark.parametrize("garbage", [math.nan, 1e6])
 def test_next_state_of_done_rows_counts_on_neither_half_of_the_states(
-    family, family_batch, record, assert_same_bits, model, states, garbage
+    family, family_batch, record, assert_same_bits, name, options, garbage
 ) -> None:
-    loss, batch = family(model, states=states), family_batch(model, 10)
+    loss, batch = family(name, **options), family_batch(name, 10)
     spoiled = spoil(batch, batch["next", "done"], garbage)
     assert_same_bits(record(loss, spoiled), record(loss, batch))
 
 
-def test_a_batch_without_any_transition_gives_no_loss_of_transitions(
-    family, family_batch, name
-) -> None:
-    batch = family_batch(name, 10)
-    batch["next", "done"][:] = True
-    out = family(name)(batch)
-    for key in family[name].groups:
-        assert (key not in OF_TRANSITIONS) or out[key].item() == 0.0, key
-
-
-@pytest.mark.parametrize("pessimist", ["osr", "cql", "cql-options", "osrv", "discrete"])
+@pytest.mark.losses("osr", "cql", "cql-options", "osrv", "discrete", "edac")
 def test_the_lowest_critic_alone_decides_actor_and_target(
-    family, family_batch, seeded, pessimist
+    family, family_batch, seeded, name
 ) -> None:
-    # A third critic that is lower everywhere decides actor and target alone.
-    networks, alone = (family.networks(pessimist, num_critics=3) for _ in range(2))
+    # One critic that is lower everywhere, among three or alone with its copy.
+    networks, alone = (family.networks(name, num_critics=3) for _ in range(2))
     for each in (networks, alone):
         each.critics[2].module[-1].bias.data -= 100.0
-    alone.critics = alone.critics[2:]
-    batch = family_batch(pessimist, 10)
-    out, wanted = (seeded(family(pessimist, each), batch) for each in (networks, alone))
+    alone.critics = [alone.critics[2], copy.deepcopy(alone.critics[2])]
+    batch = family_batch(name, 10)
+    out, wanted = (seeded(family(name, each), batch) for each in (networks, alone))
     for key in ("loss_actor", "target_value"):
         torch.testing.assert_close(out[key], wanted[key], rtol=1e-12, atol=1e-12)

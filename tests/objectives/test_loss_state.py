@@ -37,6 +37,7 @@ def changed(loss, member):
     return loss
 
 
+@pytest.mark.losses
 @pytest.mark.parametrize("source", ["before any call", "after a call"])
 @pytest.mark.parametrize("estimator", [True, False], ids=["estimator", "fresh"])
 def test_state_dict_restores_every_number(
@@ -48,7 +49,7 @@ def test_state_dict_restores_every_number(
     wanted = record(loss, batch)
     assert loss.state_dict().keys() == before.keys()
     fresh = family(name, family.networks(name, seed=9))
-    if estimator and member.has_critics:
+    if estimator and family.has(name, "critics"):
         fresh.make_value_estimator(gamma=0.99)
     fresh.load_state_dict(loss.state_dict() if source == "after a call" else before)
     assert_same_bits(record(fresh, batch), wanted)
@@ -63,6 +64,7 @@ def tensors(loss) -> list[torch.Tensor]:
 
 
 # What .to(device) does with each tensor. Not .to("meta"), see test_torchrl_defects.
+@pytest.mark.losses
 def test_every_tensor_moves_with_the_loss(
     family, family_batch, record, assert_same_bits, name
 ) -> None:
@@ -79,25 +81,31 @@ def test_every_tensor_moves_with_the_loss(
     assert_same_bits(record(loss, batch), wanted)
 
 
+@pytest.mark.losses
 def test_every_number_is_cast_with_the_loss(family, name) -> None:
     loss = family(name).to(torch.float32)
     assert {tensor.dtype for tensor in tensors(loss)} == {torch.float32}
 
 
-def test_a_trained_model_loss_hands_its_model_over(
-    family, family_batch, seeded, modelled
+@pytest.mark.losses(having="model")
+def test_what_the_model_learns_later_the_loss_knows(
+    family, family_batch, seeded, name
 ) -> None:
-    # The recovery term reads the network that the model's loss trained in place.
-    model_loss = "discrete-idm" if family[modelled].discrete else "idm"
-    batch, networks = family_batch(modelled, 10), family.networks(modelled)
+    # The example builds the policy's loss before the model is trained, in place.
+    model_loss = "discrete-idm" if family[name].discrete else "idm"
+    batch, networks = family_batch(name, 10), family.networks(name)
+    metric = family[name].recovery_metric
+    early = family(name, networks)
+    before = seeded(early, batch)[metric]
     shift(family(model_loss, networks).inverse_dynamics_network_params, 0.3)
-    trained, untrained = family(modelled, networks), family(modelled)
-    key = "loss_recovery"
-    assert seeded(trained, batch)[key] != seeded(untrained, batch)[key]
+    after = seeded(early, batch)[metric]
+    assert after != before
+    assert torch.equal(seeded(family(name, networks), batch)[metric], after)
 
 
-def test_soft_update_moves_targets_a_little(family, critic_loss) -> None:
-    loss = family(critic_loss, updated=False)
+@pytest.mark.losses(having="critics")
+def test_soft_update_moves_targets_a_little(family, name) -> None:
+    loss = family(name, updated=False)
     updater = SoftUpdate(loss, tau=0.25)
     old = values(loss.target_qvalue_network_params)
     shift(loss.qvalue_network_params, 1.0)
@@ -107,8 +115,9 @@ def test_soft_update_moves_targets_a_little(family, critic_loss) -> None:
         torch.testing.assert_close(after, before + 0.25)
 
 
-def test_hard_update_copies_at_its_interval(family, critic_loss) -> None:
-    loss = family(critic_loss, updated=False)
+@pytest.mark.losses(having="critics")
+def test_hard_update_copies_at_its_interval(family, name) -> None:
+    loss = family(name, updated=False)
     updater = HardUpdate(loss, value_network_update_interval=2)
     shift(loss.qvalue_network_params, 1.0)
     equal = []
@@ -120,85 +129,88 @@ def test_hard_update_copies_at_its_interval(family, critic_loss) -> None:
     assert equal == [False, False, True]  # TorchRL counts two steps, then copies
 
 
+@pytest.mark.losses(having="critics")
 def test_forward_warns_when_nothing_moves_the_targets(
-    family, family_batch, critic_loss
+    family, family_batch, name
 ) -> None:
-    loss = family(critic_loss, updated=False)
+    loss = family(name, updated=False)
     with pytest.warns(UserWarning, match="target network updater"):
-        loss(family_batch(critic_loss, 10))
+        loss(family_batch(name, 10))
 
 
+@pytest.mark.losses(having="critics")
 def test_without_delay_the_online_critics_are_the_target(
-    family, family_batch, seeded, critic_loss
+    family, family_batch, seeded, name
 ) -> None:
-    batch = family_batch(critic_loss, 10)
-    loss = family(critic_loss, updated=False, delay_qvalue=False)
+    batch = family_batch(name, 10)
+    loss = family(name, updated=False, delay_qvalue=False)
     before = seeded(loss, batch)["target_value"]
     shift(loss.qvalue_network_params, 0.5)
     assert seeded(loss, batch)["target_value"] != before
 
 
+@pytest.mark.losses(having="critics")
 @pytest.mark.parametrize("count", [1, 3])
-def test_a_list_of_critics_keeps_its_weights(
-    family, family_batch, critic_loss, count
-) -> None:
-    if count == 1 and critic_loss == "edac":
-        count = 2  # whose critics are compared with each other
-    critics = family.networks(critic_loss, num_critics=count).critics
+def test_a_list_of_critics_keeps_its_weights(family, family_batch, name, count) -> None:
+    count = max(count, 2) if name == "edac" else count
+    critics = family.networks(name, num_critics=count).critics
     wanted = [list(critic.parameters()) for critic in critics]
-    loss = family(critic_loss, family.networks(critic_loss, num_critics=count))
+    loss = family(name, family.networks(name, num_critics=count))
     stacked = values(loss.qvalue_network_params)
     for i, tensors in enumerate(zip(*wanted, strict=True)):
         assert torch.equal(stacked[i], torch.stack(tensors))
     assert loss.num_qvalue_nets == count
-    assert loss(family_batch(critic_loss, 10))["loss_qvalue"].isfinite()
+    assert loss(family_batch(name, 10))["loss_qvalue"].isfinite()
 
 
-def test_one_critic_is_copied_as_often_as_asked(
-    family, family_batch, critic_loss
-) -> None:
-    networks = family.networks(critic_loss)
+@pytest.mark.losses(having="critics")
+def test_one_critic_is_copied_as_often_as_asked(family, family_batch, name) -> None:
+    networks = family.networks(name)
     networks.critics = networks.critics[0]
-    loss = family(critic_loss, networks, num_qvalue_nets=4)
+    loss = family(name, networks, num_qvalue_nets=4)
     for tensor in values(loss.qvalue_network_params):
         assert tensor.shape[0] == 4
         # TorchRL draws between a tensor's extremes: a single number stays itself.
         assert tensor[0].numel() == 1 or not torch.equal(tensor[0], tensor[1])
-    assert loss(family_batch(critic_loss, 10))["loss_qvalue"].isfinite()
+    assert loss(family_batch(name, 10))["loss_qvalue"].isfinite()
 
 
-def test_weights_can_be_scheduled_in_place(
-    family, family_batch, seeded, scheduled
-) -> None:
-    loss, batch = family(scheduled), family_batch(scheduled, 10)
+@pytest.mark.losses(having="weights")
+def test_weights_can_be_scheduled_in_place(family, family_batch, seeded, name) -> None:
+    loss, batch = family(name), family_batch(name, 10)
     before = seeded(loss, batch)
-    for weight, scaled in family[scheduled].weights.items():
+    for weight, scaled in family[name].weights.items():
         buffer, old = getattr(loss, weight), getattr(loss, weight).item()
+        setattr(loss, weight, 0.0)
+        without = seeded(loss, batch)
         for factor in (0.0, 2.0, 1.0):
             setattr(loss, weight, factor * old)
             after = seeded(loss, batch)
             assert getattr(loss, weight) is buffer
             assert loss.state_dict()[weight].item() == factor * old
-            for key in family[scheduled].out_keys:
-                expected = factor * before[key] if key in scaled else before[key]
+            for key in family[name].out_keys:
+                term = before[key] - without[key]
+                assert term.any() == (key in scaled)
+                expected = without[key] + factor * term
                 torch.testing.assert_close(after[key], expected, rtol=1e-12, atol=1e-12)
 
 
 # Elsewhere a weight of 0 leaves the term out for good.
-@pytest.mark.parametrize("from_zero", ["osrv", "recovery", "recovery-plain"])
+@pytest.mark.losses("osrv", "recovery", "recovery-plain")
 def test_recovery_weight_can_be_scheduled_from_zero(
-    family, family_batch, seeded, from_zero
+    family, family_batch, seeded, terms, name
 ) -> None:
-    batch, metric = family_batch(from_zero, 10), family[from_zero].metrics[-1]
-    loss = family(from_zero, recovery_weight=0.0)
+    batch, metric = family_batch(name, 10), family[name].recovery_metric
+    loss = family(name, recovery_weight=0.0)
     before = seeded(loss, batch)
-    assert before["loss_recovery"] == 0
+    assert not terms(name, loss, batch)["recovery"].any()
     loss.recovery_weight = 2.0
-    after = seeded(loss, batch)
-    torch.testing.assert_close(after["loss_recovery"].detach(), 2.0 * before[metric])
-    assert torch.equal(after[metric], before[metric])
+    term = terms(name, loss, batch)["recovery"].detach()
+    torch.testing.assert_close(term, 2.0 * before[metric])
+    assert torch.equal(seeded(loss, batch)[metric], before[metric])
 
 
+@pytest.mark.losses
 def test_reset_redraws_what_is_trained_and_keeps_a_frozen_model(family, name) -> None:
     loss, groups = family(name), family[name].groups
     for params in held(loss).values():
@@ -207,7 +219,9 @@ def test_reset_redraws_what_is_trained_and_keeps_a_frozen_model(family, name) ->
     for key, params in held(loss).items():
         trains = key.removeprefix("target_") in groups.values()
         (trained if trains else frozen)[key] = params
-    assert list(frozen) == ["inverse_dynamics_network_params"] * family[name].modelled
+    assert list(frozen) == ["inverse_dynamics_network_params"] * family.has(
+        name, "model"
+    )
     kept = [values(params) for params in frozen.values()]
     draws = []
     for _ in range(2):
@@ -226,9 +240,10 @@ def with_dropout(networks):
     return networks
 
 
-def test_randomness_of_vmap_can_be_chosen(family, family_batch, critic_loss) -> None:
-    networks = with_dropout(family.networks(critic_loss))
-    loss, batch = family(critic_loss, networks), family_batch(critic_loss, 10)
+@pytest.mark.losses(having="critics")
+def test_randomness_of_vmap_can_be_chosen(family, family_batch, name) -> None:
+    networks = with_dropout(family.networks(name))
+    loss, batch = family(name, networks), family_batch(name, 10)
     states = batch.select(*loss.qvalue_network.in_keys)
     key = loss.qvalue_network.out_keys[-1]
     assert loss.vmap_randomness == "different"
@@ -242,16 +257,3 @@ def test_randomness_of_vmap_can_be_chosen(family, family_batch, critic_loss) -> 
         loss(batch)
     with pytest.raises(ValueError, match="should be one of"):
         loss.set_vmap_randomness("some")
-
-
-def test_what_the_model_learns_later_the_loss_knows(
-    family, family_batch, seeded, modelled
-) -> None:
-    # The example builds the policy's loss before the model is trained.
-    model_loss = "discrete-idm" if family[modelled].discrete else "idm"
-    batch, networks = family_batch(modelled, 10), family.networks(modelled)
-    early = family(modelled, networks)
-    shift(family(model_loss, networks).inverse_dynamics_network_params, 0.3)
-    late = family(modelled, networks)
-    key = "loss_recovery"
-    assert torch.equal(seeded(early, batch)[key], seeded(late, batch)[key])

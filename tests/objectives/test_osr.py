@@ -1,4 +1,10 @@
-"""OSRLoss against a plain restatement of its equations: losses, gradients, CQL(H)."""
+"""OSRLoss against a plain restatement of its equations: losses, gradients, CQL(H).
+
+"Conservative Q-Learning" (Kumar et al. 2020, https://arxiv.org/abs/2006.04779) and its
+common implementations for CQL's options, "Uncertainty-Based Offline Reinforcement
+Learning with Diversified Q-Ensemble" (An et al. 2021,
+https://arxiv.org/abs/2110.01548) for SAC-N.
+"""
 
 from __future__ import annotations
 
@@ -13,43 +19,58 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_osr import OSRLoss, StatePerturbation
 
-GAMMA, NUM_RANDOM, TEMPERATURE, ALPHA = 0.875, 4, 1.7, 0.3
-MIN_Q_WEIGHT, TARGET_ENTROPY, TARGET_SCALE = 2.5, -1.5, 0.8
-LOSSES = ["loss_actor", "loss_alpha", "loss_qvalue", "loss_cql", "loss_recovery"]
+GAMMA, K, ALPHA, LOG_PRIME = 0.875, 3, 0.3, 0.4
+TARGET_ENTROPY, TARGET_SCALE = -1.5, 0.8
+# Every option, most numbers off their defaults.
+OPTIONS = {
+    "recovery_weight": 0.75,
+    "recovery_direction": "forward",
+    "recovery_target": "inverse_dynamics",
+    "recovery_states": "both",
+    "action_reduction": "sum",
+    "actor_states": "both",
+    "min_q_weight": 2.5,
+    "temperature": 1.7,
+    "clip_diff_min": -math.inf,
+    "max_q_backup": False,
+    "deterministic_backup": True,
+    "with_lagrange": False,
+    "lagrange_thresh": 2.0,
+}
 
 
-def make_osr(networks, *, weight: float = 0.75, **kwargs) -> OSRLoss:
-    """A loss with every option off its default and target critics of their own."""
-    settings = {
-        "min_q_weight": MIN_Q_WEIGHT,
-        "num_random": NUM_RANDOM,
-        "temperature": TEMPERATURE,
+def make_osr(networks, **options) -> OSRLoss:
+    """A loss with target critics of their own."""
+    numbers = {
+        "num_random": K,
         "alpha_init": ALPHA,
         "target_entropy": TARGET_ENTROPY,
-    } | kwargs
+    }
     loss = OSRLoss(
         networks.actor,
         networks.critics,
         networks.inverse_dynamics,
-        recovery_weight=weight,
-        **settings,
+        **(OPTIONS | numbers | options),
     ).double()
     loss.make_value_estimator(gamma=GAMMA)
     SoftUpdate(loss, tau=0.1)
     loss.target_qvalue_network_params.apply_(lambda tensor: tensor.mul_(TARGET_SCALE))
+    # The constructor takes the logarithm in float32.
+    loss.log_alpha.data.fill_(math.log(ALPHA))
+    if loss.with_lagrange:
+        loss.log_alpha_prime.data.fill_(LOG_PRIME)
     return loss
 
 
-def network_losses(loss, batch) -> dict[str, Tensor]:
-    return {key: value for key, value in loss(batch).items() if key in LOSSES}
+def losses_of(loss, batch, seed: int = 5) -> dict[str, Tensor]:
+    torch.manual_seed(seed)
+    return {key: v for key, v in loss(batch).items() if key.startswith("loss_")}
 
 
 class Restatement:
-    """The equations once more: critics in a loop, densities by hand, no torchrl_osr."""
+    """The equations once more: critics and actions in loops, no torchrl_osr."""
 
-    def __init__(
-        self, networks, *, low: Tensor, high: Tensor, weight: float, variant: str
-    ) -> None:
+    def __init__(self, networks, *, low: Tensor, high: Tensor, **options) -> None:
         networks = copy.deepcopy(networks)
         self.policy_net, self.idm_net = networks.actor[0], networks.inverse_dynamics[0]
         self.critics = [critic.module for critic in networks.critics]
@@ -57,9 +78,12 @@ class Restatement:
         for target in self.targets:
             for parameter in target.parameters():
                 parameter.data.mul_(TARGET_SCALE)
-        self.log_alpha = torch.tensor(math.log(ALPHA)).double().requires_grad_()
+        self.log_alpha, self.log_prime = (
+            torch.tensor(number, dtype=torch.float64).requires_grad_()
+            for number in (math.log(ALPHA), LOG_PRIME)
+        )
         self.center, self.half = (high + low) / 2, (high - low) / 2
-        self.weight, self.variant = weight, variant
+        self.options = OPTIONS | options
 
     def policy(self, state: Tensor) -> Normal:
         _, loc, scale = self.policy_net(state)
@@ -78,176 +102,256 @@ class Restatement:
         log_prob = gaussian.log_prob(torch.atanh(squashed))
         return (log_prob - torch.log(self.half * (1 - squashed**2))).sum(-1)
 
-    def losses(self, batch, seed: int) -> dict[str, Tensor]:
-        s, a = batch["observation"], batch["action"]
-        reward = batch["next", "reward"].squeeze(-1)
-        done = batch["next", "done"]
-        terminated = batch["next", "terminated"]
-        # Rows without a next state never reach a network; any finite stand-in will do.
-        s_next = torch.where(terminated, s, batch["next", "observation"])
-        s_tot = torch.stack([s, batch["perturbed", "observation"]])
-        # Where values are sought, and where the policy recovers: the paper's D_tot, or
-        # what the authors' released code has, or the data alone.
-        official, cloning = "official" in self.variant, "cloning" in self.variant
-        if self.variant in CLEAN:
-            s_tot = s_tot[:1]
-        s_actor = s_tot[:1] if official else s_tot
-        s_recover = s_tot[1:] if official else s_tot
-        # The draws, in the order in which the loss makes them.
+    def losses(self, batch, seed: int = 5) -> dict[str, Tensor]:
         torch.manual_seed(seed)
-        like = {"dtype": torch.float64}
-        noise_actor = torch.randn(*s_actor.shape[:-1], a.shape[-1], **like)
-        uniform = 2 * torch.rand(NUM_RANDOM, *a.shape, **like) - 1
-        noise_proposals = torch.randn(NUM_RANDOM, 2, *a.shape, **like)
-        noise_target = torch.randn(*a.shape, **like)
+        ended = batch["next", "terminated"]
+        # Rows without a next state never reach a network; any finite stand-in will do.
+        batch = batch.clone()
+        batch["next", "observation"] = torch.where(
+            ended, batch["observation"], batch["next", "observation"]
+        )
+        losses = self.policy_losses(batch)
+        # The loss draws the conservative term's actions before the target's.
+        cql = self.conservative_losses(batch) if self.options["min_q_weight"] else {}
+        return losses | {"loss_qvalue": self.td_error(batch)} | cql
 
-        action, log_prob = self.act(self.policy(s_actor), noise_actor)
-        values = torch.stack([q(s_actor, action).squeeze(-1) for q in self.critics])
+    def states(self, batch, which: str) -> Tensor:
+        both = [batch["observation"], batch["perturbed", "observation"]]
+        return torch.stack({"clean": both[:1], "perturbed": both[1:]}.get(which, both))
+
+    def policy_losses(self, batch) -> dict[str, Tensor]:
+        s = self.states(batch, self.options["actor_states"])
+        noise = torch.randn(*s.shape[:-1], len(self.half), dtype=s.dtype)
+        action, log_prob = self.act(self.policy(s), noise)
+        values = torch.stack([q(s, action).squeeze(-1) for q in self.critics])
         alpha = self.log_alpha.detach().exp()
-        losses = {
-            "loss_actor": (alpha * log_prob - values.amin(0)).mean(),
-            "loss_alpha": (
-                -self.log_alpha * (log_prob.detach() + TARGET_ENTROPY)
-            ).mean(),
+        actor = (alpha * log_prob - values.amin(0)).mean()
+        if self.options["recovery_weight"]:
+            actor = actor + self.options["recovery_weight"] * self.recovery(batch)
+        entropy_gap = log_prob.detach() + TARGET_ENTROPY
+        return {
+            "loss_actor": actor,
+            "loss_alpha": (-self.log_alpha * entropy_gap).mean(),
         }
-        with torch.no_grad():
-            next_action, _ = self.act(self.policy(s_next), noise_target)
-            bootstrap = torch.stack(
-                [q(s_next, next_action).squeeze(-1) for q in self.targets]
-            ).amin(0)
-            target = reward + GAMMA * (1 - terminated.squeeze(-1).double()) * bootstrap
-            box = -torch.log(2 * self.half).sum()
-            proposals = [(self.center + self.half * u, box) for u in uniform]
-            for noise in noise_proposals:
-                proposals.append(self.act(self.policy(s), noise[0]))
-                proposals.append(self.act(self.policy(s_next), noise[1]))
-        td, gap = 0.0, 0.0
-        for critic in self.critics:
-            pred = critic(s, a).squeeze(-1)
-            logits = torch.stack(
-                [
-                    (critic(s, x).squeeze(-1) - density) / TEMPERATURE
-                    for x, density in proposals
-                ]
-            )
-            td = td + (pred - target) ** 2
-            gap = gap + TEMPERATURE * logits.exp().sum(0).log() - pred
-        losses |= {"loss_qvalue": td.mean(), "loss_cql": MIN_Q_WEIGHT * gap.mean()}
-        if self.weight:
+
+    def recovery(self, batch) -> Tensor:
+        s = self.states(batch, self.options["recovery_states"])
+        policy, a = self.policy(s), batch["action"]
+        if self.options["recovery_target"] == "data":
+            each = -self.log_prob(policy, a.expand_as(policy.loc))
+        else:
             with torch.no_grad():
-                s_next = s_next.expand_as(s_recover)
-                _, loc, scale = self.idm_net(s_recover, s_next)
-            model, policy = Normal(loc, scale), self.policy(s_recover)
-            if cloning:
-                kl = -self.log_prob(policy, a.expand_as(loc))
-            elif official:
-                kl = kl_divergence(policy, model).mean(-1)
-            else:
-                kl = kl_divergence(model, policy).sum(-1)
-            valid = ~done.squeeze(-1)
-            losses["loss_recovery"] = self.weight * kl.mean(0)[valid].mean()
-        return losses
+                _, *model = self.idm_net(s, batch["next", "observation"].expand_as(s))
+            pair = [Normal(*model), policy]
+            if self.options["recovery_direction"] == "reverse":
+                pair.reverse()
+            each = kl_divergence(*pair)
+            mean = self.options["action_reduction"] == "mean"
+            each = each.sum(-1) / (a.shape[-1] if mean else 1)
+        return each.mean(0)[~batch["next", "done"].squeeze(-1)].mean()
+
+    @torch.no_grad()
+    def td_target(self, batch) -> Tensor:
+        s_next, a = batch["next", "observation"], batch["action"]
+        number = K if self.options["max_q_backup"] else 1
+        values = []
+        for noise in torch.randn(number, *a.shape, dtype=a.dtype):
+            action, log_prob = self.act(self.policy(s_next), noise)
+            value = torch.stack([q(s_next, action) for q in self.targets]).amin(0)
+            if not self.options["deterministic_backup"]:
+                value = value - ALPHA * log_prob.unsqueeze(-1)
+            values.append(value)
+        alive = 1 - batch["next", "terminated"].double()
+        best = torch.stack(values).amax(0)
+        return batch["next", "reward"] + GAMMA * alive * best
+
+    def td_error(self, batch) -> Tensor:
+        s, a = batch["observation"], batch["action"]
+        self.target = self.td_target(batch)
+        return sum((q(s, a) - self.target).square().mean() for q in self.critics)
+
+    @torch.no_grad()
+    def proposals(self, batch) -> list[tuple[Tensor, Tensor]]:
+        s, a = batch["observation"], batch["action"]
+        s_next, box = batch["next", "observation"], -torch.log(2 * self.half).sum()
+        uniform = 2 * torch.rand(K, *a.shape, dtype=a.dtype) - 1
+        found = [(self.center + self.half * each, box) for each in uniform]
+        for noise in torch.randn(K, 2, *a.shape, dtype=a.dtype):
+            found.append(self.act(self.policy(s), noise[0]))
+            found.append(self.act(self.policy(s_next), noise[1]))
+        return found
+
+    def conservative_losses(self, batch) -> dict[str, Tensor]:
+        s, a, o = batch["observation"], batch["action"], self.options
+        proposals, tau, gaps = self.proposals(batch), o["temperature"], []
+        for q in self.critics:
+            # Importance weights 1 / p, whatever the temperature.
+            terms = [
+                (q(s, x).squeeze(-1) / tau).exp() / density.exp()
+                for x, density in proposals
+            ]
+            gap = tau * sum(terms).log() - q(s, a).squeeze(-1)
+            gaps.append(gap.clamp(min=o["clip_diff_min"]).mean())
+        weight = o["min_q_weight"]
+        if not o["with_lagrange"]:
+            return {"loss_cql": weight * sum(gaps)}
+        # CORL: half the sum over two critics, both sides of one product.
+        gaps = [gap - o["lagrange_thresh"] for gap in gaps]
+        slack = sum(gap.detach() for gap in gaps) / len(gaps)
+        return {
+            "loss_cql": weight * math.exp(LOG_PRIME) * sum(gaps),
+            "loss_alpha_prime": -weight * self.log_prime.exp() * slack,
+        }
 
 
+CQL = {"recovery_weight": 0.0, "actor_states": "clean"}
+LAGRANGE = {"with_lagrange": True}
+SAC_N = {"min_q_weight": 0.0, "deterministic_backup": False}
+# Up to the colon: the label of the checks.
 VARIANTS = {
     "OSR": {},
-    "CQL(H)": {"weight": 0.0},
+    "OSR: temperature 1": {"temperature": 1.0},
+    "OSR: recovery at clean states": {"recovery_states": "clean"},
+    "OSR: values at perturbed states": {"actor_states": "perturbed"},
+    "OSR, clean states": {"recovery_states": "clean", "actor_states": "clean"},
     "OSR, official variant": {
         "recovery_direction": "reverse",
         "action_reduction": "mean",
         "recovery_states": "perturbed",
         "actor_states": "clean",
     },
-    "OSR, clean states": {"recovery_states": "clean"},
+    "OSR-10": SAC_N,
+    "CQL(H)": CQL,
+    "CQL(H): on D_tot": {"recovery_weight": 0.0, "actor_states": "both"},
     "CQL(H) and cloning": {
         "recovery_target": "data",
         "recovery_states": "clean",
+        "actor_states": "clean",
     },
     "CQL(H) and noisy cloning": {"recovery_target": "data"},
+    "CQL(H) with its options: temperature": CQL | {"temperature": 0.6},
+    "CQL(H) with its options: clipped": CQL | {"clip_diff_min": 5.9},
+    "CQL(H) with its options: max backup": CQL | {"max_q_backup": True},
+    "CQL(H) with its options: entropy": CQL | {"deterministic_backup": False},
+    "CQL(H) with its options: lagrange": CQL | LAGRANGE,
+    "CQL(H) with its options: all": CQL
+    | LAGRANGE
+    | {"clip_diff_min": 5.9, "lagrange_thresh": -1.0, "max_q_backup": True},
+    "SAC-N": CQL | SAC_N,
 }
 
-CLEAN = ["CQL(H)", "OSR, clean states", "CQL(H) and cloning"]  # no perturbed state
-
-
-@pytest.mark.parametrize("variant", VARIANTS)
 # Bounds are float64 tensors: TorchRL would keep numbers in float32, to 1e-8 only.
-@pytest.mark.parametrize(
-    ("low", "high"), [([-1.0, -1.0], [1.0, 1.0]), ([-1.0, -0.5], [2.0, 1.5])]
-)
-# Critics with ReLUs are plain MLPs, which have a path of their own.
-@pytest.mark.parametrize("activation", [nn.Tanh, nn.ReLU])
+UNIT = {"low": -torch.ones(2).double(), "high": torch.ones(2).double()}
+BOX = {
+    "low": torch.tensor([-1.0, -0.5]).double(),
+    "high": torch.tensor([2.0, 1.5]).double(),
+}
+# Critics with ReLUs are plain MLPs, which have a path of their own on a CPU.
+RELU = {"critic_activation": nn.ReLU}
+WAYS = {
+    "vmap": (UNIT, {}, {}),
+    "loop": (BOX, {"num_critics": 3}, {"deactivate_vmap": True}),
+    "kernel": (UNIT, RELU, {}),
+    "kernel, chunks": (BOX, RELU | {"num_critics": 10}, {"chunk_size": 3}),
+    "plain": (BOX, RELU | {"num_critics": 1}, {"chunk_size": None}),
+}
+
+
+def stacked(critics, gradients) -> list[Tensor]:
+    """Gradients of critic after critic as TorchRL stacks them."""
+    number = len(gradients) // len(critics)
+    each = [gradients[i : i + number] for i in range(0, len(gradients), number)]
+    return [torch.stack(group) for group in zip(*each, strict=True)]
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("variant", VARIANTS)
 def test_losses_and_gradients_equal_the_restatement(
-    make_networks, make_batch, check, variant, low, high, activation
+    make_networks, make_batch, check, variant, way
 ) -> None:
-    options = {"weight": 0.75} | VARIANTS[variant]
-    weight = options["weight"]
-    bounds = {"low": torch.tensor(low).double(), "high": torch.tensor(high).double()}
-    networks = make_networks(**bounds, critic_activation=activation)
-    batch = make_batch(10)
-    restatement = Restatement(networks, **bounds, weight=weight, variant=variant)
-    loss = make_osr(networks, **options)
-    torch.manual_seed(5)
-    losses = network_losses(loss, batch)
-    expected = restatement.losses(batch, seed=5)
-    assert set(losses) == set(expected) == set(LOSSES[: 5 if weight else 4])
+    bounds, critics, options = WAYS[way]
+    networks = make_networks(**bounds, **critics)
+    restatement = Restatement(networks, **bounds, **VARIANTS[variant])
+    loss = make_osr(networks, **VARIANTS[variant], **options)
+    losses = losses_of(loss, make_batch(10))
+    expected = restatement.losses(make_batch(10))
+    assert set(losses) == set(expected)
+    label, _, _ = variant.partition(":")
     values = [losses[key] for key in expected]
-    check(variant, values, expected.values(), tolerance=1e-8)
+    check(label, values, expected.values(), tolerance=1e-12)
 
     # The sum of ours is correct training; the plain one needs each group by itself.
     actor = list(restatement.policy_net.parameters())
-    critics = [
-        parameter for critic in restatement.critics for parameter in critic.parameters()
-    ]
-    policy_part = expected["loss_actor"] + expected.get("loss_recovery", 0)
-    expected_actor = torch.autograd.grad(policy_part, actor)
-    critic_part = expected["loss_qvalue"] + expected["loss_cql"]
-    expected_critic = torch.autograd.grad(critic_part, critics)
-    (expected_alpha,) = torch.autograd.grad(
-        expected["loss_alpha"], restatement.log_alpha
-    )
+    wanted = list(torch.autograd.grad(expected["loss_actor"], actor))
+    parameters = [each for q in restatement.critics for each in q.parameters()]
+    critic_part = expected["loss_qvalue"] + expected.get("loss_cql", 0)
+    gradients = torch.autograd.grad(critic_part, parameters)
+    wanted += stacked(restatement.critics, gradients)
+    wanted += torch.autograd.grad(expected["loss_alpha"], restatement.log_alpha)
+    ours = [*loss.actor_network_params.values(True, True)]
+    ours += [*loss.qvalue_network_params.values(True, True), loss.log_alpha]
+    if loss.with_lagrange:
+        dual = expected["loss_alpha_prime"]
+        wanted += torch.autograd.grad(dual, restatement.log_prime)
+        ours.append(loss.log_alpha_prime)
     sum(losses.values()).backward()
-    ours = [p.grad for p in loss.actor_network_params.values(True, True)]
-    half = len(critics) // 2
-    first, second = expected_critic[:half], expected_critic[half:]
-    stacked = [torch.stack(pair) for pair in zip(first, second, strict=True)]
-    ours += [p.grad for p in loss.qvalue_network_params.values(True, True)]
-    ours.append(loss.log_alpha.grad)
-    wanted = [*expected_actor, *stacked, expected_alpha]
-    check(variant, ours, wanted, tolerance=1e-7)
+    check(label, [each.grad for each in ours], wanted, tolerance=1e-12)
 
 
-@pytest.mark.parametrize("recovery_weight", [0.75, 0.0])
-def test_behavior_cloning_puts_the_data_in_the_place_of_the_values(
-    make_networks, make_batch, recovery_weight
+def test_clipping_reaches_some_rows_and_sends_no_gradient(
+    make_networks, make_batch
 ) -> None:
-    networks, batch = make_networks(), make_batch(10)
-    loss = make_osr(networks, weight=recovery_weight, behavior_cloning=True)
-    torch.manual_seed(5)
-    out = loss(batch)
-    # -log alpha (mean log pi + target) tells the entropy that was drawn.
-    entropy = out["entropy"]
-    cloned = networks.actor.get_dist(batch).log_prob(batch["action"]).mean()
-    expected = -math.exp(loss.log_alpha.item()) * entropy - cloned
-    torch.testing.assert_close(out["loss_actor"], expected)
-    out["loss_actor"].backward()
-    assert all(p.grad is None for p in loss.qvalue_network_params.values(True, True))
-    # The other terms are what they are without it, and so is this one afterwards.
-    reference = make_osr(make_networks(), weight=recovery_weight)
-    loss.behavior_cloning = False
-    for each in (loss, reference):
-        torch.manual_seed(5)
-        each.record = network_losses(each, make_batch(10))
-    assert loss.record == reference.record
-    for key in set(reference.record) - {"loss_actor"}:
-        assert torch.equal(out[key], reference.record[key])
+    free, bound, all_bound = (
+        make_osr(
+            make_networks(),
+            clip_diff_min=clip_diff_min,
+            reduction="none",
+            scalar_output_mode="exclude",
+        )
+        for clip_diff_min in (-math.inf, 5.9, 1e3)
+    )
+    gaps = [losses_of(loss, make_batch(10))["loss_cql"] for loss in (free, bound)]
+    # Summed over critics: equal where neither is clipped.
+    assert 0 < (gaps[0] == gaps[1]).sum() < 10
+    losses_of(all_bound, make_batch(10))["loss_cql"].sum().backward()
+    for each in all_bound.qvalue_network_params.values(True, True):
+        assert each.grad.abs().max() == 0
+
+
+@pytest.mark.parametrize(("threshold", "rises"), [(-100.0, True), (100.0, False)])
+def test_multiplier_rises_while_the_gap_is_too_large(
+    make_networks, make_batch, threshold, rises
+) -> None:
+    loss = make_osr(make_networks(), lagrange_thresh=threshold, **CQL, **LAGRANGE)
+    optimizer = torch.optim.SGD([loss.log_alpha_prime], lr=1e-4)
+    sum(losses_of(loss, make_batch(10)).values()).backward()
+    optimizer.step()
+    assert (loss.log_alpha_prime.item() > LOG_PRIME) == rises
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (LAGRANGE | {"min_q_weight": 0.0}, "needs min_q_weight above 0"),
+        (SAC_N | {"max_q_backup": True}, "leave deterministic_backup=True"),
+    ],
+)
+def test_options_that_contradict_each_other_are_refused(
+    make_networks, options, message
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_osr(make_networks(), **options)
 
 
 def test_metrics_say_what_they_are_called(make_networks, make_batch) -> None:
-    loss, batch = make_osr(make_networks()), make_batch(10)
+    networks, batch = make_networks(**UNIT), make_batch(10)
+    loss, without = make_osr(networks), make_osr(networks, recovery_weight=0.0)
+    torch.manual_seed(5)
     out = loss(batch)
     assert out["alpha"].item() == pytest.approx(ALPHA)
-    recovery = loss.recovery_weight * out["recovery_kl"]
-    assert out["loss_recovery"].item() == pytest.approx(recovery.item())
+    # What the recovery term adds to the policy's loss.
+    term = out["loss_actor"] - losses_of(without, batch)["loss_actor"]
+    assert term.item() == pytest.approx(0.75 * out["recovery_kl"].item())
     # -log alpha (mean log pi + target): the entropy is what the temperature sees.
     entropy = TARGET_ENTROPY + out["loss_alpha"] / math.log(ALPHA)
     assert out["entropy"].item() == pytest.approx(entropy.item())
@@ -256,6 +360,19 @@ def test_metrics_say_what_they_are_called(make_networks, make_batch) -> None:
         for critic in make_networks().critics
     )
     assert out["pred_value"].item() == pytest.approx(pred.item() / 2)
+    restatement = Restatement(networks, **UNIT)
+    restatement.losses(batch)
+    torch.testing.assert_close(out["target_value"], restatement.target.mean())
+
+
+def test_a_list_of_one_critic_is_trained(make_networks, make_batch) -> None:
+    # TorchRL 0.14.1 by itself would hide its parameters from the optimizer.
+    networks = make_networks(num_critics=1)
+    loss = make_osr(networks)
+    weight = loss.qvalue_network_params["module", "0", "weight"]
+    assert torch.equal(weight[0], networks.critics[0].module[0].weight)
+    train(loss, make_batch(10), 1)
+    assert not torch.equal(weight[0], networks.critics[0].module[0].weight)
 
 
 @pytest.mark.parametrize("function", ["l1", "l2", "smooth_l1"])
@@ -295,9 +412,8 @@ def train(loss, batch, steps: int) -> list[Tensor]:
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
     updater = SoftUpdate(loss, tau=0.1)
     record = []
-    torch.manual_seed(11)
-    for _ in range(steps):
-        losses = network_losses(loss, batch)
+    for step in range(steps):
+        losses = losses_of(loss, batch, seed=step)
         optimizer.zero_grad()
         sum(losses.values()).backward()
         record += [value.detach() for value in losses.values()]
@@ -309,28 +425,31 @@ def train(loss, batch, steps: int) -> list[Tensor]:
 
 @pytest.mark.parametrize("with_model", [True, False])
 @pytest.mark.parametrize("perturb", [True, False])
-def test_weight_zero_is_cql_to_the_bit_whatever_else_is_given(
+def test_cql_is_the_same_to_the_bit_whatever_else_is_given(
     make_networks, make_batch, with_model, perturb
 ) -> None:
-    reference = make_osr(make_networks(), weight=0.0)
+    reference = make_osr(make_networks(), **CQL)
     expected = train(reference, make_batch(10, twin=False), 10)
     networks, batch = make_networks(), make_batch(10, twin=False)
     if not with_model:
         networks.inverse_dynamics = None
-    loss = make_osr(networks, weight=0.0)
+    loss = make_osr(networks, **CQL)
     if perturb:
         batch = StatePerturbation(std=0.1)(batch)
     for got, wanted in zip(train(loss, batch, 10), expected, strict=True):
         assert torch.equal(got, wanted)
 
 
-@pytest.mark.parametrize(("weight", "calls"), [(0.75, 1), (0.0, 0)])
-def test_weight_zero_never_calls_the_inverse_dynamics_model(
-    make_networks, make_batch, weight, calls
+@pytest.mark.parametrize(
+    ("options", "calls"),
+    [({}, 1), ({"recovery_weight": 0.0}, 0), ({"recovery_target": "data"}, 0)],
+)
+def test_model_is_called_once_where_the_policy_is_pulled_to_it(
+    make_networks, make_batch, options, calls
 ) -> None:
     networks, counted = make_networks(), []
     networks.inverse_dynamics[0][0].register_forward_pre_hook(
         lambda *_: counted.append(1)
     )
-    make_osr(networks, weight=weight)(make_batch(10))
+    make_osr(networks, **options)(make_batch(10))
     assert len(counted) == calls

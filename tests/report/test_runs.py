@@ -74,7 +74,7 @@ def write_config(folder: Path, text: str) -> None:
         (lambda f: (f / "returns.json").write_text("{}"), "no entry 'evaluations'"),
         (lambda f: fakes.write_json(f / "returns.json", {"evaluations": 7}), "int"),
         (lambda f: os.truncate(f / "returns.json", 10**9), "268,435,456 bytes"),
-        (lambda f: os.truncate(f / "config.yaml", 10**9), "1,048,576 bytes"),
+        (lambda f: os.truncate(f / "config.yaml", 10**9), "65,536 bytes"),
         (lambda f: write_config(f, "a: [1"), "while parsing"),
         (lambda f: write_config(f, "other: 1"), "no entry"),
         (lambda f: write_config(f, "[" * 200 + "]" * 200), "more than 32 deep"),

@@ -1,4 +1,8 @@
-"""Offline data: behaviour policies, collection, readers, guards and replay buffers.
+"""Offline data: collected on this machine or recorded, in memory or memory-mapped.
+
+Three rooms, each of which knows only those before it: ``store`` (what a data set is,
+where its rows are, how they are drawn), ``collect`` (tasks, behaviour policies,
+roll-outs) and ``read`` (Minari, D4RL, files of your own). ``load_dataset`` opens all.
 
 Collecting needs Gymnasium, MuJoCo, tqdm and platformdirs (``torchrl-osr[examples]``),
 reading HDF5, Arrow or Parquet those and Minari, h5py and pyarrow (``[minari]``); the
@@ -14,86 +18,104 @@ from typing import TYPE_CHECKING, Any
 
 from torchrl.data.datasets import register_dataset
 
-from torchrl_osr.data.behavior import (
+from torchrl_osr.data.collect.behavior import (
     BehaviorPolicy,
     load_behavior_card,
     load_behavior_policy,
     save_behavior_policy,
     update_behavior_card,
 )
-from torchrl_osr.data.on_disk import TransitionsOnDisk
-from torchrl_osr.data.reference_scores import (
+from torchrl_osr.data.collect.reference_scores import (
     REFERENCE_RETURNS,
     ReferenceReturns,
     normalized_score,
 )
-from torchrl_osr.data.replay_buffer import (
+from torchrl_osr.data.store.replay_buffer import (
+    check_memory,
+    is_memory_mapped,
     make_replay_buffer,
-    observation_statistics,
-    split_held_out,
-    split_on_disk,
 )
-from torchrl_osr.data.validation import check_dataset
+from torchrl_osr.data.store.splits import held_out_rows, mix_datasets, split_held_out
+from torchrl_osr.data.store.statistics import (
+    observation_statistics,
+    sampled_observations,
+)
+from torchrl_osr.data.store.validation import ACTION_LIMIT, check_dataset
 
 if TYPE_CHECKING:
-    from torchrl_osr.data.collection import (
+    from torchrl_osr.data.collect.environment import MAZE_IDS, make_environment
+    from torchrl_osr.data.collect.local import load_local_dataset
+    from torchrl_osr.data.collect.mazes import MAZE_QUALITIES
+    from torchrl_osr.data.collect.qualities import (
+        QUALITIES,
+        collect_quality,
+        quality_policies,
+    )
+    from torchrl_osr.data.collect.rollout import (
         Collection,
         collect_transitions,
         measure_policy,
     )
-    from torchrl_osr.data.d4rl_reader import load_d4rl
-    from torchrl_osr.data.disk_writer import write_on_disk
-    from torchrl_osr.data.environment import make_environment
-    from torchrl_osr.data.episodes import transitions_from_episodes
-    from torchrl_osr.data.file_reader import load_file
-    from torchrl_osr.data.levels import LEVELS, collect_level
-    from torchrl_osr.data.local import load_local_dataset
-    from torchrl_osr.data.minari_export import export_minari
-    from torchrl_osr.data.minari_reader import load_minari, minari_replay_buffer
-    from torchrl_osr.data.mixtures import load_mixture, mix_datasets
-    from torchrl_osr.data.sources import load_dataset
-    from torchrl_osr.data.trajectories import transitions_from_rows
+    from torchrl_osr.data.read.d4rl import load_d4rl
+    from torchrl_osr.data.read.files import load_file
+    from torchrl_osr.data.read.minari import load_minari, minari_replay_buffer
+    from torchrl_osr.data.read.minari_export import export_minari
+    from torchrl_osr.data.read.transitions import (
+        transitions_from_episodes,
+        transitions_from_rows,
+    )
+    from torchrl_osr.data.sources import RECORDED, load_dataset
+    from torchrl_osr.data.store.memmap import load_memmap, write_memmap
 
 _NEEDS_EXTRA = {
-    "LEVELS": "levels",
-    "Collection": "collection",
-    "collect_level": "levels",
-    "collect_transitions": "collection",
-    "export_minari": "minari_export",
-    "load_d4rl": "d4rl_reader",
+    "Collection": "collect.rollout",
+    "MAZE_IDS": "collect.environment",
+    "MAZE_QUALITIES": "collect.mazes",
+    "QUALITIES": "collect.qualities",
+    "RECORDED": "sources",
+    "collect_quality": "collect.qualities",
+    "collect_transitions": "collect.rollout",
+    "export_minari": "read.minari_export",
+    "load_d4rl": "read.d4rl",
     "load_dataset": "sources",
-    "load_file": "file_reader",
-    "load_minari": "minari_reader",
-    "make_environment": "environment",
-    "measure_policy": "collection",
-    "load_local_dataset": "local",
-    "load_mixture": "mixtures",
-    "minari_replay_buffer": "minari_reader",
-    "mix_datasets": "mixtures",
-    "transitions_from_episodes": "episodes",
-    "transitions_from_rows": "trajectories",
-    "write_on_disk": "disk_writer",
+    "load_file": "read.files",
+    "load_local_dataset": "collect.local",
+    "load_memmap": "store.memmap",
+    "load_minari": "read.minari",
+    "make_environment": "collect.environment",
+    "measure_policy": "collect.rollout",
+    "minari_replay_buffer": "read.minari",
+    "quality_policies": "collect.qualities",
+    "transitions_from_episodes": "read.transitions",
+    "transitions_from_rows": "read.transitions",
+    "write_memmap": "store.memmap",
 }
 
 __all__ = [
-    "LEVELS",
+    "ACTION_LIMIT",
+    "MAZE_IDS",
+    "MAZE_QUALITIES",
+    "QUALITIES",
+    "RECORDED",
     "REFERENCE_RETURNS",
     "BehaviorPolicy",
     "Collection",
     "ReferenceReturns",
-    "TransitionsOnDisk",
     "check_dataset",
-    "collect_level",
+    "check_memory",
+    "collect_quality",
     "collect_transitions",
     "export_minari",
+    "held_out_rows",
+    "is_memory_mapped",
     "load_behavior_card",
     "load_behavior_policy",
     "load_d4rl",
     "load_dataset",
     "load_file",
     "load_local_dataset",
+    "load_memmap",
     "load_minari",
-    "load_mixture",
     "make_environment",
     "make_replay_buffer",
     "measure_policy",
@@ -101,19 +123,20 @@ __all__ = [
     "mix_datasets",
     "normalized_score",
     "observation_statistics",
+    "quality_policies",
+    "sampled_observations",
     "save_behavior_policy",
     "split_held_out",
-    "split_on_disk",
     "transitions_from_episodes",
     "transitions_from_rows",
     "update_behavior_card",
-    "write_on_disk",
+    "write_memmap",
 ]
 
 # By name, so that Minari is imported when such a set is asked for.
 register_dataset(
     "osr-minari",
-    "torchrl_osr.data.minari_reader:minari_replay_buffer",
+    "torchrl_osr.data.read.minari:minari_replay_buffer",
     replace=True,
 )
 

@@ -1,28 +1,28 @@
 """Out-of-sample events of a robustness evaluation, as Gymnasium wrappers.
 
-What knocks, pushes, blinds or changes the robot while a policy is evaluated. The
-wrappers work in TorchRL (:class:`~torchrl.envs.GymWrapper`) and in plain Gymnasium
-loops. They have in common:
+Knocks, pushes, noise and changed dynamics while a policy is evaluated. The wrappers
+work in TorchRL (:class:`~torchrl.envs.GymWrapper`) and in plain Gymnasium loops. They
+have in common:
 
 * ``reset(seed=...)`` seeds the disturbance of an episode. It draws from a generator of
   its own, so the start state is that of the bare environment with the same seed, and
-  episodes with and without can be compared in pairs;
-* strength 0 is the bare environment, to the last bit;
-* ``info["disturbed"]`` says in each step whether a disturbance acted, this one or one
-  inside it. One that acts always is flagged in every step.
+  episodes with and without the disturbance can be compared in pairs;
+* strength 0 is the bare environment, bit for bit;
+* ``info["disturbed"]`` is true in each step in which a disturbance acted, this one or
+  one inside it. Disturbances that always act set it in every step.
 
 Order matters where several are combined. From the task outwards: changes of dynamics
-and start state, knocks and pushes, actuators, sensors. The attacks on observations need
-the networks: they make a policy of a policy (:func:`attacked_policy`).
+and start state, knocks and pushes, actuators, sensors. Attacks on observations need the
+networks: :func:`attacked_policy` makes an attacked policy from a policy.
 
 Gymnasium and MuJoCo come with ``torchrl-osr[examples]``.
 """
 
 from torchrl_osr.envs.actuators import ActionDelay, ActionNoise, StickyAction
-from torchrl_osr.envs.base import Disturbance
+from torchrl_osr.envs.disturbance import DisturbanceWrapper, TimedDisturbance
 from torchrl_osr.envs.dynamics import DynamicsChange
 from torchrl_osr.envs.knock import ActionKnock
-from torchrl_osr.envs.observation_attack import attacked_policy, networks_of
+from torchrl_osr.envs.observation_attack import attacked_policy, critics_of
 from torchrl_osr.envs.push import ExternalPush
 from torchrl_osr.envs.sensors import ObservationNoise
 from torchrl_osr.envs.start_state import StartStateNoise
@@ -31,12 +31,13 @@ __all__ = [
     "ActionDelay",
     "ActionKnock",
     "ActionNoise",
-    "Disturbance",
+    "DisturbanceWrapper",
     "DynamicsChange",
     "ExternalPush",
     "ObservationNoise",
     "StartStateNoise",
     "StickyAction",
+    "TimedDisturbance",
     "attacked_policy",
-    "networks_of",
+    "critics_of",
 ]

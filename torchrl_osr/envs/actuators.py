@@ -7,17 +7,21 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_osr.envs.base import Disturbance, Step, Vector, flag, gymnasium
-from torchrl_osr.envs.checks import (
+from torchrl_osr.envs.disturbance import (
+    DisturbanceWrapper,
+    Step,
+    Vector,
     bounded_box,
     check_count,
     check_strength,
+    flag,
+    gymnasium,
     vector_box,
 )
 
 
-class ActionNoise(Disturbance):
-    """Add Gaussian noise to every action and clip it to the action box.
+class ActionNoise(DisturbanceWrapper):
+    """Gaussian noise on every action, clipped to the action box.
 
     The random perturbation of "Robust Gymnasium" (https://arxiv.org/abs/2502.19652) on
     actions, in units of the box.
@@ -53,13 +57,13 @@ class ActionNoise(Disturbance):
         if self.std > 0:
             noise = self._scale * self._generator.standard_normal(self._scale.shape)
             noisy = (action + noise).astype(self._dtype)
-            # Not np.clip, which takes three times as long on a few numbers.
+            # np.clip is three times slower on a few numbers.
             action = np.minimum(np.maximum(noisy, self._low), self._high)
         return super().step(action)
 
 
-class ActionDelay(Disturbance):
-    """Execute every action some steps late; zeros until the first one arrives.
+class ActionDelay(DisturbanceWrapper):
+    """Delay of every action by some steps; zeros until the first one arrives.
 
     Constant delays of "Reinforcement Learning with Random Delays"
     (https://arxiv.org/abs/2010.02966).
@@ -97,14 +101,14 @@ class ActionDelay(Disturbance):
 
     def step(self, action: Vector) -> Step:
         if self.steps:
-            # A copy: whoever calls may write the next action into the same array.
+            # A copy: the caller may write the next action into the same array.
             self._pending.append(np.array(action))
             action = self._pending.popleft()
         return super().step(action)
 
 
-class StickyAction(Disturbance):
-    """Execute the previous action again, with some probability in each step.
+class StickyAction(DisturbanceWrapper):
+    """Repetition of the previous action, with some probability in each step.
 
     From "Revisiting the Arcade Learning Environment" (https://arxiv.org/abs/1709.06009),
     where it is 0.25. The previous action is the executed one, not the agent's; the

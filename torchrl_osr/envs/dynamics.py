@@ -1,24 +1,28 @@
-"""Other dynamics than the data's: masses, friction and gravity times a factor."""
+"""Changed dynamics: masses, friction and gravity times a factor."""
 
 from __future__ import annotations
 
 import copy
 import math
 
-from torchrl_osr.envs.base import Disturbance, Vector, gymnasium, mujoco
-from torchrl_osr.envs.checks import owns_simulation
+from torchrl_osr.envs.disturbance import (
+    DisturbanceWrapper,
+    Vector,
+    gymnasium,
+    mujoco,
+    owns_simulation,
+)
 
 
-class DynamicsChange(Disturbance):
-    """Play on a robot and a ground that are heavier, rougher, ...
+class DynamicsChange(DisturbanceWrapper):
+    """Masses, friction and gravity times constant factors.
 
     The changes of SCPO (https://arxiv.org/abs/2112.10513: mass and friction over grids
     of factors) and of ODRL (https://arxiv.org/abs/2410.20750: friction and gravity
     times 0.1, 0.5, 2 and 5).
 
-    The environment gets a changed copy of its model, from the construction to
-    :meth:`close`, which gives it back its own: factors never accumulate. A factor of 1
-    leaves its part of the model the same numbers.
+    The environment has a changed copy of its model until :meth:`close`, which restores
+    its own: factors never accumulate. A factor of 1 changes nothing.
 
     Args:
         env: a MuJoCo environment.
@@ -69,7 +73,7 @@ class DynamicsChange(Disturbance):
             self._bare.model = self._change(self._original)
 
     def _change(self, model: mujoco.MjModel) -> mujoco.MjModel:
-        """Return a changed copy of ``model``."""
+        """Changed copy of ``model``."""
         model = copy.deepcopy(model)
         model.body_mass *= self.mass
         model.body_inertia *= self.mass
@@ -77,12 +81,12 @@ class DynamicsChange(Disturbance):
         model.pair_friction *= self.friction
         model.opt.gravity *= self.gravity
         if self.mass != 1:
-            # What MuJoCo derives from the masses, such as the softness of contacts.
-            # With data of its own: the environment's may be in mid-episode.
+            # Constants that MuJoCo derives from the masses, such as the softness of
+            # contacts; with new data: the environment's may be in mid-episode.
             mujoco.mj_setConst(model, mujoco.MjData(model))
         return model
 
     def close(self) -> None:
-        """Give the environment back its own model and close it."""
+        """Restore the environment's own model and close it."""
         self._bare.model = self._original
         super().close()

@@ -7,47 +7,54 @@ from typing import Any, Literal
 import numpy as np
 
 from torchrl_osr._checks import check_choice
-from torchrl_osr.envs.base import Step, Vector, flag, gymnasium
-from torchrl_osr.envs.checks import bounded_box, check_count, vector_box
-from torchrl_osr.envs.moments import At, TimedDisturbance
+from torchrl_osr.envs.disturbance import (
+    At,
+    Step,
+    TimedDisturbance,
+    Vector,
+    bounded_box,
+    check_count,
+    flag,
+    gymnasium,
+    vector_box,
+)
 
 SMALL = 1e-3
 """Magnitude of the benchmark's random actions, in units of the action."""
 
 
 class ActionKnock(TimedDisturbance):
-    r"""Knock the agent out of its stride by random actions, once an episode.
+    r"""Random actions for some steps, once an episode.
 
     From "Recovering from Out-of-sample States via Inverse Dynamics in Offline
     Reinforcement Learning", section 5.2, https://openreview.net/forum?id=4gLWjSaw4o.
 
-    * ``"official"``: what the released sampler does
-      (https://github.com/Jack10843/OSR, ``sampler.py``). The agent takes ``at`` steps.
-      If it is still in the episode, the bare environment takes ``steps`` *extra* ones
-      with actions :math:`U[0, 10^{-3})^A`; their rewards are dropped and their ends
-      ignored. Only then is the agent asked again. Levels s, m, l: 5, 10, 15.
+    * ``"official"``: the released sampler's (https://github.com/Jack10843/OSR,
+      ``sampler.py``). After ``at`` steps of the agent, unless the episode has ended,
+      the bare environment takes ``steps`` *extra* steps with actions
+      :math:`U[0, 10^{-3})^A`; their rewards and ends are ignored. Sizes s, m, l: 5, 10,
+      15.
     * ``"paper"``: actions :math:`N(0, 10^{-6} I)` take the place of the agent's for
-      ``steps`` steps, which count like all others. Levels s, m, l: 5, 10, 20.
-    * ``"torque"``: full strength, every action number at its lower or upper bound,
-      each with probability 1/2 and drawn anew in every step. Counted like ``"paper"``.
+      ``steps`` steps, which count like all others. Sizes s, m, l: 5, 10, 20.
+    * ``"torque"``: every entry of the action is at its lower or upper bound, each with
+      probability 1/2 and drawn anew in every step. The steps count as in ``"paper"``.
 
-    What ``"official"`` and its numbers mean:
+    Consequences of ``"official"``:
 
     * actions that small are none: the robot goes limp for ``steps`` times 0.008 s
-      (hopper, walker2d) or 0.05 s (halfcheetah). Levels are not comparable between
-      robots, and the episode is longer by that time, unpaid;
-    * who falls before ``at`` is not knocked, and scores as without the benchmark;
-    * who falls in the knock plays on. The agent acts once more, is paid for that step,
-      and only then has fallen; unless that step puts it back on its feet;
-    * extra steps act on ``env.unwrapped``, as the sampler's do. They do not use up the
-      time limit, and no wrapper sees them, rescaled actions included. Wrap this around
-      the bare task, and what noises its observations around this.
+      (hopper, walker2d) or 0.05 s (halfcheetah). Sizes are not comparable between
+      robots, and the episode is longer by that time, without reward;
+    * an episode that ends before ``at`` has no knock;
+    * a fall during the knock ends the episode only after the agent's next step, which
+      is rewarded, and not at all if that step puts the robot back on its feet;
+    * extra steps act on ``env.unwrapped``, as the sampler's do. They do not count for
+      the time limit, and no wrapper sees them. Put this around the bare task, and
+      observation noise around this.
 
     In ``"official"`` mode the knock is inside the agent's last step before it: that
-    step returns the observation after the knock, and the reward, the end and the info
-    of its own action. ``info["knock_steps"]`` is how many steps of the knock a step
-    contained: 0 or, in that step, ``steps``; 1 for each replaced action elsewhere. The
-    sum over an episode says whether it was knocked at all.
+    step returns the observation after the knock, with the reward, end and info of the
+    agent's own action. ``info["knock_steps"]`` is the number of knock steps in a step:
+    ``steps`` in that one, 1 for each replaced action in the other modes, 0 elsewhere.
 
     Args:
         env: the environment, with real actions.
@@ -55,8 +62,8 @@ class ActionKnock(TimedDisturbance):
 
     Keyword Args:
         mode: ``"official"``, ``"paper"`` or ``"torque"``.
-        at: how many steps the agent takes before. Default 500. ``"random"`` draws it
-            for each episode.
+        at: steps of the agent before it. Default 500. ``"random"`` draws the number for
+            each episode.
         window: ``"random"`` draws from ``window[0]`` to below ``window[1]``. Default
             ``(100, 600)``.
 

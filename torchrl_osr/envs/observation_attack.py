@@ -1,77 +1,69 @@
-r"""Observations that an adversary falsifies, within a box around the true ones.
+r"""Observations that an adversary perturbs, within a box around the true ones.
 
 The evaluation of "RORL: Robust Offline Reinforcement Learning via Conservative
 Smoothing" (Yang et al., NeurIPS 2022), https://arxiv.org/abs/2206.02829. An adversary
-needs the networks, so it sits between environment and policy, not in a wrapper.
+needs the networks, so it acts between environment and policy, not in a wrapper.
 
-Shapes: ``E`` episodes, ``S`` observation, ``A`` action.
+Shapes: ``E`` episodes, ``S`` observation, ``A`` action, ``N`` critics, ``M`` candidate
+perturbations of one state.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, cast
+from typing import Literal, TypeAlias, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import ObservationNorm
 from torchrl.modules import TanhNormal
+from torchrl.objectives import LossModule
 
+from torchrl_osr import Adversary
 from torchrl_osr._checks import check_choice
-from torchrl_osr.objectives.adversary import Adversary
-from torchrl_osr.objectives.tanh_gaussian import TanhGaussianActorCritic
 
-Distribution = Callable[[TensorDictBase], TanhNormal]
+PolicyDistribution: TypeAlias = Callable[[TensorDictBase], TanhNormal]
 """Maps states of any batch size to the policy's distribution there."""
 
-Values = Callable[[TensorDictBase, Tensor], Tensor]
+CriticValues: TypeAlias = Callable[[TensorDictBase, Tensor], Tensor]
 """Maps states ``[M, E]`` and actions ``[M, E, A]`` to all critics' ``[N, M, E]``."""
 
 
-def networks_of(loss: TanhGaussianActorCritic) -> tuple[Distribution, Values]:
-    """Return the policy and the critics of a loss, as they are at each call.
+def critics_of(loss: LossModule) -> CriticValues:
+    """Values of all critics of a loss, as a function of states and actions.
+
+    The critics themselves, not their target networks, with the parameters that the loss
+    has at each call.
 
     Args:
-        loss: :class:`~torchrl_osr.OSRLoss` or :class:`~torchrl_osr.OSRVLoss`, trained.
-
-    Returns:
-        The policy's distribution as a function of states, and the values of all critics
-        (not of the target critics) as a function of states and actions: the first two
-        arguments of :func:`attacked_policy`.
+        loss: a loss module with a ``qvalue_network``: :class:`~torchrl_osr.OSRLoss`,
+            :class:`~torchrl_osr.OSRVLoss`, TorchRL's SAC or CQL loss.
 
     Raises:
-        TypeError: if the loss has no tanh-Gaussian policy.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_osr import OSRLoss
-        >>> from torchrl_osr.envs import attacked_policy, networks_of
-        >>> from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
-        >>> loss = OSRLoss(tanh_gaussian_actor(11, 3), critic_ensemble(11, 3),
-        ...                recovery_weight=0)
-        >>> policy = attacked_policy(*networks_of(loss), kind="min_Q", epsilon=0.1)
-        >>> policy(torch.zeros(4, 11)).shape
-        torch.Size([4, 3])
+        TypeError: if the loss has no ``qvalue_network``.
     """
-    if not isinstance(loss, TanhGaussianActorCritic):
+    if not hasattr(loss, "qvalue_network"):
         raise TypeError(
-            f"Expected an OSRLoss or OSRVLoss, got {type(loss).__name__}; pass "
-            "attacked_policy its actor's get_dist and a function of its critics."
+            f"{type(loss).__name__} has no qvalue_network; pass attacked_policy a "
+            "function from states and actions [M, E] to values [N, M, E] instead."
         )
 
-    def distribution(states: TensorDictBase) -> TanhNormal:
-        return loss._distribution(loss._policy(states))
+    def values(states: TensorDictBase, action: Tensor) -> Tensor:
+        keys, each = loss.tensor_keys, []
+        for params in loss.qvalue_network_params.detach().unbind(0):
+            batch = states.copy().set(keys.action, action)
+            with params.to_module(loss.qvalue_network, preserve_module_state=False):
+                batch = loss.qvalue_network(batch)
+            each.append(batch.get(keys.state_action_value).squeeze(-1))
+        return torch.stack(each)
 
-    def qvalue(states: TensorDictBase, action: Tensor) -> Tensor:
-        return loss._qvalue(states, action, loss.qvalue_network_params.detach())
-
-    return distribution, qvalue
+    return values
 
 
 def attacked_policy(
-    policy_distribution: Distribution,
-    qvalue: Values | None = None,
+    policy_distribution: PolicyDistribution,
+    qvalue: CriticValues | None = None,
     observation_norm: ObservationNorm | None = None,
     *,
     kind: Literal["random", "action_diff", "min_Q"],
@@ -81,25 +73,25 @@ def attacked_policy(
     seed: int = 0,
     device: torch.device | str = "cpu",
 ) -> Callable[[Tensor], Tensor]:
-    r"""Return a deterministic policy that is shown falsified observations.
+    r"""Deterministic policy that sees perturbed observations.
 
-    Each number of an observation is off by at most :math:`\epsilon` standard deviations
-    of the data. Where in that box:
+    Each entry of an observation is off by at most :math:`\epsilon` standard deviations
+    of the data. The perturbation is
 
-    * ``"random"``: anywhere, uniformly;
-    * ``"action_diff"``: where the policy's distribution differs most from the one at
-      the true state, by the Jeffreys divergence;
-    * ``"min_Q"``: where the policy's action has the lowest value, averaged over the
-      critics, at the true state.
+    * ``"random"``: uniform in that box;
+    * ``"action_diff"``: the one that changes the policy's distribution most, by the
+      Jeffreys divergence;
+    * ``"min_Q"``: the one that leads the policy to the action of lowest value at the
+      true state, averaged over the critics.
 
-    The last two look as :class:`~torchrl_osr.Adversary` does: among 50 draws by
-    default; ``method="gradient"`` with ``num_samples=1`` is RORL's first order, with 20
-    its mixed order. ``epsilon=0`` is the bare policy.
+    The last two are searched by :class:`~torchrl_osr.Adversary`: the best of 50 draws
+    by default; ``method="gradient"`` with ``num_samples=1`` is RORL's first order, with
+    20 its mixed order. ``epsilon=0`` is the unperturbed policy.
 
     Args:
-        policy_distribution: the actor's ``get_dist``, for instance, or what
-            :func:`networks_of` returns.
-        qvalue: the critics; only ``"min_Q"`` asks.
+        policy_distribution: the actor's ``get_dist``, for instance.
+        qvalue: values of the critics, see :func:`critics_of`; only ``"min_Q"`` needs
+            them.
         observation_norm: how the training data were standardised
             (``standard_normal=True``). Default: not at all, and ``epsilon`` is in the
             observation's own units.
@@ -109,9 +101,9 @@ def attacked_policy(
         epsilon: half-width of the box, in standard deviations; RORL's go from 0 to 0.3.
         method: ``"sample"`` (default) or ``"gradient"``.
         num_samples: draws, or starts of the gradient steps. Default 50.
-        seed: of the draws' own generator, which goes on from call to call and draws
-            for the whole batch: the same numbers again take a new policy, and the same
-            episodes. Default 0.
+        seed: of the draws' own generator, which continues from call to call and draws
+            for the whole batch: only a new policy and the same episodes give the same
+            numbers again. Default 0.
         device: where the policy is. Default CPU.
 
     Returns:
@@ -124,10 +116,14 @@ def attacked_policy(
 
     Examples:
         >>> import torch
-        >>> from torchrl_osr.envs import attacked_policy
-        >>> from torchrl_osr.modules import tanh_gaussian_actor
+        >>> from torchrl_osr import OSRLoss
+        >>> from torchrl_osr.envs import attacked_policy, critics_of
+        >>> from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
         >>> actor = tanh_gaussian_actor(11, 3)
-        >>> policy = attacked_policy(actor.get_dist, kind="action_diff", epsilon=0.1)
+        >>> loss = OSRLoss(actor, critic_ensemble(11, 3), recovery_weight=0)
+        >>> policy = attacked_policy(
+        ...     actor.get_dist, critics_of(loss), kind="min_Q", epsilon=0.1
+        ... )
         >>> policy(torch.zeros(4, 11)).shape
         torch.Size([4, 3])
     """
@@ -135,34 +131,37 @@ def attacked_policy(
     if kind == "min_Q" and qvalue is None:
         raise ValueError(
             "kind='min_Q' needs qvalue, the critics whose value it lowers; got None. "
-            "networks_of(loss) returns a trained loss's."
+            "critics_of(loss) returns those of a trained loss."
         )
     objective: Literal["action_diff", "min_Q"] = (
         "min_Q" if kind == "min_Q" else "action_diff"
     )
+    # Checks the other arguments, also for "random".
     adversary = Adversary(objective, method, epsilon, num_samples)
-    critics = cast(Values, qvalue)  # asked for "min_Q" alone
+    critics = cast(CriticValues, qvalue)  # only "min_Q" calls it
     generator = torch.Generator(device).manual_seed(seed)
-
-    def falsify(states: TensorDictBase) -> TensorDictBase:
-        if kind != "random":
-            return adversary.perturb(
-                states, ["observation"], policy_distribution, critics, generator
-            )
-        clean = states["observation"]
-        uniform = torch.rand(
-            clean.shape, generator=generator, dtype=clean.dtype, device=clean.device
-        )
-        return states.copy().set("observation", clean + epsilon * (2 * uniform - 1))
 
     @torch.no_grad()
     def policy(observation: Tensor) -> Tensor:
         if observation_norm is not None:
             observation = (observation - observation_norm.loc) / observation_norm.scale
         states = TensorDict({"observation": observation}, [len(observation)])
-        if epsilon > 0:
-            states = falsify(states)
+        if epsilon > 0 and kind == "random":
+            states["observation"] = _uniform_in_box(observation, epsilon, generator)
+        elif epsilon > 0:
+            states = adversary.perturb(
+                states, ["observation"], policy_distribution, critics, generator
+            )
         action: Tensor = policy_distribution(states).deterministic_sample
         return action
 
     return policy
+
+
+def _uniform_in_box(
+    centre: Tensor, half_width: float, generator: torch.Generator
+) -> Tensor:
+    uniform = torch.rand(
+        centre.shape, generator=generator, dtype=centre.dtype, device=centre.device
+    )
+    return centre + half_width * (2 * uniform - 1)

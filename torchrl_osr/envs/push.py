@@ -1,4 +1,4 @@
-"""A push from outside: a force on the robot's body for some steps."""
+"""A push: an external force on the robot's body for some steps."""
 
 from __future__ import annotations
 
@@ -7,9 +7,18 @@ from typing import Any, Literal
 import numpy as np
 
 from torchrl_osr._checks import check_choice
-from torchrl_osr.envs.base import Step, Vector, flag, gymnasium, mujoco
-from torchrl_osr.envs.checks import check_count, check_strength, simulated
-from torchrl_osr.envs.moments import At, TimedDisturbance
+from torchrl_osr.envs.disturbance import (
+    At,
+    Step,
+    TimedDisturbance,
+    Vector,
+    check_count,
+    check_strength,
+    flag,
+    gymnasium,
+    mujoco,
+    simulated,
+)
 
 
 class ExternalPush(TimedDisturbance):
@@ -30,13 +39,12 @@ class ExternalPush(TimedDisturbance):
     Keyword Args:
         duration: in steps of the agent: 0.008 s each for hopper and walker2d, 0.05 s
             for halfcheetah.
-        at: how many steps the agent takes before. Default ``"random"``, drawn for each
-            episode.
+        at: steps of the agent before it. Default ``"random"``, drawn for each episode.
         window: ``"random"`` draws from ``window[0]`` to below ``window[1]``. Default
             ``(100, 600)``.
-        unit: ``"newton"`` (default) or ``"body_weight"``, the weight of all bodies of
-            the model as it is when it is wrapped. Hopper weighs 155 N, walker2d 232 N,
-            halfcheetah 137 N; forces in units of the weight accelerate robots alike.
+        unit: ``"newton"`` (default) or ``"body_weight"``, the weight of all bodies when
+            the model is wrapped. Hopper weighs 155 N, walker2d 232 N, halfcheetah
+            137 N; forces in units of the weight accelerate robots alike.
         body: name of the body. Default ``"torso"``.
 
     Raises:
@@ -99,7 +107,7 @@ class ExternalPush(TimedDisturbance):
             applied[0] = before + force
         result = super().step(action)
         if pushed:
-            # Put back, not subtracted: what rounding leaves would be a force forever.
+            # Restored, not subtracted: a rounding error would stay as a force.
             applied[0] = before
         flag(result[-1], pushed)["push_force"] = np.float64(force)
         return result

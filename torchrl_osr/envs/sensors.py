@@ -1,4 +1,4 @@
-"""Noise on the sensors: the agent sees a state that is not quite the true one."""
+"""Noise of the sensors: observations that differ from the true state."""
 
 from __future__ import annotations
 
@@ -8,17 +8,23 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from torchrl_osr._checks import check_choice
-from torchrl_osr.envs.base import Disturbance, Step, Vector, gymnasium
-from torchrl_osr.envs.checks import check_strength, vector_box
+from torchrl_osr.envs.disturbance import (
+    DisturbanceWrapper,
+    Step,
+    Vector,
+    check_strength,
+    gymnasium,
+    vector_box,
+)
 
 
-class ObservationNoise(Disturbance):
-    r"""Add noise to every observation; the simulated state is left alone.
+class ObservationNoise(DisturbanceWrapper):
+    r"""Noise on every observation; the simulated state is unchanged.
 
     The noise of "DMBP: Diffusion Model-Based Predictor for Robust Offline
     Reinforcement Learning against State Observation Perturbations" (ICLR 2024), which
     is absolute; with ``unit`` it is relative to the data, as in RORL,
-    https://arxiv.org/abs/2206.02829. The first observation of an episode has it too.
+    https://arxiv.org/abs/2206.02829. The first observation of an episode is noisy, too.
     Bounds of the observation space are not enforced.
 
     Args:

@@ -1,4 +1,4 @@
-"""Start states outside of the data's: noise on joint positions and velocities."""
+"""Noise on start states: joint positions and velocities."""
 
 from __future__ import annotations
 
@@ -6,19 +6,26 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_osr.envs.base import Disturbance, Vector, flag, gymnasium, mujoco
-from torchrl_osr.envs.checks import check_strength, owns_simulation
+from torchrl_osr.envs.disturbance import (
+    DisturbanceWrapper,
+    Vector,
+    check_strength,
+    flag,
+    gymnasium,
+    mujoco,
+    owns_simulation,
+)
 
 
-class StartStateNoise(Disturbance):
-    """Add Gaussian noise to the state that an episode starts from.
+class StartStateNoise(DisturbanceWrapper):
+    """Gaussian noise on the start state of an episode.
 
-    It comes on top of the environment's own (uniform, half-width 5e-3 for hopper and
-    walker2d). Orientations of free bodies are turned, not added to. A strong noise may
-    start an episode fallen or with a foot in the ground: MuJoCo pushes it out.
+    It is added to the environment's own noise (uniform, half-width 5e-3 for hopper and
+    walker2d). Orientations of free bodies are rotated. After strong noise an episode
+    may start fallen, or with a foot in the ground, which MuJoCo pushes out.
 
-    Wrap it around the bare task: the observation is the task's own, and what changes
-    observations belongs around this.
+    Put this around the bare task, whose observation it returns, and observation noise
+    around this.
 
     Args:
         env: a MuJoCo environment of Gymnasium.
@@ -54,7 +61,7 @@ class StartStateNoise(Disturbance):
         position, velocity = self.std * self._generator.standard_normal((2, model.nv))
         qpos = np.array(data.qpos)
         mujoco.mj_integratePos(model, qpos, position, 1.0)
-        # Ends in mj_forward, so that all that follows from the state is up to date.
+        # Calls mj_forward: everything that depends on the state is up to date.
         self._bare.set_state(qpos, data.qvel + velocity)
         info |= self._bare._get_reset_info()
         return self._bare._get_obs(), flag(info, True)

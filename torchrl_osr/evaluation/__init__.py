@@ -1,6 +1,105 @@
-"""Episodes, statistics, the inverse dynamics model's report and figures."""
+"""Evaluation of trained policies: episodes, statistics, disturbances and figures.
 
-from torchrl_osr.evaluation.inverse_dynamics import inverse_dynamics_report
-from torchrl_osr.evaluation.statistics import mean_interval
+* :class:`EpisodeEvaluator` plays complete episodes; :func:`summarize` has their scores.
+* :func:`evaluate_paired` plays them with and without a :class:`Disturbance`;
+  :func:`summarize_disturbances` has the score lost, survival and time to recovery.
+* :class:`DataDistance` measures how far a state is from the data.
+* :func:`inverse_dynamics_report` judges an inverse dynamics model.
+"""
 
-__all__ = ["inverse_dynamics_report", "mean_interval"]
+from torchrl_osr.evaluation.data_distance import DataDistance
+from torchrl_osr.evaluation.episodes import (
+    EpisodeEvaluator,
+    EpisodeResults,
+    Policy,
+    Watch,
+    Wrap,
+    deterministic_policy,
+    summarize,
+)
+from torchrl_osr.evaluation.inverse_dynamics_fit import (
+    describe_inverse_dynamics,
+    inverse_dynamics_report,
+)
+from torchrl_osr.evaluation.recovery import (
+    STEPS_AFTER,
+    STEPS_BEFORE,
+    Recorder,
+    Recovery,
+    Trajectory,
+    disturbed_at,
+    measure_recovery,
+)
+from torchrl_osr.evaluation.robustness import (
+    Disturbance,
+    DisturbanceResults,
+    PairedResults,
+    check_disturbances,
+    decrease_interval,
+    evaluate_paired,
+    evaluation_json,
+    robustness_table,
+    summarize_disturbances,
+)
+from torchrl_osr.evaluation.robustness_figure import distance_curves, robustness_figure
+from torchrl_osr.evaluation.statistics import (
+    NUM_RESAMPLES,
+    interquartile_mean,
+    mean_interval,
+    nested_resamples,
+    percentile_interval,
+    performance_profile,
+    stratified_resamples,
+    wilson_interval,
+)
+from torchrl_osr.evaluation.training_summary import (
+    NUM_RECENT,
+    learning_curve,
+    read_scalars,
+    recent_score,
+    score_table,
+)
+
+__all__ = [
+    "NUM_RECENT",
+    "NUM_RESAMPLES",
+    "STEPS_AFTER",
+    "STEPS_BEFORE",
+    "DataDistance",
+    "Disturbance",
+    "DisturbanceResults",
+    "EpisodeEvaluator",
+    "EpisodeResults",
+    "PairedResults",
+    "Policy",
+    "Recorder",
+    "Recovery",
+    "Trajectory",
+    "Watch",
+    "Wrap",
+    "check_disturbances",
+    "decrease_interval",
+    "describe_inverse_dynamics",
+    "deterministic_policy",
+    "distance_curves",
+    "disturbed_at",
+    "evaluate_paired",
+    "evaluation_json",
+    "interquartile_mean",
+    "inverse_dynamics_report",
+    "learning_curve",
+    "mean_interval",
+    "measure_recovery",
+    "nested_resamples",
+    "percentile_interval",
+    "performance_profile",
+    "read_scalars",
+    "recent_score",
+    "robustness_figure",
+    "robustness_table",
+    "score_table",
+    "stratified_resamples",
+    "summarize",
+    "summarize_disturbances",
+    "wilson_interval",
+]

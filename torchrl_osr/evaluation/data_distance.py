@@ -1,7 +1,6 @@
-"""How far is a state from the data? The mean distance to its nearest neighbours there.
+"""Distance of a state to the data: the mean over its nearest neighbours there.
 
-Shapes: ``N`` rows of the data, ``M`` states that are asked about, ``S`` observation,
-``K`` neighbours.
+Shapes: ``N`` rows of the data, ``M`` states, ``S`` observation, ``K`` neighbours.
 """
 
 from __future__ import annotations
@@ -10,10 +9,12 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_osr.data.on_disk import TransitionsOnDisk
-from torchrl_osr.data.replay_buffer import observation_statistics
+from torchrl_osr.data import observation_statistics
 
-# More of them fall out of the processor's cache and are slower.
+# States that the threshold is computed from, and at most a fifth of the data.
+MAX_HELD_OUT = 2_000
+
+# More rows do not fit into the processor's cache and are slower.
 ROWS_AT_A_TIME = 64
 
 
@@ -25,8 +26,8 @@ class DataDistance:
 
     with :math:`s_{(k)}` the ``k``-th nearest of a random subset of the data's states
     and :math:`\sigma` their standard deviation in each dimension. A state counts as in
-    the data up to :attr:`threshold`, which 95 % of held-out states of the data are
-    within: states that are in no subset that they are compared with.
+    the data up to :attr:`threshold`: 95 % of the data's held-out states, which are not
+    in the subset, are within it.
 
     Args:
         data: transitions ``[N]`` with raw ``observation`` ``[N, S]``, in memory or on
@@ -34,23 +35,20 @@ class DataDistance:
 
     Keyword Args:
         num_neighbors: ``K``. Default 10.
-        max_reference: at most so many states are compared with. Default 20,000.
-        max_held_out: at most so many states make the threshold, and at most a fifth
-            of the data. Default 2,000.
-        quantile: share of the held-out states within the threshold. Default 0.95.
+        max_reference: size of the subset, at most. Default 20,000.
         seed: of the two random subsets, which have a generator of their own. Default 0.
 
     Attributes:
         threshold: see above, in the unit of the distance: standard deviations.
 
     Raises:
-        ValueError: if the data have too few rows for ``K`` neighbours and a held-out
-            state, or a number is out of its range.
+        ValueError: if ``num_neighbors`` is below 1, or the data have too few rows for
+            ``K`` neighbours and a held-out state.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl_osr.evaluation.data_distance import DataDistance
+        >>> from torchrl_osr.evaluation import DataDistance
         >>> rows = torch.randn(1000, 3, generator=torch.Generator().manual_seed(0))
         >>> distance = DataDistance(TensorDict({"observation": rows}, [1000]))
         >>> far = torch.tensor([[0.0, 0.0, 0.0], [9.0, 9.0, 9.0]])
@@ -60,20 +58,15 @@ class DataDistance:
 
     def __init__(
         self,
-        data: TensorDictBase | TransitionsOnDisk,
+        data: TensorDictBase,
         *,
         num_neighbors: int = 10,
         max_reference: int = 20_000,
-        max_held_out: int = 2_000,
-        quantile: float = 0.95,
         seed: int = 0,
     ) -> None:
-        if num_neighbors < 1 or max_held_out < 1 or not 0 < quantile <= 1:
-            raise ValueError(
-                "num_neighbors and max_held_out must be at least 1, quantile above 0 "
-                f"and at most 1, got {num_neighbors}, {max_held_out} and {quantile}."
-            )
-        held_out = min(max_held_out, len(data) // 5)
+        if num_neighbors < 1:
+            raise ValueError(f"num_neighbors must be at least 1, got {num_neighbors}.")
+        held_out = min(MAX_HELD_OUT, len(data) // 5)
         reference = min(max_reference, len(data) - held_out)
         if reference < num_neighbors or held_out < 1:
             raise ValueError(
@@ -84,7 +77,7 @@ class DataDistance:
         self._loc, self._scale = loc.cpu().double(), scale.cpu().double()
         generator = torch.Generator().manual_seed(seed)
         order = torch.randperm(len(data), generator=generator)
-        # Read, of a set on disk, and not the rest.
+        # Of a set on disk, only these rows are read.
         states, others = (
             data[rows]["observation"].cpu()
             for rows in (order[held_out:][:reference], order[:held_out])
@@ -93,10 +86,10 @@ class DataDistance:
         self._states = self._standard(states)
         self._squares = self._states.square().sum(-1)
         distances = self(others)
-        self.threshold = float(torch.quantile(distances.double(), quantile))
+        self.threshold = float(torch.quantile(distances.double(), 0.95))
 
     def __call__(self, observation: Tensor) -> Tensor:
-        """Return the distance of raw observations ``[M, S]``, float32 ``[M]``."""
+        """Distance of raw observations ``[M, S]``, float32 ``[M]``."""
         distances = [
             self._chunk(self._standard(rows))
             for rows in torch.split(observation.cpu(), ROWS_AT_A_TIME)
@@ -107,8 +100,8 @@ class DataDistance:
         return (observation.double() - self._loc) / self._scale
 
     def _chunk(self, states: Tensor) -> Tensor:
-        # |s - r|^2 = |s|^2 + |r|^2 - 2 s r cancels digits where s and r are near: in
-        # double precision there are enough of them, for a third of time more.
+        # |s - r|^2 = |s|^2 + |r|^2 - 2 s r cancels digits where s and r are near:
+        # double precision has enough of them, and takes a third longer.
         others = torch.addmm(self._squares, states, self._states.T, alpha=-2)
         # |s|^2 does not change which are near.
         near = others.topk(self.num_neighbors, largest=False, sorted=False).values

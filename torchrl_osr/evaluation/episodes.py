@@ -30,17 +30,17 @@ Wrap: TypeAlias = "Callable[[gymnasium.Env[Any, Any]], gymnasium.Env[Any, Any]]"
 """Puts wrappers around an environment."""
 
 Watch = Callable[[int, NDArray[Any], bool, dict[str, Any]], None]
-"""Is told episode, observation ``[S]``, terminated and info at each reset and step."""
+"""Gets episode, observation ``[S]``, terminated and info of each reset and step."""
 
 
 @dataclass(frozen=True)
 class EpisodeResults:
-    """What came out of an evaluation, one entry an episode, in the order of the seeds.
+    """Returns and lengths of an evaluation's episodes, in the order of the seeds.
 
     Attributes:
         returns: undiscounted sum of rewards, ``[E]``.
         lengths: steps until the end, ``[E]``.
-        seeds: what ``env.reset`` was seeded with, ``[E]``.
+        seeds: of ``env.reset``, ``[E]``.
         successes: whether the goal was reached, as ``info["success"]`` of the last step
             says, ``[E]``. Default: ``None``, the task has no such entry.
     """
@@ -55,7 +55,7 @@ def deterministic_policy(
     actor_network: ProbabilisticTensorDictSequential,
     observation_norm: ObservationNorm | None = None,
 ) -> Policy:
-    """Return the actor's deterministic action as a function of raw observations.
+    """The actor's deterministic action as a function of raw observations.
 
     Args:
         actor_network: reads ``"observation"``, ends in a
@@ -90,10 +90,10 @@ class EpisodeEvaluator:
         seed: the episodes are seeded ``seed, seed + 1, ...``. Default 0.
         device: where the policy is. Default CPU.
         wrap: put around each environment. Default: nothing.
-        fixed_batch: call the policy with all ``E`` rows to the end, those of finished
-            episodes as they were left. How torch rounds depends on the number of rows;
-            with it fixed, an episode does not depend on when others end. Default
-            ``False``.
+        fixed_batch: call the policy with all ``E`` rows to the end, with the last
+            observation of finished episodes. torch's rounding depends on the number of
+            rows; with a fixed number, an episode does not depend on when others end.
+            Default ``False``.
 
     Examples:
         >>> import torch
@@ -123,11 +123,11 @@ class EpisodeEvaluator:
         self.fixed_batch = fixed_batch
 
     def __call__(self, policy: Policy, watch: Watch | None = None) -> EpisodeResults:
-        """Return the raw results of one episode a seed.
+        """Play one episode for each seed.
 
         Args:
             policy: the same for all episodes.
-            watch: told what happens in each step. Default: nobody.
+            watch: called at each reset and step. Default: nothing.
         """
         episodes = len(self.environments)
         returns = np.zeros(episodes)
@@ -173,7 +173,7 @@ class EpisodeEvaluator:
 
 
 def summarize(results: EpisodeResults, env_name: str) -> dict[str, Any]:
-    """Return normalised score, its interval and the raw results, JSON-compatible.
+    """Normalised score, its interval and the raw results, JSON-compatible.
 
     Args:
         results: raw results of ``E`` episodes.

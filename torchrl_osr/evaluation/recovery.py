@@ -1,7 +1,7 @@
-"""What became of an episode after a disturbance: survival and the way back.
+"""Survival and return to the data after a transient disturbance.
 
-Moments: entry 0 of a trajectory is the reset, entry ``i + 1`` is step ``i``. Offsets
-count from the entry in which the disturbance acted last, offset 0.
+Entry 0 of a trajectory is the reset, entry ``i + 1`` is step ``i``. Offsets count from
+the last entry in which the disturbance acted, offset 0.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from numpy.typing import NDArray
 from torchrl_osr.evaluation.data_distance import DataDistance
 
 STEPS_BEFORE, STEPS_AFTER = 10, 100
-"""How far the distance is followed around the end of a disturbance.
+"""Steps around the end of a disturbance over which distances are averaged.
 
-Whoever has not fallen that many steps after it counts as alive.
+An episode without a fall until :data:`STEPS_AFTER` steps after it counts as alive.
 """
 
 
 @dataclass
 class Trajectory:
-    """One episode as it was played.
+    """One recorded episode.
 
     Attributes:
         observations: of the reset and of each step, float32 ``[S]`` each.
-        disturbed: whether the disturbance acted there, as ``info`` says.
+        disturbed: ``info["disturbed"]`` of each.
         terminated: whether the episode ended by a fall, neither by the time limit nor
             at a goal.
     """
@@ -45,10 +45,13 @@ class Trajectory:
 
 
 class Recorder:
-    """Keeps the trajectories of an evaluation; its ``watch``.
+    """Keeps the trajectories of an evaluation, as its ``watch``.
 
     Args:
         num_episodes: of the evaluation.
+
+    Attributes:
+        trajectories: one for each episode.
     """
 
     def __init__(self, num_episodes: int) -> None:
@@ -61,7 +64,7 @@ class Recorder:
         terminated: bool,
         info: dict[str, Any],
     ) -> None:
-        """Append what a reset or a step returned."""
+        """Append the results of a reset or a step."""
         trajectory = self.trajectories[episode]
         # astype copies: an environment may write into the same array again.
         trajectory.observations.append(observation.astype(np.float32))
@@ -69,61 +72,42 @@ class Recorder:
         trajectory.terminated = bool(terminated) and not info.get("success", False)
 
 
-class DistanceCurve:
-    """Mean distance to the data around the end of a disturbance.
-
-    Offsets go from :data:`STEPS_BEFORE` steps before to :data:`STEPS_AFTER` after it.
-
-    Attributes:
-        count: episodes behind each mean, those that have that step.
-    """
-
-    def __init__(self) -> None:
-        size = STEPS_BEFORE + 1 + STEPS_AFTER
-        self._total = np.zeros(size)
-        self.count = np.zeros(size, dtype=np.int64)
-
-    def add(self, curve: NDArray[np.float64], offset: int) -> None:
-        """Add an episode's distances from ``offset`` on."""
-        place = slice(offset + STEPS_BEFORE, offset + STEPS_BEFORE + len(curve))
-        self._total[place] += curve
-        self.count[place] += 1
-
-    def mean(self) -> list[float | None]:
-        """Return the mean at each offset, ``None`` where no episode has one."""
-        pairs = zip(self._total, self.count, strict=True)
-        return [float(total / count) if count else None for total, count in pairs]
+def _nowhere() -> NDArray[np.float64]:
+    return np.full(STEPS_BEFORE + 1 + STEPS_AFTER, np.nan)
 
 
-@dataclass
+@dataclass(frozen=True)
 class Recovery:
-    """How the episodes took a transient disturbance, one entry an episode.
+    """Survival and recovery of one episode after a transient disturbance.
+
+    Everything is ``None``, and distances are NaN, if the disturbance never acted.
 
     Attributes:
-        ended_at: last step that it acted in, ``None`` where there was none.
-        survived: had not fallen then; ``None`` where there was none.
-        alive_after: had not fallen :data:`STEPS_AFTER` steps later; ``None`` where
-            there was none, or the time limit came first.
-        clean_alive_after: the same for the undisturbed episodes of the pairs: some
-            would have fallen anyway.
-        steps: from its end until the distance to the data is within the threshold,
-            0 if it is at once; ``None`` where there was none, and for those who fell or
-            were not back at the episode's end.
-        distance: in units of the threshold, as far as the episodes go.
-        clean_distance: of the undisturbed episodes, at the same steps.
+        ended_at: last step in which the disturbance acted.
+        survived: had not fallen by then.
+        alive_after: had not fallen :data:`STEPS_AFTER` steps later; ``None`` if the
+            time limit came first.
+        clean_alive_after: the same for the undisturbed episode of the pair, which may
+            have fallen anyway.
+        steps: from its end until the distance to the data is within the threshold, 0 if
+            it never left; ``None`` if the episode ended before.
+        distance: in units of the threshold, from :data:`STEPS_BEFORE` steps before the
+            end of the disturbance to :data:`STEPS_AFTER` after it; NaN at steps that
+            the episode does not have.
+        clean_distance: of the undisturbed episode, at the same steps.
     """
 
-    ended_at: list[int | None] = field(default_factory=list)
-    survived: list[bool | None] = field(default_factory=list)
-    alive_after: list[bool | None] = field(default_factory=list)
-    clean_alive_after: list[bool | None] = field(default_factory=list)
-    steps: list[int | None] = field(default_factory=list)
-    distance: DistanceCurve = field(default_factory=DistanceCurve)
-    clean_distance: DistanceCurve = field(default_factory=DistanceCurve)
+    ended_at: int | None = None
+    survived: bool | None = None
+    alive_after: bool | None = None
+    clean_alive_after: bool | None = None
+    steps: int | None = None
+    distance: NDArray[np.float64] = field(default_factory=_nowhere)
+    clean_distance: NDArray[np.float64] = field(default_factory=_nowhere)
 
 
 def disturbed_at(trajectory: Trajectory) -> int | None:
-    """Return the step of the first disturbance, from 0; ``None`` if there was none.
+    """Step of the first disturbance, from 0; ``None`` if there was none.
 
     A disturbance of the start state counts as step 0.
     """
@@ -132,48 +116,52 @@ def disturbed_at(trajectory: Trajectory) -> int | None:
 
 
 def measure_recovery(
-    disturbed: Sequence[Trajectory], clean: Sequence[Trajectory], distance: DataDistance
+    disturbed: Trajectory, clean: Trajectory, distance: DataDistance
 ) -> Recovery:
-    """Return survival, recovery and the distance around the disturbance.
+    """Survival, recovery and distances of one pair of episodes.
 
     Args:
-        disturbed: of one level's episodes.
-        clean: the undisturbed ones of the pairs.
+        disturbed: the episode with the disturbance.
+        clean: the one without.
         distance: to the data, with its threshold.
     """
-    recovery = Recovery()
-    for trajectory, pair in zip(disturbed, clean, strict=True):
-        block = _first_block(trajectory.disturbed)
-        if block is None:
-            for each in (recovery.ended_at, recovery.survived, recovery.steps):
-                each.append(None)
-            recovery.alive_after.append(None)
-            recovery.clean_alive_after.append(None)
-            continue
-        end = block[1]
-        recovery.ended_at.append(max(end - 1, 0))
-        fell_in_it = trajectory.terminated and trajectory.last == end
-        recovery.survived.append(not fell_in_it)
-        recovery.alive_after.append(_alive_after(trajectory, end))
-        recovery.clean_alive_after.append(_alive_after(pair, end))
-        start = max(end - STEPS_BEFORE, 0)
-        window = slice(start, end + STEPS_AFTER + 1)
-        curve = _relative(trajectory.observations[window], distance)
-        recovery.distance.add(curve, start - end)
-        clean_curve = _relative(pair.observations[window], distance)
-        recovery.clean_distance.add(clean_curve, start - end)
-        back = _first_within(curve[end - start :])
-        if back is None:
-            later = _relative(trajectory.observations[window.stop :], distance)
-            back = _first_within(later, STEPS_AFTER + 1)
-        # The place where somebody lies is not one that they have come back to.
-        lies_there = trajectory.terminated and back == trajectory.last - end
-        recovery.steps.append(None if lies_there else back)
-    return recovery
+    block = _first_block(disturbed.disturbed)
+    if block is None:
+        return Recovery()
+    end = block[1]
+    curve = _around(disturbed, end, distance)
+    steps = _first_within(curve[STEPS_BEFORE:])
+    if steps is None:
+        later = _relative(disturbed.observations[end + STEPS_AFTER + 1 :], distance)
+        steps = _first_within(later, STEPS_AFTER + 1)
+    # The state of the fall itself does not count as recovered.
+    if disturbed.terminated and steps == disturbed.last - end:
+        steps = None
+    return Recovery(
+        ended_at=max(end - 1, 0),
+        survived=not (disturbed.terminated and disturbed.last == end),
+        alive_after=_alive_after(disturbed, end),
+        clean_alive_after=_alive_after(clean, end),
+        steps=steps,
+        distance=curve,
+        clean_distance=_around(clean, end, distance),
+    )
+
+
+def _around(
+    trajectory: Trajectory, end: int, distance: DataDistance
+) -> NDArray[np.float64]:
+    """Distances around entry ``end``, NaN where there is no such entry."""
+    curve = _nowhere()
+    start = max(end - STEPS_BEFORE, 0)
+    there = trajectory.observations[start : end + STEPS_AFTER + 1]
+    first = start - end + STEPS_BEFORE
+    curve[first : first + len(there)] = _relative(there, distance)
+    return curve
 
 
 def _alive_after(trajectory: Trajectory, end: int) -> bool | None:
-    """Return whether it has not fallen :data:`STEPS_AFTER` steps after ``end``."""
+    """Whether there is no fall until :data:`STEPS_AFTER` steps after ``end``."""
     fell_within = trajectory.terminated and trajectory.last <= end + STEPS_AFTER
     if fell_within:
         return False
@@ -181,7 +169,7 @@ def _alive_after(trajectory: Trajectory, end: int) -> bool | None:
 
 
 def _first_block(disturbed: Sequence[bool]) -> tuple[int, int] | None:
-    """Return first and last entry of the first disturbance."""
+    """First and last entry of the first disturbance."""
     if True not in disturbed:
         return None
     first = last = disturbed.index(True)
@@ -193,7 +181,7 @@ def _first_block(disturbed: Sequence[bool]) -> tuple[int, int] | None:
 def _relative(
     observations: Sequence[NDArray[np.float32]], distance: DataDistance
 ) -> NDArray[np.float64]:
-    """Return distances in units of the threshold."""
+    """Distances in units of the threshold."""
     if not observations:
         return np.empty(0)
     rows = torch.from_numpy(np.stack(observations))
@@ -202,6 +190,6 @@ def _relative(
 
 
 def _first_within(curve: NDArray[np.float64], offset: int = 0) -> int | None:
-    """Return where the curve is first within the threshold, counted from ``offset``."""
+    """First entry within the threshold, counted from ``offset``."""
     within = np.flatnonzero(curve <= 1)
     return offset + int(within[0]) if within.size else None

@@ -1,16 +1,21 @@
 """Episodes with and without a disturbance, in pairs: same policy, same start state.
 
-Shapes: ``E`` episodes.
+Played by :func:`evaluate_paired`, kept as JSON by :func:`evaluation_json`, averaged by
+:func:`summarize_disturbances`. How it is measured is in ``docs/robustness.md``.
+
+Shapes: ``E`` pairs of episodes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import torch
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
+from torchrl_osr.data import normalized_score
 from torchrl_osr.evaluation.data_distance import DataDistance
 from torchrl_osr.evaluation.episodes import (
     EpisodeEvaluator,
@@ -19,27 +24,45 @@ from torchrl_osr.evaluation.episodes import (
     Wrap,
 )
 from torchrl_osr.evaluation.recovery import (
+    STEPS_AFTER,
+    STEPS_BEFORE,
     Recorder,
     Recovery,
     disturbed_at,
     measure_recovery,
 )
+from torchrl_osr.evaluation.statistics import (
+    NUM_RESAMPLES,
+    mean_interval,
+    percentile_interval,
+)
 
 TRANSIENT = ("knock", "push", "start")
 """Kinds of disturbance that end, so that there is something to recover from."""
 
+RECOVERY_ENTRIES = (
+    "ended_at", "survived_knock", "alive_after", "clean_alive_after", "recovery_steps",
+    "distance",
+)  # fmt: skip
+"""Of a disturbance's JSON; ``None`` if it does not end."""
+
+TABLE_HEADER = (
+    "disturbance", "clean", "score", "loss %", "[95 %]", "met it",
+    f"alive +{STEPS_AFTER}", "(clean)", "back", "steps back",
+)  # fmt: skip
+
 
 @dataclass(frozen=True)
-class Level:
-    """One disturbance at one strength.
+class Disturbance:
+    """One kind of disturbance at one strength.
 
     Attributes:
         name: unique in its suite.
-        kind: what is disturbed; those of :data:`TRANSIENT` end.
+        kind: of the disturbance; those of :data:`TRANSIENT` end.
         strength: in the unit of its kind.
         wrap: puts the disturbance around an environment. Default: nothing.
-        policy: plays instead of the one that is evaluated, for attacks that sit
-            between environment and policy. Default: that one.
+        policy: plays in the place of the evaluated one, for attacks that act between
+            environment and policy. Default: the evaluated one.
     """
 
     name: str
@@ -49,80 +72,78 @@ class Level:
     policy: Policy | None = None
 
 
-class LevelResults(NamedTuple):
-    """What came out of one level.
+class DisturbanceResults(NamedTuple):
+    """Episodes under one disturbance.
 
     Attributes:
-        level: the disturbance.
+        disturbance: which one.
         results: returns, lengths and seeds, ``[E]`` each.
         disturbed_at: step of the first disturbance of each episode, from 0; ``None``
             where the episode ended before it, or there is none.
-        recovery: ``None`` for a disturbance that does not end.
+        recovery: of each episode, ``[E]``; ``None`` if the disturbance does not end.
     """
 
-    level: Level
+    disturbance: Disturbance
     results: EpisodeResults
     disturbed_at: list[int | None]
-    recovery: Recovery | None
+    recovery: list[Recovery] | None
 
 
 class PairedResults(NamedTuple):
-    """Clean episodes, and those of each level with the same seeds.
+    """Clean episodes, and those under each disturbance with the same seeds.
 
     Attributes:
         clean: without a disturbance.
-        levels: in the order of the suite.
+        disturbed: in the order of the suite.
     """
 
     clean: EpisodeResults
-    levels: list[LevelResults]
+    disturbed: list[DisturbanceResults]
 
 
 def evaluate_paired(
     policy: Policy,
     env_id: str,
-    levels: Sequence[Level],
+    disturbances: Sequence[Disturbance],
     distance: DataDistance,
     *,
     num_episodes: int = 10,
     seed: int = 0,
-    device: torch.device | str = "cpu",
     advance: Callable[[], object] = lambda: None,
 ) -> PairedResults:
     """Play clean episodes once, and the same episodes under each disturbance.
 
     Episodes of a pair have the same seed, hence the same start state, and the policy
     is called with batches of one size: until the disturbance acts they are equal, bit
-    for bit. Every level has new environments, so that none inherits another's changes.
+    for bit. Every disturbance has environments of its own: no change of a model is
+    carried over to the next one.
 
     Args:
-        policy: what is evaluated.
+        policy: to be evaluated, on the CPU.
         env_id: a Gymnasium id, ``"Hopper-v5"`` for instance.
-        levels: the disturbances.
+        disturbances: of one suite.
         distance: to the data that the policy was trained on.
 
     Keyword Args:
         num_episodes: ``E``, at least 2. Default 10.
         seed: the episodes are seeded ``seed, seed + 1, ...``. Default 0.
-        device: where the policy is. Default CPU.
-        advance: called after the clean episodes and after each level.
+        advance: called after the clean episodes and after each disturbance.
 
     Raises:
-        ValueError: if ``num_episodes`` is below 2, two levels have one name, or a level
-            is not possible for this environment.
+        ValueError: if ``num_episodes`` is below 2, two disturbances have one name, or
+            one of them is not possible for this environment.
     """
     if num_episodes < 2:
         raise ValueError(
             f"num_episodes must be at least 2, got {num_episodes}: one pair of "
             "episodes has no interval."
         )
-    check_levels(env_id, levels)
+    check_disturbances(env_id, disturbances)
 
     def play(policy: Policy, wrap: Wrap | None) -> tuple[EpisodeResults, Recorder]:
         evaluator = EpisodeEvaluator(
-            env_id, num_episodes=num_episodes, seed=seed, device=device, wrap=wrap,
-            fixed_batch=True,
-        )  # fmt: skip
+            env_id, num_episodes=num_episodes, seed=seed, wrap=wrap, fixed_batch=True
+        )
         recorder = Recorder(num_episodes)
         try:
             results = evaluator(policy, recorder)
@@ -133,39 +154,266 @@ def evaluate_paired(
 
     clean, undisturbed = play(policy, None)
     played = []
-    for level in levels:
-        results, recorder = play(level.policy or policy, level.wrap)
-        trajectories = recorder.trajectories
-        played.append(
-            LevelResults(
-                level,
-                results,
-                # An attack is between environment and policy, in every step.
-                [0] * num_episodes
-                if level.policy
-                else [disturbed_at(each) for each in trajectories],
-                measure_recovery(trajectories, undisturbed.trajectories, distance)
-                if level.kind in TRANSIENT
-                else None,
-            )
-        )
+    for each in disturbances:
+        results, recorder = play(each.policy or policy, each.wrap)
+        moments: list[int | None] = [0] * num_episodes  # an attack: in every step
+        if each.policy is None:
+            moments = [disturbed_at(episode) for episode in recorder.trajectories]
+        recovery = None
+        if each.kind in TRANSIENT:
+            pairs = zip(recorder.trajectories, undisturbed.trajectories, strict=True)
+            recovery = [measure_recovery(*pair, distance) for pair in pairs]
+        played.append(DisturbanceResults(each, results, moments, recovery))
     return PairedResults(clean, played)
 
 
-def check_levels(env_id: str, levels: Sequence[Level]) -> None:
-    """Raise unless every level has its own name and fits the environment.
+def check_disturbances(env_id: str, disturbances: Sequence[Disturbance]) -> None:
+    """Raise unless every disturbance has its own name and fits the environment.
 
     Raises:
-        ValueError: naming the level and what is wrong with it.
+        ValueError: naming the disturbance and what is wrong with it.
     """
-    names = [level.name for level in levels]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice or not names:
-        raise ValueError(f"levels need one name each, got {names}.")
-    for level in levels:
+    names = [each.name for each in disturbances]
+    if len(set(names)) < len(names) or not names:
+        raise ValueError(f"disturbances need one name each, got {names}.")
+    for each in disturbances:
         try:
-            EpisodeEvaluator(env_id, num_episodes=1, wrap=level.wrap).close()
+            EpisodeEvaluator(env_id, num_episodes=1, wrap=each.wrap).close()
         except (TypeError, ValueError) as error:
             raise ValueError(
-                f"level {level.name!r} is not possible for {env_id}: {error}"
+                f"disturbance {each.name!r} is not possible for {env_id}: {error}"
             ) from error
+
+
+def decrease_interval(
+    clean: ArrayLike, disturbed: ArrayLike
+) -> tuple[float | None, float | None, float | None]:
+    """Decrease of the mean score in percent, with its 95 % paired-bootstrap interval.
+
+    Pairs of episodes are resampled together, so that what both have in common does not
+    widen the interval.
+
+    Args:
+        clean, disturbed: normalised scores of the pairs, ``[E]`` each.
+
+    Returns:
+        ``100 (1 - mean(disturbed) / mean(clean))``, lower and upper end. All three are
+        ``None`` if the clean mean is not above 0, the ends alone if that is so in a
+        resample.
+
+    Raises:
+        ValueError: if there are not two pairs or more, or a score is not finite.
+
+    Examples:
+        >>> decrease_interval([40.0, 60.0], [20.0, 30.0])
+        (50.0, 50.0, 50.0)
+    """
+    pairs = np.stack([np.asarray(clean, float), np.asarray(disturbed, float)])
+    if pairs.ndim != 2 or pairs.shape[1] < 2 or not np.isfinite(pairs).all():
+        raise ValueError(
+            f"decrease_interval needs two finite pairs or more, got {pairs.tolist()}."
+        )
+    clean_mean, disturbed_mean = pairs.mean(1)
+    if clean_mean <= 0:
+        return None, None, None
+    decrease = float(100 * (1 - disturbed_mean / clean_mean))
+    rng = np.random.default_rng(0)
+    rows = rng.integers(pairs.shape[1], size=(NUM_RESAMPLES, pairs.shape[1]))
+    resampled_clean, resampled = pairs[:, rows].mean(-1)
+    if (resampled_clean <= 0).any():
+        return decrease, None, None
+    low, high = percentile_interval(100 * (1 - resampled / resampled_clean))
+    return decrease, float(low), float(high)
+
+
+def evaluation_json(step: int, paired: PairedResults, env_name: str) -> dict[str, Any]:
+    """Raw results of one checkpoint, JSON-compatible.
+
+    Args:
+        step: gradient steps of the checkpoint.
+        paired: its episodes.
+        env_name: short name with reference returns, ``"hopper"`` for instance.
+    """
+    return {
+        "step": step,
+        "clean": _episodes_json(paired.clean, env_name),
+        "levels": [_disturbance_json(each, env_name) for each in paired.disturbed],
+    }
+
+
+def _episodes_json(results: EpisodeResults, env_name: str) -> dict[str, Any]:
+    return {
+        "returns": results.returns.tolist(),
+        "lengths": results.lengths.tolist(),
+        "seeds": results.seeds.tolist(),
+        "scores": normalized_score(env_name, results.returns).tolist(),
+    }
+
+
+def _disturbance_json(results: DisturbanceResults, env_name: str) -> dict[str, Any]:
+    disturbance = results.disturbance
+    return {
+        "name": disturbance.name,
+        "kind": disturbance.kind,
+        "strength": disturbance.strength,
+        **_episodes_json(results.results, env_name),
+        "disturbed_at": results.disturbed_at,
+        **_recovery_json(results.recovery),
+    }
+
+
+def _recovery_json(recovery: Sequence[Recovery] | None) -> dict[str, Any]:
+    if recovery is None:
+        return dict.fromkeys(RECOVERY_ENTRIES)
+    mean, count = _mean_curve([each.distance for each in recovery])
+    clean_mean, clean_count = _mean_curve([each.clean_distance for each in recovery])
+    return {
+        "ended_at": [each.ended_at for each in recovery],
+        "survived_knock": [each.survived for each in recovery],
+        "alive_after": [each.alive_after for each in recovery],
+        "clean_alive_after": [each.clean_alive_after for each in recovery],
+        "recovery_steps": [each.steps for each in recovery],
+        "distance": {
+            "offset": list(range(-STEPS_BEFORE, STEPS_AFTER + 1)),
+            "mean": mean,
+            "count": count,
+            "clean_mean": clean_mean,
+            "clean_count": clean_count,
+        },
+    }
+
+
+def _mean_curve(
+    curves: Sequence[NDArray[np.float64]],
+) -> tuple[list[float | None], list[int]]:
+    """Mean over the episodes that have a step at each offset, and their number."""
+    counts = (~np.isnan(curves)).sum(0).tolist()
+    totals = np.nansum(curves, axis=0).tolist()
+    pairs = zip(totals, counts, strict=True)
+    return [total / count if count else None for total, count in pairs], counts
+
+
+def summarize_disturbances(
+    evaluations: Sequence[Mapping[str, Any]],
+) -> list[dict[str, Any]]:
+    """Means of each disturbance over the episodes of all checkpoints.
+
+    Args:
+        evaluations: see :func:`evaluation_json`; the same disturbances in all.
+
+    Returns:
+        A row for each disturbance: ``"name"``, ``"kind"``, ``"strength"``,
+        ``"clean_score"`` and ``"score"`` (means over all pairs of episodes),
+        ``"score_low"``, ``"score_high"``, ``"decrease"`` with its interval
+        ``"decrease_low"``, ``"decrease_high"``; ``"disturbed_share"``, the share of
+        episodes that the disturbance acted in; and over those alone
+        ``"clean_score_disturbed"``, ``"score_disturbed"``, ``"decrease_disturbed"``
+        with interval, ``"survived"`` (share alive at its end), ``"survival"`` (share
+        alive 100 steps later), ``"clean_survival"`` (of the undisturbed ones of the
+        pairs, at the same step), ``"recovered_share"`` and ``"recovery_median"``
+        (episodes that never came back count as infinitely late). ``None`` where there
+        is nothing to average, or the median is infinite.
+    """
+    rows = []
+    for position, first in enumerate(evaluations[0]["levels"]):
+        played = [each["levels"][position] for each in evaluations]
+
+        def joined(key: str, played: Sequence[Mapping[str, Any]] = played) -> list[Any]:
+            return [value for each in played for value in each[key] or ()]
+
+        clean = np.array([s for each in evaluations for s in each["clean"]["scores"]])
+        scores = np.array(joined("scores"))
+        hit = np.array([moment is not None for moment in joined("disturbed_at")])
+        score, low, high = mean_interval(scores)
+        rows.append(
+            {
+                "name": first["name"],
+                "kind": first["kind"],
+                "strength": first["strength"],
+                "clean_score": float(clean.mean()),
+                "score": score,
+                "score_low": low,
+                "score_high": high,
+                **_decrease("decrease", clean, scores),
+                "disturbed_share": float(hit.mean()),
+                "clean_score_disturbed": _mean(clean[hit]),
+                "score_disturbed": _mean(scores[hit]),
+                **_decrease("decrease_disturbed", clean[hit], scores[hit]),
+                "survived": _share(joined("survived_knock")),
+                "survival": _share(joined("alive_after")),
+                "clean_survival": _share(joined("clean_alive_after")),
+                **_recovered(joined("recovery_steps"), hit),
+            }
+        )
+    return rows
+
+
+def _decrease(name: str, clean: ArrayLike, scores: ArrayLike) -> dict[str, Any]:
+    enough = np.size(clean) >= 2
+    values = decrease_interval(clean, scores) if enough else (None,) * 3
+    return dict(zip((name, f"{name}_low", f"{name}_high"), values, strict=True))
+
+
+def _mean(values: NDArray[Any]) -> float | None:
+    return float(values.mean()) if values.size else None
+
+
+def _share(values: Sequence[bool | None]) -> float | None:
+    return _mean(np.array([value for value in values if value is not None]))
+
+
+def _recovered(
+    steps: Sequence[int | None], hit: NDArray[np.bool_]
+) -> dict[str, float | None]:
+    """Median and share of the disturbed episodes; the others have no steps."""
+    if not steps or not hit.any():
+        return {"recovery_median": None, "recovered_share": None}
+    late = np.array([np.inf if each is None else each for each in steps])[hit]
+    median = float(np.median(late))
+    return {
+        "recovery_median": median if np.isfinite(median) else None,
+        "recovered_share": float(np.isfinite(late).mean()),
+    }
+
+
+def robustness_table(title: str, summary: Sequence[Mapping[str, Any]]) -> str:
+    """Table of a summary, as text.
+
+    Args:
+        title: what was evaluated.
+        summary: see :func:`summarize_disturbances`.
+    """
+
+    def number(value: float | None, digits: int = 1) -> str:
+        return "-" if value is None else f"{value:.{digits}f}"
+
+    def percent(value: float | None) -> str:
+        return "-" if value is None else f"{100 * value:.0f} %"
+
+    rows = [
+        (
+            row["name"],
+            number(row["clean_score"]),
+            number(row["score"]),
+            number(row["decrease"]),
+            f"[{number(row['decrease_low'])}, {number(row['decrease_high'])}]",
+            percent(row["disturbed_share"]),
+            percent(row["survival"]),
+            percent(row["clean_survival"]),
+            percent(row["recovered_share"]),
+            number(row["recovery_median"]),
+        )
+        for row in summary
+    ]
+    return "\n".join([title, *aligned_columns([TABLE_HEADER, *rows])])
+
+
+def aligned_columns(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a text table: the first column to the left, the others to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for first, *cells in rows:
+        pairs = zip(cells, widths[1:], strict=True)
+        aligned = [cell.rjust(width) for cell, width in pairs]
+        lines.append("  ".join(["", first.ljust(widths[0]), *aligned]))
+    return lines

@@ -4,26 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from torchrl_osr.evaluation.figures import BLUE, GREY, whole_picture
+from torchrl_osr.evaluation.drawing import BLUE, GREY, new_figure, save_figure
 
-try:
-    from matplotlib import colormaps
+if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-except ImportError as error:
-    raise ImportError(
-        f"figures need {error.name!r}: pip install torchrl-osr[examples]"
-    ) from error
 
 UNDISTURBED = "undisturbed"
-
-# Colour-blind readers can tell them apart, and a printer too.
-COLORS = colormaps["viridis"]
 
 
 def robustness_figure(
@@ -33,14 +24,14 @@ def robustness_figure(
     *,
     title: str,
 ) -> None:
-    """Draw the score at each level, and the distance to the data after disturbances.
+    """Draw scores under disturbances, and distances to the data after them.
 
-    Where each kind has several strengths, the score is over the strength; otherwise
-    one line a level. Without a disturbance that ends there is no second panel.
+    Where each kind has several strengths, the score is drawn over the strength;
+    otherwise each disturbance has a line of its own. Without a disturbance that ends
+    there is no second panel.
 
     Args:
-        summary: of
-            :func:`~torchrl_osr.evaluation.robustness_summary.summarize_levels`.
+        summary: see :func:`~torchrl_osr.evaluation.summarize_disturbances`.
         evaluations: the raw results that it summarises.
         path: the PNG to write.
 
@@ -48,8 +39,7 @@ def robustness_figure(
         title: what was evaluated.
     """
     curves = distance_curves(evaluations)
-    figure = Figure(figsize=(11 if curves else 6.5, 4.6), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(11 if curves else 6.5, 4.6, layout="constrained")
     figure.suptitle(title)
     axes = figure.subplots(1, 2 if curves else 1, squeeze=False)[0]
     series: dict[str, list[Mapping[str, Any]]] = {}
@@ -68,30 +58,33 @@ def robustness_figure(
         _draw_curves(axes[1], curves)
     for each in figure.axes:
         each.spines[["top", "right"]].set_visible(False)
-    with whole_picture(path) as beside:
-        figure.savefig(beside, dpi=150, format="png")
+    save_figure(figure, path)
 
 
 def distance_curves(
     evaluations: Sequence[Mapping[str, Any]],
 ) -> dict[str, tuple[list[int], list[float]]]:
-    """Return mean distances over all checkpoints by level, as offsets and values.
+    """Mean distance to the data around the end of each disturbance.
 
-    Also those of the undisturbed episodes, all levels' together, as ``"undisturbed"``.
-    Offsets with fewer than a tenth of the episodes there at offset 0 are left out: a
-    mean of the last one or two on their feet says nothing about the level.
+    Over all checkpoints; those of the undisturbed episodes, of all disturbances
+    together, are named ``"undisturbed"``. Offsets with fewer than a tenth of the
+    episodes at offset 0 are left out: a mean of one or two episodes that still run says
+    nothing about the disturbance.
 
     Args:
-        evaluations: raw results; levels without a distance are left out.
+        evaluations: raw results; disturbances without a distance are left out.
+
+    Returns:
+        Offsets and distances in units of the threshold, by name.
     """
     parts: dict[str, list[tuple[Any, Any]]] = {}
     offset: list[int] = []
-    for level in (level for each in evaluations for level in each["levels"]):
-        distance = level["distance"]
+    for played in (played for each in evaluations for played in each["levels"]):
+        distance = played["distance"]
         if distance is None:
             continue
         offset = distance["offset"]
-        for name, prefix in ((level["name"], ""), (UNDISTURBED, "clean_")):
+        for name, prefix in ((played["name"], ""), (UNDISTURBED, "clean_")):
             pair = distance[f"{prefix}mean"], distance[f"{prefix}count"]
             parts.setdefault(name, []).append(pair)
     curves = {}
@@ -107,8 +100,16 @@ def distance_curves(
     return {name: curve for name, curve in curves.items() if curve[0]}
 
 
+def _colors(start: float, end: float, number: int) -> NDArray[np.float64]:
+    """Colours, ``[number, 4]``, that colour-blind readers and printers keep apart."""
+    from matplotlib import colormaps
+
+    colors: NDArray[np.float64] = colormaps["viridis"](np.linspace(start, end, number))
+    return colors
+
+
 def _over_strength(axes: Axes, series: Mapping[str, list[Mapping[str, Any]]]) -> None:
-    colors = COLORS(np.linspace(0.1, 0.8, len(series)))
+    colors = _colors(0.1, 0.8, len(series))
     for color, (kind, rows) in zip(colors, series.items(), strict=True):
         rows = sorted(rows, key=lambda row: float(row["strength"]))
         x = [row["strength"] for row in rows]
@@ -137,9 +138,9 @@ def _one_by_one(axes: Axes, series: Mapping[str, list[Mapping[str, Any]]]) -> No
 def _draw_curves(
     axes: Axes, curves: Mapping[str, tuple[list[int], list[float]]]
 ) -> None:
-    levels = {name: curve for name, curve in curves.items() if name != UNDISTURBED}
-    colors = COLORS(np.linspace(0, 0.9, len(levels)))
-    for color, (name, curve) in zip(colors, levels.items(), strict=True):
+    disturbed = {name: curve for name, curve in curves.items() if name != UNDISTURBED}
+    colors = _colors(0, 0.9, len(disturbed))
+    for color, (name, curve) in zip(colors, disturbed.items(), strict=True):
         axes.plot(*curve, color=color, linewidth=1.5, label=name)
     if UNDISTURBED in curves:
         axes.plot(*curves[UNDISTURBED], color=GREY, linewidth=1.5, label=UNDISTURBED)

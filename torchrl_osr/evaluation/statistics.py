@@ -1,4 +1,4 @@
-"""Means and intervals that a claim can stand on.
+"""Means of scores and their 95 % confidence intervals.
 
 Shapes: ``E`` episodes of a run, ``K`` numbers of an episode, ``R`` resamples, ``N``
 runs, ``T`` thresholds.
@@ -18,21 +18,19 @@ NUM_RESAMPLES = 2000
 NORMAL_QUANTILE_975 = 1.959963984540054
 """A normal variable is below this many standard deviations with probability 0.975."""
 
+TAIL = 50 * (1 - 0.95)
+"""Percent of the resamples below an interval, and above it."""
+
 
 def mean_interval(
-    values: ArrayLike,
-    *,
-    confidence: float = 0.95,
-    num_resamples: int = NUM_RESAMPLES,
-    seed: int = 0,
+    values: ArrayLike, *, num_resamples: int = NUM_RESAMPLES, seed: int = 0
 ) -> tuple[float, float, float]:
-    """Return the mean and its percentile-bootstrap confidence interval.
+    """Mean and its 95 % percentile-bootstrap interval.
 
     Args:
         values: independent results, returns of episodes for instance, ``[E]``.
 
     Keyword Args:
-        confidence: coverage of the interval. Default 0.95.
         num_resamples: bootstrap resamples. Default 2000.
         seed: of the resampling. Default 0.
 
@@ -52,13 +50,12 @@ def mean_interval(
         raise ValueError(f"mean_interval needs finite values, got {sample}.")
     rng = np.random.default_rng(seed)
     resamples = sample[rng.integers(sample.size, size=(num_resamples, sample.size))]
-    tail = 50 * (1 - confidence)
-    low, high = np.percentile(resamples.mean(1), [tail, 100 - tail])
+    low, high = percentile_interval(resamples.mean(1))
     return float(sample.mean()), float(low), float(high)
 
 
 def wilson_interval(count: int, total: int) -> tuple[float, float]:
-    """Return Wilson's 95 % interval of a share, which is honest at 0 and 1, too.
+    """Wilson's 95 % interval of a share, which keeps its coverage near 0 and 1.
 
     Args:
         count: successes.
@@ -68,7 +65,7 @@ def wilson_interval(count: int, total: int) -> tuple[float, float]:
         ValueError: if there is no trial, or there are more successes than trials.
 
     Examples:
-        >>> from torchrl_osr.evaluation.statistics import wilson_interval
+        >>> from torchrl_osr.evaluation import wilson_interval
         >>> low, high = wilson_interval(20, 20)
         >>> round(low, 3), round(high, 3)
         (0.839, 1.0)
@@ -83,25 +80,21 @@ def wilson_interval(count: int, total: int) -> tuple[float, float]:
 
 
 def percentile_interval(
-    resamples: NDArray[np.float64], *, confidence: float = 0.95
+    resamples: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return lower and upper end of the percentile interval, over the first axis.
+    """Lower and upper end of the 95 % percentile interval, over the first axis.
 
     Args:
         resamples: a statistic of each resample, ``[R, ...]``.
-
-    Keyword Args:
-        confidence: coverage of the interval. Default 0.95.
     """
-    tail = 50 * (1 - confidence)
-    low, high = np.percentile(resamples, [tail, 100 - tail], axis=0)
+    low, high = np.percentile(resamples, [TAIL, 100 - TAIL], axis=0)
     return low, high
 
 
 def nested_resamples(
     runs: Sequence[ArrayLike], *, num_resamples: int = NUM_RESAMPLES, seed: int = 0
 ) -> NDArray[np.float64]:
-    """Return means over resampled runs, and in each of them resampled episodes.
+    """Bootstrap means over resampled runs and, in each of them, resampled episodes.
 
     The numbers of an episode stay together, so that a ratio or a difference of them is
     one of pairs. With one run only its episodes are resampled.
@@ -144,7 +137,7 @@ def nested_resamples(
 def stratified_resamples(
     strata: Sequence[ArrayLike], *, num_resamples: int = NUM_RESAMPLES, seed: int = 0
 ) -> NDArray[np.float64]:
-    """Return resamples that keep the number of runs of every stratum.
+    """Bootstrap resamples that keep the number of runs of every stratum.
 
     Args:
         strata: a number of each run, a sequence for each data set.
@@ -173,7 +166,7 @@ def stratified_resamples(
 
 
 def interquartile_mean(values: ArrayLike) -> NDArray[np.float64]:
-    """Return the mean without the lowest and the highest quarter, over the last axis.
+    """Mean without the lowest and the highest quarter, over the last axis.
 
     As rliable has it (Agarwal et al., 2021, https://arxiv.org/abs/2108.13264): of ``N``
     values ``N // 4`` are left out at each end.
@@ -191,7 +184,7 @@ def interquartile_mean(values: ArrayLike) -> NDArray[np.float64]:
 def performance_profile(
     values: ArrayLike, thresholds: ArrayLike
 ) -> NDArray[np.float64]:
-    """Return the share of values above each threshold, over the last axis.
+    """Share of values above each threshold, over the last axis.
 
     Args:
         values: scores, ``[..., N]``.

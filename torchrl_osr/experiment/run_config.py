@@ -1,7 +1,7 @@
-"""The configuration of a run that may be somebody else's.
+"""Reading the configuration of a run that may come from somebody else.
 
-Networks and loss are built by calling what the configuration names as ``_target_``. Of
-a run that was handed over, nothing is called but what this package offers.
+Networks and loss are built by calling the functions that the configuration names as
+``_target_``: only this package's are allowed.
 """
 
 from __future__ import annotations
@@ -16,14 +16,13 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_osr._files import read_text
 
-# Those of our runs have 4 kB.
-MAX_CONFIG_BYTES = 2**20
-
-# Those of our runs have 4 levels; a few hundred would exhaust the parser's stack.
+# Those of our runs have 4 kB and four levels of nesting. PyYAML needs two seconds for
+# 64 kB, and deep nesting exhausts Python's stack.
+MAX_CONFIG_BYTES = 2**16
 MAX_CONFIG_DEPTH = 32
 
 TARGET_PACKAGES = ("torchrl_osr", "torchrl_osr.modules", "torchrl_osr.objectives")
-"""Whose public names a configuration may have called."""
+"""Packages whose public names are allowed as ``_target_``."""
 
 
 def read_config(path: Path) -> DictConfig:
@@ -35,7 +34,7 @@ def read_config(path: Path) -> DictConfig:
     Raises:
         OSError: if it cannot be read.
         ValueError: if it is no mapping, has interpolations, which no run writes and
-            which would hide what is called, or :func:`read_yaml` refuses it.
+            which could hide a ``_target_``, or :func:`read_yaml` refuses it.
     """
     content = read_yaml(path)
     if not isinstance(content, dict):
@@ -54,33 +53,33 @@ def read_yaml(path: Path) -> Any:
 
     Raises:
         OSError: if it cannot be read.
-        ValueError: if it is too large or nested too deep, or has aliases, which no run
-            writes and a few of which can fill the memory.
+        ValueError: if it has more than 64 KiB or 32 levels of nesting, or has aliases,
+            which no run writes and a few of which can fill the memory.
         YAMLError: if it is no YAML.
     """
     text = read_text(path, max_bytes=MAX_CONFIG_BYTES)
     depth = 0
-    for event in yaml.parse(text):
+    for event in yaml.parse(text):  # without recursion, and only as far as needed
+        if isinstance(event, yaml.AliasEvent):
+            raise ValueError(f"{path.name} has YAML aliases, which no run writes")
         depth += isinstance(event, yaml.CollectionStartEvent)
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if depth > MAX_CONFIG_DEPTH:
             raise ValueError(f"{path.name} is nested more than {MAX_CONFIG_DEPTH} deep")
-        if isinstance(event, yaml.AliasEvent):
-            raise ValueError(f"{path.name} has YAML aliases, which no run writes")
     return OmegaConf.to_container(OmegaConf.create(text))
 
 
 def check_targets(config: DictConfig) -> None:
-    """Raise unless all that is called to build networks and loss is this package's.
+    """Raise unless every ``_target_`` is a public name of this package.
 
     Gymnasium imports the module that an environment's id begins with, as in
-    ``"module:Name-v0"``; that is not let through either.
+    ``"module:Name-v0"``; such an id is refused, too.
 
     Args:
         config: of the run.
 
     Raises:
-        ValueError: naming what is not.
+        ValueError: naming the target or the id.
     """
     env_id = str(OmegaConf.select(config, "env.id", default=""))
     if ":" in env_id:

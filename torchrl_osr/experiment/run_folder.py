@@ -1,8 +1,13 @@
-"""The folder of a run: which configuration it is, how it stands, its small files."""
+"""The folder of a run: its configuration and its status."""
 
 from __future__ import annotations
 
+import dataclasses
+import logging
 import os
+import re
+import shlex
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
@@ -12,19 +17,51 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_osr._files import write_atomically, write_json
-from torchrl_osr.trainers.preemption import Preempted
+from torchrl_osr.trainers import Interrupted
+
+log = logging.getLogger(__name__)
 
 CONFIG, STATUS = "config.yaml", "status.json"
 
 PACKAGES = ("torchrl-osr", "torch", "torchrl", "tensordict", "gymnasium", "mujoco")
 """Packages whose versions decide a run's numbers."""
 
-# May differ when a run is continued: they do not touch a single number.
 FREE_KEYS = ("resume", "trainer.progress")
+"""Keys that may differ when a run is continued: no number depends on them."""
+
+
+def check_keys(config: DictConfig) -> None:
+    """Raise if a composed configuration has keys that its schema lacks.
+
+    Hydra refuses a mistyped ``key=value``, but adds ``+key=value`` even to a typed
+    group, where nothing would read it.
+
+    Args:
+        config: composed with its schema.
+
+    Raises:
+        ValueError: naming the keys.
+    """
+    unknown = list(_unknown_keys(config))
+    if unknown:
+        raise ValueError(
+            f"there is no key {', '.join(unknown)}: docs/configuration.md has them all."
+        )
+
+
+def _unknown_keys(node: DictConfig, prefix: str = "") -> Iterator[str]:
+    kind = OmegaConf.get_type(node)
+    known = {each.name for each in dataclasses.fields(kind)} if kind else set()
+    for key in map(str, node):
+        # A _target_ alone may be any function, which has its own keywords.
+        if known != {"_target_"} and key not in known:
+            yield f"{prefix}{key}"
+        elif isinstance(node[key], DictConfig):
+            yield from _unknown_keys(node[key], f"{prefix}{key}.")
 
 
 def claim(folder: Path, config: DictConfig) -> None:
-    """Write the run's configuration into its folder, or check the one that is there.
+    """Write the run's configuration into its folder, or compare it with the one there.
 
     Args:
         folder: made if need be.
@@ -39,13 +76,13 @@ def claim(folder: Path, config: DictConfig) -> None:
     if not path.exists():
         write_atomically(path, OmegaConf.to_yaml(config, resolve=True))
         return
-    here, there = (flatten(OmegaConf.to_container(each, resolve=True)) for each in (
-        config, OmegaConf.load(path)
-    ))  # fmt: skip
+    here = flatten(OmegaConf.to_container(config, resolve=True))
+    there = flatten(OmegaConf.to_container(OmegaConf.load(path), resolve=True))
+    absent = "nothing"
     differences = [
-        f"{key}: {there.get(key)!r} there, {here.get(key)!r} now"
+        f"{key}: {there.get(key, absent)!r} there, {here.get(key, absent)!r} now"
         for key in sorted(here.keys() | there.keys())
-        if here.get(key) != there.get(key) and key not in FREE_KEYS
+        if here.get(key, absent) != there.get(key, absent) and key not in FREE_KEYS
     ]
     if differences:
         raise ValueError(
@@ -84,12 +121,17 @@ def saved_config(folder: Path | str, overrides: Sequence[str]) -> DictConfig:
 
 @contextmanager
 def status(folder: Path) -> Iterator[None]:
-    """Keep ``status.json`` true: running, then done, preempted, or failed and why."""
+    """Keep ``status.json`` true: running, then done, preempted, or failed and why.
+
+    A run that a signal has stopped is ``preempted``; the command that continues it is
+    logged.
+    """
     write_json(folder / STATUS, {"status": "running", "pid": os.getpid()})
     try:
         yield
-    except Preempted as error:
+    except Interrupted as error:
         write_json(folder / STATUS, {"status": "preempted", "reason": error.reason})
+        log.warning(f"Continue with: python {sys.argv[0]} {_resume(folder)}")
         raise
     except BaseException as error:
         reason = f"{type(error).__name__}: {error}"
@@ -99,13 +141,21 @@ def status(folder: Path) -> Iterator[None]:
     write_json(folder / STATUS, {"status": "done"})
 
 
+def _resume(folder: Path) -> str:
+    """Override that continues a run, quoted for Hydra and for the shell."""
+    if re.fullmatch(r"[\w./+-]+", str(folder)):
+        return f"resume={folder}"
+    quoted = str(folder).replace("\\", "\\\\").replace("'", "\\'")
+    return shlex.quote(f"resume='{quoted}'")
+
+
 def package_versions() -> dict[str, str]:
     """Versions of :data:`PACKAGES`, by name with underscores."""
     return {package.replace("-", "_"): version(package) for package in PACKAGES}
 
 
 def flatten(value: Any, prefix: str = "") -> dict[str, Any]:
-    """Return nested mappings as one, with dotted keys."""
+    """Nested mappings as one, with dotted keys."""
     if not isinstance(value, Mapping):
         return {prefix: value}
     flat: dict[str, Any] = {}

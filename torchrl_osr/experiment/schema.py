@@ -13,11 +13,8 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, OmegaConf
 
-from torchrl_osr.experiment.loss_config import (
-    InverseDynamicsConfig,
-    OSRLossConfig,
-    OSRVLossConfig,
-)
+from torchrl_osr import objectives
+from torchrl_osr.experiment.derived_schema import schema_of
 
 # File systems allow 255 bytes, and temporary names beside it need some of them.
 MAX_FOLDER_NAME = 200
@@ -69,14 +66,23 @@ class DataConfig:
 
 
 @dataclass
+class TargetConfig:
+    """A function or class to be called, by its full name."""
+
+    _target_: str = MISSING
+
+
+@dataclass
 class NetworkConfig:
     """Actor, critics and inverse dynamics model.
 
     Attributes:
+        actor: the function that builds the policy, of the kind that the loss trains.
         num_cells: width of each hidden layer.
         layer_norm: in the critics; steadier, but not in the paper.
     """
 
+    actor: TargetConfig = field(default_factory=TargetConfig)
     num_cells: list[int] = MISSING
     layer_norm: bool = MISSING
 
@@ -89,10 +95,28 @@ class PerturbationConfig:
         std: in units of each observation entry's standard deviation in the data, or
             of the observation itself where ``data.standardize`` is false.
         noise: gaussian or uniform.
+        adversary: options of ``Adversary``, which chooses the perturbed states of the
+            policy's training in the place of the noise; null for the noise.
     """
 
     std: float = MISSING
     noise: str = MISSING
+    adversary: Any = None
+
+
+@dataclass
+class InverseDynamicsConfig:
+    """Which inverse dynamics model, and how it is trained.
+
+    Attributes:
+        network: the function that builds it.
+        loss: options of ``InverseDynamicsLoss``.
+        shuffle_next: train it with the next state of another row, an ablation.
+    """
+
+    network: TargetConfig = field(default_factory=TargetConfig)
+    loss: Any = MISSING
+    shuffle_next: bool = False
 
 
 @dataclass
@@ -122,7 +146,6 @@ class TrainerConfig:
         batch_size: rows of a gradient step.
         inverse_dynamics_steps: gradient steps of the first phase.
         steps: gradient steps of the policy phase.
-        bc_steps: how many of them the policy clones behaviour, for a warm start.
         log_interval: steps between log entries.
         eval_interval: steps between evaluations.
         eval_episodes: complete episodes of an evaluation.
@@ -141,7 +164,6 @@ class TrainerConfig:
     batch_size: int = MISSING
     inverse_dynamics_steps: int = MISSING
     steps: int = MISSING
-    bc_steps: int = MISSING
     log_interval: int = MISSING
     eval_interval: int = MISSING
     eval_episodes: int = MISSING
@@ -180,7 +202,6 @@ class OfflineOSRConfig:
         seed: of networks, sampling, noise and evaluation episodes.
         num_random: what ``loss.num_random`` is for the losses with CQL's term.
         resume: folder of a killed run to continue.
-        population: number of seeds, or a list of mappings, to be trained at once.
     """
 
     env: EnvConfig = field(default_factory=EnvConfig)
@@ -190,26 +211,27 @@ class OfflineOSRConfig:
     inverse_dynamics: InverseDynamicsConfig = field(
         default_factory=InverseDynamicsConfig
     )
-    loss: Any = MISSING  # OSRLossConfig or OSRVLossConfig, as the option says
+    loss: Any = MISSING  # derived from the class that _target_ names
     optim: OptimConfig = field(default_factory=OptimConfig)
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     seed: int = MISSING
     num_random: int = MISSING
     resume: str | None = None
-    population: Any = None  # int | list[dict[str, Any]] | None
 
 
 def register() -> None:
-    """Make the schema known to Hydra as ``offline_osr_schema``.
+    """Make the schemas known to Hydra: ``offline_osr_schema`` and the group ``schema``.
 
-    And two resolvers: ``run_dir``, by which ``resume=folder`` becomes the run's folder,
-    and ``job_dir``, which names a sweep's folders by number and overrides.
+    The group holds one schema for each class of :mod:`torchrl_osr.objectives`, by its
+    name. And two resolvers: ``run_dir``, by which ``resume=folder`` becomes the run's
+    folder, and ``job_dir``, which names a sweep's folders by number and overrides.
     """
     store = ConfigStore.instance()
     store.store(name="offline_osr_schema", node=OfflineOSRConfig)
-    store.store(group="loss", name="osr_schema", node=OSRLossConfig)
-    store.store(group="loss", name="osr_v_schema", node=OSRVLossConfig)
+    for name in set(objectives.__all__) - {"BaseLoss"}:
+        schema = schema_of(getattr(objectives, name))
+        store.store(group="schema", name=name, node=schema)
     OmegaConf.register_new_resolver(
         "run_dir", lambda resume, fresh: resume or fresh, replace=True
     )

@@ -1,4 +1,4 @@
-"""A trained policy, from the folder of its run."""
+"""Loading a trained policy from the folder of its run."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from torchrl_osr.data import make_environment
 from torchrl_osr.experiment.build import make_learner
 from torchrl_osr.experiment.run_config import check_targets, read_config
 from torchrl_osr.experiment.run_folder import CONFIG
-from torchrl_osr.trainers.checkpointing import find_damage, safe_checkpoint
+from torchrl_osr.trainers.checkpoints import find_damage, safe_checkpoint
 
 CHECKPOINTS = Path("checkpoint") / "policy"
-"""Where a run keeps the checkpoints of its policy."""
+"""Folder of the policy's checkpoints, in the run's folder."""
 
 
 class TrainedRun(NamedTuple):
@@ -29,15 +29,18 @@ class TrainedRun(NamedTuple):
     Attributes:
         config: the run's configuration.
         actor: the policy; shares its parameters with the loss.
+        inverse_dynamics: the model that taught the policy, with the loss's frozen
+            parameters; ``None`` if the loss has none, as CQL and SAC-N have not.
         loss: holds the critics, too.
-        observation_norm: how the networks' observations were standardised.
-        step: gradient steps until then.
-        path: the checkpoint's file.
-        folder: the run's.
+        observation_norm: standardisation of the networks' observations.
+        step: gradient steps of the checkpoint.
+        path: of the checkpoint's file.
+        folder: of the run.
     """
 
     config: DictConfig
     actor: ProbabilisticTensorDictSequential
+    inverse_dynamics: ProbabilisticTensorDictSequential | None
     loss: LossModule
     observation_norm: ObservationNorm
     step: int
@@ -46,7 +49,7 @@ class TrainedRun(NamedTuple):
 
 
 def run_folder_of(path: Path | str) -> Path:
-    """Return the run's folder of a run's folder or of one of its checkpoints.
+    """Folder of the run that a checkpoint, or the folder itself, belongs to.
 
     Raises:
         FileNotFoundError: if nothing is there, or no run.
@@ -64,9 +67,9 @@ def run_folder_of(path: Path | str) -> Path:
 
 
 def checkpoints_of(folder: Path | str) -> list[Path]:
-    """Return the checkpoints that a run has kept of its policy, oldest first.
+    """Checkpoints of the policy that a run has kept, oldest first.
 
-    The best one is not among them: it is a copy of one of the evaluations.
+    Without ``best.torchrl``, which was saved besides them.
 
     Args:
         folder: of the run.
@@ -84,7 +87,7 @@ def checkpoints_of(folder: Path | str) -> list[Path]:
 
 
 def load_trained(path: Path | str) -> TrainedRun:
-    """Load one checkpoint, weights only: loading runs no code of whoever made it.
+    """Load one checkpoint, weights only: no code from the file is run.
 
     torch's global generator is left as it was.
 
@@ -95,8 +98,8 @@ def load_trained(path: Path | str) -> TrainedRun:
         FileNotFoundError: if there is no run or no checkpoint.
         CheckpointError: if the file is damaged, or does not fit the run's
             configuration; tensors of another shape are named.
-        ValueError: if the configuration has something built that is not of this
-            package, see :func:`~torchrl_osr.experiment.run_config.check_targets`.
+        ValueError: if the configuration names a ``_target_`` outside of this package,
+            see :func:`~torchrl_osr.experiment.run_config.check_targets`.
     """
     folder = run_folder_of(path)
     path = checkpoints_of(path)[-1] if Path(path).is_dir() else Path(path)
@@ -110,7 +113,7 @@ def load_trained(path: Path | str) -> TrainedRun:
     (action_size,) = environment.action_space.shape or (0,)
     environment.close()
     with torch.random.fork_rng(devices=[]):
-        actor, _, loss = make_learner(config, observation_size, action_size)
+        actor, model, loss = make_learner(config, observation_size, action_size)
     shape = (observation_size,) if config.data.standardize else ()
     norm = ObservationNorm(
         torch.zeros(shape), torch.ones(shape), in_keys=["observation"],
@@ -125,4 +128,6 @@ def load_trained(path: Path | str) -> TrainedRun:
         ) from error
     numbered = re.fullmatch(r"checkpoint-(\d+)\.torchrl", path.name)
     step = int(numbered[1]) if numbered else int(manifest["metadata"]["step"])
-    return TrainedRun(config, actor, loss, norm, step, path, folder)
+    # The loss's parameters of the model are the model's own tensors.
+    inverse_dynamics = model if hasattr(loss, "inverse_dynamics_network") else None
+    return TrainedRun(config, actor, inverse_dynamics, loss, norm, step, path, folder)

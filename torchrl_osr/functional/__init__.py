@@ -17,7 +17,6 @@ from torchrl_osr.functional.critics import (
     gradient_diversity,
     lagrange_terms,
     soft_maximum,
-    td_target,
     value_constraint,
 )
 from torchrl_osr.functional.divergences import (
@@ -28,13 +27,18 @@ from torchrl_osr.functional.divergences import (
     state_recovery,
 )
 from torchrl_osr.functional.policy import (
+    bootstrap_value,
+    cloning_error,
     discrete_policy_value,
     soft_policy_value,
+    td3_bc_objective,
     temperature_objective,
 )
 
 __all__ = [
+    "bootstrap_value",
     "categorical_kl",
+    "cloning_error",
     "conservative_gap",
     "deterministic_recovery",
     "discrete_policy_value",
@@ -45,7 +49,7 @@ __all__ = [
     "soft_maximum",
     "soft_policy_value",
     "state_recovery",
-    "td_target",
+    "td3_bc_objective",
     "temperature_objective",
     "value_constraint",
 ]

@@ -1,4 +1,4 @@
-"""What the critics minimise.
+"""Objectives of the critics.
 
 Shapes: ``B`` batch (any leading dimensions), ``A`` action, ``N`` critics, ``M``
 sampled actions of one state.
@@ -10,68 +10,41 @@ import torch
 from torch import Tensor
 
 
-def td_target(
-    reward: Tensor, terminated: Tensor, next_qvalue: Tensor, gamma: float | Tensor
-) -> Tensor:
-    r"""Return the one-step target of equation (2) with the pessimistic ensemble value.
-
-    .. math::
-        r + \gamma\,(1 - \text{terminated})\,\min_i \bar Q_i(s', a'),
-        \quad a' \sim \pi(s')
-
-    ``terminated``, not ``done``: a time-out cuts the recording, not the task. A value
-    at a terminated ``s'`` is ignored even when it is not finite.
-
-    ``OSRLoss`` reaches the same number through the value estimator that its user
-    chose with ``make_value_estimator``; this is its default, TD(0), spelled out.
-
-    Args:
-        reward: ``[B]``.
-        terminated: bool, ``[B]``.
-        next_qvalue: target networks' values of the policy's action at ``s'``,
-            ``[N, B]``.
-        gamma: discount factor.
-
-    Returns:
-        ``[B]``.
-    """
-    next_value = next_qvalue.min(0).values
-    return reward + gamma * torch.where(terminated, 0.0, next_value)
-
-
 def soft_maximum(
-    qvalue: Tensor, log_prob: Tensor | None, *, temperature: float = 1.0
+    qvalue: Tensor, log_prob: Tensor, *, temperature: float = 1.0
 ) -> Tensor:
-    r"""Return the log-sum-exp of values of sampled actions, weighted by densities.
+    r"""Log-sum-exp of the values of sampled actions, weighted by their densities.
 
     .. math::
-        \tau \log \sum_{j=1}^{M} \exp\!\big((Q(s, a_j) - \log p(a_j)) / \tau\big)
+        \tau \log \sum_{j=1}^{M} \exp\big(Q(s, a_j) / \tau\big) / p(a_j)
+
+    Each weight :math:`1/p` makes a term an unbiased estimate of
+    :math:`\int e^{Q(s, a) / \tau} da`. Other codes divide the log-density by
+    :math:`\tau` too, which for :math:`\tau \ne 1` is the weight
+    :math:`p^{-1/\tau}`; with the default both are the same.
 
     Args:
         qvalue: values of the sampled actions, ``[B, M]``.
-        log_prob: log-density of each action under what drew it, ``[B, M]``, or
-            ``None`` for a plain sum.
+        log_prob: log-density of each action under what drew it, ``[B, M]``.
         temperature: :math:`\tau`, in units of the value.
 
     Returns:
         ``[B]``.
+
+    Examples:
+        >>> two_uniform_actions = torch.tensor([1.0, 3.0])
+        >>> density = torch.tensor([0.5, 0.5]).log()
+        >>> round(soft_maximum(two_uniform_actions, density).item(), 4)
+        3.8201
     """
-    logits = qvalue if log_prob is None else qvalue - log_prob
-    return temperature * torch.logsumexp(logits / temperature, -1)
+    return temperature * torch.logsumexp(qvalue / temperature - log_prob, -1)
 
 
-def conservative_gap(
-    sampled_qvalue: Tensor,
-    sampled_log_prob: Tensor | None,
-    data_qvalue: Tensor,
-    *,
-    temperature: float = 1.0,
-) -> Tensor:
-    r"""Return the CQL(H) regulariser with importance-weighted actions.
+def conservative_gap(soft_maximum: Tensor, data_qvalue: Tensor) -> Tensor:
+    r"""CQL(H) penalty: by how much sampled actions are valued above the data's.
 
     .. math::
-        \tau \log \sum_{j=1}^{M} \exp\!\big((Q(s, a_j) - \log p(a_j)) / \tau\big)
-        - Q(s, a)
+        \tau \log \sum_{j=1}^{M} \exp\big(Q(s, a_j) / \tau\big) / p(a_j) - Q(s, a)
 
     with ``M = 3K`` actions: uniform, from ``pi(s)`` and from ``pi(s')``, *all scored
     at* ``s`` and all in one log-sum-exp ("Conservative Q-Learning", Kumar et al.
@@ -79,33 +52,23 @@ def conservative_gap(
     (3); its authors' code, like the reference CQL code, computes this. As there, the
     sum is not divided by ``M``: a constant, without effect on the gradient.
 
-    Without densities the sum is plain, and the data's action is one of its ``M + 1``
-    terms, as in the reference CQL code (its ``min_q_version=2``) and in CORL with
-    ``cql_importance_sample=False``.
-
     TorchRL 0.14.1 ``CQLLoss`` differs: it takes the log-sum-exp over three actions at
     a time and scores the actions of ``pi(s')`` at ``s'``.
 
     Args:
-        sampled_qvalue: values of the sampled actions at ``s``, ``[B, M]``.
-        sampled_log_prob: log-density of each action under what drew it, ``[B, M]``, or
-            ``None`` for a plain sum.
+        soft_maximum: the first term, see :func:`soft_maximum`, ``[B]``.
         data_qvalue: value of the data's action, ``[B]``.
-        temperature: :math:`\tau`, in units of the value.
 
     Returns:
         ``[B]``.
     """
-    if sampled_log_prob is None:
-        sampled_qvalue = torch.cat([sampled_qvalue, data_qvalue.unsqueeze(-1)], -1)
-    soft = soft_maximum(sampled_qvalue, sampled_log_prob, temperature=temperature)
-    return soft - data_qvalue
+    return soft_maximum - data_qvalue
 
 
 def lagrange_terms(
     gap: Tensor, log_multiplier: Tensor, threshold: float
 ) -> tuple[Tensor, Tensor]:
-    r"""Return both sides of CQL's Lagrangian, each to be minimised.
+    r"""Both sides of CQL's Lagrangian, each to be minimised.
 
     .. math::
         \max_{\alpha' \ge 0} \min_Q \; \alpha' \, (\text{gap}(Q) - \tau)
@@ -137,7 +100,7 @@ def value_constraint(
     log_prob: Tensor | None = None,
     temperature: float = 1.0,
 ) -> Tensor:
-    r"""Return OSR-v's constraint on the values, equation (8).
+    r"""OSR-v constraint on the values, equation (8).
 
     .. math::
         \mathbb E_{\hat a \sim \pi(\tilde s)} Q(\tilde s, \hat a)
@@ -145,8 +108,8 @@ def value_constraint(
 
     Minimised over Q, it lowers actions with unknown consequences and raises those that
     lead to ``s'``. With ``log_prob`` the first expectation is a log-sum-exp over
-    importance-weighted actions instead, as in :func:`conservative_gap`: an addition,
-    not in the paper, which puts the weight on the actions that Q overrates.
+    importance-weighted actions instead (:func:`soft_maximum`): an addition, not in the
+    paper, which puts the weight on the actions that Q overrates.
 
     Args:
         policy_qvalue: values of the sampled actions at ``s~``, ``[B, M]``.
@@ -161,11 +124,11 @@ def value_constraint(
     target = inverse_dynamics_qvalue.mean(-1)
     if log_prob is None:
         return policy_qvalue.mean(-1) - target
-    return conservative_gap(policy_qvalue, log_prob, target, temperature=temperature)
+    return soft_maximum(policy_qvalue, log_prob, temperature=temperature) - target
 
 
 def gradient_diversity(action_gradients: Tensor) -> Tensor:
-    r"""Return EDAC's ensemble similarity, to be minimised.
+    r"""EDAC similarity of the critics' action gradients, to be minimised.
 
     .. math::
         \frac{1}{N - 1} \sum_{i \ne j} \Big\langle

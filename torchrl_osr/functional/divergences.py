@@ -15,7 +15,7 @@ from torch import Tensor
 def gaussian_kl(
     loc_p: Tensor, scale_p: Tensor, loc_q: Tensor, scale_q: Tensor
 ) -> Tensor:
-    r"""Return :math:`KL(p \,\|\, q)` of diagonal Gaussians, one number a dimension.
+    r""":math:`KL(p \,\|\, q)` of diagonal Gaussians, one number a dimension.
 
     .. math::
         \log\frac{\sigma_q}{\sigma_p}
@@ -47,7 +47,7 @@ def gaussian_kl(
 def jeffreys_divergence(
     loc_p: Tensor, scale_p: Tensor, loc_q: Tensor, scale_q: Tensor
 ) -> Tensor:
-    r"""Return :math:`KL(p \,\|\, q) + KL(q \,\|\, p)` of diagonal Gaussians.
+    r"""Jeffreys divergence :math:`KL(p \,\|\, q) + KL(q \,\|\, p)` of Gaussians.
 
     .. math::
         \frac12 \sum_i \Big(\frac{\sigma_p}{\sigma_q} - \frac{\sigma_q}{\sigma_p}\Big)^2
@@ -77,7 +77,7 @@ def jeffreys_divergence(
 
 
 def categorical_kl(log_prob_p: Tensor, log_prob_q: Tensor) -> Tensor:
-    r"""Return :math:`KL(p \,\|\, q)` of categorical distributions.
+    r""":math:`KL(p \,\|\, q)` of categorical distributions.
 
     .. math::
         \sum_a p(a) \, [\log p(a) - \log q(a)]
@@ -113,7 +113,7 @@ def state_recovery(
     direction: Literal["forward", "reverse"] = "forward",
     action_reduction: Literal["sum", "mean"] = "sum",
 ) -> Tensor:
-    r"""Return the state-recovery term :math:`L_{sr}`, equations (11) and (12).
+    r"""State-recovery term :math:`L_{sr}`, equations (11) and (12).
 
     .. math::
         KL\big(I(a \mid \tilde s, s') \,\|\, \pi(a \mid \tilde s)\big)
@@ -160,7 +160,7 @@ def deterministic_recovery(
     *,
     action_reduction: Literal["sum", "mean"] = "sum",
 ) -> Tensor:
-    r"""Return the state-recovery term of a policy without a density.
+    r"""State-recovery term of a policy without a density.
 
     .. math::
         \sum_d \frac{(x_d - \mu_{I,d})^2}{2\sigma_{I,d}^2}

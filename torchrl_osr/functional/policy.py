@@ -1,4 +1,4 @@
-"""What the policy and the entropy temperature minimise.
+"""Objectives of the policy and of the entropy temperature, and the bootstrap value.
 
 Shapes: ``B`` batch (any leading dimensions), ``N`` critics, ``n`` number of discrete
 actions.
@@ -13,7 +13,7 @@ from torch import Tensor
 def soft_policy_value(
     log_prob: Tensor, qvalue: Tensor, alpha: Tensor | float
 ) -> Tensor:
-    r"""Return the policy's objective to be minimised, section 4.4.
+    r"""SAC objective of the policy, to be minimised, section 4.4.
 
     .. math::
         \alpha_e \log\pi(\hat a \mid \tilde s) - \min_i Q_i(\tilde s, \hat a)
@@ -33,10 +33,39 @@ def soft_policy_value(
     return alpha * log_prob - qvalue.min(0).values
 
 
+def bootstrap_value(
+    qvalue: Tensor, log_prob: Tensor | None = None, alpha: Tensor | float = 0.0
+) -> Tensor:
+    r"""Pessimistic value of the next state, :math:`V(s')` of the target (2).
+
+    .. math::
+        \min_i \bar Q_i(s', a') - \alpha_e \log\pi(a' \mid s'),
+        \quad a' \sim \pi(s')
+
+    The target itself, :math:`r + \gamma\,(1 - \text{terminated})\,V(s')`, is that of
+    TorchRL's value estimator.
+
+    Args:
+        qvalue: target critics' values of the action, ``[N, B]``.
+        log_prob: log-density of the action, ``[B]``, for SAC's target with its
+            entropy. Default ``None``, the paper's.
+        alpha: entropy temperature, a scalar.
+
+    Returns:
+        ``[B]``.
+
+    Examples:
+        >>> bootstrap_value(torch.tensor([[1.0, 4.0], [2.0, 3.0]]))
+        tensor([1., 3.])
+    """
+    value = qvalue.min(0).values
+    return value if log_prob is None else value - alpha * log_prob
+
+
 def discrete_policy_value(
     log_prob: Tensor, qvalue: Tensor, alpha: Tensor | float
 ) -> Tensor:
-    r"""Return :func:`soft_policy_value` in expectation over all ``n`` actions.
+    r""":func:`soft_policy_value` in expectation over all ``n`` actions.
 
     .. math::
         \sum_{a=1}^{n} \pi(a \mid \tilde s)
@@ -67,7 +96,7 @@ def discrete_policy_value(
 def temperature_objective(
     log_alpha: Tensor, log_prob: Tensor, target_entropy: float
 ) -> Tensor:
-    r"""Return SAC's objective for the entropy temperature, linear in its logarithm.
+    r"""SAC objective of the entropy temperature, linear in its logarithm.
 
     .. math::
         -\log\alpha_e \, \big(\log\pi(\hat a \mid \tilde s) + \bar{\mathcal H}\big)
@@ -81,3 +110,48 @@ def temperature_objective(
         ``[B]``.
     """
     return -log_alpha * (log_prob.detach() + target_entropy)
+
+
+def cloning_error(action: Tensor, data_action: Tensor) -> Tensor:
+    r"""Mean squared distance of an action from the data's, in squared action units.
+
+    .. math::
+        \frac1A \sum_d (\pi_d(s) - a_d)^2
+
+    Args:
+        action: of a deterministic policy, ``[B, A]``.
+        data_action: ``[B, A]``.
+
+    Returns:
+        ``[B]``.
+    """
+    return (action - data_action).square().mean(-1)
+
+
+def td3_bc_objective(
+    qvalue: Tensor, cloning_error: Tensor, magnitude: Tensor, alpha: float
+) -> Tensor:
+    r"""TD3+BC objective of the policy, to be minimised.
+
+    .. math::
+        \frac1A \|\pi(s) - a\|^2
+        - \frac{\alpha}{\mathbb E_D |Q(s, \pi(s))|}\, Q(s, \pi(s))
+
+    "A Minimalist Approach to Offline Reinforcement Learning",
+    https://arxiv.org/abs/2106.06860, equations (3) to (5).
+
+    Args:
+        qvalue: value of the policy's action, ``[B]``.
+        cloning_error: see :func:`cloning_error`, ``[B]``.
+        magnitude: :math:`\mathbb E_D |Q(s, \pi(s))|`, a scalar without gradient.
+        alpha: weight of the values.
+
+    Returns:
+        ``[B]``.
+
+    Examples:
+        >>> one = torch.ones(1)
+        >>> td3_bc_objective(4 * one, 0.5 * one, magnitude=2 * one, alpha=2.5)
+        tensor([-4.5000])
+    """
+    return cloning_error - alpha / magnitude * qvalue

@@ -1,6 +1,6 @@
 """Networks: the actor, the critics and the inverse dynamics models."""
 
-from torchrl_osr.modules.actor import tanh_gaussian_actor
+from torchrl_osr.modules.actor import deterministic_actor, tanh_gaussian_actor
 from torchrl_osr.modules.critic import critic_ensemble
 from torchrl_osr.modules.cvae_inverse_dynamics import cvae_inverse_dynamics
 from torchrl_osr.modules.discrete import (
@@ -15,6 +15,7 @@ __all__ = [
     "categorical_inverse_dynamics",
     "critic_ensemble",
     "cvae_inverse_dynamics",
+    "deterministic_actor",
     "discrete_critic_ensemble",
     "tanh_gaussian_actor",
     "tanh_gaussian_inverse_dynamics",

@@ -1,4 +1,4 @@
-"""The policy: a tanh-Gaussian actor."""
+"""Policies: a tanh-Gaussian actor and a deterministic one."""
 
 from __future__ import annotations
 
@@ -6,7 +6,13 @@ from collections.abc import Sequence
 
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal
+from torchrl.modules import (
+    MLP,
+    NormalParamExtractor,
+    ProbabilisticActor,
+    TanhDelta,
+    TanhNormal,
+)
 
 SCALE_MAPPING = "biased_softplus_1.0_0.01"
 """Standard deviation before the tanh, of policy and inverse dynamics alike: a softplus
@@ -62,4 +68,49 @@ def tanh_gaussian_actor(
         distribution_class=TanhNormal,
         distribution_kwargs={"low": low, "high": high},
         return_log_prob=True,
+    )
+
+
+def deterministic_actor(
+    observation_dim: int,
+    action_dim: int,
+    *,
+    num_cells: Sequence[int] = (256, 256),
+    activation_class: type[nn.Module] = nn.ReLU,
+    low: float | Tensor = -1.0,
+    high: float | Tensor = 1.0,
+) -> ProbabilisticActor:
+    """Deterministic actor that reads ``"observation"``; its action ends in a tanh.
+
+    Args:
+        observation_dim: size of the observation, ``S``.
+        action_dim: size of the action, ``A``.
+        num_cells: width of each hidden layer.
+        activation_class: activation between the layers.
+        low, high: action bounds, a number or ``[A]``.
+
+    Returns:
+        An actor that writes ``"param"`` (before the tanh, which
+        :class:`~torchrl.modules.TanhDelta` takes of its sum with the center of the
+        bounds) and ``"action"``, each ``[B, A]``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> actor = deterministic_actor(11, 3, num_cells=[32])
+        >>> actor(TensorDict({"observation": torch.zeros(4, 11)}, [4]))["action"].shape
+        torch.Size([4, 3])
+    """
+    network = MLP(
+        in_features=observation_dim,
+        out_features=action_dim,
+        num_cells=list(num_cells),
+        activation_class=activation_class,
+    )
+    return ProbabilisticActor(
+        TensorDictModule(network, ["observation"], ["param"]),
+        in_keys=["param"],
+        out_keys=["action"],
+        distribution_class=TanhDelta,
+        distribution_kwargs={"low": low, "high": high, "safe": False},
     )

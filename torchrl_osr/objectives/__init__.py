@@ -1,21 +1,23 @@
 """Loss modules, one a file; the mathematics is in :mod:`torchrl_osr.functional`."""
 
 from torchrl_osr.objectives.adversary import Adversary
-from torchrl_osr.objectives.discrete_inverse_dynamics import (
-    DiscreteInverseDynamicsLoss,
-)
+from torchrl_osr.objectives.base import BaseLoss
 from torchrl_osr.objectives.discrete_osr import DiscreteOSRLoss
+from torchrl_osr.objectives.edac import EDACLoss
 from torchrl_osr.objectives.inverse_dynamics import InverseDynamicsLoss
 from torchrl_osr.objectives.osr import OSRLoss
 from torchrl_osr.objectives.osr_v import OSRVLoss
 from torchrl_osr.objectives.state_recovery import StateRecoveryLoss
+from torchrl_osr.objectives.td3_bc import TD3BCLoss
 
 __all__ = [
     "Adversary",
-    "DiscreteInverseDynamicsLoss",
+    "BaseLoss",
     "DiscreteOSRLoss",
+    "EDACLoss",
     "InverseDynamicsLoss",
     "OSRLoss",
     "OSRVLoss",
     "StateRecoveryLoss",
+    "TD3BCLoss",
 ]

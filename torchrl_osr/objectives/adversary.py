@@ -21,9 +21,11 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.modules import TanhNormal
 
-from torchrl_osr._checks import check_choice
+from torchrl_osr._checks import check_choice, check_positive
+from torchrl_osr._entries import entry, nested, select
 from torchrl_osr.functional import jeffreys_divergence
-from torchrl_osr.objectives.mixed_states import entry
+from torchrl_osr.objectives.base import BaseLoss
+from torchrl_osr.objectives.step import distribution_params, observation_keys, qvalue
 
 Policy = Callable[[TensorDictBase], TanhNormal]
 """Maps states ``[M, B]`` (or ``[B]``) to the policy's distribution there."""
@@ -105,13 +107,40 @@ class Adversary:
         check_choice("method", self.method, ("sample", "gradient"))
         if not 0 <= self.epsilon < math.inf:
             raise ValueError(f"epsilon must be at least 0, got {self.epsilon}.")
-        for name in ("num_samples", "num_steps"):
-            if getattr(self, name) < 1:
-                raise ValueError(
-                    f"{name} must be at least 1, got {getattr(self, name)}."
-                )
-        if not 0 < self.step_size < math.inf:
-            raise ValueError(f"step_size must be above 0, got {self.step_size}.")
+        check_positive("num_samples", self.num_samples, minimum=1)
+        check_positive("num_steps", self.num_steps, minimum=1)
+        check_positive("step_size", self.step_size)
+
+    def __call__(self, loss: BaseLoss, tensordict: TensorDictBase) -> TensorDictBase:
+        """A batch whose perturbed states are the worst for a loss's networks.
+
+        It stands in the place of :class:`~torchrl_osr.StatePerturbation`: in a plain
+        loop ``loss(adversary(loss, buffer.sample()))``, with a trainer in the hook
+        ``process_optim_batch``.
+
+        Args:
+            loss: holds the policy and the critics, such as
+                :class:`~torchrl_osr.OSRLoss`.
+            tensordict: a batch ``[B]``, left as it is.
+        """
+        keys = observation_keys(loss)
+        critics = loss.qvalue_network_params.detach()
+
+        def policy(states: TensorDictBase) -> TanhNormal:
+            network, params = loss.actor_network, loss.actor_network_params
+            found = distribution_params(network, params, states)
+            return network.build_dist_from_params(found)
+
+        worst = self.perturb(
+            select(tensordict, keys),
+            keys,
+            policy,
+            lambda states, action: qvalue(loss, states, action, critics),
+        )
+        tensordict = tensordict.copy()
+        for key in keys:
+            tensordict.set(nested(loss.tensor_keys.perturbed, key), worst.get(key))
+        return tensordict
 
     @torch.no_grad()
     def perturb(

@@ -61,10 +61,7 @@ def action_bounds(network: TensorDictModuleBase, name: str) -> tuple[Tensor, Ten
     if not _is_a(distribution, TanhNormal):
         cure = "torchrl_osr.modules builds such networks."
         if _is_a(distribution, *CATEGORICAL):
-            cure = (
-                "For discrete actions use DiscreteOSRLoss, and train its model with "
-                "DiscreteInverseDynamicsLoss."
-            )
+            cure = "For discrete actions use DiscreteOSRLoss."
         raise TypeError(
             f"{name} must end in a TanhNormal distribution, got "
             f"{getattr(distribution, '__name__', distribution)}: the recovery term is "
@@ -74,6 +71,11 @@ def action_bounds(network: TensorDictModuleBase, name: str) -> tuple[Tensor, Ten
     low = torch.as_tensor(kwargs.get("low", -1.0), dtype=default)
     high = torch.as_tensor(kwargs.get("high", 1.0), dtype=default)
     return low, high
+
+
+def is_categorical(network: TensorDictModuleBase) -> bool:
+    """Whether a network chooses among finitely many actions."""
+    return _is_a(_head(network)[0], *CATEGORICAL)
 
 
 def check_categorical(network: TensorDictModuleBase, name: str) -> None:
@@ -90,10 +92,7 @@ def check_categorical(network: TensorDictModuleBase, name: str) -> None:
     if not _is_a(distribution, *CATEGORICAL):
         cure = "torchrl_osr.modules builds such networks."
         if _is_a(distribution, TanhNormal):
-            cure = (
-                "For continuous actions use OSRLoss, and train its model with "
-                "InverseDynamicsLoss."
-            )
+            cure = "For continuous actions use OSRLoss."
         raise TypeError(
             f"{name} must end in a categorical distribution, such as "
             "torchrl.modules.OneHotCategorical or torch.distributions.Categorical, "

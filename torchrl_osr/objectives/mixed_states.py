@@ -1,103 +1,53 @@
-"""The mixed data set D_tot: every clean state together with its perturbed twin.
+"""The mixed data set D_tot: every clean state together with its perturbed state.
 
-The twin lies beside the clean state under ``("perturbed", key)``, as the next state
-lies under ``("next", key)``, so the batch size never changes; the losses stack the
-two where an expectation over D_tot is meant (section 4.1). Shapes: ``B`` batch.
+The perturbed state is the entry ``("perturbed", key)`` of the same row, as the next
+state is ``("next", key)``, so the batch size never changes; the losses stack the two
+where an expectation over D_tot is meant (section 4.1). Shapes: ``B`` batch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
-from torchrl.objectives import LossModule
+
+from torchrl_osr._entries import entry, is_next, nested, select, state_keys
 
 States = Literal["both", "clean", "perturbed"]
-"""Which states of D_tot a term is taken on."""
+"""The states of D_tot on which a term is taken."""
+
+STATES = ("both", "clean", "perturbed")
 
 
-def nested(prefix: NestedKey, key: NestedKey) -> NestedKey:
-    """Return ``key`` below ``prefix``: ``("next", "observation")``, for instance."""
-    return unravel_key((prefix, key))
-
-
-def is_next(key: NestedKey) -> bool:
-    """Return whether ``key`` lies below ``"next"``."""
-    return isinstance(key, tuple) and key[0] == "next"
-
-
-def entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    """Return an entry that must be there.
-
-    Raises:
-        KeyError: naming the missing entry and those that are there.
-    """
-    value: Tensor | None = tensordict.get(key, None)
-    if value is None:
-        there = sorted(map(str, tensordict.keys(True, True)))
-        raise KeyError(f"The batch has no entry {key!r}; it has {there}.")
-    return value
-
-
-def column(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    """Return an entry with one number a row, ``[B, 1]``, as ``[B]``.
-
-    Raises:
-        KeyError: if it is missing.
-        ValueError: if it has another shape.
-    """
-    value = entry(tensordict, key)
-    expected = (*tensordict.batch_size, 1)
-    if value.shape != expected:
-        raise ValueError(
-            f"{key!r} has shape {tuple(value.shape)}, expected {expected}: the batch "
-            "size and a last dimension of 1."
-        )
-    return value.squeeze(-1)
-
-
-def select(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> TensorDictBase:
-    """Return the entries ``keys``, all of which must be there (see :func:`entry`)."""
-    for key in keys:
-        entry(tensordict, key)
-    return tensordict.select(*keys)
-
-
-def state_keys(in_keys: Iterable[NestedKey], *exclude: NestedKey) -> list[NestedKey]:
-    """Return the current-state entries of ``in_keys``, once each and in order."""
-    keys = dict.fromkeys(unravel_key(key) for key in in_keys)
-    return [key for key in keys if not is_next(key) and key not in exclude]
-
-
-def perturbed_twin(
+def perturbed_state(
     tensordict: TensorDictBase, keys: Sequence[NestedKey], perturbed: NestedKey
 ) -> TensorDictBase:
-    """Return the entries ``keys`` with every perturbed one in place of the clean.
+    """The entries ``keys``, each perturbed one in place of the clean.
 
     Args:
         tensordict: a batch ``[B]``.
         keys: the state entries that a network reads.
-        perturbed: where :class:`~torchrl_osr.StatePerturbation` wrote the twins.
+        perturbed: where :class:`~torchrl_osr.StatePerturbation` wrote them.
 
     Raises:
-        KeyError: if no entry has a twin.
-        ValueError: if a twin has another shape than its clean state.
+        KeyError: if no entry has a perturbed one.
+        ValueError: if a perturbed entry has another shape than its clean one.
     """
-    twin = select(tensordict, keys)
-    twins = {key: tensordict.get(nested(perturbed, key), None) for key in keys}
-    if all(value is None for value in twins.values()):
+    state = select(tensordict, keys)
+    found = {key: tensordict.get(nested(perturbed, key), None) for key in keys}
+    if all(value is None for value in found.values()):
         wanted = [nested(perturbed, key) for key in keys]
         raise KeyError(
             f"No perturbed state in the batch: expected one of {wanted}, the batch has "
             f"{sorted(map(str, tensordict.keys(True, True)))}. Append "
-            "StatePerturbation(std=...) to the replay buffer, or do without the "
-            "perturbed states: recovery_weight=0 makes OSRLoss CQL, states='clean' "
-            "trains InverseDynamicsLoss on the data alone."
+            "StatePerturbation(std=...) to the replay buffer, or ask for the clean "
+            "states alone: actor_states='clean' and recovery_states='clean' (or "
+            "recovery_weight=0) in OSRLoss, states='clean' in InverseDynamicsLoss."
         )
-    for key, value in twins.items():
+    for key, value in found.items():
         if value is None:
             continue
         if value.shape != tensordict.get(key).shape:
@@ -105,12 +55,12 @@ def perturbed_twin(
                 f"{nested(perturbed, key)!r} has shape {tuple(value.shape)}, but "
                 f"{key!r} has {tuple(tensordict.get(key).shape)}."
             )
-        twin.set(key, value)
-    return twin
+        state.set(key, value)
+    return state
 
 
-def replace_next(tensordict: TensorDictBase, key: NestedKey, flag: Tensor) -> Tensor:
-    """Return ``("next", key)`` with the current state wherever ``flag`` is set.
+def next_state(tensordict: TensorDictBase, key: NestedKey, absent: Tensor) -> Tensor:
+    """``("next", key)``, with the current state wherever ``absent`` is set.
 
     What a loader left as the next state of an ended trajectory may be zeros, the first
     state of the next episode or NaN. Selecting before the networks run, rather than
@@ -119,16 +69,16 @@ def replace_next(tensordict: TensorDictBase, key: NestedKey, flag: Tensor) -> Te
     Args:
         tensordict: a batch ``[B]`` with ``key`` and ``("next", key)``, ``[B, ...]``.
         key: a state entry.
-        flag: bool ``[B]``.
+        absent: rows without a true next state, bool ``[B]``.
     """
-    state, next_state = entry(tensordict, key), entry(tensordict, nested("next", key))
-    if state.shape != next_state.shape:
+    state, following = entry(tensordict, key), entry(tensordict, nested("next", key))
+    if state.shape != following.shape:
         raise ValueError(
-            f"{nested('next', key)!r} has shape {tuple(next_state.shape)}, but "
+            f"{nested('next', key)!r} has shape {tuple(following.shape)}, but "
             f"{key!r} has {tuple(state.shape)}."
         )
-    flag = flag.reshape(flag.shape + (1,) * (state.ndim - flag.ndim))
-    return torch.where(flag, state, next_state)
+    absent = absent.reshape(absent.shape + (1,) * (state.ndim - absent.ndim))
+    return torch.where(absent, state, following)
 
 
 def transitions(
@@ -139,56 +89,40 @@ def transitions(
     perturbed: NestedKey,
     states: States = "both",
 ) -> TensorDictBase:
-    """Return what an inverse dynamics model reads, on D_tot or a half of it.
+    """What an inverse dynamics model reads, on D_tot or a half of it.
 
     Args:
         tensordict: a batch ``[B]``.
         in_keys: the model's inputs, some of them below ``"next"``.
         done: bool ``[B]``; such rows get their own state as the next one.
-        perturbed: where the twins are.
+        perturbed: where the perturbed states are.
         states: ``"both"`` (default), ``"clean"`` or ``"perturbed"``.
 
     Returns:
         ``[2, B]``, clean then perturbed, or ``[1, B]``. The next state is never
         perturbed: it is where the agent shall return to.
+
+    Raises:
+        ValueError: if the next states are several steps ahead.
     """
+    steps = tensordict.get("steps_to_next_obs", None)
+    # Tracing cannot branch on a number; the first, eager call has looked.
+    if steps is not None and not torch.compiler.is_compiling() and (steps > 1).any():
+        raise ValueError(
+            f"The batch holds multi-step transitions (steps_to_next_obs up to "
+            f"{int(steps.max())}), but the inverse dynamics model tells which action "
+            "leads to the *next* state: leave MultiStep out of the buffer, or train "
+            "without the recovery term (recovery_weight=0)."
+        )
     keys = state_keys(in_keys)
     stack = []
     if states != "perturbed":
         stack.append(select(tensordict, keys))
     if states != "clean":
-        stack.append(perturbed_twin(tensordict, keys, perturbed))
+        stack.append(perturbed_state(tensordict, keys, perturbed))
     for key in in_keys:
         if is_next(key):
-            next_state = replace_next(tensordict, unravel_key(key[1:]), done)
+            value = next_state(tensordict, unravel_key(key[1:]), done)
             for half in stack:
-                half.set(key, next_state)
+                half.set(key, value)
     return torch.stack(stack)
-
-
-def reduce_transitions(
-    loss: LossModule,
-    value: Tensor,
-    done: Tensor,
-    tensordict: TensorDictBase,
-    weights: Tensor | None = None,
-    reduction: str | None = None,
-) -> Tensor:
-    """Reduce ``value`` over the rows that are true transitions.
-
-    Args:
-        loss: the module whose ``reduction`` and masks apply.
-        value: one number a row, ``[B]``.
-        done: bool ``[B]``; such rows do not count, and are 0 under ``"none"``.
-        tensordict: the batch ``[B]``, for the masks in it.
-        weights: importance weights of the rows, ``[B]``.
-        reduction: in place of the module's.
-    """
-    reduction = reduction or loss.reduction
-    value = torch.where(done, torch.zeros_like(value), value)
-    # A mask handed to _reduce_loss would compact the result under "none".
-    mask = None if reduction == "none" else ~done
-    reduced: Tensor = loss._reduce_loss(
-        value, tensordict, mask=mask, weights=weights, reduction=reduction
-    )
-    return reduced

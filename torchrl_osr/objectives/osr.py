@@ -1,32 +1,41 @@
 r"""OSR: conservative Q-learning whose policy learns to come back to the data.
 
 Shapes: ``B`` batch (any leading dimensions), ``A`` action, ``N`` critics, ``K``
-sampled actions of a kind, ``D`` state sets of D_tot (2: clean and perturbed; 1 where
-nothing recovers). The equations are in :mod:`torchrl_osr.functional`.
+sampled actions of a kind, ``D`` sets of states (2 for D_tot: clean and perturbed). The
+equations are in :mod:`torchrl_osr.functional`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
+import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModule,
+    dispatch,
 )
-from torch import Tensor
-from torchrl.modules import TanhNormal
+from torch import Tensor, nn
+from torchrl.modules.distributions.utils import rsample_and_log_prob
 
 from torchrl_osr import functional
-from torchrl_osr._checks import check_choice, check_weight
-from torchrl_osr.objectives.adversary import Adversary
-from torchrl_osr.objectives.base import Reduction, ScalarOutputMode
-from torchrl_osr.objectives.conservative import ConservativeCritics
+from torchrl_osr._checks import check_literals, check_positive, check_weight
+from torchrl_osr.objectives import critic_kernel
+from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
+from torchrl_osr.objectives.distributions import check_num_actions
+from torchrl_osr.objectives.mixed_states import States
+from torchrl_osr.objectives.step import (
+    Step,
+    actor_critic_in_keys,
+    critic_state,
+    uniform_actions,
+)
 
 
-class OSRLoss(ConservativeCritics):
+class OSRLoss(BaseLoss):
     r"""Out-of-sample State Recovery by a constraint on the policy (OSR).
 
     .. math::
@@ -39,13 +48,14 @@ class OSRLoss(ConservativeCritics):
 
     Presented in "Recovering from Out-of-sample States via Inverse Dynamics in Offline
     Reinforcement Learning", https://openreview.net/forum?id=4gLWjSaw4o. With
-    ``recovery_weight=0`` it is CQL(H) ("Conservative Q-Learning",
+    ``recovery_weight=0, actor_states="clean"`` it is CQL(H) ("Conservative Q-Learning",
     https://arxiv.org/abs/2006.04779): no inverse dynamics model is called and no
     perturbed state is read.
 
-    Every ``loss_*`` entry is weighted already and sends gradient into its own group of
-    parameters only, so their sum, one backward and one optimizer step is right, and so
-    are separate optimizers.
+    The entries are those of :class:`~torchrl.objectives.CQLLoss`: ``loss_actor`` (both
+    terms of :math:`L_\pi`), ``loss_qvalue``, ``loss_cql`` and ``loss_alpha``. Each is
+    weighted already and sends gradient into its own group of parameters only, so their
+    sum, one backward and one optimizer step is right, and so are separate optimizers.
 
     Args:
         actor_network: ends in a :class:`~torchrl.modules.TanhNormal`.
@@ -58,64 +68,51 @@ class OSRLoss(ConservativeCritics):
 
     Keyword Args:
         recovery_weight: :math:`\lambda`. Default 0.5. A number assigned later makes a
-            schedule; 0 *here* makes the loss CQL(H) for good.
+            schedule; 0 *here* leaves the recovery term out for good.
         recovery_direction: ``"forward"`` (default, the paper's ``KL(I || pi)``) or
             ``"reverse"`` (``KL(pi || I)``, the released code's).
-        action_reduction: of the divergence over action dimensions: ``"sum"`` (default,
-            the paper's) or ``"mean"`` (the released code's).
         recovery_target: what the policy is pulled to: ``"inverse_dynamics"``
             (default), the model, or ``"data"``, the data's action,
             ``-log pi(a | s~)`` in the place of the divergence. The latter is CQL with
-            behaviour cloning, noisy on D_tot: what OSR would be without its model.
-        recovery_states: ``"both"`` (default) for D_tot, ``"perturbed"`` alone, or
-            ``"clean"``: no perturbed state is read, D_tot is the data.
-        actor_states: where the policy seeks values: ``"both"`` (default) or ``"clean"``
-            states alone.
-        adversary: finds the perturbed states in the place of the batch's, see
-            :class:`~torchrl_osr.Adversary`. Default ``None``.
-        behavior_cloning: train the policy on the data's actions in the place of the
-            values, for a warm start: assign ``False`` to end it. Default ``False``.
+            behaviour cloning, noisy on D_tot: OSR without its model.
+        recovery_states: where the recovery term is taken: ``"both"`` (default) for
+            D_tot, ``"perturbed"`` or ``"clean"`` states alone.
+        action_reduction: of the divergence over action dimensions: ``"sum"`` (default,
+            the paper's) or ``"mean"`` (the released code's).
+        actor_states: where the policy seeks values, whatever the recovery term does:
+            ``"both"`` (default) for D_tot, ``"clean"`` or ``"perturbed"`` states alone.
         min_q_weight: :math:`\alpha`, weight of the conservative term. Default 5.0. May
             be assigned later; 0 *here* leaves the term out for good, which with
-            ``num_qvalue_nets=10`` is OSR-10, and with ``recovery_weight=0`` SAC-N
+            ``num_qvalue_nets=10`` is OSR-10, and without recovery SAC-N
             (https://arxiv.org/abs/2110.01548).
         num_random: ``K``, actions drawn of each kind (uniform, at ``s``, at ``s'``).
             Default 10.
-        temperature: of the log-sum-exp. Default 1.0.
-        importance_sample: weigh the drawn actions by their densities. Default ``True``.
-        clip_diff_min, clip_diff_max: bounds of the conservative gap, per critic and
-            row, in units of the value. Default: none.
+        temperature: :math:`\tau` of the log-sum-exp, in units of the value. Default
+            1.0.
+        clip_diff_min: lower bound of the conservative gap, per critic and row, in
+            units of the value. Default: none.
         max_q_backup: the target's value is the largest of ``num_random`` actions'.
             Default ``False``.
         deterministic_backup: leave the entropy out of the target, as CQL does and
             SAC-N does not. Default ``True``.
         with_lagrange: learn a multiplier of the conservative term that holds the gap
-            at ``lagrange_thresh``. Default ``False``.
+            at ``lagrange_thresh``; adds ``loss_alpha_prime``. Default ``False``.
         lagrange_thresh: the tolerated gap, in units of the value. Default 0.0.
-        diversity_weight: EDAC's :math:`\eta`, weight of the similarity of the critics'
-            gradients by the action. Default 0.0, which leaves it out for good.
-        chunk_size: on a CPU, how many states go through the critics at a time, with
-            all their sampled actions, if the critics are plain MLPs; ``None`` for all
-            at once, as other networks go. Default 64. The mathematics is the same.
-        num_qvalue_nets: ``N``, for a single critic; a list has its own length.
-            Default 2.
-        loss_function: distance of the TD error: ``"l2"`` (default), ``"l1"`` or
-            ``"smooth_l1"``.
         alpha_init: initial entropy temperature :math:`\alpha_e`. Default 1.0.
         fixed_alpha: keep the temperature. Default ``False``.
         target_entropy: in nats; ``"auto"`` (default) is minus the action's size.
-        delay_qvalue: use target critics, to be moved by
-            :class:`~torchrl.objectives.SoftUpdate`. Default ``True``.
-        reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
-        deactivate_vmap: run the critics one by one. Default ``False``.
-        use_prioritized_weights: weigh rows by ``"priority_weight"``; ``"auto"``
-            (default) does when the entry is there.
-        scalar_output_mode: with ``reduction="none"``, ``"exclude"`` (with a warning by
-            default) or ``"non_tensor"`` for the scalar metrics.
+        chunk_size: on a CPU, how many states go through the critics at a time, with
+            all their sampled actions, if the critics are plain MLPs; ``None`` for all
+            at once, as other networks go. Default 64. The mathematics is the same.
+        options: of every loss: ``num_qvalue_nets``, ``loss_function``,
+            ``delay_qvalue``, ``deactivate_vmap``, ``reduction``,
+            ``use_prioritized_weights`` and ``scalar_output_mode``, see
+            :class:`~torchrl_osr.objectives.BaseLoss`.
 
     Raises:
         TypeError: if a distribution is not a ``TanhNormal``.
-        ValueError: if bounds differ, a weight is negative or the model is missing.
+        ValueError: if bounds differ, an option is out of its range or the model is
+            missing; in the call, if the batch is empty or holds several steps a row.
         KeyError: in the call, if the batch has no perturbed entry.
 
     Examples:
@@ -135,12 +132,14 @@ class OSRLoss(ConservativeCritics):
         ...              "done": no, "terminated": no}}, [4])
         >>> losses = loss(StatePerturbation(std=1e-3)(batch))
         >>> sorted(key for key in losses.keys() if key.startswith("loss_"))
-        ['loss_actor', 'loss_alpha', 'loss_cql', 'loss_qvalue', 'loss_recovery']
+        ['loss_actor', 'loss_alpha', 'loss_cql', 'loss_qvalue']
     """
 
-    _schedulable_buffers = frozenset(
-        {"recovery_weight", "min_q_weight", "diversity_weight"}
-    )
+    _schedulable_buffers = frozenset({"recovery_weight", "min_q_weight"})
+
+    _AcceptedKeys = TransitionKeys
+    default_keys = TransitionKeys
+    tensor_keys: TransitionKeys
 
     def __init__(
         self,
@@ -150,122 +149,154 @@ class OSRLoss(ConservativeCritics):
         *,
         recovery_weight: float = 0.5,
         recovery_direction: Literal["forward", "reverse"] = "forward",
-        action_reduction: Literal["sum", "mean"] = "sum",
         recovery_target: Literal["inverse_dynamics", "data"] = "inverse_dynamics",
-        recovery_states: Literal["both", "perturbed", "clean"] = "both",
-        actor_states: Literal["both", "clean"] = "both",
-        adversary: Adversary | None = None,
-        behavior_cloning: bool = False,
+        recovery_states: States = "both",
+        action_reduction: Literal["sum", "mean"] = "sum",
+        actor_states: States = "both",
         min_q_weight: float = 5.0,
         num_random: int = 10,
         temperature: float = 1.0,
-        importance_sample: bool = True,
         clip_diff_min: float = -math.inf,
-        clip_diff_max: float = math.inf,
         max_q_backup: bool = False,
         deterministic_backup: bool = True,
         with_lagrange: bool = False,
         lagrange_thresh: float = 0.0,
-        diversity_weight: float = 0.0,
-        chunk_size: int | None = 64,
-        num_qvalue_nets: int = 2,
-        loss_function: str = "l2",
         alpha_init: float = 1.0,
         fixed_alpha: bool = False,
         target_entropy: float | Literal["auto"] = "auto",
-        delay_qvalue: bool = True,
-        reduction: Reduction = None,
-        deactivate_vmap: bool = False,
-        use_prioritized_weights: bool | Literal["auto"] = "auto",
-        scalar_output_mode: ScalarOutputMode = None,
+        chunk_size: int | None = 64,
+        **options: Any,
     ) -> None:
+        check_literals(OSRLoss.__init__, locals())
         check_weight("recovery_weight", recovery_weight)
-        check_choice("recovery_direction", recovery_direction, ("forward", "reverse"))
-        check_choice("action_reduction", action_reduction, ("sum", "mean"))
-        choices = ("inverse_dynamics", "data")
-        check_choice("recovery_target", recovery_target, choices)
-        has_model = recovery_weight > 0 and recovery_target == "inverse_dynamics"
-        if has_model and inverse_dynamics_network is None:
+        check_weight("min_q_weight", min_q_weight)
+        check_positive("num_random", num_random, minimum=1)
+        check_positive("temperature", temperature)
+        if chunk_size is not None:
+            check_positive("chunk_size", chunk_size, minimum=1)
+        if with_lagrange and not min_q_weight:
+            raise ValueError("with_lagrange=True needs min_q_weight above 0.")
+        if max_q_backup and not deterministic_backup:
+            raise ValueError(
+                "max_q_backup=True takes the best action's value without entropy, as "
+                "CQL does: leave deterministic_backup=True."
+            )
+        needs_model = recovery_weight > 0 and recovery_target == "inverse_dynamics"
+        if needs_model and inverse_dynamics_network is None:
             raise ValueError(
                 f"recovery_weight={recovery_weight} needs an inverse_dynamics_network; "
                 "pass one, or recovery_weight=0 for CQL."
             )
-        super().__init__(
+        super().__init__(**options)
+        model = inverse_dynamics_network if needs_model else None
+        self._hold_action_bounds(actor_network, model)
+        self._hold_actor_critic(
             actor_network,
             qvalue_network,
-            inverse_dynamics_network if has_model else None,
-            recovers=recovery_weight > 0,
-            recovery_states=recovery_states,
-            actor_states=actor_states,
-            adversary=adversary,
-            behavior_cloning=behavior_cloning,
-            min_q_weight=min_q_weight,
-            num_random=num_random,
-            temperature=temperature,
-            importance_sample=importance_sample,
-            clip_diff=(clip_diff_min, clip_diff_max),
-            max_q_backup=max_q_backup,
-            deterministic_backup=deterministic_backup,
-            with_lagrange=with_lagrange,
-            lagrange_thresh=lagrange_thresh,
-            diversity_weight=diversity_weight,
-            chunk_size=chunk_size,
-            num_qvalue_nets=num_qvalue_nets,
-            loss_function=loss_function,
-            alpha_init=alpha_init,
-            fixed_alpha=fixed_alpha,
-            target_entropy=target_entropy,
-            delay_qvalue=delay_qvalue,
-            reduction=reduction,
-            deactivate_vmap=deactivate_vmap,
-            use_prioritized_weights=use_prioritized_weights,
-            scalar_output_mode=scalar_output_mode,
+            inverse_dynamics_network=model,
         )
+        self._hold_temperature(alpha_init, fixed_alpha, target_entropy)
+        if with_lagrange:
+            self.log_alpha_prime = nn.Parameter(torch.zeros(()))
         self.register_coeff_buffer("recovery_weight", float(recovery_weight))
+        self.register_coeff_buffer("min_q_weight", float(min_q_weight))
+        self.has_recovery, self.has_cql = recovery_weight > 0, min_q_weight > 0
         self.recovery_direction = recovery_direction
         self.recovery_target = recovery_target
+        self.recovery_states = recovery_states
         self.action_reduction = action_reduction
+        self.actor_states = actor_states
+        self.num_random = num_random
+        self.temperature = temperature
+        self.clip_diff_min = clip_diff_min
+        self.max_q_backup = max_q_backup
+        self.deterministic_backup = deterministic_backup
+        self.with_lagrange = with_lagrange
+        self.lagrange_thresh = lagrange_thresh
+        self.chunk_size = chunk_size
+        # Now, not at the first call as TorchRL does: a state dict has the same entries
+        # before and after it.
+        self.make_value_estimator()
+
+    @property
+    def reads_perturbed(self) -> bool:
+        """Whether the batch must hold perturbed states."""
+        recovers = self.has_recovery and self.recovery_states != "clean"
+        return recovers or self.actor_states != "clean"
+
+    def _input_keys(self) -> list[NestedKey]:
+        return actor_critic_in_keys(self, perturbed=self.reads_perturbed)
 
     def _output_keys(self) -> tuple[list[NestedKey], list[NestedKey]]:
         losses: list[NestedKey] = ["loss_actor", "loss_alpha", "loss_qvalue"]
+        losses += ["loss_cql"] * self.has_cql
+        losses += ["loss_alpha_prime"] * self.with_lagrange
         metrics: list[NestedKey] = ["alpha", "entropy", "pred_value", "target_value"]
-        critic_losses, critic_metrics = self._critic_keys()
-        losses += critic_losses + ["loss_recovery"] * self.recovers
-        metrics += critic_metrics + [self._recovery_metric] * self.recovers
-        return losses, metrics
+        metrics += ["alpha_prime"] * self.with_lagrange
+        return losses, metrics + [self._recovery_metric] * self.has_recovery
 
     @property
     def _recovery_metric(self) -> str:
         return "recovery_nll" if self.recovery_target == "data" else "recovery_kl"
 
-    def _constraints(
-        self,
-        tensordict: TensorDictBase,
-        states: TensorDictBase,
-        policy: TensorDictBase,
-        pi: TanhNormal,
-        data_action: Tensor,
-    ) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
-        pred_value, losses, metrics = self._critic_terms(
-            tensordict, states, policy, data_action
-        )
-        if not self.recovers:
-            return pred_value, losses, metrics
-        pi = self._recovery_policy(policy, pi)
-        value = self._recovery_divergence(tensordict, pi, data_action)
-        value, mean = self._reduce_recovery(value, tensordict)
-        losses["loss_recovery"] = self.recovery_weight * value
-        return pred_value, losses, metrics | {self._recovery_metric: mean}
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return the losses and metrics of a batch, see ``out_keys``.
 
-    def _recovery_divergence(
-        self, tensordict: TensorDictBase, pi: TanhNormal, data_action: Tensor
-    ) -> Tensor:
-        """Return how far the policy is from its target on D_tot, ``[D, B]``."""
+        Writes the largest absolute TD error of the critics under the ``priority`` key,
+        ``[B]``, and nothing else, into ``tensordict``.
+
+        Args:
+            tensordict: a batch ``[B]`` with the entries of ``in_keys``.
+        """
+        step = Step(self, tensordict, perturbed=self.reads_perturbed)
+        actor, log_prob, metrics = self.actor_loss(step)
+        alpha = self.alpha_loss(step, log_prob)
+        pred_value, cql, cql_metrics = self.cql_loss(step)
+        target_value = self._target_value(step)
+        qvalue = self.qvalue_loss(step, pred_value, target_value)
+        step.write_priority(pred_value, target_value)
+        losses = {"loss_actor": actor, "loss_alpha": alpha, "loss_qvalue": qvalue} | cql
+        metrics = {
+            "alpha": self.log_alpha.detach().exp(),
+            "entropy": -step.mean(log_prob),
+            "pred_value": step.mean(pred_value),
+            "target_value": step.mean(target_value),
+            **cql_metrics,
+            **metrics,
+        }
+        return self._output(tensordict, losses, metrics)
+
+    def actor_loss(self, step: Step) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+        r""":math:`L_\pi`: values sought on ``actor_states``, and the recovery term.
+
+        Returns:
+            The loss, the log-density of the policy's own actions ``[D, B]``, metrics.
+        """
+        pi = step.policy(self.actor_states)
+        action, log_prob = rsample_and_log_prob(pi)
+        # Detached: the policy's objective shall not train the critics.
+        params = self.qvalue_network_params.detach()
+        qvalue = step.qvalue(step.at(self.actor_states), action, params)
+        alpha = self.log_alpha.detach().exp()
+        objective = functional.soft_policy_value(log_prob, qvalue, alpha)
+        loss, metrics = step.reduce(objective.mean(0)), {}
+        if self.has_recovery:
+            recovery = self._recovery_divergence(step).mean(0)
+            term = step.reduce(recovery, transitions=True)
+            loss = loss + self.recovery_weight * term
+            metrics[self._recovery_metric] = step.mean(recovery, transitions=True)
+        return loss, log_prob, metrics
+
+    def _recovery_divergence(self, step: Step) -> Tensor:
+        """Divergence of policy and target on ``recovery_states``, ``[D, B]``."""
+        pi = step.policy(self.recovery_states)
         if self.recovery_target == "data":
-            log_prob: Tensor = pi.log_prob(data_action.expand_as(pi.loc))
+            log_prob: Tensor = pi.log_prob(step.data_action.expand_as(pi.loc))
             return -log_prob
-        done = self._flag(tensordict, self.tensor_keys.done)
-        model = self._inverse_dynamics(tensordict, done)
+        model = step.inverse_dynamics(self.recovery_states)
+        sizes = model.loc.shape[-1], pi.loc.shape[-1]
+        check_num_actions("inverse_dynamics_network", *sizes)
         return functional.state_recovery(
             pi.loc,
             pi.scale,
@@ -274,3 +305,110 @@ class OSRLoss(ConservativeCritics):
             direction=self.recovery_direction,
             action_reduction=self.action_reduction,
         )
+
+    def alpha_loss(self, step: Step, log_prob: Tensor) -> Tensor:
+        """SAC's objective of the entropy temperature."""
+        auto = -float(step.data_action.shape[-1])
+        target_entropy = auto if self.target_entropy == "auto" else self.target_entropy
+        objective = functional.temperature_objective(
+            self.log_alpha, log_prob, target_entropy
+        )
+        return step.reduce(objective.mean(0))
+
+    def cql_loss(
+        self, step: Step
+    ) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
+        """CQL(H) penalty, weighted, and the critics' values of the data's action.
+
+        Returns:
+            :math:`Q_i(s, a)`, ``[N, B]``; ``loss_cql`` and, with a Lagrange multiplier,
+            ``loss_alpha_prime``; metrics.
+        """
+        if not self.has_cql:
+            return self._data_qvalue(step), {}, {}
+        pred_value, soft_maximum = self._data_qvalue_and_soft_maximum(step)
+        gap = functional.conservative_gap(soft_maximum, pred_value)
+        if self.clip_diff_min > -math.inf:
+            gap = gap.clamp(min=self.clip_diff_min)
+        losses: dict[str, Tensor] = {}
+        metrics: dict[str, Tensor] = {}
+        if self.with_lagrange:
+            gap, multiplier = functional.lagrange_terms(
+                gap, self.log_alpha_prime, self.lagrange_thresh
+            )
+            multiplier = step.reduce(multiplier.mean(0))
+            losses["loss_alpha_prime"] = self.min_q_weight * multiplier
+            metrics["alpha_prime"] = self.log_alpha_prime.detach().exp()
+        losses = {"loss_cql": self.min_q_weight * step.reduce(gap.sum(0))} | losses
+        return pred_value, losses, metrics
+
+    def _data_qvalue(self, step: Step) -> Tensor:
+        state, params = step.states[0], self.qvalue_network_params
+        return step.qvalue(state, step.data_action, params)
+
+    @torch.no_grad()
+    def _proposals(self, step: Step) -> tuple[Tensor, Tensor]:
+        """``K`` actions each: uniform, from ``pi(s)`` and from ``pi(s')``.
+
+        Returns:
+            Actions ``[3K, B, A]`` and their log-densities ``[3K, B]``.
+        """
+        number, bounds = self.num_random, (self.action_low, self.action_high)
+        uniform, log_density = uniform_actions(number, step.data_action, *bounds)
+        # rsample also without gradient: torch's sample reads the scale back to the host
+        # to check its sign.
+        action, log_prob = rsample_and_log_prob(step.policy("true"), (number,))
+        return (
+            torch.cat([uniform, action.flatten(0, 1)]),
+            torch.cat([log_density, log_prob.flatten(0, 1)]),
+        )
+
+    def _data_qvalue_and_soft_maximum(self, step: Step) -> tuple[Tensor, Tensor]:
+        """Both terms of the conservative gap, each ``[N, B]``; all actions at ``s``."""
+        action, log_prob = self._proposals(step)
+        state, params = step.states[0], self.qvalue_network_params
+        # The one place where a kernel replaces a function of the same value.
+        mlp = critic_kernel.applicable(self, state, action)
+        if self.chunk_size is not None and mlp is not None:
+            soft_maximum = critic_kernel.soft_maximum(
+                params,
+                mlp,
+                critic_state(self, state),
+                action,
+                log_prob,
+                temperature=self.temperature,
+                chunk_size=self.chunk_size,
+            )
+            return self._data_qvalue(step), soft_maximum
+        # One pass of the critics for the data's action and all proposals.
+        action = torch.cat([step.data_action.unsqueeze(0), action])
+        qvalue = step.qvalue(state.expand(action.shape[:-1]), action, params)
+        sampled = qvalue[:, 1:].movedim(1, -1)
+        soft_maximum = functional.soft_maximum(
+            sampled, log_prob.movedim(0, -1), temperature=self.temperature
+        )
+        return qvalue[:, 0], soft_maximum
+
+    @torch.no_grad()
+    def _target_value(self, step: Step) -> Tensor:
+        """The TD target, ``[B]``, from an action of the policy at ``s'``."""
+        state, pi = step.at("next"), step.policy("next")
+        number = (self.num_random,) if self.max_q_backup else ()
+        action, log_prob = rsample_and_log_prob(pi, number)
+        params = self.target_qvalue_network_params
+        qvalue = step.qvalue(state.expand(action.shape[:-1]), action, params)
+        if self.max_q_backup:
+            next_value = functional.bootstrap_value(qvalue).max(0).values
+        elif self.deterministic_backup:
+            next_value = functional.bootstrap_value(qvalue)
+        else:
+            alpha = self.log_alpha.exp()
+            next_value = functional.bootstrap_value(qvalue, log_prob, alpha)
+        return step.td_target(next_value.squeeze(0))
+
+    def qvalue_loss(
+        self, step: Step, pred_value: Tensor, target_value: Tensor
+    ) -> Tensor:
+        """Sum over critics of the TD distance, equation (2)."""
+        distance = step.td_distance(pred_value, target_value)
+        return step.reduce(distance)

@@ -7,23 +7,26 @@ sampled actions of a kind. The equations are in :mod:`torchrl_osr.functional`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    dispatch,
+)
 from torch import Tensor
-from torchrl.modules import TanhNormal
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 
 from torchrl_osr import functional
-from torchrl_osr._checks import check_choice, check_weight
-from torchrl_osr.objectives.adversary import Adversary
-from torchrl_osr.objectives.base import Reduction, ScalarOutputMode
-from torchrl_osr.objectives.tanh_gaussian import TanhGaussianActorCritic
+from torchrl_osr._checks import check_literals, check_positive, check_weight
+from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
+from torchrl_osr.objectives.distributions import check_num_actions
+from torchrl_osr.objectives.step import Step, actor_critic_in_keys, uniform_actions
 
 
-class OSRVLoss(TanhGaussianActorCritic):
+class OSRVLoss(BaseLoss):
     r"""Out-of-sample State Recovery by a constraint on the values (OSR-v).
 
     .. math::
@@ -40,8 +43,8 @@ class OSRVLoss(TanhGaussianActorCritic):
     ``OSRVLoss`` costs a fraction of :class:`~torchrl_osr.OSRLoss`. There is no
     lower-bound guarantee as CQL has: off the data the constraint may be negative.
 
-    Every ``loss_*`` entry is weighted already and sends gradient into its own group of
-    parameters only; here ``loss_recovery`` belongs to the critics.
+    ``loss_qvalue`` holds both terms of :math:`L_Q`. Each entry is weighted already and
+    sends gradient into its own group of parameters only.
 
     Args:
         actor_network: ends in a :class:`~torchrl.modules.TanhNormal`.
@@ -58,28 +61,18 @@ class OSRVLoss(TanhGaussianActorCritic):
             the policy and ``K`` uniform ones, weighted by their densities.
         num_random: ``K``, actions drawn of each kind. Default 1.
         temperature: of the log-sum-exp. Default 1.0.
-        adversary: finds the perturbed states in the place of the batch's, see
-            :class:`~torchrl_osr.Adversary`. Default ``None``.
-        behavior_cloning: train the policy on the data's actions in the place of the
-            values, for a warm start: assign ``False`` to end it. Default ``False``.
-        num_qvalue_nets: ``N``, for a single critic; a list has its own length.
-            Default 2.
-        loss_function: distance of the TD error: ``"l2"`` (default), ``"l1"`` or
-            ``"smooth_l1"``.
         alpha_init: initial entropy temperature :math:`\alpha_e`. Default 1.0.
         fixed_alpha: keep the temperature. Default ``False``.
         target_entropy: in nats; ``"auto"`` (default) is minus the action's size.
-        delay_qvalue: use target critics. Default ``True``.
-        reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
-        deactivate_vmap: run the critics one by one. Default ``False``.
-        use_prioritized_weights: weigh rows by ``"priority_weight"``; ``"auto"``
-            (default) does when the entry is there.
-        scalar_output_mode: with ``reduction="none"``, ``"exclude"`` (with a warning by
-            default) or ``"non_tensor"`` for the scalar metrics.
+        options: of every loss: ``num_qvalue_nets``, ``loss_function``,
+            ``delay_qvalue``, ``deactivate_vmap``, ``reduction``,
+            ``use_prioritized_weights`` and ``scalar_output_mode``, see
+            :class:`~torchrl_osr.objectives.BaseLoss`.
 
     Raises:
         TypeError: if a distribution is not a ``TanhNormal``.
-        ValueError: if bounds differ or a value is out of its range.
+        ValueError: if bounds differ or an option is out of its range; in the call, if
+            the batch is empty or holds several steps a row.
         KeyError: in the call, if the batch has no perturbed entry.
 
     Examples:
@@ -99,10 +92,14 @@ class OSRVLoss(TanhGaussianActorCritic):
         ...              "done": no, "terminated": no}}, [4])
         >>> losses = loss(StatePerturbation(std=1e-3)(batch))
         >>> sorted(key for key in losses.keys() if key.startswith("loss_"))
-        ['loss_actor', 'loss_alpha', 'loss_qvalue', 'loss_recovery']
+        ['loss_actor', 'loss_alpha', 'loss_qvalue']
     """
 
     _schedulable_buffers = frozenset({"recovery_weight"})
+
+    _AcceptedKeys = TransitionKeys
+    default_keys = TransitionKeys
+    tensor_keys: TransitionKeys
 
     def __init__(
         self,
@@ -114,88 +111,117 @@ class OSRVLoss(TanhGaussianActorCritic):
         policy_values: Literal["mean", "logsumexp"] = "mean",
         num_random: int = 1,
         temperature: float = 1.0,
-        adversary: Adversary | None = None,
-        behavior_cloning: bool = False,
-        num_qvalue_nets: int = 2,
-        loss_function: str = "l2",
         alpha_init: float = 1.0,
         fixed_alpha: bool = False,
         target_entropy: float | Literal["auto"] = "auto",
-        delay_qvalue: bool = True,
-        reduction: Reduction = None,
-        deactivate_vmap: bool = False,
-        use_prioritized_weights: bool | Literal["auto"] = "auto",
-        scalar_output_mode: ScalarOutputMode = None,
+        **options: Any,
     ) -> None:
+        check_literals(OSRVLoss.__init__, locals())
         if inverse_dynamics_network is None:
             raise ValueError("OSRVLoss needs an inverse_dynamics_network.")
-        check_choice("policy_values", policy_values, ("mean", "logsumexp"))
         check_weight("recovery_weight", recovery_weight)
-        super().__init__(
+        check_positive("num_random", num_random, minimum=1)
+        check_positive("temperature", temperature)
+        super().__init__(**options)
+        self._hold_action_bounds(actor_network, inverse_dynamics_network)
+        self._hold_actor_critic(
             actor_network,
             qvalue_network,
-            inverse_dynamics_network,
-            num_random=num_random,
-            temperature=temperature,
-            adversary=adversary,
-            behavior_cloning=behavior_cloning,
-            num_qvalue_nets=num_qvalue_nets,
-            loss_function=loss_function,
-            alpha_init=alpha_init,
-            fixed_alpha=fixed_alpha,
-            target_entropy=target_entropy,
-            delay_qvalue=delay_qvalue,
-            reduction=reduction,
-            deactivate_vmap=deactivate_vmap,
-            use_prioritized_weights=use_prioritized_weights,
-            scalar_output_mode=scalar_output_mode,
+            inverse_dynamics_network=inverse_dynamics_network,
         )
+        self._hold_temperature(alpha_init, fixed_alpha, target_entropy)
         self.register_coeff_buffer("recovery_weight", float(recovery_weight))
         self.policy_values = policy_values
+        self.num_random = num_random
+        self.temperature = temperature
+        self.make_value_estimator()
+
+    def _input_keys(self) -> list[NestedKey]:
+        return actor_critic_in_keys(self, perturbed=True)
 
     def _output_keys(self) -> tuple[list[NestedKey], list[NestedKey]]:
-        losses = ["loss_actor", "loss_alpha", "loss_qvalue", "loss_recovery"]
         metrics = ["alpha", "entropy", "pred_value", "target_value", "recovery_gap"]
-        return losses, metrics
+        return ["loss_actor", "loss_alpha", "loss_qvalue"], metrics
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return the losses and metrics of a batch, see ``out_keys``.
+
+        Writes the largest absolute TD error of the critics under the ``priority`` key,
+        ``[B]``, and nothing else, into ``tensordict``.
+
+        Args:
+            tensordict: a batch ``[B]`` with the entries of ``in_keys``.
+        """
+        step = Step(self, tensordict, perturbed=True)
+        actor, log_prob = self.actor_loss(step)
+        alpha = self.alpha_loss(step, log_prob)
+        pred_value, gap = self._data_qvalue_and_gap(step)
+        target_value = self._target_value(step)
+        qvalue = self.qvalue_loss(step, pred_value, target_value, gap)
+        step.write_priority(pred_value, target_value)
+        losses = {"loss_actor": actor, "loss_alpha": alpha, "loss_qvalue": qvalue}
+        metrics = {
+            "alpha": self.log_alpha.detach().exp(),
+            "entropy": -step.mean(log_prob),
+            "pred_value": step.mean(pred_value),
+            "target_value": step.mean(target_value),
+            "recovery_gap": step.mean(gap.mean(1).sum(0), transitions=True),
+        }
+        return self._output(tensordict, losses, metrics)
+
+    def actor_loss(self, step: Step) -> tuple[Tensor, Tensor]:
+        r""":math:`L_\pi` on D_tot, and the log-density of the policy's own actions."""
+        action, log_prob = rsample_and_log_prob(step.policy("both"))
+        # Detached: the policy's objective shall not train the critics.
+        params = self.qvalue_network_params.detach()
+        qvalue = step.qvalue(step.at("both"), action, params)
+        alpha = self.log_alpha.detach().exp()
+        objective = functional.soft_policy_value(log_prob, qvalue, alpha)
+        return step.reduce(objective.mean(0)), log_prob
+
+    def alpha_loss(self, step: Step, log_prob: Tensor) -> Tensor:
+        """SAC's objective of the entropy temperature."""
+        auto = -float(step.data_action.shape[-1])
+        target_entropy = auto if self.target_entropy == "auto" else self.target_entropy
+        objective = functional.temperature_objective(
+            self.log_alpha, log_prob, target_entropy
+        )
+        return step.reduce(objective.mean(0))
 
     @torch.no_grad()
-    def _candidates(
-        self, tensordict: TensorDictBase, pi: TanhNormal
-    ) -> tuple[Tensor, Tensor | None]:
-        """Draw the actions whose values are compared, all on D_tot.
+    def _candidates(self, step: Step) -> tuple[Tensor, Tensor | None]:
+        """The actions whose values are compared, all on D_tot.
 
         Returns:
             Actions ``[M, 2, B, A]``, the last ``K`` of them the model's, and the
             log-densities of the others, ``[M - K, 2, B]``, where they are needed.
         """
-        done = self._flag(tensordict, self.tensor_keys.done)
-        model = self._inverse_dynamics(tensordict, done)
-        number = (self.num_random,)
+        number, pi = (self.num_random,), step.policy("both")
         action, log_prob = rsample_and_log_prob(pi, number)
+        model = step.inverse_dynamics("both")
+        sizes = model.loc.shape[-1], pi.loc.shape[-1]
+        check_num_actions("inverse_dynamics_network", *sizes)
         target, _ = rsample_and_log_prob(model, number)
         if self.policy_values == "mean":
             return torch.cat([action, target]), None
-        uniform, log_density = self._uniform(self.num_random, pi.loc)
-        log_prob = torch.cat([log_density, log_prob])
-        return torch.cat([uniform, action, target]), log_prob
+        bounds = self.action_low, self.action_high
+        uniform, log_density = uniform_actions(self.num_random, pi.loc, *bounds)
+        return (
+            torch.cat([uniform, action, target]),
+            torch.cat([log_density, log_prob]),
+        )
 
-    def _constraints(
-        self,
-        tensordict: TensorDictBase,
-        states: TensorDictBase,
-        policy: TensorDictBase,
-        pi: TanhNormal,
-        data_action: Tensor,
-    ) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
-        candidates, log_prob = self._candidates(tensordict, pi)
-        mixed = states[::2].expand(candidates.shape[:-1])
+    def _data_qvalue_and_gap(self, step: Step) -> tuple[Tensor, Tensor]:
+        """:math:`Q_i(s, a)`, ``[N, B]``, and the gap of (8) on D_tot, ``[N, 2, B]``."""
+        candidates, log_prob = self._candidates(step)
+        mixed = step.at("both").expand(candidates.shape[:-1])
         # One pass of the critics for the data's action and all candidates.
-        qvalue = self._qvalue(
-            torch.cat([states[:1], mixed.flatten(0, 1)]),
-            torch.cat([data_action.unsqueeze(0), candidates.flatten(0, 1)]),
+        qvalue = step.qvalue(
+            torch.cat([step.at("clean"), mixed.flatten(0, 1)]),
+            torch.cat([step.data_action.unsqueeze(0), candidates.flatten(0, 1)]),
             self.qvalue_network_params,
         )
-        pred_value = qvalue[:, 0]
         compared = qvalue[:, 1:].reshape(-1, *candidates.shape[:-1]).movedim(1, -1)
         gap = functional.value_constraint(
             compared[..., : -self.num_random],
@@ -203,6 +229,25 @@ class OSRVLoss(TanhGaussianActorCritic):
             log_prob=None if log_prob is None else log_prob.movedim(0, -1),
             temperature=self.temperature,
         )
-        gap, mean_gap = self._reduce_recovery(gap.sum(0), tensordict)
-        losses = {"loss_recovery": self.recovery_weight * gap}
-        return pred_value, losses, {"recovery_gap": mean_gap}
+        return qvalue[:, 0], gap
+
+    @torch.no_grad()
+    def _target_value(self, step: Step) -> Tensor:
+        """The TD target, ``[B]``, from an action of the policy at ``s'``."""
+        action, _ = rsample_and_log_prob(step.policy("next"))
+        params = self.target_qvalue_network_params
+        qvalue = step.qvalue(step.at("next"), action, params)
+        return step.td_target(functional.bootstrap_value(qvalue).squeeze(0))
+
+    def qvalue_loss(
+        self, step: Step, pred_value: Tensor, target_value: Tensor, gap: Tensor
+    ) -> Tensor:
+        """:math:`L_Q`: the TD distance, equation (2), and the constraint (8).
+
+        The paper prints OSR-v's TD error without the square; (2) has it.
+        """
+        distance = step.td_distance(pred_value, target_value)
+        # Over both halves of D_tot; summed over critics, as the TD error is.
+        constraint = step.reduce(gap.mean(1).sum(0), transitions=True)
+        loss: Tensor = step.reduce(distance) + self.recovery_weight * constraint
+        return loss

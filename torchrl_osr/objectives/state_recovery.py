@@ -1,12 +1,12 @@
 r"""The state-recovery term by itself, to be added to any loss that trains an actor.
 
-Shapes: ``B`` batch (any leading dimensions), ``A`` action, ``D`` state sets (2 or 1).
+Shapes: ``B`` batch (any leading dimensions), ``A`` action, ``D`` sets of states
+(2 for D_tot, 1 for either half).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Literal, cast
 
 import torch
@@ -15,7 +15,6 @@ from tensordict.nn import (
     ProbabilisticTensorDictModule,
     ProbabilisticTensorDictSequential,
     TensorDictModuleBase,
-    TensorDictParams,
     dispatch,
 )
 from torch import Tensor
@@ -23,23 +22,17 @@ from torchrl.modules import TanhDelta, TanhNormal
 from torchrl.modules.distributions.utils import safeatanh_noeps
 
 from torchrl_osr import functional
-from torchrl_osr._checks import check_choice, check_weight
-from torchrl_osr.objectives.base import BaseLoss, Reduction
+from torchrl_osr._checks import check_literals, check_weight
+from torchrl_osr._entries import column, nested, state_keys
+from torchrl_osr.objectives.base import BaseLoss
 from torchrl_osr.objectives.distributions import (
     action_bounds,
     check_num_actions,
     check_same_bounds,
     check_same_size,
 )
-from torchrl_osr.objectives.frozen_model import freeze, frozen_distribution
-from torchrl_osr.objectives.mixed_states import (
-    States,
-    column,
-    nested,
-    reduce_transitions,
-    state_keys,
-    transitions,
-)
+from torchrl_osr.objectives.mixed_states import States, transitions
+from torchrl_osr.objectives.step import frozen_distribution
 
 
 class StateRecoveryLoss(BaseLoss):
@@ -71,19 +64,21 @@ class StateRecoveryLoss(BaseLoss):
 
     Keyword Args:
         recovery_weight: :math:`\lambda`. Default 0.5. May be assigned later.
-        direction: ``"forward"`` (default) is the paper's ``KL(I || pi)``, ``"reverse"``
-            the ``KL(pi || I)`` of the authors' code, which a deterministic actor needs.
+        recovery_direction: ``"forward"`` (default) is the paper's ``KL(I || pi)``,
+            ``"reverse"`` the ``KL(pi || I)`` of the authors' code, which a
+            deterministic actor needs.
         action_reduction: ``"sum"`` (default) over action dimensions, or ``"mean"``.
-        states: ``"both"`` (default) for D_tot, ``"perturbed"``, or ``"clean"``, which
-            needs no perturbed entry.
-        reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
+        recovery_states: ``"both"`` (default) for D_tot, ``"perturbed"``, or
+            ``"clean"``, which needs no perturbed entry.
+        reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``, without the metric.
         use_prioritized_weights: weigh rows by ``"priority_weight"``; ``"auto"``
             (default) does when the entry is there.
 
     Raises:
         TypeError: if a distribution is another one.
         ValueError: if bounds differ, the weight is negative, an option is unknown, or
-            a deterministic actor is not given ``direction="reverse"``.
+            a deterministic actor is not given ``recovery_direction="reverse"``; in the
+            call, if the batch is empty or holds several steps a row.
         KeyError: in the call, if the batch has no perturbed entry.
 
     Examples:
@@ -113,7 +108,7 @@ class StateRecoveryLoss(BaseLoss):
             done: end of a trajectory, below ``"next"``. Defaults to ``"done"``.
             priority_weight: importance weight of a row. Defaults to
                 ``"priority_weight"``.
-            perturbed: where the perturbed twins are. Defaults to ``"perturbed"``.
+            perturbed: where the perturbed states are. Defaults to ``"perturbed"``.
         """
 
         action: NestedKey = "action"
@@ -124,13 +119,6 @@ class StateRecoveryLoss(BaseLoss):
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
 
-    actor_network: TensorDictModuleBase
-    actor_network_params: TensorDictParams
-    target_actor_network_params: TensorDictParams
-    inverse_dynamics_network: ProbabilisticTensorDictSequential
-    inverse_dynamics_network_params: TensorDictParams
-    target_inverse_dynamics_network_params: TensorDictParams
-
     _schedulable_buffers = frozenset({"recovery_weight"})
 
     def __init__(
@@ -139,92 +127,65 @@ class StateRecoveryLoss(BaseLoss):
         inverse_dynamics_network: ProbabilisticTensorDictSequential,
         *,
         recovery_weight: float = 0.5,
-        direction: Literal["forward", "reverse"] = "forward",
+        recovery_direction: Literal["forward", "reverse"] = "forward",
+        recovery_states: States = "both",
         action_reduction: Literal["sum", "mean"] = "sum",
-        states: States = "both",
-        reduction: Reduction = None,
+        reduction: Literal["none", "mean", "sum"] | None = None,
         use_prioritized_weights: bool | Literal["auto"] = "auto",
     ) -> None:
+        check_literals(StateRecoveryLoss.__init__, locals())
         check_weight("recovery_weight", recovery_weight)
-        check_choice("direction", direction, ("forward", "reverse"))
-        check_choice("action_reduction", action_reduction, ("sum", "mean"))
-        check_choice("states", states, ("both", "clean", "perturbed"))
-        super().__init__(reduction, use_prioritized_weights=use_prioritized_weights)
-        self.direction, self.states = direction, states
+        super().__init__(
+            reduction=reduction,
+            use_prioritized_weights=use_prioritized_weights,
+            scalar_output_mode="exclude",
+        )
+        self.recovery_direction = recovery_direction
+        self.recovery_states = recovery_states
+        self.action_reduction = action_reduction
         name = "inverse_dynamics_network"
         low, high = bounds = action_bounds(inverse_dynamics_network, name)
         self.register_buffer("action_low", low, persistent=False)
         self.register_buffer("action_high", high, persistent=False)
         self._check_actor(actor_network, bounds)
-        if not self.deterministic:
+        if not self.is_deterministic:
             check_same_size(actor_network, inverse_dynamics_network)
-        density = partial(functional.state_recovery, direction=direction)
-        recovery = functional.deterministic_recovery if self.deterministic else density
-        self._recovery = partial(recovery, action_reduction=action_reduction)
         self.convert_to_functional(actor_network, "actor_network")
-        self.convert_to_functional(inverse_dynamics_network, name)
-        params = freeze(self.inverse_dynamics_network_params)
-        self.inverse_dynamics_network_params = params
+        self._hold_inverse_dynamics(inverse_dynamics_network)
         self.register_coeff_buffer("recovery_weight", float(recovery_weight))
 
     def _check_actor(
         self, network: TensorDictModuleBase, bounds: tuple[Tensor, Tensor]
     ) -> None:
-        """Find out what the actor ends in; raise unless the term is defined for it."""
+        """Note what the actor ends in; raise unless the term is defined for it."""
         kind = ProbabilisticTensorDictModule
         heads = [module for module in network.modules() if isinstance(module, kind)]
         self.has_distribution = bool(heads)
-        self.deterministic = not heads or heads[-1].distribution_class is TanhDelta
-        if self.deterministic and self.direction == "forward":
+        self.is_deterministic = not heads or heads[-1].distribution_class is TanhDelta
+        if self.is_deterministic and self.recovery_direction == "forward":
             raise ValueError(
                 "actor_network is deterministic, which is infinitely far from a "
-                "density in the forward direction. Pass direction='reverse': it pulls "
-                "the action to the mean of the inverse dynamics model."
+                "density in the forward direction. Pass recovery_direction='reverse': "
+                "it pulls the action to the mean of the inverse dynamics model."
             )
-        if not self.deterministic:
+        if not self.is_deterministic:
             check_same_bounds(action_bounds(network, "actor_network"), bounds)
         elif heads:
             kwargs = {"low": -1.0, "high": 1.0} | heads[-1].distribution_kwargs
             low, high = (torch.as_tensor(kwargs[key]) for key in ("low", "high"))
             check_same_bounds((low.to(bounds[0]), high.to(bounds[1])), bounds)
 
-    def reset_parameters_recursive(self) -> None:
-        """Reset the actor; the inverse dynamics model keeps what it learnt."""
-        self._reset_module_parameters("actor_network", self.actor_network)
-
     def _input_keys(self) -> list[NestedKey]:
         states = state_keys(self.actor_network.in_keys)
         network_keys = self.inverse_dynamics_network.in_keys
         keys = [*states, *network_keys, nested("next", self.tensor_keys.done)]
-        if self.states != "clean":
+        if self.recovery_states != "clean":
             states += state_keys(network_keys)
             keys += [nested(self.tensor_keys.perturbed, key) for key in states]
         return keys
 
     def _output_keys(self) -> tuple[list[NestedKey], list[NestedKey]]:
         return ["loss_recovery"], ["recovery_kl"]
-
-    def _policy(self, states: TensorDictBase) -> tuple[Tensor, ...]:
-        """Return the policy's pre-tanh location and, if it has one, its scale."""
-        with self.actor_network_params.to_module(
-            self.actor_network, preserve_module_state=False
-        ):
-            if not self.has_distribution:
-                return (self._pre_tanh(self.actor_network(states)),)
-            pi = self.actor_network.get_dist(states)
-        # Not TanhDelta's action, which may have saturated.
-        return (pi.base_dist.param,) if self.deterministic else (pi.loc, pi.scale)
-
-    def _pre_tanh(self, output: TensorDictBase) -> Tensor:
-        """Return the written action before the tanh, ``[D, B, A]``."""
-        key = self.tensor_keys.action
-        action = output.get(key, None)
-        if action is None:
-            raise KeyError(f"The actor writes no {key!r}: call set_keys(action=...).")
-        width = self.action_high - self.action_low
-        squashed = 2 * (action - self.action_low) / width - 1
-        # Clamped a little inside the bounds, where the slope is finite.
-        return cast(Tensor, safeatanh_noeps(squashed))
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -233,25 +194,57 @@ class StateRecoveryLoss(BaseLoss):
         Args:
             tensordict: a batch ``[B]`` with the entries of :attr:`in_keys`.
         """
-        done = column(tensordict, nested("next", self.tensor_keys.done))
-        perturbed, states = self.tensor_keys.perturbed, self.states
+        self._check_not_empty(tensordict)
+        done = column(tensordict, nested("next", self.tensor_keys.done)).bool()
+        states = self.recovery_states
         model: TanhNormal = frozen_distribution(
-            self.inverse_dynamics_network,
-            self.inverse_dynamics_network_params,
+            self, tensordict, done=done, states=states
+        )
+        mixed = transitions(
             tensordict,
+            state_keys(self.actor_network.in_keys),
             done=done,
-            perturbed=perturbed,
+            perturbed=self.tensor_keys.perturbed,
             states=states,
         )
-        keys = state_keys(self.actor_network.in_keys)
-        mixed = transitions(
-            tensordict, keys, done=done, perturbed=perturbed, states=states
+        divergence = self._divergence(mixed, model).mean(0)
+        loss = self.recovery_weight * self._reduce(divergence, tensordict, ~done)
+        mean = self._mean(divergence, tensordict, ~done)
+        return self._output(tensordict, {"loss_recovery": loss}, {"recovery_kl": mean})
+
+    def _divergence(self, states: TensorDictBase, model: TanhNormal) -> Tensor:
+        """The recovery term (11) at ``states``, ``[D, B]``."""
+        with self.actor_network_params.to_module(
+            self.actor_network, preserve_module_state=False
+        ):
+            if self.has_distribution:
+                pi = self.actor_network.get_dist(states)
+                # Not TanhDelta's action, which may have saturated.
+                loc = pi.base_dist.param if self.is_deterministic else pi.loc
+            else:
+                loc = self._pre_tanh(self.actor_network(states))
+        sizes = model.loc.shape[-1], loc.shape[-1]
+        check_num_actions("inverse_dynamics_network", *sizes)
+        if self.is_deterministic:
+            return functional.deterministic_recovery(
+                loc, model.loc, model.scale, action_reduction=self.action_reduction
+            )
+        return functional.state_recovery(
+            loc,
+            pi.scale,
+            model.loc,
+            model.scale,
+            direction=self.recovery_direction,
+            action_reduction=self.action_reduction,
         )
-        policy = self._policy(mixed)
-        size = policy[0].shape[-1]
-        check_num_actions("inverse_dynamics_network", model.loc.shape[-1], size)
-        kl = self._recovery(*policy, model.loc, model.scale).mean(0)
-        mean = reduce_transitions(self, kl.detach(), done, tensordict, reduction="mean")
-        kl = reduce_transitions(self, kl, done, tensordict, self._weights(tensordict))
-        losses = {"loss_recovery": self.recovery_weight * kl}
-        return self._output(tensordict, losses, {"recovery_kl": mean})
+
+    def _pre_tanh(self, output: TensorDictBase) -> Tensor:
+        """The written action before the tanh, ``[D, B, A]``."""
+        key = self.tensor_keys.action
+        action = output.get(key, None)
+        if action is None:
+            raise KeyError(f"The actor writes no {key!r}: call set_keys(action=...).")
+        width = self.action_high - self.action_low
+        squashed = 2 * (action - self.action_low) / width - 1
+        # Clamped a little inside the bounds, where the slope is finite.
+        return cast(Tensor, safeatanh_noeps(squashed))

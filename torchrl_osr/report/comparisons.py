@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from torchrl_osr.evaluation.statistics import nested_resamples, percentile_interval
+from torchrl_osr.evaluation import nested_resamples, percentile_interval
 from torchrl_osr.report.methods import METHOD, comparable, exact
 from torchrl_osr.report.runs import Run, RunTables
 from torchrl_osr.report.scores import (

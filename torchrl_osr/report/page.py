@@ -12,8 +12,7 @@ import numpy as np
 import pandas as pd
 
 from torchrl_osr._files import write_atomically
-from torchrl_osr.evaluation.statistics import NUM_RESAMPLES
-from torchrl_osr.evaluation.summary import NUM_RECENT
+from torchrl_osr.evaluation import NUM_RECENT, NUM_RESAMPLES
 from torchrl_osr.report import published
 from torchrl_osr.report.comparisons import (
     ALL_DATA,

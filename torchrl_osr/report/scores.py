@@ -14,7 +14,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from torchrl_osr.evaluation.statistics import (
+from torchrl_osr.evaluation import (
+    NUM_RECENT,
     NUM_RESAMPLES,
     interquartile_mean,
     mean_interval,
@@ -23,7 +24,6 @@ from torchrl_osr.evaluation.statistics import (
     performance_profile,
     stratified_resamples,
 )
-from torchrl_osr.evaluation.summary import NUM_RECENT
 
 Array = NDArray[np.float64]
 

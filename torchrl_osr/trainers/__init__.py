@@ -1,6 +1,8 @@
 """Offline training on TorchRL's trainer."""
 
+from torchrl_osr.trainers.hardware import check_hardware
+from torchrl_osr.trainers.interruption import Interrupted
 from torchrl_osr.trainers.offline import OfflineTrainer
-from torchrl_osr.trainers.together import train_together
+from torchrl_osr.trainers.value_limits import largest_value
 
-__all__ = ["OfflineTrainer", "train_together"]
+__all__ = ["Interrupted", "OfflineTrainer", "check_hardware", "largest_value"]

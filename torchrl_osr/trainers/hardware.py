@@ -6,6 +6,8 @@ from typing import Literal
 
 import torch
 
+from torchrl_osr._checks import check_choice
+
 Precision = Literal["float32", "bfloat16"]
 
 
@@ -21,7 +23,7 @@ def check_cudagraph(device: torch.device) -> None:
 def check_hardware(
     device: str, precision: Precision, *, cudagraph: bool = False
 ) -> tuple[torch.device, torch.dtype | None]:
-    """Return the device and what to autocast to, or say what this machine lacks.
+    """Device and autocast type of a run, if this machine has them.
 
     Args:
         device: ``"cpu"``, ``"cuda"`` or ``"cuda:1"``.
@@ -30,16 +32,13 @@ def check_hardware(
             optimizer stay in float32.
 
     Keyword Args:
-        cudagraph: whether updates shall be CUDA graphs.
+        cudagraph: whether updates shall be CUDA graphs. Default ``False``.
 
     Raises:
         ValueError: if there is no such device or precision, or the device does not
             compute in it or has no CUDA graphs.
     """
-    if precision not in ("float32", "bfloat16"):
-        raise ValueError(
-            f"precision must be 'float32' or 'bfloat16', got {precision!r}."
-        )
+    check_choice("precision", precision, ("float32", "bfloat16"))
     where = torch.device(device)
     if cudagraph:
         check_cudagraph(where)

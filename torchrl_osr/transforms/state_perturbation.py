@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
-from torchrl_osr.objectives.mixed_states import nested
+from torchrl_osr._entries import nested
 
 
 class StatePerturbation(Transform):

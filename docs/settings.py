@@ -1,0 +1,130 @@
+"""Write ``settings.md``: every key of the training script, from the schemas themselves.
+
+Run it with ``python docs/settings.py`` from the repository's root. Names and types are
+those of the schemas and of the losses' signatures, meanings those of their docstrings,
+values those of the two presets.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra.utils import get_class
+from omegaconf import DictConfig, OmegaConf
+
+from torchrl_osr.experiment import schema
+
+ROOT = Path(__file__).parents[1]
+PRESETS = ("quick", "paper")
+# What everybody changes; the rest follows by group.
+COMMON = (
+    *("env.name", "data.level", "seed", "resume", "trainer.steps"),
+    *("loss.recovery_weight", "perturbation.std", "optim.actor_lr", "optim.qvalue_lr"),
+    "trainer.device",
+)
+HEAD = """# Settings
+
+Every key of `examples/offline_osr.py` with its value in two presets. The options of a
+loss are those of its class, here those of {py:class}`~torchrl_osr.OSRLoss`;
+`python examples/offline_osr.py loss=osr_v --cfg job` prints those of another. This page
+is written by `python docs/settings.py`.
+"""
+
+
+def described(documented: Any) -> dict[str, str]:
+    """The meaning of each argument or attribute in a Google-style docstring."""
+    text = inspect.getdoc(documented) or ""
+    found: dict[str, str] = {}
+    names: list[str] = []
+    for line in text.splitlines():
+        item = re.match(r"    (\w+(?:, \w+)*): (.*)", line)
+        if item:
+            names = item[1].split(", ")
+            found |= dict.fromkeys(names, item[2])
+        elif names and line.startswith("        "):
+            for name in names:
+                found[name] += " " + line.strip()
+        else:
+            names = []
+    return found
+
+
+def markdown(text: str) -> str:
+    """A docstring's markup as Markdown that fits into a table's cell."""
+    text = re.sub(r":math:`(.*?)`", r"$\1$", text)
+    text = re.sub(r":(?:class|func|attr|meth):`~?(.*?)`", r"`\1`", text)
+    text = text.replace("``", "`").replace("|", "\\|").replace("`None`", "`null`")
+    # The two columns of values say it.
+    text = re.sub(r" Default `?[\w.-]+?`?\.(?= |$)| Default: none\.", "", text)
+    capital = text[1:2].islower() and not text.startswith("Gymnasium")
+    text = text[:1].lower() + text[1:] if capital else text
+    return text.rstrip(".")
+
+
+def meanings(cfg: DictConfig) -> dict[str, str]:
+    """The meaning of every key, dotted."""
+    found = described(schema.OfflineOSRConfig)
+    for name, field in schema.OfflineOSRConfig.__dataclass_fields__.items():
+        if inspect.isclass(field.default_factory):
+            group = described(field.default_factory)
+            found |= {f"{name}.{key}": text for key, text in group.items()}
+    for name in ("loss", "inverse_dynamics.loss"):
+        target = get_class(OmegaConf.select(cfg, f"{name}._target_"))
+        for each in reversed(target.__mro__):
+            if each.__module__.startswith("torchrl_osr"):
+                options = described(each)
+                found |= {f"{name}.{key}": text for key, text in options.items()}
+    return found
+
+
+def leaves(tree: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Every key, dotted, with its value; what is called for a key is no setting."""
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from leaves(value, f"{prefix}{key}.")
+        elif key != "_target_":
+            yield f"{prefix}{key}", value
+
+
+def shown(value: Any) -> str:
+    """A value as one types it."""
+    text = OmegaConf.to_yaml(OmegaConf.create({"_": value})).removeprefix("_:").strip()
+    if isinstance(value, list):
+        text = f"[{', '.join(map(str, value))}]"
+    return f"`{text}`"
+
+
+def page() -> str:
+    """The whole page."""
+    schema.register()
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        composed = [compose("offline_osr", [f"preset={name}"]) for name in PRESETS]
+    values = [
+        dict(leaves(OmegaConf.to_container(cfg, resolve=True))) for cfg in composed
+    ]
+    known = meanings(composed[0])
+    groups: dict[str, list[str]] = {"The common ones": list(COMMON)}
+    for key in values[0]:
+        name = key.partition(".")[0] if "." in key else "run"
+        groups.setdefault(f"`{name}`", []).append(key)
+    lines = [HEAD]
+    for title, keys in groups.items():
+        lines += [
+            f"## {title}\n",
+            "| key | quick | paper | meaning |",
+            "|---|---|---|---|",
+        ]
+        for key in keys:
+            cells = [shown(each[key]) for each in values]
+            lines.append(f"| `{key}` | {' | '.join(cells)} | {markdown(known[key])} |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    (ROOT / "docs" / "settings.md").write_text(page(), encoding="utf-8")

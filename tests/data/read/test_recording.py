@@ -1,0 +1,225 @@
+"""Reading in parts gives the rows of reading at once, whatever the parts are."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import h5py
+import numpy as np
+import pyarrow
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from pyarrow import parquet
+
+from torchrl_osr.data import load_d4rl, load_dataset, load_file, transitions_from_rows
+from torchrl_osr.data.read import recording
+from torchrl_osr.data.read.d4rl import open_d4rl
+from torchrl_osr.data.read.files import open_file
+from torchrl_osr.data.read.recording import (
+    Conversion,
+    Recording,
+    whole_trajectories,
+)
+
+
+@st.composite
+def recordings(draw):
+    """Return columns of some steps, one in ten with a flaw."""
+    count = draw(st.integers(1, 30))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    rows = {
+        "observation": rng.normal(size=(count, 2)).astype(draw(st.sampled_from("fd"))),
+        "action": rng.uniform(-1, 1, (count, 1)),
+        "reward": rng.normal(size=count),
+        "terminated": rng.random(count) < draw(st.sampled_from([0, 0.1, 0.5])),
+    }
+    kinds = draw(st.sampled_from(["truncated", "episode", "both"]))
+    if kinds != "episode":
+        rows["truncated"] = rng.random(count) < draw(st.sampled_from([0, 0.2, 1]))
+    if kinds != "truncated":
+        rows["episode"] = np.cumsum(rng.random(count) < 0.2)
+        if draw(st.integers(0, 9)) == 0:
+            rows["episode"] %= 2  # some come back
+    if draw(st.booleans()):
+        rows["next_observation"] = rng.normal(size=(count, 2))
+    if draw(st.integers(0, 9)) == 0:
+        rows["reward"][rng.integers(count)] = np.nan
+    return rows
+
+
+def in_parts(opened, rows):
+    """Rows and manifest of a recording that is converted part by part."""
+    conversion = Conversion(opened)
+    data = torch.cat(list(conversion.chunks(rows)))
+    return data, conversion.manifest()
+
+
+def assert_same(opened, rows, data, manifest):
+    there, described = in_parts(opened, rows)
+    assert (there == data).all()
+    assert described.items() <= manifest.items()
+
+
+def recorded(columns):
+    total = len(columns["reward"])
+
+    def read(start, stop):
+        return {name: column[start:stop] for name, column in columns.items()}
+
+    return Recording({}, [], total, partial(whole_trajectories, read, total))
+
+
+@settings(
+    max_examples=60,
+    deadline=None,
+    database=None,
+    derandomize=True,
+    suppress_health_check=list(HealthCheck),
+)
+@given(columns=recordings(), rows=st.integers(1, 40))
+def test_any_recording_in_parts_of_any_size(columns, rows):
+    opened = recorded(columns)
+    try:
+        data, manifest = transitions_from_rows(columns)
+    except ValueError:
+        with pytest.raises(ValueError, match="holds nan|comes back|true next state"):
+            in_parts(opened, rows)
+        return
+    assert_same(opened, rows, data, manifest)
+
+
+def test_errors_say_in_which_rows_they_are(make_columns):
+    columns = make_columns()
+    columns["reward"][250] = np.nan
+    message = r"in the rows from 240 on: 'reward' holds nan in row 10 of 40"
+    with pytest.raises(ValueError, match=message):
+        in_parts(recorded(columns), 50)
+
+
+@pytest.mark.parametrize("rows", [1, 50, 1000])
+@pytest.mark.parametrize("with_next", [True, False])
+@pytest.mark.parametrize("ending", ["npz", "h5", "parquet"])
+def test_files(tmp_path, make_columns, ending, with_next, rows):
+    columns, path = make_columns(with_next=with_next), tmp_path / f"log.{ending}"
+    if ending == "npz":
+        np.savez(path, **columns)
+    elif ending == "h5":
+        save_hdf5(path, columns)
+    else:
+        lists = {n: c.tolist() if c.ndim == 2 else c for n, c in columns.items()}
+        parquet.write_table(pyarrow.table(lists), path, row_group_size=70)
+    assert_same(open_file(path), rows, *load_file(path))
+
+
+NAMES = {
+    "observation": "observations",
+    "action": "actions",
+    "reward": "rewards",
+    "terminated": "terminals",
+    "truncated": "timeouts",
+    "next_observation": "next_observations",
+}
+
+
+def save_hdf5(path, columns, names=None):
+    with h5py.File(path, "w") as file:
+        for name, column in columns.items():
+            file[names[name] if names else name] = column
+
+
+@pytest.mark.parametrize("rows", [1, 50, 1000])
+@pytest.mark.parametrize("limit", [None, 10])
+def test_d4rl(tmp_path, make_columns, rows, limit):
+    columns, path = make_columns(), tmp_path / "set.hdf5"
+    if limit:
+        del columns["truncated"]
+    save_hdf5(path, columns, NAMES)
+    options = {"max_episode_steps": limit}
+    assert_same(open_d4rl(path, **options), rows, *load_d4rl(path, **options))
+
+
+def test_a_trajectory_without_an_end_is_refused(make_columns, monkeypatch):
+    columns = make_columns()
+    columns["terminated"][:] = columns["truncated"][:] = False
+    monkeypatch.setattr(recording, "MAX_TRAJECTORY", 100)
+    with pytest.raises(ValueError, match=r"begins in row 0 has no end within 160 rows"):
+        in_parts(recorded(columns), 40)
+
+
+def external(file, folder):
+    file["rewards"] = h5py.ExternalLink("other.hdf5", "reward")
+
+
+def soft_to_external(file, folder):
+    file["infos/elsewhere"] = h5py.ExternalLink("other.hdf5", "/")
+    file["rewards"] = h5py.SoftLink("/infos/elsewhere/reward")
+
+
+def soft_to_soft_to_external(file, folder):
+    soft_to_external(file, folder)
+    file["first"] = file.get("rewards", getlink=True)
+    del file["rewards"]
+    file["rewards"] = h5py.SoftLink("/first")
+
+
+def raw(file, folder):
+    where = [(str(folder / "secret"), 0, 2400)]
+    file.create_dataset("rewards", (300,), "f8", external=where)
+
+
+def virtual(file, folder):
+    layout = h5py.VirtualLayout((300,), "f8")
+    layout[:] = h5py.VirtualSource(folder / "other.hdf5", "reward", (300,))
+    file.create_virtual_dataset("rewards", layout)
+
+
+@pytest.mark.parametrize("on_disk", [False, True])
+@pytest.mark.parametrize("quality", ["d4rl", "file"])
+@pytest.mark.parametrize(
+    "craft", [external, soft_to_external, soft_to_soft_to_external, raw, virtual]
+)
+@pytest.mark.usefixtures("cache")
+def test_nothing_is_read_from_another_hdf5_file(
+    tmp_path, make_columns, craft, quality, on_disk
+):
+    (tmp_path / "secret").write_bytes(bytes(2400))
+    columns, path = make_columns(), tmp_path / "log.hdf5"
+    save_hdf5(tmp_path / "other.hdf5", columns)
+    del columns["reward"]
+    save_hdf5(path, columns, NAMES)
+    with h5py.File(path, "a") as file:
+        craft(file, tmp_path)
+        assert file["rewards"].shape == (300,), "the crafted file works"
+    with pytest.raises(ValueError, match="leads into another file"):
+        load_dataset("hopper", quality, path=str(path), on_disk=on_disk)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda file: file.create_group("more"), "'more' is no array with rows"),
+        (lambda file: file.create_dataset("more", data=3), "'more' is no array with"),
+        (
+            lambda file: file.create_dataset("rewards", (10**10,), "i1", chunks=True),
+            r"log\.h5 would unpack to [\d,]+ bytes; at most 4,294,967,296",
+        ),
+    ],
+)
+def test_deviating_hdf5_files_are_refused(tmp_path, make_columns, change, message):
+    path = tmp_path / "log.h5"
+    save_hdf5(path, make_columns())
+    with h5py.File(path, "a") as file:
+        change(file)
+    with pytest.raises(ValueError, match=message):
+        load_file(path)
+
+
+def test_columns_of_unequal_length_are_refused(tmp_path, make_columns):
+    columns, path = make_columns(), tmp_path / "log.h5"
+    columns["action"] = columns["action"][:290]
+    save_hdf5(path, columns)
+    for rows in (50, 1000):
+        with pytest.raises(ValueError, match="'action' has shape"):
+            in_parts(open_file(path), rows)

@@ -1,0 +1,42 @@
+"""What ``torchrl_osr.data`` exports, with and without the extras."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+WITHOUT_EXTRAS = """
+import sys
+for name in ("gymnasium", "mujoco", "tqdm", "platformdirs"):
+    sys.modules[name] = None
+from torchrl_osr.data import load_behavior_policy, normalized_score
+from torchrl_osr.data import make_replay_buffer, check_dataset
+for name in ("load_local_dataset", "collect_quality", "make_environment"):
+    try:
+        exec(f"from torchrl_osr.data import {name}")
+    except ImportError as error:
+        assert "pip install torchrl-osr[examples]" in str(error), error
+    else:
+        raise AssertionError(name)
+"""
+
+
+def test_the_rest_works_without_the_examples_extra():
+    completed = subprocess.run(
+        [sys.executable, "-c", WITHOUT_EXTRAS],
+        cwd=Path(__file__).parents[2],
+        capture_output=True,
+        text=True,
+    )
+    assert completed.returncode == 0, completed.stderr
+
+
+def test_public_names_exist():
+    import torchrl_osr.data
+
+    assert all(hasattr(torchrl_osr.data, name) for name in torchrl_osr.data.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'missing'"):
+        torchrl_osr.data.missing  # noqa: B018

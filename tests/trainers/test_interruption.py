@@ -1,0 +1,152 @@
+"""Signals: the run stops at its next update, is saved, and goes on to the same bits."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import threading
+
+import pytest
+
+from torchrl_osr.trainers import Interrupted
+from torchrl_osr.trainers.interruption import EXIT_CODES, signals_noted
+
+STEPS = 12
+
+
+@pytest.fixture(autouse=True)
+def _handlers_are_put_back():
+    before = [signal.getsignal(number) for number in EXIT_CODES]
+    yield
+    assert [signal.getsignal(number) for number in EXIT_CODES] == before
+
+
+def stop_in(trainer, step: int, number: int = signal.SIGTERM) -> None:
+    """Send the process a signal in the middle of an update."""
+
+    def send(batch):
+        if trainer.step == step:
+            os.kill(os.getpid(), number)
+        return batch
+
+    trainer.register_op("process_optim_batch", send)
+
+
+def files(trainer) -> set[str]:
+    return {path.name for path in trainer.checkpoints.folder.iterdir()}
+
+
+@pytest.mark.parametrize("steps", [[1], [5], [6], [11], [2, 3, 9], [7, 8]])
+def test_interrupted_run_ends_as_an_undisturbed_one(tmp_path, runs, steps):
+    def make(folder, numbers):
+        loggers = [runs.log_of(numbers)]
+        return runs.make(tmp_path / folder, checkpoint_interval=5, loggers=loggers)
+
+    numbers, wanted = [], []
+    undisturbed = make("undisturbed", wanted)
+    undisturbed.train()
+    for step in steps:
+        trainer = make("run", numbers)
+        stop_in(trainer, step)
+        with pytest.raises(Interrupted, match=f"at step {step}; .*{step:012d}"):
+            trainer.train()
+        # Regular ones stay; of the extra ones only the newest does.
+        regular = {each for each in (5, 10) if each <= step}
+        names = {f"checkpoint-{each:012d}.torchrl" for each in regular | {step}}
+        assert files(trainer) == names
+    resumed = make("run", numbers)
+    resumed.train()
+    runs.assert_same_bits(runs.state(resumed), runs.state(undisturbed))
+    assert files(resumed) == files(undisturbed)
+    assert [row[:2] for row in numbers] == [row[:2] for row in wanted]
+
+
+@pytest.mark.parametrize(("name", "code"), [("TERM", 75), ("HUP", 75), ("INT", 130)])
+def test_each_signal_has_its_exit_code(tmp_path, runs, caplog, name, code):
+    trainer = runs.make(tmp_path)
+    stop_in(trainer, 3, signal.Signals[f"SIG{name}"])
+    with pytest.raises(Interrupted, match=f"stopped by SIG{name} at step 3") as raised:
+        trainer.train()
+    assert raised.value.code == code
+    assert raised.value.reason in caplog.text
+
+
+def test_second_ctrl_c_interrupts_at_once(tmp_path, runs, capfd):
+    def evaluate():
+        os.kill(os.getpid(), signal.SIGINT)
+        assert "Ctrl-C again stops at once" in capfd.readouterr().err
+        os.kill(os.getpid(), signal.SIGINT)
+        pytest.fail("not reached")
+
+    with pytest.raises(KeyboardInterrupt):
+        runs.make(tmp_path, evaluate=evaluate).train()
+
+
+def test_evaluation_is_finished_first(tmp_path, runs):
+    def make(*steps: int):
+        def evaluate():
+            if trainer.step in steps:
+                os.kill(os.getpid(), signal.SIGTERM)
+            return {"score": 1.0}
+
+        trainer = runs.make(tmp_path, evaluate=evaluate)
+        return trainer
+
+    # Before the first update there is nothing to continue from.
+    with pytest.raises(Interrupted, match="at step 0; the last checkpoint is None"):
+        make(0).train()
+    for step in (6, STEPS):
+        with pytest.raises(Interrupted, match=f"at step {step}"):
+            make(step).train()
+    finished = make(0, 6, STEPS)
+    finished.train()
+    assert [row["step"] for row in finished.history] == [0, 6, STEPS]
+
+
+def test_updates_are_settled_before_they_are_saved(tmp_path, runs):
+    """A skipped one is counted; after a bad one no checkpoint is written."""
+
+    def spoiled(mode):
+        trainer = runs.make(tmp_path / mode, nonfinite=mode)
+        original = trainer.loss_module.forward
+
+        def forward(batch):
+            losses = original(batch)
+            return losses * float("nan") if trainer.step == 2 else losses
+
+        trainer.loss_module.forward = forward
+        stop_in(trainer, 2)
+        return trainer
+
+    with pytest.raises(Interrupted):
+        spoiled("skip").train()
+    resumed = runs.make(tmp_path / "skip", nonfinite="skip")
+    resumed.resume()
+    assert (resumed.step, resumed.nonfinite_check.skipped) == (2, 1)
+    with pytest.raises(FloatingPointError):
+        spoiled("stop").train()
+
+
+def test_handlers_of_others_and_other_threads_are_left_alone(tmp_path, runs):
+    def of_submitit(number, frame): ...
+
+    signal.signal(signal.SIGTERM, of_submitit)
+    try:
+        with signals_noted():
+            assert signal.getsignal(signal.SIGTERM) is of_submitit
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    trainer, handlers = runs.make(tmp_path), []
+    trainer.register_op(
+        "post_optim", lambda: handlers.append(signal.getsignal(signal.SIGTERM))
+    )
+    thread = threading.Thread(target=trainer.train)
+    thread.start()
+    thread.join()
+    assert handlers == [signal.SIG_DFL] * STEPS
+
+
+def test_it_reaches_another_process_whole():
+    again = pickle.loads(pickle.dumps(Interrupted("saved at step 3", 75)))
+    assert (again.code, again.reason) == (75, "saved at step 3")

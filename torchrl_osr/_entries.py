@@ -1,0 +1,64 @@
+"""Entries of a batch: their names, and errors that name them.
+
+Shapes: ``B`` batch (any leading dimensions).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from torch import Tensor
+
+
+def nested(prefix: NestedKey, key: NestedKey) -> NestedKey:
+    """``key`` below ``prefix``: ``("next", "observation")``, for instance."""
+    return unravel_key((prefix, key))
+
+
+def is_next(key: NestedKey) -> bool:
+    """Whether ``key`` lies below ``"next"``."""
+    return isinstance(key, tuple) and key[0] == "next"
+
+
+def state_keys(in_keys: Iterable[NestedKey], *exclude: NestedKey) -> list[NestedKey]:
+    """The current-state entries of ``in_keys``, once each and in order."""
+    keys = dict.fromkeys(unravel_key(key) for key in in_keys)
+    return [key for key in keys if not is_next(key) and key not in exclude]
+
+
+def entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+    """An entry that must be there.
+
+    Raises:
+        KeyError: naming the missing entry and those that are there.
+    """
+    value: Tensor | None = tensordict.get(key, None)
+    if value is None:
+        there = sorted(map(str, tensordict.keys(True, True)))
+        raise KeyError(f"The batch has no entry {key!r}; it has {there}.")
+    return value
+
+
+def column(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+    """An entry with one number a row, ``[B, 1]``, as ``[B]``.
+
+    Raises:
+        KeyError: if it is missing.
+        ValueError: if it has another shape.
+    """
+    value = entry(tensordict, key)
+    expected = (*tensordict.batch_size, 1)
+    if value.shape != expected:
+        raise ValueError(
+            f"{key!r} has shape {tuple(value.shape)}, expected {expected}: the batch "
+            "size and a last dimension of 1."
+        )
+    return value.squeeze(-1)
+
+
+def select(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> TensorDictBase:
+    """The entries ``keys``, all of which must be there (see :func:`entry`)."""
+    for key in keys:
+        entry(tensordict, key)
+    return tensordict.select(*keys)

@@ -1,0 +1,1 @@
+"""Recorded data: Minari, D4RL and files of your own, read as transitions."""

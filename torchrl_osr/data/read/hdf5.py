@@ -1,0 +1,101 @@
+"""Arrays at the root of an HDF5 file, read in slices; never from another file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from torchrl_osr._files import check_unpacked_size
+
+try:
+    import h5py
+except ImportError as error:
+    raise ImportError(
+        f"HDF5 files need {error.name!r}: pip install torchrl-osr[minari]"
+    ) from error
+
+
+def open_hdf5(
+    path: Path, names: Iterable[str] | None = None
+) -> tuple[int, Callable[[int, int], dict[str, NDArray[Any]]]]:
+    """Number of rows of an HDF5 file, and what reads the rows from one up to another.
+
+    Args:
+        path: the file.
+        names: which arrays to read if they are there. Default: all, and then anything
+            that is not an array is an error.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no HDF5 file or damaged, something in it leads into another
+            file, or a name is no array. Arrays of unequal length are read as they are:
+            whoever checks the columns names them. So is reading more than both 4 GiB
+            and the file's own size at once.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file {path}.")
+    with _opened(path) as file:
+        _check_links(path, file)
+        chosen = [n for n in file if n in set(names)] if names else list(file)
+        for name in chosen:
+            if not isinstance(file[name], h5py.Dataset) or not file[name].ndim:
+                raise ValueError(f"{path}: {name!r} is no array with rows.")
+        rows = max((len(file[name]) for name in chosen), default=0)
+
+    def read(start: int, stop: int) -> dict[str, NDArray[Any]]:
+        with _opened(path) as file:
+            arrays = [file[name] for name in chosen]
+            row_bytes = sum(each.nbytes // max(len(each), 1) for each in arrays)
+            check_unpacked_size(path, row_bytes * (stop - start))
+            return {name: file[name][start:stop] for name in chosen}
+
+    return rows, read
+
+
+def check_hdf5(path: Path) -> None:
+    """Raise unless a file can be read whole, on its own.
+
+    Args:
+        path: the file.
+
+    Raises:
+        ValueError: it is no HDF5 file or damaged, announces more than both 4 GiB and
+            its own size, or leads into another file.
+    """
+    with _opened(path) as file:
+        _check_links(path, file)
+        sizes: list[int] = []
+        file.visititems(lambda _, node: sizes.append(getattr(node, "nbytes", 0)))
+        check_unpacked_size(path, sum(sizes))
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[h5py.File]:
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except (OSError, KeyError, RuntimeError) as error:
+        raise ValueError(f"{path} is no HDF5 file, or damaged: {error}") from error
+
+
+def _check_links(path: Path, file: h5py.File) -> None:
+    """Raise if anything in a file, however it is linked, lies in another one."""
+    elsewhere: list[str] = []
+
+    def look_at_link(name: str, link: Any) -> None:
+        # A soft link to an external one is found here too: that one is in this file.
+        if isinstance(link, h5py.ExternalLink):
+            elsewhere.append(name)
+
+    def look_at(name: str, node: Any) -> None:
+        if isinstance(node, h5py.Dataset) and (node.external or node.is_virtual):
+            elsewhere.append(name)
+
+    file.visititems_links(look_at_link)
+    file.visititems(look_at)
+    if elsewhere:
+        raise ValueError(f"{path}: {elsewhere[0]!r} leads into another file.")

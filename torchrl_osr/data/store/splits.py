@@ -1,0 +1,117 @@
+"""Which rows of a data set are used: held-out rows, and mixtures of two sets.
+
+Shapes: ``N`` transitions.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+
+def held_out_rows(rows: int, held_out: int | float, *, seed: int) -> Tensor:
+    """Numbers of randomly chosen rows, in random order.
+
+    Args:
+        rows: number of rows ``N``.
+        held_out: number of held-out rows (``int``), or their share (``float`` between
+            0 and 1, rounded to whole rows).
+
+    Keyword Args:
+        seed: of the choice, which has a generator of its own.
+
+    Raises:
+        ValueError: none would be held out, or all.
+    """
+    count = round(held_out * rows) if isinstance(held_out, float) else held_out
+    if not 0 < count < rows:
+        raise ValueError(
+            f"held_out={held_out!r} would hold out {count} of {rows} rows; "
+            "expected at least one row on each side."
+        )
+    order = torch.randperm(rows, generator=torch.Generator().manual_seed(seed))
+    return order[:count].clone()  # not the rest of the memory with it
+
+
+def split_held_out(
+    data: TensorDict, held_out: int | float, *, seed: int
+) -> tuple[TensorDict, TensorDict]:
+    """Split a data set in memory into training and held-out rows, chosen at random.
+
+    A memory-mapped set would be copied into memory: see ``left_out`` of
+    :func:`~torchrl_osr.data.make_replay_buffer`.
+
+    Args:
+        data: transitions ``[N]``.
+        held_out: see :func:`held_out_rows`.
+
+    Keyword Args:
+        seed: see there.
+
+    Returns:
+        Training rows and held-out rows, each in their original order.
+
+    Raises:
+        ValueError: one of the two parts would be empty.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_osr.data import split_held_out
+        >>> data = TensorDict({"observation": torch.rand(10, 3)}, batch_size=[10])
+        >>> train, held_out = split_held_out(data, 0.2, seed=0)
+        >>> len(train), len(held_out)
+        (8, 2)
+    """
+    mask = torch.zeros(len(data), dtype=torch.bool)
+    mask[held_out_rows(len(data), held_out, seed=seed)] = True
+    mask = mask.to(data.device or "cpu")
+    return data[~mask], data[mask]
+
+
+def mix_datasets(
+    valuable: TensorDict, random: TensorDict, *, random_share: float, seed: int
+) -> TensorDict:
+    """Replace a share of the rows by rows of another data set; the number stays.
+
+    Limited valuable data, section 5.3 of the paper. The rows of each set are drawn
+    without replacement, and neither set is changed.
+
+    Args:
+        valuable: ``N`` transitions.
+        random: at least as many as are needed of it.
+
+    Keyword Args:
+        random_share: of the ``N`` rows, rounded to whole ones.
+        seed: of the choice, which has a generator of its own.
+
+    Returns:
+        ``N`` transitions: those kept of ``valuable``, then those of ``random``.
+
+    Raises:
+        ValueError: if the share is not between 0 and 1, or ``random`` is too small.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_osr.data import mix_datasets
+        >>> expert = TensorDict({"reward": torch.ones(10)}, [10])
+        >>> random = TensorDict({"reward": torch.zeros(10)}, [10])
+        >>> mixed = mix_datasets(expert, random, random_share=0.7, seed=0)
+        >>> len(mixed), int(mixed["reward"].sum())
+        (10, 3)
+    """
+    if not 0 <= random_share <= 1:
+        raise ValueError(f"random_share must be in [0, 1], got {random_share}.")
+    number = round(random_share * len(valuable))
+    if number > len(random):
+        raise ValueError(
+            f"random_share={random_share} of {len(valuable)} rows is {number}, but the "
+            f"random set has {len(random)}: collect more, or lower the share."
+        )
+    generator = torch.Generator().manual_seed(seed)
+    kept = torch.randperm(len(valuable), generator=generator)[number:].sort().values
+    taken = torch.randperm(len(random), generator=generator)[:number].sort().values
+    mixed: TensorDict = torch.cat([valuable[kept], random[taken]])
+    return mixed

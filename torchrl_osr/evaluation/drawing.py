@@ -1,0 +1,50 @@
+"""Figures that need no display and are written whole or not at all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from torchrl_osr._files import whole_file
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# Okabe and Ito's palette, which colour-blind readers can tell apart.
+BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
+
+
+def new_figure(width: float, height: float, **options: Any) -> Figure:
+    """Matplotlib figure that draws in memory.
+
+    Args:
+        width, height: in inches.
+        **options: of :class:`matplotlib.figure.Figure`.
+
+    Raises:
+        ImportError: if matplotlib is not installed, with what to install.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError(
+            f"figures need {error.name!r}: pip install torchrl-osr[examples]"
+        ) from error
+    figure = Figure(figsize=(width, height), **options)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save_figure(figure: Figure, path: Path | str, *, dpi: int = 150) -> None:
+    """Write a figure as PNG; a file of that name is replaced once it is whole.
+
+    Args:
+        figure: drawn.
+        path: of the file.
+
+    Keyword Args:
+        dpi: dots per inch. Default 150.
+    """
+    with whole_file(Path(path)) as file:
+        figure.savefig(file, dpi=dpi, format="png")

@@ -1,0 +1,77 @@
+"""Accuracy and calibration of an inverse dynamics model on held-out rows.
+
+Shapes: ``N`` rows, ``A`` action.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import (
+    InteractionType,
+    ProbabilisticTensorDictSequential,
+    set_interaction_type,
+)
+
+NORMAL_QUANTILE_95 = 1.6448536269514722
+"""A normal variable is within this many standard deviations with probability 0.9."""
+
+
+@torch.no_grad()
+def inverse_dynamics_report(
+    inverse_dynamics_network: ProbabilisticTensorDictSequential, data: TensorDictBase
+) -> dict[str, Any]:
+    """Held-out likelihood, explained variance and calibration.
+
+    Args:
+        inverse_dynamics_network: reads states and next states, ends in a
+            :class:`~torchrl.modules.TanhNormal`.
+        data: held-out rows, ``[N]``; ``done`` rows are left out.
+
+    Returns:
+        ``"nll"``, mean negative log-likelihood of the action in nats; ``"r2"``, share
+        of each action dimension's variance that the deterministic action explains,
+        ``A`` numbers, and their mean ``"r2_mean"``; ``"coverage_90"``, share of actions
+        inside the model's central 90 % interval, over all dimensions (0.9 is
+        calibrated); ``"rows"``.
+
+    Raises:
+        ValueError: if no row is left.
+    """
+    data = data[~data.get(("next", "done")).squeeze(-1)]
+    if not len(data):
+        raise ValueError("No held-out row is a true transition: all are done.")
+    # Latent variables at their mean, as the policy's losses use the model.
+    with set_interaction_type(InteractionType.DETERMINISTIC):
+        distribution = inverse_dynamics_network.get_dist(
+            data.select(*inverse_dynamics_network.in_keys)
+        )
+    action = data.get("action")
+    error = (action - distribution.deterministic_sample).square().sum(0)
+    spread = (action - action.mean(0)).square().sum(0)
+    r2 = 1 - error / spread
+    # The squash is monotonic: a quantile of the Gaussian is one of the action.
+    half_width = NORMAL_QUANTILE_95 * distribution.scale
+    squash = distribution.transforms[0]
+    inside = (squash(distribution.loc - half_width) <= action) & (
+        action <= squash(distribution.loc + half_width)
+    )
+    return {
+        "nll": -distribution.log_prob(action).mean().item(),
+        "r2_mean": r2.mean().item(),
+        "r2": r2.tolist(),
+        "coverage_90": inside.float().mean().item(),
+        "rows": len(data),
+    }
+
+
+def describe_inverse_dynamics(report: Mapping[str, Any]) -> str:
+    """One line of text with the numbers of a report; ``None`` is a dash."""
+    r2 = ", ".join("-" if each is None else f"{each:.2f}" for each in report["r2"])
+    return (
+        f"inverse dynamics, {report['rows']} held-out rows: NLL {report['nll']:.2f}, "
+        f"R2 {r2}, 90 % interval covers {100 * report['coverage_90']:.0f} %"
+    )

@@ -1,0 +1,149 @@
+"""Summary of a training run at its end: table of scores and learning curve."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchrl_osr.evaluation.drawing import (
+    BLUE,
+    GREY,
+    ORANGE,
+    new_figure,
+    save_figure,
+)
+
+NUM_RECENT = 5
+"""Evaluations in the mean of the last ones.
+
+Scores of neighbouring evaluations swing by tens of points, so one of them says little.
+"""
+
+PANELS = {
+    "loss_qvalue": "TD error (critics)",
+    "loss_cql": "conservative term (critics)",
+    "recovery_kl": "state recovery (policy)",
+    "pred_value": "Q of the data's actions",
+}
+"""Logged scalars below the score, and their titles."""
+
+
+def recent_score(history: Sequence[Mapping[str, Any]]) -> float:
+    """Return the mean score of the last :data:`NUM_RECENT` evaluations."""
+    return float(np.mean([row["score"] for row in history[-NUM_RECENT:]]))
+
+
+def score_table(
+    title: str,
+    history: Sequence[Mapping[str, Any]],
+    best: Mapping[str, Any],
+    data_score: float | None,
+    folder: Path,
+) -> str:
+    """Return the table of data's and policy's scores.
+
+    Args:
+        title: what was trained on what.
+        history: all evaluations with their ``"step"``, see
+            :func:`~torchrl_osr.evaluation.summarize`.
+        best: the best of them; chosen by its own episodes, hence optimistic.
+        data_score: mean normalised score of the data's episodes, if it is known.
+        folder: where the run's files are.
+    """
+
+    def with_interval(row: Mapping[str, Any]) -> str:
+        return f"{row['score']:6.1f}  [{row['score_low']:.1f}, {row['score_high']:.1f}]"
+
+    known = "unknown" if data_score is None else f"{data_score:6.1f}"
+    rows = [
+        ("data, mean episode", known),
+        ("policy, last", with_interval(history[-1])),
+        (
+            f"policy, mean of last {min(NUM_RECENT, len(history))}",
+            f"{recent_score(history):6.1f}",
+        ),
+        ("policy, best evaluation", f"{with_interval(best)}  at step {best['step']}"),
+    ]
+    if "success_rate" in history[-1]:
+        last = history[-1]
+        rate, low, high = (
+            100 * last[name] for name in ("success_rate", "success_low", "success_high")
+        )
+        said = f"{rate:6.1f}  [{low:.1f}, {high:.1f}]  % of {len(last['successes'])}"
+        rows.insert(2, ("policy, last, success", f"{said} episodes, Wilson interval"))
+    lines = [f"{title}: normalised score, 0 random and 100 expert [95 % interval]"]
+    lines += [f"  {label:<25}{value}" for label, value in rows]
+    return "\n".join([*lines, f"  {'files':<26}{folder}"])
+
+
+def read_scalars(folder: Path | str) -> dict[str, list[tuple[int, float]]]:
+    """Read what a TorchRL ``CSVLogger`` wrote, by name.
+
+    A resumed run logs the steps since its checkpoint once more; the later row counts.
+
+    Args:
+        folder: the logger's ``scalars`` folder of one phase.
+
+    Returns:
+        Step and value pairs, in the order of the steps.
+    """
+    scalars = {}
+    for path in sorted(Path(folder).glob("*.csv")):
+        with path.open(newline="") as file:
+            rows = {int(step): float(value) for step, value in csv.reader(file)}
+        scalars[path.stem] = sorted(rows.items())
+    return scalars
+
+
+def learning_curve(
+    history: Sequence[Mapping[str, Any]],
+    scalars: Mapping[str, Sequence[tuple[int, float]]],
+    path: Path | str,
+    *,
+    title: str,
+    data_score: float | None,
+) -> None:
+    """Draw the score with its interval, and the losses, over gradient steps.
+
+    Args:
+        history: evaluations with ``"step"``, ``"score"``, ``"score_low"`` and
+            ``"score_high"``.
+        scalars: see :func:`read_scalars`.
+        path: the PNG to write.
+
+    Keyword Args:
+        title: what was trained on what.
+        data_score: mean normalised score of the data's episodes, if it is known.
+    """
+    panels = [name for name in PANELS if scalars.get(name)]
+    figure = new_figure(9, 6.4, layout="constrained")
+    grid = figure.add_gridspec(2, max(len(panels), 1), height_ratios=(2, 1))
+    figure.suptitle(title)
+
+    axes = figure.add_subplot(grid[0, :])
+    steps = [row["step"] for row in history]
+    low, high = ([row[f"score_{end}"] for row in history] for end in ("low", "high"))
+    axes.fill_between(steps, low, high, color=BLUE, alpha=0.2, linewidth=0)
+    axes.plot(
+        steps, [row["score"] for row in history], "o-", color=BLUE, markersize=4,
+        label="policy (mean of the episodes, 95 % interval)",
+    )  # fmt: skip
+    if data_score is not None:
+        label = "data (mean episode)"
+        axes.axhline(data_score, color=ORANGE, linestyle="--", label=label)
+    axes.set(xlabel="gradient steps", ylabel="normalised score")
+    axes.legend(loc="upper left", frameon=False)
+    for column, name in enumerate(panels):
+        small = figure.add_subplot(grid[1, column])
+        small.plot(*zip(*scalars[name], strict=True), color=GREY, linewidth=1)
+        small.set_title(PANELS[name], fontsize=9)
+        small.tick_params(labelsize=8)
+        small.set_xlabel("gradient steps", fontsize=8)
+        small.ticklabel_format(axis="x", style="sci", scilimits=(3, 3))
+    for each in figure.axes:
+        each.spines[["top", "right"]].set_visible(False)
+    save_figure(figure, path)

@@ -1,0 +1,137 @@
+"""The configuration of ``examples/evaluate.py``: its schema, and what is made of it.
+
+:func:`register` makes the schema known to Hydra, which then refuses a mistyped key or a
+value of the wrong type by name. :func:`make_disturbances` builds a suite's wrappers and
+attacks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import numpy as np
+from hydra.core.config_store import ConfigStore
+from hydra.utils import instantiate
+from numpy.typing import NDArray
+from omegaconf import MISSING
+
+from torchrl_osr.envs import attacked_policy, critics_of
+from torchrl_osr.evaluation import Disturbance
+from torchrl_osr.experiment.trained_run import TrainedRun
+
+DATA_UNIT = "data"
+"""As a wrapper's ``unit``: the data's standard deviations."""
+
+
+@dataclass
+class DisturbanceConfig:
+    """One kind of disturbance at one strength: either a wrapper or an attack.
+
+    Attributes:
+        kind: what is disturbed; knock, push and start end, the others stay.
+        strength: for the figure's axis, in the unit of its kind.
+        wrap: the wrapper of ``torchrl_osr.envs``, with ``_target_`` and ``_partial_``.
+        attack: options of ``attacked_policy``.
+    """
+
+    kind: str = MISSING
+    strength: float = MISSING
+    wrap: Any = None
+    attack: Any = None
+
+
+@dataclass
+class SuiteConfig:
+    """A list of disturbances.
+
+    Attributes:
+        name: part of the names of the result files.
+        disturbances: by name.
+    """
+
+    name: str = MISSING
+    disturbances: dict[str, DisturbanceConfig] = MISSING
+
+
+@dataclass
+class EvaluateConfig:
+    """All keys of ``examples/evaluate.py``.
+
+    Attributes:
+        checkpoint: a run's folder, or one checkpoint's file in it.
+        suite: the disturbances.
+        episodes: pairs of episodes for each checkpoint and disturbance, at least 2.
+        last: number of the run's newest checkpoints, or fewer if it has fewer.
+        seed: of the first checkpoint's first episode; the next checkpoint's is 1000
+            more.
+        force: repeat a finished evaluation.
+        num_threads: torch threads; several fight where the machine is shared.
+        progress: a progress bar, when on a terminal.
+    """
+
+    checkpoint: str = MISSING
+    suite: SuiteConfig = field(default_factory=SuiteConfig)
+    episodes: int = MISSING
+    last: int = MISSING
+    seed: int = MISSING
+    force: bool = MISSING
+    num_threads: int = MISSING
+    progress: bool = MISSING
+
+
+def register() -> None:
+    """Make the schema known to Hydra as ``evaluate_schema``."""
+    ConfigStore.instance().store(name="evaluate_schema", node=EvaluateConfig)
+
+
+def make_disturbances(
+    configs: Mapping[str, Any],
+    trained: TrainedRun,
+    scale: NDArray[np.floating],
+    *,
+    seed: int = 0,
+) -> list[Disturbance]:
+    """Build the wrappers and attacks of a suite.
+
+    Args:
+        configs: a :class:`DisturbanceConfig` by name.
+        trained: its networks are those that are attacked.
+        scale: standard deviation of each observation entry in the data, ``[S]``; takes
+            the place of a wrapper's ``unit: data``.
+
+    Keyword Args:
+        seed: of the attacks' draws. Default 0.
+
+    Raises:
+        ValueError: if a disturbance has both wrapper and attack, or neither, or if
+            there is an attack, whose unit is the data's standard deviation, but the
+            networks were trained on raw observations.
+    """
+    made = []
+    for name, config in configs.items():
+        if (config.wrap is None) == (config.attack is None):
+            raise ValueError(f"disturbance {name!r} needs either wrap or attack.")
+        wrap = policy = None
+        if config.wrap is not None:
+            wrap = instantiate(config.wrap)
+            if wrap.keywords.get("unit") == DATA_UNIT:
+                wrap = partial(wrap, unit=scale)
+        else:
+            if not trained.config.data.standardize:
+                raise ValueError(
+                    f"disturbance {name!r} is not possible for {trained.folder}: "
+                    "attacks are in standard deviations of the data, and the run has "
+                    "data.standardize=false."
+                )
+            policy = attacked_policy(
+                trained.actor.get_dist,
+                critics_of(trained.loss),
+                trained.observation_norm,
+                **config.attack,
+                seed=seed,
+            )
+        made.append(Disturbance(name, config.kind, config.strength, wrap, policy))
+    return made

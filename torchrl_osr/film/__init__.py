@@ -1,0 +1,55 @@
+"""Films of a recovery: several controllers that go on from the same disturbed state.
+
+* :func:`play_takeovers` plays the episodes, :func:`survival_table` counts survivors;
+* :class:`InverseDynamicsController` is the inverse dynamics model as a controller;
+* :func:`film_strip`, :func:`film_gif` and :func:`visited_states` draw one episode.
+
+``examples/film.py`` puts them together, ``docs/film.md`` has the meaning.
+"""
+
+from torchrl_osr.film.control import InverseDynamicsController, TargetRule
+from torchrl_osr.film.pictures import (
+    GIF_STRIDE,
+    Camera,
+    Take,
+    film_gif,
+    film_strip,
+    principal_plane,
+    visited_states,
+)
+from torchrl_osr.film.takeover import (
+    BEHAVIOR,
+    NEVER,
+    Controller,
+    PoseRecorder,
+    Survival,
+    Takeover,
+    discordant,
+    hand_over,
+    play_takeovers,
+    steps_alive,
+    survival_table,
+)
+
+__all__ = [
+    "BEHAVIOR",
+    "GIF_STRIDE",
+    "NEVER",
+    "Camera",
+    "Controller",
+    "InverseDynamicsController",
+    "PoseRecorder",
+    "Survival",
+    "Take",
+    "Takeover",
+    "TargetRule",
+    "discordant",
+    "film_gif",
+    "film_strip",
+    "hand_over",
+    "play_takeovers",
+    "principal_plane",
+    "steps_alive",
+    "survival_table",
+    "visited_states",
+]

@@ -1,0 +1,312 @@
+"""Several controllers that go on from the same state after a disturbance.
+
+The behaviour policy plays until the disturbance is over; then the controller that is
+tested takes over. The rest of the episode depends on the controller alone, not on the
+state in which each would have met the disturbance.
+
+Shapes: ``E`` episodes, ``S`` observation, ``A`` action, ``Q`` joint positions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeAlias
+
+import gymnasium
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchrl_osr.evaluation import (
+    DataDistance,
+    EpisodeEvaluator,
+    Policy,
+    Recorder,
+    Trajectory,
+    Wrap,
+    disturbed_at,
+    measure_recovery,
+    wilson_interval,
+)
+from torchrl_osr.evaluation.robustness import aligned_columns
+
+NEVER = torch.iinfo(torch.int64).max
+"""Moment of the takeover in an episode without a disturbance."""
+
+BEHAVIOR = "behaviour policy"
+"""Name of the behaviour policy among the controllers: it goes on playing."""
+
+Controller: TypeAlias = Callable[[list[Tensor]], Policy]
+"""Makes a policy for one evaluation.
+
+Its argument is the behaviour policy's undisturbed episodes, raw observations ``[T, S]``
+of each from the reset on.
+"""
+
+
+def steps_alive(trajectory: Trajectory, moment: int, steps: int) -> int:
+    """Steps of an episode without a fall after a moment, at most ``steps``.
+
+    Args:
+        trajectory: lasts ``steps`` steps after the moment, or ends in a fall.
+        moment: the entry to count from.
+        steps: to be counted at most.
+
+    Raises:
+        ValueError: if it ended before that without a fall.
+    """
+    later = trajectory.last - moment
+    if later < steps and not trajectory.terminated:
+        raise ValueError(f"broken off {later} steps after entry {moment}, not {steps}.")
+    # The last entry of a fallen one is the fall.
+    return max(min(later - trajectory.terminated, steps), 0)
+
+
+@dataclass(frozen=True)
+class Survival:
+    """Survival and recovery of one controller, one entry an episode.
+
+    Attributes:
+        horizons: numbers of steps after the disturbance at which survivors are counted,
+            ascending.
+        returns: sum of the rewards of all steps, ``[E]``.
+        alive: steps without a fall after it, at most the last horizon, ``[E]``.
+        alive_clean: the same in the undisturbed episode, after the same moment,
+            ``[E]``.
+        steps_back: steps until back in the data, ``None`` if never, ``[E]``.
+    """
+
+    horizons: tuple[int, ...]
+    returns: list[float]
+    alive: list[int]
+    alive_clean: list[int]
+    steps_back: list[int | None]
+
+    @property
+    def up(self) -> list[bool]:
+        """Whether it had not fallen at the last horizon, ``[E]``."""
+        return [steps >= self.horizons[-1] for steps in self.alive]
+
+    def count(self, horizon: int, *, clean: bool = False) -> int:
+        """Number of episodes without a fall until ``horizon`` steps later."""
+        alive = self.alive_clean if clean else self.alive
+        return sum(steps >= horizon for steps in alive)
+
+
+class PoseRecorder(Recorder):
+    """Keeps trajectories and the poses of the robot.
+
+    Args:
+        environments: of the evaluation, MuJoCo's.
+
+    Attributes:
+        poses: joint positions at each entry of each episode, ``[Q]`` each.
+        forces: of the push in each episode, with its sign; 0 if there was none.
+        returns: sum of rewards of each episode.
+    """
+
+    def __init__(self, environments: Sequence[gymnasium.Env[Any, Any]]) -> None:
+        super().__init__(len(environments))
+        self._simulations: list[Any] = [each.unwrapped for each in environments]
+        self.poses: list[list[NDArray[np.float64]]] = [[] for _ in environments]
+        self.forces = [0.0] * len(environments)
+        self.returns: list[float] = []
+
+    def __call__(
+        self,
+        episode: int,
+        observation: NDArray[Any],
+        terminated: bool,
+        info: dict[str, Any],
+    ) -> None:
+        super().__call__(episode, observation, terminated, info)
+        self.poses[episode].append(self._simulations[episode].data.qpos.copy())
+        self.forces[episode] = info.get("push_force") or self.forces[episode]
+
+
+class Takeover(NamedTuple):
+    """One controller's episodes.
+
+    Attributes:
+        disturbed: with the disturbance.
+        clean: without it; the controller takes over at the same moments.
+    """
+
+    disturbed: PoseRecorder
+    clean: PoseRecorder
+
+    def up_clean(self, moments: Tensor, steps: int) -> list[int]:
+        """Numbers of the disturbed episodes that last that long without disturbance.
+
+        Args:
+            moments: when it was over, int64 ``[E]``, or :data:`NEVER`.
+            steps: without a fall after it.
+        """
+        pairs = zip(self.clean.trajectories, moments.tolist(), strict=True)
+        # A difference, since NEVER plus anything overflows.
+        return [
+            episode
+            for episode, (trajectory, moment) in enumerate(pairs)
+            if trajectory.last - trajectory.terminated - moment >= steps
+        ]
+
+    def survival(
+        self,
+        episodes: Sequence[int],
+        moments: Tensor,
+        distance: DataDistance,
+        horizons: tuple[int, ...],
+    ) -> Survival:
+        """Survival and recovery in some of the episodes.
+
+        Args:
+            episodes: their numbers; each met the disturbance.
+            moments: when it was over, int64 ``[E]``.
+            distance: to the data.
+            horizons: see :class:`Survival`.
+        """
+        disturbed, clean = (
+            [recorder.trajectories[episode] for episode in episodes]
+            for recorder in self
+        )
+        ends = moments[list(episodes)].tolist()
+        alive, alive_clean = (
+            [
+                steps_alive(trajectory, end, horizons[-1])
+                for trajectory, end in zip(some, ends, strict=True)
+            ]
+            for some in (disturbed, clean)
+        )
+        steps = [
+            measure_recovery(*pair, distance).steps
+            for pair in zip(disturbed, clean, strict=True)
+        ]
+        returns = [self.disturbed.returns[episode] for episode in episodes]
+        return Survival(horizons, returns, alive, alive_clean, steps)
+
+
+def hand_over(before: Policy, after: Policy, moments: Tensor) -> Policy:
+    """One policy up to a moment, and another one from then on.
+
+    Both are called in every step, so that a controller that counts its calls knows the
+    time. The policy counts its own calls, too: it is for one evaluation with all rows
+    in every call.
+
+    Args:
+        before: acts first.
+        after: takes over.
+        moments: steps of each row before it does, int64 ``[E]``.
+    """
+    step = 0
+
+    def policy(observation: Tensor) -> Tensor:
+        nonlocal step
+        first, second = before(observation), after(observation)
+        over = (step >= moments)[:, None]
+        step += 1
+        return torch.where(over, second, first)
+
+    return policy
+
+
+def play_takeovers(
+    env_id: str,
+    behavior: Policy,
+    controllers: Mapping[str, Controller],
+    disturbance: Wrap,
+    *,
+    duration: int,
+    latest: int,
+    after: int,
+    num_episodes: int = 20,
+    seed: int = 0,
+) -> tuple[dict[str, Takeover], Tensor]:
+    """Play every controller's episodes, disturbed and clean.
+
+    Args:
+        env_id: a Gymnasium id of a MuJoCo task.
+        behavior: plays first; the same observation gives the same action.
+        controllers: by name.
+        disturbance: wraps the environment, acts once an episode.
+
+    Keyword Args:
+        duration: of the disturbance, in steps.
+        latest: step at which it begins at the latest.
+        after: steps that are played after its end, at least.
+        num_episodes: ``E``. Default 20.
+        seed: the episodes are seeded ``seed, seed + 1, ...``. Default 0.
+
+    Returns:
+        Episodes by controller, the behaviour policy first as :data:`BEHAVIOR`; and the
+        entry after each episode's disturbance, at which the controller takes over,
+        int64 ``[E]``, :data:`NEVER` where the behaviour policy fell before.
+    """
+
+    def play(policy: Policy, wrap: Wrap) -> PoseRecorder:
+        limit = latest + duration + after
+        evaluator = EpisodeEvaluator(
+            env_id, num_episodes=num_episodes, seed=seed, fixed_batch=True,
+            wrap=lambda env: gymnasium.wrappers.TimeLimit(wrap(env), limit),
+        )  # fmt: skip
+        recorder = PoseRecorder(evaluator.environments)
+        recorder.returns = evaluator(policy, recorder).returns.tolist()
+        evaluator.close()
+        return recorder
+
+    wraps: tuple[Wrap, Wrap] = (disturbance, lambda env: env)
+    played = {BEHAVIOR: Takeover(*(play(behavior, wrap) for wrap in wraps))}
+    begins = map(disturbed_at, played[BEHAVIOR].disturbed.trajectories)
+    moments = torch.tensor([NEVER if at is None else at + duration for at in begins])
+    references = [
+        torch.from_numpy(np.stack(each.observations))
+        for each in played[BEHAVIOR].clean.trajectories
+    ]
+    for name, make in controllers.items():
+        # One policy for each evaluation: it may count its calls.
+        played[name] = Takeover(
+            *(
+                play(hand_over(behavior, make(references), moments), wrap)
+                for wrap in wraps
+            )
+        )
+    return played, moments
+
+
+def discordant(ours: Sequence[bool], theirs: Sequence[bool]) -> tuple[int, int]:
+    """Numbers of pairs in which only the first is true, and only the second."""
+    pairs = list(zip(ours, theirs, strict=True))
+    return pairs.count((True, False)), pairs.count((False, True))
+
+
+def survival_table(controllers: Mapping[str, Survival]) -> str:
+    """Text table with one line for each controller, the first being the reference.
+
+    The last column counts pairs at the last horizon: those in which only this
+    controller was up, and those in which only the reference was.
+
+    Args:
+        controllers: by name; the same disturbed episodes each.
+    """
+    reference = next(iter(controllers.values()))
+    total, last = len(reference.alive), reference.horizons[-1]
+    titles = [f"up after {each}" for each in reference.horizons]
+    titles += ["95 % interval", f"undisturbed {last}", "back in data", "only it/first"]
+    rows = [["", *titles]]
+    for name, each in controllers.items():
+        low, high = wilson_interval(each.count(last), total)
+        back = [steps for steps in each.steps_back if steps is not None]
+        median = f" in {np.median(back):.0f}" if back else ""
+        only_it, only_reference = discordant(each.up, reference.up)
+        rows.append(
+            [
+                name,
+                *(str(each.count(horizon)) for horizon in each.horizons),
+                f"{100 * low:.0f}-{100 * high:.0f} %",
+                str(each.count(last, clean=True)),
+                f"{len(back)}{median}",
+                "" if each is reference else f"{only_it}/{only_reference}",
+            ]
+        )
+    return "\n".join(line.rstrip() for line in aligned_columns(rows))

@@ -1,0 +1,172 @@
+r"""TD3+BC: a deterministic policy that seeks values and stays with the data's actions.
+
+Shapes: ``B`` batch (any leading dimensions), ``A`` action, ``N`` critics. The equations
+are in :mod:`torchrl_osr.functional`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
+from torch import Tensor
+
+from torchrl_osr import functional
+from torchrl_osr._checks import check_literals, check_positive, check_weight
+from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
+from torchrl_osr.objectives.step import Step, actor_critic_in_keys
+
+
+class TD3BCLoss(BaseLoss):
+    r"""TD3 with behaviour cloning (TD3+BC).
+
+    .. math::
+        L_\pi &= \mathbb E_D \Big[ \|\pi(s) - a\|^2 / A
+            - \frac{\alpha}{\mathbb E_D |Q_1(s, \pi(s))|}\, Q_1(s, \pi(s)) \Big] \\
+        L_Q &= \sum_i \mathbb E_D (Q_i - T)^2, \quad
+        T = r + \gamma\,(1 - \text{terminated}) \min_i
+            \bar Q_i(s', \bar\pi(s') + \epsilon)
+
+    Presented in "A Minimalist Approach to Offline Reinforcement Learning",
+    https://arxiv.org/abs/2106.06860. In TorchRL 0.14.1's ``TD3BCLoss`` the cloning term
+    is a mean over the batch that is added to each row: masks and priority weights do
+    not reach it, and with ``reduction="none"`` it is not the row's. The authors update
+    policy and targets every second step; how often is the training loop's to say.
+
+    Args:
+        actor_network: writes the action; see
+            :func:`~torchrl_osr.modules.deterministic_actor`.
+        qvalue_network: one critic, copied by TorchRL, or a list of critics that keep
+            their own weights (:func:`~torchrl_osr.modules.critic_ensemble`).
+
+    Keyword Args:
+        alpha: weight of the values against cloning. Default 2.5.
+        policy_noise: standard deviation of :math:`\epsilon`, in units of the action.
+            Default 0.2.
+        noise_clip: largest magnitude of :math:`\epsilon`. Default 0.5.
+        low, high: action bounds, between which the target's action is kept. Default
+            -1 and 1.
+        options: of every loss: ``num_qvalue_nets``, ``loss_function``,
+            ``delay_qvalue``, ``deactivate_vmap``, ``reduction``,
+            ``use_prioritized_weights`` and ``scalar_output_mode``, see
+            :class:`~torchrl_osr.objectives.BaseLoss`.
+
+    Raises:
+        ValueError: if an option is out of its range; in the call, if the batch is
+            empty.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.objectives import SoftUpdate
+        >>> from torchrl_osr.modules import critic_ensemble, deterministic_actor
+        >>> from torchrl_osr.objectives import TD3BCLoss
+        >>> loss = TD3BCLoss(deterministic_actor(11, 3), critic_ensemble(11, 3))
+        >>> updater = SoftUpdate(loss, tau=5e-3)
+        >>> no = torch.zeros(4, 1, dtype=torch.bool)
+        >>> batch = TensorDict({
+        ...     "observation": torch.randn(4, 11), "action": torch.rand(4, 3),
+        ...     "next": {"observation": torch.randn(4, 11), "reward": torch.ones(4, 1),
+        ...              "done": no, "terminated": no}}, [4])
+        >>> sorted(loss(batch).keys())
+        ['cloning_error', 'loss_actor', 'loss_qvalue', 'pred_value', 'target_value']
+    """
+
+    _AcceptedKeys = TransitionKeys
+    default_keys = TransitionKeys
+    tensor_keys: TransitionKeys
+
+    def __init__(
+        self,
+        actor_network: TensorDictModuleBase,
+        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+        *,
+        alpha: float = 2.5,
+        policy_noise: float = 0.2,
+        noise_clip: float = 0.5,
+        low: float = -1.0,
+        high: float = 1.0,
+        **options: Any,
+    ) -> None:
+        check_literals(TD3BCLoss.__init__, locals())
+        check_weight("alpha", alpha)
+        check_weight("policy_noise", policy_noise)
+        check_positive("noise_clip", noise_clip, minimum=0)
+        if not low < high:
+            raise ValueError(f"high must be above low={low}, got {high}.")
+        super().__init__(**options)
+        self._hold_actor_critic(
+            actor_network,
+            qvalue_network,
+            delay_actor=self.delay_qvalue,
+        )
+        self.alpha = alpha
+        self.policy_noise, self.noise_clip = policy_noise, noise_clip
+        self.low, self.high = low, high
+        self.make_value_estimator()
+
+    def _input_keys(self) -> list[NestedKey]:
+        return actor_critic_in_keys(self, perturbed=False)
+
+    def _output_keys(self) -> tuple[list[NestedKey], list[NestedKey]]:
+        metrics = ["cloning_error", "pred_value", "target_value"]
+        return ["loss_actor", "loss_qvalue"], metrics
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return the losses and metrics of a batch, see ``out_keys``.
+
+        Writes the largest absolute TD error of the critics under the ``priority`` key,
+        ``[B]``, and nothing else, into ``tensordict``.
+
+        Args:
+            tensordict: a batch ``[B]`` with the entries of ``in_keys``.
+        """
+        step = Step(self, tensordict, perturbed=False)
+        actor, cloning_error = self.actor_loss(step)
+        params = self.qvalue_network_params
+        pred_value = step.qvalue(step.states[0], step.data_action, params)
+        target_value = self._target_value(step)
+        qvalue = self.qvalue_loss(step, pred_value, target_value)
+        step.write_priority(pred_value, target_value)
+        metrics = {
+            "cloning_error": step.mean(cloning_error),
+            "pred_value": step.mean(pred_value),
+            "target_value": step.mean(target_value),
+        }
+        losses = {"loss_actor": actor, "loss_qvalue": qvalue}
+        return self._output(tensordict, losses, metrics)
+
+    def actor_loss(self, step: Step) -> tuple[Tensor, Tensor]:
+        r""":math:`L_\pi`, and the squared distance to the data's action, ``[B]``."""
+        action = step.action(step.states[0], self.actor_network_params)
+        # Detached: the policy's objective shall not train the critics.
+        params = self.qvalue_network_params.detach()
+        qvalue = step.qvalue(step.states[0], action, params)[0]
+        cloning_error = functional.cloning_error(action, step.data_action)
+        magnitude = step.mean(qvalue.abs())
+        objective = functional.td3_bc_objective(
+            qvalue, cloning_error, magnitude, self.alpha
+        )
+        return step.reduce(objective), cloning_error
+
+    @torch.no_grad()
+    def _target_value(self, step: Step) -> Tensor:
+        """The TD target, ``[B]``, with target policy smoothing."""
+        state = step.states[1]
+        action = step.action(state, self.target_actor_network_params)
+        noise = self.policy_noise * torch.randn_like(action)
+        noise = noise.clamp(-self.noise_clip, self.noise_clip)
+        action = (action + noise).clamp(self.low, self.high)
+        qvalue = step.qvalue(state, action, self.target_qvalue_network_params)
+        return step.td_target(functional.bootstrap_value(qvalue))
+
+    def qvalue_loss(
+        self, step: Step, pred_value: Tensor, target_value: Tensor
+    ) -> Tensor:
+        """Sum over critics of the TD distance."""
+        distance = step.td_distance(pred_value, target_value)
+        return step.reduce(distance)

@@ -1,0 +1,296 @@
+"""Checkpoints that are whole, and that cannot run code when loaded.
+
+They are :mod:`torchrl.checkpoint` archives: one ZIP file each, written under another
+name and renamed, every member with a checksum. Two things are added: a payload that is
+only ever read with ``weights_only=True`` (TorchRL 0.14.1 unpickles what it finds beside
+a memory-mapped tensordict), and a way back from a damaged newest file.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import zipfile
+import zlib
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from torchrl.checkpoint import (
+    Checkpoint,
+    CheckpointAdapter,
+    CheckpointError,
+    CheckpointRotation,
+)
+
+from torchrl_osr._files import check_disk_space, refuse_archive
+
+log = logging.getLogger(__name__)
+
+
+class WeightsOnlyAdapter(CheckpointAdapter):
+    """Saves ``state_dict()`` with :func:`torch.save`, loads it weights only."""
+
+    adapter_id = "torchrl_osr.weights_only"
+    filename = "state.pt"
+
+    def save(
+        self,
+        component: Any,
+        path: Path,
+        *,
+        args: tuple[Any, ...],
+        kwargs: Mapping[str, Any],
+    ) -> None:
+        """Write the component's state below the folder ``path``."""
+        path.mkdir(parents=True, exist_ok=True)
+        # Given a path, torch.save turns an error of the disk into a RuntimeError.
+        with (path / self.filename).open("wb") as file:
+            torch.save(component.state_dict(*args, **kwargs), file)
+
+    def load(
+        self,
+        component: Any,
+        path: Path,
+        *,
+        map_location: Any,
+        tensor_load_kwargs: Mapping[str, Any],
+        args: tuple[Any, ...],
+        kwargs: Mapping[str, Any],
+    ) -> None:
+        """Restore the component's state from the folder ``path``."""
+        del tensor_load_kwargs
+        with zipfile.ZipFile(path / self.filename) as archive:
+            refuse_archive(archive)
+        state = torch.load(
+            path / self.filename, map_location=map_location, weights_only=True
+        )
+        if isinstance(component, torch.nn.Module):
+            _check_fits(component.state_dict(), state)
+        component.load_state_dict(state, *args, **kwargs)
+
+
+def _check_fits(here: Mapping[str, Any], there: Mapping[str, Any]) -> None:
+    """Raise before anything is overwritten; tensordict's own error names no shapes."""
+
+    def shape(state: Mapping[str, Any], key: str) -> str:
+        value = state.get(key, "nothing")
+        return str(tuple(value.shape)) if isinstance(value, torch.Tensor) else "nothing"
+
+    differences = [
+        f"{key} is {shape(there, key)} in the file, {shape(here, key)} here"
+        for key in sorted(here.keys() | there.keys())
+        if shape(here, key) != shape(there, key)
+    ]
+    if differences:
+        shown = "; ".join(differences[:3])
+        raise ValueError(f"{len(differences)} tensors differ: {shown}.")
+
+
+class GeneratorState:
+    """Makes a :class:`torch.Generator` checkpointable.
+
+    Args:
+        generator: whose state to save and restore.
+    """
+
+    def __init__(self, generator: torch.Generator) -> None:
+        self.generator = generator
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """Return the generator's state."""
+        return {"state": self.generator.get_state()}
+
+    def load_state_dict(self, state_dict: Mapping[str, torch.Tensor]) -> None:
+        """Continue from a saved state."""
+        self.generator.set_state(state_dict["state"].cpu())
+
+
+def safe_checkpoint(**components: Any) -> Checkpoint:
+    """Checkpoint of ``components`` in one archive without pickled objects.
+
+    Args:
+        **components: whatever has ``state_dict`` and ``load_state_dict``, or is
+            JSON-compatible (lists and mappings are restored in place).
+    """
+    checkpoint = Checkpoint(format="archive")
+    for name, component in components.items():
+        stateful = hasattr(component, "state_dict")
+        adapter = WeightsOnlyAdapter() if stateful else None
+        checkpoint.register(name, component, adapter=adapter)
+    return checkpoint
+
+
+def find_damage(path: Path) -> str | None:
+    """Description of a checkpoint's damage, ``None`` if it is whole.
+
+    Members with a path out of the archive count as damage, and so do compressed ones,
+    which ours are not: torchrl.checkpoint unpacks whatever the manifest lists.
+
+    Args:
+        path: of the archive. Every member is read and its checksum compared, and the
+            components' files must be there.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            refuse_archive(archive)
+            damaged = archive.testzip()
+            members = set(archive.namelist())
+        if damaged is not None:
+            return f"wrong checksum of {damaged}"
+        # The names of the members have no checksum.
+        listed = {
+            f"{component['path']}/{file}"
+            for component in Checkpoint.manifest(path)["components"].values()
+            for file in component["files"]
+        }
+    except (
+        zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, KeyError,
+        TypeError, AttributeError, NotImplementedError, CheckpointError,
+    ) as error:  # fmt: skip
+        return str(error)
+    missing = sorted(listed - members)
+    return f"{', '.join(missing)} missing" if missing else None
+
+
+class Checkpoints:
+    """The checkpoints of one training run, in a folder of its own.
+
+    ``checkpoint-<step>.torchrl`` are the newest; ``best.torchrl`` has the model of the
+    best evaluation.
+
+    Args:
+        folder: where they are; made when the run is restored.
+        components: the live objects to save and restore, by name, see
+            :func:`safe_checkpoint`.
+
+    Keyword Args:
+        interval: steps between two checkpoints.
+        kept: how many of the newest stay.
+    """
+
+    def __init__(
+        self,
+        folder: Path | str,
+        components: Mapping[str, Any],
+        *,
+        interval: int,
+        kept: int,
+    ) -> None:
+        self.folder, self.interval = Path(folder), interval
+        self.best_path = self.folder / "best.torchrl"
+        self._rotation = CheckpointRotation(self.folder, keep_last=kept)
+        self._checkpoint = safe_checkpoint(**components)
+
+    def latest(self) -> Path | None:
+        """Path of the newest checkpoint, or ``None``."""
+        path: Path | None = self._rotation.latest()
+        return path
+
+    def check_room(
+        self, loss_module: torch.nn.Module, optimizer: torch.optim.Optimizer
+    ) -> None:
+        """Raise an OSError unless all checkpoints of a run will fit on the disk."""
+        groups = optimizer.param_groups
+        trained = [each for group in groups for each in group["params"]]
+        # The networks, and Adam's two moments of what is trained.
+        held = [*loss_module.parameters(), *loss_module.buffers(), *trained, *trained]
+        size = sum(each.numel() * each.element_size() for each in held)
+        number = self._rotation.keep_last + 2  # the best, and one being written
+        there = sum(path.stat().st_size for path in self.folder.glob("*.torchrl"))
+        check_disk_space(self.folder, number * size - there, f"{number} checkpoints")
+
+    def save(self, step: int, *, extra: bool = False) -> None:
+        """Write the checkpoint of a step; the oldest one makes room.
+
+        Args:
+            step: of the run.
+
+        Keyword Args:
+            extra: whether it is one more, written because the run is interrupted. It is
+                removed when the next regular one is written, so that the folder of a
+                continued run ends up with the files of an undisturbed one.
+
+        Raises:
+            OSError: if it cannot be written.
+        """
+        outdated = [
+            path for path in self._rotation.checkpoints()
+            if (saved := int(path.stem.rpartition("-")[2])) % self.interval
+            and saved != step
+        ]  # fmt: skip
+        kept = self._rotation.keep_last
+        self._rotation.keep_last += len(outdated) + extra
+        try:
+            with self.write_errors_explained():
+                self._rotation.save(self._checkpoint, step=step)
+        finally:
+            self._rotation.keep_last = kept
+        for path in outdated:
+            path.unlink()
+
+    def save_best(self, names: Collection[str], metadata: Mapping[str, Any]) -> None:
+        """Write the components of these names to :attr:`best_path`."""
+        with self.write_errors_explained():
+            self._checkpoint.save(
+                self.best_path, components=names, metadata=dict(metadata)
+            )
+
+    def restore(self) -> Path | None:
+        """Restore the newest undamaged checkpoint.
+
+        What a killed process left half written is removed: only one run uses a folder.
+
+        Returns:
+            Path of the checkpoint, or ``None`` if the folder holds none.
+
+        Raises:
+            CheckpointError: if a checkpoint does not fit the components, or every one
+                in the folder is damaged.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        for leftover in self.folder.glob(".*.torchrl.*"):
+            if leftover.is_dir():
+                shutil.rmtree(leftover)
+            else:
+                leftover.unlink()
+        pattern = f"{self._rotation.prefix}-*.torchrl"
+        found: list[Path] = sorted(self.folder.glob(pattern), reverse=True)
+        for path in found:
+            damage = find_damage(path)
+            if damage is not None:
+                log.warning(
+                    f"Checkpoint {path} is damaged ({damage}); trying the one before."
+                )
+                continue
+            try:
+                self._checkpoint.load(path, map_location="cpu")
+            except CheckpointError as error:
+                raise CheckpointError(
+                    f"{path} does not fit this run: {error} Resume with the "
+                    "configuration that it was written with, or start in another "
+                    "folder.",
+                    error.result,
+                ) from error
+            return path
+        if found:
+            raise CheckpointError(
+                f"All {len(found)} checkpoints in {self.folder} are damaged; move them "
+                "away to start anew."
+            )
+        return None
+
+    @contextmanager
+    def write_errors_explained(self, what: str = "a checkpoint") -> Iterator[None]:
+        """Add to an error of the disk what to do about it."""
+        try:
+            yield
+        except OSError as error:
+            raise OSError(
+                error.errno,
+                f"Cannot write {what} of {self.folder}: {error}. Free space or mend "
+                "the folder's rights and run again: the last whole checkpoint is "
+                f"{self.latest()}.",
+            ) from error

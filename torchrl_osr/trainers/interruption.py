@@ -1,0 +1,95 @@
+"""Signals that end a run: noted, and acted upon between two updates.
+
+Clusters, containers and preemptible machines send SIGTERM and kill a while later,
+Ctrl-C sends SIGINT, a closed terminal SIGHUP. In each case the run finishes the update
+that it is in, writes a checkpoint and ends with an exit code of its own.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+EXIT_CODES = {signal.SIGTERM: 75, signal.SIGINT: 130}
+"""75 is ``EX_TEMPFAIL`` of ``sysexits.h``, "try again"; 130 is what shells have for
+Ctrl-C. SIGHUP, which Windows lacks, is added where it exists."""
+
+if hasattr(signal, "SIGHUP"):
+    EXIT_CODES[signal.SIGHUP] = EXIT_CODES[signal.SIGTERM]
+
+
+class Interrupted(SystemExit):
+    """Ends the process after a signal, with everything saved to be continued.
+
+    Args:
+        reason: which signal, and what was saved where.
+        code: the exit code, see :data:`EXIT_CODES`.
+    """
+
+    def __init__(self, reason: str, code: int) -> None:
+        super().__init__(code)
+        self.reason = reason
+
+    def __str__(self) -> str:
+        return self.reason
+
+    def __reduce__(self) -> tuple[type[Interrupted], tuple[str, int]]:
+        # A worker process sends it to its parent.
+        return type(self), (self.reason, int(self.code or 0))
+
+
+class StopRequest:
+    """Whether the process was asked to end.
+
+    Attributes:
+        signal: the first of the signals that came, or ``None``.
+    """
+
+    signal: signal.Signals | None = None
+
+
+@contextmanager
+def signals_noted() -> Iterator[StopRequest]:
+    """Note SIGTERM, SIGINT and SIGHUP instead of dying of them.
+
+    A second Ctrl-C raises :class:`KeyboardInterrupt` at once. Handlers are installed in
+    the main thread only, since Python runs them there, and only in place of Python's
+    defaults: a handler that somebody else has installed stays, such as submitit's.
+
+    Examples:
+        >>> import os, signal
+        >>> from torchrl_osr.trainers.interruption import signals_noted
+        >>> with signals_noted() as request:
+        ...     os.kill(os.getpid(), signal.SIGTERM)
+        ...     request.signal.name
+        'SIGTERM'
+    """
+    request = StopRequest()
+    defaults = dict.fromkeys(EXIT_CODES, signal.SIG_DFL)
+    defaults[signal.SIGINT] = signal.default_int_handler  # type: ignore[assignment]
+    in_main = threading.current_thread() is threading.main_thread()
+    ours = [
+        number for number, default in defaults.items()
+        if in_main and signal.getsignal(number) is default
+    ]  # fmt: skip
+
+    def note(number: int, frame: FrameType | None) -> None:
+        request.signal = request.signal or signal.Signals(number)
+        if number == signal.SIGINT:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            # A print could interrupt another one halfway, which Python refuses.
+            message = "\nStopping after this update; Ctrl-C again stops at once.\n"
+            os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, message.encode())
+
+    for number in ours:
+        signal.signal(number, note)
+    try:
+        yield request
+    finally:
+        for number in ours:
+            signal.signal(number, defaults[number])

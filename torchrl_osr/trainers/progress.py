@@ -1,0 +1,80 @@
+"""Progress of a training phase: a bar on a terminal, lines in the log elsewhere."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+
+try:
+    from tqdm.auto import tqdm
+    from tqdm.contrib.logging import logging_redirect_tqdm
+except ImportError as error:
+    raise ImportError(
+        f"the trainer needs {error.name!r}: pip install torchrl-osr[examples]"
+    ) from error
+
+log = logging.getLogger(__name__)
+
+SECONDS_BETWEEN_LINES = 30
+
+
+class Progress:
+    """Shows how far a phase is, and logs a line where there is no bar to look at.
+
+    A line has the phase, the step, the rate, the time left and the last result:
+    ``policy: step 2500 of 20000, 210 steps/s, 01:23 left, score 31.2``.
+
+    Args:
+        description: names the phase.
+        total: steps of the whole run.
+
+    Keyword Args:
+        bar: show a progress bar when on a terminal. Default ``True``.
+    """
+
+    def __init__(self, description: str, total: int, *, bar: bool = True) -> None:
+        self._description, self._total, self._wanted = description, total, bar
+        self._result = ""
+
+    @contextmanager
+    def shown(self, step: int) -> Iterator[None]:
+        """Show the bar, if there is one, from a step on."""
+        self._bar = tqdm(
+            total=self._total,
+            initial=step,
+            desc=self._description,
+            unit="step",
+            # None: disabled where the output is not a terminal.
+            disable=None if self._wanted else True,
+        )
+        self._first, self._began = step, time.monotonic()
+        self._last_line = self._began
+        redirected = nullcontext() if self._bar.disable else logging_redirect_tqdm()
+        with self._bar, redirected:
+            yield
+
+    def update(self, step: int) -> None:
+        """Show a step; where there is no bar, log a line every half minute at most."""
+        self._bar.update(step - self._bar.n)
+        since = time.monotonic() - self._last_line
+        if self._bar.disable and since >= SECONDS_BETWEEN_LINES:
+            self._log(step)
+
+    def result(self, step: int, text: str) -> None:
+        """Show the result of an evaluation, and log it."""
+        self._result = f", {text}"
+        self._bar.set_postfix_str(text)
+        self._log(step)
+
+    def _log(self, step: int) -> None:
+        self._last_line = time.monotonic()
+        rate = (step - self._first) / max(self._last_line - self._began, 1e-9)
+        pace = ""
+        if rate:
+            left = tqdm.format_interval((self._total - step) / rate)
+            pace = f", {rate:.3g} steps/s, {left} left"
+        log.info(
+            f"{self._description}: step {step} of {self._total}{pace}{self._result}"
+        )
