@@ -223,3 +223,24 @@ def test_five_seeds_have_a_verdict_and_many_methods_small_panels(tmp_path):
 def test_names_of_files_are_safe():
     assert slug("../Hopper medium-replay, 50 %") == "hopper-medium-replay-50"
     assert slug("$$$") == "unnamed"
+
+
+def test_the_example_packs_runs_reports_on_them_and_says_what_is_missing(
+    tmp_path, monkeypatch, capsys
+):
+    example = Path(__file__).parents[2] / "examples" / "report.py"
+
+    def run(*arguments: object) -> str:
+        monkeypatch.setattr("sys.argv", ["report.py", *map(str, arguments)])
+        runpy.run_path(str(example), run_name="__main__")
+        return capsys.readouterr().out
+
+    fakes.write_run(tmp_path / "runs" / "a", {1: [1.0, 2.0]})
+    table, page = tmp_path / "runs.jsonl.gz", tmp_path / "page"
+    assert "1 runs in" in run(tmp_path / "runs", "--pack", table)
+    output = run(table, "--output", page)
+    assert "mind: Every method has one seed" in output
+    assert (page / "report.html").exists()
+    with pytest.raises(SystemExit):
+        run(tmp_path / "nowhere")
+    assert "nowhere does not exist" in capsys.readouterr().err

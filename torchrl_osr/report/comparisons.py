@@ -15,7 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from torchrl_osr.evaluation import nested_resamples, percentile_interval
-from torchrl_osr.report.methods import METHOD, comparable, entry
+from torchrl_osr.report.methods import METHOD, comparable, exact
 from torchrl_osr.report.runs import Run, RunTables
 from torchrl_osr.report.scores import (
     Estimate,
@@ -232,7 +232,7 @@ def _caveat(pairs: Sequence[tuple[Run, Run]]) -> str:
         keys |= {
             key
             for key in mine.keys() | theirs.keys()
-            if not key.startswith(METHOD) and entry(key, mine) != entry(key, theirs)
+            if not key.startswith(METHOD) and exact(key, mine) != exact(key, theirs)
         }
         if own.versions != other.versions:
             keys.add("versions")

@@ -89,10 +89,9 @@ def name_methods(runs: Sequence[Run]) -> tuple[list[Run], list[LeftOut]]:
         kinds = distinctions([comparable(run) for run in group])
         for run, kind in zip(group, kinds, strict=True):
             name = f"{method} ({kind})" if kind else method
-            first = kept.setdefault(
-                (name, run.data, run.seed), replace(run, method=name)
-            )
-            if first.folder != run.folder:
+            run = replace(run, method=name)
+            first = kept.setdefault((name, run.data, run.seed), run)
+            if first is not run:
                 reason = f"the same run as {first.folder}, which is in the report"
                 left_out.append(LeftOut(run.folder, reason))
     return list(kept.values()), left_out
@@ -136,10 +135,10 @@ def comparable(run: Run) -> dict[str, Any]:
 def differing(facts: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return the entries in which they are not all equal."""
     keys = dict.fromkeys(key for each in facts for key in each)
-    return [key for key in keys if len({entry(key, each) for each in facts}) > 1]
+    return [key for key in keys if len({exact(key, each) for each in facts}) > 1]
 
 
-def entry(key: str, facts: Mapping[str, Any]) -> str:
+def exact(key: str, facts: Mapping[str, Any]) -> str:
     """Return an entry in full, as a text to compare."""
     return repr(facts[key]) if key in facts else "none"
 
@@ -152,16 +151,11 @@ def distinctions(facts: Sequence[Mapping[str, Any]]) -> list[str]:
         equal.
     """
     keys = differing(facts)
-    kinds = ["; ".join(entry(key, each) for key in keys) for each in facts]
+    kinds = ["; ".join(exact(key, each) for key in keys) for each in facts]
     shown = sorted(keys, key=lambda key: (key != "trainer.steps", keys.index(key)))
     if "trainer.steps" in shown and "evaluated at" in shown:
         shown.remove("evaluated at")  # the one brings the other with it
-    rest = len(shown) - NUM_NAMED
-    texts = [
-        ", ".join(describe(key, each) for key in shown[:NUM_NAMED])
-        + (f" and {rest} more" if rest > 0 else "")
-        for each in facts
-    ]
+    texts = [_few(shown, each) for each in facts]
     if len(set(texts)) < len(set(kinds)):  # what differs did not fit in
         order = list(dict.fromkeys(kinds))
         texts = [
@@ -171,7 +165,7 @@ def distinctions(facts: Sequence[Mapping[str, Any]]) -> list[str]:
     return texts
 
 
-def describe(key: str, facts: Mapping[str, Any]) -> str:
+def in_words(key: str, facts: Mapping[str, Any]) -> str:
     """Return an entry in words."""
     # What is built is known by its name; where it is imported from is no setting.
     name = key.removesuffix("._target_")
@@ -185,6 +179,13 @@ def describe(key: str, facts: Mapping[str, Any]) -> str:
         return f"other {key}"
     value = str(facts[key])
     return f"{name}={value.rpartition('.')[2] if name != key else value}"
+
+
+def _few(keys: Sequence[str], facts: Mapping[str, Any]) -> str:
+    """Return the first of some entries in words, and how many more there are."""
+    rest = len(keys) - NUM_NAMED
+    more = f" and {rest} more" if rest > 0 else ""
+    return ", ".join(in_words(key, facts) for key in keys[:NUM_NAMED]) + more
 
 
 def comparison_notes(tables: RunTables) -> list[str]:
@@ -221,19 +222,12 @@ def _setting_notes(tables: RunTables) -> list[str]:
             comparable(run) | {"the data's own score": _known_score(run)}
             for run in rivals
         ]
-        # A preset changes many entries along the same line between runs: one sentence.
-        lines: dict[tuple[str, ...], list[list[str]]] = defaultdict(list)
-        for key in differing(facts):
-            if not key.startswith(METHOD):
-                texts = [describe(key, each) for each in facts]
-                lines[tuple(entry(key, each) for each in facts)].append(texts)
-        merged: dict[tuple[int, ...], list[list[str]]] = defaultdict(list)
-        for line, keys in lines.items():
-            merged[tuple(line.index(each) for each in line)] += keys
-        for order, keys in merged.items():
+        keys = [key for key in differing(facts) if not key.startswith(METHOD)]
+        kinds = _by_value(rivals, [str([exact(key, f) for key in keys]) for f in facts])
+        if keys:
             parts = [
-                f"{_names(each)}: {', '.join(texts[first] for texts in keys)}"
-                for first, each in _by_value(rivals, order)
+                f"{_names(each)}: {_few(keys, facts[rivals.index(each[0])])}"
+                for _, each in kinds
             ]
             notes.append(f"{data}: different settings. {'; '.join(parts)}.")
     return notes

@@ -107,10 +107,11 @@ def write_report(
     if reference not in methods:
         raise ValueError(f"no method {reference!r}; there are: {'; '.join(methods)}")
     main = compare_all(tables, reference, quantities(tables))
+    paired = [each for each in main if each.estimate is not None]
     means = {method: iqm(rows) for method, rows in _by_method(tables.episodes)}
     suites = [_suite(tables, suite, reference) for suite in tables.suites]
     figures = {
-        "differences": _differences(main, reference),
+        "differences": draw_differences(paired, reference) if paired else None,
         "curves": _curves(tables),
         "profiles": _profiles(tables),
         "iqm": draw_intervals(means, "interquartile mean of the normalised score"),
@@ -136,7 +137,6 @@ def write_report(
         "suites": suites,
         "published": _published(tables.runs),
         "paper": published,
-        "coverage": _coverage(tables),
         "every_run": _every_run(tables.runs),
     }
     environment = Environment(
@@ -276,6 +276,7 @@ def _suite(tables: RunTables, suite: str, reference: str) -> dict[str, Any]:
     """Return tables and figures of one suite; those of a data set by its title."""
     rows = tables.episodes[tables.episodes["suite"] == suite]
     distances = dict(iter(tables.distances.groupby(["data", "method"])))
+    none = tables.distances[:0]
     levels = disturbances(rows, suite)
     scores = {key: disturbed(group, suite) for key, group in _cells(rows)}
     ends = levels.index[levels["transient"]]
@@ -288,7 +289,7 @@ def _suite(tables: RunTables, suite: str, reference: str) -> dict[str, Any]:
         back = {
             name: {
                 m: way_back(rows[(rows["data"] == data) & (rows["method"] == m)],
-                            distances[data, m], suite, name)
+                            distances.get((data, m), none), suite, name)
                 for m in here
             }
             for name in ends
@@ -406,12 +407,6 @@ def _way_row(each: WayBack | None) -> dict[str, Any]:
     }
 
 
-def _differences(found: Sequence[Difference], reference: str) -> Figure | None:
-    """Draw all differences; nothing if there is not one pair."""
-    paired = [each for each in found if each.estimate is not None]
-    return draw_differences(paired, reference) if paired else None
-
-
 def _difference_table(found: Sequence[Difference]) -> pd.DataFrame | None:
     """Return differences by data set and method; nothing if there are none."""
     rows: dict[tuple[str, str], dict[str, Cell]] = {}
@@ -456,15 +451,6 @@ def _published(runs: Sequence[Run]) -> pd.DataFrame | None:
         if env in envs
     }
     return _frame(rows) if rows else None
-
-
-def _coverage(tables: RunTables) -> pd.DataFrame:
-    """Return the seeds of each method on each data set."""
-    rows = {method: dict.fromkeys(tables.data, "none") for method in tables.methods}
-    for (data, method), runs in tables.cells().items():
-        seeds = ", ".join(str(run.seed) for run in runs)
-        rows[method][data] = f"{seeds} ({runs[0].steps:,})"
-    return _frame(rows)
 
 
 def _every_run(runs: Sequence[Run]) -> pd.DataFrame:

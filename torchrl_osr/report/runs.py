@@ -39,6 +39,15 @@ MAX_REASON = 300
 MAX_OFFSET = 100_000
 """Steps from a disturbance to the end of its distance curve."""
 
+SETTINGS = (
+    *("env.name", "data.level", "data.path", "data.random_share", "seed"),
+    *("trainer.steps", "trainer.device", "trainer.num_threads"),
+)
+"""Settings that a report reads."""
+
+LARGEST = 1e12
+"""Of returns and scores; beyond it sums of squares lose their digits."""
+
 DISTANCES = {
     "mean": "distance",
     "count": "count",
@@ -122,7 +131,7 @@ class RunTables:
 
     Attributes:
         runs: in the order in which they were found.
-        episodes: a row for each episode: ``run`` (its folder), ``data``, ``method``,
+        episodes: a row for each episode: ``run`` (its number), ``data``, ``method``,
             ``seed``, ``suite`` (``""``: the training's own evaluations),
             ``disturbance`` (``""``: none), ``kind``, ``strength``, ``step`` of the
             checkpoint, ``episode`` (its seed), ``score``. For disturbances that end,
@@ -169,8 +178,8 @@ class RunTables:
 def tables_of(runs: Sequence[Run], left_out: Sequence[LeftOut] = ()) -> RunTables:
     """Put the runs' episodes into one table, and their distances into another."""
     keys = [
-        {"run": run.folder, "data": run.data, "method": run.method, "seed": run.seed}
-        for run in runs
+        {"run": number, "data": run.data, "method": run.method, "seed": run.seed}
+        for number, run in enumerate(runs)
     ]
     episodes, distances = (
         pd.concat([getattr(run, name).assign(**key) for run, key in
@@ -330,8 +339,11 @@ def parse_run(record: Mapping[str, Any]) -> tuple[Run, list[tuple[str, str]]]:
     names = ("folder", "method", "config", "overrides")
     folder, method, config, overrides = _encodable([record[name] for name in names])
     config = flatten(config)
-    returns = record["returns"]
-    steps = int(config["trainer.steps"])
+    for key in SETTINGS:  # a configuration of another program has none of them
+        config[key]
+    returns, steps = record["returns"], config["trainer.steps"]
+    if not isinstance(steps, int):
+        raise ValueError(f"trainer.steps is {steps!r}, no number of steps")
     parts = [_training_episodes(returns["evaluations"], config["env.name"], steps)]
     distances = [_stack([NO_CURVE])]
     versions = [returns["versions"]]
@@ -481,7 +493,8 @@ def _parse_suite(content: Any) -> tuple[str, pd.DataFrame, pd.DataFrame]:
         raise ValueError("it has no evaluations")
     suite = _encodable(str(content["suite"]))
     first = [_level(each) for each in content["evaluations"][0]["levels"]]
-    if not suite or not first or len({name for name, *_ in first}) < len(first):
+    names = {name for name, *_ in first}
+    if not suite or not first or "" in names or len(names) < len(first):
         raise ValueError("suite and levels need one name each")
     episodes, curves = [], [NO_CURVE]
     for row in content["evaluations"]:
@@ -493,19 +506,13 @@ def _parse_suite(content: Any) -> tuple[str, pd.DataFrame, pd.DataFrame]:
         for level, (name, kind, strength) in zip(row["levels"], first, strict=True):
             scores = _numbers(level["scores"], seeds, f"step {step}, {name}")
             ends = level["recovery_steps"] is not None
+            way_back = level if ends else None
             episodes.append(
-                _rows(
-                    suite,
-                    step,
-                    seeds,
-                    scores,
-                    name,
-                    kind,
-                    strength,
-                    level if ends else None,
-                )
+                _rows(suite, step, seeds, scores, name, kind, strength, way_back)
             )
             if ends:
+                if max(level["distance"]["offset"], default=-1) < 0:
+                    raise ValueError(f"{name}: no distance after the disturbance")
                 where = {"suite": suite, "disturbance": name, "step": int(step)}
                 curves.append(_curve(level["distance"], where))
     return suite, _stack(episodes), _stack(curves)
@@ -521,18 +528,7 @@ def _rows(
     strength: float = math.nan,
     level: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Return the columns of one checkpoint's episodes under one disturbance.
-
-    Args:
-        suite: or "".
-        step: of the checkpoint.
-        seeds: of the episodes.
-        scores: of the episodes.
-        disturbance: its name; "" is none.
-        kind: what is disturbed.
-        strength: in the unit of its kind.
-        level: the file's entry of a disturbance that ends.
-    """
+    """Return the columns of one checkpoint's episodes; ``level`` is one that ends."""
     columns = {
         "suite": suite,
         "disturbance": disturbance,
@@ -620,9 +616,8 @@ def _numbers(values: Any, seeds: Sequence[Any], where: str) -> Any:
 def _finite(values: Any, where: str) -> Any:
     """Return numbers as an array, all of them finite."""
     numbers = np.array(values, dtype=np.float64)
-    # Beyond this sums of squares overflow; no score is anywhere near.
-    if numbers.ndim != 1 or not (np.abs(numbers) < 1e100).all():
-        raise ValueError(f"a number of {where} is not finite")
+    if numbers.ndim != 1 or not (np.abs(numbers) < LARGEST).all():
+        raise ValueError(f"a number of {where} is not finite, or beyond {LARGEST:g}")
     return numbers
 
 
