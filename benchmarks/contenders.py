@@ -117,7 +117,7 @@ def our_loss(name: str, size: Size, device: torch.device) -> LossModule:
     if name == "OSR-v":
         loss = OSRVLoss(actor, critics, inverse_dynamics)
     elif name == "CQL(H)":
-        loss = OSRLoss(actor, critics, recovery_weight=0)
+        loss = OSRLoss(actor, critics, recovery_weight=0, actor_states="clean")
     elif name == "OSR-10":
         loss = OSRLoss(
             actor,

@@ -90,8 +90,8 @@ class Adversary:
         ...     return torch.stack(values).squeeze(-1)
         >>> states = TensorDict({"observation": torch.zeros(5, 3)}, [5])
         >>> adversary = Adversary("min_Q", epsilon=0.1)
-        >>> twin = adversary.perturb(states, ["observation"], actor.get_dist, qvalue)
-        >>> bool((twin["observation"].abs() <= 0.1).all())
+        >>> worst = adversary.perturb(states, ["observation"], actor.get_dist, qvalue)
+        >>> bool((worst["observation"].abs() <= 0.1).all())
         True
     """
 
@@ -170,12 +170,12 @@ class Adversary:
         if self.method == "gradient":
             noise = self._ascend(noise, objective)
         best = objective(noise).argmax(0, keepdim=True)
-        twin = states.copy()
+        worst = states.copy()
         for key, candidates in zip(keys, noise, strict=True):
             index = best.reshape(best.shape + (1,) * (candidates.ndim - best.ndim))
             chosen = candidates.take_along_dim(index, 0).squeeze(0)
-            twin.set(key, states.get(key) + chosen)
-        return twin
+            worst.set(key, states.get(key) + chosen)
+        return worst
 
     def _draw(
         self, states: TensorDictBase, key: NestedKey, generator: torch.Generator | None

@@ -71,14 +71,14 @@ def next_state(tensordict: TensorDictBase, key: NestedKey, absent: Tensor) -> Te
         key: a state entry.
         absent: rows without a true next state, bool ``[B]``.
     """
-    state, following = entry(tensordict, key), entry(tensordict, nested("next", key))
-    if state.shape != following.shape:
+    state, after = entry(tensordict, key), entry(tensordict, nested("next", key))
+    if state.shape != after.shape:
         raise ValueError(
-            f"{nested('next', key)!r} has shape {tuple(following.shape)}, but "
+            f"{nested('next', key)!r} has shape {tuple(after.shape)}, but "
             f"{key!r} has {tuple(state.shape)}."
         )
     absent = absent.reshape(absent.shape + (1,) * (state.ndim - absent.ndim))
-    return torch.where(absent, state, following)
+    return torch.where(absent, state, after)
 
 
 def transitions(

@@ -187,10 +187,10 @@ class Step:
         )
         keys = observation_keys(loss)
         clean = select(tensordict, keys)
-        following = clean.copy()
+        after = clean.copy()
         for key in keys:
-            following.set(key, next_state(tensordict, key, self.terminated))
-        stack = [clean, following]
+            after.set(key, next_state(tensordict, key, self.terminated))
+        stack = [clean, after]
         if perturbed:
             stack.append(perturbed_state(tensordict, keys, loss.tensor_keys.perturbed))
         self.states = torch.stack(stack)

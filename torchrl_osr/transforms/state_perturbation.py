@@ -15,10 +15,10 @@ from torchrl_osr._entries import nested
 
 
 class StatePerturbation(Transform):
-    r"""Give every state a perturbed twin, ``("perturbed", key)`` beside ``key``.
+    r"""Add a perturbed state to every row: ``("perturbed", key)`` from ``key``.
 
     Appended to a replay buffer it makes the mixed data set D_tot of section 4.1: one
-    freshly perturbed twin for each clean state, the next state untouched. It works out
+    freshly perturbed state for each clean one, the next state untouched. It works out
     of place, needs no train mode, leaves the batch size alone and draws from a
     generator of its own, so that the rest of a run stays the same bits with and without
     it. In an environment it adds the same entry to observations and specs.
@@ -33,7 +33,7 @@ class StatePerturbation(Transform):
             single tensor for a single key). Default: none, ``std`` is absolute.
         noise: ``"gaussian"`` (default), or ``"uniform"`` with the same standard
             deviation (half-width :math:`\sqrt 3\,\beta`).
-        perturbed: where to write the twins. Default ``"perturbed"``.
+        perturbed: where to write the perturbed states. Default ``"perturbed"``.
         seed: of the generator. Default: torch's initial seed.
 
     Raises:
@@ -123,8 +123,10 @@ class StatePerturbation(Transform):
         return torch.addcmul(state, noise, scale.to(state))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Add the perturbed twins to a batch of any shape."""
-        for i, (key, twin) in enumerate(zip(self.in_keys, self.out_keys, strict=True)):
+        """Add the perturbed states to a batch of any shape."""
+        for i, (key, out_key) in enumerate(
+            zip(self.in_keys, self.out_keys, strict=True)
+        ):
             state = tensordict.get(key, None)
             if state is None:
                 raise KeyError(
@@ -136,7 +138,7 @@ class StatePerturbation(Transform):
                 # cannot be captured in a CUDA graph.
                 self.to(state.device)
             unit: Tensor = getattr(self, f"_unit_{i}")
-            tensordict.set(twin, self._perturb(state, key, self.std * unit))
+            tensordict.set(out_key, self._perturb(state, key, self.std * unit))
         return tensordict
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -148,14 +150,14 @@ class StatePerturbation(Transform):
         return self.forward(tensordict_reset)
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add the twins' entries: unbounded, of the states' shape and dtype."""
+        """Add the perturbed entries: unbounded, of the states' shape and dtype."""
         if not isinstance(observation_spec, Composite):
             raise TypeError(
                 f"StatePerturbation needs a Composite spec, got {observation_spec}."
             )
-        for key, twin in zip(self.in_keys, self.out_keys, strict=True):
+        for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
             spec = observation_spec[key]
-            observation_spec[twin] = Unbounded(
+            observation_spec[out_key] = Unbounded(
                 shape=spec.shape, dtype=spec.dtype, device=spec.device
             )
         return observation_spec
