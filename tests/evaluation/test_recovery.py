@@ -121,3 +121,10 @@ def test_recorder_keeps_what_it_was_told():
     assert kept.terminated
     assert kept.last == 1
     assert recorder.trajectories[0].observations == []
+
+
+def test_who_reaches_the_goal_has_not_fallen():
+    recorder = Recorder(2)
+    for episode, success in enumerate((True, False)):
+        recorder(episode, np.zeros(8), True, {"success": success})
+    assert [each.terminated for each in recorder.trajectories] == [False, True]

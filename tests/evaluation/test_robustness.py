@@ -10,6 +10,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from torchrl_osr import OSRLoss
 from torchrl_osr.data import load_behavior_policy
 from torchrl_osr.envs import (
     ActionKnock,
@@ -17,9 +18,10 @@ from torchrl_osr.envs import (
     ExternalPush,
     ObservationNoise,
     attacked_policy,
+    critics_of,
 )
 from torchrl_osr.evaluation import DataDistance, Disturbance, evaluate_paired
-from torchrl_osr.modules import tanh_gaussian_actor
+from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
 
 LINE = "Line-v0"
 LIMIT = 150
@@ -147,7 +149,8 @@ def play(*disturbances: Disturbance, policy=linear_policy, episodes: int = 4):
 
 def test_strength_zero_is_the_clean_episodes_bit_for_bit():
     actor = tanh_gaussian_actor(11, 3, num_cells=[16])
-    attack = partial(attacked_policy, actor.get_dist, kind="action_diff")
+    critics = critics_of(OSRLoss(actor, critic_ensemble(11, 3), recovery_weight=0))
+    attack = partial(attacked_policy, actor.get_dist, critics, kind="action_diff")
     bare = attack(epsilon=0.0)
     results = play(
         Disturbance("push", "push", 0.0, partial(ExternalPush, force=0.0, duration=5)),

@@ -1,8 +1,7 @@
 """Out-of-sample events of a robustness evaluation, as Gymnasium wrappers.
 
-Knocks, pushes, noise and changed dynamics while a policy is evaluated. The wrappers
-work in TorchRL (:class:`~torchrl.envs.GymWrapper`) and in plain Gymnasium loops. They
-have in common:
+The wrappers work in TorchRL (:class:`~torchrl.envs.GymWrapper`) and in plain Gymnasium
+loops. They have in common:
 
 * ``reset(seed=...)`` seeds the disturbance of an episode. It draws from a generator of
   its own, so the start state is that of the bare environment with the same seed, and
@@ -18,26 +17,33 @@ networks: :func:`attacked_policy` makes an attacked policy from a policy.
 Gymnasium and MuJoCo come with ``torchrl-osr[examples]``.
 """
 
-from torchrl_osr.envs.actuators import ActionDelay, ActionNoise, StickyAction
-from torchrl_osr.envs.disturbance import DisturbanceWrapper, TimedDisturbance
-from torchrl_osr.envs.dynamics import DynamicsChange
-from torchrl_osr.envs.knock import ActionKnock
+try:
+    import gymnasium  # noqa: F401
+    import mujoco  # noqa: F401
+except ImportError as error:
+    raise ImportError(
+        f"disturbances need {error.name!r}: pip install torchrl-osr[examples]"
+    ) from error
+
+from torchrl_osr.envs.faults import (
+    ActionDelay,
+    ActionNoise,
+    ObservationNoise,
+    StickyAction,
+)
 from torchrl_osr.envs.observation_attack import attacked_policy, critics_of
-from torchrl_osr.envs.push import ExternalPush
-from torchrl_osr.envs.sensors import ObservationNoise
-from torchrl_osr.envs.start_state import StartStateNoise
+from torchrl_osr.envs.simulation import DynamicsChange, StartStateNoise
+from torchrl_osr.envs.timed import ActionKnock, ExternalPush
 
 __all__ = [
     "ActionDelay",
     "ActionKnock",
     "ActionNoise",
-    "DisturbanceWrapper",
     "DynamicsChange",
     "ExternalPush",
     "ObservationNoise",
     "StartStateNoise",
     "StickyAction",
-    "TimedDisturbance",
     "attacked_policy",
     "critics_of",
 ]

@@ -11,29 +11,21 @@ perturbations of one state.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, TypeAlias, cast
+from typing import Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import ObservationNorm
-from torchrl.modules import TanhNormal
 from torchrl.objectives import LossModule
 
 from torchrl_osr import Adversary
 from torchrl_osr._checks import check_choice
-
-PolicyDistribution: TypeAlias = Callable[[TensorDictBase], TanhNormal]
-"""Maps states of any batch size to the policy's distribution there."""
-
-CriticValues: TypeAlias = Callable[[TensorDictBase, Tensor], Tensor]
-"""Maps states ``[M, E]`` and actions ``[M, E, A]`` to all critics' ``[N, M, E]``."""
-
-Objective: TypeAlias = Literal["action_diff", "min_Q"]
+from torchrl_osr.objectives.adversary import TanhNormalPolicy, Values
 
 
-def critics_of(loss: LossModule) -> CriticValues:
-    """Values of all critics of a loss, as a function of states and actions.
+def critics_of(loss: LossModule) -> Values:
+    """Values ``[N, M, E]`` of a loss's critics, as a function of states and actions.
 
     The critics themselves, not their target networks, with the parameters that the loss
     has at each call.
@@ -64,8 +56,8 @@ def critics_of(loss: LossModule) -> CriticValues:
 
 
 def attacked_policy(
-    policy_distribution: PolicyDistribution,
-    qvalue: CriticValues | None = None,
+    policy_distribution: TanhNormalPolicy,
+    qvalue: Values,
     observation_norm: ObservationNorm | None = None,
     *,
     kind: Literal["random", "action_diff", "min_Q"],
@@ -73,46 +65,33 @@ def attacked_policy(
     method: Literal["sample", "gradient"] = "sample",
     num_samples: int = 50,
     seed: int = 0,
-    device: torch.device | str = "cpu",
 ) -> Callable[[Tensor], Tensor]:
     r"""Deterministic policy that sees perturbed observations.
 
-    Each entry of an observation is off by at most :math:`\epsilon` standard deviations
-    of the data. The perturbation is
-
-    * ``"random"``: uniform in that box;
-    * ``"action_diff"``: the one that changes the policy's distribution most, by the
-      Jeffreys divergence;
-    * ``"min_Q"``: the one that leads the policy to the action of lowest value at the
-      true state, averaged over the critics.
-
-    :class:`~torchrl_osr.Adversary` searches for the last two: the best of 50 draws by
-    default; ``method="gradient"`` with ``num_samples=1`` is RORL's first order, with 20
-    its mixed order. ``epsilon=0`` is the unperturbed policy.
+    Each entry of an observation is off by at most :math:`\epsilon` standard deviations:
+    uniformly (``"random"``), or as :class:`~torchrl_osr.Adversary` finds it, with the
+    largest change of the policy (``"action_diff"``) or the action of lowest value
+    (``"min_Q"``).
 
     Args:
         policy_distribution: the actor's ``get_dist``, for instance.
-        qvalue: the critics, see :func:`critics_of`; only ``"min_Q"`` needs them.
+        qvalue: the critics, see :func:`critics_of`; only ``"min_Q"`` calls them.
         observation_norm: how the training data were standardised
-            (``standard_normal=True``). Default: not at all, and ``epsilon`` is in the
-            observation's own units.
+            (``standard_normal=True``). Default: not at all.
 
     Keyword Args:
-        kind: ``"random"``, ``"action_diff"`` or ``"min_Q"``.
-        epsilon: half-width of the box, in standard deviations; RORL's go from 0 to 0.3.
-        method: ``"sample"`` (default) or ``"gradient"``.
+        kind: see above.
+        epsilon: half-width of the box; RORL's go from 0, the bare policy, to 0.3.
+        method: ``"sample"`` (default), or ``"gradient"``: RORL's first order with one
+            start, its mixed order with 20.
         num_samples: draws, or starts of the gradient steps. Default 50.
-        seed: of the draws' own generator, which continues from call to call: the same
-            numbers again take a new policy and the same episodes. Default 0.
-        device: where the policy is. Default CPU.
+        seed: of the draws, which continue from call to call. Default 0.
 
     Returns:
-        A function from observations ``[E, S]``, as the environment gives them, to
-        actions ``[E, A]``.
+        A function from raw observations ``[E, S]`` to actions ``[E, A]``, on the CPU.
 
     Raises:
-        ValueError: if ``kind`` or ``method`` is unknown, ``epsilon`` negative,
-            ``num_samples`` below 1, or ``qvalue`` missing for ``"min_Q"``.
+        ValueError: if an argument is unknown or out of its range.
 
     Examples:
         >>> import torch
@@ -121,45 +100,31 @@ def attacked_policy(
         >>> from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
         >>> actor = tanh_gaussian_actor(11, 3)
         >>> loss = OSRLoss(actor, critic_ensemble(11, 3), recovery_weight=0)
-        >>> policy = attacked_policy(
-        ...     actor.get_dist, critics_of(loss), kind="min_Q", epsilon=0.1
-        ... )
+        >>> critics = critics_of(loss)
+        >>> policy = attacked_policy(actor.get_dist, critics, kind="min_Q", epsilon=0.1)
         >>> policy(torch.zeros(4, 11)).shape
         torch.Size([4, 3])
     """
     check_choice("kind", kind, ("random", "action_diff", "min_Q"))
-    if kind == "min_Q" and qvalue is None:
-        raise ValueError(
-            "kind='min_Q' needs qvalue, the critics whose value it lowers; got None. "
-            "critics_of(loss) returns those of a trained loss."
-        )
     # Checks the other arguments, also for "random".
-    objective: Objective = "min_Q" if kind == "min_Q" else "action_diff"
-    adversary = Adversary(objective, method, epsilon, num_samples)
-    generator = torch.Generator(device).manual_seed(seed)
+    adversary = Adversary(
+        "min_Q" if kind == "min_Q" else "action_diff", method, epsilon, num_samples
+    )
+    generator = torch.Generator().manual_seed(seed)
 
     @torch.no_grad()
     def policy(observation: Tensor) -> Tensor:
         if observation_norm is not None:
             observation = (observation - observation_norm.loc) / observation_norm.scale
         states = TensorDict({"observation": observation}, [len(observation)])
-        if epsilon > 0 and kind == "random":
-            states["observation"] = _uniform_in_box(observation, epsilon, generator)
-        elif epsilon > 0:
-            critics = cast(CriticValues, qvalue)  # only "min_Q" calls it
+        if kind == "random":
+            uniform = torch.rand(observation.shape, generator=generator)
+            states["observation"] = observation + epsilon * (2 * uniform - 1)
+        else:
             states = adversary.perturb(
-                states, ["observation"], policy_distribution, critics, generator
+                states, ["observation"], policy_distribution, qvalue, generator
             )
         action: Tensor = policy_distribution(states).deterministic_sample
         return action
 
     return policy
-
-
-def _uniform_in_box(
-    centre: Tensor, half_width: float, generator: torch.Generator
-) -> Tensor:
-    uniform = torch.rand(
-        centre.shape, generator=generator, dtype=centre.dtype, device=centre.device
-    )
-    return centre + half_width * (2 * uniform - 1)

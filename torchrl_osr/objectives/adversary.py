@@ -27,7 +27,7 @@ from torchrl_osr.functional import jeffreys_divergence
 from torchrl_osr.objectives.base import BaseLoss
 from torchrl_osr.objectives.step import distribution_params, observation_keys, qvalue
 
-Policy = Callable[[TensorDictBase], TanhNormal]
+TanhNormalPolicy = Callable[[TensorDictBase], TanhNormal]
 """Maps states ``[M, B]`` (or ``[B]``) to the policy's distribution there."""
 
 Values = Callable[[TensorDictBase, Tensor], Tensor]
@@ -147,7 +147,7 @@ class Adversary:
         self,
         states: TensorDictBase,
         keys: Sequence[NestedKey],
-        policy: Policy,
+        policy: TanhNormalPolicy,
         qvalue: Values,
         generator: torch.Generator | None = None,
     ) -> TensorDictBase:
@@ -201,7 +201,7 @@ class Adversary:
         self,
         states: TensorDictBase,
         keys: Sequence[NestedKey],
-        policy: Policy,
+        policy: TanhNormalPolicy,
         qvalue: Values,
     ) -> _Objective:
         """Return the function to maximise, from perturbations to ``[M, B]``."""

@@ -1,11 +1,13 @@
-"""Faults of the actuators: actions that arrive noisy, late or not at all."""
+"""Faults of actuators and sensors: noisy, late and repeated actions, noisy readings."""
 
 from __future__ import annotations
 
 from collections import deque
 from typing import Any
 
+import gymnasium
 import numpy as np
+from numpy.typing import ArrayLike
 
 from torchrl_osr.envs.disturbance import (
     DisturbanceWrapper,
@@ -15,7 +17,6 @@ from torchrl_osr.envs.disturbance import (
     check_count,
     check_strength,
     flag,
-    gymnasium,
     vector_box,
 )
 
@@ -23,13 +24,11 @@ from torchrl_osr.envs.disturbance import (
 class ActionNoise(DisturbanceWrapper):
     """Gaussian noise on every action, clipped to the action box.
 
-    The random perturbation of "Robust Gymnasium" (https://arxiv.org/abs/2502.19652) on
-    actions, in units of the box.
+    The random perturbation of "Robust Gymnasium" (https://arxiv.org/abs/2502.19652).
 
     Args:
         env: the environment, with bounded actions.
-        std: standard deviation in units of the box's half-width; 0 is off, and leaves
-            actions outside the box to the environment.
+        std: standard deviation in half-widths of the box; 0 is off.
 
     Raises:
         ValueError: if ``std`` is negative or actions are unbounded.
@@ -39,8 +38,8 @@ class ActionNoise(DisturbanceWrapper):
         >>> from torchrl_osr.data import make_environment
         >>> from torchrl_osr.envs import ActionNoise
         >>> env = ActionNoise(make_environment("Hopper-v5"), 0.05)
-        >>> observation, _ = env.reset(seed=0)
-        >>> bool(env.step(env.action_space.high)[-1]["disturbed"])
+        >>> _, info = env.reset(seed=0)
+        >>> bool(info["disturbed"])
         True
     """
 
@@ -80,8 +79,8 @@ class ActionDelay(DisturbanceWrapper):
         >>> from torchrl_osr.data import make_environment
         >>> from torchrl_osr.envs import ActionDelay
         >>> env = ActionDelay(make_environment("Hopper-v5"), 2)
-        >>> observation, _ = env.reset(seed=0)
-        >>> bool(env.step(env.action_space.high)[-1]["disturbed"])
+        >>> _, info = env.reset(seed=0)
+        >>> bool(info["disturbed"])
         True
     """
 
@@ -93,11 +92,9 @@ class ActionDelay(DisturbanceWrapper):
         self._zero = np.zeros(box.shape, box.dtype)
         self._pending: deque[Vector] = deque()
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Vector, dict[str, Any]]:
+    def reset(self, **options: Any) -> tuple[Vector, dict[str, Any]]:
         self._pending = deque([self._zero] * self.steps)
-        return super().reset(seed=seed, options=options)
+        return super().reset(**options)
 
     def step(self, action: Vector) -> Step:
         if self.steps:
@@ -132,28 +129,89 @@ class StickyAction(DisturbanceWrapper):
 
     def __init__(self, env: gymnasium.Env[Vector, Vector], probability: float) -> None:
         if not 0 <= probability <= 1:
-            raise ValueError(
-                f"probability must be between 0 and 1, got {probability!r}; 0 is off."
-            )
+            raise ValueError(f"probability must be in [0, 1], got {probability!r}.")
         super().__init__(env)
         self.probability = probability
         self._previous: Vector | None = None
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Vector, dict[str, Any]]:
+    def reset(self, **options: Any) -> tuple[Vector, dict[str, Any]]:
         self._previous = None
-        return super().reset(seed=seed, options=options)
+        return super().reset(**options)
 
     def step(self, action: Vector) -> Step:
         sticks = False
-        if self.probability:
-            if self._previous is not None:
-                sticks = bool(self._generator.random() < self.probability)
-            if not sticks:
-                self._previous = np.array(action)
-            assert self._previous is not None
-            action = self._previous
-        result = super().step(action)
+        if self._previous is not None and self.probability:
+            sticks = bool(self._generator.random() < self.probability)
+        if self._previous is None or not sticks:
+            self._previous = np.array(action)
+        result = super().step(self._previous)
         flag(result[-1], sticks)
         return result
+
+
+class ObservationNoise(DisturbanceWrapper):
+    """Gaussian noise on every observation; the simulated state is unchanged.
+
+    The noise of "DMBP: Diffusion Model-Based Predictor for Robust Offline
+    Reinforcement Learning against State Observation Perturbations" (ICLR 2024), which
+    is absolute; with ``unit`` it is relative to the data, as in RORL,
+    https://arxiv.org/abs/2206.02829. The first observation of an episode is noisy, too.
+    Bounds of the observation space are not enforced.
+
+    Args:
+        env: the environment, with real observations.
+        std: standard deviation, in ``unit``; 0 is off.
+
+    Keyword Args:
+        unit: the data's standard deviation in each dimension, in the shape of an
+            observation. Default: 1, ``std`` is in the observation's own units.
+
+    Raises:
+        ValueError: if ``std`` or a number of ``unit`` is negative, or ``unit`` of
+            another shape.
+        TypeError: if observations are not a Box.
+
+    Examples:
+        >>> from torchrl_osr.data import make_environment
+        >>> from torchrl_osr.envs import ObservationNoise
+        >>> env = ObservationNoise(make_environment("Hopper-v5"), 0.1)
+        >>> observation, _ = env.reset(seed=0)
+        >>> clean, _ = make_environment("Hopper-v5").reset(seed=0)
+        >>> bool((abs(observation - clean) > 0).all())
+        True
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env[Vector, Vector],
+        std: float,
+        *,
+        unit: ArrayLike | None = None,
+    ) -> None:
+        check_strength("std", std)
+        super().__init__(env, always=std > 0)
+        shape = vector_box(env.observation_space, "observations").shape
+        scale = np.ones(shape) if unit is None else np.asarray(unit, dtype=np.float64)
+        if scale.shape != shape:
+            raise ValueError(
+                f"unit has shape {scale.shape}, but observations have {shape}; pass "
+                "one standard deviation for each number of an observation."
+            )
+        if not (np.isfinite(scale) & (scale >= 0)).all():
+            raise ValueError(f"unit must be finite and at least 0, got {scale}.")
+        self.std = std
+        self._scale = std * scale
+
+    def reset(self, **options: Any) -> tuple[Vector, dict[str, Any]]:
+        observation, info = super().reset(**options)
+        return self._seen(observation), info
+
+    def step(self, action: Vector) -> Step:
+        observation, *rest = super().step(action)
+        return self._seen(observation), *rest
+
+    def _seen(self, observation: Vector) -> Vector:
+        if self.std == 0:
+            return observation
+        noise = self._generator.standard_normal(observation.shape)
+        return (observation + self._scale * noise).astype(observation.dtype)

@@ -1,16 +1,20 @@
-"""Changed dynamics: masses, friction and gravity times a factor."""
+"""Changes of the simulation itself: other dynamics, other start states."""
 
 from __future__ import annotations
 
 import copy
-import math
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
 
 from torchrl_osr.envs.disturbance import (
     DisturbanceWrapper,
     Vector,
-    gymnasium,
-    mujoco,
-    owns_simulation,
+    check_strength,
+    flag,
+    mujoco_task,
 )
 
 
@@ -25,7 +29,7 @@ class DynamicsChange(DisturbanceWrapper):
     its own: factors never accumulate. A factor of 1 changes nothing.
 
     Args:
-        env: a MuJoCo environment.
+        env: one of Gymnasium's MuJoCo tasks.
 
     Keyword Args:
         mass: factor of all masses and moments of inertia; the motors' own (MuJoCo's
@@ -36,7 +40,7 @@ class DynamicsChange(DisturbanceWrapper):
 
     Raises:
         ValueError: if a factor is negative or infinite, or ``mass`` is 0.
-        TypeError: if it is none of Gymnasium's own MuJoCo tasks.
+        TypeError: if it is another environment.
 
     Examples:
         >>> from torchrl_osr.data import make_environment
@@ -59,15 +63,13 @@ class DynamicsChange(DisturbanceWrapper):
     ) -> None:
         factors = {"mass": mass, "friction": friction, "gravity": gravity}
         for name, factor in factors.items():
-            if not 0 <= factor < math.inf or (name == "mass" and factor == 0):
-                least = "above 0" if name == "mass" else "at least 0"
-                raise ValueError(
-                    f"{name} must be finite, {least}, got {factor!r}; 1 is off."
-                )
+            check_strength(name, factor)
+        if mass == 0:
+            raise ValueError("mass must be above 0, got 0.")
         changed = any(factor != 1 for factor in factors.values())
         super().__init__(env, always=changed)
         self.mass, self.friction, self.gravity = mass, friction, gravity
-        self._bare = owns_simulation(env, "DynamicsChange")
+        self._bare = mujoco_task(env, "DynamicsChange")
         self._original = self._bare.model
         if changed:
             self._bare.model = self._change(self._original)
@@ -90,3 +92,51 @@ class DynamicsChange(DisturbanceWrapper):
         """Restore the environment's own model and close it."""
         self._bare.model = self._original
         super().close()
+
+
+class StartStateNoise(DisturbanceWrapper):
+    """Gaussian noise on the start state of an episode.
+
+    It is added to the environment's own noise (uniform, half-width 5e-3 for hopper and
+    walker2d). Orientations of free bodies are rotated. After strong noise an episode
+    may start fallen, or with a foot in the ground, which MuJoCo pushes out.
+
+    Put this around the bare task, whose observation it returns, and observation noise
+    around this.
+
+    Args:
+        env: one of Gymnasium's MuJoCo tasks.
+        std: standard deviation in each degree of freedom, of positions in metres or
+            radians, of velocities in metres or radians a second; 0 is off.
+
+    Raises:
+        ValueError: if ``std`` is negative.
+        TypeError: if it is another environment.
+
+    Examples:
+        >>> from torchrl_osr.data import make_environment
+        >>> from torchrl_osr.envs import StartStateNoise
+        >>> env = StartStateNoise(make_environment("Hopper-v5"), 0.05)
+        >>> observation, info = env.reset(seed=0)
+        >>> bool(info["disturbed"])
+        True
+    """
+
+    def __init__(self, env: gymnasium.Env[Vector, Vector], std: float) -> None:
+        check_strength("std", std)
+        super().__init__(env)
+        self.std = std
+        self._bare = mujoco_task(env, "StartStateNoise")
+
+    def reset(self, **options: Any) -> tuple[Vector, dict[str, Any]]:
+        observation, info = super().reset(**options)
+        if self.std == 0:
+            return observation, info
+        model, data = self._bare.model, self._bare.data
+        position, velocity = self.std * self._generator.standard_normal((2, model.nv))
+        qpos = np.array(data.qpos)
+        mujoco.mj_integratePos(model, qpos, position, 1.0)
+        # Calls mj_forward: everything that depends on the state is up to date.
+        self._bare.set_state(qpos, data.qvel + velocity)
+        info |= self._bare._get_reset_info()
+        return self._bare._get_obs(), flag(info, True)

@@ -1,10 +1,11 @@
-"""The knock, call by call, against hand-made sequences and the released sampler."""
+"""Knocks and pushes against sequences by hand and the released sampler."""
 
 from __future__ import annotations
 
 import math
 
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -12,7 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchrl_osr.data import make_environment
-from torchrl_osr.envs import ActionKnock
+from torchrl_osr.envs import ActionKnock, DynamicsChange, ExternalPush
+
+ROBOTS = ["Hopper-v5", "Walker2d-v5", "HalfCheetah-v5"]
 
 
 def column(steps, index):
@@ -80,14 +83,6 @@ def test_official_does_not_use_up_the_time_limit(outside, play, recorder):
     assert len(bare.actions) == 11
 
 
-def test_official_knock_of_an_episode_that_is_cut_at_that_step(play, recorder):
-    bare = recorder()
-    limited = gymnasium.wrappers.TimeLimit(bare, 3)
-    played = play(ActionKnock(limited, 5, mode="official", at=3), 3)
-    assert played[-1][3]
-    assert len(bare.actions) == 3
-
-
 def sampler(env, policy, observation, shakes, *, at, steps):
     """The released TrajSampler's loop, on an environment without time limit."""
     observations, rewards = [], []
@@ -147,11 +142,6 @@ def test_counted_modes_replace_the_agents_actions(mode, play, recorder):
     assert bare.actions[5].dtype == bare.action_space.dtype
 
 
-def test_counted_modes_report_falls_within_the_knock(play, recorder):
-    played = play(ActionKnock(recorder(falls=[3]), 5, mode="paper", at=1), 3)
-    assert column(played, 2) == [False, False, True]
-
-
 def test_paper_actions_are_normal_with_std_1e_3(play, recorder):
     bare = recorder(size=4)
     play(ActionKnock(bare, 2500, mode="paper", at=0), 2500)
@@ -170,6 +160,20 @@ def test_torque_is_full_strength_of_either_sign(play, recorder):
     assert set(np.unique(actions)) == {-2.0, 3.0}
     # 10,000 fair coins, 5 standard errors of 0.005.
     assert abs((actions == 3).mean() - 0.5) < 0.025
+
+
+def spy(env):
+    """Note the applied forces ``[bodies, 6]`` of every step of the simulation."""
+    bare, seen = env.unwrapped, []
+    step = bare.step
+    bare.step = lambda a: seen.append(bare.data.xfrc_applied.copy()) or step(a)
+    return seen
+
+
+def momentum(bare) -> float:
+    """Horizontal momentum of the whole robot, in newton seconds."""
+    mujoco.mj_subtreeVel(bare.model, bare.data)
+    return float(bare.data.subtree_linvel[0, 0] * bare.model.body_mass.sum())
 
 
 @given(
@@ -195,37 +199,76 @@ def test_random_moments_lie_in_the_window_and_follow_the_seed(
     assert moments[0] == moments[1]
 
 
-def test_random_moments_are_uniform(recorder):
-    env = ActionKnock(recorder(), 2, mode="paper", at="random", window=(5, 9))
-    counts = np.zeros(9)
-    for seed in range(1000):
+@pytest.mark.parametrize("name", ROBOTS)
+def test_force_is_applied_and_removed(name, play):
+    env = ExternalPush(make_environment(name), 25.0, duration=3, at=2)
+    seen = spy(env)
+    forces = [step[-1]["push_force"] for step in play(env, 7)]
+    sign = np.sign(forces[2])
+    assert forces == [0, 0, 25 * sign, 25 * sign, 25 * sign, 0, 0]
+    torso = mujoco.mj_name2id(env.unwrapped.model, mujoco.mjtObj.mjOBJ_BODY, "torso")
+    for number, applied in enumerate(seen):
+        expected = np.zeros_like(applied)
+        expected[torso, 0] = forces[number]
+        assert (applied == expected).all()
+    assert not env.unwrapped.data.xfrc_applied.any()
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_momentum_grows_by_force_times_time(name, play):
+    env = ExternalPush(make_environment(name), 40.0, duration=4, at=0)
+    bare = env.unwrapped
+    env.reset(seed=0)
+    # High above the ground: nothing but the push acts horizontally.
+    qpos = bare.data.qpos.copy()
+    qpos[1] += 100
+    bare.set_state(qpos, bare.data.qvel.copy())
+    before = momentum(bare)
+    for _ in range(6):
+        force = env.step(np.zeros(env.action_space.shape, np.float32))[-1]["push_force"]
+        if force:
+            sign = np.sign(force)
+    # The integrator's error in the joints' inner forces is what is left.
+    assert momentum(bare) - before == pytest.approx(sign * 40 * 4 * bare.dt, rel=1e-3)
+
+
+def test_both_directions_occur_and_the_seed_decides(recorder):
+    env = ExternalPush(make_environment("Hopper-v5"), 1.0, duration=1, at=0)
+    action, signs = env.action_space.low, []
+    for seed in [*range(40), *range(40)]:
         env.reset(seed=seed)
-        counts[env._start] += 1
-    assert counts[:5].sum() == 0
-    # Four cells of 250 each: chi squared with 3 degrees of freedom, level 0.001.
-    assert ((counts[5:] - 250) ** 2 / 250).sum() < 16.27
+        signs.append(env.step(action)[-1]["push_force"])
+    assert signs[:40] == signs[40:]
+    # 40 fair coins, 4 standard errors of 3.2.
+    assert abs(signs[:40].count(1.0) - 20) < 13
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"mode": "hard"}, "mode must be one of .*'torque'.* got 'hard'"),
-        ({"steps": 0}, "steps must be an integer, at least 1; got 0"),
-        ({"steps": 2.5}, "steps must be an integer, at least 1; got 2.5"),
-        ({"at": -1}, "at must be an integer, at least 1, or .*'random'; got -1"),
-        ({"at": 0}, "at must be an integer, at least 1"),
-        ({"at": "later"}, "at must be an integer, .*got 'later'"),
-        ({"window": (9, 9)}, "the end of window must be .* at least 10; got 9"),
-        ({"window": (0, 9)}, "the start of window must be .* at least 1; got 0"),
-    ],
-)
-def test_wrong_arguments(arguments, message, recorder):
-    arguments = {"steps": 5, "mode": "official"} | arguments
-    with pytest.raises(ValueError, match=message):
-        ActionKnock(recorder(), **arguments)
+def test_a_reset_within_the_push_ends_it():
+    env = ExternalPush(make_environment("Hopper-v5"), 5.0, duration=9, at=0)
+    env.reset(seed=0)
+    env.step(env.action_space.low)
+    env.reset(seed=0)
+    assert not env.unwrapped.data.xfrc_applied.any()
+    assert env.step(env.action_space.low)[-1]["push_force"] in (-5.0, 5.0)
 
 
-def test_torque_needs_bounds(recorder):
-    with pytest.raises(ValueError, match="expected finite bounds"):
-        ActionKnock(recorder(high=np.inf), 5, mode="torque")
-    ActionKnock(recorder(high=np.inf), 5, mode="paper", at=0)
+def test_pushes_at_the_same_time_add_up(play):
+    inner = ExternalPush(make_environment("Hopper-v5"), 0.1, duration=3, at=0)
+    env = ExternalPush(inner, 0.7, duration=2, at=1)
+    seen = spy(env)
+    play(env, 4)
+    totals = [np.abs(applied).sum() for applied in seen]
+    assert totals[0] == 0.1
+    assert totals[1] == pytest.approx(0.8) or totals[1] == pytest.approx(0.6)
+    assert totals[3] == 0
+
+
+def test_units_of_body_weight():
+    # Gymnasium's models, weighed: their masses times 9.81 m/s².
+    for name, weight in zip(ROBOTS, (155.19, 232.27, 137.34), strict=True):
+        env = make_environment(name)
+        push = ExternalPush(env, 2.0, duration=1, unit="body_weight")
+        assert push.force == pytest.approx(2 * weight, abs=0.01)
+    heavy = DynamicsChange(make_environment("Hopper-v5"), mass=3.0)
+    push = ExternalPush(heavy, 1.0, duration=1, unit="body_weight")
+    assert push.force == pytest.approx(3 * 155.19, abs=0.05)

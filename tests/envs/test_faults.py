@@ -1,13 +1,17 @@
-"""Noisy, late and sticky actions, against hand-made sequences."""
+"""Noisy, late and repeated actions, and noisy observations, against numbers by hand."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchrl_osr.envs import ActionDelay, ActionNoise, StickyAction
+from torchrl_osr.data import make_environment
+from torchrl_osr.envs import ActionDelay, ActionNoise, ObservationNoise, StickyAction
+
+DRAWS = 20_000
 
 
 def executed(env, actions, *, seed=0):
@@ -18,7 +22,7 @@ def executed(env, actions, *, seed=0):
     return [float(action[0]) for action in env.unwrapped.actions]
 
 
-def test_noise_is_in_units_of_the_half_width(recorder):
+def test_action_noise_is_in_units_of_the_half_width(recorder):
     env = ActionNoise(recorder(size=4, low=-1.0, high=3.0), 0.05)
     env.reset(seed=0)
     for _ in range(5000):
@@ -26,7 +30,7 @@ def test_noise_is_in_units_of_the_half_width(recorder):
     actions = np.array(env.unwrapped.actions)
     # 0.05 times a half-width of 2; 20,000 draws, five standard errors, no clipping.
     assert actions.std() == pytest.approx(0.1, rel=0.025)
-    assert actions.mean() == pytest.approx(1.0, abs=5 * 0.1 / 20_000**0.5)
+    assert actions.mean() == pytest.approx(1.0, abs=5 * 0.1 / DRAWS**0.5)
     assert actions.dtype == env.action_space.dtype
 
 
@@ -39,22 +43,14 @@ def test_noisy_actions_stay_in_the_box(recorder, std, action, seed):
     assert all(action in env.action_space for action in env.unwrapped.actions)
 
 
-def test_delay_by_hand(recorder):
-    env = ActionDelay(recorder(), 2)
-    sent = [0.1, 0.2, 0.3, 0.4, 0.5]
-    expected = pytest.approx([0.0, 0.0, 0.1, 0.2, 0.3])
-    assert executed(env, sent) == expected
-    # Nothing is left over from one episode to the next.
-    assert executed(env, sent) == expected
-
-
 @given(
     st.lists(st.floats(-1, 1, width=32), max_size=12),
     st.integers(min_value=0, max_value=9),
 )
 def test_delay_shifts_the_actions(recorder, sent, steps):
-    arrived = executed(ActionDelay(recorder(), steps), sent)
-    assert arrived == ([0.0] * steps + sent)[: len(sent)]
+    env = ActionDelay(recorder(), steps)
+    for _ in range(2):  # nothing is left over from one episode to the next
+        assert executed(env, sent) == ([0.0] * steps + sent)[: len(sent)]
 
 
 @pytest.mark.parametrize("make", [ActionDelay, StickyAction])
@@ -90,31 +86,44 @@ def test_sticky_by_hand(recorder):
     assert flags == [False, True, False, True, True, False]
 
 
-def test_sticky_probability(recorder):
-    env = StickyAction(recorder(), 0.25)
-    env.reset(seed=0)
-    flags = [env.step(np.zeros(2))[-1]["disturbed"] for _ in range(10_000)]
-    # Five standard errors of 0.0043.
-    assert np.mean(flags) == pytest.approx(0.25, abs=0.022)
-
-
 def test_always_sticky_repeats_the_first_action_of_each_episode(recorder):
     env = StickyAction(recorder(), 1.0)
     assert executed(env, [0.25, 0.5, 0.75]) == [0.25] * 3
     assert executed(env, [0.5, 0.75]) == [0.5] * 2
 
 
-def test_wrong_arguments(recorder):
-    with pytest.raises(ValueError, match="std must be a finite number, at least 0"):
-        ActionNoise(recorder(), -0.1)
-    with pytest.raises(ValueError, match="RescaleAction or ClipAction"):
-        ActionNoise(recorder(high=np.inf), 0.1)
-    with pytest.raises(
-        ValueError, match="steps must be an integer, at least 0; got -1"
-    ):
-        ActionDelay(recorder(), -1)
-    with pytest.raises(ValueError, match="steps must be an integer"):
-        ActionDelay(recorder(), True)
-    for probability in (-0.1, 1.1, float("nan")):
-        with pytest.raises(ValueError, match="between 0 and 1"):
-            StickyAction(recorder(), probability)
+def test_observation_noise_has_the_stated_deviation(play, recorder):
+    env = ObservationNoise(recorder(sensors=3), 0.2, unit=[1.0, 0.5, 0.0])
+    observations = np.array([step[0] for step in play(env, DRAWS)])
+    # The recorder observes the number of the step.
+    noise = observations - np.arange(1, DRAWS + 1)[:, None]
+    # The standard error of a standard deviation is 1/sqrt(2n) = 0.5 %, that of a mean
+    # std/sqrt(n): five of each.
+    np.testing.assert_allclose(noise.std(0), [0.2, 0.1, 0.0], rtol=0.025, atol=1e-9)
+    np.testing.assert_allclose(noise.mean(0), 0, atol=5 * 0.2 / DRAWS**0.5)
+    assert abs(np.corrcoef(noise[:, 0], noise[:, 1])[0, 1]) < 5 / DRAWS**0.5
+    assert abs(np.corrcoef(noise[1:, 0], noise[:-1, 0])[0, 1]) < 5 / DRAWS**0.5
+
+
+def test_observation_noise_leaves_the_state_alone():
+    env, bare = (make_environment("HalfCheetah-v5") for _ in range(2))
+    env = ObservationNoise(env, 0.3)
+    seen, _ = env.reset(seed=2)
+    clean, _ = bare.reset(seed=2)
+    for _ in range(100):
+        assert (seen != clean).all()
+        assert (env.unwrapped.data.qpos == bare.unwrapped.data.qpos).all()
+        seen, reward, *_ = env.step(env.action_space.high)
+        clean, clean_reward, *_ = bare.step(env.action_space.high)
+        assert reward == clean_reward
+
+
+def test_first_observation_is_noisy_and_dtypes_are_kept(recorder):
+    bare = recorder(sensors=2)
+    bare._observe = lambda: np.zeros(2, np.float32)
+    unit = torch.ones(2, dtype=torch.float64)
+    env = ObservationNoise(bare, 0.3, unit=unit)
+    unit.zero_()  # it was copied
+    first, _ = env.reset(seed=0)
+    assert (first != 0).all()
+    assert first.dtype == env.step(np.zeros(2))[0].dtype == np.float32
