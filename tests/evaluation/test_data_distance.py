@@ -20,18 +20,18 @@ def brute_force(distance: DataDistance, rows: torch.Tensor, scale: torch.Tensor)
     loc = distance._loc.numpy()
     asked = (rows.double().numpy() - loc) / scale.double().numpy()
     exact = np.sqrt(np.square(asked[:, None] - states[None]).sum(-1))
-    return np.sort(exact, axis=1)[:, : distance.num_neighbors].mean(1)
+    return np.sort(exact, axis=1)[:, :10].mean(1)
 
 
 def test_distance_is_the_mean_to_the_nearest_by_hand():
-    # Ten rows, two of them held out; whichever eight stay: neighbours of 100 are known.
-    rows = torch.tensor([[float(x)] for x in range(10)])
-    distance = DataDistance(dataset(rows), num_neighbors=8)
-    scale = rows.std(correction=0)  # 2.8723
+    # Twelve rows, two of them held out: the ten that stay are the neighbours of 100.
+    rows = torch.tensor([[float(x)] for x in range(12)])
+    distance = DataDistance(dataset(rows))
+    scale = rows.std(correction=0)
     kept = (distance._states * scale + rows.mean()).flatten()
     wanted = ((100 - kept) / scale).mean()
     assert distance(torch.tensor([[100.0]])).item() == pytest.approx(wanted.item())
-    assert len(kept) == 8
+    assert len(kept) == 10
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e3])
@@ -78,14 +78,8 @@ def test_the_subset_depends_on_the_seed_alone():
     assert one.threshold != other.threshold
 
 
-@pytest.mark.parametrize(
-    ("options", "named"),
-    [
-        ({"num_neighbors": 0}, "num_neighbors"),
-        ({"num_neighbors": 9}, "10 rows"),
-        ({"max_reference": 4, "num_neighbors": 5}, "max_reference=4"),
-    ],
-)
-def test_bad_input_is_named(options, named):
-    with pytest.raises(ValueError, match=named):
-        DataDistance(dataset(torch.randn(10, 2)), **options)
+def test_too_few_rows_are_named():
+    with pytest.raises(ValueError, match="10 rows.* too few for 10 neighbours"):
+        DataDistance(dataset(torch.randn(10, 2)))
+    with pytest.raises(ValueError, match="max_reference=4"):
+        DataDistance(dataset(torch.randn(50, 2)), max_reference=4)

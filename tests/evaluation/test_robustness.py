@@ -192,7 +192,7 @@ def test_an_episode_depends_on_its_own_disturbance_alone():
 @pytest.mark.parametrize(
     ("disturbances", "episodes", "named"),
     [
-        ([Disturbance("a", "push", 1.0)], 1, "at least 2, got 1"),
+        ([Disturbance("a", "push", 1.0)], 1, "num_episodes must be at least 2"),
         (
             [Disturbance("a", "push", 1.0), Disturbance("a", "push", 2.0)],
             2,

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchrl_osr.evaluation import (
+    NUM_RESAMPLES,
     interquartile_mean,
     mean_interval,
     nested_resamples,
@@ -22,7 +23,7 @@ FINITE = st.floats(-1e6, 1e6)
 
 @given(st.lists(FINITE, min_size=1, max_size=20))
 def test_interval_lies_within_the_values_and_holds_the_mean_of_resamples(values):
-    mean, low, high = mean_interval(values, num_resamples=200)
+    mean, low, high = mean_interval(values)
     slack = 1e-9 * (1 + max(map(abs, values)))
     assert min(values) - slack <= low <= high <= max(values) + slack
     assert mean == pytest.approx(np.mean(values), abs=slack)
@@ -33,8 +34,8 @@ def test_coverage_of_a_normal_sample():
     # 0.93 is what its theory gives here. 400 trials: standard error 0.013.
     rng = np.random.default_rng(0)
     hits = 0
-    for trial in range(400):
-        _, low, high = mean_interval(rng.normal(size=30), num_resamples=500, seed=trial)
+    for _ in range(400):
+        _, low, high = mean_interval(rng.normal(size=30))
         hits += low <= 0 <= high
     assert hits / 400 == pytest.approx(0.93, abs=0.04)
 
@@ -79,10 +80,10 @@ def test_profile_of_a_known_sample():
 @given(st.lists(st.integers(1, 4), min_size=1, max_size=3), FINITE)
 def test_resamples_of_a_constant_are_that_constant(sizes, value):
     runs = [np.full((size, 2), value) for size in sizes]
-    np.testing.assert_allclose(nested_resamples(runs, num_resamples=20), value)
+    np.testing.assert_allclose(nested_resamples(runs), value)
     strata = [np.full(size, value) for size in sizes]
-    resamples = stratified_resamples(strata, num_resamples=20)
-    assert resamples.shape == (20, sum(sizes))
+    resamples = stratified_resamples(strata)
+    assert resamples.shape == (NUM_RESAMPLES, sum(sizes))
     assert (resamples == value).all()
     low, high = percentile_interval(interquartile_mean(resamples))
     assert low == high == pytest.approx(value)
@@ -94,6 +95,10 @@ def test_strata_keep_their_places_and_sizes():
     assert set(np.unique(resamples[:, 2:])) == {10, 20, 30}
 
 
+def many_resamples(runs) -> np.ndarray:
+    return np.concatenate([nested_resamples(runs, seed=seed) for seed in range(5)])
+
+
 def test_nested_resamples_spread_as_theory_says():
     # Of S runs of E episodes with unit variances between and within: resampling runs
     # and then episodes has the variance (between + within / E) / S of the sample.
@@ -101,7 +106,7 @@ def test_nested_resamples_spread_as_theory_says():
     runs = [rng.normal(loc, 1, size=(25, 1)) for loc in rng.normal(size=12)]
     means = np.array([run.mean() for run in runs])
     within = np.mean([run.var() for run in runs]) / 25
-    resamples = nested_resamples(runs, num_resamples=10_000)
+    resamples = many_resamples(runs)
     assert resamples.mean() == pytest.approx(means.mean(), abs=0.02)
     assert resamples.var() == pytest.approx((means.var() + within) / 12, rel=0.06)
 
@@ -117,7 +122,7 @@ def test_nested_resamples_are_those_of_a_loop_over_draws():
         ])
         for _ in range(8000)
     ]  # fmt: skip
-    ours = nested_resamples(runs, num_resamples=8000)[:, 0]
+    ours = many_resamples(runs)[:, 0]
     for share in (5, 25, 50, 75, 95):
         wanted = np.percentile(loop, share)
         assert np.percentile(ours, share) == pytest.approx(wanted, abs=0.35)

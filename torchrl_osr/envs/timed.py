@@ -21,24 +21,14 @@ from torchrl_osr.envs.disturbance import (
 )
 
 At: TypeAlias = int | Literal["random"]
-"""Steps of the agent before the disturbance, or a moment drawn for each episode."""
+"""Steps of the agent before the disturbance; ``"random"`` averages over the gait."""
 
 SMALL = 1e-3
 """Magnitude of the benchmark's random actions, in units of the action."""
 
 
 class TimedDisturbance(DisturbanceWrapper):
-    """Abstract base of the wrappers that act for some steps, once an episode.
-
-    At a fixed moment all episodes are in much the same phase of the gait; ``"random"``
-    averages over the phase.
-
-    Args:
-        env: the environment.
-        at: number of the agent's steps before it, or ``"random"``.
-        window: first moment and the one after the last, for ``"random"``.
-        first: the earliest moment allowed.
-    """
+    """Abstract base that knows the moment; ``first`` is the earliest one allowed."""
 
     def __init__(
         self,
@@ -57,10 +47,8 @@ class TimedDisturbance(DisturbanceWrapper):
         self.at, self.window = at, (start, end)
         self._start = self._steps = 0
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Vector, dict[str, Any]]:
-        observation, info = super().reset(seed=seed, options=options)
+    def reset(self, **options: Any) -> tuple[Vector, dict[str, Any]]:
+        observation, info = super().reset(**options)
         if self.at == "random":
             self._start = int(self._generator.integers(*self.window))
         else:
@@ -189,11 +177,10 @@ class ActionKnock(TimedDisturbance):
 class ExternalPush(TimedDisturbance):
     """Push the torso forwards or backwards, once an episode.
 
-    The knock that the figures of "Recovering from Out-of-sample States via Inverse
-    Dynamics in Offline Reinforcement Learning" draw as arrows, as a real force: along
-    the world's x axis at the torso's centre of mass (MuJoCo's ``xfrc_applied``),
-    constant for ``duration`` steps of the agent. The sign is drawn for each episode.
-    The agent acts on, rewards and survival count.
+    The arrow in the figures of the OSR paper, see :class:`ActionKnock`, as a force along
+    the world's x axis at the torso's centre of mass (MuJoCo's ``xfrc_applied``), for
+    ``duration`` steps of the agent. The sign is drawn for each episode. The agent acts
+    on, rewards and survival count.
 
     ``info["push_force"]`` is the force of a step in newtons, with its sign.
 

@@ -56,7 +56,6 @@ from torchrl_osr.evaluation.training_summary import (
     NUM_RECENT,
     learning_curve,
     read_scalars,
-    recent_score,
     score_table,
 )
 
@@ -94,7 +93,6 @@ __all__ = [
     "percentile_interval",
     "performance_profile",
     "read_scalars",
-    "recent_score",
     "robustness_figure",
     "robustness_table",
     "score_table",

@@ -1,4 +1,4 @@
-"""Distance of a state to the data: the mean over its nearest neighbours there.
+"""Distance of a state to the data.
 
 Shapes: ``N`` rows of the data, ``M`` states, ``S`` observation, ``K`` neighbours.
 """
@@ -11,6 +11,9 @@ from torch import Tensor
 
 from torchrl_osr.data import observation_statistics
 
+NUM_NEIGHBORS = 10
+"""``K``."""
+
 # States that the threshold is computed from, and at most a fifth of the data.
 MAX_HELD_OUT = 2_000
 
@@ -19,7 +22,7 @@ ROWS_AT_A_TIME = 64
 
 
 class DataDistance:
-    r"""Mean distance to the ``K`` nearest of the data's states, standardised.
+    r"""Mean distance to the ``K = 10`` nearest of the data's states, standardised.
 
     .. math::
         d(s) = \frac{1}{K} \sum_{k=1}^{K} \lVert \sigma^{-1} (s - s_{(k)}) \rVert_2
@@ -34,16 +37,14 @@ class DataDistance:
             disk.
 
     Keyword Args:
-        num_neighbors: ``K``. Default 10.
         max_reference: size of the subset, at most. Default 20,000.
-        seed: of the two random subsets, which have a generator of their own. Default 0.
+        seed: of the two random subsets. Default 0.
 
     Attributes:
         threshold: see above, in the unit of the distance: standard deviations.
 
     Raises:
-        ValueError: if ``num_neighbors`` is below 1, or the data have too few rows for
-            ``K`` neighbours and a held-out state.
+        ValueError: if there are too few rows for ``K`` neighbours and a held-out state.
 
     Examples:
         >>> import torch
@@ -60,18 +61,15 @@ class DataDistance:
         self,
         data: TensorDictBase,
         *,
-        num_neighbors: int = 10,
         max_reference: int = 20_000,
         seed: int = 0,
     ) -> None:
-        if num_neighbors < 1:
-            raise ValueError(f"num_neighbors must be at least 1, got {num_neighbors}.")
         held_out = min(MAX_HELD_OUT, len(data) // 5)
         reference = min(max_reference, len(data) - held_out)
-        if reference < num_neighbors or held_out < 1:
+        if reference < NUM_NEIGHBORS or held_out < 1:
             raise ValueError(
                 f"{len(data)} rows, max_reference={max_reference}: too few for "
-                f"{num_neighbors} neighbours and a held-out state."
+                f"{NUM_NEIGHBORS} neighbours and a held-out state."
             )
         loc, scale = observation_statistics(data)
         self._loc, self._scale = loc.cpu().double(), scale.cpu().double()
@@ -82,7 +80,6 @@ class DataDistance:
             data[rows]["observation"].cpu()
             for rows in (order[held_out:][:reference], order[:held_out])
         )
-        self.num_neighbors = num_neighbors
         self._states = self._standard(states)
         self._squares = self._states.square().sum(-1)
         distances = self(others)
@@ -104,6 +101,6 @@ class DataDistance:
         # double precision has enough of them, and takes a third longer.
         others = torch.addmm(self._squares, states, self._states.T, alpha=-2)
         # |s|^2 does not change which are near.
-        near = others.topk(self.num_neighbors, largest=False, sorted=False).values
+        near = others.topk(NUM_NEIGHBORS, largest=False, sorted=False).values
         squares = near + states.square().sum(-1, keepdim=True)
         return squares.clamp_min(0).sqrt().mean(-1)

@@ -15,15 +15,7 @@ BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 
 
 def new_figure(width: float, height: float, **options: Any) -> Figure:
-    """Matplotlib figure that draws in memory.
-
-    Args:
-        width, height: in inches.
-        **options: of :class:`matplotlib.figure.Figure`.
-
-    Raises:
-        ImportError: if matplotlib is not installed, with what to install.
-    """
+    """Matplotlib figure, ``width`` x ``height`` inches, that draws in memory."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -37,14 +29,6 @@ def new_figure(width: float, height: float, **options: Any) -> Figure:
 
 
 def save_figure(figure: Figure, path: Path | str, *, dpi: int = 150) -> None:
-    """Write a figure as PNG; a file of that name is replaced once it is whole.
-
-    Args:
-        figure: drawn.
-        path: of the file.
-
-    Keyword Args:
-        dpi: dots per inch. Default 150.
-    """
+    """Write a figure as PNG; a file of that name is replaced once it is whole."""
     with whole_file(Path(path)) as file:
         figure.savefig(file, dpi=dpi, format="png")

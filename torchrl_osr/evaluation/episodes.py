@@ -35,14 +35,14 @@ Watch = Callable[[int, NDArray[Any], bool, dict[str, Any]], None]
 
 @dataclass(frozen=True)
 class EpisodeResults:
-    """Returns and lengths of an evaluation's episodes, in the order of the seeds.
+    """Returns and lengths of an evaluation's episodes, ``[E]`` each.
 
     Attributes:
-        returns: undiscounted sum of rewards, ``[E]``.
-        lengths: steps until the end, ``[E]``.
-        seeds: of ``env.reset``, ``[E]``.
-        successes: whether the goal was reached, as ``info["success"]`` of the last step
-            says, ``[E]``. Default: ``None``, the task has no such entry.
+        returns: undiscounted sum of rewards.
+        lengths: steps until the end.
+        seeds: of ``env.reset``.
+        successes: ``info["success"]`` of the last step. Default: the task has no such
+            entry.
     """
 
     returns: NDArray[np.float64]
@@ -58,8 +58,7 @@ def deterministic_policy(
     """The actor's deterministic action as a function of raw observations.
 
     Args:
-        actor_network: reads ``"observation"``, ends in a
-            :class:`~torchrl.modules.TanhNormal`.
+        actor_network: reads ``"observation"``.
         observation_norm: how the training data were standardised
             (``standard_normal=True``). Default: not at all.
     """
@@ -78,9 +77,8 @@ def deterministic_policy(
 class EpisodeEvaluator:
     """Runs one episode for each of a fixed list of seeds, to its end.
 
-    The environments step together, so that the policy is called once a step for all
-    unfinished episodes; they are kept from one evaluation to the next. Neither torch's
-    nor NumPy's global generator is touched.
+    The policy is called once a step, with all unfinished episodes. The environments are
+    kept from one evaluation to the next.
 
     Args:
         env_id: a Gymnasium id, ``"Hopper-v5"`` for instance.
@@ -122,7 +120,9 @@ class EpisodeEvaluator:
         self.device = device
         self.fixed_batch = fixed_batch
 
-    def __call__(self, policy: Policy, watch: Watch | None = None) -> EpisodeResults:
+    def __call__(
+        self, policy: Policy, watch: Watch = lambda *_: None
+    ) -> EpisodeResults:
         """Play one episode for each seed.
 
         Args:
@@ -138,9 +138,8 @@ class EpisodeEvaluator:
             for environment, seed in zip(self.environments, self.seeds, strict=True)
         ]
         observations = np.stack([start for start, _ in starts]).astype(np.float32)
-        if watch is not None:
-            for episode, (start, info) in enumerate(starts):
-                watch(episode, start, False, info)
+        for episode, (start, info) in enumerate(starts):
+            watch(episode, start, False, info)
         running = np.arange(episodes)
         while running.size:
             rows = np.arange(episodes) if self.fixed_batch else running
@@ -153,8 +152,7 @@ class EpisodeEvaluator:
                 observation, reward, terminated, truncated, info = self.environments[
                     episode
                 ].step(actions[row])
-                if watch is not None:
-                    watch(episode, observation, terminated, info)
+                watch(episode, observation, terminated, info)
                 observations[episode] = observation
                 returns[episode] += float(reward)
                 lengths[episode] += 1
@@ -176,7 +174,7 @@ def summarize(results: EpisodeResults, env_name: str) -> dict[str, Any]:
     """Normalised score, its interval and the raw results, JSON-compatible.
 
     Args:
-        results: raw results of ``E`` episodes.
+        results: of ``E`` episodes.
         env_name: short name with reference returns, ``"hopper"`` for instance.
 
     Returns:

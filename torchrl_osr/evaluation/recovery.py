@@ -30,8 +30,7 @@ class Trajectory:
     Attributes:
         observations: of the reset and of each step, float32 ``[S]`` each.
         disturbed: ``info["disturbed"]`` of each.
-        terminated: whether the episode ended by a fall, neither by the time limit nor
-            at a goal.
+        terminated: whether it ended by a fall: not at the time limit or a goal.
     """
 
     observations: list[NDArray[np.float32]] = field(default_factory=list)
@@ -45,14 +44,7 @@ class Trajectory:
 
 
 class Recorder:
-    """Keeps the trajectories of an evaluation, as its ``watch``.
-
-    Args:
-        num_episodes: of the evaluation.
-
-    Attributes:
-        trajectories: one for each episode.
-    """
+    """Keeps the trajectories of an evaluation's episodes, as its ``watch``."""
 
     def __init__(self, num_episodes: int) -> None:
         self.trajectories = [Trajectory() for _ in range(num_episodes)]
@@ -64,7 +56,6 @@ class Recorder:
         terminated: bool,
         info: dict[str, Any],
     ) -> None:
-        """Append the results of a reset or a step."""
         trajectory = self.trajectories[episode]
         # astype copies: an environment may write into the same array again.
         trajectory.observations.append(observation.astype(np.float32))
@@ -87,10 +78,9 @@ class Recovery:
         survived: had not fallen by then.
         alive_after: had not fallen :data:`STEPS_AFTER` steps later; ``None`` if the
             time limit came first.
-        clean_alive_after: the same for the undisturbed episode of the pair, which may
-            have fallen anyway.
-        steps: from its end until the distance to the data is within the threshold, 0 if
-            it never left; ``None`` if the episode ended before.
+        clean_alive_after: the same for the undisturbed episode of the pair.
+        steps: from its end until the distance to the data is within the threshold;
+            ``None`` if the episode ended before.
         distance: in units of the threshold, from :data:`STEPS_BEFORE` steps before the
             end of the disturbance to :data:`STEPS_AFTER` after it; NaN at steps that
             the episode does not have.
@@ -118,13 +108,7 @@ def disturbed_at(trajectory: Trajectory) -> int | None:
 def measure_recovery(
     disturbed: Trajectory, clean: Trajectory, distance: DataDistance
 ) -> Recovery:
-    """Survival, recovery and distances of one pair of episodes.
-
-    Args:
-        disturbed: the episode with the disturbance.
-        clean: the one without.
-        distance: to the data, with its threshold.
-    """
+    """Survival, recovery and distances of one pair of episodes."""
     block = _first_block(disturbed.disturbed)
     if block is None:
         return Recovery()
@@ -162,10 +146,10 @@ def _around(
 
 def _alive_after(trajectory: Trajectory, end: int) -> bool | None:
     """Whether there is no fall until :data:`STEPS_AFTER` steps after ``end``."""
-    fell_within = trajectory.terminated and trajectory.last <= end + STEPS_AFTER
-    if fell_within:
+    later = trajectory.last - end
+    if trajectory.terminated and later <= STEPS_AFTER:
         return False
-    return True if trajectory.last >= end + STEPS_AFTER else None
+    return True if later >= STEPS_AFTER else None
 
 
 def _first_block(disturbed: Sequence[bool]) -> tuple[int, int] | None:

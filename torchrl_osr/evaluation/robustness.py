@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from torchrl_osr._checks import check_positive
 from torchrl_osr.data import normalized_score
 from torchrl_osr.evaluation.data_distance import DataDistance
 from torchrl_osr.evaluation.episodes import (
@@ -61,8 +62,7 @@ class Disturbance:
         kind: of the disturbance; those of :data:`TRANSIENT` end.
         strength: in the unit of its kind.
         wrap: puts the disturbance around an environment. Default: nothing.
-        policy: plays in the place of the evaluated one, for attacks that act between
-            environment and policy. Default: the evaluated one.
+        policy: an attacked one, in the place of the evaluated one. Default: none.
     """
 
     name: str
@@ -90,12 +90,7 @@ class DisturbanceResults(NamedTuple):
 
 
 class PairedResults(NamedTuple):
-    """Clean episodes, and those under each disturbance with the same seeds.
-
-    Attributes:
-        clean: without a disturbance.
-        disturbed: in the order of the suite.
-    """
+    """Clean episodes, and those with the same seeds under each of the disturbances."""
 
     clean: EpisodeResults
     disturbed: list[DisturbanceResults]
@@ -115,8 +110,7 @@ def evaluate_paired(
 
     Episodes of a pair have the same seed, hence the same start state, and the policy
     is called with batches of one size: until the disturbance acts they are equal, bit
-    for bit. Every disturbance has environments of its own: no change of a model is
-    carried over to the next one.
+    for bit. Every disturbance has environments of its own.
 
     Args:
         policy: to be evaluated, on the CPU.
@@ -133,11 +127,7 @@ def evaluate_paired(
         ValueError: if ``num_episodes`` is below 2, two disturbances have one name, or
             one of them is not possible for this environment.
     """
-    if num_episodes < 2:
-        raise ValueError(
-            f"num_episodes must be at least 2, got {num_episodes}: one pair of "
-            "episodes has no interval."
-        )
+    check_positive("num_episodes", num_episodes, minimum=2)
     check_disturbances(env_id, disturbances)
 
     def play(policy: Policy, wrap: Wrap | None) -> tuple[EpisodeResults, Recorder]:
@@ -168,11 +158,7 @@ def evaluate_paired(
 
 
 def check_disturbances(env_id: str, disturbances: Sequence[Disturbance]) -> None:
-    """Raise unless every disturbance has its own name and fits the environment.
-
-    Raises:
-        ValueError: naming the disturbance and what is wrong with it.
-    """
+    """Raise a ValueError unless all have their own names and fit the environment."""
     names = [each.name for each in disturbances]
     if len(set(names)) < len(names) or not names:
         raise ValueError(f"disturbances need one name each, got {names}.")
@@ -198,24 +184,17 @@ def decrease_interval(
 
     Returns:
         ``100 (1 - mean(disturbed) / mean(clean))``, lower and upper end. All three are
-        ``None`` if the clean mean is not above 0, the ends alone if that is so in a
-        resample.
-
-    Raises:
-        ValueError: if there are not two pairs or more, or a score is not finite.
+        ``None`` for fewer than two pairs or a clean mean that is not above 0, the ends
+        alone if that is so in a resample.
 
     Examples:
         >>> decrease_interval([40.0, 60.0], [20.0, 30.0])
         (50.0, 50.0, 50.0)
     """
     pairs = np.stack([np.asarray(clean, float), np.asarray(disturbed, float)])
-    if pairs.ndim != 2 or pairs.shape[1] < 2 or not np.isfinite(pairs).all():
-        raise ValueError(
-            f"decrease_interval needs two finite pairs or more, got {pairs.tolist()}."
-        )
-    clean_mean, disturbed_mean = pairs.mean(1)
-    if clean_mean <= 0:
+    if pairs.shape[1] < 2 or pairs[0].mean() <= 0:
         return None, None, None
+    clean_mean, disturbed_mean = pairs.mean(1)
     decrease = float(100 * (1 - disturbed_mean / clean_mean))
     rng = np.random.default_rng(0)
     rows = rng.integers(pairs.shape[1], size=(NUM_RESAMPLES, pairs.shape[1]))
@@ -227,10 +206,10 @@ def decrease_interval(
 
 
 def evaluation_json(step: int, paired: PairedResults, env_name: str) -> dict[str, Any]:
-    """Raw results of one checkpoint, JSON-compatible.
+    """Raw results of the checkpoint after ``step`` gradient steps, JSON-compatible.
 
     Args:
-        step: gradient steps of the checkpoint.
+        step: of the checkpoint.
         paired: its episodes.
         env_name: short name with reference returns, ``"hopper"`` for instance.
     """
@@ -302,17 +281,14 @@ def summarize_disturbances(
         evaluations: see :func:`evaluation_json`; the same disturbances in all.
 
     Returns:
-        A row for each disturbance: ``"name"``, ``"kind"``, ``"strength"``,
-        ``"clean_score"`` and ``"score"`` (means over all pairs of episodes),
-        ``"score_low"``, ``"score_high"``, ``"decrease"`` with its interval
-        ``"decrease_low"``, ``"decrease_high"``; ``"disturbed_share"``, the share of
-        episodes that the disturbance acted in; and over those alone
-        ``"clean_score_disturbed"``, ``"score_disturbed"``, ``"decrease_disturbed"``
-        with interval, ``"survived"`` (share alive at its end), ``"survival"`` (share
-        alive 100 steps later), ``"clean_survival"`` (of the undisturbed ones of the
-        pairs, at the same step), ``"recovered_share"`` and ``"recovery_median"``
-        (episodes that never came back count as infinitely late). ``None`` where there
-        is nothing to average, or the median is infinite.
+        A row for each disturbance. Over all pairs of episodes: ``"clean_score"``,
+        ``"score"`` and ``"decrease"`` (see :func:`decrease_interval`), and
+        ``"disturbed_share"``, the share that the disturbance acted in. Over those
+        alone: ``"clean_score_disturbed"``, ``"score_disturbed"``,
+        ``"decrease_disturbed"``, the shares alive at its end (``"survived"``) and 100
+        steps later (``"survival"``; ``"clean_survival"`` of the undisturbed ones),
+        ``"recovered_share"`` and ``"recovery_median"``, steps until back in the data.
+        ``None`` where there is nothing to average, or the median is infinite.
     """
     rows = []
     for position, first in enumerate(evaluations[0]["levels"]):
@@ -349,9 +325,8 @@ def summarize_disturbances(
 
 
 def _decrease(name: str, clean: ArrayLike, scores: ArrayLike) -> dict[str, Any]:
-    enough = np.size(clean) >= 2
-    values = decrease_interval(clean, scores) if enough else (None,) * 3
-    return dict(zip((name, f"{name}_low", f"{name}_high"), values, strict=True))
+    names = (name, f"{name}_low", f"{name}_high")
+    return dict(zip(names, decrease_interval(clean, scores), strict=True))
 
 
 def _mean(values: NDArray[Any]) -> float | None:
@@ -377,12 +352,7 @@ def _recovered(
 
 
 def robustness_table(title: str, summary: Sequence[Mapping[str, Any]]) -> str:
-    """Table of a summary, as text.
-
-    Args:
-        title: what was evaluated.
-        summary: see :func:`summarize_disturbances`.
-    """
+    """Text table of a summary, see :func:`summarize_disturbances`."""
 
     def number(value: float | None, digits: int = 1) -> str:
         return "-" if value is None else f"{value:.{digits}f}"

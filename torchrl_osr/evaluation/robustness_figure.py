@@ -24,11 +24,10 @@ def robustness_figure(
     *,
     title: str,
 ) -> None:
-    """Draw scores under disturbances, and distances to the data after them.
+    """Draw scores under disturbances and, after those that end, distances to the data.
 
     Where each kind has several strengths, the score is drawn over the strength;
-    otherwise each disturbance has a line of its own. Without a disturbance that ends
-    there is no second panel.
+    otherwise each disturbance has a line of its own.
 
     Args:
         summary: see :func:`~torchrl_osr.evaluation.summarize_disturbances`.
@@ -66,16 +65,13 @@ def distance_curves(
 ) -> dict[str, tuple[list[int], list[float]]]:
     """Mean distance to the data around the end of each disturbance.
 
-    Over all checkpoints; those of the undisturbed episodes, of all disturbances
-    together, are named ``"undisturbed"``. Offsets with fewer than a tenth of the
-    episodes at offset 0 are left out: a mean of one or two episodes that still run says
-    nothing about the disturbance.
-
     Args:
-        evaluations: raw results; disturbances without a distance are left out.
+        evaluations: raw results of all checkpoints.
 
     Returns:
-        Offsets and distances in units of the threshold, by name.
+        Offsets and distances in units of the threshold, by name of the disturbance;
+        those of all undisturbed episodes are named ``"undisturbed"``. Offsets with
+        fewer than a tenth of the episodes at offset 0 are left out.
     """
     parts: dict[str, list[tuple[Any, Any]]] = {}
     offset: list[int] = []

@@ -22,17 +22,11 @@ TAIL = 50 * (1 - 0.95)
 """Percent of the resamples below an interval, and above it."""
 
 
-def mean_interval(
-    values: ArrayLike, *, num_resamples: int = NUM_RESAMPLES, seed: int = 0
-) -> tuple[float, float, float]:
+def mean_interval(values: ArrayLike) -> tuple[float, float, float]:
     """Mean and its 95 % percentile-bootstrap interval.
 
     Args:
         values: independent results, returns of episodes for instance, ``[E]``.
-
-    Keyword Args:
-        num_resamples: bootstrap resamples. Default 2000.
-        seed: of the resampling. Default 0.
 
     Returns:
         Mean, lower and upper end. With a single value all three are that value.
@@ -48,8 +42,8 @@ def mean_interval(
     sample = np.asarray(values, dtype=np.float64).ravel()
     if not sample.size or not np.isfinite(sample).all():
         raise ValueError(f"mean_interval needs finite values, got {sample}.")
-    rng = np.random.default_rng(seed)
-    resamples = sample[rng.integers(sample.size, size=(num_resamples, sample.size))]
+    rng = np.random.default_rng(0)
+    resamples = sample[rng.integers(sample.size, size=(NUM_RESAMPLES, sample.size))]
     low, high = percentile_interval(resamples.mean(1))
     return float(sample.mean()), float(low), float(high)
 
@@ -62,7 +56,7 @@ def wilson_interval(count: int, total: int) -> tuple[float, float]:
         total: trials.
 
     Raises:
-        ValueError: if there is no trial, or there are more successes than trials.
+        ValueError: without trials, or with more successes than trials.
 
     Examples:
         >>> from torchrl_osr.evaluation import wilson_interval
@@ -82,17 +76,13 @@ def wilson_interval(count: int, total: int) -> tuple[float, float]:
 def percentile_interval(
     resamples: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lower and upper end of the 95 % percentile interval, over the first axis.
-
-    Args:
-        resamples: a statistic of each resample, ``[R, ...]``.
-    """
+    """Ends of the 95 % percentile interval of resamples ``[R, ...]``."""
     low, high = np.percentile(resamples, [TAIL, 100 - TAIL], axis=0)
     return low, high
 
 
 def nested_resamples(
-    runs: Sequence[ArrayLike], *, num_resamples: int = NUM_RESAMPLES, seed: int = 0
+    runs: Sequence[ArrayLike], *, seed: int = 0
 ) -> NDArray[np.float64]:
     """Bootstrap means over resampled runs and, in each of them, resampled episodes.
 
@@ -103,14 +93,13 @@ def nested_resamples(
         runs: numbers of the episodes of each run, ``[E, K]``; ``E`` may differ.
 
     Keyword Args:
-        num_resamples: ``R``. Default 2000.
         seed: of the resampling. Default 0.
 
     Returns:
         Means, every run with equal weight, ``[R, K]``.
 
     Raises:
-        ValueError: if there are no runs, or one of them has no episodes.
+        ValueError: if there are no runs, or one has no episodes.
 
     Examples:
         >>> resamples = nested_resamples([[[1.0, 5.0]] * 3, [[1.0, 5.0]] * 4])
@@ -122,8 +111,8 @@ def nested_resamples(
         shapes = [table.shape for table in tables]
         raise ValueError(f"nested_resamples needs episodes [E, K], got {shapes}.")
     rng = np.random.default_rng(seed)
-    drawn = rng.integers(len(tables), size=(num_resamples, len(tables)))
-    total = np.zeros((num_resamples, tables[0].shape[1]))
+    drawn = rng.integers(len(tables), size=(NUM_RESAMPLES, len(tables)))
+    total = np.zeros((NUM_RESAMPLES, tables[0].shape[1]))
     for place in drawn.T:
         for number, table in enumerate(tables):
             rows = np.flatnonzero(place == number)
@@ -134,17 +123,11 @@ def nested_resamples(
     return total / len(tables)
 
 
-def stratified_resamples(
-    strata: Sequence[ArrayLike], *, num_resamples: int = NUM_RESAMPLES, seed: int = 0
-) -> NDArray[np.float64]:
+def stratified_resamples(strata: Sequence[ArrayLike]) -> NDArray[np.float64]:
     """Bootstrap resamples that keep the number of runs of every stratum.
 
     Args:
         strata: a number of each run, a sequence for each data set.
-
-    Keyword Args:
-        num_resamples: ``R``. Default 2000.
-        seed: of the resampling. Default 0.
 
     Returns:
         The runs of all strata side by side, ``[R, N]``.
@@ -155,14 +138,12 @@ def stratified_resamples(
     samples = [np.asarray(stratum, dtype=np.float64) for stratum in strata]
     if not samples or not all(sample.size for sample in samples):
         raise ValueError("stratified_resamples needs a value in every stratum.")
-    rng = np.random.default_rng(seed)
-    return np.concatenate(
-        [
-            sample[rng.integers(sample.size, size=(num_resamples, sample.size))]
-            for sample in samples
-        ],
-        axis=1,
-    )
+    rng = np.random.default_rng(0)
+    resamples = [
+        sample[rng.integers(sample.size, size=(NUM_RESAMPLES, sample.size))]
+        for sample in samples
+    ]
+    return np.concatenate(resamples, axis=1)
 
 
 def interquartile_mean(values: ArrayLike) -> NDArray[np.float64]:

@@ -9,13 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_osr.evaluation.drawing import (
-    BLUE,
-    GREY,
-    ORANGE,
-    new_figure,
-    save_figure,
-)
+from torchrl_osr.evaluation.drawing import BLUE, GREY, ORANGE, new_figure, save_figure
 
 NUM_RECENT = 5
 """Evaluations in the mean of the last ones.
@@ -33,11 +27,6 @@ PANELS = {
 """Logged scalars below the score, and their titles."""
 
 
-def recent_score(history: Sequence[Mapping[str, Any]]) -> float:
-    """Return the mean score of the last :data:`NUM_RECENT` evaluations."""
-    return float(np.mean([row["score"] for row in history[-NUM_RECENT:]]))
-
-
 def score_table(
     title: str,
     history: Sequence[Mapping[str, Any]],
@@ -45,14 +34,14 @@ def score_table(
     data_score: float | None,
     folder: Path,
 ) -> str:
-    """Return the table of data's and policy's scores.
+    """Text table of the data's and the policy's scores.
 
     Args:
         title: what was trained on what.
         history: all evaluations with their ``"step"``, see
             :func:`~torchrl_osr.evaluation.summarize`.
         best: the best of them; chosen by its own episodes, hence optimistic.
-        data_score: mean normalised score of the data's episodes, if it is known.
+        data_score: mean normalised score of the data's episodes, if known.
         folder: where the run's files are.
     """
 
@@ -60,13 +49,11 @@ def score_table(
         return f"{row['score']:6.1f}  [{row['score_low']:.1f}, {row['score_high']:.1f}]"
 
     known = "unknown" if data_score is None else f"{data_score:6.1f}"
+    recent = [row["score"] for row in history[-NUM_RECENT:]]
     rows = [
         ("data, mean episode", known),
         ("policy, last", with_interval(history[-1])),
-        (
-            f"policy, mean of last {min(NUM_RECENT, len(history))}",
-            f"{recent_score(history):6.1f}",
-        ),
+        (f"policy, mean of last {len(recent)}", f"{np.mean(recent):6.1f}"),
         ("policy, best evaluation", f"{with_interval(best)}  at step {best['step']}"),
     ]
     if "success_rate" in history[-1]:
@@ -82,15 +69,12 @@ def score_table(
 
 
 def read_scalars(folder: Path | str) -> dict[str, list[tuple[int, float]]]:
-    """Read what a TorchRL ``CSVLogger`` wrote, by name.
+    """Step and value pairs that a TorchRL ``CSVLogger`` wrote, by name.
 
     A resumed run logs the steps since its checkpoint once more; the later row counts.
 
     Args:
         folder: the logger's ``scalars`` folder of one phase.
-
-    Returns:
-        Step and value pairs, in the order of the steps.
     """
     scalars = {}
     for path in sorted(Path(folder).glob("*.csv")):
@@ -111,14 +95,12 @@ def learning_curve(
     """Draw the score with its interval, and the losses, over gradient steps.
 
     Args:
-        history: evaluations with ``"step"``, ``"score"``, ``"score_low"`` and
-            ``"score_high"``.
+        history: see :func:`score_table`.
         scalars: see :func:`read_scalars`.
         path: the PNG to write.
 
     Keyword Args:
-        title: what was trained on what.
-        data_score: mean normalised score of the data's episodes, if it is known.
+        title, data_score: see :func:`score_table`.
     """
     panels = [name for name in PANELS if scalars.get(name)]
     figure = new_figure(9, 6.4, layout="constrained")
