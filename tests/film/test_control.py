@@ -155,7 +155,6 @@ def test_latent_is_at_its_mean():
 @pytest.mark.parametrize(
     ("references", "rule", "named"),
     [
-        ([], "time", "got 0"),
         ([torch.zeros(1, 2)], "time", r"reference 0 has shape \(1, 2\)"),
         ([torch.zeros(3, 2), torch.zeros(3)], "time", r"reference 1 has shape \(3,\)"),
         ([torch.zeros(3, 2)], "next", "rule"),

@@ -1,9 +1,7 @@
 """The inverse dynamics model as a controller that follows a reference trajectory.
 
 Figure 3 of "Recovering from Out-of-sample States via Inverse Dynamics in Offline
-Reinforcement Learning", https://openreview.net/forum?id=4gLWjSaw4o, where the model
-leads a knocked robot back to the trajectory of the behaviour policy. Nothing is learnt
-here; the model gives the action that leads from the present state to a target.
+Reinforcement Learning", https://openreview.net/forum?id=4gLWjSaw4o
 
 Shapes: ``E`` episodes side by side, ``T`` states of a reference (each its own), ``S``
 observation, ``A`` action.
@@ -41,22 +39,15 @@ class InverseDynamicsController:
             & \text{"nearest"}
         \end{cases}
 
-    * ``"time"``: the reference's next state at the same time. After a delay the gait is
-      out of phase: the target is then out of reach, and the pair of states unlike those
-      that the model was trained on.
-    * ``"nearest"``: the successor of the reference's nearest state, the last one left
-      out. Any phase of the gait can be taken up again, and the pair is as close to the
-      data as possible.
-
-    The paper only says "we set the target state of IDM to the corresponding state in
-    the expert trajectory". That reads as ``"time"``; ``"nearest"`` is ours.
+    ``"time"`` is how the paper reads: "the corresponding state in the expert
+    trajectory". A push shifts the phase of the gait, and then that target is out of
+    reach; ``"nearest"``, which is ours, takes up the gait in any phase.
 
     A controller counts its calls, so it is a policy for one evaluation in which every
     call has all ``E`` rows: ``EpisodeEvaluator(..., fixed_batch=True)``.
 
     Args:
-        inverse_dynamics_network: a trained model of ``I(a | s, s')``, reads
-            ``"observation"`` and ``("next", "observation")``.
+        inverse_dynamics_network: a trained model of ``I(a | s, s')``.
         references: raw observations of one episode for each row, from the reset on,
             ``[T, S]`` each; they may differ in ``T``.
 
@@ -69,8 +60,7 @@ class InverseDynamicsController:
         step: number of calls.
 
     Raises:
-        ValueError: if ``rule`` is unknown, there is no reference, or one has no next
-            state.
+        ValueError: if ``rule`` is unknown, or a reference has no next state.
 
     Examples:
         >>> import torch
@@ -91,8 +81,6 @@ class InverseDynamicsController:
         observation_norm: ObservationNorm | None = None,
     ) -> None:
         check_choice("rule", rule, ("time", "nearest"))
-        if not references:
-            raise ValueError("references must have one trajectory for each row, got 0.")
         for row, reference in enumerate(references):
             if reference.ndim != 2 or len(reference) < 2:
                 raise ValueError(
@@ -105,11 +93,7 @@ class InverseDynamicsController:
 
     @torch.no_grad()
     def __call__(self, observation: Tensor) -> Tensor:
-        """Actions ``[E, A]`` at raw observations ``[E, S]``.
-
-        Raises:
-            ValueError: if there is not one row for each reference.
-        """
+        """Actions ``[E, A]`` at raw observations ``[E, S]``, one for each reference."""
         if len(observation) != len(self._references):
             raise ValueError(
                 f"{len(observation)} observations for {len(self._references)} "
@@ -127,11 +111,7 @@ class InverseDynamicsController:
         return action
 
     def targets(self, observation: Tensor) -> Tensor:
-        """Target of each row for the next call, standardised, ``[E, S]``.
-
-        Args:
-            observation: standardised, ``[E, S]``.
-        """
+        """Targets ``[E, S]`` of the next call, standardised like ``observation``."""
         if self.rule == "time":
             # Past its end a reference stays at its last state.
             rows = [

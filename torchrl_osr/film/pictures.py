@@ -15,20 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_osr._files import whole_file
-from torchrl_osr.evaluation.drawing import (
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    new_figure,
-    save_figure,
-)
+from torchrl_osr.evaluation import drawing
+from torchrl_osr.evaluation.drawing import GREY, new_figure, save_figure
 from torchrl_osr.film.takeover import PoseRecorder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-COLORS = (ORANGE, GREEN, BLUE)
+COLORS = (drawing.ORANGE, drawing.GREEN, drawing.BLUE)
 """Of the takes, in their order."""
 
 MARKED = "#A0457E"
@@ -46,11 +40,7 @@ GIF_STRIDE, GIF_MILLISECONDS = 3, 80
 CENTRAL = (0.2, 99.8)
 """Percentiles of the data that the map of visited states shows."""
 
-MARKER: dict[str, Any] = {
-    "markersize": 12,
-    "markeredgecolor": "black",
-    "linestyle": "",
-}
+MARKER: dict[str, Any] = {"markersize": 12, "markeredgecolor": "black", "ls": ""}
 
 
 @dataclass(frozen=True)
@@ -276,22 +266,10 @@ def film_gif(
 def principal_plane(
     rows: NDArray[np.floating],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The two directions of largest variance, and their shares of it.
+    """The two directions of largest variance, ``[2, S]``, and their shares of it.
 
     Args:
         rows: centred, ``[N, S]``.
-
-    Returns:
-        Directions ``[2, S]``, the largest entry of each positive, and shares ``[2]``.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_osr.film import principal_plane
-        >>> rows = np.array([[0.0, 3.0, 0.0], [0.0, -3.0, 0.0], [1.0, 0.0, 0.0],
-        ...                  [-1.0, 0.0, 0.0]])
-        >>> directions, shares = principal_plane(rows)
-        >>> directions.round(6).tolist(), shares.round(6).tolist()
-        ([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]], [0.9, 0.1])
     """
     _, values, directions = np.linalg.svd(np.asarray(rows, float), full_matrices=False)
     plane = directions[:2]

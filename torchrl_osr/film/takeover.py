@@ -1,8 +1,7 @@
 """Several controllers that go on from the same state after a disturbance.
 
 The behaviour policy plays until the disturbance is over; then the controller that is
-tested takes over. The rest of the episode depends on the controller alone, not on the
-state in which each would have met the disturbance.
+tested takes over.
 
 Shapes: ``E`` episodes, ``S`` observation, ``A`` action, ``Q`` joint positions.
 """
@@ -39,29 +38,16 @@ BEHAVIOR = "behaviour policy"
 """Name of the behaviour policy among the controllers: it goes on playing."""
 
 Controller: TypeAlias = Callable[[list[Tensor]], Policy]
-"""Makes a policy for one evaluation.
+"""Makes a policy for one evaluation from the behaviour policy's undisturbed episodes.
 
-Its argument is the behaviour policy's undisturbed episodes, raw observations ``[T, S]``
-of each from the reset on.
+Of each, the raw observations ``[T, S]`` from the reset on.
 """
 
 
 def steps_alive(trajectory: Trajectory, moment: int, steps: int) -> int:
-    """Steps of an episode without a fall after a moment, at most ``steps``.
-
-    Args:
-        trajectory: lasts ``steps`` steps after the moment, or ends in a fall.
-        moment: the entry to count from.
-        steps: to be counted at most.
-
-    Raises:
-        ValueError: if it ended before that without a fall.
-    """
-    later = trajectory.last - moment
-    if later < steps and not trajectory.terminated:
-        raise ValueError(f"broken off {later} steps after entry {moment}, not {steps}.")
-    # The last entry of a fallen one is the fall.
-    return max(min(later - trajectory.terminated, steps), 0)
+    """Steps without a fall after the entry ``moment``, at most ``steps``."""
+    # The last entry of a fallen one is the fall. NEVER is later than all entries.
+    return max(min(trajectory.last - trajectory.terminated - moment, steps), 0)
 
 
 @dataclass(frozen=True)
@@ -69,13 +55,11 @@ class Survival:
     """Survival and recovery of one controller, one entry an episode.
 
     Attributes:
-        horizons: numbers of steps after the disturbance at which survivors are counted,
-            ascending.
-        returns: sum of the rewards of all steps, ``[E]``.
-        alive: steps without a fall after it, at most the last horizon, ``[E]``.
-        alive_clean: the same in the undisturbed episode, after the same moment,
-            ``[E]``.
-        steps_back: steps until back in the data, ``None`` if never, ``[E]``.
+        horizons: steps after the disturbance at which survivors are counted, ascending.
+        returns: undiscounted sum of rewards.
+        alive: steps without a fall after it, at most the last horizon.
+        alive_clean: the same in the undisturbed episode, after the same moment.
+        steps_back: steps until back in the data, ``None`` if never.
     """
 
     horizons: tuple[int, ...]
@@ -86,20 +70,17 @@ class Survival:
 
     @property
     def up(self) -> list[bool]:
-        """Whether it had not fallen at the last horizon, ``[E]``."""
+        """Whether it had not fallen at the last horizon."""
         return [steps >= self.horizons[-1] for steps in self.alive]
 
     def count(self, horizon: int, *, clean: bool = False) -> int:
-        """Number of episodes without a fall until ``horizon`` steps later."""
+        """Number of episodes without a fall until then."""
         alive = self.alive_clean if clean else self.alive
         return sum(steps >= horizon for steps in alive)
 
 
 class PoseRecorder(Recorder):
     """Keeps trajectories and the poses of the robot.
-
-    Args:
-        environments: of the evaluation, MuJoCo's.
 
     Attributes:
         poses: joint positions at each entry of each episode, ``[Q]`` each.
@@ -138,18 +119,15 @@ class Takeover(NamedTuple):
     clean: PoseRecorder
 
     def up_clean(self, moments: Tensor, steps: int) -> list[int]:
-        """Numbers of the disturbed episodes that last that long without disturbance.
+        """Numbers of the episodes without a fall in the ``steps`` after the moments.
 
-        Args:
-            moments: when it was over, int64 ``[E]``, or :data:`NEVER`.
-            steps: without a fall after it.
+        Of the clean ones, for the ``moments`` that :func:`play_takeovers` returned.
         """
         pairs = zip(self.clean.trajectories, moments.tolist(), strict=True)
-        # A difference, since NEVER plus anything overflows.
         return [
             episode
             for episode, (trajectory, moment) in enumerate(pairs)
-            if trajectory.last - trajectory.terminated - moment >= steps
+            if steps_alive(trajectory, moment, steps) == steps
         ]
 
     def survival(
@@ -188,16 +166,10 @@ class Takeover(NamedTuple):
 
 
 def hand_over(before: Policy, after: Policy, moments: Tensor) -> Policy:
-    """One policy up to a moment, and another one from then on.
+    """One policy for the first ``moments`` steps of each row, and then another one.
 
     Both are called in every step, so that a controller that counts its calls knows the
-    time. The policy counts its own calls, too: it is for one evaluation with all rows
-    in every call.
-
-    Args:
-        before: acts first.
-        after: takes over.
-        moments: steps of each row before it does, int64 ``[E]``.
+    time. This one counts its calls, too: it is for one evaluation.
     """
     step = 0
 
@@ -274,20 +246,11 @@ def play_takeovers(
     return played, moments
 
 
-def discordant(ours: Sequence[bool], theirs: Sequence[bool]) -> tuple[int, int]:
-    """Numbers of pairs in which only the first is true, and only the second."""
-    pairs = list(zip(ours, theirs, strict=True))
-    return pairs.count((True, False)), pairs.count((False, True))
-
-
 def survival_table(controllers: Mapping[str, Survival]) -> str:
     """Text table with one line for each controller, the first being the reference.
 
-    The last column counts pairs at the last horizon: those in which only this
-    controller was up, and those in which only the reference was.
-
-    Args:
-        controllers: by name; the same disturbed episodes each.
+    The last column counts pairs of episodes: in how many only this controller was up at
+    the last horizon, and in how many only the reference.
     """
     reference = next(iter(controllers.values()))
     total, last = len(reference.alive), reference.horizons[-1]
@@ -298,7 +261,8 @@ def survival_table(controllers: Mapping[str, Survival]) -> str:
         low, high = wilson_interval(each.count(last), total)
         back = [steps for steps in each.steps_back if steps is not None]
         median = f" in {np.median(back):.0f}" if back else ""
-        only_it, only_reference = discordant(each.up, reference.up)
+        up = list(zip(each.up, reference.up, strict=True))
+        only_it, only_reference = up.count((True, False)), up.count((False, True))
         rows.append(
             [
                 name,
