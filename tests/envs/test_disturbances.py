@@ -119,17 +119,6 @@ def test_the_environments_own_random_stream_is_that_of_the_bare_one(wrap):
         assert states[0] == states[1]
 
 
-@each_on
-def test_a_reset_without_a_seed_continues_the_disturbances_generator(wrap):
-    env = wrap(make_environment("Hopper-v5"))
-    env.reset(seed=5)
-    generator, state = env._generator, env._generator.bit_generator.state
-    env.reset()
-    assert env._generator is generator
-    env.reset(seed=5)
-    assert env._generator.bit_generator.state == state
-
-
 @pytest.mark.parametrize("name", ON)
 def test_info_says_whether_the_disturbance_acted(name):
     env = ON[name](make_environment("HalfCheetah-v5"))

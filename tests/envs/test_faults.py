@@ -86,12 +86,6 @@ def test_sticky_by_hand(recorder):
     assert flags == [False, True, False, True, True, False]
 
 
-def test_always_sticky_repeats_the_first_action_of_each_episode(recorder):
-    env = StickyAction(recorder(), 1.0)
-    assert executed(env, [0.25, 0.5, 0.75]) == [0.25] * 3
-    assert executed(env, [0.5, 0.75]) == [0.5] * 2
-
-
 def test_observation_noise_has_the_stated_deviation(play, recorder):
     env = ObservationNoise(recorder(sensors=3), 0.2, unit=[1.0, 0.5, 0.0])
     observations = np.array([step[0] for step in play(env, DRAWS)])

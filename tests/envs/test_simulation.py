@@ -55,30 +55,6 @@ def test_friction_and_gravity(friction, gravity):
     env.close()
 
 
-def test_falling_is_by_the_changed_gravity():
-    env = DynamicsChange(make_environment("Hopper-v5"), gravity=2.0)
-    env.reset(seed=0)
-    bare = env.unwrapped
-    qpos = bare.data.qpos.copy()
-    qpos[1] += 100
-    bare.set_state(qpos, np.zeros(bare.model.nv))
-    env.step(np.zeros(3, np.float32))
-    mujoco.mj_subtreeVel(bare.model, bare.data)
-    # 2 g for 8 ms, in which the legs' joint stops may stir.
-    fall = bare.data.subtree_linvel[0, 2]
-    assert fall == pytest.approx(-2 * 9.81 * 0.008, rel=0.01)
-
-
-def test_friction_of_contacts(play):
-    for factor in (1.0, 0.5):
-        env = DynamicsChange(make_environment("HalfCheetah-v5"), friction=factor)
-        play(env, 30)
-        data = env.unwrapped.data
-        assert data.ncon
-        # Cheetah and ground both have 0.4.
-        assert data.contact.friction[:, 0] == pytest.approx(0.4 * factor)
-
-
 def test_factors_do_not_accumulate_and_close_restores_the_model():
     env = make_environment("Walker2d-v5")
     original = env.unwrapped.model
@@ -94,14 +70,6 @@ def test_factors_do_not_accumulate_and_close_restores_the_model():
         wrapped.close()
         assert env.unwrapped.model is original
         assert same(original, BARE)
-
-
-def test_wrapping_in_the_middle_of_an_episode_leaves_the_state(play):
-    env = make_environment("Walker2d-v5")
-    play(env, 5)
-    before = env.unwrapped.data.qpos.copy()
-    DynamicsChange(env, mass=2.0)
-    assert (env.unwrapped.data.qpos == before).all()
 
 
 def starts(env, number):

@@ -68,21 +68,6 @@ def test_official_spares_who_fell_before(fall, play, recorder):
     assert knocks(played) == [0] * fall
 
 
-@pytest.mark.parametrize("outside", [True, False])
-def test_official_does_not_use_up_the_time_limit(outside, play, recorder):
-    def limit(env):
-        return gymnasium.wrappers.TimeLimit(env, 6)
-
-    bare = recorder()
-    if outside:
-        env = limit(ActionKnock(bare, 5, mode="official", at=3))
-    else:
-        env = ActionKnock(limit(bare), 5, mode="official", at=3)
-    played = play(env, 6)
-    assert column(played, 3) == [False] * 5 + [True]
-    assert len(bare.actions) == 11
-
-
 def sampler(env, policy, observation, shakes, *, at, steps):
     """The released TrajSampler's loop, on an environment without time limit."""
     observations, rewards = [], []
@@ -241,26 +226,6 @@ def test_both_directions_occur_and_the_seed_decides(recorder):
     assert signs[:40] == signs[40:]
     # 40 fair coins, 4 standard errors of 3.2.
     assert abs(signs[:40].count(1.0) - 20) < 13
-
-
-def test_a_reset_within_the_push_ends_it():
-    env = ExternalPush(make_environment("Hopper-v5"), 5.0, duration=9, at=0)
-    env.reset(seed=0)
-    env.step(env.action_space.low)
-    env.reset(seed=0)
-    assert not env.unwrapped.data.xfrc_applied.any()
-    assert env.step(env.action_space.low)[-1]["push_force"] in (-5.0, 5.0)
-
-
-def test_pushes_at_the_same_time_add_up(play):
-    inner = ExternalPush(make_environment("Hopper-v5"), 0.1, duration=3, at=0)
-    env = ExternalPush(inner, 0.7, duration=2, at=1)
-    seen = spy(env)
-    play(env, 4)
-    totals = [np.abs(applied).sum() for applied in seen]
-    assert totals[0] == 0.1
-    assert totals[1] == pytest.approx(0.8) or totals[1] == pytest.approx(0.6)
-    assert totals[3] == 0
 
 
 def test_units_of_body_weight():

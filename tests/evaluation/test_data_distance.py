@@ -23,17 +23,6 @@ def brute_force(distance: DataDistance, rows: torch.Tensor, scale: torch.Tensor)
     return np.sort(exact, axis=1)[:, :10].mean(1)
 
 
-def test_distance_is_the_mean_to_the_nearest_by_hand():
-    # Twelve rows, two of them held out: the ten that stay are the neighbours of 100.
-    rows = torch.tensor([[float(x)] for x in range(12)])
-    distance = DataDistance(dataset(rows))
-    scale = rows.std(correction=0)
-    kept = (distance._states * scale + rows.mean()).flatten()
-    wanted = ((100 - kept) / scale).mean()
-    assert distance(torch.tensor([[100.0]])).item() == pytest.approx(wanted.item())
-    assert len(kept) == 10
-
-
 @pytest.mark.parametrize("offset", [0.0, 1e3])
 def test_small_distances_keep_their_digits(offset):
     """Far from zero and close together, a float32 product would lose them."""

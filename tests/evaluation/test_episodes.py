@@ -50,12 +50,6 @@ def test_each_episode_is_what_it_would_be_alone():
     np.testing.assert_array_equal(results.returns, again.returns)
 
 
-def test_time_limit_ends_an_episode():
-    evaluator = EpisodeEvaluator("HalfCheetah-v5", num_episodes=1)
-    results = evaluator(lambda observation: torch.zeros(len(observation), 6))
-    assert results.lengths.tolist() == [1000]
-
-
 def test_global_generators_are_left_alone():
     before, state = np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
     EpisodeEvaluator("Hopper-v5", num_episodes=2)(linear_policy)
@@ -130,8 +124,3 @@ def test_success_rate_has_wilsons_interval():
     summary = {k: v for k, v in summary.items() if "success" not in k}
     table = score_table("maze", [summary], summary | {"step": 1}, None, Path("run"))
     assert "success" not in table
-
-
-def test_no_episodes_is_an_error():
-    with pytest.raises(ValueError, match="at least 1"):
-        EpisodeEvaluator("Hopper-v5", num_episodes=0)

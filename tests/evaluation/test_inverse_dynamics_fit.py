@@ -58,13 +58,6 @@ def test_overconfident_model_covers_too_little():
     assert report["coverage_90"] == pytest.approx(0.589, abs=0.01)
 
 
-def test_constant_prediction_explains_nothing():
-    data = make_data()
-    data["next", "observation"] = data["observation"].clone()
-    report = inverse_dynamics_report(make_model(), data)
-    assert report["r2"] == pytest.approx([0, 0], abs=0.01)
-
-
 def test_ended_rows_do_not_count():
     data = make_data(100)
     expected = inverse_dynamics_report(make_model(), data[10:])

@@ -213,12 +213,3 @@ def test_an_episode_depends_on_its_own_disturbance_alone():
 def test_bad_input_is_named(disturbances, episodes, named):
     with pytest.raises(ValueError, match=named):
         play(*disturbances, episodes=episodes)
-
-
-def test_what_needs_a_simulation_is_not_possible_without():
-    wrap = partial(ExternalPush, force=1.0, duration=5)
-    push = Disturbance("push", "push", 1.0, wrap)
-    with pytest.raises(ValueError, match="'push' is not possible for Pendulum-v1"):
-        evaluate_paired(
-            linear_policy, "Pendulum-v1", [push], hopper_distance(), num_episodes=2
-        )

@@ -131,14 +131,6 @@ def test_summary_is_over_all_checkpoints(evaluations):
     )
 
 
-def test_median_of_mostly_never_is_no_number(evaluations):
-    for each in evaluations:
-        each["levels"][0]["recovery_steps"] = [5, None, None]
-    knock, _ = summarize_disturbances(evaluations)
-    assert knock["recovery_median"] is None
-    assert knock["recovered_share"] == pytest.approx(2 / 4)
-
-
 def test_nobody_met_it(evaluations):
     for each in evaluations:
         each["levels"][0]["disturbed_at"] = [None] * 3

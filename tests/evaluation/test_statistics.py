@@ -8,11 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchrl_osr.evaluation import (
-    NUM_RESAMPLES,
     interquartile_mean,
     mean_interval,
     nested_resamples,
-    percentile_interval,
     performance_profile,
     stratified_resamples,
     wilson_interval,
@@ -40,16 +38,6 @@ def test_coverage_of_a_normal_sample():
     assert hits / 400 == pytest.approx(0.93, abs=0.04)
 
 
-def test_width_is_that_of_the_standard_error():
-    values = np.random.default_rng(0).normal(size=400)
-    _, low, high = mean_interval(values)
-    assert high - low == pytest.approx(2 * 1.96 * values.std() / 20, rel=0.1)
-
-
-def test_single_value_is_its_own_interval():
-    assert mean_interval([3.0]) == (3.0, 3.0, 3.0)
-
-
 @pytest.mark.parametrize("values", [[], [1.0, np.nan], [np.inf]])
 def test_no_or_non_finite_values_are_an_error(values):
     with pytest.raises(ValueError, match="finite"):
@@ -75,18 +63,6 @@ def test_profile_of_a_known_sample():
     np.testing.assert_array_equal(
         profile, [[1, 0.75, 0.25, 0.25, 0, 0], [1, 1, 1, 1, 1, 0]]
     )
-
-
-@given(st.lists(st.integers(1, 4), min_size=1, max_size=3), FINITE)
-def test_resamples_of_a_constant_are_that_constant(sizes, value):
-    runs = [np.full((size, 2), value) for size in sizes]
-    np.testing.assert_allclose(nested_resamples(runs), value)
-    strata = [np.full(size, value) for size in sizes]
-    resamples = stratified_resamples(strata)
-    assert resamples.shape == (NUM_RESAMPLES, sum(sizes))
-    assert (resamples == value).all()
-    low, high = percentile_interval(interquartile_mean(resamples))
-    assert low == high == pytest.approx(value)
 
 
 def test_strata_keep_their_places_and_sizes():

@@ -122,19 +122,6 @@ def test_nearest_target_is_the_successor_whatever_the_time():
     assert target(0.0, 1.0) == [1, 0], "the last has no successor; (0, 0) is first"
 
 
-def test_late_by_two_steps_only_time_asks_for_a_jump():
-    reference = torch.arange(10.0)[:, None].expand(10, 2)
-    late = torch.tensor([[1.0, 1.0]])
-    rules = {
-        rule: InverseDynamicsController(exact_model(), [reference], rule=rule)
-        for rule in ("time", "nearest")
-    }
-    for controller in rules.values():
-        controller.step = 3
-    assert rules["time"].targets(late).tolist() == [[4, 4]]
-    assert rules["nearest"].targets(late).tolist() == [[2, 2]]
-
-
 def test_every_row_has_its_own_reference_of_its_own_length():
     references = [torch.tensor([[0.0, 0.0], [0.2, 0.0]]), torch.zeros(5, 2)]
     controller = InverseDynamicsController(exact_model(), references)
@@ -152,6 +139,12 @@ def test_latent_is_at_its_mean():
     assert torch.equal(first, second)
 
 
+def test_a_row_that_is_missing_is_an_error():
+    controller = InverseDynamicsController(exact_model(), [torch.zeros(3, 2)] * 2)
+    with pytest.raises(ValueError, match="1 observations for 2 references"):
+        controller(torch.zeros(1, 2))
+
+
 @pytest.mark.parametrize(
     ("references", "rule", "named"),
     [
@@ -163,9 +156,3 @@ def test_latent_is_at_its_mean():
 def test_bad_input_is_named(references, rule, named):
     with pytest.raises(ValueError, match=named):
         InverseDynamicsController(exact_model(), references, rule=rule)
-
-
-def test_a_row_that_is_missing_is_an_error():
-    controller = InverseDynamicsController(exact_model(), [torch.zeros(3, 2)] * 2)
-    with pytest.raises(ValueError, match="1 observations for 2 references"):
-        controller(torch.zeros(1, 2))
