@@ -196,8 +196,3 @@ def test_wrong_arguments(trained, arguments, message):
     arguments = {"kind": "random", "epsilon": 0.1} | arguments
     with pytest.raises(ValueError, match=message):
         attacked_policy(trained.policy, trained.qvalue, **arguments)
-
-
-def test_a_loss_without_critics_is_an_error():
-    with pytest.raises(TypeError, match="Linear has no qvalue_network"):
-        critics_of(torch.nn.Linear(2, 2))

@@ -33,15 +33,7 @@ def critics_of(loss: LossModule) -> Values:
     Args:
         loss: a loss module with a ``qvalue_network``: :class:`~torchrl_osr.OSRLoss`,
             :class:`~torchrl_osr.OSRVLoss`, TorchRL's SAC or CQL loss.
-
-    Raises:
-        TypeError: if the loss has no ``qvalue_network``.
     """
-    if not hasattr(loss, "qvalue_network"):
-        raise TypeError(
-            f"{type(loss).__name__} has no qvalue_network; pass attacked_policy a "
-            "function from states and actions [M, E] to values [N, M, E] instead."
-        )
 
     def values(states: TensorDictBase, action: Tensor) -> Tensor:
         keys, each = loss.tensor_keys, []

@@ -208,10 +208,7 @@ def decrease_interval(
 def evaluation_json(step: int, paired: PairedResults, env_name: str) -> dict[str, Any]:
     """Raw results of the checkpoint after ``step`` gradient steps, JSON-compatible.
 
-    Args:
-        step: of the checkpoint.
-        paired: its episodes.
-        env_name: short name with reference returns, ``"hopper"`` for instance.
+    Normalised by the reference returns of ``env_name``, ``"hopper"`` for instance.
     """
     return {
         "step": step,
@@ -266,10 +263,8 @@ def _mean_curve(
     curves: Sequence[NDArray[np.float64]],
 ) -> tuple[list[float | None], list[int]]:
     """Mean over the episodes that have a step at each offset, and their number."""
-    counts = (~np.isnan(curves)).sum(0).tolist()
-    totals = np.nansum(curves, axis=0).tolist()
-    pairs = zip(totals, counts, strict=True)
-    return [total / count if count else None for total, count in pairs], counts
+    known = np.ma.masked_invalid(curves)
+    return known.mean(0).tolist(), known.count(0).tolist()  # None without a step
 
 
 def summarize_disturbances(

@@ -45,10 +45,9 @@ MARKER: dict[str, Any] = {"markersize": 12, "markeredgecolor": "black", "ls": ""
 
 @dataclass(frozen=True)
 class Take:
-    """One controller's episode.
+    """The episode of the controller ``name``.
 
     Attributes:
-        name: of the controller.
         observations: raw, ``[T, S]``.
         poses: joint positions, ``[T, Q]``.
         begin: entry before the disturbance.
@@ -93,7 +92,7 @@ class Camera:
         seconds: duration of one step of the agent.
 
     Raises:
-        RuntimeError: if OpenGL does not start, with what to try.
+        RuntimeError: if OpenGL does not start.
     """
 
     def __init__(self, environment: Any, size: int) -> None:
@@ -219,8 +218,7 @@ def film_gif(
 ) -> None:
     """Write a moving film of all takes side by side; see :func:`film_strip`.
 
-    Keyword Args:
-        offsets: first and last picture; only each :data:`GIF_STRIDE`-th is taken.
+    Only each :data:`GIF_STRIDE`-th of the ``offsets`` is taken.
     """
     from PIL import Image  # comes with matplotlib
 
@@ -296,8 +294,7 @@ def visited_states(
         path: the PNG to write.
 
     Keyword Args:
-        title, note: two lines above.
-        event: name of the disturbance.
+        title, note, event: see :func:`film_strip`.
         steps: of each take at most.
     """
     loc, scale = data.mean(0), data.std(0)

@@ -123,11 +123,10 @@ class Takeover(NamedTuple):
 
         Of the clean ones, for the ``moments`` that :func:`play_takeovers` returned.
         """
-        pairs = zip(self.clean.trajectories, moments.tolist(), strict=True)
         return [
             episode
-            for episode, (trajectory, moment) in enumerate(pairs)
-            if steps_alive(trajectory, moment, steps) == steps
+            for episode, trajectory in enumerate(self.clean.trajectories)
+            if steps_alive(trajectory, int(moments[episode]), steps) == steps
         ]
 
     def survival(
@@ -137,32 +136,17 @@ class Takeover(NamedTuple):
         distance: DataDistance,
         horizons: tuple[int, ...],
     ) -> Survival:
-        """Survival and recovery in some of the episodes.
-
-        Args:
-            episodes: their numbers; each met the disturbance.
-            moments: when it was over, int64 ``[E]``.
-            distance: to the data.
-            horizons: see :class:`Survival`.
-        """
-        disturbed, clean = (
-            [recorder.trajectories[episode] for episode in episodes]
-            for recorder in self
-        )
-        ends = moments[list(episodes)].tolist()
-        alive, alive_clean = (
-            [
-                steps_alive(trajectory, end, horizons[-1])
-                for trajectory, end in zip(some, ends, strict=True)
-            ]
-            for some in (disturbed, clean)
-        )
-        steps = [
-            measure_recovery(*pair, distance).steps
-            for pair in zip(disturbed, clean, strict=True)
-        ]
-        returns = [self.disturbed.returns[episode] for episode in episodes]
-        return Survival(horizons, returns, alive, alive_clean, steps)
+        """Survival and recovery in the numbered episodes, which met the disturbance."""
+        survival = Survival(horizons, [], [], [], [])
+        for episode in episodes:
+            disturbed, clean = (each.trajectories[episode] for each in self)
+            end = int(moments[episode])
+            survival.returns.append(self.disturbed.returns[episode])
+            survival.alive.append(steps_alive(disturbed, end, horizons[-1]))
+            survival.alive_clean.append(steps_alive(clean, end, horizons[-1]))
+            steps = measure_recovery(disturbed, clean, distance).steps
+            survival.steps_back.append(steps)
+        return survival
 
 
 def hand_over(before: Policy, after: Policy, moments: Tensor) -> Policy:
@@ -199,7 +183,7 @@ def play_takeovers(
 
     Args:
         env_id: a Gymnasium id of a MuJoCo task.
-        behavior: plays first; the same observation gives the same action.
+        behavior: plays first, deterministic.
         controllers: by name.
         disturbance: wraps the environment, acts once an episode.
 
@@ -227,8 +211,10 @@ def play_takeovers(
         evaluator.close()
         return recorder
 
-    wraps: tuple[Wrap, Wrap] = (disturbance, lambda env: env)
-    played = {BEHAVIOR: Takeover(*(play(behavior, wrap) for wrap in wraps))}
+    def both(disturbed: Policy, clean: Policy) -> Takeover:
+        return Takeover(play(disturbed, disturbance), play(clean, lambda env: env))
+
+    played = {BEHAVIOR: both(behavior, behavior)}
     begins = map(disturbed_at, played[BEHAVIOR].disturbed.trajectories)
     moments = torch.tensor([NEVER if at is None else at + duration for at in begins])
     references = [
@@ -237,12 +223,8 @@ def play_takeovers(
     ]
     for name, make in controllers.items():
         # One policy for each evaluation: it may count its calls.
-        played[name] = Takeover(
-            *(
-                play(hand_over(behavior, make(references), moments), wrap)
-                for wrap in wraps
-            )
-        )
+        policies = [hand_over(behavior, make(references), moments) for _ in range(2)]
+        played[name] = both(*policies)
     return played, moments
 
 
