@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
-from hydra.errors import ConfigCompositionException, MissingConfigException
+from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
 from tensordict.nn import TensorDictModule
 from torchrl.modules import ProbabilisticActor, TanhDelta
@@ -77,9 +77,8 @@ def test_table_json_and_figure_are_left_in_the_runs_folder(folder, evaluated):
     assert (folder / "robustness-oos.png").read_bytes().startswith(b"\x89PNG")
     for name in names:
         assert name in evaluated
-    assert str(folder / "robustness-oos.json") in evaluated or "run/" in evaluated
-    for word in ("Warning", "Traceback"):
-        assert word not in evaluated
+    assert "run/robustness-oos.json" in evaluated
+    assert "Warning" not in evaluated
     left = {path.name for path in folder.parent.iterdir()}
     assert left == {"run"}, "nothing is left where it was called from"
 
@@ -174,23 +173,12 @@ def test_every_suite_is_possible_for_other_environments(folder, env_id):
         (["last=0"], ValueError, "last=0"),
         (["checkpoint=nowhere"], FileNotFoundError, "nowhere"),
         (["checkpoint=/"], FileNotFoundError, r"config\.yaml"),
-        (["suite=out"], MissingConfigException, "torque"),
-        (["episode=2"], ConfigCompositionException, "episode"),
         (["suite.disturbances.mass.kindd=a"], ConfigCompositionException, "kindd"),
-        (["episodes=many"], ConfigCompositionException, "many"),
     ],
 )
 def test_bad_input_is_named(example, folder, overrides, error, named):
     with pytest.raises(error, match=named):
         example.main(composed(f"checkpoint={folder}", *overrides))
-
-
-def test_a_disturbance_needs_one_of_wrapper_and_attack(folder):
-    suite = composed("suite=start", "checkpoint=none").suite
-    name = next(iter(suite.disturbances))
-    suite.disturbances[name].wrap = None
-    with pytest.raises(ValueError, match=f"{name}' needs either"):
-        make_disturbances(suite.disturbances, load_trained(folder), np.full(11, 0.5))
 
 
 def test_attacks_need_standardised_networks_and_a_stochastic_policy(folder):
@@ -207,6 +195,9 @@ def test_attacks_need_standardised_networks_and_a_stochastic_policy(folder):
         )
     trained.config.data.standardize = False
     with pytest.raises(ValueError, match="data.standardize=false"):
+        make_disturbances(suite.disturbances, trained, np.full(11, 0.5))
+    suite.disturbances["random-0.05"].attack = None
+    with pytest.raises(ValueError, match="'random-0.05' needs either wrap or attack"):
         make_disturbances(suite.disturbances, trained, np.full(11, 0.5))
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
-from hydra.errors import ConfigCompositionException
 
 CONF = Path(__file__).parents[2] / "conf/evaluation"
 SHORT = ["checkpoint=run", "episodes=2", "window=[20,30]", "after=16"]
@@ -91,8 +90,3 @@ def test_knock_takes_the_place_of_the_push(script):
 def test_bad_input_is_named(script, option, named):
     with pytest.raises(ValueError, match=named):
         script.disturbance(composed(option))
-
-
-def test_unknown_option_is_named():
-    with pytest.raises(ConfigCompositionException, match="pushh"):
-        composed("pushh=1")
