@@ -46,8 +46,8 @@ def check_weight(name: str, weight: float) -> None:
 
 
 def check_positive(name: str, value: float, *, minimum: float | None = None) -> None:
-    """Raise a ValueError unless ``value`` is above 0, or at least ``minimum``."""
-    if minimum is None and not value > 0:
+    """Raise a ValueError unless 0 < ``value`` < inf, or ``value`` >= ``minimum``."""
+    if minimum is None and not 0 < value < math.inf:
         raise ValueError(f"{name} must be above 0, got {value}.")
     if minimum is not None and not value >= minimum:
         raise ValueError(f"{name} must be at least {minimum}, got {value}.")

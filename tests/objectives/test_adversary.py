@@ -66,17 +66,21 @@ def scores(real, objective, states, deltas) -> torch.Tensor:
 
 @pytest.fixture
 def real(make_networks, make_batch) -> SimpleNamespace:
-    """Networks as a loss runs them, their parameters' copies, and states."""
+    """Networks, a loss that holds them, functions of both, and states."""
     networks = make_networks()
     loss = OSRLoss(networks.actor, networks.critics, networks.inverse_dynamics).double()
+
+    def policy(states) -> TanhNormal:
+        return networks.actor.get_dist(states.select("observation"))
+
+    def qvalue(states, action) -> torch.Tensor:
+        inputs = torch.cat([states["observation"], action], -1)
+        values = [critic.module(inputs) for critic in networks.critics]
+        return torch.stack(values).squeeze(-1)
+
+    states = make_batch(6).select("observation")
     return SimpleNamespace(
-        loss=loss,
-        networks=networks,
-        policy=lambda states: loss._distribution(loss._policy(states)),
-        qvalue=lambda states, action: loss._qvalue(
-            states, action, loss.qvalue_network_params.detach()
-        ),
-        states=make_batch(6).select("observation"),
+        loss=loss, networks=networks, policy=policy, qvalue=qvalue, states=states
     )
 
 
@@ -100,13 +104,13 @@ def test_every_perturbation_is_in_the_box(
     adversary = Adversary(objective, method, epsilon, num_samples, num_steps=2)
     clean = torch.randn(*size, 3, dtype=dtype)
     states = TensorDict({"observation": clean}, size)
-    twin = adversary.perturb(states, KEYS, linear_policy, quadratic_qvalue)
-    assert twin.batch_size == states.batch_size
-    assert twin["observation"].shape == clean.shape
-    assert twin["observation"].dtype == dtype
+    perturbed = adversary.perturb(states, KEYS, linear_policy, quadratic_qvalue)
+    assert perturbed.batch_size == states.batch_size
+    assert perturbed["observation"].shape == clean.shape
+    assert perturbed["observation"].dtype == dtype
     # The sum of state and perturbation is rounded.
     unit = torch.finfo(dtype).eps * (clean.abs() + epsilon)
-    assert ((twin["observation"] - clean).abs() <= epsilon + 2 * unit).all()
+    assert ((perturbed["observation"] - clean).abs() <= epsilon + 2 * unit).all()
 
 
 @both_objectives
@@ -114,7 +118,7 @@ def test_sampling_equals_a_plain_loop_over_the_same_draws(
     real, check, objective
 ) -> None:
     adversary = Adversary(objective, epsilon=0.5, num_samples=7)
-    twin = perturb(real, adversary, torch.Generator().manual_seed(3))
+    perturbed = perturb(real, adversary, torch.Generator().manual_seed(3))
     deltas = draw(adversary, 6, 3, seed=3)
     if objective == "min_Q":
         deltas = torch.cat([torch.zeros_like(deltas[:1]), deltas])
@@ -123,8 +127,8 @@ def test_sampling_equals_a_plain_loop_over_the_same_draws(
     for row in range(6):
         best = max(range(len(deltas)), key=lambda i: found[i, row].item())
         expected[row] += deltas[best, row]
-    check("Adversary", [twin], [expected], tolerance=1e-13)
-    assert twin.unique(dim=0).shape == twin.shape
+    check("Adversary", [perturbed], [expected], tolerance=1e-13)
+    assert perturbed.unique(dim=0).shape == perturbed.shape
 
 
 def released_gradient_attack(real, adversary, deltas) -> torch.Tensor:
@@ -146,12 +150,12 @@ def test_gradient_steps_are_those_of_the_released_attack(
     real, check, objective, num_samples
 ) -> None:
     adversary = Adversary(objective, "gradient", 0.3, num_samples, step_size=0.25)
-    twin = perturb(real, adversary, torch.Generator().manual_seed(3))
+    perturbed = perturb(real, adversary, torch.Generator().manual_seed(3))
     deltas = released_gradient_attack(real, adversary, draw(adversary, 6, 3, seed=3))
     best = scores(real, objective, real.states, deltas).argmax(0)
     expected = real.states["observation"] + deltas[best, torch.arange(6)]
     # Adam adds 1e-8 to the size of a gradient before it divides by it.
-    check("Adversary", [twin], [expected], tolerance=1e-6)
+    check("Adversary", [perturbed], [expected], tolerance=1e-6)
 
 
 # Twenty steps of .1 half-widths cross the whole box.
@@ -160,20 +164,20 @@ def test_gradient_steps_find_the_corner_of_the_lowest_value(num_samples) -> None
     adversary = Adversary("min_Q", "gradient", 0.05, num_samples, num_steps=20)
     clean = 0.3 * torch.randn(8, 3, dtype=torch.float64)
     states = TensorDict({"observation": clean}, [8])
-    twin = adversary.perturb(states, KEYS, linear_policy, quadratic_qvalue)
+    perturbed = adversary.perturb(states, KEYS, linear_policy, quadratic_qvalue)
     # The mean value falls with the action, which rises with WEIGHT @ s.
     expected = clean + 0.05 * WEIGHT.sign()
-    torch.testing.assert_close(twin["observation"], expected, rtol=0, atol=1e-12)
+    torch.testing.assert_close(perturbed["observation"], expected, rtol=0, atol=1e-12)
 
 
 def test_gradient_steps_find_a_corner_of_the_largest_divergence() -> None:
     adversary = Adversary("action_diff", "gradient", 0.05, 1, num_steps=20)
     clean = torch.randn(8, 3, dtype=torch.float64)
     states = TensorDict({"observation": clean}, [8])
-    twin = adversary.perturb(states, KEYS, linear_policy, quadratic_qvalue)
+    perturbed = adversary.perturb(states, KEYS, linear_policy, quadratic_qvalue)
     # Unit scales: the divergence is the squared change of the mean, the largest of
     # which is .05 * (.5 + 2 + 1), up or down.
-    change = (twin["observation"] - clean) @ WEIGHT
+    change = (perturbed["observation"] - clean) @ WEIGHT
     torch.testing.assert_close(change.abs(), torch.full_like(change, 0.175))
     assert 0 < (change > 0).sum() < 8
 
@@ -183,8 +187,8 @@ def test_an_adversary_gains_more_than_the_first_draw_and_than_nothing(
     real, objective
 ) -> None:
     adversary = Adversary(objective, epsilon=0.5, num_samples=5)
-    twin = perturb(real, adversary, torch.Generator().manual_seed(3))
-    found = (twin - real.states["observation"]).unsqueeze(0)
+    perturbed = perturb(real, adversary, torch.Generator().manual_seed(3))
+    found = (perturbed - real.states["observation"]).unsqueeze(0)
     nothing, first = torch.zeros_like(found), draw(adversary, 6, 3, seed=3)[:1]
     gain = scores(real, objective, real.states, torch.cat([found, nothing, first]))
     assert (gain[0] >= gain[1] - 1e-12).all()
@@ -195,7 +199,7 @@ def test_an_adversary_gains_more_than_the_first_draw_and_than_nothing(
 def test_sampling_for_low_values_may_leave_a_state_alone() -> None:
     # The critics' mean is lowest at the action of the clean state.
     states = TensorDict({"observation": torch.randn(4, 3)}, [4])
-    twin = Adversary("min_Q", epsilon=1.0).perturb(
+    perturbed = Adversary("min_Q", epsilon=1.0).perturb(
         states,
         KEYS,
         linear_policy,
@@ -205,7 +209,7 @@ def test_sampling_for_low_values_may_leave_a_state_alone() -> None:
             .movedim(-1, 0)
         ),
     )
-    assert torch.equal(twin["observation"], states["observation"])
+    assert torch.equal(perturbed["observation"], states["observation"])
 
 
 @both_objectives
@@ -227,19 +231,53 @@ def test_several_nested_observations_of_any_batch_size(objective, method) -> Non
 
     clean = states.clone()
     adversary = Adversary(objective, method, epsilon=0.1, num_samples=3)
-    twin = adversary.perturb(
+    perturbed = adversary.perturb(
         states.lock_(), keys, policy, lambda states, action: action.movedim(-1, 0)
     )
     for key in keys:
-        noise = twin[key] - states[key]
+        noise = perturbed[key] - states[key]
         assert noise.shape == states[key].shape
         assert 0 < noise.abs().max() <= 0.1 + 1e-6
         if (objective, method) == ("action_diff", "sample"):
             # Each number of each row has a noise of its own.
             assert noise.unique().numel() > 0.9 * noise.numel()
-    assert torch.equal(twin["agent", "goal"], states["agent", "goal"])
-    assert set(twin.keys(True, True)) == set(states.keys(True, True))
+    assert torch.equal(perturbed["agent", "goal"], states["agent", "goal"])
+    assert set(perturbed.keys(True, True)) == set(states.keys(True, True))
     assert (states == clean).all()
+
+
+@both_objectives
+@both_methods
+def test_call_writes_what_perturb_finds_into_a_copy_of_the_batch(
+    real, make_batch, objective, method
+) -> None:
+    adversary = Adversary(objective, method, epsilon=0.1, num_samples=3, num_steps=2)
+    batch = make_batch(6)
+    before = batch.clone()
+    torch.manual_seed(3)
+    found = adversary(real.loss, batch)
+    expected = perturb(real, adversary, torch.Generator().manual_seed(3))
+    written = found["perturbed", "observation"]
+    torch.testing.assert_close(written, expected, rtol=1e-12, atol=1e-12)
+    assert (found.exclude("perturbed") == batch.exclude("perturbed")).all()
+    assert (batch == before).all()
+    assert not written.requires_grad
+    assert all(parameter.grad is None for parameter in real.loss.parameters())
+
+
+@pytest.mark.losses("osr", "osrv", "cql-perturbed")
+def test_a_loss_trains_on_the_worst_states_of_its_own_networks(
+    family, family_batch, seeded, name
+) -> None:
+    loss, batch = family(name), family_batch(name, 10, perturbed=False)
+    adversary = Adversary(epsilon=0.5, num_samples=20)
+    out = seeded(loss, adversary(loss, batch))
+    assert all(value.isfinite() for value in out.values())
+    # Under other keys, which the loss was told of, it is the same.
+    loss.set_keys(perturbed=("worst", "state"))
+    renamed = adversary(loss, batch)
+    assert ("worst", "state", "observation") in renamed.keys(True)
+    assert seeded(loss, renamed)["loss_actor"].isfinite()
 
 
 @both_objectives
@@ -250,15 +288,15 @@ def test_nothing_receives_a_gradient(real, objective, method, grad) -> None:
     clean = real.states.clone()
     adversary = Adversary(objective, method, epsilon=0.1, num_samples=2, num_steps=2)
     with torch.set_grad_enabled(grad):
-        twin = perturb(real, adversary, torch.Generator().manual_seed(3))
-    assert not twin.requires_grad
+        perturbed = perturb(real, adversary, torch.Generator().manual_seed(3))
+    assert not perturbed.requires_grad
     assert all(parameter.grad is None for parameter in real.loss.parameters())
     assert real.states["observation"].grad is None
     assert set(real.states.keys()) == {"observation"}
     assert torch.equal(real.states["observation"], clean["observation"])
     # Steps that no_grad had switched off would end where they start.
     start = real.states["observation"] + draw(adversary, 6, 3, seed=3)
-    assert method == "sample" or (twin != start).all()
+    assert method == "sample" or (perturbed != start).all()
 
 
 @both_objectives
@@ -270,17 +308,19 @@ def test_entries_that_are_not_perturbed_come_along_alone(real, objective) -> Non
         states["action"] = states["observation"]
         return real.policy(states)
 
-    twin = Adversary(objective).perturb(real.states, KEYS, writing_policy, real.qvalue)
-    assert set(real.states.keys()) == set(twin.keys()) == {"observation", "goal"}
-    assert torch.equal(twin["goal"], goal)
-    assert not twin["goal"].requires_grad
+    perturbed = Adversary(objective).perturb(
+        real.states, KEYS, writing_policy, real.qvalue
+    )
+    assert set(real.states.keys()) == set(perturbed.keys()) == {"observation", "goal"}
+    assert torch.equal(perturbed["goal"], goal)
+    assert not perturbed["goal"].requires_grad
 
 
 @both_objectives
 @both_methods
 def test_a_box_without_width_leaves_the_states(real, objective, method) -> None:
-    twin = perturb(real, Adversary(objective, method, epsilon=0.0))
-    assert torch.equal(twin, real.states["observation"])
+    perturbed = perturb(real, Adversary(objective, method, epsilon=0.0))
+    assert torch.equal(perturbed, real.states["observation"])
 
 
 @both_methods
@@ -321,9 +361,11 @@ def test_candidates_go_through_the_policy_together(
 @pytest.mark.filterwarnings("ignore:.*autograd.function.Function:DeprecationWarning")
 @pytest.mark.filterwarnings("ignore:.*inline_inbuilt_nn_modules:FutureWarning")
 @pytest.mark.filterwarnings("ignore:Using lock_.. inside a compiled:UserWarning")
-# The other pair is compiled within OSRLoss, in test_execution.
-def test_compiled_equals_eager_without_graph_breaks(real) -> None:
-    adversary = Adversary("min_Q", "gradient", epsilon=0.1, num_samples=3, num_steps=2)
+@pytest.mark.parametrize(
+    ("objective", "method"), [("action_diff", "sample"), ("min_Q", "gradient")]
+)
+def test_compiled_equals_eager_without_graph_breaks(real, objective, method) -> None:
+    adversary = Adversary(objective, method, epsilon=0.1, num_samples=3, num_steps=2)
 
     def call() -> torch.Tensor:
         torch.manual_seed(3)

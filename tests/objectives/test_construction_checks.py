@@ -111,7 +111,7 @@ SOFT = CRITICS | {"alpha_init": [0.0, -1.0]}
 STATES = {"recovery_states": ["noisy", None]}
 DIRECTION = {"recovery_direction": ["backward"]}
 DIVERGENCE = STATES | DIRECTION | {"action_reduction": ["max"]}
-DRAWS = {"num_random": [0], "temperature": [0.0, math.nan]}
+DRAWS = {"num_random": [0], "temperature": [0.0, math.nan, math.inf]}
 WRONG = {
     "osr": SOFT
     | DIVERGENCE
