@@ -42,7 +42,7 @@ def main() -> None:
         for path, reason in tables.left_out:
             print(f"left out: {path}: {reason}")
         for note in comparison_notes(tables):
-            print(f"mind: {note}")
+            print(f"note: {note}")
         page = write_report(
             tables, options.output, reference=options.reference, command=command
         )

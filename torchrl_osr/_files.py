@@ -201,10 +201,11 @@ def check_unpacked_size(path: Path, unpacked: int) -> None:
 
 
 def refuse_archive(archive: zipfile.ZipFile) -> None:
-    """Raise if a member of a ZIP archive would be unpacked to another place.
+    """Raise unless a ZIP archive unpacks to its own place and its own size.
 
     Raises:
-        ValueError: naming the member: its path leads out, or it is a symbolic link.
+        ValueError: naming the member: its path leads out, it is a symbolic link, or it
+            is compressed, so that a small file may unpack to anything.
     """
     for member in archive.infolist():
         names = PurePosixPath(member.filename), PureWindowsPath(member.filename)
@@ -212,6 +213,8 @@ def refuse_archive(archive: zipfile.ZipFile) -> None:
             raise ValueError(f"the path {member.filename!r} leads out of the archive")
         if stat.S_ISLNK(member.external_attr >> 16):
             raise ValueError(f"{member.filename!r} is a symbolic link")
+        if member.compress_type != zipfile.ZIP_STORED:
+            raise ValueError(f"{member.filename!r} is compressed")
 
 
 def sha256_of(path: Path) -> str:

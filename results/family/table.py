@@ -1,6 +1,6 @@
 """Write docs/family.md from a test run: what was checked against what, how far off.
 
-    pytest tests -o junit_family=xunit1 --junitxml=checks.xml
+    pytest tests/objectives -o junit_family=xunit1 --junitxml=checks.xml
     python results/family/table.py checks.xml
 
 Tests note their largest deviation (the fixture ``check``) and the rows that critics
@@ -48,9 +48,10 @@ FAMILY = {
         REST,
     ),
     "SAC-N": ("`OSRLoss`, SAC-N", "`loss=sac_10`", REST),
-    "EDAC": ("`OSRLoss`, EDAC", "`loss=edac_10`", "all pairs of gradients"),
+    "EDAC": ("`EDACLoss`, EDAC", "`loss=edac_10`", "all pairs of gradients"),
+    "TD3+BC": ("`TD3BCLoss`, TD3+BC (3) to (5)", "`loss=td3_bc`", REST),
     "Adversary": (
-        "`Adversary`, RORL", "`loss=osr_adversarial`", "a loop over the same draws",
+        "`Adversary`, RORL", "`perturbation=adversarial`", "a loop over the same draws",
     ),
     "State recovery alone": (
         "`StateRecoveryLoss`, (11)", "`examples/iql_with_recovery.py`",
@@ -65,7 +66,7 @@ FAMILY = {
         "action by action, `torch.distributions.Categorical`",
     ),
     "Discrete inverse dynamics": (
-        "`DiscreteInverseDynamicsLoss`, 4.2", "`examples/discrete_osr.py`",
+        "`InverseDynamicsLoss`, 4.2", "`examples/discrete_osr.py`",
         "`torch.distributions.Categorical`",
     ),
 }  # fmt: skip
@@ -80,7 +81,7 @@ TAIL = """
 This page is written by a test run:
 
 ```bash
-pytest tests -o junit_family=xunit1 --junitxml=checks.xml
+pytest tests/objectives -o junit_family=xunit1 --junitxml=checks.xml
 python results/family/table.py checks.xml
 ```
 

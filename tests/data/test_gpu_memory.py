@@ -7,7 +7,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl_osr.data.replay_buffer import check_memory
+
+from torchrl_osr.data import check_memory
 
 
 @pytest.mark.parametrize("where", ["cpu", "cuda"])

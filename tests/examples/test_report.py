@@ -22,11 +22,11 @@ def test_report_of_several_folders(tmp_path, run):
     code, output = run(tmp_path, "report.py", *options)
     assert code == 0, output
     assert "left out: b/1: not finished, its status is running\n" in output
-    assert "mind: No run has its versions recorded.\n" in output
+    assert "note: Every method has one seed a data set" in output
     assert output.endswith("2 runs in new/report/report.html\n")
     page = (tmp_path / "new" / "report" / "report.html").read_text(encoding="utf-8")
     assert "cql is worse than" not in page
-    assert "undisturbed score: cql is not told apart from osr" in page
+    assert "cannot be told: 1 seed" in page
     assert "a b --reference osr --output new/report" in page
 
 
@@ -36,4 +36,4 @@ def test_what_cannot_be_reported_is_one_line(tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit) as stopped:
         runpy.run_path(str(ROOT / "examples" / "report.py"), run_name="__main__")
     assert stopped.value.code == 1
-    assert capsys.readouterr().err == "nowhere is no folder.\n"
+    assert capsys.readouterr().err == "nowhere does not exist.\n"

@@ -59,7 +59,8 @@ def test_value_term_is_the_plain_one_on_the_states_that_were_asked_for(
             (expected, networks.actor.parameters()),
         ]
     )
-    check("Actor states", found, wanted, tolerance=1e-10)
+    label = "Discrete OSR" if family[name].discrete else "OSR"
+    check(label, found, wanted, tolerance=1e-10)
 
 
 @pytest.mark.losses("osr", "discrete")

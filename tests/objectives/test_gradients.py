@@ -101,7 +101,9 @@ def test_next_state_of_cut_rows_is_bootstrapped_from_but_never_recovered_to(
     (key,) = family[name].weights["recovery_weight"]
     assert_same_bits(record(loss, spoiled, [key]), record(loss, batch, [key]))
     metric = family[name].recovery_metric
-    assert torch.equal(seeded(loss, spoiled)[metric], seeded(loss, batch)[metric])
+    for garbage in (1e6, math.nan):
+        spoiled = spoil(batch, at_the_limit, garbage)
+        assert torch.equal(seeded(loss, spoiled)[metric], seeded(loss, batch)[metric])
 
 
 @pytest.mark.parametrize(

@@ -65,11 +65,11 @@ numbers = st.lists(
 )
 
 
-@pytest.mark.losses("osr", "osrv", "recovery", "cloning", "discrete", "edac")
+@pytest.mark.losses("osr", "osrv", "recovery", "cloning", "discrete", "edac", "td3bc")
 @given(numbers, st.one_of(st.none(), flags), flags, st.booleans())
 @settings(
     deadline=None,
-    max_examples=25,
+    max_examples=20,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 def test_no_weight_mask_or_end_spoils_a_value_or_a_gradient(
@@ -94,7 +94,9 @@ def test_no_weight_mask_or_end_spoils_a_value_or_a_gradient(
 
 
 @pytest.mark.losses
-@pytest.mark.parametrize("case", ["all done", "weights on done rows", "weights of 0"])
+@pytest.mark.parametrize(
+    "case", ["all done", "all masked", "weights on done rows", "weights of 0"]
+)
 def test_a_term_of_no_row_is_zero_and_trains_nothing(
     family, family_batch, seeded, terms, name, case
 ) -> None:
@@ -102,6 +104,8 @@ def test_a_term_of_no_row_is_zero_and_trains_nothing(
     done = batch["next", "done"]
     if case == "all done":
         done[:] = True
+    elif case == "all masked":
+        batch["collector", "mask"] = torch.zeros_like(done)
     elif case == "weights on done rows":
         batch["priority_weight"] = done.squeeze(-1).double()
     else:
@@ -114,6 +118,6 @@ def test_a_term_of_no_row_is_zero_and_trains_nothing(
         found = [value, *(each for each in gradients if each is not None)]
         assert all(each.isfinite().all() for each in found)
         nothing = key in OF_TRANSITIONS if "done" in case else True
-        if nothing and (weighs or case == "all done"):
+        if nothing and (weighs or "all" in case):
             assert all(not each.any() for each in found), key
     assert all(value.isfinite() for value in seeded(loss, batch).values())

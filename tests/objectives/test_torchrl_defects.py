@@ -6,10 +6,11 @@ import math
 
 import pytest
 import torch
+import torchrl.objectives
 from torchrl.data.postprocs import MultiStep
 from torchrl.objectives import CQLLoss, SACLoss, SoftUpdate
 
-from torchrl_osr import OSRLoss
+from torchrl_osr import OSRLoss, TD3BCLoss
 
 NUM_RANDOM = 10
 # With zero values a log-sum-exp of n importance weights tends to log(n |A|), because
@@ -112,6 +113,41 @@ def test_cql_loss_of_torchrl_lets_the_multiplier_train_the_critics(
     )
     cosine = torch.cosine_similarity(conservative, multiplier, dim=0)
     assert cosine.item() == pytest.approx(-1.0, abs=1e-6)
+
+
+# TorchRL is wrong: a mean over weights that are all 0 is 0 / 0. A buffer may hand out
+# such a batch where priorities are 0.
+def test_weighted_mean_of_torchrl_over_no_weight_is_nan(
+    make_networks, make_batch
+) -> None:
+    networks, batch = make_networks(), make_batch(10)
+    theirs = SACLoss(networks.actor, networks.critics, target_entropy=-2.0).double()
+    ours = OSRLoss(networks.actor, networks.critics, recovery_weight=0.0).double()
+    batch["priority_weight"] = torch.zeros(10, dtype=torch.float64)
+    for loss in (ours, theirs):
+        SoftUpdate(loss, tau=0.1)
+    assert theirs(batch.clone())["loss_qvalue"].isnan()
+    assert ours(batch)["loss_qvalue"] == 0
+
+
+# TorchRL is wrong: the cloning term is a mean over the batch that is added to each
+# row, so that a row which is masked out still pulls the policy.
+def test_cloning_term_of_torchrl_ignores_masks(
+    make_networks, make_deterministic_actor, make_batch
+) -> None:
+    networks, batch = make_networks(), make_batch(10)
+    batch["collector", "mask"] = (torch.arange(10) < 5).unsqueeze(-1)
+    spoiled = batch.clone()
+    spoiled["action"][5:] = 0.99
+    seen = {}
+    for loss_class in (TD3BCLoss, torchrl.objectives.TD3BCLoss):
+        bounds = {} if loss_class is TD3BCLoss else {"bounds": (-1.0, 1.0)}
+        actor = make_deterministic_actor("actor")
+        loss = loss_class(actor, networks.critics, **bounds).double()
+        SoftUpdate(loss, tau=0.1)
+        values = [loss(each.clone())["loss_actor"] for each in (batch, spoiled)]
+        seen[loss_class] = torch.equal(*values)
+    assert seen == {TD3BCLoss: True, torchrl.objectives.TD3BCLoss: False}
 
 
 # TorchRL is wrong: the next state moves to where the n steps end, the flags do not. A

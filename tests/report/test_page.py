@@ -239,7 +239,7 @@ def test_the_example_packs_runs_reports_on_them_and_says_what_is_missing(
     table, page = tmp_path / "runs.jsonl.gz", tmp_path / "page"
     assert "1 runs in" in run(tmp_path / "runs", "--pack", table)
     output = run(table, "--output", page)
-    assert "mind: Every method has one seed" in output
+    assert "note: Every method has one seed" in output
     assert (page / "report.html").exists()
     with pytest.raises(SystemExit):
         run(tmp_path / "nowhere")

@@ -150,6 +150,8 @@ class TD3BCLoss(BaseLoss):
         qvalue = step.qvalue(step.states[0], action, params)[0]
         cloning_error = functional.cloning_error(action, step.data_action)
         magnitude = step.mean(qvalue.abs())
+        # 0 over no row, or of critics that start at 0: there is nothing to divide.
+        magnitude = torch.where(magnitude == 0, torch.ones_like(magnitude), magnitude)
         objective = functional.td3_bc_objective(
             qvalue, cloning_error, magnitude, self.alpha
         )

@@ -467,7 +467,7 @@ def _training_episodes(
     if not at or at[-1] != steps:
         last = at[-1] if at else 0
         raise ValueError(f"not finished, evaluated last at step {last} of {steps}")
-    if not all(low < high for low, high in pairwise([0, *at])):
+    if at[0] < 0 or not all(low < high for low, high in pairwise(at)):
         raise ValueError("evaluations are not in the order of their steps")
     parts = []
     for row in evaluations:
