@@ -17,6 +17,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 from torchrl.envs import ObservationNorm
 
+from torchrl_osr._checks import check_positive
 from torchrl_osr.data import make_environment, normalized_score
 from torchrl_osr.evaluation.statistics import mean_interval, wilson_interval
 
@@ -111,8 +112,7 @@ class EpisodeEvaluator:
         wrap: Wrap | None = None,
         fixed_batch: bool = False,
     ) -> None:
-        if num_episodes < 1:
-            raise ValueError(f"num_episodes must be at least 1, got {num_episodes}.")
+        check_positive("num_episodes", num_episodes, minimum=1)
         self.environments = [make_environment(env_id) for _ in range(num_episodes)]
         if wrap is not None:
             self.environments = [wrap(each) for each in self.environments]
@@ -130,35 +130,31 @@ class EpisodeEvaluator:
             watch: called at each reset and step. Default: nothing.
         """
         episodes = len(self.environments)
-        returns = np.zeros(episodes)
-        lengths = np.zeros(episodes, dtype=np.int64)
+        returns, lengths = np.zeros(episodes), np.zeros(episodes, dtype=np.int64)
         infos: list[dict[str, Any]] = [{} for _ in range(episodes)]
-        starts = [
-            environment.reset(seed=int(seed))
-            for environment, seed in zip(self.environments, self.seeds, strict=True)
-        ]
-        observations = np.stack([start for start, _ in starts]).astype(np.float32)
-        for episode, (start, info) in enumerate(starts):
+        starts = []
+        for episode, environment in enumerate(self.environments):
+            start, info = environment.reset(seed=int(self.seeds[episode]))
             watch(episode, start, False, info)
-        running = np.arange(episodes)
-        while running.size:
-            rows = np.arange(episodes) if self.fixed_batch else running
+            starts.append(start)
+        observations = np.stack(starts).astype(np.float32)
+        everyone = running = list(range(episodes))
+        while running:
+            rows = everyone if self.fixed_batch else running
             batch = torch.from_numpy(observations[rows]).to(self.device)
-            actions = policy(batch).cpu().numpy()
-            unfinished = np.ones(running.size, dtype=bool)
-            if self.fixed_batch:
-                actions = actions[running]
-            for row, episode in enumerate(running.tolist()):
-                observation, reward, terminated, truncated, info = self.environments[
-                    episode
-                ].step(actions[row])
+            actions = dict(zip(rows, policy(batch).cpu().numpy(), strict=True))
+            unfinished = []
+            for episode in running:
+                step = self.environments[episode].step(actions[episode])
+                observation, reward, terminated, truncated, info = step
                 watch(episode, observation, terminated, info)
                 observations[episode] = observation
                 returns[episode] += float(reward)
                 lengths[episode] += 1
                 infos[episode] = info
-                unfinished[row] = not (terminated or truncated)
-            running = running[unfinished]
+                if not (terminated or truncated):
+                    unfinished.append(episode)
+            running = unfinished
         successes = None
         if all("success" in info for info in infos):
             successes = np.array([bool(info["success"]) for info in infos])

@@ -9,6 +9,7 @@ Shapes: ``E`` pairs of episodes.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -135,10 +136,8 @@ def evaluate_paired(
             env_id, num_episodes=num_episodes, seed=seed, wrap=wrap, fixed_batch=True
         )
         recorder = Recorder(num_episodes)
-        try:
+        with closing(evaluator):
             results = evaluator(policy, recorder)
-        finally:
-            evaluator.close()
         advance()
         return results, recorder
 
