@@ -50,11 +50,7 @@ class Recorder:
         self.trajectories = [Trajectory() for _ in range(num_episodes)]
 
     def __call__(
-        self,
-        episode: int,
-        observation: NDArray[Any],
-        terminated: bool,
-        info: dict[str, Any],
+        self, episode: int, observation: Any, terminated: bool, info: dict[str, Any]
     ) -> None:
         trajectory = self.trajectories[episode]
         # astype copies: an environment may write into the same array again.

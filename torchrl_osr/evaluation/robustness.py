@@ -226,11 +226,10 @@ def _episodes_json(results: EpisodeResults, env_name: str) -> dict[str, Any]:
 
 
 def _disturbance_json(results: DisturbanceResults, env_name: str) -> dict[str, Any]:
-    disturbance = results.disturbance
     return {
-        "name": disturbance.name,
-        "kind": disturbance.kind,
-        "strength": disturbance.strength,
+        "name": results.disturbance.name,
+        "kind": results.disturbance.kind,
+        "strength": results.disturbance.strength,
         **_episodes_json(results.results, env_name),
         "disturbed_at": results.disturbed_at,
         **_recovery_json(results.recovery),

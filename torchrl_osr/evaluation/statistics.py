@@ -42,9 +42,7 @@ def mean_interval(values: ArrayLike) -> tuple[float, float, float]:
     sample = np.asarray(values, dtype=np.float64).ravel()
     if not sample.size or not np.isfinite(sample).all():
         raise ValueError(f"mean_interval needs finite values, got {sample}.")
-    rng = np.random.default_rng(0)
-    resamples = sample[rng.integers(sample.size, size=(NUM_RESAMPLES, sample.size))]
-    low, high = percentile_interval(resamples.mean(1))
+    low, high = percentile_interval(stratified_resamples([sample]).mean(1))
     return float(sample.mean()), float(low), float(high)
 
 

@@ -7,7 +7,7 @@
 ``examples/film.py`` puts them together, ``docs/film.md`` has the meaning.
 """
 
-from torchrl_osr.film.control import InverseDynamicsController, TargetRule
+from torchrl_osr.film.control import InverseDynamicsController
 from torchrl_osr.film.pictures import (
     GIF_STRIDE,
     Camera,
@@ -41,7 +41,6 @@ __all__ = [
     "Survival",
     "Take",
     "Takeover",
-    "TargetRule",
     "film_gif",
     "film_strip",
     "hand_over",

@@ -24,9 +24,6 @@ from torchrl.envs import ObservationNorm
 
 from torchrl_osr._checks import check_choice
 
-TargetRule = Literal["time", "nearest"]
-"""Choice of the target state, see :class:`InverseDynamicsController`."""
-
 
 class InverseDynamicsController:
     r"""Drive agents along references by the inverse dynamics model.
@@ -77,7 +74,7 @@ class InverseDynamicsController:
         inverse_dynamics_network: ProbabilisticTensorDictSequential,
         references: Sequence[Tensor],
         *,
-        rule: TargetRule = "time",
+        rule: Literal["time", "nearest"] = "time",
         observation_norm: ObservationNorm | None = None,
     ) -> None:
         check_choice("rule", rule, ("time", "nearest"))

@@ -149,8 +149,7 @@ def film_strip(
         path: the PNG to write.
 
     Keyword Args:
-        title: above the pictures.
-        note: below the pictures; how the episode was chosen, for instance.
+        title, note: above and below the pictures.
         offsets: steps since the disturbance's end, one for each column.
         event: name of the disturbance.
     """

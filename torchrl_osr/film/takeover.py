@@ -96,11 +96,7 @@ class PoseRecorder(Recorder):
         self.returns: list[float] = []
 
     def __call__(
-        self,
-        episode: int,
-        observation: NDArray[Any],
-        terminated: bool,
-        info: dict[str, Any],
+        self, episode: int, observation: Any, terminated: bool, info: dict[str, Any]
     ) -> None:
         super().__call__(episode, observation, terminated, info)
         self.poses[episode].append(self._simulations[episode].data.qpos.copy())
