@@ -177,7 +177,7 @@ class ActionKnock(TimedDisturbance):
 class ExternalPush(TimedDisturbance):
     """Push the torso forwards or backwards, once an episode.
 
-    The arrow in the figures of the OSR paper, see :class:`ActionKnock`, as a force along
+    The arrow in the figures of the OSR paper, see :class:`ActionKnock`: a force along
     the world's x axis at the torso's centre of mass (MuJoCo's ``xfrc_applied``), for
     ``duration`` steps of the agent. The sign is drawn for each episode. The agent acts
     on, rewards and survival count.
