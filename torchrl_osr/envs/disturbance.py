@@ -54,10 +54,6 @@ def mujoco_task(env: gymnasium.Env[Any, Any], name: str) -> Any:
     """The bare environment; raise a TypeError unless it is Gymnasium's own MuJoCo task.
 
     Others, such as the mazes, have their simulation in another environment inside them.
-
-    Args:
-        env: the environment, wrapped or not.
-        name: of the disturbance, for the message.
     """
     if not isinstance(env.unwrapped, MujocoEnv):
         raise TypeError(

@@ -96,10 +96,9 @@ class ActionKnock(TimedDisturbance):
 
     Keyword Args:
         mode: ``"official"``, ``"paper"`` or ``"torque"``.
-        at: steps of the agent before it. Default 500. ``"random"`` draws the number for
-            each episode.
-        window: ``"random"`` draws from ``window[0]`` to below ``window[1]``. Default
-            ``(100, 600)``.
+        at: steps of the agent before it, or ``"random"``. Default 500.
+        window: ``"random"`` draws for each episode from ``window[0]`` to below
+            ``window[1]``. Default ``(100, 600)``.
 
     Raises:
         ValueError: if ``mode`` is unknown, ``steps`` below 1, a moment negative (or 0
@@ -191,9 +190,7 @@ class ExternalPush(TimedDisturbance):
     Keyword Args:
         duration: in steps of the agent: 0.008 s each for hopper and walker2d, 0.05 s
             for halfcheetah.
-        at: steps of the agent before it. Default ``"random"``, drawn for each episode.
-        window: ``"random"`` draws from ``window[0]`` to below ``window[1]``. Default
-            ``(100, 600)``.
+        at, window: moment, as in :class:`ActionKnock`. Default ``"random"``.
         unit: ``"newton"`` (default) or ``"body_weight"``, the weight of all bodies when
             the model is wrapped. Hopper weighs 155 N, walker2d 232 N, halfcheetah
             137 N; forces in units of the weight accelerate robots alike.
@@ -232,8 +229,7 @@ class ExternalPush(TimedDisturbance):
         model = self._bare.model
         self._torso = model.body("torso").id
         if unit == "body_weight":
-            weight = model.body_mass.sum() * np.linalg.norm(model.opt.gravity)
-            force = float(force * weight)
+            force *= model.body_mass.sum() * np.linalg.norm(model.opt.gravity)
         self.force, self.duration = float(force), duration
         self._sign = 1.0
 
@@ -246,13 +242,11 @@ class ExternalPush(TimedDisturbance):
     def step(self, action: Vector) -> Step:
         pushed = 0 <= self._count() < self.duration and self.force > 0
         force = self._sign * self.force if pushed else 0.0
-        if pushed:
-            applied = self._bare.data.xfrc_applied[self._torso]
-            before = applied[0]
-            applied[0] = before + force
+        applied = self._bare.data.xfrc_applied[self._torso]
+        before = applied[0]
+        applied[0] = before + force
         result = super().step(action)
-        if pushed:
-            # Restored, not subtracted: a rounding error would stay as a force.
-            applied[0] = before
+        # Restored, not subtracted: a rounding error would stay as a force.
+        applied[0] = before
         flag(result[-1], pushed)["push_force"] = np.float64(force)
         return result
