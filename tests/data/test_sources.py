@@ -18,7 +18,7 @@ from torchrl_osr.data import (
     normalized_score,
     write_memmap,
 )
-from torchrl_osr.data.read.recording import Conversion
+from torchrl_osr.data.read import recording
 
 MIXTURE = {"random_share": 0.0, "num_transitions": 500, "seed": 0}
 
@@ -124,7 +124,7 @@ def test_rolled_out_data_on_disk_are_those_in_memory(share):
 def test_recorded_data_on_disk_are_those_in_memory(
     hopper, quality, chunk, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(Conversion.chunks, "__defaults__", (chunk,))
+    monkeypatch.setattr(recording, "CHUNK_ROWS", chunk)
     path = write_recording(quality, tmp_path, hopper[0])
     options = {"env_id": "Hopper-v5", "path": path}
     data, manifest = load_dataset("hopper", quality, **options)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from contextlib import closing
-from hashlib import sha256
-from json import dumps
 from typing import Any
 
 from gymnasium import spaces
@@ -16,8 +14,6 @@ from torchrl_osr.data.collect.reference_scores import (
     REFERENCE_RETURNS,
     normalized_score,
 )
-from torchrl_osr.data.read.recording import Conversion, Recording
-from torchrl_osr.data.store.cache import cache_root, load_or_write
 from torchrl_osr.data.store.memmap import is_memmap_folder, load_memmap
 
 RECORDED = ("minari", "d4rl", "file")
@@ -108,43 +104,21 @@ def load_dataset(
 def _load_recorded(
     quality: str, path: str, download: bool, progress: bool, on_disk: bool
 ) -> tuple[TensorDict, dict[str, Any]]:
-    if quality == "file" and is_memmap_folder(path):
-        data, manifest = load_memmap(path)
-        return data if on_disk else data.clone(), manifest
-    recording = _open(quality, path, download, progress and not on_disk)
-    if not on_disk:
-        return recording.load()
-    # Sizes and times, not checksums: to read a large source at each start takes long.
-    files = [
-        [str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns]
-        for file in recording.files
-    ]
-    request = {"source_quality": quality, "source_files": files}
-    digest = sha256(dumps(request, sort_keys=True).encode()).hexdigest()
-    conversion = Conversion(recording)
-    return load_or_write(
-        cache_root() / "recorded" / f"{quality}-{digest[:16]}",
-        request,
-        conversion.chunks,
-        describe=conversion.manifest,
-        total=recording.total,
-        progress=progress,
-    )
-
-
-def _open(quality: str, path: str, download: bool, progress: bool) -> Recording:
     # Each reader needs a library of its own, and only the one that is asked for.
     if quality == "minari":
-        from torchrl_osr.data.read.minari import open_minari
+        from torchrl_osr.data.read.minari import load_minari
 
-        return open_minari(path, download=download, progress=progress)
+        return load_minari(path, download=download, progress=progress, on_disk=on_disk)
     if quality == "d4rl":
-        from torchrl_osr.data.read.d4rl import locate_d4rl, open_d4rl
+        from torchrl_osr.data.read.d4rl import load_d4rl
 
-        return open_d4rl(locate_d4rl(path, download, progress=progress))
-    from torchrl_osr.data.read.files import open_file
+        return load_d4rl(path, download=download, progress=progress, on_disk=on_disk)
+    if is_memmap_folder(path):
+        data, manifest = load_memmap(path)
+        return data if on_disk else data.clone(), manifest
+    from torchrl_osr.data.read.files import load_file
 
-    return open_file(path)
+    return load_file(path, progress=progress, on_disk=on_disk)
 
 
 def _check_sizes(data: TensorDict, env_id: str, path: str) -> None:
