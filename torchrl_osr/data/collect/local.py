@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from tensordict import TensorDict
 
+from torchrl_osr import __version__
 from torchrl_osr._files import check_disk_space
 from torchrl_osr.data.collect.environment import (
     MAZE_IDS,
@@ -51,11 +52,10 @@ def load_local_dataset(
 ) -> tuple[TensorDict, dict[str, Any]]:
     """Load a data set rolled out on this machine, collecting it on first use.
 
-    About 10,000 transitions a second are collected; a set of a million takes one or
-    two minutes once. Processes that ask for the same set at once wait for one of them
-    to collect it; a collection that is killed begins again. The same seed gives the
-    same data on one machine and one set of library versions, not across machines:
-    contact dynamics are chaotic.
+    About 10,000 transitions a second are collected. Processes that ask for the same set
+    at once wait for one of them to collect it. The same seed gives the same data on one
+    machine and one set of library versions, not across machines: contact dynamics are
+    chaotic.
 
     Args:
         env_name: ``"hopper"``, ``"walker2d"`` or ``"halfcheetah"`` (Gymnasium v5);
@@ -72,9 +72,8 @@ def load_local_dataset(
         cache_dir: cache folder. Default: the environment variable
             ``TORCHRL_OSR_CACHE``, else the user's cache folder for ``torchrl-osr``.
         progress: show a progress bar when on a terminal. Default: ``True``.
-        on_disk: leave the rows memory-mapped, see
-            :func:`~torchrl_osr.data.load_memmap`. To collect them takes the memory of
-            the whole set, once. Default: ``False``.
+        on_disk: leave the rows memory-mapped. To collect them takes the memory of the
+            whole set, once. Default: ``False``.
 
     Returns:
         The transitions ``[N]``, see :func:`~torchrl_osr.data.check_dataset` for their
@@ -146,7 +145,7 @@ def _rolled_out(
         folder,
         request,
         collect,
-        describe=lambda: {"torchrl_osr_version": _own_version(), **episodes},
+        describe=lambda: {"torchrl_osr_version": __version__, **episodes},
         progress=False,
     )
 
@@ -203,17 +202,9 @@ def request_of(
 def _check_room(folder: Path, request: dict[str, Any]) -> None:
     """Raise an OSError before the work unless the set fits on the disk."""
     with closing(make_environment(request["env_id"])) as env:
-        observation, action = env.observation_space.shape, env.action_space.shape
-    assert observation is not None
-    assert action is not None
-    numbers = 2 * observation[0] + action[0] + 1  # both states, action, reward
+        observation = env.observation_space.sample().size
+        action = env.action_space.sample().size
+    numbers = 2 * observation + action + 1  # both states, action, reward
     row = numbers * np.dtype(np.float32).itemsize + 3  # and three flags
     what = f"the data set ({CACHE_VARIABLE}=/path chooses the folder)"
     check_disk_space(folder, request["num_transitions"] * row, what)
-
-
-def _own_version() -> str:
-    try:
-        return version("torchrl-osr")
-    except PackageNotFoundError:
-        return "not installed"

@@ -57,11 +57,6 @@ ACTION_NOISE = 0.5
 def maze_behavior(env_name: str, quality: str) -> dict[str, Any]:
     """Entries of the manifest that decide how a maze set comes about.
 
-    Args:
-        env_name: ``"pointmaze-umaze"``, ``"pointmaze-medium"`` or
-            ``"pointmaze-large"``.
-        quality: ``"diverse"`` or, but for the umaze, ``"play"``.
-
     Raises:
         ValueError: there is no such quality, or it is a maze of the ant.
     """
@@ -91,14 +86,14 @@ def maze_behavior(env_name: str, quality: str) -> dict[str, Any]:
 def maze_players(
     env: gymnasium.Env[Any, Any], env_name: str, quality: str
 ) -> tuple[gymnasium.Env[Any, Any], list[ActionSampler]]:
-    """Return a maze with a quality's starts and goals, and the controller to play it.
+    """Maze with a quality's starts and goals, and the controller that plays it.
 
     Args:
         env: the maze.
         env_name: its short name.
-        quality: ``"diverse"``: start and goal are two different free cells, each as
-            likely as another, as the environment itself draws them; ``"play"``: a pair
-            of :data:`PLAY_CELLS`. The environment moves both within their cells.
+        quality: ``"diverse"``: start and goal are two different free cells, as the
+            environment itself draws them; ``"play"``: a pair of :data:`PLAY_CELLS`. The
+            environment moves both within their cells.
     """
     pairs = maze_behavior(env_name, quality)["cells"]
     sampler = waypoint_sampler(env.get_wrapper_attr("maze"))
@@ -106,7 +101,7 @@ def maze_players(
 
 
 def waypoint_sampler(maze: Any) -> ActionSampler:
-    r"""Return the noisy controller that leads the point to its goal.
+    r"""Noisy controller that leads the point to its goal.
 
     .. math::
         a = \mathrm{clip}(k (w - x) - d \dot x) + \sigma \epsilon
@@ -147,7 +142,7 @@ def waypoint_sampler(maze: Any) -> ActionSampler:
 
 
 def shortest_path(free: NDArray[np.bool_], start: Cell, goal: Cell) -> list[Cell]:
-    """Return a shortest way from ``start`` to ``goal``, both included.
+    """Cells of a shortest way from ``start`` to ``goal``, both included.
 
     Of several it is always the same one: up goes before down, left and right.
 
