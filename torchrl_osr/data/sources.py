@@ -36,11 +36,8 @@ def load_dataset(
     Args:
         env_name: short name of the task. A recorded set has a normalised score if
             there are reference returns for that name.
-        quality: one of ``QUALITIES``, loaded by
-            :func:`~torchrl_osr.data.load_local_dataset`; or ``"minari"``, ``"d4rl"`` or
-            ``"file"``, read by :func:`~torchrl_osr.data.load_minari`,
-            :func:`~torchrl_osr.data.load_d4rl` or
-            :func:`~torchrl_osr.data.load_file`.
+        quality: one of ``QUALITIES``, see :func:`~torchrl_osr.data.load_local_dataset`;
+            or ``"minari"``, ``"d4rl"`` or ``"file"``, see the loaders of that name.
 
     Keyword Args:
         env_id: Gymnasium id of the task; recorded data of another size are then
@@ -63,13 +60,6 @@ def load_dataset(
     Raises:
         ValueError: a path is missing or has no use, a random share with recorded data,
             or data that do not fit the task.
-
-    Examples:
-        >>> from torchrl_osr.data import load_dataset
-        >>> load_dataset("hopper", "minari")
-        Traceback (most recent call last):
-            ...
-        ValueError: data=minari needs data.path=...
     """
     if quality not in RECORDED:
         if path is not None:
