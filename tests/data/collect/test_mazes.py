@@ -13,7 +13,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
-from torchrl_osr._files import sha256_of
 from torchrl_osr.data import (
     MAZE_IDS,
     check_dataset,
@@ -22,10 +21,7 @@ from torchrl_osr.data import (
     load_local_dataset,
     make_environment,
 )
-from torchrl_osr.data.collect.behavior import behavior_policy_path
-from torchrl_osr.data.collect.local import request_of
 from torchrl_osr.data.collect.mazes import PLAY_CELLS, shortest_path, waypoint_sampler
-from torchrl_osr.data.collect.qualities import behavior_of
 
 SETS = [
     ("pointmaze-umaze", "diverse"),
@@ -82,15 +78,6 @@ def test_play_has_its_pairs_of_cells_and_no_others(env_name):
     assert len(np.unique(starts[:, :4], axis=0)) == len(starts), "moved in their cells"
 
 
-def test_diverse_covers_the_free_cells():
-    data = collect_quality("pointmaze-umaze", "diverse", 8000, progress=False).data
-    starts = starts_of(data)
-    for columns in (starts[:, :2], starts[:, 2:4]):
-        # The seven cells of the U.
-        assert len(set(cells_of("PointMaze_UMaze-v3", columns))) == 7
-    assert (np.linalg.norm(starts[:, :2] - starts[:, 2:4], axis=-1) > 0.45).all()
-
-
 def test_the_controller_by_hand():
     with closing(make_environment("PointMaze_UMaze-v3")) as env:
         sample = waypoint_sampler(env.unwrapped.maze)
@@ -126,21 +113,6 @@ def test_a_set_is_cached_and_says_what_it_is_made_of(tmp_path, monkeypatch):
     other, changed = load_local_dataset("pointmaze-medium", "play", **request)
     assert changed["behavior"]["action_noise"] == 0.1
     assert not (other["action"] == data["action"]).all()
-
-
-def test_the_request_of_other_tasks_is_what_it_was():
-    path = behavior_policy_path("hopper", "medium")
-    assert behavior_of("hopper", "medium") == {
-        "behavior_sha256": {"medium": sha256_of(path)}
-    }
-    assert behavior_of("hopper", "random") == {"behavior_sha256": {}}
-    request = request_of("hopper", "medium", 500, 0)
-    assert list(request) == [
-        *["recipe_version", "env_name", "env_id", "quality", "num_transitions"],
-        "seed",
-        *["behavior_sha256", "versions"],
-    ]
-    assert set(request["versions"]) == {"numpy", "gymnasium", "mujoco"}
 
 
 @pytest.mark.parametrize(

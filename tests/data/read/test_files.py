@@ -10,7 +10,7 @@ import pyarrow
 import pytest
 from pyarrow import parquet
 
-from torchrl_osr.data import check_dataset, load_file, transitions_from_rows
+from torchrl_osr.data import load_file, transitions_from_rows
 
 ROWS = 60
 EMPTY = pyarrow.list_(pyarrow.float32())
@@ -46,16 +46,6 @@ def save(path, rows):
 @pytest.fixture(params=[".npz", ".hdf5", ".h5", ".parquet"])
 def path(request, tmp_path):
     return tmp_path / f"log{request.param}"
-
-
-def test_every_kind_of_file_gives_the_rows_in_it(path):
-    for rows in (log(), log() | {"next_observation": log()["observation"] + 1}):
-        data, manifest = load_file(save(path, rows))
-        check_dataset(data)
-        expected, about = transitions_from_rows(rows)
-        assert (data == expected).all()
-        assert {k: manifest[k] for k in about} == about
-        assert manifest["source"] == str(path)
 
 
 def test_deviations_are_named_in_every_kind_of_file(path):

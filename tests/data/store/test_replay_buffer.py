@@ -35,37 +35,12 @@ def test_batches_depend_on_the_seed_alone() -> None:
     assert not torch.equal(first, other)
 
 
-def test_sampling_leaves_the_global_generator_alone() -> None:
-    buffer = make_replay_buffer(numbered_rows(50), batch_size=16, seed=0)
-    before = torch.get_rng_state()
-    buffer.sample()
-    assert torch.equal(torch.get_rng_state(), before)
-
-
 def test_sampling_is_uniform_with_replacement() -> None:
     buffer = make_replay_buffer(numbered_rows(10), batch_size=1000, seed=0)
     counts = torch.bincount(draws(buffer, 10).long(), minlength=10)
     # Expected 1000 each with a standard deviation of 30.
     assert counts.min() > 850
     assert counts.max() < 1150
-
-
-def test_rows_stay_together_and_transforms_are_applied() -> None:
-    from torchrl.envs.transforms import ObservationNorm
-
-    halve = ObservationNorm(loc=0.0, scale=0.5, in_keys=["observation"])
-    buffer = make_replay_buffer(
-        numbered_rows(50), batch_size=16, seed=0, transform=halve
-    )
-    batch = buffer.sample()
-    assert torch.equal(2 * batch["observation"] + 1, batch["next", "observation"])
-
-
-def test_buffer_does_not_share_memory_with_the_data() -> None:
-    data = numbered_rows(50)
-    buffer = make_replay_buffer(data, batch_size=16, seed=0)
-    data["observation"].fill_(-1)
-    assert (buffer.sample()["observation"] >= 0).all()
 
 
 def test_empty_or_unflat_data_are_refused() -> None:
