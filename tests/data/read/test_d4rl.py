@@ -9,67 +9,34 @@ import threading
 import h5py
 import numpy as np
 import pytest
+from recorded_logs import make_columns, save_d4rl
 from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 
 from torchrl_osr.data import load_d4rl, transitions_from_rows
 
 NAME = "hopper-medium-v2"
-NAMES = {
-    "observations": "observation",
-    "actions": "action",
-    "rewards": "reward",
-    "terminals": "terminated",
-    "timeouts": "truncated",
-    "next_observations": "next_observation",
-}
-
-
-def write(path, *, rows=400, with_next=True, with_timeouts=True, **changes):
-    """Episodes of up to 50 steps; with ``changes`` in place of arrays."""
-    rng = np.random.default_rng(0)
-    terminals = rng.random(rows) < 0.02
-    timeouts, steps = np.zeros(rows, bool), 0
-    for row in range(rows):
-        steps += 1
-        timeouts[row] = steps == 50 and not terminals[row]
-        steps = 0 if terminals[row] or steps == 50 else steps
-    arrays = {
-        "observations": rng.normal(size=(rows, 11)).astype(np.float32),
-        "actions": rng.uniform(-1, 1, (rows, 3)).astype(np.float32),
-        "rewards": rng.normal(size=rows).astype(np.float32),
-        "terminals": terminals,
-    }
-    if with_timeouts:
-        arrays["timeouts"] = timeouts
-    if with_next:
-        ends = terminals | timeouts
-        after = np.r_[arrays["observations"][1:], arrays["observations"][:1]]
-        after[ends] = rng.normal(size=(int(ends.sum()), 11))
-        arrays["next_observations"] = after
-    arrays = {k: v for k, v in (arrays | changes).items() if v is not None}
-    with h5py.File(path, "w") as file:
-        for name, array in arrays.items():
-            file[name] = array
-        file["infos/qpos"] = np.zeros((rows, 6))
-        file["metadata/algorithm"] = "SAC"
-    return arrays | {"timeouts": timeouts}
 
 
 @pytest.mark.parametrize("with_next", [True, False], ids=["v2", "v0"])
 @pytest.mark.parametrize("with_timeouts", [True, False])
 def test_the_columns_have_other_names(tmp_path, with_next, with_timeouts):
-    path = tmp_path / "set.hdf5"
-    arrays = write(path, with_next=with_next, with_timeouts=with_timeouts)
-    data, manifest = load_d4rl(path, max_episode_steps=None if with_timeouts else 50)
-    rows = {NAMES[name]: array for name, array in arrays.items()}
-    expected, about = transitions_from_rows(rows)
+    columns = make_columns(with_next=with_next)
+    if not with_timeouts:  # a fall in an episode's last step is both
+        columns["truncated"] |= columns["terminated"]
+    expected, about = transitions_from_rows(columns)
+    if not with_timeouts:
+        del columns["truncated"]
+    path = save_d4rl(tmp_path / "set.hdf5", columns)
+    data, manifest = load_d4rl(path, max_episode_steps=None if with_timeouts else 40)
     assert (data == expected).all()
     assert about.items() <= manifest.items()
     assert len(manifest["data_sha256"]) == 64
 
 
 def test_a_time_limit_needs_to_be_known(tmp_path):
-    write(tmp_path / "set.hdf5", with_timeouts=False)
+    columns = make_columns()
+    del columns["truncated"]
+    save_d4rl(tmp_path / "set.hdf5", columns)
     with pytest.raises(ValueError, match=r"has no 'timeouts': .*max_episode_steps="):
         load_d4rl(tmp_path / "set.hdf5")
 
@@ -77,14 +44,17 @@ def test_a_time_limit_needs_to_be_known(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"rewards": None}, "is no D4RL file: it lacks rewards"),
-        ({"rewards": np.full(400, np.nan)}, "'reward' holds nan in row 0 of 400"),
-        ({"actions": np.ones((399, 3))}, r"'action' has shape \[399, 3\]"),
-        ({"observations": np.zeros((400, 11))}, "'observation' is zero in all 400"),
+        ({"reward": None}, "is no D4RL file: it lacks rewards"),
+        ({"reward": np.full(300, np.nan)}, "'reward' holds nan in row 0 of 300"),
+        ({"action": np.ones((299, 3))}, r"'action' has shape \[299, 3\]"),
+        ({"observation": np.zeros((300, 3))}, "'observation' is zero in all"),
     ],
 )
 def test_deviations_are_named(tmp_path, changes, message):
-    write(tmp_path / "set.hdf5", **changes)
+    columns = make_columns() | changes
+    save_d4rl(
+        tmp_path / "set.hdf5", {k: v for k, v in columns.items() if v is not None}
+    )
     with pytest.raises(ValueError, match=message):
         load_d4rl(tmp_path / "set.hdf5")
 
@@ -132,7 +102,7 @@ def cached(tmp_path):
 
 def test_a_named_set_is_fetched_once_and_only_when_told(tmp_path, server):
     folder, asked = server
-    write(folder / "hopper_medium-v2.hdf5")
+    save_d4rl(folder / "hopper_medium-v2.hdf5", make_columns())
     with pytest.raises(FileNotFoundError, match=r"fetch it with download=True"):
         load_d4rl(NAME)
     assert asked == []
@@ -151,7 +121,7 @@ def test_a_wrong_or_missing_file_is_not_kept(tmp_path, server):
     folder, _ = server
     with pytest.raises(OSError, match="404"):
         load_d4rl(NAME, download=True)
-    write(folder / "hopper_medium-v2.hdf5")
+    save_d4rl(folder / "hopper_medium-v2.hdf5", make_columns())
     content = (folder / "hopper_medium-v2.hdf5").read_bytes()
     (folder / "hopper_medium-v2.hdf5").write_bytes(content[:-1000])
     with pytest.raises(ValueError, match="is no HDF5 file, or damaged"):
@@ -159,7 +129,9 @@ def test_a_wrong_or_missing_file_is_not_kept(tmp_path, server):
     (folder / "hopper_medium-v2.hdf5").write_text("<html>moved</html>")
     with pytest.raises(ValueError, match="is no HDF5 file"):
         load_d4rl(NAME, download=True)
-    write(folder / "hopper_medium-v2.hdf5", terminals=None)
+    columns = make_columns()
+    del columns["terminated"]
+    save_d4rl(folder / "hopper_medium-v2.hdf5", columns)
     with pytest.raises(ValueError, match="lacks terminals"):
         load_d4rl(NAME, download=True)
     assert cached(tmp_path) == []

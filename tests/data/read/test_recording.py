@@ -7,11 +7,10 @@ from unittest import mock
 
 import h5py
 import numpy as np
-import pyarrow
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from pyarrow import parquet
+from recorded_logs import make_columns, save, save_d4rl
 
 from torchrl_osr.data import (
     is_memory_mapped,
@@ -83,10 +82,10 @@ def test_any_recording_in_parts_of_any_size(tmp_path_factory, columns, rows):
     assert_same_in_parts(partial(load_file, path), rows)
 
 
-def test_errors_say_in_which_rows_they_are(tmp_path, make_columns, monkeypatch):
+def test_errors_say_in_which_rows_they_are(tmp_path, monkeypatch):
     columns = make_columns()
     columns["reward"][250] = np.nan
-    save_hdf5(tmp_path / "log.h5", columns)
+    save(tmp_path / "log.h5", columns)
     monkeypatch.setattr(recording, "CHUNK_ROWS", 50)
     message = r"in the rows from 240 on: 'reward' holds nan in row 10 of 40"
     with pytest.raises(ValueError, match=message):
@@ -96,48 +95,27 @@ def test_errors_say_in_which_rows_they_are(tmp_path, make_columns, monkeypatch):
 @pytest.mark.parametrize("rows", [1, 50, 1000])
 @pytest.mark.parametrize("with_next", [True, False])
 @pytest.mark.parametrize("ending", ["npz", "h5", "parquet"])
-def test_files(tmp_path, make_columns, ending, with_next, rows):
-    columns, path = make_columns(with_next=with_next), tmp_path / f"log.{ending}"
-    if ending == "npz":
-        np.savez(path, **columns)
-    elif ending == "h5":
-        save_hdf5(path, columns)
-    else:
-        lists = {n: c.tolist() if c.ndim == 2 else c for n, c in columns.items()}
-        parquet.write_table(pyarrow.table(lists), path, row_group_size=70)
+def test_files(tmp_path, ending, with_next, rows):
+    columns = make_columns(with_next=with_next)
+    options = {"row_group_size": 70} if ending == "parquet" else {}
+    path = save(tmp_path / f"log.{ending}", columns, **options)
     assert_same_in_parts(partial(load_file, path), rows)
-
-
-NAMES = {
-    "observation": "observations",
-    "action": "actions",
-    "reward": "rewards",
-    "terminated": "terminals",
-    "truncated": "timeouts",
-    "next_observation": "next_observations",
-}
-
-
-def save_hdf5(path, columns, names=None):
-    with h5py.File(path, "w") as file:
-        for name, column in columns.items():
-            file[names[name] if names else name] = column
 
 
 @pytest.mark.parametrize("rows", [1, 50, 1000])
 @pytest.mark.parametrize("limit", [None, 10])
-def test_d4rl(tmp_path, make_columns, rows, limit):
+def test_d4rl(tmp_path, rows, limit):
     columns, path = make_columns(), tmp_path / "set.hdf5"
     if limit:
         del columns["truncated"]
-    save_hdf5(path, columns, NAMES)
+    save_d4rl(path, columns)
     assert_same_in_parts(partial(load_d4rl, path, max_episode_steps=limit), rows)
 
 
-def test_a_trajectory_without_an_end_is_refused(tmp_path, make_columns, monkeypatch):
+def test_a_trajectory_without_an_end_is_refused(tmp_path, monkeypatch):
     columns = make_columns()
     columns["terminated"][:] = columns["truncated"][:] = False
-    save_hdf5(tmp_path / "log.h5", columns)
+    save(tmp_path / "log.h5", columns)
     monkeypatch.setattr(recording, "MAX_TRAJECTORY", 100)
     monkeypatch.setattr(recording, "CHUNK_ROWS", 40)
     with pytest.raises(ValueError, match=r"begins in row 0 has no end within 160 rows"):
@@ -176,14 +154,12 @@ def virtual(file, folder):
 @pytest.mark.parametrize(
     "craft", [external, soft_to_external, soft_to_soft_to_external, raw, virtual]
 )
-def test_nothing_is_read_from_another_hdf5_file(
-    tmp_path, make_columns, craft, quality, on_disk
-):
+def test_nothing_is_read_from_another_hdf5_file(tmp_path, craft, quality, on_disk):
     (tmp_path / "secret").write_bytes(bytes(2400))
     columns, path = make_columns(), tmp_path / "log.hdf5"
-    save_hdf5(tmp_path / "other.hdf5", columns)
+    save(tmp_path / "other.hdf5", columns)
     del columns["reward"]
-    save_hdf5(path, columns, NAMES)
+    save_d4rl(path, columns)
     with h5py.File(path, "a") as file:
         craft(file, tmp_path)
         assert file["rewards"].shape == (300,), "the crafted file works"
@@ -202,9 +178,9 @@ def test_nothing_is_read_from_another_hdf5_file(
         ),
     ],
 )
-def test_deviating_hdf5_files_are_refused(tmp_path, make_columns, change, message):
+def test_deviating_hdf5_files_are_refused(tmp_path, change, message):
     path = tmp_path / "log.h5"
-    save_hdf5(path, make_columns())
+    save(path, make_columns())
     with h5py.File(path, "a") as file:
         change(file)
     with pytest.raises(ValueError, match=message):
@@ -212,12 +188,10 @@ def test_deviating_hdf5_files_are_refused(tmp_path, make_columns, change, messag
 
 
 @pytest.mark.parametrize("on_disk", [False, True])
-def test_columns_of_unequal_length_are_refused(
-    tmp_path, make_columns, monkeypatch, on_disk
-):
+def test_columns_of_unequal_length_are_refused(tmp_path, monkeypatch, on_disk):
     columns, path = make_columns(), tmp_path / "log.h5"
     columns["action"] = columns["action"][:290]
-    save_hdf5(path, columns)
+    save(path, columns)
     monkeypatch.setattr(recording, "CHUNK_ROWS", 50)
     with pytest.raises(ValueError, match="'action' has shape"):
         load_file(path, on_disk=on_disk)
