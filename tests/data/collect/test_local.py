@@ -18,7 +18,6 @@ from torchrl_osr.data import (
 from torchrl_osr.data.collect import local
 
 ROWS = 300
-FOLDER = f"hopper-random-{ROWS}-seed0"
 
 
 def load(cache_dir: Path | None, **changes):
@@ -84,11 +83,6 @@ def test_behaviour_files_are_recorded_by_checksum(tmp_path):
     assert manifest["normalized_score"] is None
 
 
-def test_environment_variable_moves_the_cache(cache):
-    load(None)
-    assert (cache / "rolled-out" / FOLDER / "manifest.json").is_file()
-
-
 def test_other_versions_make_the_set_anew(tmp_path, collections, monkeypatch):
     first, _ = load(tmp_path)
     with monkeypatch.context() as patch:
@@ -99,14 +93,6 @@ def test_other_versions_make_the_set_anew(tmp_path, collections, monkeypatch):
     assert (first == second).all()
     load(tmp_path)
     assert len(collections) == 3
-
-
-def test_a_folder_below_a_file_names_path_and_cure(tmp_path, collections):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OSError, match=r"TORCHRL_OSR_CACHE=.*file") as raised:
-        load(tmp_path / "file" / "cache")
-    assert isinstance(raised.value, NotADirectoryError)
-    assert collections == []
 
 
 CHILD = """

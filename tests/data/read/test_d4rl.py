@@ -18,33 +18,20 @@ NAME = "hopper-medium-v2"
 
 
 @pytest.mark.parametrize("with_next", [True, False], ids=["v2", "v0"])
-@pytest.mark.parametrize("with_timeouts", [True, False])
-def test_the_columns_have_other_names(tmp_path, with_next, with_timeouts):
+def test_the_columns_have_other_names(tmp_path, with_next):
     columns = make_columns(with_next=with_next)
-    if not with_timeouts:  # a fall in an episode's last step is both
-        columns["truncated"] |= columns["terminated"]
     expected, about = transitions_from_rows(columns)
-    if not with_timeouts:
-        del columns["truncated"]
-    path = save_d4rl(tmp_path / "set.hdf5", columns)
-    data, manifest = load_d4rl(path, max_episode_steps=None if with_timeouts else 40)
+    data, manifest = load_d4rl(save_d4rl(tmp_path / "set.hdf5", columns))
     assert (data == expected).all()
     assert about.items() <= manifest.items()
     assert len(manifest["data_sha256"]) == 64
-
-
-def test_a_time_limit_needs_to_be_known(tmp_path):
-    columns = make_columns()
-    del columns["truncated"]
-    save_d4rl(tmp_path / "set.hdf5", columns)
-    with pytest.raises(ValueError, match=r"has no 'timeouts': .*max_episode_steps="):
-        load_d4rl(tmp_path / "set.hdf5")
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"reward": None}, "is no D4RL file: it lacks rewards"),
+        ({"truncated": None}, "is no D4RL file: it lacks timeouts"),
         ({"reward": np.full(300, np.nan)}, "'reward' holds nan in row 0 of 300"),
         ({"action": np.ones((299, 3))}, r"'action' has shape \[299, 3\]"),
         ({"observation": np.zeros((300, 3))}, "'observation' is zero in all"),

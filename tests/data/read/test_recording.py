@@ -14,7 +14,6 @@ from recorded_logs import make_columns, save, save_d4rl
 
 from torchrl_osr.data import (
     is_memory_mapped,
-    load_d4rl,
     load_dataset,
     load_file,
     transitions_from_rows,
@@ -100,16 +99,6 @@ def test_files(tmp_path, ending, with_next, rows):
     options = {"row_group_size": 70} if ending == "parquet" else {}
     path = save(tmp_path / f"log.{ending}", columns, **options)
     assert_same_in_parts(partial(load_file, path), rows)
-
-
-@pytest.mark.parametrize("rows", [1, 50, 1000])
-@pytest.mark.parametrize("limit", [None, 10])
-def test_d4rl(tmp_path, rows, limit):
-    columns, path = make_columns(), tmp_path / "set.hdf5"
-    if limit:
-        del columns["truncated"]
-    save_d4rl(path, columns)
-    assert_same_in_parts(partial(load_d4rl, path, max_episode_steps=limit), rows)
 
 
 def test_a_trajectory_without_an_end_is_refused(tmp_path, monkeypatch):

@@ -24,7 +24,12 @@ from torchrl_osr.data.collect.environment import (
 )
 from torchrl_osr.data.collect.qualities import behavior_of, collect_quality
 from torchrl_osr.data.collect.reference_scores import normalized_score
-from torchrl_osr.data.store.cache import CACHE_VARIABLE, cache_root, load_or_write
+from torchrl_osr.data.store.cache import (
+    CACHE_VARIABLE,
+    CHUNK_ROWS,
+    cache_root,
+    load_or_write,
+)
 from torchrl_osr.data.store.splits import mix_datasets
 from torchrl_osr.data.store.statistics import describe_episodes
 
@@ -34,9 +39,6 @@ RECIPE_VERSION = 1
 # Other versions of these give other data for the same seed.
 DATA_PACKAGES = ("numpy", "gymnasium", "mujoco")
 MAZE_PACKAGES = (*DATA_PACKAGES, "gymnasium-robotics")
-
-# Of a set that is collected, written at a time.
-CHUNK_ROWS = 200_000
 
 
 def load_local_dataset(
@@ -84,16 +86,6 @@ def load_local_dataset(
     Raises:
         ValueError: unknown environment or quality.
         OSError: the cache folder cannot be written.
-
-    Examples:
-        >>> import tempfile
-        >>> from torchrl_osr.data import load_local_dataset
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     data, manifest = load_local_dataset(
-        ...         "hopper", "random", num_transitions=500, cache_dir=folder
-        ...     )
-        >>> len(data), manifest["env_id"]
-        (500, 'Hopper-v5')
     """
     root = cache_root(cache_dir)
     recipe = {"num_transitions": num_transitions, "seed": seed}

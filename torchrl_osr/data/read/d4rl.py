@@ -13,9 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from filelock import FileLock
-from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch.hub import download_url_to_file
 from torchrl import torchrl_logger
@@ -40,14 +38,13 @@ COLUMNS = {
     "timeouts": "truncated",
     "next_observations": "next_observation",
 }
-REQUIRED = ("observations", "actions", "rewards", "terminals")
+REQUIRED = ("observations", "actions", "rewards", "terminals", "timeouts")
 
 
 def load_d4rl(
     source: str | Path,
     *,
     download: bool = False,
-    max_episode_steps: int | None = None,
     action_bounds: ActionBounds = (-1.0, 1.0),
     clip_actions: bool = False,
     on_disk: bool = False,
@@ -67,8 +64,6 @@ def load_d4rl(
         download: fetch a named set that is not in the cache from D4RL's address. It
             publishes no checksums: compare ``data_sha256`` of the manifest between
             machines. Default: ``False``, nothing is fetched.
-        max_episode_steps: the time limit, for a file that does not have ``timeouts``;
-            an episode then ends after so many steps.
         action_bounds: see :func:`~torchrl_osr.data.transitions_from_rows`.
         clip_actions: see there.
         on_disk: see :func:`~torchrl_osr.data.load_dataset`. Default: ``False``.
@@ -76,28 +71,22 @@ def load_d4rl(
 
     Returns:
         The transitions ``[N]`` and the manifest of that function, with ``reader``,
-        ``source``, ``max_episode_steps`` and ``data_sha256``.
+        ``source`` and ``data_sha256``.
 
     Raises:
         FileNotFoundError: no such file, or a named set that is not in the cache while
             ``download`` is false.
-        ValueError: unknown name, no D4RL file, or data that
+        ValueError: unknown name, no D4RL file, one without ``timeouts``, or data that
             :func:`~torchrl_osr.data.transitions_from_rows` refuses.
     """
     path = _located(source, download, progress)
     total, read_arrays = _open(path)
 
     def read(start: int, stop: int) -> Columns:
-        arrays = dict(read_arrays(start, stop))
-        if "timeouts" not in arrays:
-            arrays["timeouts"] = _timeouts(path, arrays["terminals"], max_episode_steps)
+        arrays = read_arrays(start, stop)
         return {COLUMNS[name]: array for name, array in arrays.items()}
 
-    about = {
-        "reader": "d4rl",
-        "source": str(path),
-        "max_episode_steps": max_episode_steps,
-    }
+    about = {"reader": "d4rl", "source": str(path)}
     parts = partial(whole_trajectories, read, total)
     recording = Recording(parts, action_bounds, clip_actions, about, [path], total)
     return recording.load(on_disk=on_disk, progress=progress)
@@ -149,19 +138,3 @@ def _download(url: str, path: Path, progress: bool) -> None:
             os.replace(part, path)
         finally:
             part.unlink(missing_ok=True)
-
-
-def _timeouts(
-    path: Path, terminals: NDArray[Any], limit: int | None
-) -> NDArray[np.bool_]:
-    if limit is None or limit < 1:
-        raise ValueError(
-            f"{path} has no 'timeouts': say with max_episode_steps= after how many "
-            "steps (at least 1) the task's time limit cut an episode."
-        )
-    row = np.arange(terminals.size)
-    # The first row of each row's episode, as the terminals tell it.
-    starts = np.r_[0, np.flatnonzero(terminals) + 1]
-    first = starts[np.searchsorted(starts, row, side="right") - 1]
-    timeouts: NDArray[np.bool_] = (row - first + 1) % limit == 0
-    return timeouts

@@ -126,19 +126,10 @@ def load_minari(
 def minari_replay_buffer(
     dataset: str, *, batch_size: int = 256, seed: int = 0, **options: Any
 ) -> ReplayBuffer:
-    """Load a Minari data set into a replay buffer.
+    """Replay buffer of a Minari data set, see :func:`load_minari` for the options.
 
-    Importing ``torchrl_osr.data`` registers it with TorchRL as ``osr-minari``, beside
-    TorchRL's own ``minari``, so that
+    Importing ``torchrl_osr.data`` registers it with TorchRL, so that
     ``torchrl.data.datasets.load_dataset("osr-minari:mujoco/hopper/medium-v0")`` works.
-
-    Args:
-        dataset: as in :func:`load_minari`.
-
-    Keyword Args:
-        batch_size: rows per ``sample()``. Default: 256.
-        seed: of the sampling. Default: 0.
-        **options: of :func:`load_minari`.
     """
     data, _ = load_minari(dataset, **options)
     return make_replay_buffer(data, batch_size=batch_size, seed=seed)
@@ -188,7 +179,7 @@ def _damaged(dataset: str | Path, error: Exception) -> ValueError:
 
 
 def _leaves(space: gymnasium.Space[Any], name: tuple[str, ...] = ()) -> Leaves:
-    """Return the boxes that an observation is made of, in order of their names."""
+    """Boxes that an observation is made of, in order of their names."""
     if isinstance(space, gymnasium.spaces.Dict):
         parts = [_leaves(space[key], (*name, key)) for key in sorted(space.keys())]
         return {key: box for part in parts for key, box in part.items()}

@@ -25,16 +25,13 @@ from tensordict import TensorDict
 from torchrl_osr._files import sha256_of
 from torchrl_osr.data.read.column_checks import ActionBounds
 from torchrl_osr.data.read.transitions import transitions_of
-from torchrl_osr.data.store.cache import cache_root, load_or_write
+from torchrl_osr.data.store.cache import CHUNK_ROWS, cache_root, load_or_write
 from torchrl_osr.data.store.statistics import describe_episodes
 from torchrl_osr.data.store.validation import ACTION_LIMIT, check_dataset
 
 Columns = Mapping[str, NDArray[Any]]
 ReadRows = Callable[[int, int], Columns]
 """Columns of the rows from one number up to another."""
-
-# Some ten megabytes of hopper.
-CHUNK_ROWS = 200_000
 
 # A trajectory is in memory as a whole; without an end in so many rows, the flags are
 # more likely to be missing.
@@ -144,12 +141,7 @@ class Recording:
 
 
 def _check_order(column: ArrayLike, seen: set[int], last: int | None) -> int:
-    """Raise if an episode comes back; return the number of the last.
-
-    Args:
-        column: numbers of the episodes, a row each.
-        seen: those of the parts before, ``last`` the very last; updated.
-    """
+    """Raise if an episode comes back or was seen; return the number of the last."""
     episode = np.asarray(column).reshape(-1)
     for row in np.flatnonzero(np.r_[True, episode[1:] != episode[:-1]]).tolist():
         number = int(episode[row])
@@ -164,12 +156,7 @@ def _check_order(column: ArrayLike, seen: set[int], last: int | None) -> int:
 
 
 def whole_trajectories(read: ReadRows, total: int, rows: int) -> Iterator[Columns]:
-    """Yield parts that end where a trajectory ends.
-
-    Args:
-        read: returns the columns of rows from one number up to another.
-        total: number of rows.
-        rows: of a part; more, if one trajectory has more.
+    """Yield parts of so many of ``total`` rows, or more if one trajectory has more.
 
     Raises:
         ValueError: a trajectory has no end within ``MAX_TRAJECTORY`` rows.

@@ -26,6 +26,9 @@ from torchrl_osr.data.store.memmap import (
 CACHE_VARIABLE = "TORCHRL_OSR_CACHE"
 """Environment variable that moves the cache folder."""
 
+CHUNK_ROWS = 200_000
+"""Rows that are converted and written at a time: some ten megabytes of hopper."""
+
 
 def cache_root(cache_dir: Path | str | None = None) -> Path:
     """Folder of all cached data sets: as given, or as the user has it."""

@@ -41,15 +41,6 @@ def split_held_out(
 
     A memory-mapped set would be copied into memory: see ``left_out`` of
     :func:`~torchrl_osr.data.make_replay_buffer`.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_osr.data import split_held_out
-        >>> data = TensorDict({"observation": torch.rand(10, 3)}, batch_size=[10])
-        >>> train, held_out = split_held_out(data, 0.2, seed=0)
-        >>> len(train), len(held_out)
-        (8, 2)
     """
     mask = torch.zeros(len(data), dtype=torch.bool)
     mask[held_out_rows(len(data), held_out, seed=seed)] = True

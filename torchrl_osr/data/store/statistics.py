@@ -82,11 +82,8 @@ def describe_episodes(returns: ArrayLike, lengths: ArrayLike) -> dict[str, Any]:
     """Entries of a manifest about the episodes that were played to their end.
 
     Args:
-        returns, lengths: of each episode, ``[E]``.
-
-    Returns:
-        ``num_complete_episodes``, ``return`` and ``episode_length`` (mean, std, min and
-        max; ``None`` without an episode), ``episode_returns`` and ``episode_lengths``.
+        returns: of each episode, ``[E]``.
+        lengths: in steps, ``[E]``.
     """
     returns, lengths = np.asarray(returns), np.asarray(lengths)
     return {
