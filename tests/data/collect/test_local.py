@@ -139,13 +139,6 @@ def test_two_processes_at_once_collect_once(tmp_path):
     assert outputs[0][-1] == outputs[1][-1]
 
 
-def test_unknown_names_list_what_exists(tmp_path):
-    with pytest.raises(ValueError, match=r"'ant'.*halfcheetah, hopper, walker2d"):
-        load_local_dataset("ant", "random", num_transitions=5, cache_dir=tmp_path)
-    with pytest.raises(ValueError, match=r"'simple'.*random, medium, medium-replay"):
-        load_local_dataset("hopper", "simple", num_transitions=5, cache_dir=tmp_path)
-
-
 @pytest.mark.parametrize("on_disk", [False, True])
 def test_a_mixture_says_what_it_is_made_of(tmp_path, on_disk):
     request = {"num_transitions": 2000, "seed": 3, "cache_dir": tmp_path}

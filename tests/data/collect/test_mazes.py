@@ -122,7 +122,8 @@ def test_a_set_is_cached_and_says_what_it_is_made_of(tmp_path, monkeypatch):
         ("pointmaze-large", "medium", "'medium' .* there are: diverse, play"),
         ("antmaze-umaze", "diverse", "data=minari.*D4RL/antmaze/umaze-v1"),
         ("antmaze-large", "play", "data=minari.*D4RL/antmaze/large-play-v1"),
-        ("hopper", "diverse", "unknown quality 'diverse'; there are: random"),
+        ("hopper", "diverse", "unknown quality 'diverse'; there are: random, medium"),
+        ("ant", "medium", "'ant'.*halfcheetah, hopper, walker2d"),
     ],
 )
 def test_qualities_that_are_not_there_are_named(env_name, quality, message, tmp_path):

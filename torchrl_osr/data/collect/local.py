@@ -88,44 +88,41 @@ def load_local_dataset(
         OSError: the cache folder cannot be written.
     """
     root = cache_root(cache_dir)
-    recipe = {"num_transitions": num_transitions, "seed": seed}
-    data, manifest = _rolled_out(root, env_name, quality, progress=progress, **recipe)
-    if random_share:
-        other, random = _rolled_out(
-            root, env_name, "random", progress=progress, **recipe
-        )
+    request = request_of(env_name, quality, num_transitions, seed)
+    data, manifest = _rolled_out(root, request, progress)
+    if not random_share:
+        return data if on_disk else data.clone(), manifest
+    request = request_of(env_name, "random", num_transitions, seed)
+    other, random = _rolled_out(root, request, progress)
+    manifest = _mixture_manifest(manifest, random, random_share)
 
-        def mixed() -> TensorDict:
-            return mix_datasets(data, other, random_share=random_share, seed=seed)
+    def mixed() -> TensorDict:
+        return mix_datasets(data, other, random_share=random_share, seed=seed)
 
-        manifest = _mixture_manifest(manifest, random, random_share)
-        if not on_disk:
-            return mixed(), manifest
-        folder = root / "mixed" / f"{_name(**manifest)}-random{random_share}"
-        return load_or_write(
-            folder, manifest, lambda: mixed().split(CHUNK_ROWS), progress=False
-        )
-    return data if on_disk else data.clone(), manifest
+    if not on_disk:
+        return mixed(), manifest
+    folder = root / "mixed" / f"{_name(**manifest)}-random{random_share}"
+    return load_or_write(
+        folder, manifest, lambda: mixed().split(CHUNK_ROWS), progress=False
+    )
 
 
 def _rolled_out(
-    root: Path,
-    env_name: str,
-    quality: str,
-    *,
-    num_transitions: int,
-    seed: int,
-    progress: bool,
+    root: Path, request: dict[str, Any], progress: bool
 ) -> tuple[TensorDict, dict[str, Any]]:
     """Open one quality's own set, memory-mapped; collect it first if need be."""
-    request = request_of(env_name, quality, num_transitions, seed)
     folder = root / "rolled-out" / _name(**request)
+    env_name = request["env_name"]
     episodes: dict[str, Any] = {}
 
     def collect() -> Iterator[TensorDict]:
         _check_room(folder, request)
         data, returns, lengths = collect_quality(
-            env_name, quality, num_transitions, seed=seed, progress=progress
+            env_name,
+            request["quality"],
+            request["num_transitions"],
+            seed=request["seed"],
+            progress=progress,
         )
         episodes.update(describe_episodes(returns, lengths), normalized_score=None)
         if len(returns):
