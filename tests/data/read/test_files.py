@@ -33,6 +33,18 @@ def test_deviations_are_named_in_every_kind_of_file(path):
         )
 
 
+def test_empty_files_are_refused(path):
+    rows = make_columns(60)
+    if path.suffix == ".parquet":
+        pairs = pyarrow.array([], EMPTY)
+        empty = {k: pairs if v.ndim > 1 else v[:0] for k, v in rows.items()}
+        parquet.write_table(pyarrow.table(empty), path)
+    else:
+        save(path, {name: column[:0] for name, column in rows.items()})
+    with pytest.raises(ValueError, match="the data hold no rows"):
+        load_file(path)
+
+
 def test_damaged_files_are_named(path):
     content = save(path, make_columns(60)).read_bytes()
     for damaged in (b"", b"nothing of the kind", content[: len(content) // 2]):

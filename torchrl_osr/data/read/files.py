@@ -124,7 +124,8 @@ def _open_parquet(path: Path) -> tuple[int, ReadRows]:
         first = int(np.searchsorted(bounds, start, side="right")) - 1
         last = int(np.searchsorted(bounds, stop, side="left"))
         check_unpacked_size(path, sum(sizes[first:last]))
-        table = pyarrow.concat_tables([group(number) for number in range(first, last)])
+        groups = [group(number) for number in range(first, last)]
+        table = pyarrow.concat_tables([file.schema_arrow.empty_table(), *groups])
         table = table.slice(start - bounds[first], stop - start)
         return {name: _as_numpy(name, table[name]) for name in table.column_names}
 
