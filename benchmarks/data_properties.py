@@ -14,6 +14,7 @@ import argparse
 import importlib.util
 import json
 import os
+import sys
 import time
 import warnings
 from pathlib import Path
@@ -27,6 +28,7 @@ TESTS = ("test_episodes", "test_rows_and_files", "test_minari", "test_export_and
 def property_tests(examples: int) -> ModuleType:
     """Import the tests, which read the number of examples when they are imported."""
     os.environ["TORCHRL_OSR_PROPERTY_EXAMPLES"] = str(examples)
+    sys.path.insert(0, str(ROOT / "tests"))  # what the tests share
     path = ROOT / "tests" / "data" / "read" / "test_data_properties.py"
     spec = importlib.util.spec_from_file_location("data_properties_tests", path)
     assert spec is not None

@@ -36,9 +36,6 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
 
     It is written beside its place, synced to the disk and renamed.
 
-    Args:
-        path: of the file, in a folder that exists.
-
     Raises:
         OSError: naming ``path``, if it cannot be written.
     """
@@ -58,30 +55,19 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Write a file so that a reader finds the old one or the new one, never a part.
-
-    Raises:
-        OSError: naming ``path``, if it cannot be written.
-    """
+    """Write text or bytes, see :func:`whole_file`."""
     with whole_file(path) as file:
         file.write(content.encode() if isinstance(content, str) else content)
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write ``value`` as JSON, atomically; NaN and infinity, which JSON lacks, as null.
-
-    Raises:
-        OSError: naming ``path``, if it cannot be written.
-    """
+    """Write JSON, see :func:`whole_file`; NaN and infinity, which it lacks, as null."""
     text = json.dumps(finite_or_none(value), indent=1, allow_nan=False)
     write_atomically(path, text + "\n")
 
 
 def finite_or_none(value: Any) -> Any:
-    """``value`` with ``None`` in place of every float that is not finite.
-
-    Args:
-        value: JSON-compatible: mappings and lists are copied, all else is kept.
+    """JSON-compatible value with ``None`` in place of every float that is not finite.
 
     Examples:
         >>> from torchrl_osr._files import finite_or_none
@@ -98,13 +84,7 @@ def finite_or_none(value: Any) -> Any:
 
 
 def read_text(path: Path, *, max_bytes: int = MAX_JSON_BYTES) -> str:
-    """Text of a small file.
-
-    Args:
-        path: the file.
-
-    Keyword Args:
-        max_bytes: a larger file is refused. Default: 256 MiB.
+    """Text of a small file, of at most ``max_bytes``.
 
     Raises:
         OSError: it cannot be read.
@@ -122,13 +102,7 @@ def read_text(path: Path, *, max_bytes: int = MAX_JSON_BYTES) -> str:
 
 
 def read_json(path: Path, *, max_bytes: int = MAX_JSON_BYTES) -> dict[str, Any]:
-    """JSON object that a file holds.
-
-    Args:
-        path: the file.
-
-    Keyword Args:
-        max_bytes: see :func:`read_text`.
+    """JSON object that a file holds, see :func:`read_text`.
 
     Raises:
         OSError: it cannot be read.
@@ -138,15 +112,7 @@ def read_json(path: Path, *, max_bytes: int = MAX_JSON_BYTES) -> dict[str, Any]:
 
 
 def parse_json(text: str, name: str) -> dict[str, Any]:
-    """JSON object in a text.
-
-    Args:
-        text: of the file, or of a line of it.
-        name: of the file, for the message.
-
-    Raises:
-        ValueError: it holds something else, naming the file.
-    """
+    """JSON object in a text; a ValueError names the file if it is something else."""
     try:
         value = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -183,15 +149,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def check_unpacked_size(path: Path, unpacked: int) -> None:
-    """Raise if a file announces more than fits in memory.
-
-    Args:
-        path: the file; as many bytes as it has are always allowed.
-        unpacked: bytes that its contents would have in memory.
-
-    Raises:
-        ValueError: more than both 4 GiB and the file's own size.
-    """
+    """Raise a ValueError if contents have more bytes than 4 GiB and the file's size."""
     most = max(path.stat().st_size, MAX_UNPACKED_BYTES)
     if unpacked > most:
         raise ValueError(
@@ -239,15 +197,7 @@ def checksummed(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_checksum(record: Mapping[str, Any], name: str) -> None:
-    """Raise unless a record is as :func:`checksummed` made it.
-
-    Args:
-        record: as it was read.
-        name: of its file, for the message.
-
-    Raises:
-        ValueError: it was changed, or has no checksum.
-    """
+    """Raise a ValueError that names the file unless :func:`checksummed` made it so."""
     if record.get(CHECKSUM) != _checksum(record):
         flaw = "wrong" if CHECKSUM in record else "missing"
         raise ValueError(f"the checksum of {name} is {flaw}")
@@ -262,8 +212,6 @@ def _checksum(record: Mapping[str, Any]) -> str:
 def check_disk_space(folder: Path | str, needed_bytes: int, what: str) -> None:
     """Raise unless a folder's disk has room.
 
-    A disk that other programs fill later is not foreseen.
-
     Args:
         folder: need not be there yet.
         needed_bytes: how much will be written.
@@ -271,11 +219,6 @@ def check_disk_space(folder: Path | str, needed_bytes: int, what: str) -> None:
 
     Raises:
         OSError: ``ENOSPC``, with what is needed, what is free and what to do.
-
-    Examples:
-        >>> import tempfile
-        >>> from torchrl_osr._files import check_disk_space
-        >>> check_disk_space(tempfile.gettempdir(), 1, "one byte")
     """
     there = Path(folder).absolute()
     while not there.exists():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -44,26 +43,5 @@ def make_transitions():
             },
             [rows],
         )
-
-    return make
-
-
-@pytest.fixture(scope="session")
-def make_columns():
-    """Factory of recorded columns: episodes of 40 steps, half of which fall."""
-
-    def make(rows: int = 300, *, with_next: bool = False) -> dict[str, np.ndarray]:
-        rng = np.random.default_rng(1)
-        ends = np.arange(rows) % 40 == 39
-        columns = {
-            "observation": rng.normal(size=(rows, 3)).astype(np.float32),
-            "action": rng.uniform(-1, 1, (rows, 2)).astype(np.float32),
-            "reward": rng.normal(size=rows),
-            "terminated": ends & (rng.random(rows) < 0.5),
-        }
-        columns["truncated"] = ends & ~columns["terminated"]
-        if with_next:
-            columns["next_observation"] = rng.normal(size=(rows, 3)).astype(np.float32)
-        return columns
 
     return make

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 
-import h5py
 import numpy as np
 import pytest
+from recorded_logs import columns_of, save, save_d4rl
 
 from torchrl_osr.data import (
     RECORDED,
@@ -18,7 +18,7 @@ from torchrl_osr.data import (
     normalized_score,
     write_memmap,
 )
-from torchrl_osr.data.read.recording import Conversion
+from torchrl_osr.data.read import recording
 
 MIXTURE = {"random_share": 0.0, "num_transitions": 500, "seed": 0}
 
@@ -29,28 +29,6 @@ pytestmark = pytest.mark.usefixtures("cache")
 @pytest.fixture
 def hopper():
     return load_local_dataset("hopper", "medium", num_transitions=500)
-
-
-def write(path, data):
-    following = data["next"]
-    if path.suffix == ".hdf5":
-        with h5py.File(path, "w") as file:
-            file["observations"] = data["observation"]
-            file["actions"] = data["action"]
-            file["next_observations"] = following["observation"]
-            file["rewards"] = following["reward"][:, 0]
-            file["terminals"] = following["terminated"][:, 0]
-            file["timeouts"] = following["truncated"][:, 0]
-        return
-    np.savez(
-        path,
-        observation=data["observation"],
-        action=data["action"],
-        next_observation=following["observation"],
-        reward=following["reward"],
-        terminated=following["terminated"],
-        truncated=following["truncated"],
-    )
 
 
 def test_qualities_are_rolled_out(hopper):
@@ -64,9 +42,9 @@ def write_recording(quality, folder, data):
     if quality == "minari":
         export_minari(data, "mine/hopper-v0")
         return "mine/hopper-v0"
-    path = folder / {"d4rl": "hopper.hdf5", "file": "hopper.npz"}[quality]
-    write(path, data)
-    return str(path)
+    if quality == "d4rl":
+        return str(save_d4rl(folder / "hopper.hdf5", columns_of(data)))
+    return str(save(folder / "hopper.npz", columns_of(data)))
 
 
 @pytest.mark.parametrize("quality", RECORDED)
@@ -88,10 +66,9 @@ def test_recorded_data_are_read(hopper, quality, tmp_path):
 
 def test_a_set_without_a_complete_episode_has_no_score(tmp_path):
     data, _ = load_local_dataset("hopper", "expert", num_transitions=100)
-    columns = {"observation": data["observation"], "action": data["action"]}
-    columns["reward"] = data["next", "reward"]
-    columns |= {"terminated": np.zeros(100), "episode": np.zeros(100, int)}
-    np.savez(tmp_path / "part.npz", **columns)
+    columns = columns_of(data) | {"truncated": np.zeros(100)}
+    del columns["next_observation"]
+    save(tmp_path / "part.npz", columns)
     _, manifest = load_dataset("hopper", "file", path=str(tmp_path / "part.npz"))
     assert manifest["normalized_score"] is None
     assert manifest["dropped_rows"] == 1
@@ -124,7 +101,7 @@ def test_rolled_out_data_on_disk_are_those_in_memory(share):
 def test_recorded_data_on_disk_are_those_in_memory(
     hopper, quality, chunk, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(Conversion.chunks, "__defaults__", (chunk,))
+    monkeypatch.setattr(recording, "CHUNK_ROWS", chunk)
     path = write_recording(quality, tmp_path, hopper[0])
     options = {"env_id": "Hopper-v5", "path": path}
     data, manifest = load_dataset("hopper", quality, **options)
@@ -138,14 +115,14 @@ def test_recorded_data_on_disk_are_those_in_memory(
 
 def test_a_source_that_has_changed_is_converted_anew(hopper, cache, tmp_path):
     path = tmp_path / "hopper.hdf5"
-    write(path, hopper[0])
+    save_d4rl(path, columns_of(hopper[0]))
     options = {"path": str(path), "on_disk": True}
     for _ in range(2):
         stored, _ = load_dataset("hopper", "d4rl", **options)
         assert len(stored) == 500
         assert len(list((cache / "recorded").glob("d4rl-*/"))) == 1
     path.unlink()
-    write(path, hopper[0][:400])
+    save_d4rl(path, columns_of(hopper[0][:400]))
     os.utime(path, ns=(0, 0))  # clocks may be coarse
     stored, _ = load_dataset("hopper", "d4rl", **options)
     assert len(stored) == 400

@@ -56,14 +56,14 @@ if TYPE_CHECKING:
         collect_transitions,
         measure_policy,
     )
+    from torchrl_osr.data.read.arrays import (
+        transitions_from_episodes,
+        transitions_from_rows,
+    )
     from torchrl_osr.data.read.d4rl import load_d4rl
     from torchrl_osr.data.read.files import load_file
     from torchrl_osr.data.read.minari import load_minari, minari_replay_buffer
     from torchrl_osr.data.read.minari_export import export_minari
-    from torchrl_osr.data.read.transitions import (
-        transitions_from_episodes,
-        transitions_from_rows,
-    )
     from torchrl_osr.data.sources import RECORDED, load_dataset
     from torchrl_osr.data.store.memmap import load_memmap, write_memmap
 
@@ -86,8 +86,8 @@ _NEEDS_EXTRA = {
     "measure_policy": "collect.rollout",
     "minari_replay_buffer": "read.minari",
     "quality_policies": "collect.qualities",
-    "transitions_from_episodes": "read.transitions",
-    "transitions_from_rows": "read.transitions",
+    "transitions_from_episodes": "read.arrays",
+    "transitions_from_rows": "read.arrays",
     "write_memmap": "store.memmap",
 }
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from contextlib import closing
-from hashlib import sha256
-from json import dumps
 from typing import Any
 
 from gymnasium import spaces
@@ -16,8 +14,6 @@ from torchrl_osr.data.collect.reference_scores import (
     REFERENCE_RETURNS,
     normalized_score,
 )
-from torchrl_osr.data.read.recording import Conversion, Recording
-from torchrl_osr.data.store.cache import cache_root, load_or_write
 from torchrl_osr.data.store.memmap import is_memmap_folder, load_memmap
 
 RECORDED = ("minari", "d4rl", "file")
@@ -40,11 +36,8 @@ def load_dataset(
     Args:
         env_name: short name of the task. A recorded set has a normalised score if
             there are reference returns for that name.
-        quality: one of ``QUALITIES``, loaded by
-            :func:`~torchrl_osr.data.load_local_dataset`; or ``"minari"``, ``"d4rl"`` or
-            ``"file"``, read by :func:`~torchrl_osr.data.load_minari`,
-            :func:`~torchrl_osr.data.load_d4rl` or
-            :func:`~torchrl_osr.data.load_file`.
+        quality: one of ``QUALITIES``, see :func:`~torchrl_osr.data.load_local_dataset`;
+            or ``"minari"``, ``"d4rl"`` or ``"file"``, see the loaders of that name.
 
     Keyword Args:
         env_id: Gymnasium id of the task; recorded data of another size are then
@@ -67,13 +60,6 @@ def load_dataset(
     Raises:
         ValueError: a path is missing or has no use, a random share with recorded data,
             or data that do not fit the task.
-
-    Examples:
-        >>> from torchrl_osr.data import load_dataset
-        >>> load_dataset("hopper", "minari")
-        Traceback (most recent call last):
-            ...
-        ValueError: data=minari needs data.path=...
     """
     if quality not in RECORDED:
         if path is not None:
@@ -108,43 +94,21 @@ def load_dataset(
 def _load_recorded(
     quality: str, path: str, download: bool, progress: bool, on_disk: bool
 ) -> tuple[TensorDict, dict[str, Any]]:
-    if quality == "file" and is_memmap_folder(path):
-        data, manifest = load_memmap(path)
-        return data if on_disk else data.clone(), manifest
-    recording = _open(quality, path, download, progress and not on_disk)
-    if not on_disk:
-        return recording.load()
-    # Sizes and times, not checksums: to read a large source at each start takes long.
-    files = [
-        [str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns]
-        for file in recording.files
-    ]
-    request = {"source_quality": quality, "source_files": files}
-    digest = sha256(dumps(request, sort_keys=True).encode()).hexdigest()
-    conversion = Conversion(recording)
-    return load_or_write(
-        cache_root() / "recorded" / f"{quality}-{digest[:16]}",
-        request,
-        conversion.chunks,
-        describe=conversion.manifest,
-        total=recording.total,
-        progress=progress,
-    )
-
-
-def _open(quality: str, path: str, download: bool, progress: bool) -> Recording:
     # Each reader needs a library of its own, and only the one that is asked for.
     if quality == "minari":
-        from torchrl_osr.data.read.minari import open_minari
+        from torchrl_osr.data.read.minari import load_minari
 
-        return open_minari(path, download=download, progress=progress)
+        return load_minari(path, download=download, progress=progress, on_disk=on_disk)
     if quality == "d4rl":
-        from torchrl_osr.data.read.d4rl import locate_d4rl, open_d4rl
+        from torchrl_osr.data.read.d4rl import load_d4rl
 
-        return open_d4rl(locate_d4rl(path, download, progress=progress))
-    from torchrl_osr.data.read.files import open_file
+        return load_d4rl(path, download=download, progress=progress, on_disk=on_disk)
+    if is_memmap_folder(path):
+        data, manifest = load_memmap(path)
+        return data if on_disk else data.clone(), manifest
+    from torchrl_osr.data.read.files import load_file
 
-    return open_file(path)
+    return load_file(path, progress=progress, on_disk=on_disk)
 
 
 def _check_sizes(data: TensorDict, env_id: str, path: str) -> None:

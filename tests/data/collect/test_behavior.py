@@ -16,7 +16,6 @@ from torchrl_osr.data import (
     save_behavior_policy,
     update_behavior_card,
 )
-from torchrl_osr.data.collect.behavior import behavior_policy_path
 
 CARD = load_behavior_card()
 ALL_POLICIES = [(env, name) for env in CARD for name in CARD[env]["policies"]]
@@ -72,22 +71,6 @@ def test_one_observation_is_a_batch_without_its_axis() -> None:
     assert single.shape == (6,)
     assert single.dtype == np.float32
     np.testing.assert_allclose(single, batched[0], atol=1e-6)
-
-
-def test_half_precision_snapshots_are_computed_in_float32() -> None:
-    policy = load_behavior_policy("hopper", "replay_1")
-    assert policy.mean.weight.dtype == np.float32
-    assert policy.hidden0.bias.dtype == np.float32
-
-
-def test_every_shipped_file_is_on_the_card_and_plain() -> None:
-    for env_name, policy_name in ALL_POLICIES:
-        path = behavior_policy_path(env_name, policy_name)
-        with np.load(path, allow_pickle=False) as arrays:
-            dtypes = {str(array.dtype) for array in arrays.values()}
-        assert dtypes == {CARD[env_name]["policies"][policy_name]["dtype"]}
-    shipped = {(p.parent.name, p.stem) for p in path.parents[1].glob("*/*.npz")}
-    assert shipped == set(ALL_POLICIES)
 
 
 def test_unknown_names_list_what_exists() -> None:

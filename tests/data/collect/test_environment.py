@@ -97,3 +97,23 @@ def test_unknown_ids_are_gymnasiums_errors():
         make_environment("Hopper-v99")
     with pytest.raises(ValueError, match=r"'ant'.*hopper.*pointmaze-umaze"):
         environment_id("ant")
+
+
+def test_other_action_bounds_are_rescaled():
+    with closing(make_environment("InvertedPendulum-v5")) as env:
+        assert (env.action_space.low, env.action_space.high) == (-1, 1)
+        assert env.unwrapped.action_space.high == 3
+        env.reset(seed=0)
+        env.step(np.float32([0.5]))
+        assert env.unwrapped.data.ctrl == pytest.approx([1.5])
+
+
+def test_tasks_without_vectors_are_refused():
+    with pytest.raises(ValueError, match=r"CartPole-v1 has actions Discrete\(2\)"):
+        make_environment("CartPole-v1")
+
+
+def test_nothing_is_left_in_the_working_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    make_environment("HalfCheetah-v5").close()
+    assert list(tmp_path.iterdir()) == []

@@ -6,14 +6,13 @@ import json
 from contextlib import closing
 from importlib.metadata import version
 
-import h5py
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
+from recorded_logs import make_columns, save_d4rl
 
-from torchrl_osr._files import sha256_of
 from torchrl_osr.data import (
     MAZE_IDS,
     check_dataset,
@@ -22,10 +21,7 @@ from torchrl_osr.data import (
     load_local_dataset,
     make_environment,
 )
-from torchrl_osr.data.collect.behavior import behavior_policy_path
-from torchrl_osr.data.collect.local import request_of
 from torchrl_osr.data.collect.mazes import PLAY_CELLS, shortest_path, waypoint_sampler
-from torchrl_osr.data.collect.qualities import behavior_of
 
 SETS = [
     ("pointmaze-umaze", "diverse"),
@@ -82,15 +78,6 @@ def test_play_has_its_pairs_of_cells_and_no_others(env_name):
     assert len(np.unique(starts[:, :4], axis=0)) == len(starts), "moved in their cells"
 
 
-def test_diverse_covers_the_free_cells():
-    data = collect_quality("pointmaze-umaze", "diverse", 8000, progress=False).data
-    starts = starts_of(data)
-    for columns in (starts[:, :2], starts[:, 2:4]):
-        # The seven cells of the U.
-        assert len(set(cells_of("PointMaze_UMaze-v3", columns))) == 7
-    assert (np.linalg.norm(starts[:, :2] - starts[:, 2:4], axis=-1) > 0.45).all()
-
-
 def test_the_controller_by_hand():
     with closing(make_environment("PointMaze_UMaze-v3")) as env:
         sample = waypoint_sampler(env.unwrapped.maze)
@@ -128,21 +115,6 @@ def test_a_set_is_cached_and_says_what_it_is_made_of(tmp_path, monkeypatch):
     assert not (other["action"] == data["action"]).all()
 
 
-def test_the_request_of_other_tasks_is_what_it_was():
-    path = behavior_policy_path("hopper", "medium")
-    assert behavior_of("hopper", "medium") == {
-        "behavior_sha256": {"medium": sha256_of(path)}
-    }
-    assert behavior_of("hopper", "random") == {"behavior_sha256": {}}
-    request = request_of("hopper", "medium", 500, 0)
-    assert list(request) == [
-        *["recipe_version", "env_name", "env_id", "quality", "num_transitions"],
-        "seed",
-        *["behavior_sha256", "versions"],
-    ]
-    assert set(request["versions"]) == {"numpy", "gymnasium", "mujoco"}
-
-
 @pytest.mark.parametrize(
     ("env_name", "quality", "message"),
     [
@@ -150,7 +122,8 @@ def test_the_request_of_other_tasks_is_what_it_was():
         ("pointmaze-large", "medium", "'medium' .* there are: diverse, play"),
         ("antmaze-umaze", "diverse", "data=minari.*D4RL/antmaze/umaze-v1"),
         ("antmaze-large", "play", "data=minari.*D4RL/antmaze/large-play-v1"),
-        ("hopper", "diverse", "unknown quality 'diverse'; there are: random"),
+        ("hopper", "diverse", "unknown quality 'diverse'; there are: random, medium"),
+        ("ant", "medium", "'ant'.*halfcheetah, hopper, walker2d"),
     ],
 )
 def test_qualities_that_are_not_there_are_named(env_name, quality, message, tmp_path):
@@ -161,23 +134,20 @@ def test_qualities_that_are_not_there_are_named(env_name, quality, message, tmp_
 
 
 def test_d4rls_own_files_of_the_ant_are_refused(tmp_path):
-    rng, rows = np.random.default_rng(0), 60
-    with h5py.File(tmp_path / "Ant_maze.hdf5", "w") as file:
-        file["observations"] = rng.normal(size=(rows, 29)).astype(np.float32)
-        file["actions"] = rng.uniform(-0.9, 0.9, (rows, 8)).astype(np.float32)
-        file["rewards"] = (np.arange(rows) % 20 == 19).astype(np.float32)
-        file["terminals"] = np.arange(rows) % 20 == 19
-        file["timeouts"] = np.zeros(rows, bool)
+    rng, columns = np.random.default_rng(0), make_columns(60)
+    columns["observation"] = rng.normal(size=(60, 29))
+    columns["action"] = rng.uniform(-0.9, 0.9, (60, 8))
+    save_d4rl(tmp_path / "Ant_maze.hdf5", columns)
     path = str(tmp_path / "Ant_maze.hdf5")
-    data, _ = load_dataset("antmaze-umaze", "d4rl", path=path)
-    assert data["observation"].shape == (rows, 29)
     message = "29 observation .*AntMaze_UMaze-v4 has 31 and 8.*hold the goal.*mirrored"
     with pytest.raises(ValueError, match=message):
         load_dataset("antmaze-umaze", "d4rl", path=path, env_id="AntMaze_UMaze-v4")
 
 
 def maze(*rows: str):
-    return np.array([[cell == "." for cell in row] for row in rows])
+    return {
+        (i, j) for i, row in enumerate(rows) for j in range(len(row)) if row[j] == "."
+    }
 
 
 def test_the_shorter_of_two_ways_is_taken():
@@ -185,32 +155,6 @@ def test_the_shorter_of_two_ways_is_taken():
     left = [(0, 1), (0, 0), (1, 0), (2, 0), (3, 0)]
     assert shortest_path(free, (0, 1), (3, 0)) == left
     assert shortest_path(free, (0, 4), (3, 4)) == [(0, 4), (1, 4), (2, 4), (3, 4)]
-
-
-def test_dead_ends_are_left_out():
-    free = maze("..#.", "#.#.", "#...", "....")
-    assert shortest_path(free, (0, 0), (0, 3)) == [
-        *[(0, 0), (0, 1), (1, 1), (2, 1)],
-        *[(2, 2), (2, 3), (1, 3), (0, 3)],
-    ]
-
-
-def test_the_goal_may_be_the_start():
-    assert shortest_path(maze("."), (0, 0), (0, 0)) == [(0, 0)]
-
-
-@pytest.mark.parametrize(
-    ("start", "goal", "message"),
-    [
-        ((0, 1), (0, 0), r"start \(0, 1\) is a wall"),
-        ((0, 0), (-1, 0), r"goal \(-1, 0\) is a wall of the maze, or outside"),
-        ((0, 0), (0, 3), "goal .* outside"),
-        ((0, 0), (0, 2), r"no way leads from \(0, 0\) to \(0, 2\)"),
-    ],
-)
-def test_what_cannot_be_is_named(start, goal, message):
-    with pytest.raises(ValueError, match=message):
-        shortest_path(maze(".#."), start, goal)
 
 
 @given(
@@ -231,9 +175,9 @@ def test_ways_are_valid_and_as_short_as_a_matrix_says(free, random):
         reached, steps = reached | (beside @ reached), steps + 1
     if not reached[goal]:
         with pytest.raises(ValueError, match="no way"):
-            shortest_path(free, cells[start], cells[goal])
+            shortest_path(set(cells), cells[start], cells[goal])
         return
-    path = shortest_path(free, cells[start], cells[goal])
+    path = shortest_path(set(cells), cells[start], cells[goal])
     assert (path[0], path[-1]) == (cells[start], cells[goal])
     assert len(path) == steps + 1
     assert all(free[cell] for cell in path)

@@ -86,21 +86,6 @@ def test_fewer_transitions_than_policies_are_refused() -> None:
         collect_transitions(CountingEnv(), [saturated] * 2, 1)
 
 
-def test_other_action_bounds_are_rescaled() -> None:
-    env = make_environment("InvertedPendulum-v5")
-    assert (env.action_space.low, env.action_space.high) == (-1, 1)
-    assert env.unwrapped.action_space.high == 3
-    data, *_ = collect_transitions(env, [saturated], 5, progress=False)
-    assert data["action"].max() == torch.tensor(ACTION_LIMIT)
-    assert env.unwrapped.data.ctrl == pytest.approx([3 * ACTION_LIMIT])
-    env.close()
-
-
-def test_tasks_without_vectors_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"CartPole-v1 has actions Discrete\(2\)"):
-        make_environment("CartPole-v1")
-
-
 @pytest.mark.parametrize("env_name", load_behavior_card())
 @pytest.mark.parametrize("quality", QUALITIES)
 def test_named_sets_are_sound(env_name: str, quality: str) -> None:
@@ -155,19 +140,6 @@ def test_returns_are_near_the_card(
     assert np.median(result.episode_returns) == pytest.approx(
         card["stochastic_return"][0], rel=0.2
     )
-
-
-def test_nothing_is_left_in_the_working_folder(tmp_path, monkeypatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    make_environment("HalfCheetah-v5").close()
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_unknown_names_list_what_exists() -> None:
-    with pytest.raises(ValueError, match=r"'ant'.*halfcheetah, hopper, walker2d"):
-        collect_quality("ant", "medium", 10)
-    with pytest.raises(ValueError, match=r"'simple'.*random, medium, medium-replay"):
-        collect_quality("hopper", "simple", 10)
 
 
 def test_measured_policy_matches_its_card() -> None:

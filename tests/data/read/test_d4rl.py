@@ -9,115 +9,39 @@ import threading
 import h5py
 import numpy as np
 import pytest
+from recorded_logs import make_columns, save_d4rl
 from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 
-from torchrl_osr.data import check_dataset, load_d4rl
+from torchrl_osr.data import load_d4rl, transitions_from_rows
 
 NAME = "hopper-medium-v2"
 
 
-def write(path, *, rows=400, with_next=True, with_timeouts=True, **changes):
-    """Episodes of up to 50 steps; with ``changes`` in place of arrays."""
-    rng = np.random.default_rng(0)
-    terminals = rng.random(rows) < 0.02
-    timeouts, steps = np.zeros(rows, bool), 0
-    for row in range(rows):
-        steps += 1
-        timeouts[row] = steps == 50 and not terminals[row]
-        steps = 0 if terminals[row] or steps == 50 else steps
-    arrays = {
-        "observations": rng.normal(size=(rows, 11)).astype(np.float32),
-        "actions": rng.uniform(-1, 1, (rows, 3)).astype(np.float32),
-        "rewards": rng.normal(size=rows).astype(np.float32),
-        "terminals": terminals,
-    }
-    if with_timeouts:
-        arrays["timeouts"] = timeouts
-    if with_next:
-        ends = terminals | timeouts
-        after = np.r_[arrays["observations"][1:], arrays["observations"][:1]]
-        after[ends] = rng.normal(size=(int(ends.sum()), 11))
-        arrays["next_observations"] = after
-    arrays = {k: v for k, v in (arrays | changes).items() if v is not None}
-    with h5py.File(path, "w") as file:
-        for name, array in arrays.items():
-            file[name] = array
-        file["infos/qpos"] = np.zeros((rows, 6))
-        file["metadata/algorithm"] = "SAC"
-    return arrays | {"timeouts": timeouts}
-
-
-def plain_reading(arrays):
-    """Row by row: (s, a, r, s' or None, terminated, cut off here), all that is true."""
-    rows = []
-    for row in range(len(arrays["rewards"])):
-        terminal, timeout = arrays["terminals"][row], arrays["timeouts"][row]
-        if "next_observations" in arrays:
-            after = arrays["next_observations"][row]
-        elif terminal or timeout or row + 1 == len(arrays["rewards"]):
-            after = None
-        else:
-            after = arrays["observations"][row + 1]
-        if after is None and not terminal:
-            rows[-1][-1] = True
-            continue
-        rows.append(
-            [
-                arrays["observations"][row],
-                np.clip(arrays["actions"][row], -0.999, 0.999),
-                arrays["rewards"][row],
-                after,
-                terminal,
-                timeout or (row + 1 == len(arrays["rewards"]) and not terminal),
-            ]
-        )
-    return rows
-
-
 @pytest.mark.parametrize("with_next", [True, False], ids=["v2", "v0"])
-@pytest.mark.parametrize("with_timeouts", [True, False])
-def test_every_row_is_the_files(tmp_path, with_next, with_timeouts):
-    path = tmp_path / "set.hdf5"
-    arrays = write(path, with_next=with_next, with_timeouts=with_timeouts)
-    options = {} if with_timeouts else {"max_episode_steps": 50}
-    data, manifest = load_d4rl(path, **options)
-    check_dataset(data)
-    expected = plain_reading(arrays)
-    assert len(data) == len(expected)
-    for got, (before, action, reward, after, terminal, cut) in zip(
-        data, expected, strict=True
-    ):
-        assert np.array_equal(got["observation"], before)
-        assert np.array_equal(got["action"], action)
-        assert got["next", "reward"].item() == reward
-        if after is not None:
-            assert np.array_equal(got["next", "observation"], after)
-        assert got["next", "terminated"].item() == terminal
-        assert got["next", "truncated"].item() == cut
-    ends = np.flatnonzero(arrays["terminals"] | arrays["timeouts"])
-    sums = [part.sum() for part in np.split(arrays["rewards"].astype(float), ends + 1)]
-    assert np.allclose(manifest["episode_returns"], sums[: len(ends)], rtol=1e-12)
-    assert manifest["dropped_rows"] == 400 - len(expected)
+def test_the_columns_have_other_names(tmp_path, with_next):
+    columns = make_columns(with_next=with_next)
+    expected, about = transitions_from_rows(columns)
+    data, manifest = load_d4rl(save_d4rl(tmp_path / "set.hdf5", columns))
+    assert (data == expected).all()
+    assert about.items() <= manifest.items()
     assert len(manifest["data_sha256"]) == 64
-
-
-def test_a_time_limit_needs_to_be_known(tmp_path):
-    write(tmp_path / "set.hdf5", with_timeouts=False)
-    with pytest.raises(ValueError, match=r"has no 'timeouts': .*max_episode_steps="):
-        load_d4rl(tmp_path / "set.hdf5")
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"rewards": None}, "is no D4RL file: it lacks rewards"),
-        ({"rewards": np.full(400, np.nan)}, "'reward' holds nan in row 0 of 400"),
-        ({"actions": np.ones((399, 3))}, r"'action' has shape \[399, 3\]"),
-        ({"observations": np.zeros((400, 11))}, "'observation' is zero in all 400"),
+        ({"reward": None}, "is no D4RL file: it lacks rewards"),
+        ({"truncated": None}, "is no D4RL file: it lacks timeouts"),
+        ({"reward": np.full(300, np.nan)}, "'reward' holds nan in row 0 of 300"),
+        ({"action": np.ones((299, 3))}, r"'action' has shape \[299, 3\]"),
+        ({"observation": np.zeros((300, 3))}, "'observation' is zero in all"),
     ],
 )
 def test_deviations_are_named(tmp_path, changes, message):
-    write(tmp_path / "set.hdf5", **changes)
+    columns = make_columns() | changes
+    save_d4rl(
+        tmp_path / "set.hdf5", {k: v for k, v in columns.items() if v is not None}
+    )
     with pytest.raises(ValueError, match=message):
         load_d4rl(tmp_path / "set.hdf5")
 
@@ -165,7 +89,7 @@ def cached(tmp_path):
 
 def test_a_named_set_is_fetched_once_and_only_when_told(tmp_path, server):
     folder, asked = server
-    write(folder / "hopper_medium-v2.hdf5")
+    save_d4rl(folder / "hopper_medium-v2.hdf5", make_columns())
     with pytest.raises(FileNotFoundError, match=r"fetch it with download=True"):
         load_d4rl(NAME)
     assert asked == []
@@ -184,7 +108,7 @@ def test_a_wrong_or_missing_file_is_not_kept(tmp_path, server):
     folder, _ = server
     with pytest.raises(OSError, match="404"):
         load_d4rl(NAME, download=True)
-    write(folder / "hopper_medium-v2.hdf5")
+    save_d4rl(folder / "hopper_medium-v2.hdf5", make_columns())
     content = (folder / "hopper_medium-v2.hdf5").read_bytes()
     (folder / "hopper_medium-v2.hdf5").write_bytes(content[:-1000])
     with pytest.raises(ValueError, match="is no HDF5 file, or damaged"):
@@ -192,7 +116,9 @@ def test_a_wrong_or_missing_file_is_not_kept(tmp_path, server):
     (folder / "hopper_medium-v2.hdf5").write_text("<html>moved</html>")
     with pytest.raises(ValueError, match="is no HDF5 file"):
         load_d4rl(NAME, download=True)
-    write(folder / "hopper_medium-v2.hdf5", terminals=None)
+    columns = make_columns()
+    del columns["terminated"]
+    save_d4rl(folder / "hopper_medium-v2.hdf5", columns)
     with pytest.raises(ValueError, match="lacks terminals"):
         load_d4rl(NAME, download=True)
     assert cached(tmp_path) == []

@@ -15,16 +15,14 @@ from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
 
-import h5py
 import minari
 import numpy as np
-import pyarrow
 import pytest
 from gymnasium import spaces
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from minari.data_collector import EpisodeBuffer
-from pyarrow import parquet
+from recorded_logs import save
 
 from torchrl_osr.data import (
     check_dataset,
@@ -195,23 +193,6 @@ def flat(episodes, *, with_next):
     steps = [len(each["reward"]) for each in long]
     rows["episode"] = np.repeat(np.arange(len(long)), steps)
     return rows
-
-
-def save(path, rows):
-    if path.suffix == ".npz":
-        np.savez(path, **rows)
-    elif path.suffix == ".hdf5":
-        with h5py.File(path, "w") as file:
-            for name, array in rows.items():
-                file[name] = array
-    else:
-        table = {
-            name: list(array) if array.ndim > 1 else array
-            for name, array in (
-                (name, a.astype(a.dtype.newbyteorder("="))) for name, a in rows.items()
-            )
-        }
-        parquet.write_table(pyarrow.table(table), path)
 
 
 @tried

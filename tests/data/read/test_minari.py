@@ -86,36 +86,32 @@ def test_every_row_is_minaris_own(space, data_format):
     made = make("test/set-v0", space, data_format=data_format)
     data, manifest = load_minari("test/set-v0")
     check_dataset(data)
-    row = 0
-    for episode in minari.load_dataset("test/set-v0").iterate_episodes():
-        for step in range(len(episode)):
-            before, after = (
-                spaces.flatten(space, at(episode.observations, step + later))
-                for later in (0, 1)
-            )
-            got = data[row]
-            assert np.array_equal(got["observation"], before.astype(np.float32))
-            assert np.array_equal(got["next", "observation"], after.astype(np.float32))
-            action = np.clip(episode.actions[step], -0.999, 0.999)
-            assert np.array_equal(got["action"], action)
-            assert got["next", "reward"].item() == np.float32(episode.rewards[step])
-            for ours, theirs in (
-                ("terminated", episode.terminations),
-                ("truncated", episode.truncations),
-            ):
-                assert got["next", ours].item() == theirs[step]
-            row += 1
-    assert row == len(data) == sum(LENGTHS)
+    episodes = [*minari.load_dataset("test/set-v0").iterate_episodes()]
+    states = [flat(space, each.observations, len(each) + 1) for each in episodes]
+    columns = {
+        "observation": [each[:-1] for each in states],
+        ("next", "observation"): [each[1:] for each in states],
+        "action": [each.actions.clip(-0.999, 0.999) for each in episodes],
+        ("next", "reward"): [each.rewards[:, None] for each in episodes],
+        ("next", "terminated"): [each.terminations[:, None] for each in episodes],
+        ("next", "truncated"): [each.truncations[:, None] for each in episodes],
+    }
+    for key, parts in columns.items():
+        column = data[key].numpy()
+        assert np.array_equal(column, np.concatenate(parts).astype(column.dtype))
     assert manifest["episode_lengths"] == LENGTHS
     assert manifest["dropped_rows"] == 0
     again, _ = load_minari(made.storage.data_path.parent)
     assert (again == data).all()
 
 
-def at(observations, step):
-    if isinstance(observations, dict):
-        return {key: at(value, step) for key, value in observations.items()}
-    return observations[step]
+def flat(space, observations, steps):
+    def at(node, step):
+        if isinstance(node, dict):
+            return {key: at(value, step) for key, value in node.items()}
+        return node[step]
+
+    return np.stack([spaces.flatten(space, at(observations, t)) for t in range(steps)])
 
 
 def test_entries_of_a_dictionary_can_be_chosen():

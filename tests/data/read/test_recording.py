@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 from functools import partial
+from unittest import mock
 
 import h5py
 import numpy as np
-import pyarrow
 import pytest
-import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from pyarrow import parquet
+from recorded_logs import make_columns, save, save_d4rl
 
-from torchrl_osr.data import load_d4rl, load_dataset, load_file, transitions_from_rows
-from torchrl_osr.data.read import recording
-from torchrl_osr.data.read.d4rl import open_d4rl
-from torchrl_osr.data.read.files import open_file
-from torchrl_osr.data.read.recording import (
-    Conversion,
-    Recording,
-    whole_trajectories,
+from torchrl_osr.data import (
+    is_memory_mapped,
+    load_dataset,
+    load_file,
+    transitions_from_rows,
 )
+from torchrl_osr.data.read import recording
+
+pytestmark = pytest.mark.usefixtures("cache")
 
 
 @st.composite
@@ -49,26 +48,14 @@ def recordings(draw):
     return rows
 
 
-def in_parts(opened, rows):
-    """Rows and manifest of a recording that is converted part by part."""
-    conversion = Conversion(opened)
-    data = torch.cat(list(conversion.chunks(rows)))
-    return data, conversion.manifest()
-
-
-def assert_same(opened, rows, data, manifest):
-    there, described = in_parts(opened, rows)
-    assert (there == data).all()
-    assert described.items() <= manifest.items()
-
-
-def recorded(columns):
-    total = len(columns["reward"])
-
-    def read(start, stop):
-        return {name: column[start:stop] for name, column in columns.items()}
-
-    return Recording({}, [], total, partial(whole_trajectories, read, total))
+def assert_same_in_parts(load, rows):
+    """Require the same rows and manifest, read at once and in parts."""
+    data, manifest = load()
+    with mock.patch.object(recording, "CHUNK_ROWS", rows):
+        stored, described = load(on_disk=True, progress=False)
+    assert is_memory_mapped(stored)
+    assert (stored == data).all()
+    assert manifest.items() <= described.items()
 
 
 @settings(
@@ -79,73 +66,49 @@ def recorded(columns):
     suppress_health_check=list(HealthCheck),
 )
 @given(columns=recordings(), rows=st.integers(1, 40))
-def test_any_recording_in_parts_of_any_size(columns, rows):
-    opened = recorded(columns)
+def test_any_recording_in_parts_of_any_size(tmp_path_factory, columns, rows):
+    path = tmp_path_factory.mktemp("log") / "log.npz"
+    np.savez(path, **columns)
     try:
-        data, manifest = transitions_from_rows(columns)
+        transitions_from_rows(columns)
     except ValueError:
-        with pytest.raises(ValueError, match="holds nan|comes back|true next state"):
-            in_parts(opened, rows)
+        with (
+            mock.patch.object(recording, "CHUNK_ROWS", rows),
+            pytest.raises(ValueError, match="holds nan|comes back|true next state"),
+        ):
+            load_file(path, on_disk=True, progress=False)
         return
-    assert_same(opened, rows, data, manifest)
+    assert_same_in_parts(partial(load_file, path), rows)
 
 
-def test_errors_say_in_which_rows_they_are(make_columns):
+def test_errors_say_in_which_rows_they_are(tmp_path, monkeypatch):
     columns = make_columns()
     columns["reward"][250] = np.nan
+    save(tmp_path / "log.h5", columns)
+    monkeypatch.setattr(recording, "CHUNK_ROWS", 50)
     message = r"in the rows from 240 on: 'reward' holds nan in row 10 of 40"
     with pytest.raises(ValueError, match=message):
-        in_parts(recorded(columns), 50)
+        load_file(tmp_path / "log.h5", on_disk=True)
 
 
 @pytest.mark.parametrize("rows", [1, 50, 1000])
 @pytest.mark.parametrize("with_next", [True, False])
 @pytest.mark.parametrize("ending", ["npz", "h5", "parquet"])
-def test_files(tmp_path, make_columns, ending, with_next, rows):
-    columns, path = make_columns(with_next=with_next), tmp_path / f"log.{ending}"
-    if ending == "npz":
-        np.savez(path, **columns)
-    elif ending == "h5":
-        save_hdf5(path, columns)
-    else:
-        lists = {n: c.tolist() if c.ndim == 2 else c for n, c in columns.items()}
-        parquet.write_table(pyarrow.table(lists), path, row_group_size=70)
-    assert_same(open_file(path), rows, *load_file(path))
+def test_files(tmp_path, ending, with_next, rows):
+    columns = make_columns(with_next=with_next)
+    options = {"row_group_size": 70} if ending == "parquet" else {}
+    path = save(tmp_path / f"log.{ending}", columns, **options)
+    assert_same_in_parts(partial(load_file, path), rows)
 
 
-NAMES = {
-    "observation": "observations",
-    "action": "actions",
-    "reward": "rewards",
-    "terminated": "terminals",
-    "truncated": "timeouts",
-    "next_observation": "next_observations",
-}
-
-
-def save_hdf5(path, columns, names=None):
-    with h5py.File(path, "w") as file:
-        for name, column in columns.items():
-            file[names[name] if names else name] = column
-
-
-@pytest.mark.parametrize("rows", [1, 50, 1000])
-@pytest.mark.parametrize("limit", [None, 10])
-def test_d4rl(tmp_path, make_columns, rows, limit):
-    columns, path = make_columns(), tmp_path / "set.hdf5"
-    if limit:
-        del columns["truncated"]
-    save_hdf5(path, columns, NAMES)
-    options = {"max_episode_steps": limit}
-    assert_same(open_d4rl(path, **options), rows, *load_d4rl(path, **options))
-
-
-def test_a_trajectory_without_an_end_is_refused(make_columns, monkeypatch):
+def test_a_trajectory_without_an_end_is_refused(tmp_path, monkeypatch):
     columns = make_columns()
     columns["terminated"][:] = columns["truncated"][:] = False
+    save(tmp_path / "log.h5", columns)
     monkeypatch.setattr(recording, "MAX_TRAJECTORY", 100)
+    monkeypatch.setattr(recording, "CHUNK_ROWS", 40)
     with pytest.raises(ValueError, match=r"begins in row 0 has no end within 160 rows"):
-        in_parts(recorded(columns), 40)
+        load_file(tmp_path / "log.h5", on_disk=True)
 
 
 def external(file, folder):
@@ -180,15 +143,12 @@ def virtual(file, folder):
 @pytest.mark.parametrize(
     "craft", [external, soft_to_external, soft_to_soft_to_external, raw, virtual]
 )
-@pytest.mark.usefixtures("cache")
-def test_nothing_is_read_from_another_hdf5_file(
-    tmp_path, make_columns, craft, quality, on_disk
-):
+def test_nothing_is_read_from_another_hdf5_file(tmp_path, craft, quality, on_disk):
     (tmp_path / "secret").write_bytes(bytes(2400))
     columns, path = make_columns(), tmp_path / "log.hdf5"
-    save_hdf5(tmp_path / "other.hdf5", columns)
+    save(tmp_path / "other.hdf5", columns)
     del columns["reward"]
-    save_hdf5(path, columns, NAMES)
+    save_d4rl(path, columns)
     with h5py.File(path, "a") as file:
         craft(file, tmp_path)
         assert file["rewards"].shape == (300,), "the crafted file works"
@@ -207,19 +167,20 @@ def test_nothing_is_read_from_another_hdf5_file(
         ),
     ],
 )
-def test_deviating_hdf5_files_are_refused(tmp_path, make_columns, change, message):
+def test_deviating_hdf5_files_are_refused(tmp_path, change, message):
     path = tmp_path / "log.h5"
-    save_hdf5(path, make_columns())
+    save(path, make_columns())
     with h5py.File(path, "a") as file:
         change(file)
     with pytest.raises(ValueError, match=message):
         load_file(path)
 
 
-def test_columns_of_unequal_length_are_refused(tmp_path, make_columns):
+@pytest.mark.parametrize("on_disk", [False, True])
+def test_columns_of_unequal_length_are_refused(tmp_path, monkeypatch, on_disk):
     columns, path = make_columns(), tmp_path / "log.h5"
     columns["action"] = columns["action"][:290]
-    save_hdf5(path, columns)
-    for rows in (50, 1000):
-        with pytest.raises(ValueError, match="'action' has shape"):
-            in_parts(open_file(path), rows)
+    save(path, columns)
+    monkeypatch.setattr(recording, "CHUNK_ROWS", 50)
+    with pytest.raises(ValueError, match="'action' has shape"):
+        load_file(path, on_disk=on_disk)

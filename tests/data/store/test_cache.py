@@ -70,14 +70,6 @@ def test_a_damaged_set_is_made_anew(load, tmp_path, warnings_logged, name, damag
     assert name in message
 
 
-def test_a_folder_of_somebody_else_stays(load, tmp_path):
-    (tmp_path / "set").mkdir()
-    (tmp_path / "set" / "thesis.tex").write_text("three years")
-    with pytest.raises(FileExistsError, match=r"it holds thesis\.tex"):
-        load()
-    assert (tmp_path / "set" / "thesis.tex").read_text() == "three years"
-
-
 def test_a_whole_set_is_read_without_writing(load, monkeypatch):
     load()
 

@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from tensordict import TensorDict
 
 from torchrl_osr.data import (
+    check_memory,
     held_out_rows,
     make_replay_buffer,
     split_held_out,
@@ -32,37 +35,12 @@ def test_batches_depend_on_the_seed_alone() -> None:
     assert not torch.equal(first, other)
 
 
-def test_sampling_leaves_the_global_generator_alone() -> None:
-    buffer = make_replay_buffer(numbered_rows(50), batch_size=16, seed=0)
-    before = torch.get_rng_state()
-    buffer.sample()
-    assert torch.equal(torch.get_rng_state(), before)
-
-
 def test_sampling_is_uniform_with_replacement() -> None:
     buffer = make_replay_buffer(numbered_rows(10), batch_size=1000, seed=0)
     counts = torch.bincount(draws(buffer, 10).long(), minlength=10)
     # Expected 1000 each with a standard deviation of 30.
     assert counts.min() > 850
     assert counts.max() < 1150
-
-
-def test_rows_stay_together_and_transforms_are_applied() -> None:
-    from torchrl.envs.transforms import ObservationNorm
-
-    halve = ObservationNorm(loc=0.0, scale=0.5, in_keys=["observation"])
-    buffer = make_replay_buffer(
-        numbered_rows(50), batch_size=16, seed=0, transform=halve
-    )
-    batch = buffer.sample()
-    assert torch.equal(2 * batch["observation"] + 1, batch["next", "observation"])
-
-
-def test_buffer_does_not_share_memory_with_the_data() -> None:
-    data = numbered_rows(50)
-    buffer = make_replay_buffer(data, batch_size=16, seed=0)
-    data["observation"].fill_(-1)
-    assert (buffer.sample()["observation"] >= 0).all()
 
 
 def test_empty_or_unflat_data_are_refused() -> None:
@@ -102,3 +80,27 @@ def test_rows_on_disk_that_are_left_out(both, held_out) -> None:
         assert (buffer.sample() == same.sample()).all()
     with pytest.raises(ValueError, match="left_out is for memory-mapped data"):
         make_replay_buffer(data, batch_size=32, seed=3, left_out=left_out)
+
+
+@pytest.mark.parametrize("where", ["cpu", "cuda"])
+def test_data_that_do_not_fit_on_a_gpu_are_refused_with_both_sizes(
+    monkeypatch, where
+) -> None:
+    rows = torch.zeros(100, 10)  # 4000 bytes
+    data = SimpleNamespace(
+        bytes=TensorDict({"observation": rows}, [100]).bytes,
+        device=torch.device(where),
+        shape=torch.Size([100]),
+    )
+    copies = 1 if where == "cuda" else 2
+    cached = 300 - 100
+    for name, number in (("memory_reserved", 300), ("memory_allocated", 100)):
+        monkeypatch.setattr(torch.cuda, name, lambda _, number=number: number)
+    device, free = torch.device("cuda"), 4000 * copies - cached
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: (free, 10**9))
+    check_memory(data, device)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: (free - 1, 10**9))
+    match = f"needs {4000 * copies:,} bytes on cuda, which has {4000 * copies - 1:,}"
+    with pytest.raises(MemoryError, match=match):
+        check_memory(data, device)
+    check_memory(data, torch.device("cpu"))

@@ -36,7 +36,6 @@ class Affine(NamedTuple):
     bias: FloatArray
 
     def __call__(self, inputs: FloatArray) -> FloatArray:
-        """Return ``inputs @ weight.T + bias`` for ``[..., in]`` inputs."""
         outputs: FloatArray = inputs @ self.weight.T + self.bias
         return outputs
 
@@ -83,14 +82,11 @@ class BehaviorPolicy:
     def sample(
         self, observation: NDArray[np.floating[Any]], rng: np.random.Generator
     ) -> FloatArray:
-        """Draw an action for each observation.
+        """Random actions ``[A]`` or ``[B, A]`` in -1 to 1, float32.
 
         Args:
-            observation: ``[S]`` or ``[B, S]``, raw (not normalised); cast to float32.
-            rng: source of the noise; one standard normal per action entry is drawn.
-
-        Returns:
-            Actions ``[A]`` or ``[B, A]`` in ``[-1, 1]``, float32.
+            observation: ``[S]`` or ``[B, S]``, not standardised.
+            rng: source of the noise.
         """
         features = self._features(observation)
         loc = self.mean(features)
@@ -100,14 +96,7 @@ class BehaviorPolicy:
         return action
 
     def deterministic(self, observation: NDArray[np.floating[Any]]) -> FloatArray:
-        """Return the squashed mean action.
-
-        Args:
-            observation: ``[S]`` or ``[B, S]``, raw (not normalised); cast to float32.
-
-        Returns:
-            Actions ``[A]`` or ``[B, A]`` in ``[-1, 1]``, float32.
-        """
+        """Squashed mean actions ``[A]`` or ``[B, A]``, see :meth:`sample`."""
         action: FloatArray = np.tanh(self.mean(self._features(observation)))
         return action
 
@@ -123,13 +112,10 @@ class BehaviorPolicy:
 
 
 def load_behavior_card(folder: Path | str | None = None) -> dict[str, Any]:
-    """Read ``card.json``: environment id, returns and training step of each policy.
+    """``card.json``: ``{env_name: {"env": id, "policies": {policy_name: {...}}}}``.
 
     Args:
-        folder: folder of the card; default: the policies of the package.
-
-    Returns:
-        ``{env_name: {"env": gymnasium id, "policies": {policy_name: {...}}}}``.
+        folder: of the card. Default: the policies of the package.
     """
     return read_json(Path(folder or BEHAVIOR_POLICIES_DIR) / "card.json")
 
@@ -137,16 +123,7 @@ def load_behavior_card(folder: Path | str | None = None) -> dict[str, Any]:
 def behavior_policy_path(
     env_name: str, policy_name: str, folder: Path | str | None = None
 ) -> Path:
-    """Return the file of a policy that the card names.
-
-    Args:
-        env_name: short environment name, such as ``"hopper"``.
-        policy_name: ``"medium"``, ``"expert"``, ``"replay_1"`` ... ``"replay_8"``.
-        folder: folder of the card; default: the policies of the package.
-
-    Raises:
-        ValueError: the card has no such environment or policy.
-    """
+    """File of a policy that the card names, see :func:`load_behavior_policy`."""
     card = load_behavior_card(folder)
     if env_name not in card:
         raise ValueError(
@@ -165,26 +142,20 @@ def behavior_policy_path(
 def load_behavior_policy(
     env_name: str, policy_name: str, *, folder: Path | str | None = None
 ) -> BehaviorPolicy:
-    """Load a behaviour policy by name.
+    """Load a behaviour policy by name, in float32.
 
     Args:
         env_name: short environment name, such as ``"hopper"``.
         policy_name: ``"medium"``, ``"expert"``, ``"replay_1"`` ... ``"replay_8"``.
-        folder: folder with ``card.json`` and ``<env_name>/<policy_name>.npz``, as
-            ``examples/train_behavior.py`` writes it; default: the policies of the
-            package.
 
-    Returns:
-        The policy in float32; half-precision snapshots are cast.
+    Keyword Args:
+        folder: with ``card.json`` and ``<env_name>/<policy_name>.npz``, as
+            ``examples/train_behavior.py`` writes it. Default: the policies of the
+            package.
 
     Raises:
         ValueError: unknown name (the message lists the known ones), or a file that
             lacks an array or is damaged.
-
-    Examples:
-        >>> from torchrl_osr.data import load_behavior_policy
-        >>> load_behavior_policy("hopper", "expert").action_size
-        3
     """
     path = behavior_policy_path(env_name, policy_name, folder)
     arrays, layers = read_arrays(path), {}
@@ -205,10 +176,11 @@ def save_behavior_policy(
     """Write a policy as plain arrays; the file appears whole or not at all.
 
     Args:
-        path: file to write, ``<folder>/<env_name>/<policy_name>.npz``; missing
-            folders are made.
+        path: ``<folder>/<env_name>/<policy_name>.npz``; missing folders are made.
         policy: the policy.
-        half: store float16 (half the size) instead of float32. Default: ``False``.
+
+    Keyword Args:
+        half: store float16 instead of float32. Default: ``False``.
     """
     arrays = {
         f"{field.name}.{part}": array.astype(np.float16 if half else np.float32)
@@ -227,8 +199,8 @@ def update_behavior_card(
     """Put the entry of one environment into a folder's ``card.json``.
 
     Args:
-        folder: folder of the card, which is made if there is none.
-        env_name: short environment name; an entry of that name is replaced.
+        folder: of the card; made if there is none.
+        env_name: short name of the task; an entry of that name is replaced.
         env_id: Gymnasium id.
         policies: ``{policy_name: {...}}``, what is known of each saved policy.
     """

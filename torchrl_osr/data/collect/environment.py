@@ -39,11 +39,7 @@ MAZE_IDS = {
 
 
 def environment_id(env_name: str) -> str:
-    """Return the Gymnasium id of a short environment name.
-
-    Raises:
-        ValueError: it is neither a maze nor a task with behaviour policies.
-    """
+    """Gymnasium id of a maze, or of a task with behaviour policies, by short name."""
     if env_name in MAZE_IDS:
         return MAZE_IDS[env_name]
     card = load_behavior_card()
@@ -64,10 +60,6 @@ def make_environment(env_id: str) -> gymnasium.Env[Any, Any]:
 
     Args:
         env_id: Gymnasium id, such as ``"Hopper-v5"``.
-
-    Returns:
-        The environment; MuJoCo's notes on deprecated model attributes do not end up
-        in a ``MUJOCO_LOG.TXT`` in the working folder.
 
     Raises:
         ValueError: observations or actions are not real vectors.

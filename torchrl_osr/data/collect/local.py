@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from tensordict import TensorDict
 
+from torchrl_osr import __version__
 from torchrl_osr._files import check_disk_space
 from torchrl_osr.data.collect.environment import (
     MAZE_IDS,
@@ -23,7 +24,12 @@ from torchrl_osr.data.collect.environment import (
 )
 from torchrl_osr.data.collect.qualities import behavior_of, collect_quality
 from torchrl_osr.data.collect.reference_scores import normalized_score
-from torchrl_osr.data.store.cache import CACHE_VARIABLE, cache_root, load_or_write
+from torchrl_osr.data.store.cache import (
+    CACHE_VARIABLE,
+    CHUNK_ROWS,
+    cache_root,
+    load_or_write,
+)
 from torchrl_osr.data.store.splits import mix_datasets
 from torchrl_osr.data.store.statistics import describe_episodes
 
@@ -33,9 +39,6 @@ RECIPE_VERSION = 1
 # Other versions of these give other data for the same seed.
 DATA_PACKAGES = ("numpy", "gymnasium", "mujoco")
 MAZE_PACKAGES = (*DATA_PACKAGES, "gymnasium-robotics")
-
-# Of a set that is collected, written at a time.
-CHUNK_ROWS = 200_000
 
 
 def load_local_dataset(
@@ -51,11 +54,10 @@ def load_local_dataset(
 ) -> tuple[TensorDict, dict[str, Any]]:
     """Load a data set rolled out on this machine, collecting it on first use.
 
-    About 10,000 transitions a second are collected; a set of a million takes one or
-    two minutes once. Processes that ask for the same set at once wait for one of them
-    to collect it; a collection that is killed begins again. The same seed gives the
-    same data on one machine and one set of library versions, not across machines:
-    contact dynamics are chaotic.
+    About 10,000 transitions a second are collected. Processes that ask for the same set
+    at once wait for one of them to collect it. The same seed gives the same data on one
+    machine and one set of library versions, not across machines: contact dynamics are
+    chaotic.
 
     Args:
         env_name: ``"hopper"``, ``"walker2d"`` or ``"halfcheetah"`` (Gymnasium v5);
@@ -72,9 +74,8 @@ def load_local_dataset(
         cache_dir: cache folder. Default: the environment variable
             ``TORCHRL_OSR_CACHE``, else the user's cache folder for ``torchrl-osr``.
         progress: show a progress bar when on a terminal. Default: ``True``.
-        on_disk: leave the rows memory-mapped, see
-            :func:`~torchrl_osr.data.load_memmap`. To collect them takes the memory of
-            the whole set, once. Default: ``False``.
+        on_disk: leave the rows memory-mapped. To collect them takes the memory of the
+            whole set, once. Default: ``False``.
 
     Returns:
         The transitions ``[N]``, see :func:`~torchrl_osr.data.check_dataset` for their
@@ -85,56 +86,43 @@ def load_local_dataset(
     Raises:
         ValueError: unknown environment or quality.
         OSError: the cache folder cannot be written.
-
-    Examples:
-        >>> import tempfile
-        >>> from torchrl_osr.data import load_local_dataset
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     data, manifest = load_local_dataset(
-        ...         "hopper", "random", num_transitions=500, cache_dir=folder
-        ...     )
-        >>> len(data), manifest["env_id"]
-        (500, 'Hopper-v5')
     """
     root = cache_root(cache_dir)
-    recipe = {"num_transitions": num_transitions, "seed": seed}
-    data, manifest = _rolled_out(root, env_name, quality, progress=progress, **recipe)
-    if random_share:
-        other, random = _rolled_out(
-            root, env_name, "random", progress=progress, **recipe
-        )
+    request = request_of(env_name, quality, num_transitions, seed)
+    data, manifest = _rolled_out(root, request, progress)
+    if not random_share:
+        return data if on_disk else data.clone(), manifest
+    request = request_of(env_name, "random", num_transitions, seed)
+    other, random = _rolled_out(root, request, progress)
+    manifest = _mixture_manifest(manifest, random, random_share)
 
-        def mixed() -> TensorDict:
-            return mix_datasets(data, other, random_share=random_share, seed=seed)
+    def mixed() -> TensorDict:
+        return mix_datasets(data, other, random_share=random_share, seed=seed)
 
-        manifest = _mixture_manifest(manifest, random, random_share)
-        if not on_disk:
-            return mixed(), manifest
-        folder = root / "mixed" / f"{_name(**manifest)}-random{random_share}"
-        return load_or_write(
-            folder, manifest, lambda: mixed().split(CHUNK_ROWS), progress=False
-        )
-    return data if on_disk else data.clone(), manifest
+    if not on_disk:
+        return mixed(), manifest
+    folder = root / "mixed" / f"{_name(**manifest)}-random{random_share}"
+    return load_or_write(
+        folder, manifest, lambda: mixed().split(CHUNK_ROWS), progress=False
+    )
 
 
 def _rolled_out(
-    root: Path,
-    env_name: str,
-    quality: str,
-    *,
-    num_transitions: int,
-    seed: int,
-    progress: bool,
+    root: Path, request: dict[str, Any], progress: bool
 ) -> tuple[TensorDict, dict[str, Any]]:
     """Open one quality's own set, memory-mapped; collect it first if need be."""
-    request = request_of(env_name, quality, num_transitions, seed)
     folder = root / "rolled-out" / _name(**request)
+    env_name = request["env_name"]
     episodes: dict[str, Any] = {}
 
     def collect() -> Iterator[TensorDict]:
         _check_room(folder, request)
         data, returns, lengths = collect_quality(
-            env_name, quality, num_transitions, seed=seed, progress=progress
+            env_name,
+            request["quality"],
+            request["num_transitions"],
+            seed=request["seed"],
+            progress=progress,
         )
         episodes.update(describe_episodes(returns, lengths), normalized_score=None)
         if len(returns):
@@ -146,7 +134,7 @@ def _rolled_out(
         folder,
         request,
         collect,
-        describe=lambda: {"torchrl_osr_version": _own_version(), **episodes},
+        describe=lambda: {"torchrl_osr_version": __version__, **episodes},
         progress=False,
     )
 
@@ -203,17 +191,9 @@ def request_of(
 def _check_room(folder: Path, request: dict[str, Any]) -> None:
     """Raise an OSError before the work unless the set fits on the disk."""
     with closing(make_environment(request["env_id"])) as env:
-        observation, action = env.observation_space.shape, env.action_space.shape
-    assert observation is not None
-    assert action is not None
-    numbers = 2 * observation[0] + action[0] + 1  # both states, action, reward
+        observation = env.observation_space.sample().size
+        action = env.action_space.sample().size
+    numbers = 2 * observation + action + 1  # both states, action, reward
     row = numbers * np.dtype(np.float32).itemsize + 3  # and three flags
     what = f"the data set ({CACHE_VARIABLE}=/path chooses the folder)"
     check_disk_space(folder, request["num_transitions"] * row, what)
-
-
-def _own_version() -> str:
-    try:
-        return version("torchrl-osr")
-    except PackageNotFoundError:
-        return "not installed"

@@ -3,8 +3,7 @@
 A planner gives the next cell, a controller pushes the point towards it. Both know only
 the observation, so that the behaviour has no memory.
 
-Shapes: ``I`` rows and ``J`` columns of the maze; a step of the planner leads to one of
-the four cells beside a cell.
+A step of the planner leads to one of the four cells beside a cell.
 """
 
 from __future__ import annotations
@@ -57,11 +56,6 @@ ACTION_NOISE = 0.5
 def maze_behavior(env_name: str, quality: str) -> dict[str, Any]:
     """Entries of the manifest that decide how a maze set comes about.
 
-    Args:
-        env_name: ``"pointmaze-umaze"``, ``"pointmaze-medium"`` or
-            ``"pointmaze-large"``.
-        quality: ``"diverse"`` or, but for the umaze, ``"play"``.
-
     Raises:
         ValueError: there is no such quality, or it is a maze of the ant.
     """
@@ -91,14 +85,14 @@ def maze_behavior(env_name: str, quality: str) -> dict[str, Any]:
 def maze_players(
     env: gymnasium.Env[Any, Any], env_name: str, quality: str
 ) -> tuple[gymnasium.Env[Any, Any], list[ActionSampler]]:
-    """Return a maze with a quality's starts and goals, and the controller to play it.
+    """Maze with a quality's starts and goals, and the controller that plays it.
 
     Args:
         env: the maze.
         env_name: its short name.
-        quality: ``"diverse"``: start and goal are two different free cells, each as
-            likely as another, as the environment itself draws them; ``"play"``: a pair
-            of :data:`PLAY_CELLS`. The environment moves both within their cells.
+        quality: ``"diverse"``: start and goal are two different free cells, as the
+            environment itself draws them; ``"play"``: a pair of :data:`PLAY_CELLS`. The
+            environment moves both within their cells.
     """
     pairs = maze_behavior(env_name, quality)["cells"]
     sampler = waypoint_sampler(env.get_wrapper_attr("maze"))
@@ -106,7 +100,7 @@ def maze_players(
 
 
 def waypoint_sampler(maze: Any) -> ActionSampler:
-    r"""Return the noisy controller that leads the point to its goal.
+    r"""Noisy controller that leads the point to its goal.
 
     .. math::
         a = \mathrm{clip}(k (w - x) - d \dot x) + \sigma \epsilon
@@ -117,7 +111,12 @@ def waypoint_sampler(maze: Any) -> ActionSampler:
     Args:
         maze: of the environment, gymnasium-robotics' ``Maze``.
     """
-    free = np.array([[cell != 1 for cell in row] for row in maze.maze_map])
+    free = {
+        (i, j)
+        for i, row in enumerate(maze.maze_map)
+        for j, cell in enumerate(row)
+        if cell != 1
+    }
 
     @cache
     def middle_of_next(start: Cell, goal: Cell) -> NDArray[np.float64] | None:
@@ -146,35 +145,32 @@ def waypoint_sampler(maze: Any) -> ActionSampler:
     return sample
 
 
-def shortest_path(free: NDArray[np.bool_], start: Cell, goal: Cell) -> list[Cell]:
-    """Return a shortest way from ``start`` to ``goal``, both included.
+def shortest_path(free: set[Cell], start: Cell, goal: Cell) -> list[Cell]:
+    """Cells of a shortest way from ``start`` to ``goal``, both included.
 
     Of several it is always the same one: up goes before down, left and right.
 
     Args:
-        free: which cells can be entered, ``[I, J]``.
-        start, goal: free cells.
+        free: cells that can be entered.
+        start: one of them.
+        goal: another, or the same.
 
     Raises:
-        ValueError: if one of them is a wall or outside, or there is no way.
+        ValueError: there is no way.
 
     Examples:
-        >>> import numpy as np
         >>> from torchrl_osr.data.collect.mazes import shortest_path
-        >>> free = np.array([[1, 1, 1], [0, 0, 1], [1, 1, 1]], dtype=bool)
-        >>> shortest_path(free, (0, 1), (2, 1))
-        [(0, 1), (0, 2), (1, 2), (2, 2), (2, 1)]
+        >>> shortest_path({(0, 0), (0, 1), (1, 1)}, (0, 0), (1, 1))
+        [(0, 0), (0, 1), (1, 1)]
     """
-    for name, cell in (("start", start), ("goal", goal)):
-        if not _is_free(free, cell):
-            raise ValueError(f"{name} {cell} is a wall of the maze, or outside of it.")
     # From the goal, so that each cell that is reached knows the next one on its way.
     next_cell: dict[Cell, Cell] = {goal: goal}
     waiting = deque([goal])
     while waiting and start not in next_cell:
-        cell = waiting.popleft()
-        for beside in _beside(cell):
-            if _is_free(free, beside) and beside not in next_cell:
+        row, column = cell = waiting.popleft()
+        for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+            beside = row + down, column + right
+            if beside in free and beside not in next_cell:
                 next_cell[beside] = cell
                 waiting.append(beside)
     if start not in next_cell:
@@ -183,17 +179,6 @@ def shortest_path(free: NDArray[np.bool_], start: Cell, goal: Cell) -> list[Cell
     while path[-1] != goal:
         path.append(next_cell[path[-1]])
     return path
-
-
-def _beside(cell: Cell) -> list[Cell]:
-    row, column = cell
-    return [(row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)]
-
-
-def _is_free(free: NDArray[np.bool_], cell: Cell) -> bool:
-    # A negative index would count from the other side.
-    inside = 0 <= cell[0] < free.shape[0] and 0 <= cell[1] < free.shape[1]
-    return inside and bool(free[cell])
 
 
 class StartsAndGoals(gymnasium.Wrapper[Any, Any, Any, Any]):

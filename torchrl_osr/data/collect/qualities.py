@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import zlib
 from contextlib import closing
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torchrl_osr._files import sha256_of
 from torchrl_osr.data.collect.behavior import (
@@ -24,14 +24,10 @@ from torchrl_osr.data.collect.environment import (
 )
 from torchrl_osr.data.collect.mazes import maze_behavior, maze_players
 from torchrl_osr.data.collect.rollout import (
-    ActionSampler,
     Collection,
     collect_transitions,
     uniform_sampler,
 )
-
-if TYPE_CHECKING:
-    import gymnasium
 
 QUALITIES: dict[str, tuple[str, ...]] = {
     "random": (),
@@ -44,11 +40,7 @@ QUALITIES: dict[str, tuple[str, ...]] = {
 
 
 def quality_policies(quality: str) -> tuple[str, ...]:
-    """Names of the behaviour policies that a quality is made of.
-
-    Raises:
-        ValueError: unknown quality.
-    """
+    """Names of the behaviour policies that a quality is made of."""
     if quality not in QUALITIES:
         raise ValueError(
             f"unknown quality {quality!r}; there are: {', '.join(QUALITIES)}."
@@ -57,11 +49,7 @@ def quality_policies(quality: str) -> tuple[str, ...]:
 
 
 def behavior_of(env_name: str, quality: str) -> dict[str, Any]:
-    """Entries of the manifest that decide, beside the seed, what the rows are.
-
-    Raises:
-        ValueError: unknown quality.
-    """
+    """Entries of the manifest that decide, beside the seed, what the rows are."""
     if env_name in MAZE_IDS:
         return {"behavior": maze_behavior(env_name, quality)}
     checksums = {
@@ -99,19 +87,14 @@ def collect_quality(
     env_id = environment_id(env_name)
     behavior_of(env_name, quality)  # an unknown quality stops here
     entropy = (seed, zlib.crc32(f"{env_name}-{quality}".encode()))
-    with closing(make_environment(env_id)) as bare:
-        env, samplers = _players(bare, env_name, quality)
+    with closing(make_environment(env_id)) as env:
+        if env_name in MAZE_IDS:
+            env, samplers = maze_players(env, env_name, quality)
+        else:
+            samplers = [
+                load_behavior_policy(env_name, name).sample
+                for name in quality_policies(quality)
+            ] or [uniform_sampler(env)]
         return collect_transitions(
             env, samplers, num_transitions, seed=entropy, progress=progress
         )
-
-
-def _players(
-    env: gymnasium.Env[Any, Any], env_name: str, quality: str
-) -> tuple[gymnasium.Env[Any, Any], list[ActionSampler]]:
-    if env_name in MAZE_IDS:
-        return maze_players(env, env_name, quality)
-    policies = [
-        load_behavior_policy(env_name, name) for name in quality_policies(quality)
-    ]
-    return env, [policy.sample for policy in policies] or [uniform_sampler(env)]

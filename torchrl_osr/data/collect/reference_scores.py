@@ -61,11 +61,7 @@ def normalized_score(
 
     Args:
         env_name: short environment name, such as ``"hopper"``.
-        episode_return: undiscounted return(s) of complete episodes, a number or an
-            array of any shape.
-
-    Returns:
-        A float for a number, a float64 array of the same shape for an array.
+        episode_return: undiscounted, a number or an array of any shape.
 
     Raises:
         ValueError: there are no reference returns for the environment.

@@ -36,8 +36,7 @@ class Collection(NamedTuple):
 
     Attributes:
         data: flat tensordict ``[N]``.
-        episode_returns: undiscounted returns ``[E]``, float64. An episode that was
-            cut because the number of transitions was reached is not among them.
+        episode_returns: undiscounted returns ``[E]``, float64.
         episode_lengths: steps ``[E]``.
     """
 
@@ -57,19 +56,6 @@ def uniform_sampler(env: gymnasium.Env[Any, Any]) -> ActionSampler:
     return sample
 
 
-def _allocate(rows: int, env: gymnasium.Env[Any, Any]) -> dict[str, NDArray[Any]]:
-    observation_size = gymnasium.spaces.flatdim(env.observation_space)
-    action_size = gymnasium.spaces.flatdim(env.action_space)
-    return {
-        "observation": np.empty((rows, observation_size), np.float32),
-        "action": np.empty((rows, action_size), np.float32),
-        "next_observation": np.empty((rows, observation_size), np.float32),
-        "reward": np.empty((rows, 1), np.float32),
-        "terminated": np.zeros((rows, 1), np.bool_),
-        "truncated": np.zeros((rows, 1), np.bool_),
-    }
-
-
 def collect_transitions(
     env: gymnasium.Env[Any, Any],
     samplers: Sequence[ActionSampler],
@@ -81,20 +67,18 @@ def collect_transitions(
     """Roll out an exact number of transitions, in equal shares of several policies.
 
     Each policy plays episode after episode until its share is full; the last row of
-    a share that is cut within an episode is marked truncated, so that no trajectory
-    runs into the next. Every row keeps its true next observation. The stored actions
-    are the executed ones, clipped to ``ACTION_LIMIT``.
+    a share that is cut within an episode is marked truncated. The stored actions are
+    the executed ones, clipped to ``ACTION_LIMIT``.
 
     Args:
-        env: task with vector observations and actions bounded by -1 and 1, as
-            :func:`~torchrl_osr.data.make_environment` returns it.
-        samplers: one action sampler for each policy.
-        num_transitions: exact number of transitions ``N``; if it does not divide by
-            the number of policies, shares differ by one.
+        env: task as :func:`~torchrl_osr.data.make_environment` returns it.
+        samplers: draw actions ``[A]`` in -1 to 1 for an observation ``[S]``, given a
+            NumPy generator; one for each policy.
+        num_transitions: ``N``. If it does not divide by the number of policies, shares
+            differ by one.
 
     Keyword Args:
-        seed: non-negative seed or seeds; global generators are neither read nor
-            touched. Default: 0.
+        seed: non-negative seed or seeds; global generators are not used. Default: 0.
         progress: show a progress bar when on a terminal. Default: ``True``.
 
     Returns:
@@ -108,7 +92,16 @@ def collect_transitions(
             f"num_transitions={num_transitions} for {len(samplers)} policies; "
             "expected at least one transition each."
         )
-    columns = _allocate(num_transitions, env)
+    state = num_transitions, gymnasium.spaces.flatdim(env.observation_space)
+    action = num_transitions, gymnasium.spaces.flatdim(env.action_space)
+    columns: dict[str, NDArray[Any]] = {
+        "observation": np.empty(state, np.float32),
+        "action": np.empty(action, np.float32),
+        "next_observation": np.empty(state, np.float32),
+        "reward": np.empty(num_transitions, np.float32),
+        "terminated": np.zeros(num_transitions, np.bool_),
+        "truncated": np.zeros(num_transitions, np.bool_),
+    }
     bounds = [num_transitions * i // len(samplers) for i in range(len(samplers) + 1)]
     seeds = np.random.SeedSequence(seed).spawn(len(samplers))
     returns: list[float] = []
@@ -173,7 +166,7 @@ def measure_policy(
     *,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Measure a policy's returns, as a behaviour card states them.
+    """Returns of a policy, as a behaviour card states them.
 
     Args:
         env: task, see :func:`collect_transitions`.
@@ -184,9 +177,8 @@ def measure_policy(
         seed: non-negative seed. Default: 0.
 
     Returns:
-        ``stochastic_return`` and ``deterministic_return`` (``[mean, standard
-        deviation]``), and mean ``episode_length`` and number of ``episodes`` of the
-        stochastic policy.
+        ``stochastic_return`` and ``deterministic_return``, each a mean and a standard
+        deviation; mean ``episode_length`` and number of ``episodes`` of the former.
 
     Raises:
         ValueError: no episode is complete.

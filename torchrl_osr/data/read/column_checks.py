@@ -27,14 +27,12 @@ ROUNDING = 1e-5
 
 
 def checked_columns(
-    rows: Mapping[str, ArrayLike], *, action_bounds: ActionBounds, clip_actions: bool
+    rows: Mapping[str, ArrayLike], action_bounds: ActionBounds, clip_actions: bool
 ) -> tuple[dict[str, NDArray[Any]], int]:
-    """Columns in float32, bool and int64, and the number of clipped actions.
+    """Columns in float32, bool and whole numbers, and the number of clipped actions.
 
     Args:
         rows: the columns, see :func:`~torchrl_osr.data.transitions_from_rows`.
-
-    Keyword Args:
         action_bounds: as there.
         clip_actions: as there.
 
@@ -43,38 +41,24 @@ def checked_columns(
             or holds a value that it cannot hold.
     """
     _check_names(rows)
-    arrays = {name: _as_array(name, values) for name, values in rows.items()}
-    count = len(arrays["observation"]) if arrays["observation"].ndim else 0
+    columns = {name: _as_array(name, values) for name, values in rows.items()}
+    count = len(columns["observation"]) if columns["observation"].ndim else 0
     if count == 0:
         raise ValueError("the data hold no rows; expected at least one transition.")
-    columns: dict[str, NDArray[Any]] = {}
-    for name in ("observation", "next_observation", "action"):
-        if name in arrays:
-            _check_shape(name, arrays[name], count, vector=True)
-            columns[name] = arrays[name]
-    for name in ("reward", "terminated", "truncated", "episode"):
-        if name in arrays:
-            _check_shape(name, arrays[name], count, vector=False)
-            columns[name] = arrays[name].reshape(count)
-    if (next_observation := columns.get("next_observation")) is not None:
-        expected = columns["observation"].shape
-        if next_observation.shape != expected:
-            raise ValueError(
-                f"'next_observation' has shape {list(next_observation.shape)}; "
-                f"expected that of 'observation', {list(expected)}."
-            )
-    for name in ("observation", "next_observation", "reward"):
-        if name in columns:
-            columns[name] = _as_float32(name, columns[name])
-    for name in ("terminated", "truncated"):
-        if name in columns:
-            columns[name] = _as_flags(name, columns[name])
-    if "episode" in columns and columns["episode"].dtype.kind not in "iu":
-        kind = columns["episode"].dtype
-        raise ValueError(f"'episode' has type {kind}; expected whole numbers.")
-    columns["action"], clipped = _unit_actions(
-        columns["action"], action_bounds, clip_actions
-    )
+    for name in columns:
+        _check_shape(name, columns, count)
+    clipped = 0
+    for name, array in columns.items():
+        if name == "action":
+            columns[name], clipped = _unit_actions(array, action_bounds, clip_actions)
+        elif name in ("observation", "next_observation"):
+            columns[name] = _as_float32(name, array)
+        elif name == "reward":
+            columns[name] = _as_float32(name, array.reshape(count))
+        elif name == "episode":
+            columns[name] = _as_whole_numbers(name, array.reshape(count))
+        else:
+            columns[name] = _as_flags(name, array.reshape(count))
     return columns, clipped
 
 
@@ -104,17 +88,19 @@ def _as_array(name: str, values: ArrayLike) -> NDArray[Any]:
     return array
 
 
-def _check_shape(name: str, array: NDArray[Any], count: int, *, vector: bool) -> None:
-    if vector:
-        right = array.ndim == 2 and len(array) == count and array.shape[1] > 0
+def _check_shape(name: str, columns: Mapping[str, NDArray[Any]], count: int) -> None:
+    shape = columns[name].shape
+    if name in ("observation", "action"):
+        right = len(shape) == 2 and shape[0] == count and shape[1] > 0
+        expected = f"[{count}, D] with D > 0, one row for each observation."
+    elif name == "next_observation":
+        right = shape == columns["observation"].shape
+        expected = f"that of 'observation', {list(columns['observation'].shape)}."
     else:
-        right = array.shape in ((count,), (count, 1))
+        right = shape in ((count,), (count, 1))
+        expected = f"[{count}], one row for each observation."
     if not right:
-        expected = f"[{count}, D] with D > 0" if vector else f"[{count}]"
-        raise ValueError(
-            f"{name!r} has shape {list(array.shape)}; expected {expected}, one row "
-            "for each observation."
-        )
+        raise ValueError(f"{name!r} has shape {list(shape)}; expected {expected}")
 
 
 def _as_float32(name: str, array: NDArray[Any]) -> NDArray[np.float32]:
@@ -131,6 +117,12 @@ def _as_float32(name: str, array: NDArray[Any]) -> NDArray[np.float32]:
     return cast
 
 
+def _as_whole_numbers(name: str, array: NDArray[Any]) -> NDArray[Any]:
+    if array.dtype.kind not in "iu":
+        raise ValueError(f"{name!r} has type {array.dtype}; expected whole numbers.")
+    return array
+
+
 def _as_flags(name: str, array: NDArray[Any]) -> NDArray[np.bool_]:
     wrong = np.flatnonzero((array != 0) & (array != 1))
     if len(wrong):
@@ -145,11 +137,15 @@ def _unit_actions(
     action: NDArray[Any], bounds: ActionBounds, clip: bool
 ) -> tuple[NDArray[np.float32], int]:
     """Map ``bounds`` to -1 and 1, clip to ``ACTION_LIMIT``, count the clipped rows."""
-    size = action.shape[1]
     try:
-        low, high = (np.broadcast_to(np.asarray(b, np.float64), size) for b in bounds)
+        low, high = (
+            np.broadcast_to(np.asarray(bound, np.float64), action.shape[1])
+            for bound in bounds
+        )
     except ValueError as error:
-        raise ValueError(f"action_bounds={bounds} for {size} actions.") from error
+        raise ValueError(
+            f"action_bounds={bounds} for {action.shape[1]} actions."
+        ) from error
     if not (np.isfinite([low, high]).all() and (low < high).all()):
         raise ValueError(
             f"action bounds {low.tolist()} and {high.tolist()}; expected finite "

@@ -13,9 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from filelock import FileLock
-from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch.hub import download_url_to_file
 from torchrl import torchrl_logger
@@ -23,7 +21,12 @@ from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 
 from torchrl_osr.data.read.column_checks import ActionBounds
 from torchrl_osr.data.read.hdf5 import open_hdf5
-from torchrl_osr.data.read.recording import Recording, whole_trajectories
+from torchrl_osr.data.read.recording import (
+    Columns,
+    ReadRows,
+    Recording,
+    whole_trajectories,
+)
 from torchrl_osr.data.store.cache import cache_root
 
 # D4RL's names of our columns; a file's other arrays and groups are not read.
@@ -35,17 +38,16 @@ COLUMNS = {
     "timeouts": "truncated",
     "next_observations": "next_observation",
 }
-REQUIRED = ("observations", "actions", "rewards", "terminals")
+REQUIRED = ("observations", "actions", "rewards", "terminals", "timeouts")
 
 
 def load_d4rl(
     source: str | Path,
     *,
     download: bool = False,
-    cache_dir: Path | str | None = None,
-    max_episode_steps: int | None = None,
     action_bounds: ActionBounds = (-1.0, 1.0),
     clip_actions: bool = False,
+    on_disk: bool = False,
     progress: bool = True,
 ) -> tuple[TensorDict, dict[str, Any]]:
     """Load a D4RL data set from a file, or by its name.
@@ -56,86 +58,60 @@ def load_d4rl(
 
     Args:
         source: path of an HDF5 file (``.hdf5`` or ``.h5``), or a name such as
-            ``"hopper-medium-v2"``.
+            ``"hopper-medium-v2"``, which is looked for in the cache folder.
 
     Keyword Args:
         download: fetch a named set that is not in the cache from D4RL's address. It
             publishes no checksums: compare ``data_sha256`` of the manifest between
             machines. Default: ``False``, nothing is fetched.
-        cache_dir: cache folder. Default: the environment variable
-            ``TORCHRL_OSR_CACHE``, else the user's cache folder for ``torchrl-osr``.
-        max_episode_steps: the time limit, for a file that does not have ``timeouts``;
-            an episode then ends after so many steps.
         action_bounds: see :func:`~torchrl_osr.data.transitions_from_rows`.
         clip_actions: see there.
-        progress: show a progress bar of the download. Default: ``True``.
+        on_disk: see :func:`~torchrl_osr.data.load_dataset`. Default: ``False``.
+        progress: show a progress bar when on a terminal. Default: ``True``.
 
     Returns:
-        The transitions ``[N]`` and the manifest of that function, with ``source`` and
-        ``data_sha256``.
+        The transitions ``[N]`` and the manifest of that function, with ``reader``,
+        ``source`` and ``data_sha256``.
 
     Raises:
         FileNotFoundError: no such file, or a named set that is not in the cache while
             ``download`` is false.
-        ValueError: unknown name, no D4RL file, or data that
+        ValueError: unknown name, no D4RL file, one without ``timeouts``, or data that
             :func:`~torchrl_osr.data.transitions_from_rows` refuses.
-
-    Examples:
-        >>> import tempfile, h5py, numpy as np
-        >>> from torchrl_osr.data import load_d4rl
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     with h5py.File(f"{folder}/mine.hdf5", "w") as file:
-        ...         file["observations"] = np.random.rand(4, 3)
-        ...         file["actions"] = np.random.rand(4, 2)
-        ...         file["rewards"] = np.ones(4)
-        ...         file["terminals"] = np.zeros(4, bool)
-        ...         file["timeouts"] = np.array([False, False, False, True])
-        ...     data, manifest = load_d4rl(f"{folder}/mine.hdf5")
-        >>> len(data), manifest["dropped_rows"]
-        (3, 1)
     """
-    path = locate_d4rl(source, download, cache_dir, progress)
-    return open_d4rl(path, max_episode_steps, action_bounds, clip_actions).load()
+    path = _located(source, download, progress)
+    total, read_arrays = _open(path)
+
+    def read(start: int, stop: int) -> Columns:
+        arrays = read_arrays(start, stop)
+        return {COLUMNS[name]: array for name, array in arrays.items()}
+
+    about = {"reader": "d4rl", "source": str(path)}
+    parts = partial(whole_trajectories, read, total)
+    recording = Recording(parts, action_bounds, clip_actions, about, [path], total)
+    return recording.load(on_disk=on_disk, progress=progress)
 
 
-def open_d4rl(
-    path: Path,
-    max_episode_steps: int | None = None,
-    action_bounds: ActionBounds = (-1.0, 1.0),
-    clip_actions: bool = False,
-) -> Recording:
-    """Open a D4RL file, see :func:`load_d4rl`."""
+def _open(path: Path) -> tuple[int, ReadRows]:
+    """Number of rows and what reads them; raise unless all arrays are there."""
     total, read_arrays = open_hdf5(path, COLUMNS)
-
-    def read(start: int, stop: int) -> dict[str, NDArray[Any]]:
-        return _columns(path, read_arrays(start, stop), max_episode_steps)
-
-    return Recording(
-        {"source": str(path)},
-        [path],
-        total,
-        partial(whole_trajectories, read, total),
-        action_bounds,
-        clip_actions,
-    )
+    arrays = read_arrays(0, 0)
+    if missing := [name for name in REQUIRED if name not in arrays]:
+        raise ValueError(f"{path} is no D4RL file: it lacks {', '.join(missing)}.")
+    return total, read_arrays
 
 
-def locate_d4rl(
-    source: str | Path,
-    download: bool = False,
-    cache_dir: Path | str | None = None,
-    progress: bool = True,
-) -> Path:
+def _located(source: str | Path, download: bool, progress: bool) -> Path:
     """Path of a D4RL file, which is fetched if that was asked for."""
     given = Path(source).expanduser()
     if given.suffix in (".hdf5", ".h5"):
-        return given
+        return given.absolute()
     if str(source) not in D4RL_DATASETS:
         raise ValueError(
             f"{str(source)!r} is neither a path that ends in .hdf5 or .h5 nor a D4RL "
             "set, such as hopper-medium-v2; torchrl.data.datasets.d4rl_infos has all."
         )
-    path = cache_root(cache_dir) / "d4rl" / f"{source}.hdf5"
+    path = cache_root() / "d4rl" / f"{source}.hdf5"
     if not path.exists():
         if not download:
             raise FileNotFoundError(
@@ -158,39 +134,7 @@ def _download(url: str, path: Path, progress: bool) -> None:
             download_url_to_file(
                 url, str(part), progress=progress and sys.stderr.isatty()
             )
-            _, read_arrays = open_hdf5(part, COLUMNS)
-            _check_arrays(part, read_arrays(0, 0))
+            _open(part)
             os.replace(part, path)
         finally:
             part.unlink(missing_ok=True)
-
-
-def _columns(
-    path: Path, arrays: dict[str, NDArray[Any]], max_episode_steps: int | None
-) -> dict[str, NDArray[Any]]:
-    """Columns by our names, of rows that begin with a trajectory."""
-    _check_arrays(path, arrays)
-    if "timeouts" not in arrays:
-        arrays["timeouts"] = _timeouts(path, arrays["terminals"], max_episode_steps)
-    return {COLUMNS[name]: array for name, array in arrays.items()}
-
-
-def _check_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
-    if missing := [name for name in REQUIRED if name not in arrays]:
-        raise ValueError(f"{path} is no D4RL file: it lacks {', '.join(missing)}.")
-
-
-def _timeouts(
-    path: Path, terminals: NDArray[Any], limit: int | None
-) -> NDArray[np.bool_]:
-    if limit is None or limit < 1:
-        raise ValueError(
-            f"{path} has no 'timeouts': say with max_episode_steps= after how many "
-            "steps (at least 1) the task's time limit cut an episode."
-        )
-    row = np.arange(terminals.size)
-    # The first row of each row's episode, as the terminals tell it.
-    starts = np.r_[0, np.flatnonzero(terminals) + 1]
-    first = starts[np.searchsorted(starts, row, side="right") - 1]
-    timeouts: NDArray[np.bool_] = (row - first + 1) % limit == 0
-    return timeouts

@@ -5,7 +5,7 @@ All three hold the same columns; nothing is unpickled.
 
 from __future__ import annotations
 
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,7 @@ from tensordict import TensorDict
 
 from torchrl_osr._files import check_unpacked_size, read_arrays
 from torchrl_osr.data.read.column_checks import ActionBounds
-from torchrl_osr.data.read.recording import (
-    ReadRows,
-    Recording,
-    whole_trajectories,
-)
+from torchrl_osr.data.read.recording import ReadRows, Recording, whole_trajectories
 
 
 def load_file(
@@ -27,25 +23,28 @@ def load_file(
     *,
     action_bounds: ActionBounds = (-1.0, 1.0),
     clip_actions: bool = False,
+    on_disk: bool = False,
+    progress: bool = True,
 ) -> tuple[TensorDict, dict[str, Any]]:
     """Load recorded steps from a file of your own.
 
-    Columns: ``observation`` ``[N, S]``, ``action`` ``[N, A]``, ``reward`` ``[N]``,
-    ``terminated`` ``[N]``, then ``truncated`` ``[N]`` or ``episode`` ``[N]`` (whole
-    numbers) or both, and possibly ``next_observation`` ``[N, S]``; nothing else. Rows
-    are in order of time. In an HDF5 file they are arrays at the root; in Parquet,
-    ``observation``, ``action`` and ``next_observation`` are columns of lists.
+    Columns are those of :func:`~torchrl_osr.data.transitions_from_rows`, and nothing
+    else; rows are in order of time. In an HDF5 file they are arrays at the root; in
+    Parquet, ``observation``, ``action`` and ``next_observation`` are columns of lists.
 
     Args:
-        path: ends in ``.npz``, ``.hdf5``, ``.h5`` or ``.parquet``.
+        path: ends in ``.npz`` (always read at once), ``.hdf5``, ``.h5`` or
+            ``.parquet``.
 
     Keyword Args:
         action_bounds: see :func:`~torchrl_osr.data.transitions_from_rows`.
         clip_actions: see there.
+        on_disk: see :func:`~torchrl_osr.data.load_dataset`. Default: ``False``.
+        progress: show a progress bar while writing to disk. Default: ``True``.
 
     Returns:
-        The transitions ``[N]`` and the manifest of that function, with ``source`` and
-        ``data_sha256``.
+        The transitions ``[N]`` and the manifest of that function, with ``reader``,
+        ``source`` and ``data_sha256``.
 
     Raises:
         FileNotFoundError: no such file.
@@ -68,19 +67,7 @@ def load_file(
         >>> len(data), manifest["dropped_rows"]
         (5, 1)
     """
-    return open_file(
-        path, action_bounds=action_bounds, clip_actions=clip_actions
-    ).load()
-
-
-def open_file(
-    path: str | Path,
-    *,
-    action_bounds: ActionBounds = (-1.0, 1.0),
-    clip_actions: bool = False,
-) -> Recording:
-    """Open a file of your own, see :func:`load_file`; an archive is read at once."""
-    path = Path(path).expanduser()
+    path = Path(path).expanduser().absolute()
     openers = {
         ".npz": _open_npz,
         ".hdf5": _open_hdf5,
@@ -92,14 +79,10 @@ def open_file(
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}.")
     total, read = openers[path.suffix](path)
-    return Recording(
-        {"source": str(path)},
-        [path],
-        total,
-        partial(whole_trajectories, read, total),
-        action_bounds,
-        clip_actions,
-    )
+    about = {"reader": "file", "source": str(path)}
+    parts = partial(whole_trajectories, read, total)
+    recording = Recording(parts, action_bounds, clip_actions, about, [path], total)
+    return recording.load(on_disk=on_disk, progress=progress)
 
 
 def _open_npz(path: Path) -> tuple[int, ReadRows]:
@@ -130,21 +113,19 @@ def _open_parquet(path: Path) -> tuple[int, ReadRows]:
             f"Parquet files need {error.name!r}: pip install torchrl-osr[minari]"
         ) from error
 
-    groups: dict[int, Any] = {}  # of the part before: the next may begin in its last
+    @lru_cache(maxsize=1)  # the next part may begin in the last group of this one
+    def group(number: int) -> Any:
+        try:
+            return file.read_row_group(number)
+        except (pyarrow.ArrowException, OSError) as error:
+            raise ValueError(f"{path} is damaged: {error}") from error
 
     def read(start: int, stop: int) -> dict[str, NDArray[Any]]:
         first = int(np.searchsorted(bounds, start, side="right")) - 1
         last = int(np.searchsorted(bounds, stop, side="left"))
         check_unpacked_size(path, sum(sizes[first:last]))
-        for number in [number for number in groups if number < first]:
-            del groups[number]
-        try:
-            for number in range(first, last):
-                if number not in groups:
-                    groups[number] = file.read_row_group(number)
-        except (pyarrow.ArrowException, OSError) as error:
-            raise ValueError(f"{path} is damaged: {error}") from error
-        table = pyarrow.concat_tables([groups[n] for n in range(first, last)])
+        groups = [group(number) for number in range(first, last)]
+        table = pyarrow.concat_tables([file.schema_arrow.empty_table(), *groups])
         table = table.slice(start - bounds[first], stop - start)
         return {name: _as_numpy(name, table[name]) for name in table.column_names}
 
@@ -168,14 +149,10 @@ def _as_numpy(name: str, column: Any) -> NDArray[Any]:
     if column.null_count:
         row = int(np.flatnonzero(column.is_null())[0])
         raise ValueError(f"{name!r} has no value in row {row}.")
-    kind = column.type
+    kinds = pyarrow.types
     if not any(
-        test(kind)
-        for test in (
-            pyarrow.types.is_list,
-            pyarrow.types.is_large_list,
-            pyarrow.types.is_fixed_size_list,
-        )
+        is_kind(column.type)
+        for is_kind in (kinds.is_list, kinds.is_large_list, kinds.is_fixed_size_list)
     ):
         return np.asarray(column.to_numpy())
     lengths = column.combine_chunks().value_lengths().to_numpy(zero_copy_only=False)

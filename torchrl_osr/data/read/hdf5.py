@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from torchrl_osr._files import check_unpacked_size
+from torchrl_osr.data.read.recording import ReadRows
 
 try:
     import h5py
@@ -19,28 +20,24 @@ except ImportError as error:
     ) from error
 
 
-def open_hdf5(
-    path: Path, names: Iterable[str] | None = None
-) -> tuple[int, Callable[[int, int], dict[str, NDArray[Any]]]]:
+def open_hdf5(path: Path, names: Iterable[str] | None = None) -> tuple[int, ReadRows]:
     """Number of rows of an HDF5 file, and what reads the rows from one up to another.
 
     Args:
         path: the file.
-        names: which arrays to read if they are there. Default: all, and then anything
-            that is not an array is an error.
+        names: which arrays to read if they are there. Default: all.
 
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: it is no HDF5 file or damaged, something in it leads into another
-            file, or a name is no array. Arrays of unequal length are read as they are:
-            whoever checks the columns names them. So is reading more than both 4 GiB
-            and the file's own size at once.
+            file, or a name is no array; when rows are read, too if they have more than
+            both 4 GiB and the file's own size. Unequal lengths are not looked for.
     """
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}.")
     with _opened(path) as file:
         _check_links(path, file)
-        chosen = [n for n in file if n in set(names)] if names else list(file)
+        chosen = [name for name in file if names is None or name in names]
         for name in chosen:
             if not isinstance(file[name], h5py.Dataset) or not file[name].ndim:
                 raise ValueError(f"{path}: {name!r} is no array with rows.")
@@ -58,9 +55,6 @@ def open_hdf5(
 
 def check_hdf5(path: Path) -> None:
     """Raise unless a file can be read whole, on its own.
-
-    Args:
-        path: the file.
 
     Raises:
         ValueError: it is no HDF5 file or damaged, announces more than both 4 GiB and

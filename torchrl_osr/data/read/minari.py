@@ -8,7 +8,7 @@ episode, so that every row has its true next observation.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from functools import reduce
+from functools import partial, reduce
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,9 @@ from torchrl.data import ReplayBuffer
 from tqdm.auto import tqdm
 
 from torchrl_osr._files import read_json
+from torchrl_osr.data.read.arrays import episode_parts
 from torchrl_osr.data.read.column_checks import ActionBounds
-from torchrl_osr.data.read.recording import Columns, Recording
-from torchrl_osr.data.read.transitions import join_episodes
+from torchrl_osr.data.read.recording import Recording
 from torchrl_osr.data.store.replay_buffer import make_replay_buffer
 
 try:
@@ -51,6 +51,7 @@ def load_minari(
     observation_keys: Sequence[str] | None = None,
     action_bounds: ActionBounds | None = None,
     clip_actions: bool = False,
+    on_disk: bool = False,
     progress: bool = True,
 ) -> tuple[TensorDict, dict[str, Any]]:
     """Load a Minari data set.
@@ -72,11 +73,12 @@ def load_minari(
         action_bounds: lowest and highest action, mapped to -1 and 1. Default: those of
             the set's action space.
         clip_actions: see :func:`~torchrl_osr.data.transitions_from_rows`.
+        on_disk: see :func:`~torchrl_osr.data.load_dataset`. Default: ``False``.
         progress: show a progress bar when on a terminal. Default: ``True``.
 
     Returns:
         The transitions ``[N]``, and the manifest of
-        :func:`~torchrl_osr.data.transitions_from_rows` with ``source``,
+        :func:`~torchrl_osr.data.transitions_from_rows` with ``reader``, ``source``,
         ``dataset_id``, ``env_id`` (or ``None``), ``minari_version``, ``action_bounds``
         and ``observation_layout``, a list of names and sizes.
 
@@ -86,38 +88,7 @@ def load_minari(
             of them, unknown keys, a damaged set, an HDF5 file that unpacks to more than
             both 4 GiB and its own size or leads into other files, or data that
             :func:`~torchrl_osr.data.transitions_from_rows` refuses.
-
-    Examples:
-        >>> import os, tempfile
-        >>> from torchrl_osr.data import load_minari
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     os.environ["MINARI_DATASETS_PATH"] = folder
-        ...     load_minari("mujoco/hopper/medium-v0")
-        Traceback (most recent call last):
-            ...
-        FileNotFoundError: Minari set 'mujoco/hopper/medium-v0' is not on this ...
-        >>> _ = os.environ.pop("MINARI_DATASETS_PATH")
     """
-    return open_minari(
-        dataset,
-        download=download,
-        observation_keys=observation_keys,
-        action_bounds=action_bounds,
-        clip_actions=clip_actions,
-        progress=progress,
-    ).load()
-
-
-def open_minari(
-    dataset: str | Path,
-    *,
-    download: bool = False,
-    observation_keys: Sequence[str] | None = None,
-    action_bounds: ActionBounds | None = None,
-    clip_actions: bool = False,
-    progress: bool = True,
-) -> Recording:
-    """Open a Minari data set, see :func:`load_minari`."""
     opened = _open(str(dataset), download)
     actions = opened.action_space
     if not isinstance(actions, gymnasium.spaces.Box):
@@ -128,25 +99,9 @@ def open_minari(
     leaves = _chosen(_leaves(opened.observation_space), observation_keys)
     bounds = action_bounds or (actions.low.ravel(), actions.high.ravel())
 
-    def parts(rows: int) -> Iterator[Columns]:
-        waiting: list[tuple[int, Columns]] = []
-        steps = 0
-        for number, episode in enumerate(
-            _read_episodes(dataset, opened, leaves, progress)
-        ):
-            waiting.append((number, episode))
-            steps += len(episode["reward"])
-            if steps >= rows:
-                yield join_episodes(waiting)[0]
-                waiting, steps = [], 0
-        columns, empty = join_episodes(waiting)
-        if columns:
-            yield columns
-        elif empty == opened.total_episodes:
-            raise ValueError(f"none of the {empty} episodes of {dataset} has a step.")
-
     spec = opened.env_spec
     about = {
+        "reader": "minari",
         "source": str(dataset),
         "dataset_id": opened.id,
         "env_id": None if spec is None else spec.id,
@@ -157,32 +112,24 @@ def open_minari(
         ],
     }
     files = sorted(Path(opened.storage.data_path).rglob("*"))
+    episodes = _read_episodes(dataset, opened, leaves, progress and not on_disk)
     return Recording(
+        partial(episode_parts, episodes),
+        bounds,
+        clip_actions,
         about,
         [file for file in files if file.is_file()],
         int(opened.total_steps),
-        parts,
-        bounds,
-        clip_actions,
-    )
+    ).load(on_disk=on_disk, progress=progress)
 
 
 def minari_replay_buffer(
     dataset: str, *, batch_size: int = 256, seed: int = 0, **options: Any
 ) -> ReplayBuffer:
-    """Load a Minari data set into a replay buffer.
+    """Replay buffer of a Minari data set, see :func:`load_minari` for the options.
 
-    Importing ``torchrl_osr.data`` registers it with TorchRL as ``osr-minari``, beside
-    TorchRL's own ``minari``, so that
+    Importing ``torchrl_osr.data`` registers it with TorchRL, so that
     ``torchrl.data.datasets.load_dataset("osr-minari:mujoco/hopper/medium-v0")`` works.
-
-    Args:
-        dataset: as in :func:`load_minari`.
-
-    Keyword Args:
-        batch_size: rows per ``sample()``. Default: 256.
-        seed: of the sampling. Default: 0.
-        **options: of :func:`load_minari`.
     """
     data, _ = load_minari(dataset, **options)
     return make_replay_buffer(data, batch_size=batch_size, seed=seed)
@@ -232,7 +179,7 @@ def _damaged(dataset: str | Path, error: Exception) -> ValueError:
 
 
 def _leaves(space: gymnasium.Space[Any], name: tuple[str, ...] = ()) -> Leaves:
-    """Return the boxes that an observation is made of, in order of their names."""
+    """Boxes that an observation is made of, in order of their names."""
     if isinstance(space, gymnasium.spaces.Dict):
         parts = [_leaves(space[key], (*name, key)) for key in sorted(space.keys())]
         return {key: box for part in parts for key, box in part.items()}

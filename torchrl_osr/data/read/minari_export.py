@@ -15,6 +15,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict
 
@@ -68,28 +69,11 @@ def export_minari(
             or mixed data; the set exists; the task has other spaces; an episode is too
             long for the storage; or the data do not pass
             :func:`~torchrl_osr.data.check_dataset`.
-
-    Examples:
-        >>> import os, tempfile
-        >>> from torchrl_osr.data import (
-        ...     export_minari, load_local_dataset, load_minari
-        ... )
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     os.environ["MINARI_DATASETS_PATH"] = folder
-        ...     data, _ = load_local_dataset(
-        ...         "hopper", "random", num_transitions=100, cache_dir=folder
-        ...     )
-        ...     _ = export_minari(data, "mine/random-v0", author="me")
-        ...     again, _ = load_minari("mine/random-v0")
-        >>> _ = os.environ.pop("MINARI_DATASETS_PATH")
-        >>> bool((again == data).all())
-        True
     """
     check_dataset(data)
-    rows = _columns(data)
-    stops = _stops(rows)
+    stops = _stops(data)
     spaces = {
-        name: gymnasium.spaces.Box(-bound, bound, rows[key].shape[1:], np.float32)
+        name: gymnasium.spaces.Box(-bound, bound, data[key].shape[1:], np.float32)
         for name, key, bound in (
             ("observation_space", "observation", np.inf),
             ("action_space", "action", 1.0),
@@ -106,7 +90,7 @@ def export_minari(
             warnings.simplefilter("ignore", UserWarning)
             written = minari.create_dataset_from_buffers(
                 dataset_id,
-                list(_buffers(rows, stops)),
+                list(_buffers(data, stops)),
                 env=None if env_id is None else gymnasium.spec(env_id),
                 data_format=data_format,
                 **spaces,
@@ -125,18 +109,11 @@ def export_minari(
     return folder
 
 
-def _columns(data: TensorDict) -> dict[str, NDArray[Any]]:
-    rows = {name: data[name].numpy(force=True) for name in ("observation", "action")}
-    for name in ("observation", "reward", "terminated", "truncated"):
-        rows[f"next_{name}"] = data["next", name].numpy(force=True)
-    return rows
-
-
-def _stops(rows: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
-    """Return the row after each episode's last."""
-    done = (rows["next_terminated"] | rows["next_truncated"])[:, 0]
-    goes_on = (rows["next_observation"][:-1] == rows["observation"][1:]).all(1)
-    broken = np.flatnonzero(~done & ~np.r_[goes_on, False])
+def _stops(data: TensorDict) -> NDArray[np.int64]:
+    """Row after each episode's last."""
+    done = data["next", "done"][:, 0].numpy(force=True)
+    goes_on = (data["next", "observation"][:-1] == data["observation"][1:]).all(1)
+    broken = np.flatnonzero(~done & ~np.r_[goes_on.numpy(force=True), False])
     if len(broken):
         raise ValueError(
             f"row {broken[0]}, and {len(broken) - 1} more, is not done, and the next "
@@ -160,15 +137,15 @@ def _check_spaces(env_id: str, spaces: Mapping[str, gymnasium.spaces.Box]) -> No
                 )
 
 
-def _buffers(
-    rows: dict[str, NDArray[Any]], stops: NDArray[np.int64]
-) -> Iterator[EpisodeBuffer]:
+def _buffers(data: TensorDict, stops: NDArray[np.int64]) -> Iterator[EpisodeBuffer]:
     for start, stop in pairwise([0, *stops.tolist()]):
-        last = rows["next_observation"][stop - 1 : stop]
+        episode = data[start:stop]
+        after = episode["next"]
+        states = torch.cat([episode["observation"], after["observation"][-1:]])
         yield EpisodeBuffer(
-            observations=np.concatenate([rows["observation"][start:stop], last]),
-            actions=rows["action"][start:stop],
-            rewards=rows["next_reward"][start:stop, 0],
-            terminations=rows["next_terminated"][start:stop, 0],
-            truncations=rows["next_truncated"][start:stop, 0],
+            observations=states.numpy(force=True),
+            actions=episode["action"].numpy(force=True),
+            rewards=after["reward"][:, 0].numpy(force=True),
+            terminations=after["terminated"][:, 0].numpy(force=True),
+            truncations=after["truncated"][:, 0].numpy(force=True),
         )

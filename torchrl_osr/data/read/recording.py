@@ -9,17 +9,23 @@ Shapes: ``N`` transitions.
 
 from __future__ import annotations
 
+import json
+import sys
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from hashlib import sha256
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from tensordict import TensorDict
 
 from torchrl_osr._files import sha256_of
 from torchrl_osr.data.read.column_checks import ActionBounds
-from torchrl_osr.data.read.transitions import none_left, transitions_of
+from torchrl_osr.data.read.transitions import transitions_of
+from torchrl_osr.data.store.cache import CHUNK_ROWS, cache_root, load_or_write
 from torchrl_osr.data.store.statistics import describe_episodes
 from torchrl_osr.data.store.validation import ACTION_LIMIT, check_dataset
 
@@ -27,123 +33,130 @@ Columns = Mapping[str, NDArray[Any]]
 ReadRows = Callable[[int, int], Columns]
 """Columns of the rows from one number up to another."""
 
-# Some ten megabytes of hopper.
-CHUNK_ROWS = 200_000
-
 # A trajectory is in memory as a whole; without an end in so many rows, the flags are
 # more likely to be missing.
 MAX_TRAJECTORY = 2_000_000
 
 
-class Recording(NamedTuple):
-    """A recorded set that can be read in parts.
-
-    Attributes:
-        about: what the manifest says of the source.
-        files: what is read.
-        total: rows of the source.
-        parts: yields columns of whole trajectories, about so many rows at a time.
-        action_bounds, clip_actions: see
-            :func:`~torchrl_osr.data.transitions_from_rows`.
-    """
-
-    about: dict[str, Any]
-    files: list[Path]
-    total: int
-    parts: Callable[[int], Iterator[Columns]]
-    action_bounds: ActionBounds = (-1.0, 1.0)
-    clip_actions: bool = False
-
-    def load(self) -> tuple[TensorDict, dict[str, Any]]:
-        """Transitions ``[N]`` in memory, and their manifest.
-
-        Raises:
-            ValueError: what :func:`~torchrl_osr.data.transitions_from_rows` raises.
-        """
-        conversion = Conversion(self)
-        (data,) = conversion.chunks(max(self.total, 1))
-        check_dataset(data)
-        return data, {"num_transitions": len(data)} | conversion.manifest()
-
-
-class Conversion:
-    """Transitions of a recorded set, and what has been counted on the way.
+@dataclass
+class Recording:
+    """A recorded set, to be read once.
 
     Args:
-        recording: the set.
+        parts: yields columns of whole trajectories, about so many rows at a time.
+        action_bounds: see :func:`~torchrl_osr.data.transitions_from_rows`.
+        clip_actions: see there.
+        about: JSON-compatible: what the manifest says of the source.
+        files: what is read.
+        total: rows of the source, for the progress bar.
     """
 
-    def __init__(self, recording: Recording) -> None:
-        self.recording = recording
-        self._counts: dict[str, int] = {}
-        self._returns: list[float] = []
-        self._lengths: list[int] = []
+    parts: Callable[[int], Iterator[Mapping[str, ArrayLike]]]
+    action_bounds: ActionBounds
+    clip_actions: bool
+    about: dict[str, Any] = field(default_factory=dict)
+    files: list[Path] = field(default_factory=list)
+    total: int | None = None
+    _counts: Counter[str] = field(default_factory=Counter, init=False)
+    _returns: list[float] = field(default_factory=list, init=False)
+    _lengths: list[int] = field(default_factory=list, init=False)
 
-    def chunks(self, rows: int = CHUNK_ROWS) -> Iterator[TensorDict]:
-        """Yield transitions of whole trajectories.
+    def load(
+        self, *, on_disk: bool = False, progress: bool = True
+    ) -> tuple[TensorDict, dict[str, Any]]:
+        """Transitions ``[N]``, and their manifest.
 
-        Args:
-            rows: of the source, about so many at a time. Default: 200,000.
+        Keyword Args:
+            on_disk: write them into the cache folder, unless they are there, and leave
+                them memory-mapped. Default: ``False``, all are read into memory.
+            progress: show a bar while writing. Default: ``True``.
 
         Raises:
-            ValueError: what :func:`~torchrl_osr.data.transitions_from_rows` raises; row
-                numbers count from the beginning of the chunk that is named.
+            ValueError: see :func:`~torchrl_osr.data.transitions_from_rows`. Row numbers
+                count from the beginning of the part that the message names.
         """
-        done, kept = 0, 0
+        if on_disk:
+            return self._load_or_write(progress)
+        (data,) = self._transitions(sys.maxsize)
+        check_dataset(data)
+        return data, {"num_transitions": len(data)} | self._manifest()
+
+    def _load_or_write(self, progress: bool) -> tuple[TensorDict, dict[str, Any]]:
+        # Sizes and times, not checksums: to read a large source at each start is slow.
+        files = [
+            [str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns]
+            for file in self.files
+        ]
+        bounds = [np.asarray(bound).tolist() for bound in self.action_bounds]
+        request = self.about | {
+            "source_files": files,
+            "action_bounds": bounds,
+            "clip_actions": self.clip_actions,
+        }
+        digest = sha256(json.dumps(request, sort_keys=True).encode()).hexdigest()[:16]
+        return load_or_write(
+            cache_root() / "recorded" / f"{self.about['reader']}-{digest}",
+            request,
+            lambda: self._transitions(CHUNK_ROWS),
+            describe=self._manifest,
+            total=self.total,
+            progress=progress,
+        )
+
+    def _transitions(self, rows: int) -> Iterator[TensorDict]:
+        """Yield transitions of about so many rows of the source, and count."""
+        done, kept, last = 0, 0, None
         seen: set[int] = set()
-        last: list[int] = []
-        for columns in self.recording.parts(rows):
+        for columns in self.parts(rows):
             try:
-                part = transitions_of(
-                    columns,
-                    action_bounds=self.recording.action_bounds,
-                    clip_actions=self.recording.clip_actions,
-                )
-                episode = np.asarray(columns.get("episode", [])).ravel()
-                numbers = set(np.unique(episode).tolist())
-                if last == episode[:1].tolist():  # it goes on after a flag within it
-                    seen -= set(last)
-                if again := seen & numbers:
-                    raise ValueError(
-                        f"'episode' {min(again)} comes back; expected the rows of an "
-                        "episode together, in order of time."
-                    )
+                part = transitions_of(columns, self.action_bounds, self.clip_actions)
+                if "episode" in columns:
+                    last = _check_order(columns["episode"], seen, last)
             except ValueError as error:
                 where = f"in the rows from {done:,} on: " if done else ""
                 raise ValueError(f"{where}{error}") from error
-            seen |= numbers
-            last = episode[-1:].tolist()
-            done += len(columns["reward"])
+            done += len(part.data) + part.counts["dropped_rows"]
             kept += len(part.data)
-            for name, count in part.counts.items():
-                self._counts[name] = self._counts.get(name, 0) + count
-            self._returns += part.returns
-            self._lengths += part.lengths
+            self._counts.update(part.counts)
+            self._returns += part.returns.tolist()
+            self._lengths += part.lengths.tolist()
             if len(part.data):
                 yield part.data
         if not kept:
-            raise ValueError(none_left(done))
+            raise ValueError(
+                f"none of the {done} rows has a true next state: each is the last of "
+                "its episode. Give next_observation."
+            )
 
-    def manifest(self) -> dict[str, Any]:
-        """What is known of the transitions, once all have been read."""
-        files = self.recording.files
-        single = {"data_sha256": sha256_of(files[0])} if len(files) == 1 else {}
+    def _manifest(self) -> dict[str, Any]:
+        """What is known of the transitions once all have been read."""
+        single = len(self.files) == 1
         return {
-            **self.recording.about,
-            **single,
+            **self.about,
+            **({"data_sha256": sha256_of(self.files[0])} if single else {}),
             **self._counts,
             "action_limit": ACTION_LIMIT,
             **describe_episodes(self._returns, self._lengths),
         }
 
 
-def whole_trajectories(read: ReadRows, total: int, rows: int) -> Iterator[Columns]:
-    """Yield parts that end where a trajectory ends.
+def _check_order(column: ArrayLike, seen: set[int], last: int | None) -> int:
+    """Raise if an episode comes back or was seen; return the number of the last."""
+    episode = np.asarray(column).reshape(-1)
+    for row in np.flatnonzero(np.r_[True, episode[1:] != episode[:-1]]).tolist():
+        number = int(episode[row])
+        # After a flag within an episode, the next part goes on with it.
+        if number in seen and (row or number != last):
+            raise ValueError(
+                f"'episode' {number} comes back in row {row}; expected the rows of an "
+                "episode together, in order of time."
+            )
+        seen.add(number)
+    return int(episode[-1])
 
-    Args:
-        read: returns the columns of rows from one number up to another.
-        total: number of rows.
-        rows: of a part; more, if one trajectory has more.
+
+def whole_trajectories(read: ReadRows, total: int, rows: int) -> Iterator[Columns]:
+    """Yield parts of so many of ``total`` rows, or more if one trajectory has more.
 
     Raises:
         ValueError: a trajectory has no end within ``MAX_TRAJECTORY`` rows.
@@ -155,7 +168,7 @@ def whole_trajectories(read: ReadRows, total: int, rows: int) -> Iterator[Column
             stop = min(start + length, total)
             columns = read(start, stop)
             if not total or len({column.shape[:1] for column in columns.values()}) > 1:
-                yield columns  # whoever checks them says what is wrong
+                yield columns  # the checks of the columns say what is wrong
                 return
             end = stop - start if stop == total else _last_end(columns)
             if not end and length > MAX_TRAJECTORY:
@@ -171,7 +184,7 @@ def whole_trajectories(read: ReadRows, total: int, rows: int) -> Iterator[Column
 
 def _last_end(columns: Columns) -> int:
     """Number of rows up to the last known end of a trajectory."""
-    count = len(columns["reward"]) if "reward" in columns else 0
+    count = len(next(iter(columns.values())))
     ends = np.zeros(count, np.bool_)
     for name in ("terminated", "truncated"):
         if name in columns:

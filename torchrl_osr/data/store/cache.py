@@ -26,6 +26,9 @@ from torchrl_osr.data.store.memmap import (
 CACHE_VARIABLE = "TORCHRL_OSR_CACHE"
 """Environment variable that moves the cache folder."""
 
+CHUNK_ROWS = 200_000
+"""Rows that are converted and written at a time: some ten megabytes of hopper."""
+
 
 def cache_root(cache_dir: Path | str | None = None) -> Path:
     """Folder of all cached data sets: as given, or as the user has it."""
@@ -50,7 +53,7 @@ def load_or_write(
     total: int | None = None,
     progress: bool = True,
 ) -> tuple[TensorDict, dict[str, Any]]:
-    """Open a cached set, or write it first.
+    """Open a cached set, or write it first, with what :func:`write_memmap` takes.
 
     Processes that ask for the same set at once wait for one of them to write it.
 
@@ -58,19 +61,10 @@ def load_or_write(
         folder: of the set.
         request: JSON-compatible entries of the manifest that decide the rows. A set
             with others is written anew, with a warning that says why.
-        chunks: makes the transitions, see :func:`~torchrl_osr.data.write_memmap`.
-
-    Keyword Args:
-        describe: see there.
-        total: see there.
-        progress: see there.
+        chunks: makes the transitions.
 
     Returns:
         The memory-mapped transitions ``[N]`` and the manifest.
-
-    Raises:
-        FileExistsError: see there.
-        OSError: the folder cannot be written.
     """
     wanted = json.loads(json.dumps(request))  # as the manifest's: it has no tuples
     # Without the lock first: a whole set can be read from a folder that is read-only.

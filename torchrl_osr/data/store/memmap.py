@@ -61,17 +61,15 @@ def write_memmap(
     """Write transitions to a folder, chunk by chunk, and open them.
 
     They are written to a hidden folder beside, ``.<name>.partial``, which is renamed at
-    the end: an interrupted call leaves no set, and is simply made again.
+    the end: an interrupted call leaves no set.
 
     Args:
-        chunks: transitions ``[n]`` each, float32, see
-            :func:`~torchrl_osr.data.check_dataset`. Only one is in memory at a time.
-        folder: of the set; made with all that is above it. A set that is there is
-            replaced.
+        chunks: transitions ``[n]`` each, float32. Only one is in memory at a time.
+        folder: of the set, which is made, or replaced.
 
     Keyword Args:
-        describe: is called when all chunks are written; its result, JSON-compatible,
-            is put into the manifest. Default: nothing.
+        describe: called when all chunks are written; its result, JSON-compatible, is
+            put into the manifest. Default: nothing.
         total: number of rows, or more, for the bar and for a look at the free space
             before the work. Default: unknown.
         progress: show a progress bar when on a terminal. Default: ``True``.
@@ -82,9 +80,8 @@ def write_memmap(
     Raises:
         FileExistsError: the folder is there and not one that this function has
             written, or holds other files: nothing in it is touched.
-        ValueError: transitions of a chunk are not what
-            :func:`~torchrl_osr.data.check_dataset` expects, or of another size than
-            those before, or there are none.
+        ValueError: :func:`~torchrl_osr.data.check_dataset` refuses the transitions, a
+            chunk has another size than those before, or there are none.
         OSError: the disk is full, or cannot be written.
 
     Examples:
@@ -124,15 +121,15 @@ def write_memmap(
 def load_memmap(folder: Path | str) -> tuple[TensorDict, dict[str, Any]]:
     """Open a set that :func:`write_memmap` has written.
 
-    Every file is read once, to compare its checksum: about a second for a gigabyte in
-    the page cache. Afterwards rows are read when they are asked for.
+    Every file is read once, to compare its checksum. Afterwards rows are read when they
+    are asked for.
 
     Args:
         folder: of the set; it may have been copied from another machine.
 
     Returns:
-        The transitions ``[N]``, memory-mapped. What is written into these tensors is
-        written into the files: take a ``clone()`` to change them. And the manifest.
+        The transitions ``[N]``, memory-mapped, and the manifest. What is written into
+        these tensors is written into the files: take a ``clone()`` to change them.
 
     Raises:
         FileNotFoundError: there is no such set.

@@ -46,7 +46,7 @@ class MemmapStorage(Storage):
         return int(self.max_size)
 
     def get(self, index: Tensor) -> TensorDictBase:
-        """Rows ``[B]``, read from the disk or the system's page cache."""
+        """Rows ``[B]``."""
         index = index.cpu()
         batch = self.data[index + torch.searchsorted(self._shifts, index, right=True)]
         return batch if self.device.type == "cpu" else batch.to(self.device)
@@ -70,30 +70,21 @@ def make_replay_buffer(
 ) -> ReplayBuffer:
     """Replay buffer that samples a data set uniformly, with replacement.
 
-    The buffer draws from a generator of its own: the batches depend on ``seed`` alone,
-    and sampling leaves torch's global generator as it was. There is no prefetching,
-    because threads would make the order of the draws depend on timing.
-
-    A plain :class:`~torchrl.data.ReplayBuffer` is used: it returns tensordicts like
-    :class:`~torchrl.data.TensorDictReplayBuffer`, without the priority and index
-    book-keeping that uniform sampling has no use for.
+    The batches depend on ``seed`` alone: the buffer has a generator of its own. It does
+    not prefetch, because threads would make the order of the draws depend on timing.
 
     Args:
         data: transitions ``[N]``. Memory-mapped ones (:func:`load_memmap`) stay on
-            disk: a batch is read when it is drawn, and the same seed draws the same
-            rows.
+            disk, and the same seed draws the same rows.
 
     Keyword Args:
         batch_size: rows per ``sample()``.
-        seed: seed of the sampling generator.
+        seed: of the sampling.
         left_out: sorted numbers of memory-mapped rows that are not drawn, see
             :func:`held_out_rows`. Default: none.
         transform: applied to each sampled batch. Default: none.
         device: where the rows are stored and sampled, or, of a memory-mapped set, where
             the batches are. Default: the device of ``data``, or CPU if it has none.
-
-    Returns:
-        A buffer that holds the ``N`` rows.
 
     Raises:
         ValueError: ``data`` is not flat or has no rows.

@@ -37,32 +37,10 @@ def held_out_rows(rows: int, held_out: int | float, *, seed: int) -> Tensor:
 def split_held_out(
     data: TensorDict, held_out: int | float, *, seed: int
 ) -> tuple[TensorDict, TensorDict]:
-    """Split a data set in memory into training and held-out rows, chosen at random.
+    """Training and held-out rows, see :func:`held_out_rows`, in their original order.
 
     A memory-mapped set would be copied into memory: see ``left_out`` of
     :func:`~torchrl_osr.data.make_replay_buffer`.
-
-    Args:
-        data: transitions ``[N]``.
-        held_out: see :func:`held_out_rows`.
-
-    Keyword Args:
-        seed: see there.
-
-    Returns:
-        Training rows and held-out rows, each in their original order.
-
-    Raises:
-        ValueError: one of the two parts would be empty.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_osr.data import split_held_out
-        >>> data = TensorDict({"observation": torch.rand(10, 3)}, batch_size=[10])
-        >>> train, held_out = split_held_out(data, 0.2, seed=0)
-        >>> len(train), len(held_out)
-        (8, 2)
     """
     mask = torch.zeros(len(data), dtype=torch.bool)
     mask[held_out_rows(len(data), held_out, seed=seed)] = True
@@ -91,16 +69,6 @@ def mix_datasets(
 
     Raises:
         ValueError: if the share is not between 0 and 1, or ``random`` is too small.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_osr.data import mix_datasets
-        >>> expert = TensorDict({"reward": torch.ones(10)}, [10])
-        >>> random = TensorDict({"reward": torch.zeros(10)}, [10])
-        >>> mixed = mix_datasets(expert, random, random_share=0.7, seed=0)
-        >>> len(mixed), int(mixed["reward"].sum())
-        (10, 3)
     """
     if not 0 <= random_share <= 1:
         raise ValueError(f"random_share must be in [0, 1], got {random_share}.")

@@ -25,10 +25,9 @@ ROWS_AT_A_TIME = 2**20
 def observation_statistics(data: TensorDictBase) -> tuple[Tensor, Tensor]:
     r"""Mean and standard deviation of each observation entry.
 
-    Accumulated in float64, since the float32 sum of a million rows loses digits, and
-    returned in the type of the observations. Rows are read in chunks, so that a
-    memory-mapped set is not copied; chunks :math:`A` and :math:`B` are merged by Chan's
-    formula, which cancels no digits however far the mean is from zero:
+    Accumulated in float64, since the float32 sum of a million rows loses digits. Rows
+    are read in chunks, so that a memory-mapped set is not copied; chunks :math:`A` and
+    :math:`B` are merged by Chan's formula, which cancels no digits:
 
     .. math::
         \sigma^2 = \frac{n_A \sigma_A^2 + n_B \sigma_B^2}{n_A + n_B}
@@ -83,11 +82,8 @@ def describe_episodes(returns: ArrayLike, lengths: ArrayLike) -> dict[str, Any]:
     """Entries of a manifest about the episodes that were played to their end.
 
     Args:
-        returns, lengths: of each episode, ``[E]``.
-
-    Returns:
-        ``num_complete_episodes``, ``return`` and ``episode_length`` (mean, std, min and
-        max; ``None`` without an episode), ``episode_returns`` and ``episode_lengths``.
+        returns: of each episode, ``[E]``.
+        lengths: in steps, ``[E]``.
     """
     returns, lengths = np.asarray(returns), np.asarray(lengths)
     return {

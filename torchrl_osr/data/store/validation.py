@@ -73,16 +73,6 @@ def check_dataset(data: TensorDictBase) -> None:
         ValueError: a key is missing, has the wrong shape or type, holds a NaN or an
             infinity, or an observation, next observation or action is zero
             everywhere. The message names the key, what came and what was expected.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_osr.data import check_dataset
-        >>> data = TensorDict({"observation": torch.ones(5, 3)}, batch_size=[5])
-        >>> check_dataset(data)
-        Traceback (most recent call last):
-            ...
-        ValueError: the data set lacks ('next', 'observation'), 'action', ...
     """
     check_rows(data)
     check_filled(filled_keys(data), len(data))
@@ -111,15 +101,7 @@ def filled_keys(data: TensorDictBase) -> set[NestedKey]:
 
 
 def check_filled(filled: set[NestedKey], rows: int) -> None:
-    """Raise if an observation, next observation or action was never filled.
-
-    Args:
-        filled: keys that are not zero everywhere.
-        rows: number of rows, for the message.
-
-    Raises:
-        ValueError: naming the key.
-    """
+    """Raise if one of ``VECTOR_KEYS`` is not among those that are somewhere filled."""
     for key in VECTOR_KEYS:
         if key not in filled:
             raise ValueError(
