@@ -177,7 +177,7 @@ def report(
         "best": best,
     }
     run_folder.write_json(folder / "returns.json", results | {"evaluations": history})
-    name = f"{cfg.env.name} {cfg.data.level}"
+    name = f"{cfg.env.name} {cfg.data.quality}"
     learning_curve(
         history,
         read_scalars(folder / "csv" / "scalars" / "policy"),

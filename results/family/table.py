@@ -50,7 +50,7 @@ FAMILY = {
     "SAC-N": ("`OSRLoss`, SAC-N", "`loss=sac_10`", REST),
     "EDAC": ("`OSRLoss`, EDAC", "`loss=edac_10`", "all pairs of gradients"),
     "Adversary": (
-        "`Adversary`, RORL", "`loss=osr_adversarial`", "a loop over the same draws",
+        "`Adversary`, RORL", "`perturbation=adversarial`", "a loop over the same draws",
     ),
     "State recovery alone": (
         "`StateRecoveryLoss`, (11)", "`examples/iql_with_recovery.py`",

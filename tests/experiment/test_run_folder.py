@@ -118,7 +118,7 @@ def test_keys_that_were_added_are_refused(composed, key):
 
 
 @pytest.mark.parametrize(
-    "override", ["loss=osr_adversarial", "+inverse_dynamics.network.low=-2.0"]
+    "override", ["perturbation=adversarial", "+inverse_dynamics.network.low=-2.0"]
 )
 def test_keys_of_the_schema_and_of_a_function_pass(composed, override):
     run_folder.check_keys(composed(override))

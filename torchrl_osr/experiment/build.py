@@ -37,7 +37,7 @@ def load_data(
     """
     return load_dataset(
         cfg.env.name,
-        cfg.data.level,
+        cfg.data.quality,
         env_id=cfg.env.id,
         path=cfg.data.path,
         download=cfg.data.download,

@@ -38,7 +38,7 @@ class DataConfig:
     """Which data set: rolled out from the packaged behaviour policies, or recorded.
 
     Attributes:
-        level: random, medium, medium-replay, medium-expert or expert; diverse or play
+        quality: random, medium, medium-replay, medium-expert or expert; diverse or play
             in a maze; minari, d4rl or file for recorded data.
         path: of recorded data, see docs/your_data.md.
         download: fetch a set that path names.
@@ -52,7 +52,7 @@ class DataConfig:
         reward_shift: added to them after it; evaluation has the task's own rewards.
     """
 
-    level: str = MISSING
+    quality: str = MISSING
     path: str | None = None
     download: bool = MISSING
     num_transitions: int = MISSING
