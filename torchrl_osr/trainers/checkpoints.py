@@ -36,32 +36,15 @@ class WeightsOnlyAdapter(CheckpointAdapter):
     adapter_id = "torchrl_osr.weights_only"
     filename = "state.pt"
 
-    def save(
-        self,
-        component: Any,
-        path: Path,
-        *,
-        args: tuple[Any, ...],
-        kwargs: Mapping[str, Any],
-    ) -> None:
+    def save(self, component: Any, path: Path, **_: Any) -> None:
         """Write the component's state below the folder ``path``."""
         path.mkdir(parents=True, exist_ok=True)
         # Given a path, torch.save turns an error of the disk into a RuntimeError.
         with (path / self.filename).open("wb") as file:
-            torch.save(component.state_dict(*args, **kwargs), file)
+            torch.save(component.state_dict(), file)
 
-    def load(
-        self,
-        component: Any,
-        path: Path,
-        *,
-        map_location: Any,
-        tensor_load_kwargs: Mapping[str, Any],
-        args: tuple[Any, ...],
-        kwargs: Mapping[str, Any],
-    ) -> None:
+    def load(self, component: Any, path: Path, *, map_location: Any, **_: Any) -> None:
         """Restore the component's state from the folder ``path``."""
-        del tensor_load_kwargs
         with zipfile.ZipFile(path / self.filename) as archive:
             _refuse(archive)
         state = torch.load(
@@ -69,7 +52,7 @@ class WeightsOnlyAdapter(CheckpointAdapter):
         )
         if isinstance(component, torch.nn.Module):
             _check_fits(component.state_dict(), state)
-        component.load_state_dict(state, *args, **kwargs)
+        component.load_state_dict(state)
 
 
 def _refuse(archive: zipfile.ZipFile) -> None:
@@ -167,8 +150,7 @@ class Checkpoints:
 
     Args:
         folder: where they are; made when the run is restored.
-        components: the live objects to save and restore, by name, see
-            :func:`safe_checkpoint`.
+        components: live objects, by name, see :func:`safe_checkpoint`.
 
     Keyword Args:
         interval: steps between two checkpoints.
@@ -190,8 +172,7 @@ class Checkpoints:
 
     def latest(self) -> Path | None:
         """Path of the newest checkpoint, or ``None``."""
-        path: Path | None = self._rotation.latest()
-        return path
+        return self._rotation.latest()  # type: ignore[no-any-return]
 
     def check_room(
         self, loss_module: torch.nn.Module, optimizer: torch.optim.Optimizer

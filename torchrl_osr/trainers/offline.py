@@ -262,7 +262,7 @@ class OfflineTrainer(Trainer):
         self.evaluate, self.eval_interval = evaluate, eval_interval
         self.loggers, self.description = loggers, description
         self._limits = dict(value_limits or {})
-        self._progress = Progress(description, total_steps, bar=progress)
+        self._progress = Progress(description, total_steps, progress)
         self._stop_request = StopRequest()
 
         self.register_op("process_optim_batch", self._sample)
@@ -337,8 +337,7 @@ class OfflineTrainer(Trainer):
     def _interrupted(self, step: int) -> Interrupted:
         """Save a run that was asked to end after a step; return what to raise.
 
-        The continued run does the rest of the log interval. The means that it logs are
-        over that rest; nothing else differs.
+        The continued run logs means over the rest of the log interval.
         """
         number = self._stop_request.signal
         assert number is not None
