@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import math
 import resource
 import zipfile
 from pathlib import Path
@@ -14,7 +15,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.checkpoint import CheckpointError
 
-from torchrl_osr.trainers import OfflineTrainer
+from torchrl_osr.trainers import OfflineTrainer, largest_value
 
 STEPS = 20
 
@@ -285,6 +286,22 @@ def test_cuda_graphs_are_refused_on_a_cpu(tmp_path, runs):
     match = "cudagraph=True needs a CUDA device, got device='cpu'"
     with pytest.raises(ValueError, match=match):
         runs.make(tmp_path, cudagraph=True)
+
+
+def test_largest_value_is_ten_times_the_largest_return():
+    # The reward for ever: 3 + 3/2 + 3/4 + ... = 6.
+    assert largest_value(3.0, 0.5) == 60.0
+    assert largest_value(3.0, 1.0) == math.inf
+
+
+@pytest.mark.parametrize("limits", [None, {"pred_value": 1e-9, "loss_qvalue": 1e9}])
+def test_trainer_warns_once_of_a_mean_that_it_logs(tmp_path, runs, caplog, limits):
+    runs.make(tmp_path, value_limits=limits).train()
+    said = [each.message for each in caplog.records if each.levelname == "WARNING"]
+    assert len(said) == bool(limits)
+    for message in said:
+        assert message.startswith("train, step 4: the mean pred_value is")
+        assert "optim.qvalue_lr" in message
 
 
 # tensordict 0.14.3 is slow here; when this fails, the import can go.
