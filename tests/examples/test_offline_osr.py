@@ -141,7 +141,7 @@ def refused(folder: Path, run, arguments: list[str], named: list[str]) -> None:
 @pytest.mark.parametrize(
     ("override", "named"),
     [
-        ("loss.chunk_size=0", "chunk_size must be at least 1 or None, got 0"),
+        ("loss.chunk_size=0", "chunk_size must be at least 1, got 0"),
         ("trainer.cudagraph=true", "cudagraph=True needs a CUDA device"),
     ],
 )
@@ -247,6 +247,9 @@ def test_help_offers_the_groups_of_this_script_and_fits_a_screen(tmp_path, run):
     conf = Path(__file__).parents[2] / "conf"
     offered = output.split("Groups, ")[1].split("Any key ")[0]
     names = set(re.findall(r"[\w-]+(?=[,\n])", offered))
-    groups = ("env", "data", "inverse_dynamics", "loss", "logger", "preset")
+    groups = (
+        *("env", "data", "inverse_dynamics", "loss", "perturbation"),
+        *("logger", "preset"),
+    )
     files = {path.stem for group in groups for path in conf.glob(f"{group}/*.yaml")}
     assert names - {"basic"} == files | {"pool", "cluster"}

@@ -234,7 +234,7 @@ class Checkpoints:
         found = sorted(self.folder.glob("checkpoint-*.torchrl"), reverse=True)
         for path in found:
             damage = find_damage(path)
-            if damage:
+            if damage is not None:
                 log.warning(f"{path} is damaged ({damage}); trying the one before.")
                 continue
             try:
