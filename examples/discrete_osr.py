@@ -27,7 +27,7 @@ from torchrl import torchrl_logger
 from torchrl.data import ReplayBuffer
 from torchrl.objectives import LossModule, SoftUpdate
 
-from torchrl_osr import DiscreteInverseDynamicsLoss, DiscreteOSRLoss, StatePerturbation
+from torchrl_osr import DiscreteOSRLoss, InverseDynamicsLoss, StatePerturbation
 from torchrl_osr.data import (
     check_dataset,
     make_replay_buffer,
@@ -152,8 +152,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
 
     torch.manual_seed(args.seed)
     network = categorical_inverse_dynamics(*SIZES, num_cells=CELLS)
-    train(DiscreteInverseDynamicsLoss(network), buffer(), args.model_steps, None)
-    (nll,) = DiscreteInverseDynamicsLoss(network, states="clean")(held_out).values()
+    train(InverseDynamicsLoss(network), buffer(), args.model_steps, None)
+    (nll,) = InverseDynamicsLoss(network, states="clean")(held_out).values()
     seeds = EVALUATION_SEED + np.arange(args.episodes)
     results |= {"model_nll": nll.item(), "episode_seeds": seeds.tolist(), "returns": {}}
     for name in args.loss:

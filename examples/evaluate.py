@@ -164,7 +164,7 @@ def evaluate(
             write_json(partial, begun)
     return {
         "env": run.env.name,
-        "data": run.data.level,
+        "data": run.data.quality,
         "threshold": distance.threshold,
         "evaluations": evaluations,
         "summary": summarize_disturbances(evaluations),

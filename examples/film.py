@@ -97,7 +97,7 @@ def main(cfg: DictConfig) -> None:
         Take.of(name, played[name].disturbed, episode, end - duration, end)
         for name in filmed
     ]
-    title = f"{run.env.name} {run.data.level}: {in_words(cfg, takes[0].force)}"
+    title = f"{run.env.name} {run.data.quality}: {in_words(cfg, takes[0].force)}"
     one = f"one episode: seed {cfg.seed + episode}, {why}"
     draw(cfg, takes, camera, sampled_observations(data), trained, results, title, one)
     write_json(
@@ -112,7 +112,7 @@ def main(cfg: DictConfig) -> None:
     )
     strength = cfg.push if cfg.knock is None else cfg.knock
     print(
-        f"{run.env.name} {run.data.level}, {event}={strength:g}, {len(kept)} episodes"
+        f"{run.env.name} {run.data.quality}, {event}={strength:g}, {len(kept)} episodes"
     )
     print(survival_table(results))
     print(f"  filmed: {one}\n  files:  {trained.folder}")
@@ -177,9 +177,9 @@ def in_words(cfg: DictConfig, force: float) -> str:
 def behavior_of(trained: TrainedRun) -> Policy:
     """The last, hence best, behaviour policy of the run's data."""
     run = trained.config
-    names = quality_policies(run.data.level)
+    names = quality_policies(run.data.quality)
     if not names:
-        raise ValueError(f"{run.data.level} data have no behaviour policy to film.")
+        raise ValueError(f"{run.data.quality} data have no behaviour policy to film.")
     policy = load_behavior_policy(run.env.name, names[-1])
     return lambda states: torch.from_numpy(policy.deterministic(states.numpy()))
 

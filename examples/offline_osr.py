@@ -82,8 +82,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
     torch.manual_seed(cfg.seed)
     noise = {"std": cfg.perturbation.std, "noise": cfg.perturbation.noise}
     perturbation = StatePerturbation(**noise, seed=cfg.seed)
-    buffer = data.buffer(cfg.trainer.batch_size)
-    buffer.append_transform(perturbation)
+    data.buffer.append_transform(perturbation)
 
     # Networks, and the policy's loss, which holds the inverse dynamics model.
     actor, inverse_dynamics, loss = make_learner(cfg, *data.sizes, device)
@@ -93,7 +92,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
     # checkpoint at their intervals. Both phases have this in common:
     new_trainer = partial(
         OfflineTrainer,
-        replay_buffer=buffer,
+        replay_buffer=data.buffer,
         components={"perturbation": perturbation, "observation_norm": data.norm},
         loggers=make_loggers(folder=folder, **cfg.logger),
         log_interval=cfg.trainer.log_interval,
@@ -177,7 +176,7 @@ def report(
         "best": best,
     }
     run_folder.write_json(folder / "returns.json", results | {"evaluations": history})
-    name = f"{cfg.env.name} {cfg.data.level}"
+    name = f"{cfg.env.name} {cfg.data.quality}"
     learning_curve(
         history,
         read_scalars(folder / "csv" / "scalars" / "policy"),

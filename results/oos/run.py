@@ -36,9 +36,9 @@ METHODS = {
     "cql_noisy_bc_beta_1e-1": ["loss=cql_noisy_bc", "perturbation.std=0.1"],
 }
 DATA = [
-    f"{env}-{level}"
+    f"{env}-{quality}"
     for env in ("hopper", "walker2d")
-    for level in ("medium-replay", "medium-expert")
+    for quality in ("medium-replay", "medium-expert")
 ]
 
 
@@ -49,10 +49,10 @@ def finished(file: Path, key: str, value: object) -> bool:
 
 def run(folder: Path, data: str, method: str, seed: int) -> None:
     """Train one run, then disturb its last five policies."""
-    env, level = data.split("-", 1)
+    env, quality = data.split("-", 1)
     if not finished(folder / "status.json", "status", "done"):
         train = [
-            "offline_osr.py", f"env={env}", f"data={level}", f"seed={seed}",
+            "offline_osr.py", f"env={env}", f"data={quality}", f"seed={seed}",
             *METHODS[method], "trainer.progress=false", f"hydra.run.dir={folder}",
         ]  # fmt: skip
         call(train, folder / "train.txt")

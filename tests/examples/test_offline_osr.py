@@ -141,7 +141,7 @@ def refused(folder: Path, run, arguments: list[str], named: list[str]) -> None:
 @pytest.mark.parametrize(
     ("override", "named"),
     [
-        ("loss.chunk_size=0", "chunk_size must be at least 1 or None, got 0"),
+        ("loss.chunk_size=0", "chunk_size must be at least 1, got 0"),
         ("trainer.cudagraph=true", "cudagraph=True needs a CUDA device"),
     ],
 )
@@ -186,15 +186,22 @@ def test_multirun_names_the_failed_job(tmp_path, run, tiny):
 
 def test_every_other_loss_runs_to_its_end(tmp_path, run, sizes):
     """One sweep over them; the main one has its own tests."""
-    losses = "cql,osr_v,osr_10,sac_10,edac_10,osr_adversarial"
+    losses = "cql,osr_v,osr_10,sac_10,edac_10"
     arguments = [*sizes, f"loss={losses}", "hydra.sweep.dir=sweep"]
     code, output = run(tmp_path, SCRIPT, "-m", *arguments)
     assert code == 0, output
     assert "Warning" not in output
     folders = list((tmp_path / "sweep").glob("*/returns.json"))
-    assert len(folders) == 6
+    assert len(folders) == 5
     for path in folders:
         assert json.loads(path.read_text())["last"]["step"] == 40
+
+
+def test_adversary_chooses_the_perturbed_states(tmp_path, run, sizes):
+    arguments = [*sizes, "perturbation=adversarial", "hydra.run.dir=run"]
+    code, output = run(tmp_path, SCRIPT, *arguments)
+    assert code == 0, output
+    assert "torchrl_osr.Adversary" in (tmp_path / "run" / "config.yaml").read_text()
 
 
 def test_official_preset_with_its_model_runs_in_half_precision(tmp_path, run, sizes):
@@ -240,6 +247,9 @@ def test_help_offers_the_groups_of_this_script_and_fits_a_screen(tmp_path, run):
     conf = Path(__file__).parents[2] / "conf"
     offered = output.split("Groups, ")[1].split("Any key ")[0]
     names = set(re.findall(r"[\w-]+(?=[,\n])", offered))
-    groups = ("env", "data", "inverse_dynamics", "loss", "logger", "preset")
+    groups = (
+        *("env", "data", "inverse_dynamics", "loss", "perturbation"),
+        *("logger", "preset"),
+    )
     files = {path.stem for group in groups for path in conf.glob(f"{group}/*.yaml")}
     assert names - {"basic"} == files | {"pool", "cluster"}

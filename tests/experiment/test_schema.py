@@ -21,7 +21,7 @@ from torchrl_osr.data import (
     load_behavior_card,
 )
 from torchrl_osr.experiment import schema as config
-from torchrl_osr.experiment.derived_schema import schema_of
+from torchrl_osr.experiment.schema import schema_of
 
 CONF = Path(__file__).parents[2] / "conf"
 GROUPS = ["env", "data", "inverse_dynamics", "loss", "logger", "perturbation", "preset"]

@@ -42,7 +42,7 @@ LEVELS = [
 ]
 CONFIG = {
     "env": {"name": "hopper", "id": "Hopper-v5"},
-    "data": {"level": "medium-replay", "num_transitions": 1000, "random_share": 0.0,
+    "data": {"quality": "medium-replay", "num_transitions": 1000, "random_share": 0.0,
              "path": None},
     "network": {"num_cells": [128, 128], "layer_norm": True},
     "perturbation": {"std": 0.001, "noise": "gaussian"},
@@ -74,7 +74,7 @@ def write_run(
     scores: dict[int, list[float]],
     *,
     env: str = "hopper",
-    level: str = "medium-replay",
+    quality: str = "medium-replay",
     seed: int = 0,
     loss: dict | None = None,
     changes: dict | None = None,
@@ -88,7 +88,7 @@ def write_run(
     folder.mkdir(parents=True, exist_ok=True)
     config = OmegaConf.create(copy.deepcopy(CONFIG))
     config.env = {"name": env, "id": IDS[env]}
-    config.data.level, config.seed = level, seed
+    config.data.quality, config.seed = quality, seed
     config.loss.update(loss or {})
     config.trainer.steps = max(scores, default=8000)
     for key, value in (changes or {}).items():
@@ -130,7 +130,13 @@ def episodes(rng, score: float, size: int = 10) -> list[float]:
 
 
 def robustness(
-    rng, env: str, level: str, steps: list[int], clean: float, lost: float, back: float
+    rng,
+    env: str,
+    quality: str,
+    steps: list[int],
+    clean: float,
+    lost: float,
+    back: float,
 ) -> dict:
     """Return what a robustness file holds."""
     evaluations = []
@@ -153,7 +159,7 @@ def robustness(
         part = {"scores": before.tolist(), "returns": before.tolist(), "seeds": seeds}
         evaluations.append({"step": step, "clean": part, "levels": rows})
     return {
-        "format": 1, "versions": VERSIONS, "env": env, "data": level, "suite": "oos",
+        "format": 1, "versions": VERSIONS, "env": env, "data": quality, "suite": "oos",
         "episodes": 10, "seed": 20_000, "threshold": 1.7, "evaluations": evaluations,
         "summary": [],
     }  # fmt: skip
@@ -197,7 +203,7 @@ def write_experiment(
 ) -> Path:
     """Write runs of all methods, laid out as results/oos/run.py does."""
     for number, name in enumerate(data):
-        env, level = name.split("-", 1)
+        env, quality = name.split("-", 1)
         for method, (final, lost, back) in METHODS.items():
             for seed in seeds:
                 rng = np.random.default_rng([number, final, seed])
@@ -207,13 +213,14 @@ def write_experiment(
                     for step in range(1000, 8001, 1000)
                 }
                 run = write_run(
-                    folder / name / method / f"seed{seed}", curve, env=env, level=level,
-                    seed=seed, loss=LOSSES[method], versions=versions,
+                    folder / name / method / f"seed{seed}", curve,
+                    env=env, quality=quality, seed=seed, loss=LOSSES[method],
+                    versions=versions,
                     data_score=15.6 + 30 * number,
-                    overrides=[f"env={env}", f"data={level}", f"loss={method}"],
+                    overrides=[f"env={env}", f"data={quality}", f"loss={method}"],
                 )  # fmt: skip
                 content = robustness(
-                    rng, env, level, [7000, 8000], final_here, lost, back
+                    rng, env, quality, [7000, 8000], final_here, lost, back
                 )
                 write_json(run / "robustness-oos.json", content)
     return folder

@@ -59,10 +59,10 @@ def test_symbolic_links_are_refused(path):
     assert "'link' is a symbolic link" in find_damage(path)
 
 
-def test_compressed_members_are_refused(path):
+def test_members_that_are_compressed_are_refused(path):
     with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("zeros", bytes(10**7))
-    assert "is compressed" in find_damage(path)
+    assert "'zeros' is compressed" in find_damage(path)
 
 
 @pytest.mark.parametrize("entry", ["path", "files"])
@@ -105,7 +105,7 @@ def test_packed_tensors_are_refused(path):
 
     rewritten(path, pack)
     assert find_damage(path) is None
-    with pytest.raises(CheckpointError, match="is compressed"):
+    with pytest.raises(CheckpointError, match="archive/data/9' is compressed"):
         safe_checkpoint(network=torch.nn.Linear(3, 2), history=[]).load(path)
 
 

@@ -64,12 +64,13 @@ def test_bad_update_stops_a_graph(tmp_path, runs):
         trainer.train()
 
 
-def test_optimizer_that_counts_on_the_host_is_refused(tmp_path, runs):
+@pytest.mark.parametrize("options", [{"fused": True}, {"capturable": True}])
+def test_optimizer_that_needs_the_host_is_refused(tmp_path, runs, options):
     trainer = runs.make(tmp_path, device="cuda")
-    with pytest.raises(ValueError, match="capturable=True"):
+    with pytest.raises(ValueError, match="fused=True, capturable=True"):
         type(trainer)(
             trainer.loss_module,
-            torch.optim.Adam(trainer.loss_module.parameters(), fused=True),
+            torch.optim.Adam(trainer.loss_module.parameters(), **options),
             trainer.buffer,
             total_steps=1,
             folder=tmp_path,
@@ -77,14 +78,15 @@ def test_optimizer_that_counts_on_the_host_is_refused(tmp_path, runs):
         )
 
 
-def test_skipping_needs_a_fused_optimizer(tmp_path, runs):
-    trainer = runs.make(tmp_path, device="cuda")
-    with pytest.raises(ValueError, match=r"fused=True\); got SGD without"):
-        type(trainer)(
-            trainer.loss_module,
-            torch.optim.SGD(trainer.loss_module.parameters(), lr=0.1),
-            trainer.buffer,
-            total_steps=1,
-            folder=tmp_path,
-            nonfinite="skip",
-        )
+def test_other_optimizers_are_checked_at_every_update(tmp_path, runs):
+    assert trained(runs, tmp_path / "fused").nonfinite_check.deferred
+    trainer = runs.make(tmp_path / "other", device="cuda")
+    other = type(trainer)(
+        trainer.loss_module,
+        torch.optim.SGD(trainer.loss_module.parameters(), lr=0.1),
+        trainer.buffer,
+        total_steps=1,
+        folder=tmp_path,
+        nonfinite="skip",
+    )
+    assert not other.nonfinite_check.deferred

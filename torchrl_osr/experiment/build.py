@@ -1,8 +1,4 @@
-"""Data, networks and loss as a configuration has them.
-
-The trainer's script builds them to be trained; whoever loads a trained run builds them
-once more and fills them from its checkpoint.
-"""
+"""Data, networks and loss as a configuration has them, to train or to be loaded."""
 
 from __future__ import annotations
 
@@ -24,20 +20,14 @@ from torchrl_osr.modules import critic_ensemble
 def load_data(
     cfg: DictConfig, *, progress: bool = True
 ) -> tuple[TensorDict, dict[str, Any]]:
-    """Load the run's data set, see :func:`~torchrl_osr.data.load_dataset`.
+    """Data set and manifest of a run, see :func:`~torchrl_osr.data.load_dataset`.
 
-    Rewards are the task's own: what is trained on is scaled later, see
-    :func:`~torchrl_osr.experiment.training_data.load_training_data`.
-
-    Args:
-        cfg: a whole configuration of ``examples/offline_osr.py``.
-
-    Keyword Args:
-        progress: show a progress bar when on a terminal. Default: ``True``.
+    Rewards are the task's own: :mod:`~torchrl_osr.experiment.training_data` scales
+    them.
     """
     return load_dataset(
         cfg.env.name,
-        cfg.data.level,
+        cfg.data.quality,
         env_id=cfg.env.id,
         path=cfg.data.path,
         download=cfg.data.download,
@@ -60,8 +50,7 @@ def check_storage(cfg: DictConfig) -> str:
     if storage == "disk" and cfg.trainer.cudagraph:
         raise ValueError(
             "trainer.cudagraph=true cannot be had with data.storage=disk: a CUDA graph "
-            "repeats kernels, and reading a file is none. Take data.storage=memory, or "
-            "trainer.cudagraph=false."
+            "reads no files. Take data.storage=memory, or trainer.cudagraph=false."
         )
     return storage
 

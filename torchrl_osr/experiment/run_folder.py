@@ -31,16 +31,10 @@ FREE_KEYS = ("resume", "trainer.progress")
 
 
 def check_keys(config: DictConfig) -> None:
-    """Raise if a composed configuration has keys that its schema lacks.
+    """Raise a ValueError if a composed configuration has keys that its schema lacks.
 
     Hydra refuses a mistyped ``key=value``, but adds ``+key=value`` even to a typed
     group, where nothing would read it.
-
-    Args:
-        config: composed with its schema.
-
-    Raises:
-        ValueError: naming the keys.
     """
     unknown = list(_unknown_keys(config))
     if unknown:
@@ -63,13 +57,9 @@ def _unknown_keys(node: DictConfig, prefix: str = "") -> Iterator[str]:
 def claim(folder: Path, config: DictConfig) -> None:
     """Write the run's configuration into its folder, or compare it with the one there.
 
-    Args:
-        folder: made if need be.
-        config: the composed configuration.
-
     Raises:
-        ValueError: if the folder holds a run of another configuration, naming what
-            differs.
+        ValueError: if the folder, which is made if need be, holds a run of another
+            configuration, naming what differs.
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / CONFIG
@@ -93,11 +83,11 @@ def claim(folder: Path, config: DictConfig) -> None:
 
 
 def saved_config(folder: Path | str, overrides: Sequence[str]) -> DictConfig:
-    """Read the configuration of a run that shall be continued.
+    """Configuration of a run that shall be continued.
 
     Args:
         folder: of the run.
-        overrides: what stood on the command line; only ``resume=`` may.
+        overrides: of the command line; only ``resume=`` may be among them.
 
     Raises:
         FileNotFoundError: if there is no run in ``folder``.

@@ -1,20 +1,24 @@
 """The typed schema of the examples' configuration.
 
-Types and meanings are here, values in ``conf/``. Importing this module changes nothing;
-:func:`register` makes the schema known to Hydra, which then refuses a mistyped key or a
-value of the wrong type by name.
+Types and meanings are here, values in ``conf/``. :func:`register` makes the schema
+known to Hydra, which then refuses a mistyped key or a value of the wrong type by name.
+An option of a loss is declared once, in the loss: its schema is derived from that.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+import functools
+import inspect
+import operator
+from collections.abc import Iterator
+from dataclasses import dataclass, field, make_dataclass
+from types import NoneType
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, OmegaConf
 
 from torchrl_osr import objectives
-from torchrl_osr.experiment.derived_schema import schema_of
 
 # File systems allow 255 bytes, and temporary names beside it need some of them.
 MAX_FOLDER_NAME = 200
@@ -38,7 +42,7 @@ class DataConfig:
     """Which data set: rolled out from the packaged behaviour policies, or recorded.
 
     Attributes:
-        level: random, medium, medium-replay, medium-expert or expert; diverse or play
+        quality: random, medium, medium-replay, medium-expert or expert; diverse or play
             in a maze; minari, d4rl or file for recorded data.
         path: of recorded data, see docs/your_data.md.
         download: fetch a set that path names.
@@ -52,7 +56,7 @@ class DataConfig:
         reward_shift: added to them after it; evaluation has the task's own rewards.
     """
 
-    level: str = MISSING
+    quality: str = MISSING
     path: str | None = None
     download: bool = MISSING
     num_transitions: int = MISSING
@@ -220,12 +224,70 @@ class OfflineOSRConfig:
     resume: str | None = None
 
 
-def register() -> None:
-    """Make the schemas known to Hydra: ``offline_osr_schema`` and the group ``schema``.
+def schema_of(target: type) -> type:
+    """A structured config with the keyword options of ``target``.
 
-    The group holds one schema for each class of :mod:`torchrl_osr.objectives`, by its
-    name. And two resolvers: ``run_dir``, by which ``resume=folder`` becomes the run's
-    folder, and ``job_dir``, which names a sweep's folders by number and overrides.
+    Args:
+        target: a class whose keyword-only parameters, and those of the bases that its
+            ``**options`` reach, are the fields; or a dataclass.
+
+    Returns:
+        A dataclass whose ``_target_`` is the public name of ``target``.
+
+    Examples:
+        >>> from torchrl_osr import OSRLoss
+        >>> schema = schema_of(OSRLoss)
+        >>> schema().recovery_weight, schema()._target_
+        (0.5, 'torchrl_osr.OSRLoss')
+    """
+    name = f"torchrl_osr.{target.__name__}"
+    options: dict[str, tuple[str, Any, Any]] = {"_target_": ("_target_", str, name)}
+    for parameter, annotation in _keyword_options(target):
+        option = parameter.name, _config_type(annotation), parameter.default
+        options.setdefault(parameter.name, option)
+    return make_dataclass(f"{target.__name__}Config", options.values())
+
+
+def _keyword_options(target: type) -> Iterator[tuple[inspect.Parameter, Any]]:
+    """Parameters with a default that a configuration can set, and their types."""
+    for each in target.__mro__:
+        initialize = vars(each).get("__init__")
+        if initialize is None:
+            continue
+        hints = get_type_hints(initialize, vars(inspect.getmodule(each)))
+        parameters = inspect.signature(initialize).parameters.values()
+        is_dataclass = "__dataclass_fields__" in vars(each)
+        for parameter in parameters:
+            if parameter.kind is parameter.KEYWORD_ONLY or (
+                is_dataclass and parameter.default is not parameter.empty
+            ):
+                yield parameter, hints[parameter.name]
+        if not any(each.kind is each.VAR_KEYWORD for each in parameters):
+            return
+
+
+def _config_type(annotation: Any) -> Any:
+    """The annotation as OmegaConf knows it: a ``Literal`` is the literals' type."""
+    if get_origin(annotation) is Literal:
+        (kind,) = {type(value) for value in get_args(annotation)}
+        return kind
+    parts = get_args(annotation)
+    if not parts:
+        return annotation
+    kinds = dict.fromkeys(_config_type(part) for part in parts if part is not NoneType)
+    if float in kinds and len(kinds) > 1:
+        kinds[int] = None  # in a union OmegaConf does not make a float of an int
+    if NoneType in parts:
+        kinds[None] = None
+    return functools.reduce(operator.or_, kinds)
+
+
+def register() -> None:
+    """Make schemas and resolvers known to Hydra.
+
+    ``offline_osr_schema``, and in the group ``schema`` one for each class of
+    :mod:`torchrl_osr.objectives`; ``run_dir``, by which ``resume=folder`` becomes the
+    run's folder, and ``job_dir``, which names a sweep's folders.
     """
     store = ConfigStore.instance()
     store.store(name="offline_osr_schema", node=OfflineOSRConfig)

@@ -13,12 +13,10 @@ from typing import NamedTuple
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict
-from torch import Tensor
-from torchrl.data import ReplayBuffer, TensorStorage
+from torchrl.data import ReplayBuffer
 from torchrl.envs import Compose, ObservationNorm, RewardScaling
 
 from torchrl_osr.data import (
-    check_memory,
     held_out_rows,
     make_replay_buffer,
     observation_statistics,
@@ -31,26 +29,20 @@ MAX_HELD_OUT = 50_000
 
 
 class TrainingData(NamedTuple):
-    """The rows to train on and to judge by, shared by all seeds of a run.
+    """The rows to train on and to judge by, prepared and on the device.
 
     Attributes:
-        rows: in memory prepared and on the device; on disk as they are.
-        left_out: of a set on disk, sorted numbers of the rows not to train on.
-        held_out: as they are trained on, on the device.
-        norm: what standardises observations, on the device.
-        reward: factor and addend of the rewards.
+        buffer: samples ``trainer.batch_size`` rows; the trainer seeds it.
+        held_out: rows that are not in the buffer.
+        norm: what standardises observations.
         largest_reward: the largest absolute reward, held-out rows included.
-        device: where the batches are.
         score: normalised score of the behaviour, if it is known.
     """
 
-    rows: TensorDict
-    left_out: Tensor | None
+    buffer: ReplayBuffer
     held_out: TensorDict
     norm: ObservationNorm
-    reward: tuple[float, float]
     largest_reward: float
-    device: torch.device
     score: float | None
 
     @property
@@ -58,25 +50,12 @@ class TrainingData(NamedTuple):
         """``S`` and ``A``."""
         return self.held_out["observation"].shape[-1], self.held_out["action"].shape[-1]
 
-    def buffer(self, batch_size: int) -> ReplayBuffer:
-        """Replay buffer over the rows, which are shared; its generator is not."""
-        if self.left_out is None:
-            return ReplayBuffer(storage=TensorStorage(self.rows), batch_size=batch_size)
-        return make_replay_buffer(
-            self.rows,
-            batch_size=batch_size,
-            seed=0,  # the trainer brings a generator of its own
-            left_out=self.left_out,
-            transform=_preparation(self.norm, self.reward).to(self.device),
-            device=self.device,
-        )
-
 
 def load_training_data(cfg: DictConfig, device: torch.device) -> TrainingData:
     """Load a run's data, split and prepared, see ``data`` of its configuration.
 
-    Rewards become ``data.reward_scale * r + data.reward_shift``; the manifest and the
-    score are of the task's own.
+    Rewards become ``data.reward_scale * r + data.reward_shift``; the score is of the
+    task's own.
 
     Args:
         cfg: a whole configuration of ``examples/offline_osr.py``.
@@ -89,43 +68,28 @@ def load_training_data(cfg: DictConfig, device: torch.device) -> TrainingData:
     on_disk = check_storage(cfg) == "disk"
     data, manifest = load_data(cfg, progress=cfg.trainer.progress)
     loc, scale = observation_statistics(data) if cfg.data.standardize else (0.0, 1.0)
-    norm = _norm(loc, scale)
-    reward = cfg.data.reward_scale, cfg.data.reward_shift
+    factor, addend = cfg.data.reward_scale, cfg.data.reward_shift
     extremes = torch.stack(data["next", "reward"].aminmax())
-    largest = (reward[0] * extremes + reward[1]).abs().max().item()
-    prepare = _preparation(norm, reward)
-    left_out = None
+    largest = (factor * extremes + addend).abs().max().item()
+
+    def norm() -> ObservationNorm:  # one transform belongs to one buffer
+        keys = ["observation", ("next", "observation")]
+        return ObservationNorm(loc, scale, in_keys=keys, standard_normal=True)
+
+    prepare = Compose(norm())
+    if (factor, addend) != (1.0, 0.0):
+        prepare.append(RewardScaling(addend, factor, in_keys=[("next", "reward")]))
+    options = {"batch_size": cfg.trainer.batch_size, "seed": 0, "device": device}
+    share, seed = cfg.data.held_out, cfg.data.seed
     if on_disk:
-        chosen = held_out_rows(len(data), cfg.data.held_out, seed=cfg.data.seed)
-        left_out = chosen.sort().values
-        rows, held_out = data, prepare(data[chosen[:MAX_HELD_OUT].sort().values])
-    else:
-        rows, held_out = split_held_out(
-            prepare(data), cfg.data.held_out, seed=cfg.data.seed
+        chosen = held_out_rows(len(data), share, seed=seed)
+        held_out = prepare(data[chosen[:MAX_HELD_OUT].sort().values])
+        left_out, prepare = chosen.sort().values, prepare.to(device)
+        buffer = make_replay_buffer(
+            data, left_out=left_out, transform=prepare, **options
         )
-        check_memory(rows, device)
-        rows = rows.to(device)
-    return TrainingData(
-        rows,
-        left_out,
-        held_out.to(device),
-        norm.to(device),
-        reward,
-        largest,
-        device,
-        manifest["normalized_score"],
-    )
-
-
-def _preparation(norm: ObservationNorm, reward: tuple[float, float]) -> Compose:
-    """Transform that standardises observations and scales rewards."""
-    scale, shift = reward
-    transform = Compose(_norm(norm.loc, norm.scale))  # one belongs to one buffer
-    if reward != (1.0, 0.0):
-        transform.append(RewardScaling(shift, scale, in_keys=[("next", "reward")]))
-    return transform
-
-
-def _norm(loc: Tensor | float, scale: Tensor | float) -> ObservationNorm:
-    keys = ["observation", ("next", "observation")]
-    return ObservationNorm(loc, scale, in_keys=keys, standard_normal=True)
+    else:
+        rows, held_out = split_held_out(prepare(data), share, seed=seed)
+        buffer = make_replay_buffer(rows, **options)
+    held_out, score = held_out.to(device), manifest["normalized_score"]
+    return TrainingData(buffer, held_out, norm().to(device), largest, score)

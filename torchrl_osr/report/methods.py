@@ -38,7 +38,7 @@ IGNORED = (
 )
 """Settings that decide how a number is computed, not which."""
 
-IDENTITY = ("seed", "env.", "data.level", "data.random_share", "data.path")
+IDENTITY = ("seed", "env.", "data.quality", "data.random_share", "data.path")
 """Settings that the report sorts runs by."""
 
 METHOD = ("loss.", "perturbation.", "inverse_dynamics.", "num_random")

@@ -40,7 +40,7 @@ MAX_OFFSET = 100_000
 """Steps from a disturbance to the end of its distance curve."""
 
 SETTINGS = (
-    *("env.name", "data.level", "data.path", "data.random_share", "seed"),
+    *("env.name", "data.quality", "data.path", "data.random_share", "seed"),
     *("trainer.steps", "trainer.device", "trainer.num_threads"),
 )
 """Settings that a report reads."""
@@ -106,7 +106,7 @@ class Run:
         share, path = self.config["data.random_share"], self.config["data.path"]
         mixed = f", {100 * share:g} % random" if share else ""
         recorded = f" {path}" if path else ""
-        return f"{self.env} {self.config['data.level']}{recorded}{mixed}"
+        return f"{self.env} {self.config['data.quality']}{recorded}{mixed}"
 
     @property
     def seed(self) -> int:
@@ -442,7 +442,7 @@ def _method(folder: Path, record: Mapping[str, Any]) -> str:
     config = flatten(record["config"])
     data, method, seed = ("", "", *folder.resolve().parts)[-3:]
     if re.fullmatch(r"seed\d+", seed) and data.split("-")[0] in REFERENCE_RETURNS:
-        here = f"{config['env.name']}-{config['data.level']}"
+        here = f"{config['env.name']}-{config['data.quality']}"
         if not data.startswith(here) or seed != f"seed{config['seed']}":
             raise ValueError(
                 f"the folder says {data} and {seed}, its configuration {here} and "

@@ -2,7 +2,6 @@
 
 from torchrl_osr.trainers.hardware import check_hardware
 from torchrl_osr.trainers.interruption import Interrupted
-from torchrl_osr.trainers.offline import OfflineTrainer
-from torchrl_osr.trainers.value_limits import largest_value
+from torchrl_osr.trainers.offline import OfflineTrainer, largest_value
 
 __all__ = ["Interrupted", "OfflineTrainer", "check_hardware", "largest_value"]

@@ -36,53 +36,48 @@ class WeightsOnlyAdapter(CheckpointAdapter):
     adapter_id = "torchrl_osr.weights_only"
     filename = "state.pt"
 
-    def save(
-        self,
-        component: Any,
-        path: Path,
-        *,
-        args: tuple[Any, ...],
-        kwargs: Mapping[str, Any],
-    ) -> None:
+    def save(self, component: Any, path: Path, **_: Any) -> None:
         """Write the component's state below the folder ``path``."""
         path.mkdir(parents=True, exist_ok=True)
         # Given a path, torch.save turns an error of the disk into a RuntimeError.
         with (path / self.filename).open("wb") as file:
-            torch.save(component.state_dict(*args, **kwargs), file)
+            torch.save(component.state_dict(), file)
 
-    def load(
-        self,
-        component: Any,
-        path: Path,
-        *,
-        map_location: Any,
-        tensor_load_kwargs: Mapping[str, Any],
-        args: tuple[Any, ...],
-        kwargs: Mapping[str, Any],
-    ) -> None:
+    def load(self, component: Any, path: Path, *, map_location: Any, **_: Any) -> None:
         """Restore the component's state from the folder ``path``."""
-        del tensor_load_kwargs
         with zipfile.ZipFile(path / self.filename) as archive:
-            refuse_archive(archive)
+            _refuse(archive)
         state = torch.load(
             path / self.filename, map_location=map_location, weights_only=True
         )
         if isinstance(component, torch.nn.Module):
             _check_fits(component.state_dict(), state)
-        component.load_state_dict(state, *args, **kwargs)
+        component.load_state_dict(state)
+
+
+def _refuse(archive: zipfile.ZipFile) -> None:
+    """Raise if members lead out of the archive, or are compressed as ours never are."""
+    refuse_archive(archive)
+    for member in archive.infolist():
+        if member.compress_type != zipfile.ZIP_STORED:
+            raise ValueError(f"{member.filename!r} is compressed")
 
 
 def _check_fits(here: Mapping[str, Any], there: Mapping[str, Any]) -> None:
     """Raise before anything is overwritten; tensordict's own error names no shapes."""
-
-    def shape(state: Mapping[str, Any], key: str) -> str:
-        value = state.get(key, "nothing")
-        return str(tuple(value.shape)) if isinstance(value, torch.Tensor) else "nothing"
-
+    shapes, saved = (
+        {
+            key: tuple(value.shape)
+            for key, value in state.items()
+            if torch.is_tensor(value)
+        }
+        for state in (here, there)
+    )
     differences = [
-        f"{key} is {shape(there, key)} in the file, {shape(here, key)} here"
-        for key in sorted(here.keys() | there.keys())
-        if shape(here, key) != shape(there, key)
+        f"{key} is {saved.get(key, 'nothing')} in the file, "
+        f"{shapes.get(key, 'nothing')} here"
+        for key in sorted(shapes.keys() | saved.keys())
+        if shapes.get(key) != saved.get(key)
     ]
     if differences:
         shown = "; ".join(differences[:3])
@@ -90,11 +85,7 @@ def _check_fits(here: Mapping[str, Any], there: Mapping[str, Any]) -> None:
 
 
 class GeneratorState:
-    """Makes a :class:`torch.Generator` checkpointable.
-
-    Args:
-        generator: whose state to save and restore.
-    """
+    """Makes a :class:`torch.Generator` checkpointable."""
 
     def __init__(self, generator: torch.Generator) -> None:
         self.generator = generator
@@ -111,9 +102,8 @@ class GeneratorState:
 def safe_checkpoint(**components: Any) -> Checkpoint:
     """Checkpoint of ``components`` in one archive without pickled objects.
 
-    Args:
-        **components: whatever has ``state_dict`` and ``load_state_dict``, or is
-            JSON-compatible (lists and mappings are restored in place).
+    A component has ``state_dict`` and ``load_state_dict``, or is JSON-compatible (lists
+    and mappings are restored in place).
     """
     checkpoint = Checkpoint(format="archive")
     for name, component in components.items():
@@ -126,16 +116,13 @@ def safe_checkpoint(**components: Any) -> Checkpoint:
 def find_damage(path: Path) -> str | None:
     """Description of a checkpoint's damage, ``None`` if it is whole.
 
-    Members with a path out of the archive count as damage, and so do compressed ones,
-    which ours are not: torchrl.checkpoint unpacks whatever the manifest lists.
-
-    Args:
-        path: of the archive. Every member is read and its checksum compared, and the
-            components' files must be there.
+    Every member's checksum is compared, and the components' files must be there.
+    Members that lead out of the archive or are compressed count as damage, since
+    torchrl.checkpoint unpacks whatever the manifest lists.
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            refuse_archive(archive)
+            _refuse(archive)
             damaged = archive.testzip()
             members = set(archive.namelist())
         if damaged is not None:
@@ -163,8 +150,7 @@ class Checkpoints:
 
     Args:
         folder: where they are; made when the run is restored.
-        components: the live objects to save and restore, by name, see
-            :func:`safe_checkpoint`.
+        components: live objects, by name, see :func:`safe_checkpoint`.
 
     Keyword Args:
         interval: steps between two checkpoints.
@@ -186,8 +172,7 @@ class Checkpoints:
 
     def latest(self) -> Path | None:
         """Path of the newest checkpoint, or ``None``."""
-        path: Path | None = self._rotation.latest()
-        return path
+        return self._rotation.latest()  # type: ignore[no-any-return]
 
     def check_room(
         self, loss_module: torch.nn.Module, optimizer: torch.optim.Optimizer
@@ -205,16 +190,8 @@ class Checkpoints:
     def save(self, step: int, *, extra: bool = False) -> None:
         """Write the checkpoint of a step; the oldest one makes room.
 
-        Args:
-            step: of the run.
-
-        Keyword Args:
-            extra: whether it is one more, written because the run is interrupted. It is
-                removed when the next regular one is written, so that the folder of a
-                continued run ends up with the files of an undisturbed one.
-
-        Raises:
-            OSError: if it cannot be written.
+        An ``extra`` one, of an interrupted run, stays until the next regular one is
+        written: a continued run ends up with the files of an undisturbed one.
         """
         outdated = [
             path for path in self._rotation.checkpoints()
@@ -231,12 +208,10 @@ class Checkpoints:
         for path in outdated:
             path.unlink()
 
-    def save_best(self, names: Collection[str], metadata: Mapping[str, Any]) -> None:
+    def save_best(self, names: Collection[str], metadata: dict[str, Any]) -> None:
         """Write the components of these names to :attr:`best_path`."""
         with self.write_errors_explained():
-            self._checkpoint.save(
-                self.best_path, components=names, metadata=dict(metadata)
-            )
+            self._checkpoint.save(self.best_path, components=names, metadata=metadata)
 
     def restore(self) -> Path | None:
         """Restore the newest undamaged checkpoint.
@@ -256,14 +231,11 @@ class Checkpoints:
                 shutil.rmtree(leftover)
             else:
                 leftover.unlink()
-        pattern = f"{self._rotation.prefix}-*.torchrl"
-        found: list[Path] = sorted(self.folder.glob(pattern), reverse=True)
+        found = sorted(self.folder.glob("checkpoint-*.torchrl"), reverse=True)
         for path in found:
             damage = find_damage(path)
             if damage is not None:
-                log.warning(
-                    f"Checkpoint {path} is damaged ({damage}); trying the one before."
-                )
+                log.warning(f"{path} is damaged ({damage}); trying the one before.")
                 continue
             try:
                 self._checkpoint.load(path, map_location="cpu")

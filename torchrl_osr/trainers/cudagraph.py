@@ -14,18 +14,21 @@ from tensordict.nn import CudaGraphModule, ProbabilisticTensorDictModule
 from torch import nn
 from torchrl.objectives import LossModule
 
+from torchrl_osr.trainers.nonfinite import leaves_steps_out
+
 WARM_UP = 5
 """Updates before the capture, as in TorchRL's own scripts: the optimizer's state and
 compiled code must exist by then."""
 
 
 def check_capturable(optimizer: torch.optim.Optimizer) -> None:
-    """Raise a ValueError unless the optimizer counts its steps on the device."""
-    if not all(group.get("capturable") for group in optimizer.param_groups):
+    """Raise a ValueError unless the optimizer decides on the device what it does."""
+    capturable = all(group.get("capturable") for group in optimizer.param_groups)
+    if not (capturable and leaves_steps_out(optimizer)):
         raise ValueError(
-            "cudagraph=True needs an optimizer that counts its steps on the device: "
-            f"torch.optim.Adam(..., fused=True, capturable=True); got "
-            f"{type(optimizer).__name__} without capturable=True."
+            "cudagraph=True needs an optimizer that counts its steps, and leaves some "
+            "out, on the device: torch.optim.Adam(..., fused=True, capturable=True); "
+            f"got another {type(optimizer).__name__}."
         )
 
 

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import torch
 
 from torchrl_osr._checks import check_choice
-
-Precision = Literal["float32", "bfloat16"]
 
 
 def check_cudagraph(device: torch.device) -> None:
@@ -21,7 +17,7 @@ def check_cudagraph(device: torch.device) -> None:
 
 
 def check_hardware(
-    device: str, precision: Precision, *, cudagraph: bool = False
+    device: str, precision: str, *, cudagraph: bool = False
 ) -> tuple[torch.device, torch.dtype | None]:
     """Device and autocast type of a run, if this machine has them.
 

@@ -28,7 +28,7 @@ class Interrupted(SystemExit):
 
     Args:
         reason: which signal, and what was saved where.
-        code: the exit code, see :data:`EXIT_CODES`.
+        code: of the exit, see :data:`EXIT_CODES`.
     """
 
     def __init__(self, reason: str, code: int) -> None:

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import logging
 import math
-import os
-from pathlib import Path
 from typing import Any, Literal, NoReturn
 
 import torch
@@ -18,12 +16,18 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_osr._checks import check_choice
+from torchrl_osr._files import whole_file
 from torchrl_osr.trainers.checkpoints import Checkpoints
 
 log = logging.getLogger(__name__)
 
 NUM_NAMED = 5
 """Losses and gradients that are named in a message, at most."""
+
+
+def leaves_steps_out(optimizer: torch.optim.Optimizer) -> bool:
+    """Whether a number on the device can tell ``optimizer`` to leave a step out."""
+    return bool(getattr(optimizer, "_step_supports_amp_scaling", False))
 
 
 class NonfiniteCheck:
@@ -33,12 +37,12 @@ class NonfiniteCheck:
     bad one leaves the parameters and the optimizer's state as they are, to the bit.
     Target networks take their usual step, towards parameters that have not changed.
 
-    On a CPU every update is checked before its step. On a GPU the host would have to
-    wait for each update, and a CUDA graph could not contain the check. There it is
-    ``deferred``: the verdict stays on the device, where a fused optimizer reads it
-    (``found_inf``, by which :class:`torch.amp.GradScaler` has steps left out), the
-    first bad batch is kept there, and the host looks at the end of the log interval.
-    With ``"stop"``, all updates after the first bad one are left out too.
+    Every update is checked before its step. With a fused optimizer on a GPU, where the
+    host would have to wait for each update and a CUDA graph could not contain the
+    check, it is ``deferred``: the verdict stays on the device, where the optimizer
+    reads it (``found_inf``, by which :class:`torch.amp.GradScaler` has steps left out),
+    the first bad batch is kept there, and the host looks at the end of the log
+    interval. With ``"stop"``, all updates after the first bad one are left out too.
 
     Args:
         loss_module: whose updates.
@@ -50,9 +54,6 @@ class NonfiniteCheck:
     Attributes:
         deferred: whether the host looks at the end of the log interval only.
         skipped: updates left out since the beginning of the run.
-
-    Raises:
-        ValueError: if there is no such mode, or the optimizer cannot skip on a GPU.
     """
 
     def __init__(
@@ -68,14 +69,7 @@ class NonfiniteCheck:
         self.skips, self.skipped = mode == "skip", 0
         self.checkpoints, self.description = checkpoints, description
         device = next(loss_module.parameters()).device
-        self.deferred = device.type != "cpu"
-        self._obeys = getattr(optimizer, "_step_supports_amp_scaling", False)
-        if self.skips and self.deferred and not self._obeys:
-            raise ValueError(
-                f"nonfinite='skip' on a GPU needs an optimizer that leaves a step out "
-                f"by itself, such as torch.optim.Adam(..., fused=True); got "
-                f"{type(optimizer).__name__} without. Use that, or nonfinite='stop'."
-            )
+        self.deferred = device.type != "cpu" and leaves_steps_out(optimizer)
         self._names = {each: name for name, each in loss_module.named_parameters()}
         # Since the host last looked: bad updates, all updates, the first bad one.
         self._bad = torch.zeros((), dtype=torch.int64, device=device)
@@ -114,7 +108,10 @@ class NonfiniteCheck:
         self._keep_first(bad, batch, values)
         self._bad.add_(bad)
         if self.deferred:
-            self._step_unless(bad if self.skips else self._bad > 0)
+            optimizer: Any = self.optimizer
+            optimizer.found_inf = (bad if self.skips else self._bad > 0).float()
+            optimizer.step()
+            del optimizer.found_inf
         elif not self.skips:
             self.settle()
         if not self.skips:
@@ -134,18 +131,6 @@ class NonfiniteCheck:
             for key, value in kept.items(include_nested=True, leaves_only=True):
                 if isinstance(value, Tensor):
                     torch.where(first, new[key], value, out=value)
-
-    def _step_unless(self, left_out: Tensor) -> None:
-        """Step the optimizer; a number on the device tells it to leave the step out."""
-        optimizer: Any = self.optimizer
-        if not self._obeys:
-            optimizer.step()
-            return
-        optimizer.found_inf = left_out.float()
-        try:
-            optimizer.step()
-        finally:
-            del optimizer.found_inf
 
     def settle(self, *, whole: bool = True) -> float:
         """Read the verdicts since the last call; on a GPU the host waits here.
@@ -191,37 +176,29 @@ class NonfiniteCheck:
             "gradients": gradients,
             "loss_module": self.loss_module.state_dict(),
         }
-        path = self.checkpoints.folder / "nonfinite" / f"step-{step:012d}.pt"
         every = f" All {bad} updates since were skipped." if self.skips else ""
-        before = not self.deferred or self._obeys
-        when = "before" if before else f"{updates} updates after"
         raise FloatingPointError(
             f"{self.description}: step {step}: not finite: "
             f"{_listed(nonfinite, 'losses')}; {_listed(gradients, 'gradients')}."
-            f"{every} The batch, the losses and the parameters {when} "
-            f"{_saved(path, record)}. Look at the batch, lower the learning rates, or "
-            "leave such updates out with nonfinite='skip' (trainer.nonfinite=skip). "
-            f"The last checkpoint is {self.checkpoints.latest()}."
+            f"{every} The batch, the losses and the parameters before "
+            f"{self._saved(step, record)}. Look at the batch, lower the learning "
+            "rates, or leave such updates out with nonfinite='skip' "
+            f"(trainer.nonfinite=skip). The last checkpoint is "
+            f"{self.checkpoints.latest()}."
         )
+
+    def _saved(self, step: int, record: dict[str, Any]) -> str:
+        """Save the record; return where it is, or why it is not."""
+        path = self.checkpoints.folder / "nonfinite" / f"step-{step:012d}.pt"
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with whole_file(path) as file:
+                torch.save(record, file)
+        except OSError as error:  # a full disk must not hide why the run stops
+            return f"could not be written: {error}"
+        return f"are in {path}: torch.load('{path}', weights_only=True)"
 
 
 def _listed(names: list[str], kind: str) -> str:
     more = f" and {len(names) - NUM_NAMED} more" if len(names) > NUM_NAMED else ""
     return f"{kind} {', '.join(names[:NUM_NAMED]) or 'none'}{more}"
-
-
-def _saved(path: Path, record: dict[str, Any]) -> str:
-    """Write a record under another name first; return where it is, or why it is not."""
-    beside = path.with_name(f".{path.name}.new")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with beside.open("wb") as file:
-            torch.save(record, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(beside, path)
-    # A full disk must not hide why the run stops.
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        return f"could not be written to {path} ({error})"
-    return f"are in {path}: torch.load('{path}', weights_only=True)"

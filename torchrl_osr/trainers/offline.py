@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import json
 import logging
-import sys
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
@@ -37,7 +37,6 @@ from torchrl_osr.trainers.interruption import (
 )
 from torchrl_osr.trainers.nonfinite import NonfiniteCheck
 from torchrl_osr.trainers.progress import Progress
-from torchrl_osr.trainers.value_limits import ValueLimits
 
 log = logging.getLogger(__name__)
 
@@ -122,13 +121,6 @@ class SumOfLosses(OptimizationStepper):
         """Let updates be replayed as a CUDA graph from now on."""
         self.run = captured(self.update, self.check.loss_module)
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return nothing: the stepper has no state."""
-        return {}
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Do nothing: the stepper has no state."""
-
 
 class OfflineTrainer(Trainer):
     """Train a loss module on a replay buffer, with evaluation, checkpoints and resume.
@@ -139,9 +131,8 @@ class OfflineTrainer(Trainer):
     between.
 
     A killed run continues from its newest whole checkpoint and ends with the same bits
-    as one that was never killed: networks, optimizer, targets, the sampler's and the
-    process's random generators and every entry of ``components`` are restored. (Bit
-    equality is for one machine, one set of libraries and CPU.)
+    as one that was never killed (on the same machine and libraries, on a CPU):
+    networks, optimizer, targets, random generators and ``components`` are restored.
 
     Args:
         loss_module: what to train.
@@ -153,10 +144,9 @@ class OfflineTrainer(Trainer):
     Keyword Args:
         seed: of the sampling. Default 0.
         target_net_updater: stepped after each update. Default: none.
-        evaluate: returns JSON-compatible results, of which numbers are logged. It is
-            called before the first step of a new run, so that a mistake in it shows at
-            once, then every ``eval_interval`` steps and at the end. All results are
-            kept in ``history``, with their ``"step"``. Default: no evaluation.
+        evaluate: returns JSON-compatible results, of which numbers are logged and all
+            are kept in ``history``, with their ``"step"``. Called before the first step
+            of a new run, every ``eval_interval`` steps and at the end. Default: none.
         metric: which result decides the best checkpoint, and whether ``"max"`` or
             ``"min"`` is best. Default ``("score", "max")``.
         components: more state to checkpoint, by name: a transform with a generator,
@@ -174,10 +164,10 @@ class OfflineTrainer(Trainer):
         compile: call the loss module through :func:`torch.compile`, in place. It draws
             other random numbers then. Default ``False``.
         cudagraph: replay each update, from the batch to the optimizer's step, as one
-            CUDA graph, see :class:`tensordict.nn.CudaGraphModule`. Default ``False``.
+            CUDA graph. Default ``False``.
         nonfinite: what a loss or gradient that is not finite does: ``"stop"`` the run,
-            with the batch that caused it saved, or ``"skip"`` that update, see
-            :class:`~torchrl_osr.trainers.nonfinite.NonfiniteCheck`. Default ``"stop"``.
+            with the batch that caused it saved, or ``"skip"`` that update. Default
+            ``"stop"``.
         value_limits: largest plausible magnitude of a logged mean, by its name; warns
             once for each that is exceeded. Default: none.
 
@@ -271,8 +261,8 @@ class OfflineTrainer(Trainer):
         self.buffer, self.cudagraph = replay_buffer, cudagraph
         self.evaluate, self.eval_interval = evaluate, eval_interval
         self.loggers, self.description = loggers, description
-        self._limits = ValueLimits(value_limits or {})
-        self._progress = Progress(description, total_steps, bar=progress)
+        self._limits = dict(value_limits or {})
+        self._progress = Progress(description, total_steps, progress)
         self._stop_request = StopRequest()
 
         self.register_op("process_optim_batch", self._sample)
@@ -301,8 +291,12 @@ class OfflineTrainer(Trainer):
         self.checkpoints.check_room(self.loss_module, self.optimizer)
         if self.cudagraph:  # only now: resuming has replaced the optimizer's tensors
             self._stepper.capture()
+        # tensordict 0.14.3 searches the disk for pandas in every module call until that
+        # is imported: 0.3 ms each, a tenth of a small update.
+        with suppress(ImportError):
+            import_module("pandas")
         shown = self._progress.shown(self.step)
-        with shown, pandas_imported(), signals_noted() as self._stop_request:
+        with shown, signals_noted() as self._stop_request:
             if not self.history:
                 self._evaluate()
             super().train()
@@ -343,8 +337,7 @@ class OfflineTrainer(Trainer):
     def _interrupted(self, step: int) -> Interrupted:
         """Save a run that was asked to end after a step; return what to raise.
 
-        The continued run does the rest of the log interval. The means that it logs are
-        over that rest; nothing else differs.
+        The continued run logs means over the rest of the log interval.
         """
         number = self._stop_request.signal
         assert number is not None
@@ -365,11 +358,23 @@ class OfflineTrainer(Trainer):
         names = list(losses.keys())
         values = torch.stack([losses[name].float() for name in names]).tolist()
         means = {name: share * value for name, value in zip(names, values, strict=True)}
-        self._limits.check(means, f"{self.description}, step {self.collected_frames}")
+        self._warn_of_divergence(means)
         if self.nonfinite_check.skips:
             means["skipped_updates"] = self.nonfinite_check.skipped
         self._send(means)
         self._progress.update(self.collected_frames)
+
+    def _warn_of_divergence(self, means: Mapping[str, float]) -> None:
+        """Warn once of each mean that exceeds its limit."""
+        for name in [each for each in self._limits if each in means]:
+            if abs(means[name]) > self._limits[name]:
+                log.warning(
+                    f"{self.description}, step {self.collected_frames}: the mean "
+                    f"{name} is {means[name]:.4g}; a magnitude above "
+                    f"{self._limits.pop(name):.4g} means that the values diverge. "
+                    "Lower the critics' learning rate (optim.qvalue_lr), or check the "
+                    "rewards and the discount. The run continues."
+                )
 
     def _evaluate_if_due(self, _: TensorDictBase) -> None:
         step = self.collected_frames
@@ -386,7 +391,7 @@ class OfflineTrainer(Trainer):
             raise ValueError(
                 f"evaluate() returned {', '.join(results.keys() - {'step'})}, without "
                 f"the {name!r} that decides the best checkpoint: name one of its "
-                f"results, as in metric=('score', 'max')."
+                "results, as in metric=('score', 'max')."
             )
         # As a checkpoint restores them: sorted, lists for tuples.
         results = json.loads(json.dumps(finite_or_none(results), sort_keys=True))
@@ -412,20 +417,20 @@ class OfflineTrainer(Trainer):
                     logger.log_scalar(f"{self.description}/{name}", value, step=step)
 
 
-@contextmanager
-def pandas_imported() -> Iterator[None]:
-    """Spare every module call a search of the disk for pandas.
+def largest_value(largest_reward: float, gamma: float) -> float:
+    r"""Magnitude that learned values exceed only where they diverge.
 
-    tensordict 0.14.3 asks :func:`importlib.util.find_spec` for it whenever a module
-    returns a tensor, 0.3 ms each: a tenth of a small update. A module that is imported,
-    or noted as missing, is not searched for.
+    No policy's value is above :math:`\max|r| / (1 - \gamma)`, the discounted sum of the
+    largest reward for ever. Learned values may be: the conservative penalty pushes them
+    down, and errors are bootstrapped. Ten times as much is neither.
+
+    Args:
+        largest_reward: largest magnitude of a reward in the data.
+        gamma: discount factor; with 1 there is no such magnitude.
+
+    Examples:
+        >>> from torchrl_osr.trainers import largest_value
+        >>> round(largest_value(2.0, 0.99))
+        2000
     """
-    try:
-        import_module("pandas")
-    except ImportError:
-        sys.modules["pandas"] = None  # type: ignore[assignment]
-    try:
-        yield
-    finally:
-        if sys.modules["pandas"] is None:
-            del sys.modules["pandas"]
+    return 10 * largest_reward / (1 - gamma) if gamma < 1 else math.inf

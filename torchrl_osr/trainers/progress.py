@@ -23,18 +23,15 @@ SECONDS_BETWEEN_LINES = 30
 class Progress:
     """Shows how far a phase is, and logs a line where there is no bar to look at.
 
-    A line has the phase, the step, the rate, the time left and the last result:
     ``policy: step 2500 of 20000, 210 steps/s, 01:23 left, score 31.2``.
 
     Args:
         description: names the phase.
         total: steps of the whole run.
-
-    Keyword Args:
-        bar: show a progress bar when on a terminal. Default ``True``.
+        bar: show a progress bar when on a terminal.
     """
 
-    def __init__(self, description: str, total: int, *, bar: bool = True) -> None:
+    def __init__(self, description: str, total: int, bar: bool) -> None:
         self._description, self._total, self._wanted = description, total, bar
         self._result = ""
 
