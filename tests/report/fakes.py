@@ -78,8 +78,8 @@ def write_run(
     seed: int = 0,
     loss: dict | None = None,
     changes: dict | None = None,
+    choice: str = "osr",
     overrides: list[str] | None = None,
-    choice: str = "",
     versions: dict | None = None,
     data_score: float = 20.0,
     status: str = "done",
@@ -95,13 +95,13 @@ def write_run(
         OmegaConf.update(config, key, value)
     OmegaConf.save(config, folder / "config.yaml")
     write_json(folder / "status.json", {"status": status})
-    if overrides is not None:
-        (folder / ".hydra").mkdir(exist_ok=True)
-        OmegaConf.save(overrides, folder / ".hydra" / "overrides.yaml")
-        OmegaConf.save(config, folder / ".hydra" / "config.yaml")
-        if choice:
-            hydra = {"hydra": {"runtime": {"choices": {"loss": choice}}}}
-            OmegaConf.save(hydra, folder / ".hydra" / "hydra.yaml")
+    (folder / ".hydra").mkdir(exist_ok=True)
+    OmegaConf.save(config, folder / ".hydra" / "config.yaml")
+    hydra = {
+        "overrides": {"task": overrides or []},
+        "runtime": {"choices": {"loss": choice}},
+    }
+    OmegaConf.save({"hydra": hydra}, folder / ".hydra" / "hydra.yaml")
     low, high = REFERENCE_RETURNS[env]
     evaluations = [
         {
