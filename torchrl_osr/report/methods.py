@@ -53,10 +53,10 @@ class RunTables:
         episodes: a row for each episode: ``run``, ``data``, ``method``, ``seed``,
             ``suite`` (``""``: the training's own evaluations), ``disturbance`` (``""``:
             none), ``step`` of the checkpoint, ``episode`` (its seed), ``score``. For
-            disturbances that end (``transient``) the step at which it was
-            ``disturbed_at``, whether it ``stood`` at its end, whether it was
-            ``alive_after``, or without it ``undisturbed_alive``, and its
-            ``recovery_steps``; NaN where it was not disturbed or did not recover.
+            disturbances that end the step at which it was ``disturbed_at``, whether it
+            ``stood`` at its end, whether it was ``alive_after``, or without it
+            ``undisturbed_alive``, and its ``recovery_steps``; NaN where it was not
+            disturbed or did not recover.
         distances: a row for each ``offset`` from such a disturbance, with the ``mean``
             distance to the data of the ``count`` episodes that still last.
         left_out: what could not be used.
@@ -88,7 +88,8 @@ def read_runs(paths: Sequence[Path]) -> RunTables:
     """Read all runs in or below the folders and in the tables, and name their methods.
 
     Args:
-        paths: folders of runs, or above them, and tables of runs (``.jsonl.gz``).
+        paths: folders of runs, or above them, and tables of runs (``.jsonl.gz``). A
+            run that is below two of the folders counts once.
 
     Returns:
         Runs of one method's name may be averaged. What cannot be read, is not finished

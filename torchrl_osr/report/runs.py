@@ -33,6 +33,9 @@ MAX_TABLE_BYTES = 4 * MAX_JSON_BYTES
 MAX_REASON = 300
 """Characters of the reason why a run is left out."""
 
+MAX_OFFSETS = 10_000
+"""Entries of a distance curve; 2,000 resamples of so many have 160 MB."""
+
 LARGEST = 1e12
 """Of returns and scores; beyond it sums of squares lose their digits."""
 
@@ -46,7 +49,7 @@ RECOVERY = {
 """Entries of a disturbance that ends, a number an episode, and their columns."""
 
 EPISODE = (
-    *("suite", "disturbance", "transient", "step", "episode", "score"),
+    *("suite", "disturbance", "step", "episode", "score"),
     *RECOVERY.values(),
 )
 CURVE = ("suite", "disturbance", "step", "offset", "mean", "count")
@@ -87,14 +90,7 @@ class Run(NamedTuple):
 
 
 def read_each(paths: Sequence[Path]) -> tuple[list[Run], list[LeftOut]]:
-    """Read every run in or below the folders and in the tables.
-
-    Args:
-        paths: folders of runs, or above them, and tables (``.jsonl.gz``). A run that is
-            below two of the folders counts once.
-
-    Returns:
-        The finished runs, and what was left out.
+    """The finished runs in or below folders and in tables, and what was left out.
 
     Raises:
         FileNotFoundError: if a path does not exist.
@@ -166,10 +162,7 @@ def read_records(table: Path) -> Iterator[dict[str, Any]]:
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """Gather the small files of a run's folder.
-
-    Args:
-        folder: of the run.
+    """The small files of a run's folder.
 
     Returns:
         ``folder``, ``method``, ``overrides``, and the contents of ``config``,
@@ -211,10 +204,7 @@ def read_record(folder: Path) -> dict[str, Any]:
 
 
 def parse_run(record: Mapping[str, Any]) -> Run:
-    """Check a record and make it a run.
-
-    Args:
-        record: see :func:`read_record`.
+    """The run of a record of :func:`read_record`.
 
     Raises:
         ValueError: if its numbers make no sense.
@@ -222,12 +212,9 @@ def parse_run(record: Mapping[str, Any]) -> Run:
     """
     record = _encodable(record)
     config, returns = flatten(record["config"]), record["returns"]
-    env, steps, score = (
-        config["env.name"],
-        config["trainer.steps"],
-        returns["data_score"],
-    )
+    env, steps = config["env.name"], config["trainer.steps"]
     path, share = config["data.path"], config["data.random_share"]
+    score = returns["data_score"]
     if score is not None and not abs(score) < LARGEST:
         raise ValueError(f"data_score is {score}, no finite score")
     episodes = [_training_episodes(returns["evaluations"], env, steps)]
@@ -315,7 +302,6 @@ def _training_episodes(
         {
             "suite": "",
             "disturbance": "",
-            "transient": False,
             "step": row["step"],
             "episode": row["seeds"],
             "score": row["returns"],
@@ -343,15 +329,19 @@ def _suite_episodes(content: Any) -> tuple[pd.DataFrame, pd.DataFrame]:
                 "disturbance": str(level["name"]),
                 "step": row["step"],
             }
-            ends = level["recovery_steps"] is not None
             numbers = {"episode": row["clean"]["seeds"], "score": level["scores"]}
-            if ends:
+            if level["recovery_steps"] is not None:  # it ends
                 numbers |= {name: level[key] for key, name in RECOVERY.items()}
-                curve = {key: level["distance"][key] for key in CURVE[3:]}
-                if max(curve["offset"], default=-1) < 0:
-                    raise ValueError("there is no distance after the disturbance")
+                curve = {
+                    key: level["distance"][key] for key in ("offset", "mean", "count")
+                }
+                if max(curve["offset"]) < 0 or len(curve["offset"]) > MAX_OFFSETS:
+                    raise ValueError(
+                        "there is no distance after the disturbance, or there are "
+                        f"more than {MAX_OFFSETS:,}"
+                    )
                 curves.append(where | curve)
-            episodes.append(where | {"transient": ends} | numbers)
+            episodes.append(where | numbers)
     return _table(episodes, EPISODE), _table(curves, CURVE)
 
 
@@ -389,8 +379,7 @@ def _table(parts: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> pd.Dat
     if any(frame.empty for frame in frames):
         raise ValueError("there are no episodes")
     frame = pd.concat([pd.DataFrame(columns=columns), *frames])
-    texts = ["suite", "disturbance", "transient"]
-    numbers = frame.drop(columns=texts, errors="ignore").astype(float)
+    numbers = frame.drop(columns=["suite", "disturbance"]).astype(float)
     if not (numbers.isna() | (numbers.abs() < LARGEST)).all(axis=None):
         raise ValueError(f"a number is beyond {LARGEST:g}")
     known = numbers.columns.intersection(

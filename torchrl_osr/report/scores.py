@@ -95,21 +95,13 @@ class WayBack(NamedTuple):
 
 
 def decimal(value: float, sign: str = "") -> str:
-    """Number with one decimal, and a minus that no line breaks behind.
-
-    Args:
-        value: the number.
-        sign: ``"+"`` shows that of positive numbers, too.
-    """
+    """Number with one decimal; ``sign="+"`` shows that of positive ones, too."""
+    # A minus sign, unlike a hyphen, stays with its number at the end of a line.
     return f"{value:{sign}.1f}".replace("-", "\N{MINUS SIGN}")
 
 
 def over_what(groups: Sequence[Sequence[object]]) -> str:
-    """What an interval is over: seeds, if each data set has several.
-
-    Args:
-        groups: something of each seed, data set by data set.
-    """
+    """What an interval is over: seeds, if the group of each data set has several."""
     return "seeds" if min(map(len, groups)) > 1 else "episodes"
 
 
@@ -119,12 +111,7 @@ def undisturbed(episodes: pd.DataFrame) -> pd.DataFrame:
 
 
 def recent(episodes: pd.DataFrame, number: int = NUM_RECENT) -> pd.DataFrame:
-    """The undisturbed episodes of each run's last evaluations.
-
-    Args:
-        episodes: of runs.
-        number: of evaluations. Default: :data:`NUM_RECENT`.
-    """
+    """The undisturbed episodes of each run's last evaluations, by default five."""
     found = undisturbed(episodes)
     rank = found.groupby("run")["step"].rank("dense", ascending=False)
     return found[rank <= number]
@@ -154,11 +141,7 @@ def estimate(runs: Sequence[Array]) -> Estimate:
 
 
 def score_curve(episodes: pd.DataFrame) -> Band:
-    """A method's undisturbed score along the steps, with a band over seeds.
-
-    Args:
-        episodes: of the method's runs on one data set.
-    """
+    """A method's undisturbed score on one data set, with a band over seeds."""
     rows = undisturbed(episodes).groupby("step")
     found = np.array([estimate(by_run(each))[:3] for _, each in rows])
     if episodes["run"].nunique() == 1:
@@ -171,9 +154,6 @@ def iqm(episodes: pd.DataFrame) -> Estimate:
 
     Runs are resampled within their data sets. Where one of these has no second seed
     that is impossible, and the interval is over the runs' episodes instead.
-
-    Args:
-        episodes: of the method.
     """
     groups = _strata(episodes)
     scores = [[run.mean() for run in group] for group in groups]
@@ -191,12 +171,7 @@ def iqm(episodes: pd.DataFrame) -> Estimate:
 
 
 def profile(episodes: pd.DataFrame, thresholds: Array) -> Band:
-    """Share of a method's runs above each score, with a band over seeds.
-
-    Args:
-        episodes: of the method.
-        thresholds: scores, ``[T]``.
-    """
+    """Share of a method's runs above each threshold, with a band over seeds."""
     scores = [[run.mean() for run in group] for group in _strata(episodes)]
     mean = performance_profile(np.concatenate(scores), thresholds)
     resamples = performance_profile(stratified_resamples(scores), thresholds)
@@ -304,9 +279,6 @@ def mean_distance(curves: pd.DataFrame) -> Band:
     """Mean distance to the data at each offset, with a band over seeds.
 
     There is no band with one seed, or where a seed has no episode left.
-
-    Args:
-        curves: of a method's runs on one data set, after one disturbance.
     """
     # What nobody was there to measure is NaN, and counts for nothing.
     known = curves.assign(total=curves["mean"].fillna(0.0) * curves["count"])
