@@ -96,18 +96,19 @@ def test_unlike_versions_seeds_and_data_are_said(tmp_path):
 def test_there_is_nothing_to_note_about_equals(tmp_path):
     tables = fakes.read_all(fakes.write_experiment(tmp_path, seeds=(0, 1)))
     assert len(tables.runs) == 16
-    assert tables.suites == ["oos"]
+    assert tables.suites == ["hand"]
     assert comparison_notes(tables) == []
 
 
 def test_suites_played_differently_are_not_one_suite(tmp_path):
     top = fakes.write_experiment(tmp_path, data=("hopper-medium-replay",), seeds=(0, 1))
-    path = top / "hopper-medium-replay" / "osr" / "seed1" / "robustness-oos.json"
+    path = top / "hopper-medium-replay" / "osr" / "seed1" / "robustness-hand.json"
     content = json.loads(path.read_text())
     content["evaluations"] = content["evaluations"][:1]
     fakes.write_json(path, content)
     tables = fakes.read_all(top)
     assert [name.partition(", seeds")[0] for name in tables.suites] == [
-        "oos (checkpoints=last 2, episodes=20", "oos (checkpoints=[7000], episodes=10",
-    ]  # fmt: skip
+        "hand (checkpoints=last 2, episodes=20",
+        "hand (checkpoints=[7000], episodes=10",
+    ]
     assert set(tables.episodes["suite"]) == {"", *tables.suites}

@@ -62,7 +62,7 @@ def report(tmp_path_factory) -> SimpleNamespace:
     (fakes.write_run(hopper / "\udcff" / "seed0", curve) / "config.yaml").write_text(
         "[" * 200 + "]" * 200
     )
-    path = hopper / "cql" / "seed0" / "robustness-oos.json"
+    path = hopper / "cql" / "seed0" / "robustness-hand.json"
     content = json.loads(path.read_text())
     content["versions"]["torch"] = "2.12.0"
     fakes.write_json(path, content)
@@ -103,7 +103,7 @@ def test_figures_are_in_the_page_and_beside_it(report):
     data = ("hopper-medium-replay", "walker2d-medium-expert")
     over_all = {"curves.png", "differences.png", "profiles.png"}
     assert pictures.keys() == over_all | {
-        f"{kind}-{each}-suite-oos.png"
+        f"{kind}-{each}-suite-hand.png"
         for kind in ("distance", "recovered")
         for each in data
     }
@@ -158,7 +158,7 @@ def test_clean_table_has_each_method_once_with_its_seeds(report):
 
 def test_disturbed_table_has_scores_and_decreases(report):
     found = section(report, "out-of-sample")
-    names = [name for name, *_ in fakes.LEVELS]
+    names = ["mass", "torque-20", "push-small"]
     assert [name for name in cells(found) if name in names] == names
     assert len(re.findall(r"<small>\d+\.\d % \[.*?\]", found)) == len(names) * 4 * 2
 
@@ -174,13 +174,13 @@ def test_differences_are_in_a_table_and_refusals_in_words(report):
     assert sum("are not paired" in each for each in items(table)) == 2
     assert cells(table).count("not paired") == 2
     found = [each for each in cells(by_disturbance) if re.fullmatch(numbers, each)]
-    assert len(found) == 3 * (2 + 1) * len(fakes.LEVELS)
+    assert len(found) == 3 * (2 + 1) * 3
 
 
 def test_recovery_table_counts_episodes(report):
     found = cells(section(report, "recovery"))
     shares = [each for each in found if re.fullmatch(r"\d+ % of 40", each)]
-    assert len(shares) == 5 * 4 * 2
+    assert len(shares) == 2 * 4 * 2
 
 
 def test_the_same_runs_give_the_same_page(tmp_path):

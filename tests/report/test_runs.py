@@ -134,10 +134,7 @@ def test_a_broken_robustness_file_leaves_the_run_in(tmp_path, spoil, reason):
     ],
 )  # fmt: skip
 def test_a_disturbance_that_makes_no_sense_is_left_out(tmp_path, entries, reason):
-    distance = {"offset": [0], "mean": [1], "count": [2], "clean_mean": [1],
-                "clean_count": [2]}  # fmt: skip
-    ends = dict.fromkeys(fakes.TRANSIENT, [None] * 2) | {"distance": distance}
-    level = fakes.hand_level("x", [1.0, 2.0]) | ends | entries
+    level = fakes.knock("x", [1.0, 2.0]) | entries
     content = fakes.hand_suite((5, [1, 2], [1.0, 2.0], [level]))
     fakes.write_hand(tmp_path / "a", {5: [1.0]}, suite=content)
     ((_, why),) = read_runs([tmp_path]).left_out

@@ -138,7 +138,7 @@ def transient(**entries):
             "count": [3, 3, 1, 0],
         },
     }  # fmt: skip
-    return level("knock", [30.0, 40.0, 5.0, 9.0], kind="knock", **(base | entries))
+    return fakes.knock("knock", [30.0, 40.0, 5.0, 9.0], **(base | entries))
 
 
 def came_back(folder, name="knock"):
