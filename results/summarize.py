@@ -46,8 +46,10 @@ def main(path: Path) -> None:
     tables = read_runs([path])
     records = {record["folder"]: record for record in read_records(path)}
     rows = {
-        (run.data, run.method, run.seed): row(run.episodes, records[run.folder])
-        for run in tables.runs
+        (run.data, run.method, run.seed): row(
+            tables.episodes[tables.episodes["run"] == run.Index], records[run.folder]
+        )
+        for run in tables.runs.itertuples()
     }
     frame = pd.DataFrame.from_dict(rows, orient="index").dropna(axis=1, how="all")
     print(frame.to_string(float_format="{:.2f}".format))

@@ -1,9 +1,9 @@
 """One page about any number of runs: verdict, tables, figures, differences."""
 
 from torchrl_osr.report.comparisons import compare, quantities
-from torchrl_osr.report.methods import comparison_notes, read_runs
+from torchrl_osr.report.methods import RunTables, comparison_notes, read_runs
 from torchrl_osr.report.page import write_report
-from torchrl_osr.report.runs import RunTables, pack_runs, read_records
+from torchrl_osr.report.runs import pack_runs, read_records
 
 __all__ = [
     "RunTables",

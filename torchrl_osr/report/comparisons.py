@@ -15,15 +15,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from torchrl_osr.evaluation import nested_resamples, percentile_interval
-from torchrl_osr.report.methods import METHOD, comparable, exact
-from torchrl_osr.report.runs import Run, RunTables
-from torchrl_osr.report.scores import (
-    Estimate,
-    decimal,
-    disturbances,
-    over_what,
-    recent,
-)
+from torchrl_osr.report.methods import RunTables
+from torchrl_osr.report.scores import Estimate, decimal, over_what, recent
 
 Array = NDArray[np.float64]
 
@@ -35,8 +28,6 @@ MIN_SEEDS = 5
 A bootstrap over three seeds holds the true mean in about 76 of 100 cases, over five in
 83, over ten in 89: with fewer, an interval without 0 says next to nothing.
 """
-
-PAIR = ["step", "episode"]
 
 
 class Quantity(NamedTuple):
@@ -62,7 +53,7 @@ class Difference(NamedTuple):
         quantity: in what.
         estimate: method less reference; ``None`` if they cannot be paired.
         seeds: pairs of runs, the fewest that a data set has.
-        note: why they cannot, or what else differs between them.
+        note: why they cannot, or that seeds are left out.
     """
 
     data: str
@@ -74,7 +65,7 @@ class Difference(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """Return "better", "worse", "not told apart" or why there is no verdict."""
+        """Either "better", "worse", "not told apart" or why it cannot be told."""
         if self.estimate is None:
             return "not paired"
         if self.seeds < MIN_SEEDS:
@@ -90,7 +81,7 @@ class Difference(NamedTuple):
 
 
 def quantities(tables: RunTables) -> list[Quantity]:
-    """Return what methods are compared in: the score, and two numbers of each suite."""
+    """What methods are compared in: the score, and two numbers of each suite."""
     found = [Quantity("undisturbed score", _values(recent(tables.episodes)))]
     for suite in tables.suites:
         rows = tables.episodes[tables.episodes["suite"] == suite]
@@ -104,11 +95,12 @@ def quantities(tables: RunTables) -> list[Quantity]:
 
 
 def suite_quantities(tables: RunTables, suite: str) -> list[Quantity]:
-    """Return the score under each disturbance of a suite."""
+    """The score under each disturbance of a suite."""
     rows = tables.episodes[tables.episodes["suite"] == suite]
     return [
-        Quantity(name, _values(rows[rows["disturbance"] == name]))
-        for name in disturbances(rows, suite).index
+        Quantity(name, _values(group))
+        for name, group in rows.groupby("disturbance", sort=False)
+        if name
     ]
 
 
@@ -128,43 +120,21 @@ def compare(
         where one of the two has no such numbers are left out.
     """
     found, paired = [], []
-    cells = tables.cells()
     for data in tables.data:
-        own, other = (
-            {run.seed: run for run in cells.get((data, name), ())
-             if (data, name, run.seed) in quantity.values}
-            for name in (method, reference)
-        )  # fmt: skip
-        if not own or not other:
+        values = quantity.values[quantity.values.index.get_level_values("data") == data]
+        if not {method, reference} <= set(values.index.unique("method")):
             continue
-        seeds = sorted(own.keys() & other.keys())
-        try:
-            pairs = [
-                pair(
-                    quantity.values[data, method, seed],
-                    quantity.values[data, reference, seed],
-                )
-                for seed in seeds
-            ]
-            if not pairs:
-                raise ValueError("they have no seed in common")
-        except ValueError as error:
-            found.append(Difference(data, method, quantity, None, 0, str(error)))
-            continue
-        notes = [_caveat([(own[seed], other[seed]) for seed in seeds])]
-        if len(seeds) < len(own.keys() | other.keys()):
-            notes.append("only seeds that both have")
-        note = "; ".join(filter(None, notes))
-        estimate = mean_difference([pairs])
+        pairs, note = pair(values.droplevel("data"), method, reference)
+        estimate = mean_difference([pairs]) if pairs else None
         found.append(Difference(data, method, quantity, estimate, len(pairs), note))
-        paired.append(pairs)
+        if pairs:
+            paired.append(pairs)
     if len(paired) > 1:
-        notes = [each.note for each in found if each.estimate is not None]
+        notes = [each.note for each in found if each.estimate]
         if len(paired) < len(tables.data):
             notes.insert(0, f"of {len(paired)} data sets")
-        together = mean_difference(paired)
         note = "; ".join(dict.fromkeys(filter(None, notes)))
-        fewest = min(map(len, paired))
+        together, fewest = mean_difference(paired), min(map(len, paired))
         found.append(Difference(ALL_DATA, method, quantity, together, fewest, note))
     return found
 
@@ -182,29 +152,38 @@ def compare_all(
     ]
 
 
-def pair(own: pd.Series, reference: pd.Series) -> Array:
-    """Return the differences of two runs' episodes, averaged over checkpoints, ``[E]``.
+def pair(values: pd.Series, method: str, reference: str) -> tuple[list[Array], str]:
+    """Differences of the same episodes of two methods on one data set.
 
     Args:
-        own: numbers by step and episode.
-        reference: the same of the other run.
+        values: by ``method``, ``seed``, ``step`` and ``episode``.
+        method: its name.
+        reference: the other's name.
 
-    Raises:
-        ValueError: if an episode of one is not there in the other.
+    Returns:
+        Method less reference of each seed that both have, averaged over checkpoints,
+        ``[E]``; a note if seeds are left out. Or nothing, and why it cannot be paired.
     """
-    alone = own.index.symmetric_difference(reference.index)
+    both = values.unstack("method")[[method, reference]].dropna(how="all")
+    seeds = both.groupby("seed").count()
+    common = seeds.index[(seeds > 0).all(axis=1)]
+    if common.empty:
+        return [], "they have no seed in common"
+    both = both[both.index.get_level_values("seed").isin(common)]
+    alone = both.index[both.isna().any(axis=1)]
     if len(alone):
-        step, episode = alone[0]
-        raise ValueError(
-            f"{len(alone)} episodes have no partner, the first at step {step:,} with "
-            f"episode seed {episode}"
+        seed, step, episode = alone[0]
+        return [], (
+            f"{len(alone)} episodes have no partner, the first of seed {seed} at step "
+            f"{step:,} with episode seed {episode}"
         )
-    differences: Array = (own - reference).groupby("episode").mean().to_numpy()
-    return differences
+    less = (both[method] - both[reference]).groupby(["seed", "episode"]).mean()
+    note = "only seeds that both have" if len(common) < len(seeds) else ""
+    return [each.to_numpy() for _, each in less.groupby("seed")], note
 
 
 def mean_difference(data_sets: Sequence[Sequence[Array]]) -> Estimate:
-    """Return the mean difference, every data set and every seed with equal weight.
+    """Mean difference, every data set and every seed with equal weight.
 
     Args:
         data_sets: differences of each seed's episodes, ``[E]``, data set by data set.
@@ -219,28 +198,8 @@ def mean_difference(data_sets: Sequence[Sequence[Array]]) -> Estimate:
     return Estimate(float(point), float(low), float(high), over_what(data_sets))
 
 
-def _values(rows: pd.DataFrame) -> pd.Series:
-    """Return the mean score of each episode over the disturbances in the rows."""
-    return rows.groupby(["data", "method", "seed", *PAIR])["score"].mean()
-
-
-def _caveat(pairs: Sequence[tuple[Run, Run]]) -> str:
-    """Return in which settings the partners differ, beside their methods."""
-    keys = set()
-    for own, other in pairs:
-        mine, theirs = comparable(own), comparable(other)
-        keys |= {
-            key
-            for key in mine.keys() | theirs.keys()
-            if not key.startswith(METHOD) and exact(key, mine) != exact(key, theirs)
-        }
-        if own.versions != other.versions:
-            keys.add("versions")
-    return f"they differ in {', '.join(sorted(keys))}" if keys else ""
-
-
 def verdict(differences: Sequence[Difference], reference: str) -> list[str]:
-    """Return which method is better than the reference in what, in plain sentences.
+    """Which method is better than the reference in what, in plain sentences.
 
     Args:
         differences: of all methods.
@@ -261,24 +220,25 @@ def verdict(differences: Sequence[Difference], reference: str) -> list[str]:
         f"{each.data}: {decimal(each.estimate.mean, '+')} points "
         f"{each.estimate.interval('+')}, {each.seeds} pairs of runs a data set."
         for each in found
-        if each.told and each.estimate is not None
+        if each.told and each.estimate
     ]
-    rest: dict[str, dict[str, list[str]]] = {}
-    for each in found:
-        if not each.told:
-            names = rest.setdefault(each.verdict, {}).setdefault(each.method, [])
-            names.append(each.quantity.name)
-    for why, methods in sorted(rest.items(), key=lambda each: each[0] == "not paired"):
-        alike: dict[str, list[str]] = {}
-        for method, names in methods.items():
-            alike.setdefault(", ".join(dict.fromkeys(names)), []).append(method)
-        sentences += [
-            f"{', '.join(each)} against {reference} in {names}: {why}."
-            for names, each in alike.items()
-        ]
-    if any(each.verdict.startswith("cannot") for each in found):
+    rest = pd.DataFrame(
+        [(e.verdict, e.method, e.quantity.name) for e in found if not e.told],
+        columns=["why", "method", "quantity"],
+    ).drop_duplicates()
+    rest = rest.sort_values("why", key=lambda why: why == "not paired", kind="stable")
+    by_method = rest.groupby(["why", "method"], sort=False)["quantity"].agg(", ".join)
+    alike = by_method.reset_index().groupby(["why", "quantity"], sort=False)["method"]
+    for (why, names), methods in alike:
+        sentences.append(f"{', '.join(methods)} against {reference} in {names}: {why}.")
+    if rest["why"].str.startswith("cannot").any():
         sentences.append(
             f"A verdict needs {MIN_SEEDS} pairs of runs on every data set: over fewer "
             "seeds an interval is too narrow to rank anything."
         )
     return sentences or [f"There is nothing to compare with {reference}."]
+
+
+def _values(rows: pd.DataFrame) -> pd.Series:
+    """Mean score of each episode over the disturbances in the rows."""
+    return rows.groupby(["data", "method", "seed", "step", "episode"])["score"].mean()
