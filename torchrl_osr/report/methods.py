@@ -120,12 +120,12 @@ def read_runs(paths: Sequence[Path]) -> RunTables:
         for folder, other in zip(runs["folder"][again], first[again], strict=True)
     ]
     runs = runs[~again]
-    suites_played = [
+    played_suites = [
         {"run": number, **each}
         for number in runs.index
         for each in found[number].protocols
     ]
-    protocols = pd.DataFrame(suites_played or [{"run": 0, "suite": ""}])
+    protocols = pd.DataFrame(played_suites or [{"run": 0, "suite": ""}])
     protocols = protocols.set_index(["run", "suite"])
     played = protocols.index.get_level_values("suite").to_series(protocols.index)
     suites = tell_apart(played, protocols).rename("named")
