@@ -108,11 +108,15 @@ def test_a_foreign_or_damaged_run_is_left_out_and_named(tmp_path, spoil, reason)
     [
         ({"format": 2}, "its format is 2, known is 1"),
         ({"evaluations": []}, "needs evaluations"),
+        ({"evaluations": fakes.hand_suite(
+            (4, [1], [1.0], [fakes.hand_level("x", [1.0])]),
+            (5, [1], [1.0], [fakes.hand_level("y", [1.0])]),
+        )["evaluations"]}, "all of the same levels"),
         ({"evaluations": [{}]}, "no entry"),
-        ({"suite": ""}, "names for all"),
+        ({"suite": ""}, "need names"),
         ({"evaluations": [[]]}, "TypeError"),
     ],
-)
+)  # fmt: skip
 def test_a_broken_robustness_file_leaves_the_run_in(tmp_path, spoil, reason):
     content = fakes.hand_suite((5, [1], [1.0], [fakes.hand_level("x", [1.0])]))
     fakes.write_hand(tmp_path / "a", {5: [1.0]}, suite=content | spoil)

@@ -120,11 +120,13 @@ def read_runs(paths: Sequence[Path]) -> RunTables:
         for folder, other in zip(runs["folder"][again], first[again], strict=True)
     ]
     runs = runs[~again]
-    protocols = pd.concat(
-        [pd.DataFrame(run.protocols).assign(run=number) for number, run in
-         enumerate(found) if run.protocols and number in runs.index]
-        or [pd.DataFrame({"run": [0], "suite": [""]})]
-    ).set_index(["run", "suite"])  # fmt: skip
+    played_suites = [
+        {"run": number, **each}
+        for number in runs.index
+        for each in found[number].protocols
+    ]
+    protocols = pd.DataFrame(played_suites or [{"run": 0, "suite": ""}])
+    protocols = protocols.set_index(["run", "suite"])
     played = protocols.index.get_level_values("suite").to_series(protocols.index)
     suites = tell_apart(played, protocols).rename("named")
 

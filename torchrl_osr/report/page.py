@@ -120,9 +120,7 @@ def write_report(
         "scores": _score_table(tables),
         "means": _mean_table(tables),
         "suites": suites,
-        "every_run": runs.assign(
-            versions=runs["versions"].map(", ".join),
-        ).astype(str),
+        "every_run": runs.assign(versions=runs["versions"].map(", ".join)).astype(str),
     }
     environment = Environment(
         loader=PackageLoader("torchrl_osr.report", "."),

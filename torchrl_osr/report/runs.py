@@ -350,16 +350,20 @@ def _protocol(content: Mapping[str, Any], steps: int) -> dict[str, str]:
     evaluations = content["evaluations"]
     at = [row["step"] for row in evaluations]
     seeds = [row["clean"]["seeds"] for row in evaluations]
-    levels = [(each["name"], each["kind"], each["strength"])
-              for row in evaluations[:1] for each in row["levels"]]  # fmt: skip
-    if not content["suite"] or not levels or "" in [name for name, *_ in levels]:
-        raise ValueError("it needs evaluations of levels, and names for all of them")
+    levels = [
+        [(each["name"], each["kind"], each["strength"]) for each in row["levels"]]
+        for row in evaluations
+    ]
+    if not levels or not levels[0] or levels.count(levels[0]) < len(levels):
+        raise ValueError("it needs evaluations, all of the same levels")
+    if not content["suite"] or "" in [name for name, *_ in levels[0]]:
+        raise ValueError("a suite and its levels need names")
     protocol = {
         "suite": content["suite"],
         "checkpoints": f"last {len(at)}" if at[-1] == steps else at,
         "episodes": sum(map(len, seeds)),
         "seeds": seeds,
-        "levels": levels,
+        "levels": levels[0],
     }
     return {name: str(value) for name, value in protocol.items()}
 
