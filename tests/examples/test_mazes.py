@@ -117,7 +117,9 @@ def test_a_point_is_trained_and_disturbed(train, tmp_path, load_example):
     evaluation = load_example("evaluate.py")
 
     def evaluate(suite: str) -> None:
-        with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        with initialize_config_dir(
+            str(ROOT / "conf" / "evaluation"), version_base="1.3"
+        ):
             evaluation.main(
                 compose(
                     "evaluate",

@@ -15,7 +15,7 @@ FAKES = ROOT / "tests" / "report" / "fakes.py"
 def test_report_of_several_folders(tmp_path, run):
     write_run = runpy.run_path(str(FAKES))["write_run"]
     curve = {1000: [1.0, 2.0], 2000: [3.0, 4.0]}
-    write_run(tmp_path / "a" / "0", curve, overrides=["loss=cql"])
+    write_run(tmp_path / "a" / "0", curve, choice="cql", loss={"recovery_weight": 0.0})
     write_run(tmp_path / "b" / "0", curve, overrides=["loss=osr"])
     write_run(tmp_path / "b" / "1", curve, overrides=["loss=osr"], status="running")
     options = ["a", "b", "--reference", "osr", "--output", "new/report"]

@@ -128,8 +128,8 @@ def write_experiment(
                     # Every checkpoint has episodes of its own.
                     rows.append((step, list(range(step, step + 10)), clean, levels))
                 write_hand(
-                    folder / name / method / f"seed{seed}", curve, env=env, quality=quality,
-                    seed=seed, loss=loss, suite=hand_suite(*rows),
+                    folder / name / method / f"seed{seed}", curve, env=env,
+                    quality=quality, seed=seed, loss=loss, suite=hand_suite(*rows),
                 )  # fmt: skip
     return folder
 
