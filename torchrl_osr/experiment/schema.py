@@ -29,8 +29,9 @@ class EnvConfig:
     """Which task.
 
     Attributes:
-        name: short name, as behaviour policies and reference scores know it.
-        id: the Gymnasium id that is evaluated.
+        name: short name of the task, which behaviour policies and reference scores
+            have.
+        id: Gymnasium id of the environment that is evaluated.
     """
 
     name: str = MISSING
@@ -42,18 +43,19 @@ class DataConfig:
     """Which data set: rolled out from the packaged behaviour policies, or recorded.
 
     Attributes:
-        quality: random, medium, medium-replay, medium-expert or expert; diverse or play
+        quality: of the behaviour: random, medium, medium-replay, medium-expert or expert; diverse or play
             in a maze; minari, d4rl or file for recorded data.
-        path: of recorded data, see docs/your_data.md.
-        download: fetch a set that path names.
-        num_transitions: rows of the data set.
-        seed: of the rollouts.
-        random_share: of the rows that are random instead, for limited valuable data.
-        storage: memory, or disk for sets that do not fit, see docs/large_data.md.
-        held_out: share of the rows kept from training to judge the inverse dynamics.
-        standardize: observations to mean 0 and standard deviation 1, once.
+        path: recorded data to read, see docs/your_data.md.
+        download: fetch the set that path names.
+        num_transitions: number of rows.
+        seed: random seed of the roll-outs and of the held-out rows.
+        random_share: share of the rows that are of random quality instead.
+        storage: memory, or disk for sets that do not fit in memory, see docs/large_data.md.
+        held_out: share of the rows kept from training, to judge the inverse dynamics
+            model.
+        standardize: bring observations to mean 0 and standard deviation 1.
         reward_scale: factor of the rewards that are trained on.
-        reward_shift: added to them after it; evaluation has the task's own rewards.
+        reward_shift: added to these rewards; evaluation has the task's own.
     """
 
     quality: str = MISSING
@@ -83,7 +85,7 @@ class NetworkConfig:
     Attributes:
         actor: the function that builds the policy, of the kind that the loss trains.
         num_cells: width of each hidden layer.
-        layer_norm: in the critics; steadier, but not in the paper.
+        layer_norm: layer normalisation in the critics; steadier, not in the paper.
     """
 
     actor: TargetConfig = field(default_factory=TargetConfig)
@@ -96,9 +98,9 @@ class PerturbationConfig:
     """The noise of the mixed data set, see ``StatePerturbation``.
 
     Attributes:
-        std: in units of each observation entry's standard deviation in the data, or
-            of the observation itself where ``data.standardize`` is false.
-        noise: gaussian or uniform.
+        std: standard deviation of the noise, in units of each observation entry's in
+            the data, or of the observation where ``data.standardize`` is false.
+        noise: distribution of the noise: gaussian or uniform.
         adversary: options of ``Adversary``, which chooses the perturbed states of the
             policy's training in the place of the noise; null for the noise.
     """
@@ -115,7 +117,8 @@ class InverseDynamicsConfig:
     Attributes:
         network: the function that builds it.
         loss: options of ``InverseDynamicsLoss``.
-        shuffle_next: train it with the next state of another row, an ablation.
+        shuffle_next: an ablation: train the model with the next state of another
+            row.
     """
 
     network: TargetConfig = field(default_factory=TargetConfig)
@@ -128,11 +131,11 @@ class OptimConfig:
     """Adam's learning rates and what moves with them.
 
     Attributes:
-        actor_lr: policy and entropy temperature.
-        qvalue_lr: critics.
-        inverse_dynamics_lr: inverse dynamics model.
+        actor_lr: learning rate of the policy and the entropy temperature.
+        qvalue_lr: learning rate of the critics.
+        inverse_dynamics_lr: learning rate of the inverse dynamics model.
         gamma: discount factor.
-        tau: share of the critics that flows into their targets at each step.
+        tau: step of the target networks towards the critics, at each update.
     """
 
     actor_lr: float = MISSING
@@ -148,21 +151,21 @@ class TrainerConfig:
 
     Attributes:
         batch_size: rows of a gradient step.
-        inverse_dynamics_steps: gradient steps of the first phase.
-        steps: gradient steps of the policy phase.
+        inverse_dynamics_steps: gradient steps of the inverse dynamics model.
+        steps: gradient steps of the policy and the critics.
         log_interval: steps between log entries.
         eval_interval: steps between evaluations.
-        eval_episodes: complete episodes of an evaluation.
+        eval_episodes: complete episodes in an evaluation.
         checkpoint_interval: steps between checkpoints.
-        checkpoints_kept: how many of the newest stay, beside the best.
-        nonfinite: stop at a loss or gradient that is not finite, or skip that update.
-        num_threads: torch threads; several fight where the machine is shared.
+        checkpoints_kept: number of newest checkpoints that stay, beside the best.
+        nonfinite: at a loss or gradient that is not finite, stop or skip the update.
+        num_threads: torch threads; 1 where several runs share the machine.
         device: cpu or cuda.
-        precision: float32 or bfloat16, of the losses' matrix products.
-        matmul_precision: torch's, of float32 products: highest, high or medium.
-        compile: the losses with ``torch.compile``.
-        cudagraph: each update as one CUDA graph; needs ``device=cuda``.
-        progress: progress bars, when on a terminal.
+        precision: of the losses' matrix products: float32 or bfloat16.
+        matmul_precision: of float32 products, torch's: highest, high or medium.
+        compile: run the losses through ``torch.compile``.
+        cudagraph: run updates as a CUDA graph; needs ``device=cuda``.
+        progress: show progress bars when on a terminal.
     """
 
     batch_size: int = MISSING
@@ -188,7 +191,7 @@ class LoggerConfig:
     """Where numbers go besides the CSV files, which are always written.
 
     Attributes:
-        kind: csv (nothing else), tensorboard or wandb.
+        kind: csv for the files alone, tensorboard or wandb.
         project: W&B project.
         mode: W&B mode: offline, online or disabled.
     """
@@ -203,8 +206,8 @@ class OfflineOSRConfig:
     """Everything that ``examples/offline_osr.py`` reads.
 
     Attributes:
-        seed: of networks, sampling, noise and evaluation episodes.
-        num_random: what ``loss.num_random`` is for the losses with CQL's term.
+        seed: random seed of networks, sampling and noise.
+        num_random: value of ``loss.num_random`` for the losses with CQL's term.
         resume: folder of a killed run to continue.
     """
 
