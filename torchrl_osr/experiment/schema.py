@@ -43,14 +43,15 @@ class DataConfig:
     """Which data set: rolled out from the packaged behaviour policies, or recorded.
 
     Attributes:
-        quality: of the behaviour: random, medium, medium-replay, medium-expert or expert; diverse or play
-            in a maze; minari, d4rl or file for recorded data.
+        quality: of the behaviour: random, medium, medium-replay, medium-expert or
+            expert; diverse or play in a maze; minari, d4rl or file for recorded data.
         path: recorded data to read, see docs/your_data.md.
         download: fetch the set that path names.
         num_transitions: number of rows.
         seed: random seed of the roll-outs and of the held-out rows.
         random_share: share of the rows that are of random quality instead.
-        storage: memory, or disk for sets that do not fit in memory, see docs/large_data.md.
+        storage: memory, or disk for sets that do not fit in memory, see
+            docs/large_data.md.
         held_out: share of the rows kept from training, to judge the inverse dynamics
             model.
         standardize: bring observations to mean 0 and standard deviation 1.
