@@ -138,7 +138,9 @@ def test_a_point_is_trained_and_disturbed(train, tmp_path, load_example):
     ]
     for level in levels:
         assert set(level["scores"]) <= {0.0, 100.0}
-    message = "level 'mass-0.75' is not possible for PointMaze_UMaze-v3: DynamicsChange"
+    message = (
+        "disturbance 'mass-0.75' is not possible for PointMaze_UMaze-v3: DynamicsChange"
+    )
     with pytest.raises(ValueError, match=message):
         evaluate("dynamics")
     assert not (folder / "robustness-dynamics.json").exists()
