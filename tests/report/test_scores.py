@@ -151,7 +151,7 @@ def test_recovery_counts_those_that_the_disturbance_came_to(tmp_path):
                      [level("mass", [1.0] * 4), transient()]))  # fmt: skip
     write(tmp_path / "a", {5: [1.0]}, suite=content)
     found = came_back(tmp_path)
-    assert (found.episodes, found.reached) == (4, 0.75)
+    assert (found.num_episodes, found.reached) == (4, 0.75)
     assert found.stood == pytest.approx(2 / 3)
     assert found.alive_after == 0.5  # the second ran out of time: not known
     assert np.isnan(found.undisturbed_alive)

@@ -298,7 +298,7 @@ def _way_row(each: WayBack) -> dict[str, Any]:
     """A method's way back after one disturbance."""
     mean, low, high = (_share(float(line[-1])) for line in each.recovered[1:])
     return {
-        "disturbed": f"{_share(each.reached)} of {each.episodes}",
+        "disturbed": f"{_share(each.reached)} of {each.num_episodes}",
         "stood at its end": _share(each.stood),
         "stood later": _share(each.alive_after),
         "(undisturbed)": _share(each.undisturbed_alive),

@@ -71,7 +71,7 @@ class WayBack(NamedTuple):
     """A method on a data set after one disturbance that ends.
 
     Attributes:
-        episodes: of all runs and checkpoints.
+        num_episodes: of all runs and checkpoints.
         reached: share in which the disturbance came; others had ended before.
         stood: of those, share that had not fallen when it ended.
         alive_after: of those, share that had not fallen at the end of the curves; not
@@ -83,7 +83,7 @@ class WayBack(NamedTuple):
         distance: to the data along the steps, of the ones that still stood.
     """
 
-    episodes: int
+    num_episodes: int
     reached: float
     stood: float
     alive_after: float
@@ -263,7 +263,7 @@ def way_back(
     recovered = np.mean([each.mean(0) for each in within], axis=0)
     shares = there[["stood", "alive_after", "undisturbed_alive"]].mean()
     return WayBack(
-        episodes=len(rows),
+        num_episodes=len(rows),
         reached=len(there) / len(rows),
         **shares,
         median=float(there["recovery_steps"].fillna(np.inf).median()),
