@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -69,6 +71,31 @@ def test_status_says_failed_and_why(tmp_path, error):
         "status": "failed",
         "error": f"{type(error).__name__}: why",
     }
+
+
+HOLDER = """
+import sys
+from pathlib import Path
+from torchrl_osr.experiment import run_folder
+with run_folder.status(Path(sys.argv[1])):
+    print("training", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_a_second_process_in_the_folder_is_told_who_is_there(tmp_path):
+    arguments = [sys.executable, "-c", HOLDER, str(tmp_path)]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(arguments, **pipes) as holder:
+        assert holder.stdout.readline() == "training\n"
+        message = f"process {holder.pid} on .* is training in .*choose another folder"
+        with pytest.raises(ValueError, match=message), run_folder.status(tmp_path):
+            raise AssertionError("both would write the same files")
+        assert read_status(tmp_path)["pid"] == holder.pid, "left as it was"
+        holder.kill()
+    # A lock does not outlive its process.
+    with run_folder.status(tmp_path):
+        assert read_status(tmp_path)["pid"] == os.getpid()
 
 
 def test_interrupted_run_is_preempted_and_says_how_to_continue(tmp_path, caplog):

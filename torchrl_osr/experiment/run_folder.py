@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import os
+import platform
 import re
 import shlex
 import sys
@@ -14,14 +15,15 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_osr._files import write_atomically, write_json
+from torchrl_osr._files import read_json, write_atomically, write_json
 from torchrl_osr.trainers import Interrupted
 
 log = logging.getLogger(__name__)
 
-CONFIG, STATUS = "config.yaml", "status.json"
+CONFIG, STATUS, LOCK = "config.yaml", "status.json", ".lock"
 
 PACKAGES = ("torchrl-osr", "torch", "torchrl", "tensordict", "gymnasium", "mujoco")
 """Packages whose versions decide a run's numbers."""
@@ -114,9 +116,27 @@ def status(folder: Path) -> Iterator[None]:
     """Keep ``status.json`` true: running, then done, preempted, or failed and why.
 
     A run that a signal has stopped is ``preempted``; the command that continues it is
-    logged.
+    logged. One process at a time: the lock goes with the process, however it ends.
+
+    Raises:
+        ValueError: if another process trains in the folder, naming it.
     """
-    write_json(folder / STATUS, {"status": "running", "pid": os.getpid()})
+    try:
+        lock = FileLock(folder / LOCK).acquire(timeout=0)
+    except Timeout as error:
+        there = read_json(folder / STATUS)
+        raise ValueError(
+            f"process {there.get('pid')} on {there.get('host')} is training in "
+            f"{folder}: wait for its end or stop it, or choose another folder."
+        ) from error
+    with lock, _status(folder):
+        yield
+
+
+@contextmanager
+def _status(folder: Path) -> Iterator[None]:
+    running = {"status": "running", "pid": os.getpid(), "host": platform.node()}
+    write_json(folder / STATUS, running)
     try:
         yield
     except Interrupted as error:
