@@ -12,9 +12,7 @@ the same name. A killed evaluation continues after its last finished checkpoint.
 
 from __future__ import annotations
 
-import hashlib
 import json
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +27,7 @@ from torchrl_osr._files import (
     check_checksum,
     checksummed,
     read_json,
+    sha256_of,
     write_json,
 )
 from torchrl_osr.data import observation_statistics
@@ -41,6 +40,7 @@ from torchrl_osr.evaluation import (
     robustness_table,
     summarize_disturbances,
 )
+from torchrl_osr.experiment import run_folder
 from torchrl_osr.experiment.build import load_data
 from torchrl_osr.experiment.suite import make_disturbances, register
 from torchrl_osr.experiment.trained_run import (
@@ -51,7 +51,6 @@ from torchrl_osr.experiment.trained_run import (
 
 JSON_FORMAT = 1
 SEED_STRIDE = 1000  # between checkpoints: no two of them play the same episodes
-PACKAGES = ("torchrl-osr", "torch", "torchrl", "tensordict", "gymnasium", "mujoco")
 
 register()
 
@@ -97,14 +96,12 @@ def requested(cfg: DictConfig, files: list[Path]) -> dict[str, Any]:
     """Everything that decides the results: settings, checkpoints' digests, versions."""
     return {
         "format": JSON_FORMAT,
-        "versions": {each.replace("-", "_"): version(each) for each in PACKAGES},
+        "versions": run_folder.package_versions(),
         "suite": cfg.suite.name,
         "levels": OmegaConf.to_container(cfg.suite.disturbances, resolve=True),
         "episodes": cfg.episodes,
         "seed": cfg.seed,
-        "checkpoints": {
-            file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files
-        },
+        "checkpoints": {file.name: sha256_of(file) for file in files},
     }
 
 

@@ -290,11 +290,7 @@ class DiscreteOSRLoss(BaseLoss):
     def alpha_loss(self, step: Step, pi: Any) -> Tensor:
         """SAC's objective of the entropy temperature."""
         auto = self.target_entropy_weight * math.log(pi.logits.shape[-1])
-        target_entropy = auto if self.target_entropy == "auto" else self.target_entropy
-        objective = functional.temperature_objective(
-            self.log_alpha, -pi.entropy(), target_entropy
-        )
-        return step.reduce(objective.mean(0))
+        return step.temperature_loss(-pi.entropy(), auto=auto)
 
     def cql_loss(self, step: Step, qvalue: Tensor, pred_value: Tensor) -> Tensor:
         """CQL(H) penalty, exact: each action once, and for certain."""

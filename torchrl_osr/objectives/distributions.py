@@ -88,8 +88,8 @@ def check_categorical(network: TensorDictModuleBase, name: str) -> None:
     Raises:
         TypeError: if its distribution is not in :data:`CATEGORICAL`.
     """
-    distribution, _ = _head(network)
-    if not _is_a(distribution, *CATEGORICAL):
+    if not is_categorical(network):
+        distribution, _ = _head(network)
         cure = "torchrl_osr.modules builds such networks."
         if _is_a(distribution, TanhNormal):
             cure = "For continuous actions use OSRLoss."
@@ -118,7 +118,7 @@ def _action_size(network: TensorDictModuleBase) -> int | None:
     kinds = (nn.Linear, NormalParamExtractor)
     layers = [layer for layer in network.modules() if isinstance(layer, kinds)]
     if layers and isinstance(layers[-1], nn.Linear):
-        categorical = _is_a(_head(network)[0], *CATEGORICAL)
+        categorical = is_categorical(network)
         return int(layers[-1].out_features) if categorical else None
     if len(layers) > 1 and isinstance(layers[-2], nn.Linear):
         return int(layers[-2].out_features) // 2

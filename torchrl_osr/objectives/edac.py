@@ -103,10 +103,7 @@ class EDACLoss(BaseLoss):
         check_weight("diversity_weight", diversity_weight)
         super().__init__(**options)
         self._hold_action_bounds(actor_network)
-        self._hold_actor_critic(
-            actor_network,
-            qvalue_network,
-        )
+        self._hold_actor_critic(actor_network, qvalue_network)
         if self.num_qvalue_nets < 2:
             raise ValueError(
                 "EDACLoss compares critics with each other: it needs num_qvalue_nets "
@@ -174,12 +171,7 @@ class EDACLoss(BaseLoss):
 
     def alpha_loss(self, step: Step, log_prob: Tensor) -> Tensor:
         """SAC's objective of the entropy temperature."""
-        auto = -float(step.data_action.shape[-1])
-        target_entropy = auto if self.target_entropy == "auto" else self.target_entropy
-        objective = functional.temperature_objective(
-            self.log_alpha, log_prob, target_entropy
-        )
-        return step.reduce(objective.mean(0))
+        return step.temperature_loss(log_prob, auto=-step.data_action.shape[-1])
 
     def _action_gradients(self, step: Step) -> Tensor:
         """Gradient of each critic by the data's action, ``[N, B, A]``."""

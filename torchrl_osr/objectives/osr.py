@@ -309,12 +309,7 @@ class OSRLoss(BaseLoss):
 
     def alpha_loss(self, step: Step, log_prob: Tensor) -> Tensor:
         """SAC's objective of the entropy temperature."""
-        auto = -float(step.data_action.shape[-1])
-        target_entropy = auto if self.target_entropy == "auto" else self.target_entropy
-        objective = functional.temperature_objective(
-            self.log_alpha, log_prob, target_entropy
-        )
-        return step.reduce(objective.mean(0))
+        return step.temperature_loss(log_prob, auto=-step.data_action.shape[-1])
 
     def cql_loss(
         self, step: Step

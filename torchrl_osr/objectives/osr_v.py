@@ -166,7 +166,7 @@ class OSRVLoss(BaseLoss):
             "entropy": -step.mean(log_prob),
             "pred_value": step.mean(pred_value),
             "target_value": step.mean(target_value),
-            "recovery_gap": step.mean(gap.mean(1).sum(0), transitions=True),
+            "recovery_gap": step.mean(gap, transitions=True),
         }
         return self._output(tensordict, losses, metrics)
 
@@ -183,12 +183,7 @@ class OSRVLoss(BaseLoss):
 
     def alpha_loss(self, step: Step, log_prob: Tensor) -> Tensor:
         """SAC's objective of the entropy temperature."""
-        auto = -float(step.data_action.shape[-1])
-        target_entropy = auto if self.target_entropy == "auto" else self.target_entropy
-        objective = functional.temperature_objective(
-            self.log_alpha, log_prob, target_entropy
-        )
-        return step.reduce(objective.mean(0))
+        return step.temperature_loss(log_prob, auto=-step.data_action.shape[-1])
 
     @torch.no_grad()
     def _candidates(self, step: Step) -> tuple[Tensor, Tensor | None]:
@@ -214,7 +209,11 @@ class OSRVLoss(BaseLoss):
         )
 
     def _data_qvalue_and_gap(self, step: Step) -> tuple[Tensor, Tensor]:
-        """:math:`Q_i(s, a)`, ``[N, B]``, and the gap of (8) on D_tot, ``[N, 2, B]``."""
+        """:math:`Q_i(s, a)`, ``[N, B]``, and the gap of (8), ``[B]``.
+
+        The gap is the mean over both halves of D_tot, summed over critics, as the TD
+        error is.
+        """
         candidates, log_prob = self._candidates(step)
         mixed = step.at("both").expand(candidates.shape[:-1])
         # One pass of the critics for the data's action and all candidates.
@@ -230,7 +229,7 @@ class OSRVLoss(BaseLoss):
             log_prob=None if log_prob is None else log_prob.movedim(0, -1),
             temperature=self.temperature,
         )
-        return qvalue[:, 0], gap
+        return qvalue[:, 0], gap.mean(1).sum(0)
 
     @torch.no_grad()
     def _target_value(self, step: Step) -> Tensor:
@@ -248,7 +247,6 @@ class OSRVLoss(BaseLoss):
         The paper prints OSR-v's TD error without the square; (2) has it.
         """
         distance = step.td_distance(pred_value, target_value)
-        # Over both halves of D_tot; summed over critics, as the TD error is.
-        constraint = step.reduce(gap.mean(1).sum(0), transitions=True)
+        constraint = step.reduce(gap, transitions=True)
         loss: Tensor = step.reduce(distance) + self.recovery_weight * constraint
         return loss

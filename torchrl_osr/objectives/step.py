@@ -19,6 +19,7 @@ from tensordict.nn import (
 from torch import Tensor
 from torchrl.objectives import distance_loss
 
+from torchrl_osr import functional
 from torchrl_osr._entries import column, entry, nested, select, state_keys
 from torchrl_osr.objectives import critic_kernel
 from torchrl_osr.objectives.base import BaseLoss
@@ -241,6 +242,19 @@ class Step:
         """The values of all critics, see :func:`qvalue`."""
         return qvalue(self.loss, states, action, params)
 
+    def temperature_loss(self, log_prob: Tensor, *, auto: float) -> Tensor:
+        """SAC's objective of the entropy temperature, reduced.
+
+        Args:
+            log_prob: log-density of the policy's own actions, ``[D, B]``.
+            auto: target that ``target_entropy="auto"`` stands for, in nats.
+        """
+        wanted = self.loss.target_entropy
+        objective = functional.temperature_objective(
+            self.loss.log_alpha, log_prob, auto if wanted == "auto" else wanted
+        )
+        return self.reduce(objective.mean(0))
+
     def td_target(self, next_value: Tensor) -> Tensor:
         r"""The TD target :math:`r + \gamma (1 - \text{terminated}) V(s')`, ``[B]``.
 
@@ -252,8 +266,7 @@ class Step:
             next_value: :math:`V(s')`, ``[B]``.
         """
         loss = self.loss
-        for key in loss._next_keys("reward", "done"):
-            column(self.tensordict, key)
+        column(self.tensordict, nested("next", loss.tensor_keys.reward))
         batch = self.tensordict.copy()
         key = nested("next", loss.value_estimator.tensor_keys.value)
         batch.set(key, next_value.unsqueeze(-1))
