@@ -94,11 +94,11 @@ def cpu_seconds(pid: int) -> int:
 
 def sweep(folder: Path, cache: Path) -> subprocess.Popen[bytes]:
     """Start, or continue, the sweep."""
-    script = str(ROOT / "examples" / "offline_osr.py")
+    command = [sys.executable, "-m", "torchrl_osr", "train", *SWEEP]
     folder.parent.mkdir(parents=True, exist_ok=True)
     with folder.with_suffix(".txt").open("ab") as log:
         return subprocess.Popen(
-            [sys.executable, script, *SWEEP, f"hydra.sweep.dir={folder}"],
+            [*command, f"hydra.sweep.dir={folder}"],
             env=environment(cache),
             stdout=log,
             stderr=log,

@@ -3,7 +3,7 @@
     unshare --map-root-user --mount python benchmarks/disk_and_rights.py --folder /tmp/d
 
 Needs Linux: small file systems are mounted below ``--folder``. Every case is one run of
-``examples/offline_osr.py`` that must fail with a message that names the place and the
+``torchrl-osr train`` that must fail with a message that names the place and the
 cause, leave no part of a file behind that is later taken for a whole one, and end like
 an undisturbed run, bit for bit, once the cause is gone. Writes
 ``results/reliability/disk_and_rights.json``.
@@ -46,8 +46,8 @@ def train(
     run: Path, cache: Path, before: tuple[str, ...] = ()
 ) -> subprocess.CompletedProcess[str]:
     """Start or continue a run; return its exit code and what it printed."""
-    script = str(ROOT / "examples" / "offline_osr.py")
-    command = [*before, sys.executable, script, *TRAIN, f"hydra.run.dir={run}"]
+    command = [*before, sys.executable, "-m", "torchrl_osr", "train", *TRAIN]
+    command.append(f"hydra.run.dir={run}")
     environment = os.environ | {"TORCHRL_OSR_CACHE": str(cache), "OMP_NUM_THREADS": "1"}
     return subprocess.run(
         command,

@@ -68,13 +68,12 @@ class Run:
 
     def start(self, log: Path) -> subprocess.Popen[bytes]:
         """Start the command that comes next."""
-        command = ["offline_osr.py", *TRAIN, f"hydra.run.dir={self.folder}"]
+        command = ["train", *TRAIN, f"hydra.run.dir={self.folder}"]
         if self.trained:
-            command = ["evaluate.py", *EVALUATE, f"checkpoint={self.folder}"]
-        command[0] = str(ROOT / "examples" / command[0])
+            command = ["evaluate", *EVALUATE, f"checkpoint={self.folder}"]
         with log.open("ab") as file:
             return subprocess.Popen(
-                [sys.executable, *command],
+                [sys.executable, "-m", "torchrl_osr", *command],
                 env=self.environment,
                 stdout=file,
                 stderr=file,

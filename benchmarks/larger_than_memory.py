@@ -5,7 +5,7 @@
 Writes a set of synthetic rows of hopper's sizes with ``write_memmap``, then draws the
 same batches from memory and from disk, each in a process of its own, in turns: what
 else runs on the machine slows both. ``disk_for_training`` is what training draws: rows
-without the held-out ones, standardised. At the end ``examples/offline_osr.py`` trains
+without the held-out ones, standardised. At the end ``torchrl-osr train`` trains
 on the set. Memory is a process's anonymous memory (``RssAnon``), its own; pages of the
 mapped files are the system's, which takes them back when memory is short. Linux only.
 Writes ``results/reliability/larger_than_memory.json``; the set is deleted.
@@ -195,8 +195,15 @@ def cold(folder: Path, batches: int) -> dict[str, float]:
 
 def train(folder: Path) -> dict[str, Any]:
     """Run the example on the set and watch its memory."""
-    script, run = ROOT / "examples" / "offline_osr.py", folder.with_name("run")
-    command = [sys.executable, str(script), *TRAINING, f"data.path={folder}"]
+    run = folder.with_name("run")
+    command = [
+        sys.executable,
+        "-m",
+        "torchrl_osr",
+        "train",
+        *TRAINING,
+        f"data.path={folder}",
+    ]
     process = subprocess.Popen([*command, f"hydra.run.dir={run}"])
     begin, seen = time.perf_counter(), []
     while process.poll() is None:

@@ -63,7 +63,7 @@ def main(rounds: int, steps: int, overrides: list[str]) -> dict[str, float | str
     config.register()
     conf = Path(__file__).resolve().parents[1] / "conf"
     with initialize_config_dir(str(conf), version_base="1.3"):
-        cfg = compose("offline_osr", overrides=overrides)
+        cfg = compose("train", overrides=overrides)
     torch.set_num_threads(cfg.trainer.num_threads)
     torch.manual_seed(0)
     cells = list(cfg.network.num_cells)

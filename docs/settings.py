@@ -29,9 +29,9 @@ COMMON = (
 )
 HEAD = """# Settings
 
-Every key of `examples/offline_osr.py` with its value in two presets. The options of a
+Every key of `torchrl-osr train` with its value in two presets. The options of a
 loss are those of its class, here those of {py:class}`~torchrl_osr.OSRLoss`;
-`python examples/offline_osr.py loss=osr_v --cfg job` prints those of another. This page
+`torchrl-osr train loss=osr_v --cfg job` prints those of another. This page
 is written by `python docs/settings.py`.
 """
 
@@ -68,8 +68,8 @@ def markdown(text: str) -> str:
 
 def meanings(cfg: DictConfig) -> dict[str, str]:
     """The meaning of every key, dotted."""
-    found = described(schema.OfflineOSRConfig)
-    for name, field in schema.OfflineOSRConfig.__dataclass_fields__.items():
+    found = described(schema.TrainConfig)
+    for name, field in schema.TrainConfig.__dataclass_fields__.items():
         if inspect.isclass(field.default_factory):
             group = described(field.default_factory)
             found |= {f"{name}.{key}": text for key, text in group.items()}
@@ -103,7 +103,7 @@ def page() -> str:
     """The whole page."""
     schema.register()
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        composed = [compose("offline_osr", [f"preset={name}"]) for name in PRESETS]
+        composed = [compose("train", [f"preset={name}"]) for name in PRESETS]
     values = [
         dict(leaves(OmegaConf.to_container(cfg, resolve=True))) for cfg in composed
     ]

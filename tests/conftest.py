@@ -18,6 +18,8 @@ from torchrl.modules import (
     ValueOperator,
 )
 
+pytest_plugins = ["processes"]
+
 torch.set_num_threads(1)
 
 OBSERVATION_DIM, ACTION_DIM = 3, 2

@@ -21,12 +21,12 @@ from typing import Any
 import torch
 from omegaconf import OmegaConf
 
-SCRIPT = Path(__file__).resolve().parents[2] / "examples" / "offline_osr.py"
+TRAIN = [sys.executable, "-m", "torchrl_osr", "train"]
 
 
 def run_until(folder: Path, arguments: list[str], phase: str, step: int, wait: float):
     """Start or resume the run and kill it ``wait`` seconds after a checkpoint."""
-    process = subprocess.Popen([sys.executable, str(SCRIPT), *arguments])
+    process = subprocess.Popen([*TRAIN, *arguments])
     checkpoint = folder / "checkpoint" / phase / f"checkpoint-{step:012d}.torchrl"
     while not checkpoint.exists():
         if process.poll() is not None:
@@ -81,7 +81,7 @@ def main(undisturbed: Path, killed: Path, overrides: list[str]) -> None:
     run_until(killed, first, "inverse_dynamics", every, 1.3)
     run_until(killed, resume, "policy", every, 1.7)
     run_until(killed, resume, "policy", middle, 0.4)
-    subprocess.run([sys.executable, str(SCRIPT), *resume], check=True)
+    subprocess.run([*TRAIN, *resume], check=True)
     mine, theirs = last_checkpoint(killed), last_checkpoint(undisturbed)
     for name, state in theirs.items():
         equal = mine[name].keys() == state.keys() and all(

@@ -16,7 +16,6 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
 # In the order in which they are trained: a prefix of the list is a fair comparison.
 METHODS = {
     "cql": ["loss=cql"],
@@ -52,21 +51,21 @@ def run(folder: Path, data: str, method: str, seed: int) -> None:
     env, quality = data.split("-", 1)
     if not finished(folder / "status.json", "status", "done"):
         train = [
-            "offline_osr.py", f"env={env}", f"data={quality}", f"seed={seed}",
+            "train", f"env={env}", f"data={quality}", f"seed={seed}",
             *METHODS[method], "trainer.progress=false", f"hydra.run.dir={folder}",
         ]  # fmt: skip
         call(train, folder / "train.txt")
     if not (folder / "robustness-oos.json").exists():
-        call(["evaluate.py", f"checkpoint={folder}"], folder / "evaluate.txt")
+        call(["evaluate", f"checkpoint={folder}"], folder / "evaluate.txt")
     print(folder, flush=True)
 
 
 def call(command: list[str], log: Path) -> None:
-    """Run an example; keep what it prints."""
+    """Run a command; keep what it prints."""
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("w") as file:
         subprocess.run(
-            [sys.executable, str(EXAMPLES / command[0]), *command[1:]],
+            [sys.executable, "-m", "torchrl_osr", *command],
             stdout=file, stderr=subprocess.STDOUT, check=True,
         )  # fmt: skip
 

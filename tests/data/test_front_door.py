@@ -18,7 +18,7 @@ for name in ("load_local_dataset", "collect_quality", "make_environment"):
     try:
         exec(f"from torchrl_osr.data import {name}")
     except ImportError as error:
-        assert "pip install torchrl-osr[examples]" in str(error), error
+        assert "pip install torchrl-osr[train]" in str(error), error
     else:
         raise AssertionError(name)
 """

@@ -1,87 +1,9 @@
-"""What the tests of the examples share: their processes, their code, tiny sizes."""
+"""Each file has a cache of its own."""
 
 from __future__ import annotations
 
-import importlib.util
-import subprocess
-import sys
-from collections.abc import Callable
-from pathlib import Path
-from types import ModuleType
-
 import pytest
-
-EXAMPLES = Path(__file__).parents[2] / "examples"
-PRINTED = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-
-
-def command(script: str, *arguments: str) -> list[str]:
-    return [sys.executable, str(EXAMPLES / script), *arguments]
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _cache(tmp_path_factory):
-    """One cache for the tests of a file, and one thread; processes inherit both."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TORCHRL_OSR_CACHE", str(tmp_path_factory.mktemp("cache")))
-        patch.setenv("OMP_NUM_THREADS", "1")
-        yield
-
-
-@pytest.fixture(scope="session")
-def tiny() -> Callable[..., list[str]]:
-    """Return a maker of the main example's overrides, for a run of seconds."""
-
-    def overrides(data: str = "random", **trainer: object) -> list[str]:
-        sizes: dict[str, object] = {
-            "batch_size": 8,
-            "inverse_dynamics_steps": 10,
-            "steps": 10,
-            "log_interval": 10,
-            "eval_interval": 10,
-            "eval_episodes": 1,
-            "checkpoint_interval": 10,
-        }
-        rows = [f"data={data}", "data.num_transitions=600", "data.held_out=0.1"]
-        values = [f"trainer.{key}={value}" for key, value in (sizes | trainer).items()]
-        return [*rows, "network.num_cells=[8]", *values]
-
-    return overrides
-
-
-@pytest.fixture(scope="session")
-def start() -> Callable[..., subprocess.Popen]:
-    """Return a function that starts an example in a process, as a user does."""
-
-    def start(cwd: Path, script: str, *arguments: str) -> subprocess.Popen:
-        return subprocess.Popen(command(script, *arguments), cwd=cwd, **PRINTED)
-
-    return start
-
-
-@pytest.fixture(scope="session")
-def run() -> Callable[..., tuple[int, str]]:
-    """Return a function that runs one to its end: exit code and what it printed."""
-
-    def run(cwd: Path, script: str, *arguments: str) -> tuple[int, str]:
-        # On a timeout, unlike start's, the process is killed.
-        done = subprocess.run(
-            command(script, *arguments), cwd=cwd, timeout=240, check=False, **PRINTED
-        )
-        return done.returncode, done.stdout
-
-    return run
-
-
-@pytest.fixture(scope="session")
-def load_example() -> Callable[[str], ModuleType]:
-    """Return a function that imports an example: no process for each case."""
-
-    def load(script: str) -> ModuleType:
-        name = f"{Path(script).stem}_example"
-        spec = importlib.util.spec_from_file_location(name, EXAMPLES / script)
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        return module
-
-    return load
+def _cache(own_cache) -> None: ...

@@ -23,7 +23,7 @@ def learner_of(*overrides: str):
     schema.register()
     overrides = ("network.num_cells=[8]", "optim.gamma=0.5", *overrides)
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        cfg = compose("offline_osr", overrides=list(overrides))
+        cfg = compose("train", overrides=list(overrides))
     return cfg, make_learner(cfg, 3, 2)
 
 

@@ -26,7 +26,7 @@ OPTIONS = [
 def test_every_configuration_of_ours_is_let_through(tmp_path, option):
     config.register()
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        cfg = compose("offline_osr", [option])
+        cfg = compose("train", [option])
     OmegaConf.save(cfg, tmp_path / "config.yaml", resolve=True)
     again = read_config(tmp_path / "config.yaml")
     assert again == OmegaConf.load(tmp_path / "config.yaml")

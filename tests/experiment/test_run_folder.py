@@ -133,7 +133,7 @@ def composed():
     schema.register()
     conf = Path(__file__).parents[2] / "conf"
     with initialize_config_dir(str(conf), version_base="1.3"):
-        yield lambda *overrides: compose("offline_osr", overrides=list(overrides))
+        yield lambda *overrides: compose("train", overrides=list(overrides))
 
 
 @pytest.mark.parametrize(

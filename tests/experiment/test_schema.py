@@ -37,7 +37,7 @@ def _hydra():
 
 
 def composed(*overrides: str):
-    return compose("offline_osr", overrides=list(overrides))
+    return compose("train", overrides=list(overrides))
 
 
 def options(group: str) -> list[str]:
@@ -51,7 +51,7 @@ def options(group: str) -> list[str]:
 def test_every_option_composes_without_a_missing_value(override):
     cfg = composed(override)
     assert not OmegaConf.missing_keys(cfg)
-    assert isinstance(OmegaConf.to_object(cfg), config.OfflineOSRConfig)
+    assert isinstance(OmegaConf.to_object(cfg), config.TrainConfig)
 
 
 @pytest.mark.parametrize("name", options("experiment"))
@@ -288,10 +288,10 @@ def test_schema_documents_every_field():
         for schema in vars(config).values()
         if is_dataclass(schema) and schema.__module__ == config.__name__
     ]
-    assert config.OfflineOSRConfig in schemas
+    assert config.TrainConfig in schemas
     for schema in schemas:
         own = fields(schema)
-        if schema is config.OfflineOSRConfig:
+        if schema is config.TrainConfig:
             # The groups have classes of their own.
             own = [each for each in own if each.default_factory is MISSING]
         for name in {each.name for each in own} - {"_target_", "loss"}:

@@ -33,7 +33,7 @@ def make_run(folder: Path, *overrides: str):
     """Save two checkpoints and the best of an untrained policy, as the trainer does."""
     config.register()
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        cfg = compose("offline_osr", ["network.num_cells=[8]", *overrides])
+        cfg = compose("train", ["network.num_cells=[8]", *overrides])
     folder.mkdir()
     OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
     actor, _, loss = make_learner(cfg, 11, 3)

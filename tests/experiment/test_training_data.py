@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
 from pathlib import Path
 
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
+from torchrl_osr.commands import train
 from torchrl_osr.evaluation import DataDistance
 from torchrl_osr.experiment import schema as config
 from torchrl_osr.experiment.build import load_data
 from torchrl_osr.experiment.training_data import load_training_data
 
 ROOT = Path(__file__).parents[2]
-SCRIPT = ROOT / "examples" / "offline_osr.py"
 CPU = torch.device("cpu")
 TINY = [
     "data=random",
@@ -43,7 +42,7 @@ def _cache(tmp_path_factory):
 def composed(*overrides: str):
     config.register()
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return compose("offline_osr", overrides=[*TINY, *overrides])
+        return compose("train", overrides=[*TINY, *overrides])
 
 
 @pytest.mark.parametrize(
@@ -88,13 +87,10 @@ def losses(folder: Path) -> dict[str, list[float]]:
 
 
 def test_the_same_seed_gives_the_same_training(tmp_path):
-    spec = importlib.util.spec_from_file_location("offline_osr", SCRIPT)
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
     results = []
     for storage in ("memory", "disk"):
         cfg, folder = composed(f"data.storage={storage}"), tmp_path / storage
-        script.run(cfg, folder)
+        train.run(cfg, folder)
         results.append(losses(folder))
     here, there = results
     assert len(here) > 5

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from torchrl_osr.commands.report import main
 from torchrl_osr.report import read_runs, write_report
 from torchrl_osr.report.page import slug
 from torchrl_osr.report.plots import MOST
@@ -220,14 +221,12 @@ def test_names_of_files_are_safe():
     assert slug("$$$") == "unnamed"
 
 
-def test_the_example_packs_runs_reports_on_them_and_says_what_is_missing(
+def test_the_command_packs_runs_reports_on_them_and_says_what_is_missing(
     tmp_path, monkeypatch, capsys
 ):
-    example = Path(__file__).parents[2] / "examples" / "report.py"
-
     def run(*arguments: object) -> str:
         monkeypatch.setattr("sys.argv", ["report.py", *map(str, arguments)])
-        runpy.run_path(str(example), run_name="__main__")
+        main()
         return capsys.readouterr().out
 
     fakes.write_run(tmp_path / "runs" / "a", {1: [1.0, 2.0]})

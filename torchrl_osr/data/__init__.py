@@ -4,7 +4,7 @@ Three rooms, each of which knows only those before it: ``store`` (what a data se
 where its rows are, how they are drawn), ``collect`` (tasks, behaviour policies,
 roll-outs) and ``read`` (Minari, D4RL, files of your own). ``load_dataset`` opens all.
 
-Collecting needs Gymnasium, MuJoCo, tqdm and platformdirs (``torchrl-osr[examples]``),
+Collecting needs Gymnasium, MuJoCo, tqdm and platformdirs (``torchrl-osr[train]``),
 reading HDF5, Arrow or Parquet those and Minari, h5py and pyarrow (``[minari]``); the
 names that do are loaded on first use, so that everything else works without them.
 

@@ -14,7 +14,7 @@ Order matters where several are combined. From the task outwards: changes of dyn
 and start state, knocks and pushes, actuators, sensors. Attacks on observations need the
 networks: :func:`attacked_policy` makes an attacked policy from a policy.
 
-Gymnasium and MuJoCo come with ``torchrl-osr[examples]``.
+Gymnasium and MuJoCo come with ``torchrl-osr[train]``.
 """
 
 try:
@@ -22,7 +22,7 @@ try:
     import mujoco  # noqa: F401
 except ImportError as error:
     raise ImportError(
-        f"disturbances need {error.name!r}: pip install torchrl-osr[examples]"
+        f"disturbances need {error.name!r}: pip install torchrl-osr[train]"
     ) from error
 
 from torchrl_osr.envs.faults import (

@@ -21,7 +21,7 @@ def new_figure(width: float, height: float, **options: Any) -> Figure:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise ImportError(
-            f"figures need {error.name!r}: pip install torchrl-osr[examples]"
+            f"figures need {error.name!r}: pip install torchrl-osr[train]"
         ) from error
     figure = Figure(figsize=(width, height), **options)
     FigureCanvasAgg(figure)

@@ -82,7 +82,7 @@ def make_learner(
     ``qvalue_network``, ``inverse_dynamics_network``.
 
     Args:
-        cfg: a whole configuration of ``examples/offline_osr.py``.
+        cfg: a whole configuration of ``torchrl-osr train``.
         observation_size, action_size: of the data.
         device: where they shall be. Default CPU.
 

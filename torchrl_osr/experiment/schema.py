@@ -203,8 +203,8 @@ class LoggerConfig:
 
 
 @dataclass
-class OfflineOSRConfig:
-    """Everything that ``examples/offline_osr.py`` reads.
+class TrainConfig:
+    """Everything that ``torchrl-osr train`` reads.
 
     Attributes:
         seed: random seed of networks, sampling and noise.
@@ -289,12 +289,12 @@ def _config_type(annotation: Any) -> Any:
 def register() -> None:
     """Make schemas and resolvers known to Hydra.
 
-    ``offline_osr_schema``, and in the group ``schema`` one for each class of
+    ``train_schema``, and in the group ``schema`` one for each class of
     :mod:`torchrl_osr.objectives`; ``run_dir``, by which ``resume=folder`` becomes the
     run's folder, and ``job_dir``, which names a sweep's folders.
     """
     store = ConfigStore.instance()
-    store.store(name="offline_osr_schema", node=OfflineOSRConfig)
+    store.store(name="train_schema", node=TrainConfig)
     for name in set(objectives.__all__) - {"BaseLoss"}:
         schema = schema_of(getattr(objectives, name))
         store.store(group="schema", name=name, node=schema)

@@ -1,4 +1,4 @@
-"""The configuration of ``examples/evaluate.py``: its schema, and what is made of it.
+"""The configuration of ``torchrl-osr evaluate``: its schema, and what is made of it.
 
 :func:`register` makes the schema known to Hydra, which then refuses a mistyped key or a
 value of the wrong type by name. :func:`make_disturbances` builds a suite's wrappers and
@@ -61,7 +61,7 @@ class SuiteConfig:
 
 @dataclass
 class EvaluateConfig:
-    """All keys of ``examples/evaluate.py``.
+    """All keys of ``torchrl-osr evaluate``.
 
     Attributes:
         checkpoint: a run's folder, or one checkpoint's file in it.

@@ -58,7 +58,7 @@ def load_training_data(cfg: DictConfig, device: torch.device) -> TrainingData:
     task's own.
 
     Args:
-        cfg: a whole configuration of ``examples/offline_osr.py``.
+        cfg: a whole configuration of ``torchrl-osr train``.
         device: where batches and networks are.
 
     Raises:

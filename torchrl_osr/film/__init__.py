@@ -4,7 +4,7 @@
 * :class:`InverseDynamicsController` is the inverse dynamics model as a controller;
 * :func:`film_strip`, :func:`film_gif` and :func:`visited_states` draw one episode.
 
-``examples/film.py`` puts them together, ``docs/film.md`` has the meaning.
+``torchrl-osr film`` puts them together, ``docs/film.md`` has the meaning.
 """
 
 from torchrl_osr.film.control import InverseDynamicsController

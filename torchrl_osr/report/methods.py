@@ -104,7 +104,7 @@ def read_runs(paths: Sequence[Path]) -> RunTables:
         reasons = "".join(f"\n  {each.path}: {each.reason}" for each in left_out)
         raise ValueError(
             f"no finished run in {', '.join(map(str, paths))}.{reasons}\n"
-            "Give folders of examples/offline_osr.py, or a table of such runs."
+            "Give folders of torchrl-osr train, or a table of such runs."
         )
     # Runs of one name together: what it is told apart into is then below each other.
     names = [run.facts["method"] for run in found]

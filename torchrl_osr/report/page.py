@@ -46,7 +46,7 @@ try:
     from jinja2 import Environment, PackageLoader
 except ImportError as error:
     raise ImportError(
-        f"the report needs {error.name!r}: pip install torchrl-osr[examples]"
+        f"the report needs {error.name!r}: pip install torchrl-osr[train]"
     ) from error
 
 PAGE = "report.html"

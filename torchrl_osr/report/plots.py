@@ -22,7 +22,7 @@ try:
     from PIL import Image  # Matplotlib needs it, too
 except ImportError as error:
     raise ImportError(
-        f"figures need {error.name!r}: pip install torchrl-osr[examples]"
+        f"figures need {error.name!r}: pip install torchrl-osr[train]"
     ) from error
 
 # Okabe and Ito's palette, which colour-blind readers can tell apart, without its

@@ -12,7 +12,7 @@ try:
     from tqdm.contrib.logging import logging_redirect_tqdm
 except ImportError as error:
     raise ImportError(
-        f"the trainer needs {error.name!r}: pip install torchrl-osr[examples]"
+        f"the trainer needs {error.name!r}: pip install torchrl-osr[train]"
     ) from error
 
 log = logging.getLogger(__name__)

@@ -22,7 +22,7 @@ try:
     import mujoco
 except ImportError as error:
     raise ImportError(
-        f"MuJoCo tasks need {error.name!r}: pip install torchrl-osr[examples]"
+        f"MuJoCo tasks need {error.name!r}: pip install torchrl-osr[train]"
     ) from error
 
 # v4 of the ant, although there is v5: Minari's sets are of v4, whose observations lack

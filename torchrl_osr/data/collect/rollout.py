@@ -24,7 +24,7 @@ try:
     from tqdm.auto import tqdm
 except ImportError as error:
     raise ImportError(
-        f"collecting data needs {error.name!r}: pip install torchrl-osr[examples]"
+        f"collecting data needs {error.name!r}: pip install torchrl-osr[train]"
     ) from error
 
 ActionSampler = Callable[[NDArray[Any], np.random.Generator], NDArray[np.float32]]

@@ -38,7 +38,7 @@ def cache_root(cache_dir: Path | str | None = None) -> Path:
             import platformdirs
         except ImportError as error:
             raise ImportError(
-                f"the cache needs {error.name!r}: pip install torchrl-osr[examples]"
+                f"the cache needs {error.name!r}: pip install torchrl-osr[train]"
             ) from error
         root = platformdirs.user_cache_dir("torchrl-osr")
     return Path(root).expanduser()

@@ -40,7 +40,7 @@ def train(run, tiny):
             eval_episodes=2, checkpoint_interval=2,
         )  # fmt: skip
         command = [*sizes, "hydra.run.dir=run", *arguments]
-        code, output = run(cwd, "offline_osr.py", *command)
+        code, output = run(cwd, "train", *command)
         assert code == 0, output
         return output
 
@@ -111,16 +111,15 @@ def test_recorded_ants_are_trained_on(train, tmp_path):
     assert max(last["lengths"]) <= 700
 
 
-def test_a_point_is_trained_and_disturbed(train, tmp_path, load_example):
+def test_a_point_is_trained_and_disturbed(train, tmp_path):
     train(tmp_path, "diverse", "env=pointmaze-umaze", "preset=pointmaze")
     folder = tmp_path / "run"
-    evaluation = load_example("evaluate.py")
 
-    def evaluate(suite: str) -> None:
+    def disturb(suite: str) -> None:
         with initialize_config_dir(
             str(ROOT / "conf" / "evaluation"), version_base="1.3"
         ):
-            evaluation.main(
+            evaluate.main(
                 compose(
                     "evaluate",
                     [
@@ -130,7 +129,7 @@ def test_a_point_is_trained_and_disturbed(train, tmp_path, load_example):
                 )
             )
 
-    evaluate("torque")
+    disturb("torque")
     results = json.loads((folder / "robustness-torque.json").read_text())
     levels = results["evaluations"][0]["levels"]
     assert [level["name"] for level in levels] == [
@@ -142,5 +141,5 @@ def test_a_point_is_trained_and_disturbed(train, tmp_path, load_example):
         "disturbance 'mass-0.75' is not possible for PointMaze_UMaze-v3: DynamicsChange"
     )
     with pytest.raises(ValueError, match=message):
-        evaluate("dynamics")
+        disturb("dynamics")
     assert not (folder / "robustness-dynamics.json").exists()

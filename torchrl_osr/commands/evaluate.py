@@ -1,8 +1,8 @@
 """Disturb a trained policy: score lost, survival, and time back to the data.
 
-    python examples/evaluate.py checkpoint=outputs/hopper-medium-replay/seed0-...
-    python examples/evaluate.py checkpoint=<run's folder> suite=torque episodes=20
-    python examples/evaluate.py checkpoint=<run's folder>/checkpoint/policy/best.torchrl
+    torchrl-osr evaluate checkpoint=outputs/hopper-medium-replay/seed0-...
+    torchrl-osr evaluate checkpoint=<run's folder> suite=torque episodes=20
+    torchrl-osr evaluate checkpoint=<run's folder>/checkpoint/policy/best.torchrl
 
 Each of the run's last checkpoints plays pairs of episodes, one of each pair disturbed.
 The run's folder gets ``robustness-<suite>.json`` with all raw results, and a figure of
@@ -30,6 +30,7 @@ from torchrl_osr._files import (
     sha256_of,
     write_json,
 )
+from torchrl_osr.commands import CONF
 from torchrl_osr.data import observation_statistics
 from torchrl_osr.evaluation import (
     DataDistance,
@@ -55,7 +56,7 @@ SEED_STRIDE = 1000  # between checkpoints: no two of them play the same episodes
 register()
 
 
-@hydra.main("../conf/evaluation", "evaluate", version_base="1.3")
+@hydra.main(f"{CONF}/evaluation", "evaluate", version_base="1.3")
 def main(cfg: DictConfig) -> None:
     """Evaluate, unless the result is there already, and print the table."""
     torchrl_logger.setLevel("WARNING")

@@ -15,7 +15,7 @@ import pytest
 import torch
 from torch.utils._pytree import tree_leaves
 
-SCRIPT = "offline_osr.py"
+SCRIPT = "train"
 
 
 @pytest.fixture(scope="module")

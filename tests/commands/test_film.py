@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -14,10 +15,10 @@ SHORT = ["checkpoint=run", "episodes=2", "window=[20,30]", "after=16"]
 
 
 @pytest.fixture(scope="module")
-def script(load_example):
+def script():
     """The script's functions."""
     before = os.environ.get("MUJOCO_GL")
-    module = load_example("film.py")
+    module = import_module("torchrl_osr.commands.film")
     # Not for the other tests of this process.
     if before is None:
         os.environ.pop("MUJOCO_GL", None)
@@ -31,9 +32,9 @@ def composed(*overrides: str):
 
 def test_film_leaves_pictures_numbers_and_a_table(tmp_path, run, tiny):
     sizes = [*tiny("medium"), "hydra.run.dir=run"]
-    code, output = run(tmp_path, "offline_osr.py", *sizes)
+    code, output = run(tmp_path, "train", *sizes)
     assert code == 0, output
-    code, output = run(tmp_path, "film.py", *SHORT)
+    code, output = run(tmp_path, "film", *SHORT)
     if code != 0 and "OpenGL did not start" in output:
         pytest.skip(f"no OpenGL to draw with here: {output.splitlines()[-1]}")
     assert code == 0, output

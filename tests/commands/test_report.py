@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from torchrl_osr.commands.report import main
+
 ROOT = Path(__file__).parents[2]
 FAKES = ROOT / "tests" / "report" / "fakes.py"
 
@@ -19,7 +21,7 @@ def test_report_of_several_folders(tmp_path, run):
     write_run(tmp_path / "b" / "0", curve, overrides=["loss=osr"])
     write_run(tmp_path / "b" / "1", curve, overrides=["loss=osr"], status="running")
     options = ["a", "b", "--reference", "osr", "--output", "new/report"]
-    code, output = run(tmp_path, "report.py", *options)
+    code, output = run(tmp_path, "report", *options)
     assert code == 0, output
     assert "left out: b/1: not finished, its status is running\n" in output
     assert "note: Every method has one seed a data set" in output
@@ -32,8 +34,8 @@ def test_report_of_several_folders(tmp_path, run):
 
 def test_what_cannot_be_reported_is_one_line(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["report.py", "nowhere"])
+    monkeypatch.setattr(sys, "argv", ["torchrl-osr report", "nowhere"])
     with pytest.raises(SystemExit) as stopped:
-        runpy.run_path(str(ROOT / "examples" / "report.py"), run_name="__main__")
+        main()
     assert stopped.value.code == 1
     assert capsys.readouterr().err == "nowhere does not exist.\n"

@@ -1,12 +1,12 @@
 """Write one page about any number of finished runs: verdict, tables, figures.
 
-    python examples/report.py outputs/oos
-    python examples/report.py multirun/*/ outputs/ --reference cql --output report
-    python examples/report.py outputs/oos --pack runs.jsonl.gz
-    python examples/report.py runs.jsonl.gz
+    torchrl-osr report outputs/oos
+    torchrl-osr report multirun/*/ outputs/ --reference cql --output report
+    torchrl-osr report outputs/oos --pack runs.jsonl.gz
+    torchrl-osr report runs.jsonl.gz
 
-Looks in and below the folders for what ``examples/offline_osr.py`` and
-``examples/evaluate.py`` left there. ``report.html`` needs no other file; the figures
+Looks in and below the folders for what ``torchrl-osr train`` and
+``torchrl-osr evaluate`` left there. ``report.html`` needs no other file; the figures
 are beside it as PNG files, too. ``--pack`` writes no page, but all that a page is made
 of into one table of runs. How to read the page: docs/report.md.
 """
@@ -23,7 +23,9 @@ from torchrl_osr.report import comparison_notes, pack_runs, read_runs, write_rep
 
 def main() -> None:
     """Read, report, and say what could not be."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(
+        prog=sys.argv[0], description=__doc__.split("\n")[0]
+    )
     parser.add_argument(
         "runs", nargs="+", type=Path, help="folders of runs, or above them, or tables"
     )
@@ -32,7 +34,7 @@ def main() -> None:
     parser.add_argument("--pack", type=Path, metavar="TABLE", help="a .jsonl.gz file")
     options = parser.parse_args()
 
-    command = shlex.join(["python", *sys.argv])
+    command = " ".join([sys.argv[0], shlex.join(sys.argv[1:])])
     try:
         if options.pack:
             number = pack_runs(options.runs, options.pack)

@@ -16,6 +16,7 @@ from omegaconf import OmegaConf
 from tensordict.nn import TensorDictModule
 from torchrl.modules import ProbabilisticActor, TanhDelta
 
+from torchrl_osr.commands import evaluate as example
 from torchrl_osr.data import make_environment
 from torchrl_osr.evaluation import check_disturbances
 from torchrl_osr.experiment.suite import make_disturbances, register
@@ -32,21 +33,16 @@ def folder(tmp_path_factory, run, tiny) -> Path:
     """A run with three checkpoints."""
     cwd = tmp_path_factory.mktemp("evaluate")
     sizes = tiny(steps=30, eval_interval=30, eval_episodes=2)
-    code, output = run(cwd, "offline_osr.py", *sizes, "hydra.run.dir=run")
+    code, output = run(cwd, "train", *sizes, "hydra.run.dir=run")
     assert code == 0, output
     return cwd / "run"
-
-
-@pytest.fixture(scope="module")
-def example(load_example):
-    return load_example("evaluate.py")
 
 
 @pytest.fixture(scope="module")
 def evaluated(folder, run) -> str:
     """Run as a user would; the other tests take it from there."""
     options = ["checkpoint=run", "episodes=2", "last=2", "progress=false"]
-    code, output = run(folder.parent, "evaluate.py", *options)
+    code, output = run(folder.parent, "evaluate", *options)
     assert code == 0, output
     return output
 
@@ -83,7 +79,7 @@ def test_table_json_and_figure_are_left_in_the_runs_folder(folder, evaluated):
     assert left == {"run"}, "nothing is left where it was called from"
 
 
-def test_finished_evaluation_is_not_done_again(folder, evaluated, example, capsys):
+def test_finished_evaluation_is_not_done_again(folder, evaluated, capsys):
     path = folder / "robustness-oos.json"
     before = path.stat().st_mtime_ns
     same = ["episodes=2", "last=2", f"checkpoint={folder}"]
@@ -98,9 +94,7 @@ def test_finished_evaluation_is_not_done_again(folder, evaluated, example, capsy
     assert json.loads(path.read_text())["evaluations"] != content["evaluations"]
 
 
-def test_killed_evaluation_goes_on_to_the_same_bytes(
-    folder, example, monkeypatch, capsys
-):
+def test_killed_evaluation_goes_on_to_the_same_bytes(folder, monkeypatch, capsys):
     """From the first checkpoint that was not done, and without the network."""
     same = composed(f"checkpoint={folder}", "episodes=2", "suite=start")
     path, partial = (
@@ -144,7 +138,7 @@ def test_killed_evaluation_goes_on_to_the_same_bytes(
     assert f"{partial} is ignored" in capsys.readouterr().out
 
 
-def test_one_checkpoint_has_a_file_of_its_own(folder, example):
+def test_one_checkpoint_has_a_file_of_its_own(folder):
     best = folder / "checkpoint" / "policy" / "best.torchrl"
     example.main(composed(f"checkpoint={best}", "episodes=2", "suite=start"))
     results = json.loads((folder / "best-robustness-start.json").read_text())
@@ -176,7 +170,7 @@ def test_every_suite_is_possible_for_other_environments(folder, env_id):
         (["suite.disturbances.mass.kindd=a"], ConfigCompositionException, "kindd"),
     ],
 )
-def test_bad_input_is_named(example, folder, overrides, error, named):
+def test_bad_input_is_named(folder, overrides, error, named):
     with pytest.raises(error, match=named):
         example.main(composed(f"checkpoint={folder}", *overrides))
 
@@ -201,9 +195,7 @@ def test_attacks_need_standardised_networks_and_a_stochastic_policy(folder):
         make_disturbances(suite.disturbances, trained, np.full(11, 0.5))
 
 
-@pytest.mark.parametrize(
-    ("script", "groups"), [("evaluate.py", ["suite"]), ("film.py", [])]
-)
+@pytest.mark.parametrize(("script", "groups"), [("evaluate", ["suite"]), ("film", [])])
 def test_help_offers_the_scripts_own_groups_alone(tmp_path, run, script, groups):
     code, output = run(tmp_path, script, "--help")
     assert code == 0, output

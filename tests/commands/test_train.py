@@ -16,7 +16,7 @@ import pytest
 import torch
 from torch.utils._pytree import tree_leaves
 
-SCRIPT = "offline_osr.py"
+SCRIPT = "train"
 LAST = "checkpoint/policy/checkpoint-000000000040.torchrl"
 
 
@@ -69,7 +69,7 @@ def test_run_leaves_table_figure_returns_and_checkpoints(finished):
 
 def test_log_has_a_line_for_each_evaluation(finished):
     folder, output = finished
-    log = (folder / "offline_osr.log").read_text()
+    log = (folder / "train.log").read_text()
     lines = re.findall(r"policy: step (\d+) of 40.*, score [\d.-]+$", log, re.MULTILINE)
     assert lines == ["0", "20", "40"]
     assert all(line in output for line in log.splitlines())

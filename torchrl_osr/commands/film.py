@@ -1,8 +1,8 @@
 """Film a recovery: who survives a push, and which states do they visit?
 
-    python examples/film.py checkpoint=outputs/hopper-medium-replay/seed0-...
-    python examples/film.py checkpoint=<run's folder> knock=5 rule=time
-    python examples/film.py checkpoint=<run's folder> push=1 film_seed=30004
+    torchrl-osr film checkpoint=outputs/hopper-medium-replay/seed0-...
+    torchrl-osr film checkpoint=<run's folder> knock=5 rule=time
+    torchrl-osr film checkpoint=<run's folder> push=1 film_seed=30004
 
 Figure 3 of the paper: after a push, the behaviour policy, the inverse dynamics model as
 a controller and the trained policy go on from the same state. The run's folder gets
@@ -37,6 +37,7 @@ from torchrl import torchrl_logger
 
 from torchrl_osr._checks import check_choice
 from torchrl_osr._files import write_json
+from torchrl_osr.commands import CONF
 from torchrl_osr.data import (
     load_behavior_policy,
     make_environment,
@@ -66,7 +67,7 @@ STEPS_BEFORE = 10  # in the film
 MODEL, RULES = "inverse dynamics, ", ("time", "nearest")
 
 
-@hydra.main(version_base="1.3", config_path="../conf/evaluation", config_name="film")
+@hydra.main(version_base="1.3", config_path=f"{CONF}/evaluation", config_name="film")
 def main(cfg: DictConfig) -> None:
     """Play all episodes with every controller, print the table, film one of them."""
     torchrl_logger.setLevel("WARNING")

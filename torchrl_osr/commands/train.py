@@ -1,0 +1,190 @@
+"""Train a policy with OSR on real MuJoCo transitions, from nothing, with one command.
+
+    torchrl-osr train env=hopper
+    torchrl-osr train env=walker2d data=medium-expert seed=3 preset=paper
+    torchrl-osr train -m env=hopper,walker2d seed=0,1,2 hydra/launcher=pool
+    torchrl-osr train resume=outputs/hopper-medium-replay/seed0-...
+
+The data are rolled out on this machine at the first run and cached. A run leaves
+``curve.png``, ``returns.json``, ``inverse_dynamics.json``, ``config.yaml``,
+``status.json``, CSV files and ``checkpoint/`` in its folder.
+"""
+
+from __future__ import annotations
+
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+
+import hydra
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+from tensordict import TensorDict
+from torchrl import torchrl_logger
+from torchrl.objectives import SoftUpdate
+
+from torchrl_osr import StatePerturbation
+from torchrl_osr._files import write_json
+from torchrl_osr.commands import CONF
+from torchrl_osr.evaluation import (
+    EpisodeEvaluator,
+    describe_inverse_dynamics,
+    deterministic_policy,
+    inverse_dynamics_report,
+    learning_curve,
+    read_scalars,
+    score_table,
+    summarize,
+)
+from torchrl_osr.experiment import run_folder, schema
+from torchrl_osr.experiment.build import make_learner
+from torchrl_osr.experiment.loggers import make_loggers
+from torchrl_osr.experiment.training_data import load_training_data
+from torchrl_osr.trainers import OfflineTrainer, check_hardware, largest_value
+
+EVALUATION_SEED = 10_000  # far from the seeds of the data's episodes
+
+schema.register()
+
+
+@hydra.main(version_base="1.3", config_path=CONF, config_name="train")
+def main(cfg: DictConfig) -> float:
+    """Do or continue one run in its folder; return its last score, for a sweeper."""
+    job = HydraConfig.get()
+    folder = Path(job.runtime.output_dir)
+    if cfg.resume is None:
+        run_folder.check_keys(cfg)
+    else:
+        cfg = run_folder.saved_config(folder, job.overrides.task)
+    run_folder.claim(folder, cfg)
+    with run_folder.status(folder):
+        return run(cfg, folder)
+
+
+def run(cfg: DictConfig, folder: Path) -> float:
+    """Data, networks, inverse dynamics model, policy, report."""
+    torchrl_logger.setLevel("WARNING")
+    torch.set_num_threads(cfg.trainer.num_threads)
+    torch.set_float32_matmul_precision(cfg.trainer.matmul_precision)
+    device, autocast = check_hardware(
+        cfg.trainer.device, cfg.trainer.precision, cudagraph=cfg.trainer.cudagraph
+    )
+    make_learner(cfg, 1, 1)  # a wrong option of the loss stops here, not after the data
+
+    # Transitions with standardised states. Each batch gets a perturbed state for every
+    # state, which is the paper's mixed data set.
+    data = load_training_data(cfg, device)
+    torch.manual_seed(cfg.seed)
+    noise = {"std": cfg.perturbation.std, "noise": cfg.perturbation.noise}
+    perturbation = StatePerturbation(**noise, seed=cfg.seed)
+    data.buffer.append_transform(perturbation)
+
+    # Networks, and the policy's loss, which holds the inverse dynamics model.
+    actor, inverse_dynamics, loss = make_learner(cfg, *data.sizes, device)
+
+    # One step of a trainer: sample a batch, compute the losses, go backward on their
+    # sum, step the optimizer, move the target networks; log, evaluate and write a
+    # checkpoint at their intervals. Both phases have this in common:
+    new_trainer = partial(
+        OfflineTrainer,
+        replay_buffer=data.buffer,
+        components={"perturbation": perturbation, "observation_norm": data.norm},
+        loggers=make_loggers(folder=folder, **cfg.logger),
+        log_interval=cfg.trainer.log_interval,
+        checkpoint_interval=cfg.trainer.checkpoint_interval,
+        checkpoints_kept=cfg.trainer.checkpoints_kept,
+        progress=cfg.trainer.progress,
+        nonfinite=cfg.trainer.nonfinite,
+        autocast_dtype=autocast,
+        compile=cfg.trainer.compile,
+        cudagraph=cfg.trainer.cudagraph,
+    )
+    adam = partial(torch.optim.Adam, fused=True, capturable=cfg.trainer.cudagraph)
+
+    # First phase: which action leads from the perturbed state to the next state?
+    if hasattr(loss, "inverse_dynamics_network"):
+        fit = instantiate(cfg.inverse_dynamics.loss, _partial_=True)(inverse_dynamics)
+        trainer = new_trainer(
+            fit,
+            adam(fit.parameters(), lr=cfg.optim.inverse_dynamics_lr),
+            total_steps=cfg.trainer.inverse_dynamics_steps,
+            folder=folder / "checkpoint" / "inverse_dynamics",
+            seed=cfg.seed,
+            evaluate=lambda: inverse_dynamics_report(inverse_dynamics, data.held_out),
+            metric=("nll", "min"),
+            eval_interval=cfg.trainer.inverse_dynamics_steps,
+            description="inverse_dynamics",
+        )
+        if cfg.inverse_dynamics.shuffle_next:
+            trainer.register_op("process_optim_batch", shuffle_next)
+        trainer.train()
+        write_json(folder / "inverse_dynamics.json", trainer.history[-1])
+        print(describe_inverse_dynamics(trainer.history[-1]))
+
+    # Second phase: the policy, taught by the critics and by the frozen model.
+    critic_params = list(loss.qvalue_network_params.parameters())
+    known = set(critic_params)
+    policy_params = [each for each in loss.parameters() if each not in known]
+    groups = [
+        {"params": critic_params, "lr": cfg.optim.qvalue_lr},
+        {"params": policy_params, "lr": cfg.optim.actor_lr},
+    ]
+    limit = largest_value(data.largest_reward, cfg.optim.gamma)
+    episodes = {"num_episodes": cfg.trainer.eval_episodes, "seed": EVALUATION_SEED}
+    policy = deterministic_policy(actor, data.norm)
+    with closing(EpisodeEvaluator(cfg.env.id, **episodes, device=device)) as play:
+        trainer = new_trainer(
+            loss,
+            adam(groups),
+            total_steps=cfg.trainer.steps,
+            folder=folder / "checkpoint" / "policy",
+            seed=cfg.seed + 1,
+            target_net_updater=SoftUpdate(loss, tau=cfg.optim.tau),
+            evaluate=lambda: summarize(play(policy), cfg.env.name),
+            metric=("score", "max"),
+            eval_interval=cfg.trainer.eval_interval,
+            description="policy",
+            value_limits={"pred_value": limit, "target_value": limit},
+        )
+        if cfg.perturbation.adversary is not None:
+            adversary = instantiate(cfg.perturbation.adversary)
+            trainer.register_op("process_optim_batch", partial(adversary, loss))
+        trainer.train()
+    return report(cfg, folder, data.score, trainer)
+
+
+def shuffle_next(batch: TensorDict) -> TensorDict:
+    """Give every row the next state of another: an ablation of the model."""
+    key = ("next", "observation")
+    return batch.set(key, batch[key].roll(1, 0))  # the rows came in random order
+
+
+def report(
+    cfg: DictConfig, folder: Path, data_score: float | None, trainer: OfflineTrainer
+) -> float:
+    """Write raw returns and the figure, print the table; return the last score."""
+    history, best = trainer.history, trainer.best()
+    assert best is not None  # there is an evaluation before the first update
+    results = {
+        "versions": run_folder.package_versions(),
+        "data_score": data_score,
+        "last": history[-1],
+        "best": best,
+    }
+    write_json(folder / "returns.json", results | {"evaluations": history})
+    name = f"{cfg.env.name} {cfg.data.quality}"
+    learning_curve(
+        history,
+        read_scalars(folder / "csv" / "scalars" / "policy"),
+        folder / "curve.png",
+        title=f"{name}, {type(trainer.loss_module).__name__}, seed {cfg.seed}",
+        data_score=data_score,
+    )
+    print("\n" + score_table(name, history, best, data_score, folder))
+    return float(history[-1]["score"])
+
+
+if __name__ == "__main__":
+    main()
