@@ -242,7 +242,9 @@ class _SoftMaximum(torch.autograd.Function):
         weight = upstream.flatten()[0]
         equal = (upstream == weight).all()
         if ctx.equal_rows:
-            torch._assert_async(equal, "Rows of one weight were promised, see equal_rows.")
+            torch._assert_async(
+                equal, "Rows of one weight were promised, see equal_rows."
+            )
         if ctx.equal_rows or bool(equal):
             gradient = list(torch._foreach_mul(ctx.saved_tensors, weight))
         else:

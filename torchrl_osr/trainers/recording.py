@@ -98,9 +98,13 @@ class _Recording:
         batch: of the kind that is to come; a loss may write into it.
     """
 
-    def __init__(self, losses: Any, loss_module: LossModule, batch: TensorDictBase) -> None:
+    def __init__(
+        self, losses: Any, loss_module: LossModule, batch: TensorDictBase
+    ) -> None:
         self.loss_module = loss_module
-        self.parameters = [each for each in loss_module.parameters() if each.requires_grad]
+        self.parameters = [
+            each for each in loss_module.parameters() if each.requires_grad
+        ]
         self.keys: list[NestedKey] = list(batch.keys(True, True))
         self.names: list[str] = []
         self.written: list[NestedKey] = []
@@ -133,9 +137,10 @@ class _Recording:
         self.graph = _simplified(make_fx(update)(*self._tensors(batch)))
 
     def fits(self, batch: TensorDictBase) -> bool:
-        """Whether a batch, and the loss's options, are of the kind that was recorded."""
+        """Whether batch and options are of the kind that was recorded."""
         return (
-            self._kind(batch) == self.kind and _options(self.loss_module) == self.options
+            self._kind(batch) == self.kind
+            and _options(self.loss_module) == self.options
         )
 
     @torch.no_grad()
