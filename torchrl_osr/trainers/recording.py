@@ -83,10 +83,8 @@ class LossGradients:
         return self._recording is not None
 
 
-def _total(losses: TensorDictBase) -> Tensor:
-    terms = (value for key, value in losses.items() if key.startswith("loss_"))
-    total: Tensor = sum(terms, start=torch.zeros(()))
-    return total
+def _total(losses: TensorDictBase) -> Any:
+    return sum(value for key, value in losses.items() if key.startswith("loss_"))
 
 
 class _Recording:
