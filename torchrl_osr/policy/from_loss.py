@@ -108,6 +108,7 @@ def _weights(params: TensorDict, prefix: str, name: str) -> dict[str, Tensor]:
     return {
         f"{name}.{key.removeprefix(start)}": value.cpu().float().clone()
         for key, value in flat
+        if key.startswith(start)
     }
 
 

@@ -44,7 +44,7 @@ def write_graph(
         ValueError: ``path`` has another suffix.
     """
     if path.suffix not in SUFFIXES:
-        raise ValueError(f"the name must end in {' or '.join(SUFFIXES)}, got {path}.")
+        raise ValueError(f"the path must end in {' or '.join(SUFFIXES)}, got {path}.")
     text, given = json.dumps(record), dict[str, Any](args=(), kwargs=dict(inputs))
     rows = torch.export.Dim("batch")
     given["dynamic_shapes"] = {name: {0: rows} for name in inputs}

@@ -73,7 +73,7 @@ class Policy(nn.Module):
         self, record: Mapping[str, Any], tensors: Mapping[str, Tensor]
     ) -> None:
         super().__init__()
-        self.record = dict(record)
+        self.record = dict(record) | {"source": dict(record["source"])}
         self.distribution = record["distribution"]
         check_choice("distribution", self.distribution, DISTRIBUTIONS)
         self.discrete = self.distribution == "OneHotCategorical"
@@ -97,10 +97,10 @@ class Policy(nn.Module):
         self._fill(tensors)
 
     def _set_bounds(self, low: list[float], high: list[float]) -> None:
-        bounds = torch.tensor([low, high], dtype=torch.float32)
         size = 0 if self.discrete else self.action_size
-        if bounds.shape != (2, size):
+        if not len(low) == len(high) == size:
             raise ValueError(f"low and high must have {size} entries each.")
+        bounds = torch.tensor([low, high], dtype=torch.float32)
         half = (bounds[1] - bounds[0]) / 2
         if not ((half > 0) & half.isfinite()).all():
             raise ValueError(f"low={low} must be below high={high}, and both finite.")
@@ -190,9 +190,7 @@ class Policy(nn.Module):
             ValueError: its name ends otherwise.
         """
         if Path(path).suffix != SUFFIX:
-            raise ValueError(
-                f"the name of a saved policy ends in {SUFFIX}, got {path}."
-            )
+            raise ValueError(f"the path must end in {SUFFIX}, got {path}.")
         write_tensors(Path(path), self.state_dict(), self._stamped())
 
     def export(
