@@ -5,7 +5,7 @@
 Policies of Hopper's sizes, untrained, for weights do not matter. Every way of calling
 has its turn in each round; a round is the mean of a fifth of a second of calls. One
 thread. Writes ``results/deploy/latency.json`` with every round, and prints a table of
-medians.
+the fastest rounds, in CPU time: whatever else runs on the machine only slows down.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import os
 import platform
-import statistics
 import tempfile
 import time
 from collections.abc import Callable
@@ -102,7 +101,7 @@ def microseconds(call: Call) -> tuple[float, float]:
 def main() -> None:
     """Measure, write, print."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--rounds", type=int, default=25)
     parser.add_argument("--output", type=Path, default=OUTPUT)
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -131,11 +130,8 @@ def main() -> None:
     write_json(options.output, {**machine, **settings, "microseconds": results})
     print("| a call, microseconds | 1 observation | 256 observations |\n|---|---|---|")
     for way in results["1"]:
-        medians = [
-            f"{statistics.median(results[rows][way]['cpu']):.0f}"
-            for rows in ("1", "256")
-        ]
-        print(f"| {way} | {' | '.join(medians)} |")
+        fastest = [f"{min(results[rows][way]['cpu']):.0f}" for rows in ("1", "256")]
+        print(f"| {way} | {' | '.join(fastest)} |")
 
 
 if __name__ == "__main__":

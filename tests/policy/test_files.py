@@ -120,6 +120,7 @@ def mlp(*cells: int, activation: str = "ReLU") -> dict:
         ({"actor": mlp(*[2**20] * 64)}, "has shape"),
         ({"actor": mlp(*[8] * 65)}, "must list up to 64"),
         ({"actor": mlp(8, 4, activation="Module")}, "activation must be one of"),
+        ({"critics": {}}, "no 'number' in it"),
         ({"critics": {"number": 10**9}}, "number of critics must be from 0 to 1000"),
         ({"source": None}, "NoneType"),
         ({"tensors": {"scale": torch.zeros(3)}}, "scale.* must be above 0"),

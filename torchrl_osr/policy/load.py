@@ -45,7 +45,8 @@ def load_policy(path: Path | str) -> Policy:
         tensors, record = read_tensors(path)
         return Policy(record, tensors)
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} cannot be read as a policy: {error}") from error
+        why = f"no {error} in it" if isinstance(error, KeyError) else error
+        raise ValueError(f"{path} cannot be read as a policy: {why}") from error
 
 
 def _policy_of_run(path: Path) -> Policy:

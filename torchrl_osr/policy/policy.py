@@ -33,8 +33,8 @@ SUFFIX = ".safetensors"
 PACKAGES = ("torchrl-osr", "torch", "torchrl", "tensordict")
 MAX_CRITICS = 1000
 
-# Of an action's distance from the center of its bounds, in their half-width: what
-# float32 may add on the way there and back.
+# How far an action may be out of its bounds, as a share of half their distance: a
+# caller's own arithmetic rounds.
 ROUNDING = 1e-5
 
 Array = TypeVar("Array", NDArray[Any], Tensor)
@@ -234,7 +234,7 @@ class Policy(nn.Module):
             index = action.unsqueeze(-1)
             values = [critic(state).gather(-1, index) for critic in self.critics]
         else:
-            unit = self._unit(action)
+            unit = (action - self._center) / self._half
             values = [critic(state, unit) for critic in self.critics]
         return torch.stack(values).amin(0).squeeze(-1)
 
@@ -268,9 +268,6 @@ class Policy(nn.Module):
         # Rounding may lead out of the bounds by one bit.
         return (action * self._half + self._center).clamp(self.low, self.high)
 
-    def _unit(self, action: Tensor) -> Tensor:
-        return (action - self._center) / self._half
-
     def _numbers(self, name: str, value: Any, size: int) -> Tensor:
         """The value as finite float32 rows on the policy's device."""
         rows = _tensor(value).to(self.loc.device, torch.float32)
@@ -298,7 +295,8 @@ class Policy(nn.Module):
             action = self._numbers("action", value, self.action_size)
             expected = (*batch, self.action_size)
             low, high = self.low.tolist(), self.high.tolist()
-            outside = self._unit(action).abs() > 1 + ROUNDING
+            margin = ROUNDING * self._half
+            outside = (action < self.low - margin) | (action > self.high + margin)
         if action.shape != expected:
             raise ValueError(
                 f"the action has shape {tuple(action.shape)}, expected {expected} for "
