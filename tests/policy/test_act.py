@@ -19,7 +19,7 @@ from torch import nn
 from torchrl.modules import MLP, NormalParamExtractor, ValueOperator
 from untrained_run import make_run
 
-from torchrl_osr import OSRLoss, Policy, load_policy
+from torchrl_osr import OSRLoss, Policy, TD3BCLoss, load_policy
 from torchrl_osr.envs import critics_of
 from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
 from torchrl_osr.policy import policy_from_loss
@@ -237,6 +237,9 @@ def test_networks_that_a_policy_would_not_copy_whole():
         loss = OSRLoss(*networks, recovery_weight=0)
         with pytest.raises(ValueError, match=message):
             policy_from_loss(loss)
+    plain = TensorDictModule(MLP(3, 2), ["observation"], ["action"])
+    with pytest.raises(ValueError, match="this one has no distribution"):
+        policy_from_loss(TD3BCLoss(plain, critics))
 
 
 BLOCKED = """

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from numpy.typing import ArrayLike
 from tensordict import TensorDict
+from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 from torchrl.envs import ObservationNorm
 from torchrl.modules import MLP
@@ -57,6 +58,11 @@ def policy_from_loss(
         >>> policy.act(np.zeros((4, 3))).shape, policy.value(np.zeros((4, 3))).shape
         ((4, 1), (4,))
     """
+    if not isinstance(loss.actor_network, ProbabilisticTensorDictSequential):
+        raise ValueError(
+            f"the actor of a policy ends in one of {DISTRIBUTIONS}, as those of "
+            "torchrl_osr.modules; this one has no distribution."
+        )
     actor, prefix = _mlp(loss.actor_network)
     distribution = loss.actor_network[-1].distribution_class.__name__
     check_choice("the actor's distribution", distribution, DISTRIBUTIONS)
