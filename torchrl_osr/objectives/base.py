@@ -23,6 +23,7 @@ from tensordict.nn import (
     TensorDictParams,
 )
 from torch import Tensor, nn
+from torchrl.data import TensorSpec
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
 
@@ -30,6 +31,7 @@ from torchrl_osr._checks import check_literals, check_positive
 from torchrl_osr._entries import nested
 from torchrl_osr.objectives.distributions import (
     action_bounds,
+    check_action_spec,
     check_apart,
     check_same_bounds,
     check_same_size,
@@ -78,6 +80,8 @@ class BaseLoss(LossModule):
             ``"smooth_l1"``.
         delay_qvalue: use target networks, to be moved by
             :class:`~torchrl.objectives.SoftUpdate`. Default ``True``.
+        gamma: refused as in every loss of TorchRL; it is an argument of
+            ``make_value_estimator``.
         deactivate_vmap: run the critics one by one. Default ``False``.
         reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
         use_prioritized_weights: weigh rows by ``"priority_weight"``; ``"auto"``
@@ -105,12 +109,18 @@ class BaseLoss(LossModule):
         num_qvalue_nets: int = 2,
         loss_function: Literal["l2", "l1", "smooth_l1"] = "l2",
         delay_qvalue: bool = True,
+        gamma: None = None,
         deactivate_vmap: bool = False,
         reduction: Literal["none", "mean", "sum"] | None = None,
         use_prioritized_weights: bool | Literal["auto"] = "auto",
         scalar_output_mode: Literal["exclude", "non_tensor"] | None = None,
     ) -> None:
         check_literals(BaseLoss.__init__, locals())
+        if gamma is not None:
+            raise TypeError(
+                "gamma belongs to the value estimator: leave it out here and call "
+                f"loss.make_value_estimator(gamma={gamma}) afterwards."
+            )
         super().__init__()
         self._in_keys: list[NestedKey] | None = None
         self._out_keys: list[NestedKey] | None = None
@@ -141,6 +151,7 @@ class BaseLoss(LossModule):
         delay_actor: bool = False,
     ) -> None:
         """Hold an actor, critics (one to be copied, or a list) and a frozen model."""
+        self.delay_actor = delay_actor
         check_apart(
             actor_network=actor_network,
             qvalue_network=qvalue_network,
@@ -179,9 +190,12 @@ class BaseLoss(LossModule):
         self,
         network: TensorDictModuleBase,
         inverse_dynamics_network: TensorDictModuleBase | None = None,
+        action_spec: TensorSpec | None = None,
     ) -> None:
-        """Hold the bounds of a tanh-Gaussian actor, which are those of the model."""
+        """Hold a tanh-Gaussian actor's bounds, the model's and the environment's."""
         low, high = bounds = action_bounds(network, "actor_network")
+        if action_spec is not None:
+            check_action_spec(bounds, action_spec)
         self.register_buffer("action_low", low, persistent=False)
         self.register_buffer("action_high", high, persistent=False)
         if inverse_dynamics_network is not None:
@@ -210,15 +224,35 @@ class BaseLoss(LossModule):
         alpha_init: float,
         fixed_alpha: bool,
         target_entropy: float | Literal["auto"],
+        min_alpha: float | None = None,
+        max_alpha: float | None = None,
     ) -> None:
         """Hold the logarithm of the entropy temperature, ``log_alpha``."""
         check_positive("alpha_init", alpha_init)
+        bounds = {"min_alpha": min_alpha, "max_alpha": max_alpha}
+        given = {name: bound for name, bound in bounds.items() if bound is not None}
+        for name, bound in given.items():
+            check_positive(name, bound)
+        if len(given) == 2:
+            check_positive("max_alpha", given["max_alpha"], minimum=min_alpha)
+        self._log_alpha_bounds = {
+            name.removesuffix("_alpha"): math.log(bound)
+            for name, bound in given.items()
+        }
         self.target_entropy = target_entropy
         log_alpha = torch.tensor(math.log(alpha_init))
         if fixed_alpha:
             self.register_buffer("log_alpha", log_alpha)
         else:
             self.log_alpha = nn.Parameter(log_alpha)
+
+    @property
+    def _alpha(self) -> Tensor:
+        """The entropy temperature, brought back within its bounds, detached."""
+        if self._log_alpha_bounds:
+            # The parameter itself: beyond a bound it would take long to come back.
+            self.log_alpha.data.clamp_(**self._log_alpha_bounds)
+        return self.log_alpha.detach().exp()
 
     def _make_vmap(self) -> None:
         if "qvalue_network" in self.__dict__:

@@ -220,6 +220,15 @@ class Step:
             self._policies[states] = pi
         return self._policies[states]
 
+    def target_policy(self) -> Any:
+        """The policy at the next states that the TD target is of, ``[1, B]``."""
+        loss = self.loss
+        if not loss.delay_actor:
+            return self.policy("next")
+        network, params = loss.actor_network, loss.target_actor_network_params
+        found = distribution_params(network, params, self.at("next"))
+        return network.build_dist_from_params(found)
+
     def action(self, states: TensorDictBase, params: TensorDictParams) -> Tensor:
         """The action that a deterministic policy writes, ``[..., A]``."""
         network, key = self.loss.actor_network, self.loss.tensor_keys.action
