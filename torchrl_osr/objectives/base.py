@@ -29,6 +29,7 @@ from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
 
 from torchrl_osr._checks import check_literals, check_positive
 from torchrl_osr._entries import nested
+from torchrl_osr.modules.initial_weights import digest_of_weights, initial_digest
 from torchrl_osr.objectives.distributions import (
     action_bounds,
     check_action_spec,
@@ -213,11 +214,30 @@ class BaseLoss(LossModule):
         Its parameters become buffers, so that no optimizer that takes
         ``loss.parameters()`` can move them.
         """
+        self._initial_digest = initial_digest(network)
         self.convert_to_functional(network, "inverse_dynamics_network")
         frozen = self.inverse_dynamics_network_params.apply(
             lambda tensor: tensor.data, filter_empty=False
         )
         self.inverse_dynamics_network_params = TensorDictParams(frozen, no_convert=True)
+
+    def _check_model_is_trained(self) -> None:
+        """Warn, at the first call, of a model with the weights it was built with.
+
+        Not at construction: the weights may be loaded or trained until then. Networks
+        that this package did not build are not looked at.
+        """
+        if self._initial_digest is None or torch.compiler.is_compiling():
+            return
+        digest = digest_of_weights(self.inverse_dynamics_network_params)
+        if digest == self._initial_digest:
+            warnings.warn(
+                f"{type(self).__name__} uses an inverse dynamics model that was never "
+                "trained: its weights are those that it was built with. Train it with "
+                "InverseDynamicsLoss, or load its weights, before the policy.",
+                stacklevel=_first_frame_outside(),
+            )
+        self._initial_digest = None
 
     def _hold_temperature(
         self,
@@ -437,7 +457,9 @@ def _first_frame_outside() -> int:
     frame, level = inspect.currentframe(), 0
     while frame is not None and (
         here in Path(frame.f_code.co_filename).parents
-        or frame.f_globals.get("__name__", "").startswith(("torchrl.", "tensordict."))
+        or frame.f_globals.get("__name__", "").startswith(
+            ("torch.", "torchrl.", "tensordict.")
+        )
     ):
         frame, level = frame.f_back, level + 1
     return level

@@ -215,9 +215,7 @@ def check_same_bounds(
         )
 
 
-def check_action_spec(
-    policy: tuple[Tensor, Tensor], action_spec: TensorSpec
-) -> None:
+def check_action_spec(policy: tuple[Tensor, Tensor], action_spec: TensorSpec) -> None:
     """Raise unless an environment's actions have the policy's bounds.
 
     Args:

@@ -26,7 +26,6 @@ from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
 from torchrl_osr.objectives.distributions import check_action, check_num_actions
 from torchrl_osr.objectives.step import Step, actor_critic_in_keys, uniform_actions
 
-
 _NO_CQL = "the constraint of weight recovery_weight stands in the place of CQL's term"
 _TARGET = (
     "its TD target is that of the policy's own action, without entropy; OSRLoss has "
@@ -153,9 +152,7 @@ class OSRVLoss(BaseLoss):
         check_positive("num_random", num_random, minimum=1)
         check_positive("temperature", temperature)
         super().__init__(**options)
-        self._hold_action_bounds(
-            actor_network, inverse_dynamics_network, action_spec
-        )
+        self._hold_action_bounds(actor_network, inverse_dynamics_network, action_spec)
         self._hold_actor_critic(
             actor_network,
             qvalue_network,

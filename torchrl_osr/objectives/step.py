@@ -82,6 +82,7 @@ def frozen_distribution(
         done: rows whose next state is not to be learnt from, bool ``[B]``.
         states: ``"both"``, ``"clean"`` or ``"perturbed"``.
     """
+    loss._check_model_is_trained()
     network = loss.inverse_dynamics_network
     batch = transitions(
         tensordict,
