@@ -64,6 +64,8 @@ def critic_ensemble(
                 **(norm if layer_norm else {}),
             ),
             in_keys=[observation_key, action_key],
+            # ValueOperator knows an action by the name "action" alone.
+            out_keys=["state_action_value"],
         )
         for _ in range(num_qvalue_nets)
     ]
