@@ -151,12 +151,12 @@ def main(arguments: Sequence[str]) -> None:
         point = {"frames": frames, **summarize(evaluator(policy), record["env"])}
         record["curve"].append(point)
         write_json(options.output / "online.json", record)
+        draw(record, options.output / "online.png")
         print(f"{frames} frames: score {point['score']:.1f}", flush=True)
 
     evaluate()
     trainer.register_op("post_steps", evaluate)
     trainer.train()
-    draw(record, options.output / "online.png")
     evaluator.close()
 
 

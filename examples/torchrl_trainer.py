@@ -21,7 +21,7 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import ObservationNorm
 from torchrl.trainers import DefaultOptimizationStepper, Trainer
 
-import torchrl_osr.configs  # noqa: F401  registers loss=osr and the others
+from torchrl_osr import configs
 from torchrl_osr._files import write_json
 from torchrl_osr.data import (
     load_dataset,
@@ -32,6 +32,7 @@ from torchrl_osr.data.collect.environment import environment_id
 from torchrl_osr.evaluation import EpisodeEvaluator, deterministic_policy, summarize
 from torchrl_osr.trainers import ReplayBufferCollector
 
+configs.register()
 OmegaConf.register_new_resolver("frames", lambda steps, rows: steps * rows)
 
 

@@ -1,7 +1,7 @@
 """OSR in TorchRL's own configuration system (``torchrl.trainers.algorithms.configs``).
 
-Importing this module registers, beside TorchRL's own options and with the defaults of
-the Python signatures:
+:func:`register` adds to TorchRL's own options, with the defaults of the Python
+signatures:
 
 =============  ================================================================
 group          options
@@ -27,7 +27,6 @@ from hydra.core.config_store import ConfigStore
 from hydra.utils import get_object
 from omegaconf import MISSING
 from torchrl.objectives import LossModule
-from torchrl.trainers.algorithms import configs  # noqa: F401  registers TorchRL's own
 
 from torchrl_osr import InverseDynamicsLoss, OSRLoss, OSRVLoss, StatePerturbation
 from torchrl_osr.modules import (
@@ -115,5 +114,14 @@ def _default(name: str, parameter: inspect.Parameter) -> Any:
     return list(default) if isinstance(default, tuple) else default
 
 
-for (_group, _name), _part in OPTIONS.items():
-    ConfigStore.instance().store(group=_group, name=_name, node=option(_part))
+def register() -> None:
+    """Make TorchRL's options and these known to Hydra.
+
+    In a process of its own: Hydra holds a file ``loss/osr.yaml``, such as that of
+    ``torchrl-osr train``, against a registered option of the same name.
+    """
+    # TorchRL's own are registered when they are imported.
+    from torchrl.trainers.algorithms import configs  # noqa: F401
+
+    for (group, name), part in OPTIONS.items():
+        ConfigStore.instance().store(group=group, name=name, node=option(part))

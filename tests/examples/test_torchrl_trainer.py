@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
 import json
 import os
@@ -12,6 +13,8 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from hydra.core.plugins import Plugins
 from hydra.errors import ConfigCompositionException
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
@@ -26,8 +29,20 @@ from torchrl_osr.trainers import ReplayBufferCollector
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
+@pytest.fixture(scope="module")
+def _registered():
+    """Options of the store, taken back for the tests of our own configuration."""
+    Plugins.instance()  # They register options, too, when they are first asked for.
+    store = ConfigStore.instance()
+    before = copy.copy(store.repo)
+    store.repo = copy.deepcopy(before)
+    configs.register()
+    yield
+    store.repo = before
+
+
 @pytest.fixture
-def composed(tmp_path):
+def composed(tmp_path, _registered):
     """Return a function that composes options of the store, as a user's file does."""
 
     def call(*defaults: dict[str, str], overrides=(), **values):
