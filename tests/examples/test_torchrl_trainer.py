@@ -5,10 +5,6 @@ from __future__ import annotations
 import copy
 import inspect
 import json
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -25,8 +21,6 @@ from torchrl.objectives import SoftUpdate
 from torchrl_osr import OSRLoss, OSRVLoss, StatePerturbation, configs
 from torchrl_osr.data import make_replay_buffer
 from torchrl_osr.trainers import ReplayBufferCollector
-
-EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 @pytest.fixture(scope="module")
@@ -136,26 +130,16 @@ def test_a_buffers_batches_are_a_collectors_frames() -> None:
     assert not torch.equal(batches(20, seed=3), batches(20, seed=4))
 
 
-def test_the_example_trains_on_real_data(tmp_path) -> None:
-    process = subprocess.run(
-        [
-            *(sys.executable, str(EXAMPLES / "torchrl_trainer.py")),
-            *(
-                "quality=random",
-                "num_transitions=500",
-                "steps=6",
-                "inverse_dynamics_steps=4",
-            ),
-            *("batch_size=16", "episodes=1", "trainer.progress_bar=false"),
-            *("loss.recovery_weight=0.75", f"hydra.run.dir={tmp_path}"),
-        ],
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        timeout=240,
+def test_the_example_trains_on_real_data(tmp_path, run) -> None:
+    code, printed = run(
+        tmp_path,
+        "torchrl_trainer.py",
+        *("quality=random", "num_transitions=500", "steps=6", "batch_size=16"),
+        *("inverse_dynamics_steps=4", "episodes=1", "trainer.progress_bar=false"),
+        *("loss.recovery_weight=0.75", f"hydra.run.dir={tmp_path}"),
     )
-    assert process.returncode == 0, process.stderr
-    assert "never trained" not in process.stderr
+    assert code == 0, printed
+    assert "never trained" not in printed
     result = json.loads((tmp_path / "result.json").read_text(encoding="utf-8"))
     assert result["steps"] == 6
     assert len(result["returns"]) == 1

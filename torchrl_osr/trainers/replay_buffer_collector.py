@@ -52,7 +52,8 @@ class ReplayBufferCollector(BaseCollector):
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Seed the draws; return the seed."""
-        self.replay_buffer.set_rng(torch.Generator().manual_seed(seed))
+        device = self.replay_buffer.storage.device  # where the draws are made
+        self.replay_buffer.set_rng(torch.Generator(device).manual_seed(seed))
         return seed
 
     def update_policy_weights_(self, *_: Any, **__: Any) -> None:
