@@ -125,6 +125,9 @@ def test_the_environments_bounds_are_the_actors(family, name) -> None:
     spec = Bounded(-1.0, 1.0, shape=(2,))
     for fitting in (spec, Composite(action=spec), Composite(agent={"action": spec})):
         family(name, action_spec=fitting)
+    narrow = Bounded(-0.4, 0.4, shape=(2,), dtype=torch.float64)
+    networks = family.networks(name, low=-0.4, high=0.4)
+    family(name, networks, action_spec=narrow)
     with pytest.raises(ValueError, match=r"actor's high is 1.0, .*\[2.0, 2.0\]"):
         family(name, action_spec=Bounded(-1.0, 2.0, shape=(2,)))
     with pytest.raises(ValueError, match="must be a Bounded spec"):

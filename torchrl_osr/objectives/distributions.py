@@ -242,7 +242,7 @@ def check_action_spec(policy: tuple[Tensor, Tensor], action_spec: TensorSpec) ->
     for name, ours, theirs in zip(
         ("low", "high"), policy, (spec.space.low, spec.space.high), strict=True
     ):
-        if not bool((ours.cpu() == theirs.cpu()).all()):
+        if not bool((ours == theirs.to(ours)).all()):
             raise ValueError(
                 f"the actor's {name} is {ours.tolist()}, but that of action_spec is "
                 f"{theirs.tolist()}: build actor and inverse dynamics model with "
