@@ -265,6 +265,8 @@ def _keyword_options(target: type) -> Iterator[tuple[inspect.Parameter, Any]]:
         parameters = inspect.signature(initialize).parameters.values()
         is_dataclass = "__dataclass_fields__" in vars(each)
         for parameter in parameters:
+            if parameter.name in ("action_spec", "gamma"):
+                continue  # An object of Python, and what every loss refuses.
             if parameter.kind is parameter.KEYWORD_ONLY or (
                 is_dataclass and parameter.default is not parameter.empty
             ):
