@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import pickle
+import zipfile
 
 import numpy as np
 import pyarrow
@@ -70,6 +72,26 @@ def test_nothing_is_unpickled(tmp_path):
         load_file(tmp_path / "log.npz")
     with pytest.raises(ValueError, match=r"must end in one of \.npz, \.hdf5, \.h5"):
         load_file(tmp_path / "log.pkl")
+
+
+def test_two_arrays_of_one_name_are_refused(tmp_path):
+    path = tmp_path / "log.npz"
+    np.savez(path, **make_columns(60))
+    content = io.BytesIO()
+    np.save(content, np.zeros(60))
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("reward", content.getvalue())
+    with pytest.raises(ValueError, match="two arrays in it are called 'reward'"):
+        load_file(path)
+
+
+def test_two_parquet_columns_of_one_name_are_refused(tmp_path):
+    columns = {k: list(v) if v.ndim > 1 else v for k, v in make_columns(60).items()}
+    table = pyarrow.table(columns)
+    table = table.append_column("reward", table["reward"])
+    parquet.write_table(table, tmp_path / "log.parquet")
+    with pytest.raises(ValueError, match="two columns are called 'reward'"):
+        load_file(tmp_path / "log.parquet")
 
 
 @pytest.mark.parametrize(

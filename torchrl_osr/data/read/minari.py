@@ -79,8 +79,8 @@ def load_minari(
     Returns:
         The transitions ``[N]``, and the manifest of
         :func:`~torchrl_osr.data.transitions_from_rows` with ``reader``, ``source``,
-        ``dataset_id``, ``env_id`` (or ``None``), ``minari_version``, ``action_bounds``
-        and ``observation_layout``, a list of names and sizes.
+        ``dataset_id``, ``env_id`` (or ``None``), ``minari_version`` and
+        ``observation_layout``, a list of names and sizes.
 
     Raises:
         FileNotFoundError: the set is not on this machine and ``download`` is false.
@@ -106,7 +106,6 @@ def load_minari(
         "dataset_id": opened.id,
         "env_id": None if spec is None else spec.id,
         "minari_version": opened.minari_version,
-        "action_bounds": [np.asarray(bound).tolist() for bound in bounds],
         "observation_layout": [
             ["/".join(name), int(np.prod(box.shape))] for name, box in leaves.items()
         ],
@@ -173,8 +172,9 @@ def _check_folder(folder: Path) -> None:
 
 def _damaged(dataset: str | Path, error: Exception) -> ValueError:
     return ValueError(
-        f"Minari cannot read {dataset} ({type(error).__name__}: {error}). If its "
-        "download was interrupted, delete it (minari delete) and fetch it again."
+        f"Minari cannot read {dataset} ({type(error).__name__}: {error}). Take a whole "
+        "copy in its place; one that was fetched can be fetched again "
+        "(data.download=true) once its folder is out of the way."
     )
 
 
