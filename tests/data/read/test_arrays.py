@@ -218,7 +218,10 @@ def test_episodes_keep_their_last_observation():
             {"observation": np.ones((4, 5))},
             r"1: a row of 'observation' has shape \[5\]",
         ),
-        ({"observation": [[1.0], [2.0, 3.0]] * 2}, "episode 1: 'observation' has rows of unequal"),
+        (
+            {"observation": [[1.0], [2.0, 3.0]] * 2},
+            "episode 1: 'observation' has rows of unequal",
+        ),
         ({"reward": 1.0}, "episode 1 has shapes"),
     ],
 )

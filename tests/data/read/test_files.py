@@ -70,7 +70,9 @@ def test_nothing_is_unpickled(tmp_path):
         np.save(file, np.ones(3))
     with pytest.raises(ValueError, match="it is a single array"):
         load_file(tmp_path / "log.npz")
-    with pytest.raises(ValueError, match=r"must end in one of \.npz, \.hdf5, \.h5"):
+    with pytest.raises(
+        ValueError, match=r"must end in one of \.csv, \.csv\.gz, \.parquet"
+    ):
         load_file(tmp_path / "log.pkl")
 
 
@@ -105,10 +107,10 @@ def test_two_parquet_columns_of_one_name_are_refused(tmp_path):
         ),
         ("action", [[0.1, 0.2]] * 59 + [None], "'action' has no value in row 59"),
         ("reward", [1.0] * 59 + [None], "'reward' has no value in row 59"),
-        ("reward", ["a"] * 60, "'reward' has type object; expected numbers"),
-        ("action", [[]] * 60, "'action' has type object"),
+        ("reward", ["a"] * 60, "'reward' holds 'a' in row 0 of 60; expected"),
+        ("action", [[]] * 60, r"'action' holds \[\] in row 0 of 60; expected numbers"),
         ("action", pyarrow.array([[]] * 60, EMPTY), r"'action' has shape \[60, 0\]"),
-        ("action", [[["a"]]] * 60, r"'action' has type"),
+        ("action", [[["a"]]] * 60, r"'action' holds .* in row 0 of 60; expected numb"),
     ],
 )
 def test_what_only_parquet_can_hold_is_named(tmp_path, name, column, message):

@@ -45,7 +45,10 @@ class Checked(NamedTuple):
 
 
 def checked_columns(
-    rows: Mapping[str, ArrayLike], action_bounds: ActionBounds, clip_actions: bool
+    rows: Mapping[str, ArrayLike],
+    action_bounds: ActionBounds,
+    clip_actions: bool,
+    num_actions: int | None = None,
 ) -> Checked:
     """Check and cast the columns of some steps.
 
@@ -53,6 +56,7 @@ def checked_columns(
         rows: the columns, see :func:`~torchrl_osr.data.transitions_from_rows`.
         action_bounds: as there.
         clip_actions: as there.
+        num_actions: see :func:`~torchrl_osr.data.load_file`.
 
     Raises:
         ValueError: a column is missing, unknown, of the wrong shape, length or type,
@@ -64,11 +68,13 @@ def checked_columns(
     if count == 0:
         raise ValueError("the data hold no rows; expected at least one transition.")
     for name in columns:
-        _check_shape(name, columns, count)
+        _check_shape(name, columns, count, num_actions)
     clipped = outside = 0
     changes = {}
     for name, array in columns.items():
-        if name == "action":
+        if name == "action" and num_actions is not None:
+            columns[name] = _one_hot(array.reshape(count), num_actions)
+        elif name == "action":
             columns[name], clipped, outside = _unit_actions(
                 array, action_bounds, clip_actions
             )
@@ -106,9 +112,9 @@ def as_array(name: str, values: ArrayLike) -> NDArray[Any]:
     Raises:
         ValueError: its rows are of unequal length, or entries of it are masked.
     """
-    if np.ma.is_masked(values):
-        masked = np.ma.getmaskarray(values)
-        rows = masked.reshape(len(masked), -1).any(1)
+    if isinstance(values, np.ma.MaskedArray) and values.mask.any():
+        mask = np.asarray(np.ma.getmaskarray(values))
+        rows = mask.reshape(len(mask), -1).any(1)
         raise ValueError(
             f"{name!r} is masked in row {int(rows.argmax())} of {len(rows)}, and in "
             f"{int(rows.sum())} rows: what is missing cannot be trained on; leave out "
@@ -127,9 +133,14 @@ def _as_numbers(name: str, values: ArrayLike) -> NDArray[Any]:
     return array
 
 
-def _check_shape(name: str, columns: Mapping[str, NDArray[Any]], count: int) -> None:
+def _check_shape(
+    name: str,
+    columns: Mapping[str, NDArray[Any]],
+    count: int,
+    num_actions: int | None,
+) -> None:
     shape = columns[name].shape
-    if name in ("observation", "action"):
+    if name == "observation" or (name == "action" and num_actions is None):
         right = len(shape) == 2 and shape[0] == count and shape[1] > 0
         expected = f"[{count}, D] with D > 0, one row for each observation."
     elif name == "next_observation":
@@ -168,9 +179,10 @@ def _changes(array: NDArray[Any], cast: NDArray[np.float32]) -> NDArray[np.int64
 
 
 def _as_whole_numbers(name: str, array: NDArray[Any]) -> NDArray[Any]:
-    if array.dtype.kind not in "iu":
+    whole = array.dtype.kind == "f" and bool((array == np.floor(array)).all())
+    if array.dtype.kind not in "iu" and not whole:
         raise ValueError(f"{name!r} has type {array.dtype}; expected whole numbers.")
-    return array
+    return array.astype(np.int64)
 
 
 def _as_flags(name: str, array: NDArray[Any]) -> NDArray[np.bool_]:
@@ -183,21 +195,29 @@ def _as_flags(name: str, array: NDArray[Any]) -> NDArray[np.bool_]:
     return np.asarray(array != 0)
 
 
+def _one_hot(action: NDArray[Any], num_actions: int) -> NDArray[np.float32]:
+    """Rows ``[N, num_actions]`` with a 1 at each action's number."""
+    known = (action >= 0) & (action < num_actions) & (action == np.floor(action))
+    wrong = np.flatnonzero(~known)
+    if len(wrong):
+        raise ValueError(
+            f"'action' holds {action[wrong[0]]} in row {wrong[0]} of {len(action)}; "
+            f"expected the number of a discrete action, from 0 to {num_actions - 1}."
+        )
+    return np.eye(num_actions, dtype=np.float32)[action.astype(np.int64)]
+
+
 def _unit_actions(
     action: NDArray[Any], bounds: ActionBounds, clip: bool
 ) -> tuple[NDArray[np.float32], int, int]:
     """Map ``bounds`` to -1 and 1, clip to ``ACTION_LIMIT``; count rows, see Checked."""
-    try:
-        low, high = (
-            np.broadcast_to(np.asarray(bound, np.float64), action.shape[1])
-            for bound in bounds
-        )
-    except (TypeError, ValueError) as error:
+    low, high = check_bounds(bounds)
+    if any(bound.shape not in ((), action.shape[1:]) for bound in (low, high)):
         raise ValueError(
-            f"action_bounds={bounds} for {action.shape[1]} actions; expected the "
-            "lowest and the highest, each one number or one for each action: "
-            "action_bounds=[low,high] (data.action_bounds=[low,high])."
-        ) from error
+            f"action_bounds={bounds} for {action.shape[1]} actions; expected two "
+            "numbers, or two lists with a number for each action (data.action_bounds)."
+        )
+    low, high = (np.broadcast_to(bound, action.shape[1:]) for bound in (low, high))
     if not (np.isfinite([low, high]).all() and (low < high).all()):
         raise ValueError(
             f"action bounds {low.tolist()} and {high.tolist()}; expected finite "
@@ -224,6 +244,18 @@ def _unit_actions(
     return clipped, int((clipped != unit).any(1).sum()), len(outside)
 
 
+def check_bounds(bounds: ActionBounds) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Lowest and highest action as arrays, if they are such; not whether they fit."""
+    try:
+        low, high = (np.asarray(bound, np.float64) for bound in bounds)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"action_bounds={bounds}; expected the lowest and the highest action: two "
+            "numbers, or two lists with a number for each action (data.action_bounds)."
+        ) from error
+    return low, high
+
+
 def _refuse_discrete(
     action: NDArray[np.float32], low: NDArray[Any], high: NDArray[Any]
 ) -> None:
@@ -234,7 +266,7 @@ def _refuse_discrete(
         raise ValueError(
             f"'action' holds only the whole numbers {action.min():g} to "
             f"{action.max():g}, where its bounds are {low.tolist()} and "
-            f"{high.tolist()}: they look like the numbers of discrete actions, which a "
-            "loss for continuous ones would take for forces. If they are forces, give "
-            "their own bounds with action_bounds=[0,high] (data.action_bounds=[0,high])."
+            f"{high.tolist()}: they look like numbers of discrete actions, which a "
+            "loss for continuous ones would take for forces. If they are, give their "
+            "bounds with action_bounds=[0,high] (data.action_bounds=[0,high])."
         )

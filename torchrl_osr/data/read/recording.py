@@ -24,7 +24,7 @@ from tensordict import TensorDict
 from torchrl import torchrl_logger
 
 from torchrl_osr._files import sha256_of
-from torchrl_osr.data.read.column_checks import ActionBounds
+from torchrl_osr.data.read.column_checks import ActionBounds, check_bounds
 from torchrl_osr.data.read.transitions import transitions_of
 from torchrl_osr.data.store.cache import CHUNK_ROWS, cache_root, load_or_write
 from torchrl_osr.data.store.statistics import describe_episodes
@@ -34,8 +34,8 @@ Columns = Mapping[str, NDArray[Any]]
 ReadRows = Callable[[int, int], Columns]
 """Columns of the rows from one number up to another."""
 
-# Raise it whenever what is read from a source, or said of it, changes: sets in the cache
-# are then converted anew.
+# Raise it whenever what is read from a source, or said of it, changes: sets in the
+# cache are then converted anew.
 READER_VERSION = 2
 
 # One change in a hundred may be lost to rounding before it is said.
@@ -57,6 +57,7 @@ class Recording:
         about: JSON-compatible: what the manifest says of the source.
         files: what is read.
         total: rows of the source, for the progress bar.
+        num_actions: see :func:`~torchrl_osr.data.load_file`.
     """
 
     parts: Callable[[int], Iterator[Mapping[str, ArrayLike]]]
@@ -65,10 +66,14 @@ class Recording:
     about: dict[str, Any] = field(default_factory=dict)
     files: list[Path] = field(default_factory=list)
     total: int | None = None
+    num_actions: int | None = None
     _counts: Counter[str] = field(default_factory=Counter, init=False)
     _outside: int = field(default=0, init=False)
     _changes: dict[str, NDArray[np.int64]] = field(default_factory=dict, init=False)
     _episodes: list[NDArray[Any]] = field(default_factory=list, init=False)
+
+    def __post_init__(self) -> None:
+        check_bounds(self.action_bounds)
 
     def load(
         self, *, on_disk: bool = False, progress: bool = True
@@ -106,6 +111,7 @@ class Recording:
             "source_files": files,
             "action_bounds": bounds,
             "clip_actions": self.clip_actions,
+            "num_actions": self.num_actions,
         }
         digest = sha256(json.dumps(request, sort_keys=True).encode()).hexdigest()[:16]
         return load_or_write(
@@ -123,7 +129,9 @@ class Recording:
         seen: set[int] = set()
         for columns in self.parts(rows):
             try:
-                part = transitions_of(columns, self.action_bounds, self.clip_actions)
+                part = transitions_of(
+                    columns, self.action_bounds, self.clip_actions, self.num_actions
+                )
                 if "episode" in columns:
                     last = _check_order(columns["episode"], seen, last)
             except ValueError as error:
