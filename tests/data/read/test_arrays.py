@@ -174,7 +174,7 @@ def with_value(name, row, value):
             {"action": np.array([[0], [1], [1], [0], [1], [0]])},
             r"only the whole numbers 0 to 1, where .* \[-1.0\] and \[1.0\]: .*discrete",
         ),
-        ({"action": np.eye(3)[[0, 1, 2, 0, 1, 1]]}, "look like the numbers of discr"),
+        ({"action": np.eye(3)[[0, 1, 2, 0, 1, 1]]}, "look like numbers of discrete"),
         (
             {"terminated": [0] * 6, "truncated": [1] * 6},
             "none of the 6 rows has a true next state",

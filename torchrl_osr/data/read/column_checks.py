@@ -113,10 +113,9 @@ def as_array(name: str, values: ArrayLike) -> NDArray[Any]:
         ValueError: its rows are of unequal length, or entries of it are masked.
     """
     if isinstance(values, np.ma.MaskedArray) and values.mask.any():
-        mask = np.asarray(np.ma.getmaskarray(values))
-        rows = mask.reshape(len(mask), -1).any(1)
+        rows = np.atleast_2d(np.ma.getmaskarray(values).T).any(0)
         raise ValueError(
-            f"{name!r} is masked in row {int(rows.argmax())} of {len(rows)}, and in "
+            f"{name!r} is masked in row {int(rows.argmax())} of {rows.size}, and in "
             f"{int(rows.sum())} rows: what is missing cannot be trained on; leave out "
             "these rows, or fill them in."
         )

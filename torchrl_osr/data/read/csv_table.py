@@ -38,7 +38,8 @@ def open_csv(path: Path) -> Table:
     names = _names(path)
 
     def select(chosen: list[str]) -> tuple[int, ReadRows]:
-        rows = sum(map(len, _frames(path, names, chosen[:1])))
+        # All columns: asked for some, pandas overlooks lines that are too long.
+        rows = sum(map(len, _frames(path, names, names)))
         return rows, _reader(path, names, chosen, rows)
 
     return Table(names, select)
@@ -89,10 +90,9 @@ def _frames(path: Path, names: list[str], chosen: list[str]) -> Iterator[pd.Data
                 chunksize=ROWS_AT_A_TIME,
                 header=0,
                 names=names,
-                usecols=chosen,
+                usecols=chosen if chosen != names else None,
                 index_col=False,
                 encoding="utf-8-sig",
-                float_precision="round_trip",
                 low_memory=False,
             )
     except (
