@@ -73,8 +73,7 @@ def load_dataset(
     Raises:
         ValueError: an option is missing or has no use, or the data do not fit the task.
     """
-    named = {part: each for part, each in (columns or {}).items() if each is not None}
-    given = {"columns": named, "action_bounds": action_bounds, "path": path}
+    given = {"columns": _named(columns), "action_bounds": action_bounds, "path": path}
     if quality not in RECORDED:
         for option, value in given.items():
             if value:
@@ -101,7 +100,7 @@ def load_dataset(
             quality,
             path,
             env_id=env_id,
-            columns=named,
+            columns=columns,
             action_bounds=action_bounds,
             clip_actions=clip_actions,
             download=download,
@@ -126,14 +125,14 @@ def open_recorded(
     path: str,
     *,
     env_id: str | None = None,
-    columns: Mapping[str, Any],
+    columns: Mapping[str, Any] | None = None,
     action_bounds: ActionBounds | None = None,
     clip_actions: bool = False,
     download: bool = False,
     progress: bool = True,
 ) -> Recording:
     """Open recorded data, none of whose rows is read yet; see :func:`load_dataset`."""
-    clip: dict[str, Any] = {"clip_actions": clip_actions}
+    columns, clip = _named(columns), {"clip_actions": clip_actions}
     # Each reader needs a library of its own, and only the one that is asked for.
     if quality == "minari":
         from torchrl_osr.data.read.minari import open_minari
@@ -144,13 +143,13 @@ def open_recorded(
                 "its own names; data.columns.observation=[...] takes some entries of a "
                 "dictionary."
             )
-        keys, more = columns.get("observation"), clip | {"download": download}
         return open_minari(
             path,
-            observation_keys=keys,
+            download=download,
+            observation_keys=columns.get("observation"),
             action_bounds=action_bounds,
             progress=progress,
-            **more,
+            **clip,
         )
     bounds = action_bounds or _action_bounds(env_id)
     if quality == "file":
@@ -167,6 +166,11 @@ def open_recorded(
     return open_d4rl(
         path, download=download, action_bounds=bounds, progress=progress, **clip
     )
+
+
+def _named(columns: Mapping[str, Any] | None) -> dict[str, Any]:
+    """What the user has named; ``None`` stands for the usual names."""
+    return {part: name for part, name in (columns or {}).items() if name is not None}
 
 
 def _refuse_options(path: str, given: Mapping[str, Any]) -> None:

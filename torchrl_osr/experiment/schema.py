@@ -261,6 +261,24 @@ class TrainConfig:
     resume: str | None = None
 
 
+@dataclass
+class CheckDataConfig:
+    """Everything that ``torchrl-osr data`` reads.
+
+    Attributes:
+        env: the task that the data are of; none is needed.
+        data: which data, as in ``torchrl-osr train``.
+        picture: where the picture goes; null for ``<name of the data>-data.png`` in the
+            current folder.
+        progress: show progress bars when on a terminal.
+    """
+
+    env: EnvConfig = field(default_factory=EnvConfig)
+    data: DataConfig = field(default_factory=DataConfig)
+    picture: str | None = None
+    progress: bool = MISSING
+
+
 def schema_of(target: type) -> type:
     """A structured config with the keyword options of ``target``.
 
@@ -322,12 +340,13 @@ def _config_type(annotation: Any) -> Any:
 def register() -> None:
     """Make schemas and resolvers known to Hydra.
 
-    ``train_schema``, and in the group ``schema`` one for each class of
-    :mod:`torchrl_osr.objectives`; ``run_dir``, by which ``resume=folder`` becomes the
-    run's folder, and ``job_dir``, which names a sweep's folders.
+    ``train_schema``, ``check_data_schema``, and in the group ``schema`` one for each
+    class of :mod:`torchrl_osr.objectives`; ``run_dir``, by which ``resume=folder``
+    becomes the run's folder, and ``job_dir``, which names a sweep's folders.
     """
     store = ConfigStore.instance()
     store.store(name="train_schema", node=TrainConfig)
+    store.store(name="check_data_schema", node=CheckDataConfig)
     for name in set(objectives.__all__) - {"BaseLoss"}:
         schema = schema_of(getattr(objectives, name))
         store.store(group="schema", name=name, node=schema)

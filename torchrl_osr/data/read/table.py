@@ -81,16 +81,15 @@ def find_columns(names: Sequence[str], wanted: ColumnNames) -> Layout:
             f"{', '.join(USUAL_NAMES)}."
         )
     wanted = {part: each for part, each in wanted.items() if each is not None}
-    columns = {}
-    for part in USUAL_NAMES:
-        if part not in wanted:
-            found = _usual(part, names)
-        elif part == "terminated" and wanted[part] is False:
-            found = []
-        else:
-            found = _named(part, wanted[part], names)
-        if found:
-            columns[part] = found
+    named = {
+        part: _named(part, each, names)
+        for part, each in wanted.items()
+        if not (part == "terminated" and each is False)
+    }
+    free = [name for name in names if all(name not in each for each in named.values())]
+    usual = {part: _usual(part, free) for part in USUAL_NAMES if part not in wanted}
+    found = named | usual
+    columns = {part: found[part] for part in USUAL_NAMES if found.get(part)}
     parts = [(part, name) for part, each in columns.items() for name in each]
     used = [name for _, name in parts]
     if twice := [name for name in used if used.count(name) > 1]:
@@ -221,7 +220,7 @@ def _check_complete(
         missing.append("truncated or episode")
     if missing:
         first = missing[0].split()[0]
-        cure = f"say which they are, as in data.columns.{first}=..."
+        cure = f"say which they are, as in data.columns.{first}=<name>"
         if done := [name for name in unused if name.lower() in ("done", "dones")]:
             cure = (
                 f"{done[0]!r} does not say whether the task ended (data.columns."
