@@ -62,7 +62,7 @@ def test_a_log_is_described_and_drawn(look, tmp_path):
     assert "not read  note" in output
     assert output.count("observation  ") == 3
     picture = Image.open(tmp_path / "log-data.png")
-    assert len(set(picture.convert("L").getdata())) > 10
+    assert np.asarray(picture.convert("L")).std() > 10
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "log-data.png",
         "log.csv",
@@ -71,7 +71,7 @@ def test_a_log_is_described_and_drawn(look, tmp_path):
 
 def test_what_looks_wrong_is_numbered(look):
     write_log("log.csv", speed=0.5)
-    swapped = NAMED[:1] + ["data.columns.observation=[speed,cos,sin]"] + NAMED[2:]
+    swapped = [*NAMED[:1], "data.columns.observation=[speed,cos,sin]", *NAMED[2:]]
     output, error = look(*swapped, "env.id=Pendulum-v1", "picture=here.png")
     assert error is None
     assert "1. speed is 0.5 in every row" in output
@@ -107,9 +107,9 @@ def test_what_cannot_be_trained_on_is_one_sentence(look, changes, overrides, mes
 
 def test_rolled_out_data_too(look, tmp_path, monkeypatch):
     monkeypatch.setenv("TORCHRL_OSR_CACHE", str(tmp_path / "cache"))
-    output, error = look("data=medium", "env=hopper", "data.num_transitions=1500")
+    output, error = look("data=medium", "env=hopper", "data.num_transitions=300")
     assert error is None
-    assert "1,500 rows" in output
+    assert "300 rows" in output
     assert "observation[10]" in output
 
 
