@@ -46,11 +46,9 @@ schema.register()
 def main(cfg: DictConfig) -> None:
     """Read the data, print what they are, draw them; nothing else is written."""
     torchrl_logger.setLevel("ERROR")  # warnings are among the findings
-    run_folder.check_keys(cfg)
-    env_id, env_name = (
-        None if OmegaConf.is_missing(cfg.env, key) else str(cfg.env[key])
-        for key in ("id", "name")
-    )
+    run_folder.check_keys(cfg.data)
+    env_id = None if OmegaConf.is_missing(cfg.env, "id") else str(cfg.env.id)
+    env_name = None if env_id is None else str(cfg.env.name)
     options: Any = OmegaConf.to_container(cfg.data)
     read = ("columns", "action_bounds", "clip_actions", "download")
     reading = {name: options[name] for name in read}

@@ -52,7 +52,7 @@ def _unknown_keys(node: DictConfig, prefix: str = "") -> Iterator[str]:
         # A _target_ alone may be any function, which has its own keywords.
         if known != {"_target_"} and key not in known:
             yield f"{prefix}{key}"
-        elif not OmegaConf.is_missing(node, key) and isinstance(node[key], DictConfig):
+        elif isinstance(node[key], DictConfig):
             yield from _unknown_keys(node[key], f"{prefix}{key}.")
 
 
