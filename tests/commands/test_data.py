@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 from PIL import Image
 
 from torchrl_osr.commands import data
+from torchrl_osr.data.read.table import USUAL_NAMES
 
 CONF = str(Path(__file__).parents[2] / "conf")
 
@@ -113,9 +116,10 @@ def test_rolled_out_data_too(look, tmp_path, monkeypatch):
     assert "observation[10]" in output
 
 
-def test_help_fits_a_screen(tmp_path, run):
-    code, output = run(tmp_path, "data", "--help")
-    assert code == 0
-    lines = output.strip().splitlines()
-    assert len(lines) <= 28
-    assert max(map(len, lines)) <= 80
+def test_help_fits_a_screen():
+    path = Path(CONF) / "check_data.yaml"
+    text = OmegaConf.load(path).hydra.help.template.strip()
+    assert len(text.splitlines()) <= 28
+    assert max(map(len, text.splitlines())) <= 80
+    parts = re.search(r"parts: ([\w,\s]+)\n +data", text)[1]
+    assert set(re.findall(r"\w+", parts)) == USUAL_NAMES.keys()

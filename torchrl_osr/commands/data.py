@@ -48,7 +48,7 @@ def main(cfg: DictConfig) -> None:
     torchrl_logger.setLevel("ERROR")  # warnings are among the findings
     run_folder.check_keys(cfg.data)
     env_id = None if OmegaConf.is_missing(cfg.env, "id") else str(cfg.env.id)
-    env_name = None if env_id is None else str(cfg.env.name)
+    env_name = None if env_id is None else cfg.env.get("name")
     options: Any = OmegaConf.to_container(cfg.data)
     read = ("columns", "action_bounds", "clip_actions", "download")
     reading = {name: options[name] for name in read}
@@ -57,6 +57,8 @@ def main(cfg: DictConfig) -> None:
     title = Path(path).name if path else f"{env_name or 'data'} {quality}"
     entries: list[Entry] = []
     try:
+        if quality not in RECORDED and env_id is None:
+            raise ValueError(f"data={quality} needs its task, as in env=hopper.")
         if quality in RECORDED and path and not is_memmap_folder(path):
             # As it was recorded; also of a log that is then refused.
             log = open_recorded(
