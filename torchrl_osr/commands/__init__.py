@@ -1,4 +1,4 @@
-"""The commands: ``torchrl-osr train``, ``evaluate``, ``film`` and ``report``."""
+"""The commands: ``torchrl-osr data``, ``train``, ``evaluate``, ``film``, ``report``."""
 
 from __future__ import annotations
 

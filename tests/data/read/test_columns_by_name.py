@@ -106,6 +106,8 @@ def test_a_step_that_is_missing_or_doubled_is_refused(write):
     wanted = WANTED | {"step": "tick"}
     with pytest.raises(ValueError, match=r"from 'tick' 16 to 18, where steps are 1"):
         load_file(write(robot().drop(index=17)), columns=wanted)
+    with pytest.raises(ValueError, match="'tick' has no (number|value) in row 3"):
+        load_file(write(robot(tick=[*[0.0] * 3, None, *range(116)])), columns=wanted)
     doubled = robot()
     doubled.loc[17, "tick"] = 16
     with pytest.raises(ValueError, match=r"has 'tick' 16 twice"):
@@ -191,6 +193,19 @@ def test_entries_are_in_the_order_of_their_numbers(names, named):
     assert layout.columns["observation"] == [f"q{number}" for number in range(12)]
     asked = {"observation": list(names)}
     assert find_columns([*names, *others], asked).columns["observation"] == names
+
+
+def test_numbers_of_entries_may_be_huge():
+    names = ["act", "reward", "terminal", "timeout", "obs_1", f"obs_{10**18}"]
+    with pytest.raises(ValueError, match="but none with the number 2:"):
+        find_columns(names, {})
+
+
+def test_columns_of_unequal_length_are_refused(tmp_path):
+    columns = make_columns(60) | {"episode": np.arange(60) // 40, "t": np.arange(50)}
+    np.savez(tmp_path / "log.npz", **columns)
+    with pytest.raises(ValueError, match=r"columns have .*'step': \(50,\).* equally"):
+        load_file(tmp_path / "log.npz", columns={"step": "t"})
 
 
 def test_entries_without_a_common_numbering_stay_in_the_files_order():

@@ -180,10 +180,15 @@ def _sorted(columns: Columns, name: str) -> ReadRows:
         ValueError: an episode has a step twice, or lacks one that its next state would
             be read from.
     """
-    step, episode = columns["step"], columns["episode"]
+    lengths = {key: each.shape[:1] for key, each in columns.items()}
+    if len(set(lengths.values())) > 1:
+        raise ValueError(f"columns have {lengths} rows; expected equally many.")
+    step, episode = (columns[key].reshape(-1) for key in ("step", "episode"))
+    if wrong := np.flatnonzero(~np.isfinite(step)).tolist():
+        raise ValueError(f"{name!r} has no number in row {wrong[0]} of {len(step)}.")
     order = np.lexsort((step, episode))
     rows = {key: each[order] for key, each in columns.items() if key != "step"}
-    same = rows["episode"][1:] == rows["episode"][:-1]
+    same = np.diff(episode[order]) == 0
     between = np.diff(step[order])
     if wrong := np.flatnonzero(same & (between == 0)).tolist():
         raise ValueError(

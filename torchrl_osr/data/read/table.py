@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from fnmatch import fnmatchcase
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -194,14 +195,14 @@ def _in_order(part: str, names: list[str]) -> list[str]:
         return names
     numbers = {name: int(re.findall(r"\d+", name)[-1]) for name in names}
     ordered, there = sorted(names, key=numbers.__getitem__), sorted(numbers.values())
-    missing = set(range(there[0], there[-1] + 1)) - set(there)
-    if missing or there[0] > 1:
-        gap = min(missing, default=0)
-        raise ValueError(
-            f"{part} has the columns {_listed(ordered)}, but none with the number "
-            f"{gap}: name those that it is made of (data.columns.{part}=[...]) if "
-            "that is right."
-        )
+    # Numbers begin with 0 or 1.
+    for before, number in pairwise([min(there[0] - 1, 0), *there]):
+        if number > before + 1:
+            raise ValueError(
+                f"{part} has the columns {_listed(ordered)}, but none with the number "
+                f"{before + 1}: name those that it is made of (data.columns.{part}="
+                "[...]) if that is right."
+            )
     return ordered
 
 
