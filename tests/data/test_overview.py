@@ -7,10 +7,11 @@ import re
 import numpy as np
 import pandas as pd
 import pytest
-import torch
 
-from torchrl_osr.data import transitions_from_rows
+from torchrl_osr.commands.data import overview
+from torchrl_osr.data import load_file, transitions_from_rows
 from torchrl_osr.data.overview import describe_entries, findings, out_of_space
+from torchrl_osr.evaluation.data_figure import data_figure
 
 
 def make_log(rows=1200, **changes):
@@ -114,9 +115,14 @@ def test_observations_outside_of_the_tasks_space_are_said():
     assert "where the environment's observation has -1 to 1" in sentence
 
 
-def test_discrete_actions_are_not_measured_by_bounds():
-    columns = make_log(action=np.zeros((1200, 1)))
-    data, manifest = transitions_from_rows(make_log())
-    one_hot = torch.eye(2)[torch.arange(len(data)) % 2]
-    data["action"] = one_hot
-    assert [*findings(data, manifest, describe_entries([columns], {}))][1:] == []
+def test_discrete_actions_are_not_measured_by_bounds(tmp_path):
+    columns = make_log(action=np.arange(1200) % 2)
+    np.savez(tmp_path / "log.npz", **columns)
+    data, manifest = load_file(tmp_path / "log.npz", num_actions=2)
+    assert [*findings(data, manifest, describe_entries([columns], {}))] == []
+    assert "actions   discrete, 2; shares of the rows: 51.3% 0, 48.7% 1" in overview(
+        data, manifest, ["action"]
+    )
+    names = {"observation": ["x", "y"], "action": ["action"]}
+    data_figure(data, manifest, names, tmp_path / "log.png", title="log")
+    assert (tmp_path / "log.png").stat().st_size > 10_000

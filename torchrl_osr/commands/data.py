@@ -133,14 +133,16 @@ def overview(
                 f"  {label:<10}{mean:.5g} ({min(values):.5g} to {max(values):.5g}), "
                 f"{len(values):,} {known} episodes"
             )
-    low, high = manifest.get("action_bounds", (-1, 1))
-    bounds = actions_at_bounds(data).tolist()
-    shares = ", ".join(
-        f"{share:.1%} {name}" for name, share in zip(actions, bounds, strict=True)
-    )
-    lines.append(
-        f"  actions   {low} to {high} become -1 to 1; rows at a bound: {shares}"
-    )
+    known = f"discrete, {manifest.get('num_actions')}; shares of the rows"
+    shares = data["action"].mean(0).tolist()
+    if manifest.get("num_actions") is None:
+        low, high = manifest.get("action_bounds", (-1, 1))
+        known = f"{low} to {high} become -1 to 1; rows at a bound"
+        shares = actions_at_bounds(data).tolist()
+    else:
+        actions = [str(number) for number in range(len(shares))]
+    each = [f"{share:.1%} {name}" for name, share in zip(actions, shares, strict=True)]
+    lines.append(f"  actions   {known}: {', '.join(each)}")
     if unused := manifest.get("unused_columns"):
         lines.append(f"  not read  {', '.join(unused)}")
     return "\n".join(lines)

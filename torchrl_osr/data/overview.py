@@ -100,7 +100,8 @@ def findings(
     """
     yield from manifest.get("warnings", [])
     yield from _about_entries(entries)
-    yield from _about_actions(data, [e.name for e in entries if e.part == "action"])
+    if manifest.get("num_actions") is None:
+        yield from _about_actions(data, [e.name for e in entries if e.part == "action"])
     yield from _about_episodes(data, manifest)
     yield from _about_next_states(data, manifest)
 
@@ -127,10 +128,7 @@ def _about_entries(entries: Sequence[Entry]) -> Iterator[str]:
 
 
 def _about_actions(data: TensorDict, names: Sequence[str]) -> Iterator[str]:
-    action = data["action"]
-    if set(action[:1].flatten().tolist()) <= {0.0, 1.0}:
-        return  # one-hot
-    largest = action.abs().amax(0).tolist()
+    largest = data["action"].abs().amax(0).tolist()
     for name, most, bound in zip(
         names, largest, actions_at_bounds(data).tolist(), strict=True
     ):

@@ -43,7 +43,9 @@ def data_figure(
         title: what the data are.
     """
     low, high = (np.asarray(each) for each in manifest.get("action_bounds", (-1, 1)))
-    actions = low + (data["action"].numpy() + 1) / 2 * (high - low)
+    actions: NDArray[Any] = low + (data["action"].numpy() + 1) / 2 * (high - low)
+    if manifest.get("num_actions") is not None:
+        actions = data["action"].numpy().argmax(1)[:, None]
     returns = [*manifest["episode_returns"], *manifest.get("incomplete_returns", [])]
     lengths = [*manifest["episode_lengths"], *manifest.get("incomplete_lengths", [])]
     panels: list[tuple[str, NDArray[Any], str]] = [

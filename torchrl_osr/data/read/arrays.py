@@ -47,12 +47,12 @@ def transitions_from_rows(
     Returns:
         The transitions in float32, see :func:`~torchrl_osr.data.check_dataset`, and a
         manifest: ``num_transitions``, ``dropped_rows``, ``terminal_rows_filled``,
-        ``clipped_actions`` (rows), ``action_limit``, ``action_bounds``, the number of
-        ``terminated_ends``, ``truncated_ends`` and ``unmarked_ends``, of the complete
-        episodes ``num_complete_episodes``, ``return``, ``episode_length``,
-        ``episode_returns`` and ``episode_lengths``, of the others
-        ``incomplete_returns`` and ``incomplete_lengths``, and ``warnings``, which are
-        logged, too: what the casts have changed.
+        ``clipped_actions`` (rows), ``action_limit``, ``action_bounds``, ``num_actions``
+        (of discrete ones), the number of ``terminated_ends``, ``truncated_ends`` and
+        ``unmarked_ends``, of the complete episodes ``num_complete_episodes``,
+        ``return``, ``episode_length``, ``episode_returns`` and ``episode_lengths``, of
+        the others ``incomplete_returns`` and ``incomplete_lengths``, and ``warnings``,
+        which are logged, too: what the casts have changed.
 
     Raises:
         ValueError: the columns are not as above, hold a NaN or an infinity, are masked,

@@ -165,6 +165,7 @@ class Recording:
             **self.about,
             **({"data_sha256": sha256_of(self.files[0])} if single else {}),
             **self._counts,
+            "num_actions": self.num_actions,
             "action_limit": ACTION_LIMIT,
             "action_bounds": [bound.tolist() for bound in bounds],
             **describe_episodes(returns, lengths),
