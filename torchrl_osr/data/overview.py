@@ -99,7 +99,9 @@ def findings(
         entries: as :func:`describe_entries` found them.
     """
     yield from manifest.get("warnings", [])
-    yield from _about_entries(entries)
+    # Where episodes end by themselves, to last long is worth something.
+    falls = bool(data["next", "terminated"].any())
+    yield from _about_entries([e for e in entries if e.part != "reward" or not falls])
     if manifest.get("num_actions") is None:
         yield from _about_actions(data, [e.name for e in entries if e.part == "action"])
     yield from _about_episodes(data, manifest)
