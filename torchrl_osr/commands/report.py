@@ -35,22 +35,20 @@ def main() -> None:
     options = parser.parse_args()
 
     command = " ".join([sys.argv[0], shlex.join(sys.argv[1:])])
-    try:
-        if options.pack:
-            number = pack_runs(options.runs, options.pack)
-            print(f"{number} runs in {options.pack}")
-            return
-        tables = read_runs(options.runs)
-        for path, reason in tables.left_out:
-            print(f"left out: {path}: {reason}")
-        for note in comparison_notes(tables):
-            print(f"note: {note}")
-        page = write_report(
-            tables, options.output, reference=options.reference, command=command
-        )
-    except (OSError, ValueError) as error:
-        parser.exit(1, f"{error}\n")
-    print(f"{len(tables.runs)} runs in {page}")
+    if options.pack:
+        number = pack_runs(options.runs, options.pack)
+        print(f"{number} run{'s' if number > 1 else ''} in {options.pack}")
+        return
+    tables = read_runs(options.runs)
+    for path, reason in tables.left_out:
+        print(f"left out: {path}: {reason}")
+    for note in comparison_notes(tables):
+        print(f"note: {note}")
+    page = write_report(
+        tables, options.output, reference=options.reference, command=command
+    )
+    number = len(tables.runs)
+    print(f"{number} run{'s' if number > 1 else ''} in {page}")
 
 
 if __name__ == "__main__":
