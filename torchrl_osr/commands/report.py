@@ -19,12 +19,24 @@ import sys
 from pathlib import Path
 
 from torchrl_osr.report import comparison_notes, pack_runs, read_runs, write_report
+from torchrl_osr.report.scores import counted
+
+EXAMPLES = """\
+  torchrl-osr report outputs
+  torchrl-osr report multirun outputs --reference cql --output page
+  torchrl-osr report outputs --pack runs.jsonl.gz && torchrl-osr report runs.jsonl.gz
+
+The page is <output>/report.html; docs/report.md says how to read it.
+"""
 
 
 def main() -> None:
     """Read, report, and say what could not be."""
     parser = argparse.ArgumentParser(
-        prog=sys.argv[0], description=__doc__.split("\n")[0]
+        prog=sys.argv[0],
+        description=__doc__.split("\n")[0],
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
         "runs", nargs="+", type=Path, help="folders of runs, or above them, or tables"
@@ -37,7 +49,7 @@ def main() -> None:
     command = " ".join([sys.argv[0], shlex.join(sys.argv[1:])])
     if options.pack:
         number = pack_runs(options.runs, options.pack)
-        print(f"{number} run{'s' if number > 1 else ''} in {options.pack}")
+        print(f"{counted(number, 'run')} in {options.pack}")
         return
     tables = read_runs(options.runs)
     for path, reason in tables.left_out:
@@ -47,8 +59,7 @@ def main() -> None:
     page = write_report(
         tables, options.output, reference=options.reference, command=command
     )
-    number = len(tables.runs)
-    print(f"{number} run{'s' if number > 1 else ''} in {page}")
+    print(f"{counted(len(tables.runs), 'run')} in {page}")
 
 
 if __name__ == "__main__":

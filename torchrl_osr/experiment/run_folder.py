@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import os
 import platform
@@ -47,7 +46,8 @@ def check_keys(config: DictConfig) -> None:
 
 def _unknown_keys(node: DictConfig, prefix: str = "") -> Iterator[str]:
     kind = OmegaConf.get_type(node)
-    known = {each.name for each in dataclasses.fields(kind)} if kind else set()
+    # dataclasses.fields finds none in a class that was pickled in another process.
+    known = set(getattr(kind, "__dataclass_fields__", ()))
     for key in map(str, node):
         # A _target_ alone may be any function, which has its own keywords.
         if known != {"_target_"} and key not in known:

@@ -321,8 +321,9 @@ def job_folder(number: int, overrides: str) -> str:
         '3_loss-cql_steps-200_seed-1'
     """
     last_keys = re.sub(r"[\w.]+\.(\w+=)", r"\1", overrides)
-    plain = last_keys.replace("=", "-").replace(",", "_")
-    plain = re.sub(r"[^A-Za-z0-9._-]+", "-", plain).strip("._-")
+    words = re.sub(r"[^A-Za-z0-9._=,-]+", " ", last_keys)
+    pairs = re.sub(r" *([=,]) *", r"\1", words).strip(" .=,-_")
+    plain = pairs.translate(str.maketrans("=, ", "-_-"))
     return f"{number}_{plain}"[:MAX_FOLDER_NAME] if plain else str(number)
 
 
