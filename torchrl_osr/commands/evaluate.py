@@ -13,12 +13,12 @@ the same name. A killed evaluation continues after its last finished checkpoint.
 
 from __future__ import annotations
 
+import functools
 import json
 import multiprocessing
 import signal
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from functools import partial as bound
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -137,22 +137,26 @@ def evaluate_sweep(cfg: DictConfig) -> None:
     top = Path(cfg.sweep)
     runs = []
     for folder in find_runs([top]):
-        status = read_json(folder / run_folder.STATUS)["status"]
+        try:
+            status = read_json(folder / run_folder.STATUS)["status"]
+        except (OSError, ValueError, KeyError):
+            status = "unknown"
         if status == "done":
             runs.append(folder)
         else:
             print(f"left out: {folder}: not finished, its status is {status}")
     if not runs:
         raise ValueError(f"there is no finished run in or below {top}.")
-    rows, failed = {}, []
+    rows: dict[Path, Sequence[str]] = {}
+    failed = []
     # Spawned, for torch's threads do not survive a fork. Ctrl-C ends them in silence.
     workers = ProcessPoolExecutor(
         min(cfg.jobs, len(runs)),
         multiprocessing.get_context("spawn"),
-        bound(signal.signal, signal.SIGINT, signal.SIG_DFL),
+        functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL),
     )
-    with workers:
-        jobs = {workers.submit(evaluate_one_of_many, cfg, run): run for run in runs}
+    jobs = {workers.submit(evaluate_one_of_many, cfg, run): run for run in runs}
+    try:
         for number, job in enumerate(as_completed(jobs), start=1):
             folder = jobs[job]
             try:
@@ -163,6 +167,8 @@ def evaluate_sweep(cfg: DictConfig) -> None:
             else:
                 outcome = "undisturbed {}, disturbed {}".format(*rows[folder])
             print(f"{number} of {len(runs)}: {folder}: {outcome}", flush=True)
+    finally:
+        workers.shutdown(cancel_futures=True)
     header = ("run", "undisturbed", "disturbed")
     done = [(str(run), *rows[run]) for run in runs if run in rows]
     print(f"\nsuite {cfg.suite.name}: normalised score, mean over its disturbances")
