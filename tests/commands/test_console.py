@@ -99,6 +99,17 @@ def test_error_is_alone_and_debug_shows_where(tmp_path, run):
     assert "FileNotFoundError: there is no run" in output
 
 
+def test_example_is_the_command_by_another_name(tmp_path, run):
+    (tmp_path / "mine" / "experiment").mkdir(parents=True)
+    more = "# @package _global_\ntrainer: {steps: 7}\n"
+    (tmp_path / "mine" / "experiment" / "short.yaml").write_text(more)
+    options = ["--config-dir", "mine", "+experiment=short", "--cfg", "job"]
+    code, output = run(tmp_path, "train", *options)
+    assert code == 0, output
+    assert OmegaConf.create(output).trainer.steps == 7
+    assert run(tmp_path, "offline_osr.py", *options) == (0, output)
+
+
 COMPLETE = """
 eval "$(torchrl-osr -sc install=bash)"
 complete -p torchrl-osr

@@ -6,6 +6,7 @@ import sys
 from types import SimpleNamespace
 
 import pytest
+from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
@@ -40,7 +41,7 @@ def test_tensorboard_reads_the_events(tmp_path):
 
 def test_tensorboard_has_hyperparameters_beside_the_scores(tmp_path):
     made = make_loggers("tensorboard", tmp_path)
-    log_outcome(made, CONFIG, ROWS, {})
+    log_outcome(made, OmegaConf.create(CONFIG), ROWS, {})
     events = EventAccumulator(str(tmp_path / "tensorboard"))
     events.Reload()
     assert events.Scalars("score/best")[0].value == 50
@@ -95,7 +96,7 @@ def test_wandb_knows_the_run_and_keeps_its_figures_and_scores(tmp_path, wandb_ru
              "config": CONFIG}  # fmt: skip
     made = make_loggers("wandb", tmp_path, project="mine", mode="offline", **about)
     made[1].log_scalar("policy/score", 3.0, step=7)
-    log_outcome(made, CONFIG, ROWS, {"curve": tmp_path / "curve.png"})
+    log_outcome(made, OmegaConf.create(CONFIG), ROWS, {"curve": tmp_path / "curve.png"})
     (run,) = wandb_runs
     assert about.items() <= run.options.items()
     assert (run.options["project"], run.options["mode"]) == ("mine", "offline")

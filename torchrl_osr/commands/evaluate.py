@@ -181,8 +181,9 @@ def evaluate_sweep(cfg: DictConfig) -> None:
 
 def evaluate_one_of_many(cfg: DictConfig, folder: Path) -> Sequence[str]:
     """Evaluate one run of a sweep: its scores, undisturbed and disturbed."""
-    one = {"checkpoint": str(folder), "progress": False}
-    _, results = evaluate_run(OmegaConf.merge(cfg, one))
+    one = cfg.copy()
+    one.checkpoint, one.progress = str(folder), False
+    _, results = evaluate_run(one)
     rows = results["summary"]
     scores = [sum(row[key] for row in rows) / len(rows) for key in SCORES]
     return [f"{score:.1f}" for score in scores]

@@ -27,6 +27,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 from torchrl import torchrl_logger
 from torchrl.objectives import SoftUpdate
+from torchrl.record.loggers import Logger
 
 from torchrl_osr import StatePerturbation
 from torchrl_osr._files import write_json
@@ -101,7 +102,8 @@ def run(cfg: DictConfig, folder: Path) -> float:
     # Networks, and the policy's loss, which holds the inverse dynamics model.
     actor, inverse_dynamics, loss = make_learner(cfg, *data.sizes, device)
 
-    loggers = make_loggers(folder=folder, **cfg.logger, **about(cfg, folder))
+    told = about(cfg, folder) if cfg.logger.kind == "wandb" else {}
+    loggers = make_loggers(folder=folder, **cfg.logger, **told)
 
     # One step of a trainer: sample a batch, compute the losses, go backward on their
     # sum, step the optimizer, move the target networks; log, evaluate and write a
@@ -171,11 +173,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
             adversary = instantiate(cfg.perturbation.adversary)
             trainer.register_op("process_optim_batch", partial(adversary, loss))
         trainer.train()
-    score = report(cfg, folder, data.score, trainer)
-    rows = {"last": trainer.history[-1], "best": trainer.best()}
-    config = OmegaConf.to_container(cfg, resolve=True)
-    log_outcome(loggers, config, rows, {"curve": folder / "curve.png"})
-    return score
+    return report(cfg, folder, data.score, trainer, loggers)
 
 
 def code_versions() -> dict[str, str]:
@@ -189,12 +187,12 @@ def about(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     began = read_yaml(folder / ".hydra" / "hydra.yaml")["hydra"]
     data, method = f"{cfg.env.name}-{cfg.data.quality}", began["runtime"]["choices"]
     sweep = [folder.parent.name] if began["mode"] == "MULTIRUN" else []
-    config = {"versions": code_versions(), **OmegaConf.to_container(cfg, resolve=True)}
+    settings: Any = OmegaConf.to_container(cfg, resolve=True)
     return {
         "name": f"{data} {method['loss']} seed{cfg.seed}",
         "group": f"{data} {method['loss']}",
         "tags": [cfg.env.name, cfg.data.quality, method["loss"], *sweep],
-        "config": config,
+        "config": settings | {"versions": code_versions()},
     }
 
 
@@ -205,7 +203,11 @@ def shuffle_next(batch: TensorDict) -> TensorDict:
 
 
 def report(
-    cfg: DictConfig, folder: Path, data_score: float | None, trainer: OfflineTrainer
+    cfg: DictConfig,
+    folder: Path,
+    data_score: float | None,
+    trainer: OfflineTrainer,
+    loggers: list[Logger],
 ) -> float:
     """Write raw returns and the figure, print the table; return the last score."""
     history, best = trainer.history, trainer.best()
@@ -225,6 +227,8 @@ def report(
         title=f"{name}, {type(trainer.loss_module).__name__}, seed {cfg.seed}",
         data_score=data_score,
     )
+    rows = {"last": history[-1], "best": best}
+    log_outcome(loggers, cfg, rows, {"curve": folder / "curve.png"})
     print("\n" + score_table(name, history, best, data_score, folder))
     return float(history[-1]["score"])
 

@@ -8,6 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from omegaconf import DictConfig, OmegaConf
 from torchrl.record.loggers import CSVLogger, Logger, get_logger
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 from torchrl.record.loggers.wandb import WandbLogger
@@ -51,7 +52,8 @@ def make_loggers(
         raise ImportError(
             f"logger={kind} needs {kind!r}: pip install 'torchrl-osr[{extra}]'"
         )
-    options = {"project": project, "mode": mode} | about
+    # A sweep's jobs may share a process, and one that failed has left its run open.
+    options = {"project": project, "mode": mode, "reinit": "finish_previous"} | about
     name = options.pop("name", kind)
     if kind == "wandb":
         known = folder / ".wandb_id"
@@ -65,7 +67,7 @@ def make_loggers(
 
 def log_outcome(
     loggers: Sequence[Logger],
-    config: Mapping[str, Any],
+    config: DictConfig,
     rows: Mapping[str, Mapping[str, Any]],
     figures: Mapping[str, Path],
 ) -> None:
@@ -82,9 +84,10 @@ def log_outcome(
     for logger in loggers:
         experiment = logger.experiment
         if isinstance(logger, TensorboardLogger):
+            settings = flatten(OmegaConf.to_container(config, resolve=True))
             values = {
                 key: value if isinstance(value, (bool, int, float)) else str(value)
-                for key, value in flatten(config).items()
+                for key, value in settings.items()
             }
             scores = {f"score/{name}": row["score"] for name, row in rows.items()}
             # "." is the folder of the curves, not one of its own.
