@@ -10,12 +10,14 @@ from __future__ import annotations
 import functools
 import inspect
 import operator
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, make_dataclass
 from types import NoneType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from hydra.core.config_store import ConfigStore
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import MISSING, OmegaConf
 
 from torchrl_osr import objectives
@@ -347,7 +349,8 @@ def register() -> None:
 
     ``train_schema``, ``check_data_schema``, and in the group ``schema`` one for each
     class of :mod:`torchrl_osr.objectives`; ``run_dir``, by which ``resume=folder``
-    becomes the run's folder, and ``job_dir``, which names a sweep's folders.
+    becomes the run's folder; ``hydra_dir``, by which a continued run keeps what Hydra
+    wrote when it began; and ``job_dir``, see :func:`job_folder`.
     """
     store = ConfigStore.instance()
     store.store(name="train_schema", node=TrainConfig)
@@ -355,11 +358,48 @@ def register() -> None:
     for name in set(objectives.__all__) - {"BaseLoss"}:
         schema = schema_of(getattr(objectives, name))
         store.store(group="schema", name=name, node=schema)
-    OmegaConf.register_new_resolver(
-        "run_dir", lambda resume, fresh: resume or fresh, replace=True
-    )
-    OmegaConf.register_new_resolver(
-        "job_dir",
-        lambda number, overrides: f"{number}_{overrides}"[:MAX_FOLDER_NAME],
-        replace=True,
-    )
+    resolvers: dict[str, Callable[..., Any]] = {
+        "run_dir": lambda resume, fresh: resume or fresh,
+        "hydra_dir": lambda resume: None if resume else ".hydra",
+        "job_dir": job_folder,
+    }
+    for name, resolver in resolvers.items():
+        OmegaConf.register_new_resolver(name, resolver, replace=True)
+
+
+def job_folder(number: int, overrides: str) -> str:
+    """Name of a sweep's job: its number, which is unique, and its overrides.
+
+    Letters, digits and ``._-`` alone: neither a shell nor Hydra needs quotes for it.
+
+    Examples:
+        >>> from torchrl_osr.experiment.schema import job_folder
+        >>> job_folder(3, "loss=cql,trainer.steps=200,seed=1")
+        '3_loss-cql_steps-200_seed-1'
+    """
+    last_keys = re.sub(r"[\w.]+\.(\w+=)", r"\1", overrides)
+    words = re.sub(r"[^A-Za-z0-9._=,-]+", " ", last_keys)
+    pairs = re.sub(r" *([=,]) *", r"\1", words).strip(" .=,-_")
+    plain = pairs.translate(str.maketrans("=, ", "-_-"))
+    return f"{number}_{plain}"[:MAX_FOLDER_NAME] if plain else str(number)
+
+
+def named_by_what_differs(arguments: Sequence[str]) -> list[str]:
+    """Override that leaves out of :func:`job_folder` what all jobs of a sweep share.
+
+    Args:
+        arguments: the command line.
+
+    Returns:
+        Nothing where there is no sweep.
+
+    Raises:
+        OverrideParseException: an override makes no sense.
+    """
+    if not {"-m", "--multirun"} & set(arguments):
+        return []
+    given = [each for each in arguments if "=" in each and not each.startswith("-")]
+    parsed = OverridesParser.create().parse_overrides(given)
+    shared = [each.key_or_group for each in parsed if not each.is_sweep_override()]
+    keys = [key for key in shared if not key.startswith("hydra")]
+    return [f"hydra.job.config.override_dirname.exclude_keys=[{','.join(keys)}]"]
