@@ -22,7 +22,7 @@ COMMANDS = {
     "export": "write a trained policy to one file, for use elsewhere",
 }
 
-CONFIGURED = ("train", "evaluate", "film")
+CONFIGURED = ("data", "train", "evaluate", "film")
 """Those that Hydra configures."""
 
 HELP = """\

@@ -22,6 +22,7 @@ from tensordict import TensorDict
 from torchrl import torchrl_logger
 
 from torchrl_osr.commands import CONF
+from torchrl_osr.commands.console import single_job
 from torchrl_osr.data import RECORDED, load_dataset, make_environment
 from torchrl_osr.data.overview import (
     PARTS,
@@ -43,6 +44,7 @@ schema.register()
 
 
 @hydra.main(version_base="1.3", config_path=CONF, config_name="check_data")
+@single_job
 def main(cfg: DictConfig) -> None:
     """Read the data, print what they are, draw them; nothing else is written."""
     torchrl_logger.setLevel("ERROR")  # warnings are among the findings
