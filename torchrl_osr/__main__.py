@@ -11,6 +11,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 COMMANDS = {
     "train": "train a policy on offline data, or continue a run",
+    "collect": "roll out a policy in any environment and keep the log",
     "evaluate": "disturb a trained policy: score lost, survival, way back",
     "film": "film a push and what follows",
     "report": "compare any number of runs on one page",

@@ -17,7 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
 from torchrl import torchrl_logger
 from tqdm.auto import tqdm
@@ -37,14 +39,16 @@ from torchrl_osr.evaluation import (
     deterministic_policy,
     evaluate_paired,
     evaluation_json,
+    impossible_disturbances,
     robustness_figure,
     robustness_table,
     summarize_disturbances,
 )
 from torchrl_osr.experiment import run_folder
-from torchrl_osr.experiment.build import load_data
+from torchrl_osr.experiment.build import load_data, references_of
 from torchrl_osr.experiment.suite import make_disturbances, register
 from torchrl_osr.experiment.trained_run import (
+    TrainedRun,
     checkpoints_of,
     load_trained,
     run_folder_of,
@@ -126,7 +130,8 @@ def evaluate(
     cfg: DictConfig, files: list[Path], partial: Path, request: dict[str, Any]
 ) -> dict[str, Any]:
     """Play all checkpoints of one run, except those that ``partial`` has already."""
-    run = load_trained(files[0]).config
+    first = load_trained(files[0])
+    run = first.config
     data, _ = load_data(run, progress=cfg.progress)
     distance = DataDistance(data, seed=run.data.seed)
     _, scale = observation_statistics(data)
@@ -134,7 +139,14 @@ def evaluate(
     evaluations = begun["evaluations"]
     if evaluations:
         print(f"{partial} has {len(evaluations)} of {len(files)} checkpoints already.")
-    plays = 1 + len(cfg.suite.disturbances)  # the clean episodes first
+    references = references_of(run)
+    left_out = impossible(cfg, first, scale.numpy())
+    suite = {
+        name: config
+        for name, config in cfg.suite.disturbances.items()
+        if name not in left_out
+    }
+    plays = 1 + len(suite)  # the clean episodes first
     bar = tqdm(
         initial=len(evaluations) * plays,
         total=len(files) * plays,
@@ -149,24 +161,40 @@ def evaluate(
             paired = evaluate_paired(
                 deterministic_policy(trained.actor, trained.observation_norm),
                 run.env.id,
-                make_disturbances(
-                    cfg.suite.disturbances, trained, scale.numpy(), seed=seed
-                ),
+                make_disturbances(suite, trained, scale.numpy(), seed=seed),
                 distance,
                 num_episodes=cfg.episodes,
                 seed=seed,
                 advance=bar.update,
             )
-            evaluations.append(evaluation_json(trained.step, paired, run.env.name))
+            evaluations.append(evaluation_json(trained.step, paired, references))
             begun = checksummed(request | {"evaluations": evaluations})
             write_json(partial, begun)
     return {
         "env": run.env.name,
         "data": run.data.quality,
         "threshold": distance.threshold,
+        "left_out": left_out,
         "evaluations": evaluations,
         "summary": summarize_disturbances(evaluations),
     }
+
+
+def impossible(
+    cfg: DictConfig, trained: TrainedRun, scale: NDArray[np.floating]
+) -> dict[str, str]:
+    """Say which disturbances of the suite the environment lacks what it takes for."""
+    env_id = trained.config.env.id
+    suite = make_disturbances(cfg.suite.disturbances, trained, scale)
+    left_out = impossible_disturbances(env_id, suite)
+    for name, reason in left_out.items():
+        print(f"left out: {name}: {reason}")
+    if len(left_out) == len(suite):
+        raise ValueError(
+            f"no disturbance of suite={cfg.suite.name} is possible for {env_id}: "
+            "choose another suite."
+        )
+    return left_out
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, OmegaConf
 
 from torchrl_osr import objectives
+from torchrl_osr.data.collect.environment import environment_name
 
 # File systems allow 255 bytes, and temporary names beside it need some of them.
 MAX_FOLDER_NAME = 200
@@ -29,13 +30,24 @@ class EnvConfig:
     """Which task.
 
     Attributes:
+        id: Gymnasium id of the environment that is evaluated; package:Name-v0 imports
+            the package first.
         name: short name of the task, which behaviour policies and reference scores
             have.
-        id: Gymnasium id of the environment that is evaluated.
+        random_return: mean return of a random policy, score 0; null with
+            expert_return: raw returns, unless the task is one of D4RL's.
+        expert_return: mean return of an expert, score 100.
+        action_low: lowest action in the environment's own units, read from it and kept
+            with the run; null if actions are discrete.
+        action_high: highest action, likewise.
     """
 
-    name: str = MISSING
     id: str = MISSING
+    name: str = "${environment_name:${env.id}}"
+    random_return: float | None = None
+    expert_return: float | None = None
+    action_low: list[float] | None = None
+    action_high: list[float] | None = None
 
 
 @dataclass
@@ -85,11 +97,13 @@ class NetworkConfig:
 
     Attributes:
         actor: the function that builds the policy, of the kind that the loss trains.
+        critic: the function that builds the critics, likewise.
         num_cells: width of each hidden layer.
         layer_norm: layer normalisation in the critics; steadier, not in the paper.
     """
 
     actor: TargetConfig = field(default_factory=TargetConfig)
+    critic: TargetConfig = field(default_factory=TargetConfig)
     num_cells: list[int] = MISSING
     layer_norm: bool = MISSING
 
@@ -228,6 +242,29 @@ class TrainConfig:
     resume: str | None = None
 
 
+@dataclass
+class CollectConfig:
+    """Everything that ``torchrl-osr collect`` reads.
+
+    Attributes:
+        env: which environment; of its keys ``id`` alone counts.
+        policy: random, a run's folder, or a function of a module.
+        path: of the log to write.
+        episodes: how many to play.
+        noise: on actions, see ``record_episodes``.
+        seed: of the first episode.
+        progress: a progress bar, when on a terminal.
+    """
+
+    env: EnvConfig = field(default_factory=EnvConfig)
+    policy: str = MISSING
+    path: str = MISSING
+    episodes: int = MISSING
+    noise: float = MISSING
+    seed: int = MISSING
+    progress: bool = MISSING
+
+
 def schema_of(target: type) -> type:
     """A structured config with the keyword options of ``target``.
 
@@ -289,15 +326,18 @@ def _config_type(annotation: Any) -> Any:
 def register() -> None:
     """Make schemas and resolvers known to Hydra.
 
-    ``train_schema``, and in the group ``schema`` one for each class of
-    :mod:`torchrl_osr.objectives`; ``run_dir``, by which ``resume=folder`` becomes the
-    run's folder, and ``job_dir``, which names a sweep's folders.
+    ``train_schema``, ``collect_schema``, and in the group ``schema`` one for each class of
+    :mod:`torchrl_osr.objectives`; ``environment_name``, the short name of a task;
+    ``run_dir``, by which ``resume=folder`` becomes the run's folder, and ``job_dir``,
+    which names a sweep's folders.
     """
     store = ConfigStore.instance()
     store.store(name="train_schema", node=TrainConfig)
+    store.store(name="collect_schema", node=CollectConfig)
     for name in set(objectives.__all__) - {"BaseLoss"}:
         schema = schema_of(getattr(objectives, name))
         store.store(group="schema", name=name, node=schema)
+    OmegaConf.register_new_resolver("environment_name", environment_name, replace=True)
     OmegaConf.register_new_resolver(
         "run_dir", lambda resume, fresh: resume or fresh, replace=True
     )

@@ -8,6 +8,8 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import MLP, OneHotCategorical, ProbabilisticActor
 
+from torchrl_osr.modules.critic import layer_norm_options
+
 
 def categorical_actor(
     observation_dim: int,
@@ -103,6 +105,7 @@ def discrete_critic_ensemble(
     num_qvalue_nets: int = 2,
     num_cells: Sequence[int] = (256, 256),
     activation_class: type[nn.Module] = nn.ReLU,
+    layer_norm: bool = False,
 ) -> list[TensorDictModule]:
     """Return Q networks that read ``"observation"`` and value all actions at once.
 
@@ -114,6 +117,7 @@ def discrete_critic_ensemble(
         num_qvalue_nets: number of critics, ``N``.
         num_cells: width of each hidden layer.
         activation_class: activation between the layers.
+        layer_norm: see :func:`~torchrl_osr.modules.critic_ensemble`. Default ``False``.
 
     Returns:
         ``N`` modules that write ``"action_value"``, ``[B, n]``.
@@ -126,6 +130,7 @@ def discrete_critic_ensemble(
         >>> critic(batch)["action_value"].shape
         torch.Size([3, 2])
     """
+    norm = layer_norm_options(num_cells) if layer_norm else {}
     return [
         TensorDictModule(
             MLP(
@@ -133,6 +138,7 @@ def discrete_critic_ensemble(
                 out_features=num_actions,
                 num_cells=list(num_cells),
                 activation_class=activation_class,
+                **norm,
             ),
             ["observation"],
             ["action_value"],

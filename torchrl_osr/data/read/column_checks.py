@@ -27,7 +27,10 @@ ROUNDING = 1e-5
 
 
 def checked_columns(
-    rows: Mapping[str, ArrayLike], action_bounds: ActionBounds, clip_actions: bool
+    rows: Mapping[str, ArrayLike],
+    action_bounds: ActionBounds,
+    clip_actions: bool,
+    num_actions: int | None = None,
 ) -> tuple[dict[str, NDArray[Any]], int]:
     """Columns in float32, bool and whole numbers, and the number of clipped actions.
 
@@ -35,6 +38,7 @@ def checked_columns(
         rows: the columns, see :func:`~torchrl_osr.data.transitions_from_rows`.
         action_bounds: as there.
         clip_actions: as there.
+        num_actions: see :func:`~torchrl_osr.data.load_file`.
 
     Raises:
         ValueError: a column is missing, unknown, of the wrong shape, length or type,
@@ -46,10 +50,12 @@ def checked_columns(
     if count == 0:
         raise ValueError("the data hold no rows; expected at least one transition.")
     for name in columns:
-        _check_shape(name, columns, count)
+        _check_shape(name, columns, count, num_actions)
     clipped = 0
     for name, array in columns.items():
-        if name == "action":
+        if name == "action" and num_actions is not None:
+            columns[name] = _one_hot(array.reshape(count), num_actions)
+        elif name == "action":
             columns[name], clipped = _unit_actions(array, action_bounds, clip_actions)
         elif name in ("observation", "next_observation"):
             columns[name] = _as_float32(name, array)
@@ -88,9 +94,14 @@ def _as_array(name: str, values: ArrayLike) -> NDArray[Any]:
     return array
 
 
-def _check_shape(name: str, columns: Mapping[str, NDArray[Any]], count: int) -> None:
+def _check_shape(
+    name: str,
+    columns: Mapping[str, NDArray[Any]],
+    count: int,
+    num_actions: int | None,
+) -> None:
     shape = columns[name].shape
-    if name in ("observation", "action"):
+    if name == "observation" or (name == "action" and num_actions is None):
         right = len(shape) == 2 and shape[0] == count and shape[1] > 0
         expected = f"[{count}, D] with D > 0, one row for each observation."
     elif name == "next_observation":
@@ -131,6 +142,18 @@ def _as_flags(name: str, array: NDArray[Any]) -> NDArray[np.bool_]:
             "expected bool, or 0 and 1."
         )
     return np.asarray(array != 0)
+
+
+def _one_hot(action: NDArray[Any], num_actions: int) -> NDArray[np.float32]:
+    """Rows ``[N, num_actions]`` with a 1 at each action's number."""
+    known = (action >= 0) & (action < num_actions) & (action == np.floor(action))
+    wrong = np.flatnonzero(~known)
+    if len(wrong):
+        raise ValueError(
+            f"'action' holds {action[wrong[0]]} in row {wrong[0]} of {len(action)}; "
+            f"expected the number of a discrete action, from 0 to {num_actions - 1}."
+        )
+    return np.eye(num_actions, dtype=np.float32)[action.astype(np.int64)]
 
 
 def _unit_actions(

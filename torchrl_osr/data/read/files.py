@@ -23,6 +23,7 @@ def load_file(
     *,
     action_bounds: ActionBounds = (-1.0, 1.0),
     clip_actions: bool = False,
+    num_actions: int | None = None,
     on_disk: bool = False,
     progress: bool = True,
 ) -> tuple[TensorDict, dict[str, Any]]:
@@ -39,6 +40,9 @@ def load_file(
     Keyword Args:
         action_bounds: see :func:`~torchrl_osr.data.transitions_from_rows`.
         clip_actions: see there.
+        num_actions: of a task with discrete actions: ``action`` then holds their
+            numbers from 0, ``[N]`` or ``[N, 1]``, and becomes one-hot. Default: actions
+            are real.
         on_disk: see :func:`~torchrl_osr.data.load_dataset`. Default: ``False``.
         progress: show a progress bar while writing to disk. Default: ``True``.
 
@@ -81,7 +85,9 @@ def load_file(
     total, read = openers[path.suffix](path)
     about = {"reader": "file", "source": str(path)}
     parts = partial(whole_trajectories, read, total)
-    recording = Recording(parts, action_bounds, clip_actions, about, [path], total)
+    recording = Recording(
+        parts, action_bounds, clip_actions, about, [path], total, num_actions
+    )
     return recording.load(on_disk=on_disk, progress=progress)
 
 

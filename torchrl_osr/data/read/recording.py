@@ -49,6 +49,7 @@ class Recording:
         about: JSON-compatible: what the manifest says of the source.
         files: what is read.
         total: rows of the source, for the progress bar.
+        num_actions: see :func:`~torchrl_osr.data.load_file`.
     """
 
     parts: Callable[[int], Iterator[Mapping[str, ArrayLike]]]
@@ -57,6 +58,7 @@ class Recording:
     about: dict[str, Any] = field(default_factory=dict)
     files: list[Path] = field(default_factory=list)
     total: int | None = None
+    num_actions: int | None = None
     _counts: Counter[str] = field(default_factory=Counter, init=False)
     _returns: list[float] = field(default_factory=list, init=False)
     _lengths: list[int] = field(default_factory=list, init=False)
@@ -92,6 +94,7 @@ class Recording:
             "source_files": files,
             "action_bounds": bounds,
             "clip_actions": self.clip_actions,
+            "num_actions": self.num_actions,
         }
         digest = sha256(json.dumps(request, sort_keys=True).encode()).hexdigest()[:16]
         return load_or_write(
@@ -109,7 +112,9 @@ class Recording:
         seen: set[int] = set()
         for columns in self.parts(rows):
             try:
-                part = transitions_of(columns, self.action_bounds, self.clip_actions)
+                part = transitions_of(
+                    columns, self.action_bounds, self.clip_actions, self.num_actions
+                )
                 if "episode" in columns:
                     last = _check_order(columns["episode"], seen, last)
             except ValueError as error:

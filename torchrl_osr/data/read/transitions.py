@@ -38,13 +38,16 @@ class Trajectories(NamedTuple):
 
 
 def transitions_of(
-    rows: Mapping[str, ArrayLike], action_bounds: ActionBounds, clip_actions: bool
+    rows: Mapping[str, ArrayLike],
+    action_bounds: ActionBounds,
+    clip_actions: bool,
+    num_actions: int | None = None,
 ) -> Trajectories:
     """Transitions of whole trajectories, of a data set or a part of one.
 
     The rule is that of :func:`~torchrl_osr.data.transitions_from_rows`.
     """
-    columns, clipped = checked_columns(rows, action_bounds, clip_actions)
+    columns, clipped = checked_columns(rows, action_bounds, clip_actions, num_actions)
     episode, terminated = columns.pop("episode", None), columns["terminated"]
     truncated = columns.get("truncated", np.zeros_like(terminated))
     flagged = terminated | truncated
