@@ -90,7 +90,7 @@ def load_dataset(
         )
     spec = None if env_id is None else environment_spec(env_id)
     data, manifest = _load_recorded(quality, path, download, progress, on_disk, spec)
-    if spec is not None:
+    if spec is not None and env_id is not None:
         _check_fit(data, env_id, spec, path)
     mean = (manifest.get("return") or {}).get("mean")
     references = references or REFERENCE_RETURNS.get(env_name)

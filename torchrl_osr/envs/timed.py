@@ -165,14 +165,14 @@ class ActionKnock(TimedDisturbance):
                 observation, *_ = self.unwrapped.step(extra)
             space = self.unwrapped.observation_space
             if not isinstance(space, gymnasium.spaces.Box):  # so does make_environment
-                observation = gymnasium.spaces.flatten(space, observation)
+                observation = np.asarray(gymnasium.spaces.flatten(space, observation))
         flag(info, knocked)["knock_steps"] = np.int64(self.steps * knocked)
         return observation, reward, terminated, truncated, info
 
     def _random_action(self) -> Vector:
         actions = self._actions
         if isinstance(actions, gymnasium.spaces.Discrete):
-            return actions.start + self._generator.integers(actions.n)
+            return np.asarray(actions.start + self._generator.integers(actions.n))
         box = vector_box(actions, "actions")
         if self.mode == "paper":
             action = SMALL * self._generator.standard_normal(box.shape)

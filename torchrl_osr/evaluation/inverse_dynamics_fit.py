@@ -36,9 +36,9 @@ def inverse_dynamics_report(
     Returns:
         Of discrete actions ``"nll"``, mean negative log-likelihood in nats,
         ``"accuracy"``, share of the rows whose action is the likeliest, and ``"rows"``.
-        Of real ones ``"nll"``, mean negative log-likelihood of the action in nats; ``"r2"``, share
-        of each action dimension's variance that the deterministic action explains,
-        ``A`` numbers, and their mean ``"r2_mean"``; ``"coverage_90"``, share of actions
+        Of real ones ``"nll"`` and ``"rows"`` likewise; ``"r2"``, share of each action
+        dimension's variance that the deterministic action explains, ``A`` numbers, and
+        their mean ``"r2_mean"``; ``"coverage_90"``, share of actions
         inside the model's central 90 % interval, over all dimensions (0.9 is
         calibrated); ``"rows"``.
 

@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 from torchrl_osr._checks import check_positive
 from torchrl_osr.data import ReferenceReturns
 from torchrl_osr.evaluation.data_distance import DataDistance
-from torchrl_osr.envs import NotPossible
 from torchrl_osr.evaluation.episodes import (
     EpisodeEvaluator,
     EpisodeResults,
@@ -176,6 +175,8 @@ def impossible_disturbances(
     Raises:
         ValueError: a disturbance is not what any environment could have.
     """
+    from torchrl_osr.envs import NotPossible  # needs MuJoCo, and the rest does not
+
     reasons = {}
     for each in disturbances:
         try:

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 UNDISTURBED = "undisturbed"
-ENDS = ("low", "high")
 
 
 def robustness_figure(
@@ -34,7 +33,7 @@ def robustness_figure(
 ) -> None:
     """Draw scores under disturbances and, after those that end, distances to the data.
 
-    Without scores it draws returns. Where each kind has several strengths, it is drawn over the strength;
+    Without scores it draws returns: over the strength, where each kind has several;
     otherwise each disturbance has a line of its own.
 
     Args:
@@ -113,18 +112,19 @@ def _colors(start: float, end: float, number: int) -> NDArray[np.float64]:
 
 
 def _over_strength(axes: Axes, series: Mapping[str, list[Mapping[str, Any]]]) -> None:
-    measure, least = measure_of(next(iter(series.values()))[0]), 0.0
+    every = [row for rows in series.values() for row in rows]
+    measure = measure_of(every[0])
+    low, high = f"{measure}_low", f"{measure}_high"
     colors = _colors(0.1, 0.8, len(series))
     for color, (kind, rows) in zip(colors, series.items(), strict=True):
         rows = sorted(rows, key=lambda row: float(row["strength"]))
         x = [row["strength"] for row in rows]
         axes.fill_between(
-            x, low := [row[f"{measure}_low"] for row in rows],
-            [row[f"{measure}_high"] for row in rows],
+            x, [row[low] for row in rows], [row[high] for row in rows],
             color=color, alpha=0.15, linewidth=0,
         )  # fmt: skip
         axes.plot(x, [row[measure] for row in rows], "o-", color=color, label=kind)
-        least = min(least, *low)
+    least = min(0, *(row[low] for row in every))
     label = f"{IN_WORDS[measure]} (95 % interval)"
     axes.set(xlabel="strength", ylabel=label, ylim=(least, None))
 
@@ -133,7 +133,8 @@ def _one_by_one(axes: Axes, series: Mapping[str, list[Mapping[str, Any]]]) -> No
     rows = [row for each in series.values() for row in each][::-1]
     measure = measure_of(rows[0])
     mean = np.array([row[measure] for row in rows])
-    ends = np.array([[row[f"{measure}_{end}"] for end in ENDS] for row in rows]).T
+    names = f"{measure}_low", f"{measure}_high"
+    ends = np.array([[row[name] for name in names] for row in rows]).T
     axes.errorbar(
         mean, range(len(rows)), xerr=np.abs(ends - mean), fmt="o", color=BLUE,
         capsize=3, label="disturbed (mean, 95 % interval)",

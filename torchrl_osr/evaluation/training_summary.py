@@ -52,7 +52,6 @@ def score_table(
         data_mean: mean score, or return, of the data's episodes, if known.
         folder: where the run's files are.
     """
-
     measure = measure_of(best)
 
     def with_interval(row: Mapping[str, Any]) -> str:

@@ -326,8 +326,8 @@ def _config_type(annotation: Any) -> Any:
 def register() -> None:
     """Make schemas and resolvers known to Hydra.
 
-    ``train_schema``, ``collect_schema``, and in the group ``schema`` one for each class of
-    :mod:`torchrl_osr.objectives`; ``environment_name``, the short name of a task;
+    ``train_schema``, ``collect_schema``, and in the group ``schema`` one for each class
+    of :mod:`torchrl_osr.objectives`; ``environment_name``, the short name of a task;
     ``run_dir``, by which ``resume=folder`` becomes the run's folder, and ``job_dir``,
     which names a sweep's folders.
     """

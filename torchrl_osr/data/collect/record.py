@@ -158,7 +158,7 @@ def write_log(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
                 parquet.write_table(pyarrow.table(lists), file)
         elif path.suffix == ".npz":
             with whole_file(path) as file:
-                np.savez(file, **dict(columns))
+                np.savez(file, allow_pickle=False, **columns)
         else:
             import h5py
 
