@@ -164,7 +164,7 @@ def check_disturbances(env_id: str, disturbances: Sequence[Disturbance]) -> None
     if len(set(names)) < len(names) or not names:
         raise ValueError(f"disturbances need one name each, got {names}.")
     for name, reason in impossible_disturbances(env_id, disturbances).items():
-        raise ValueError(f"disturbance {name!r} is not possible for {env_id}: {reason}")
+        raise ValueError(_not_possible(name, env_id, reason))
 
 
 def impossible_disturbances(
@@ -184,8 +184,12 @@ def impossible_disturbances(
         except NotPossible as error:
             reasons[each.name] = str(error)
         except (TypeError, ValueError) as error:
-            raise ValueError(f"disturbance {each.name!r}: {error}") from error
+            raise ValueError(_not_possible(each.name, env_id, error)) from error
     return reasons
+
+
+def _not_possible(name: str, env_id: str, reason: object) -> str:
+    return f"disturbance {name!r} is not possible for {env_id}: {reason}"
 
 
 def decrease_interval(

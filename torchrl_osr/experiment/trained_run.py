@@ -13,7 +13,7 @@ from torchrl.checkpoint import CheckpointError
 from torchrl.envs import ObservationNorm
 from torchrl.objectives import LossModule
 
-from torchrl_osr.data import make_environment
+from torchrl_osr.data import environment_spec
 from torchrl_osr.experiment.build import make_learner
 from torchrl_osr.experiment.run_config import check_targets, read_config
 from torchrl_osr.experiment.run_folder import CONFIG
@@ -108,10 +108,7 @@ def load_trained(path: Path | str) -> TrainedRun:
         raise CheckpointError(f"checkpoint {path} is damaged: {damage}.")
     config = read_config(folder / CONFIG)
     check_targets(config)
-    environment = make_environment(config.env.id)
-    (observation_size,) = environment.observation_space.shape or (0,)
-    (action_size,) = environment.action_space.shape or (0,)
-    environment.close()
+    observation_size, action_size, *_ = environment_spec(config.env.id)
     with torch.random.fork_rng(devices=[]):
         actor, model, loss = make_learner(config, observation_size, action_size)
     shape = (observation_size,) if config.data.standardize else ()

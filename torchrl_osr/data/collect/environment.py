@@ -39,6 +39,9 @@ MAZE_IDS = {
 }
 """Gymnasium ids of the mazes, by short environment name."""
 
+MAX_EPISODE = 100_000
+"""Steps of an episode, at most; one that never ends would be waited for in vain."""
+
 
 def environment_id(env_name: str) -> str:
     """Gymnasium id of a maze, or of a task with behaviour policies, by short name."""
@@ -148,6 +151,8 @@ def open_environment(env_id: str) -> gymnasium.Env[Any, Any]:
         ValueError: there is no such task, its observations are no real vectors, or its
             actions neither real vectors with finite bounds nor discrete.
         ImportError: a package that the task needs is not installed, naming it.
+        RuntimeError: in a step, if the task has no time limit and the episode has more
+            than 100,000 steps.
 
     Examples:
         >>> from torchrl_osr.data.collect.environment import open_environment
@@ -180,7 +185,30 @@ def open_environment(env_id: str) -> gymnasium.Env[Any, Any]:
             "are squashed to: wrap it in gymnasium.wrappers.ClipAction with a Box of "
             "the bounds that the machine has, and register the wrapped environment."
         )
+    if env.spec is None or env.spec.max_episode_steps is None:
+        env = _Ending(env)
     return env
+
+
+class _Ending(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """An environment without a time limit, which may or may not end by itself."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self._steps = 0
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        self._steps = 0
+        return super().reset(**options)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        self._steps += 1
+        if self._steps > MAX_EPISODE:
+            raise RuntimeError(
+                f"an episode of {self.env} has not ended after {MAX_EPISODE:,} steps: "
+                "register the environment with max_episode_steps."
+            )
+        return super().step(action)
 
 
 def _is_real_vector(space: gymnasium.Space[Any]) -> TypeGuard[spaces.Box]:
