@@ -12,7 +12,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from torchrl_osr.data import environment_spec, make_environment
-from torchrl_osr.envs import ActionDelay, ActionKnock, ActionNoise, ExternalPush
+from torchrl_osr.envs import ActionKnock, ExternalPush
 from torchrl_osr.evaluation import impossible_disturbances
 from torchrl_osr.experiment.suite import SuiteConfig, make_disturbances
 
@@ -91,11 +91,3 @@ def test_a_knock_draws_discrete_actions():
             # The cart is pushed to the right by 1, to the left by 0.
             draws.append(env.unwrapped.state[1] > -0.4)
         assert 5 < sum(draws) < 35
-
-
-@pytest.mark.parametrize(
-    "wrap", [partial(ActionNoise, std=0.1), partial(ActionDelay, steps=1)]
-)
-def test_faults_of_real_actuators_need_real_actions(wrap):
-    with pytest.raises(TypeError, match=r"actions are Discrete\(2\)"):
-        wrap(make_environment("CartPole-v1"))

@@ -9,8 +9,6 @@ The log is what ``torchrl-osr train data=file`` reads. See docs/any_environment.
 
 from __future__ import annotations
 
-import os
-import sys
 from contextlib import closing
 from importlib import import_module
 from pathlib import Path
@@ -22,7 +20,7 @@ from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_osr.commands import CONF
+from torchrl_osr.commands import CONF, import_from_here
 from torchrl_osr.data import environment_spec
 from torchrl_osr.data.collect.environment import open_environment
 from torchrl_osr.data.collect.record import (
@@ -45,6 +43,8 @@ def main(cfg: DictConfig) -> None:
     path = Path(cfg.path).expanduser()
     check_log_path(path)
     env_id = None if OmegaConf.is_missing(cfg.env, "id") else str(cfg.env.id)
+    if env_id is not None and ":" in env_id:
+        import_from_here()
     act: Act | None = None
     if Path(cfg.policy).exists():
         trained = load_trained(cfg.policy)
@@ -101,8 +101,7 @@ def policy_of(trained: TrainedRun, env_id: str) -> Act:
 
 def imported(name: str) -> Act:
     """Function of a module, as in ``"my_package:act"``; the current folder counts."""
-    # Last: what is installed is not to be replaced by a file of the same name.
-    sys.path.append(os.getcwd())
+    import_from_here()
     module, _, function = name.partition(":")
     try:
         act: Act = getattr(import_module(module), function)

@@ -29,7 +29,7 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_osr import StatePerturbation
 from torchrl_osr._files import write_json
-from torchrl_osr.commands import CONF
+from torchrl_osr.commands import CONF, import_from_here
 from torchrl_osr.data import environment_spec
 from torchrl_osr.evaluation import (
     EpisodeEvaluator,
@@ -62,11 +62,13 @@ def main(cfg: DictConfig) -> float:
     """Do or continue one run; return its last score or return, for a sweeper."""
     job = HydraConfig.get()
     folder = Path(job.runtime.output_dir)
+    if cfg.resume is not None:
+        cfg = run_folder.saved_config(folder, job.overrides.task)
+    if ":" in cfg.env.id:
+        import_from_here()
     if cfg.resume is None:
         run_folder.check_keys(cfg)
         read_environment(cfg)
-    else:
-        cfg = run_folder.saved_config(folder, job.overrides.task)
     run_folder.claim(folder, cfg)
     with run_folder.status(folder):
         return run(cfg, folder)

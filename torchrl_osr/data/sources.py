@@ -143,7 +143,13 @@ def _load_recorded(
     if spec is not None and spec.discrete:
         actions = {"num_actions": spec.action_size}
     elif spec is not None:
-        actions = {"action_bounds": (spec.action_low, spec.action_high)}
+        # As numbers where all are alike: then what has another size is told as such.
+        low, high = (
+            bound[0] if len({*bound}) == 1 else bound
+            for bound in (spec.action_low, spec.action_high)
+            if bound is not None
+        )
+        actions = {"action_bounds": (low, high)}
     return load_file(path, **actions, progress=progress, on_disk=on_disk)
 
 

@@ -94,7 +94,7 @@ class ActionKnock(TimedDisturbance):
     one, 1 for each replaced action in the other modes, 0 elsewhere.
 
     Args:
-        env: the environment, with real actions, or discrete ones (``"torque"``).
+        env: the environment, with real actions, or in ``"torque"`` mode discrete ones.
         steps: of the knock.
 
     Keyword Args:
