@@ -87,6 +87,8 @@ def main(cfg: DictConfig) -> None:
     else:
         print(f"{path} is there already; force=true repeats it.")
     partial.unlink(missing_ok=True)
+    for name, reason in results.get("left_out", {}).items():
+        print(f"left out: {name}: {reason}")
     figure = path.with_suffix(".png")
     title = (
         f"{results['env']} {results['data']}, suite {cfg.suite.name}: "
@@ -187,8 +189,6 @@ def impossible(
     env_id = trained.config.env.id
     suite = make_disturbances(cfg.suite.disturbances, trained, scale)
     left_out = impossible_disturbances(env_id, suite)
-    for name, reason in left_out.items():
-        print(f"left out: {name}: {reason}")
     if len(left_out) == len(suite):
         raise ValueError(
             f"no disturbance of suite={cfg.suite.name} is possible for {env_id}: "

@@ -124,9 +124,9 @@ def _over_strength(axes: Axes, series: Mapping[str, list[Mapping[str, Any]]]) ->
             color=color, alpha=0.15, linewidth=0,
         )  # fmt: skip
         axes.plot(x, [row[measure] for row in rows], "o-", color=color, label=kind)
-    least = min(0, *(row[low] for row in every))
-    label = f"{IN_WORDS[measure]} (95 % interval)"
-    axes.set(xlabel="strength", ylabel=label, ylim=(least, None))
+    axes.set(xlabel="strength", ylabel=f"{IN_WORDS[measure]} (95 % interval)")
+    if all(row[low] >= 0 for row in every):
+        axes.set_ylim(0)
 
 
 def _one_by_one(axes: Axes, series: Mapping[str, list[Mapping[str, Any]]]) -> None:
@@ -140,7 +140,9 @@ def _one_by_one(axes: Axes, series: Mapping[str, list[Mapping[str, Any]]]) -> No
         capsize=3, label="disturbed (mean, 95 % interval)",
     )  # fmt: skip
     axes.set_yticks(range(len(rows)), [row["name"] for row in rows])
-    axes.set(xlabel=IN_WORDS[measure], xlim=(min(0, ends.min()), None))
+    axes.set(xlabel=IN_WORDS[measure])
+    if ends.min() >= 0:
+        axes.set_xlim(0)
 
 
 def _draw_curves(
