@@ -14,6 +14,7 @@ from torchrl_osr.commands import CONF, collect, evaluate, train
 from torchrl_osr.data import environment_spec
 from torchrl_osr.experiment import run_folder, schema, suite
 from torchrl_osr.experiment.build import read_environment
+from torchrl_osr.policy import load_policy
 from torchrl_osr.report import read_runs, write_report
 
 TINY = (
@@ -95,8 +96,14 @@ def test_from_nothing_to_a_report(env_id, loss, bounds, left_out, tmp_path, caps
         size = environment_spec(env_id).observation_size
         assert columns["observation"].shape == (len(columns["reward"]), size)
         assert set(columns["episode"]) == {0, 1}
-    with pytest.raises(ValueError, match="leave out env.id"):
+    with pytest.raises(ValueError, match="observation"):
         record(tmp_path / "x.npz", f"policy={run}", "env.id=Hopper-v5")
+    policy = load_policy(run)
+    policy.record["source"]["env_id"] = f"json:{env_id}"
+    policy.save(saved := tmp_path / "stranger.safetensors")
+    with pytest.raises(ValueError, match="give env.id yourself"):
+        record(tmp_path / "x.npz", f"policy={saved}")
+    record(tmp_path / "x.npz", f"policy={saved}", f"env.id={env_id}", "episodes=1")
 
 
 def test_own_references_make_scores_and_pages_are_not_mixed(tmp_path):

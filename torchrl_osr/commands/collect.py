@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_osr.commands import CONF, import_from_here
-from torchrl_osr.data import environment_spec
 from torchrl_osr.data.collect.environment import open_environment
 from torchrl_osr.data.collect.record import (
     Act,
@@ -29,9 +28,8 @@ from torchrl_osr.data.collect.record import (
     record_episodes,
     write_log,
 )
-from torchrl_osr.evaluation import deterministic_policy
 from torchrl_osr.experiment import schema
-from torchrl_osr.experiment.trained_run import TrainedRun, load_trained
+from torchrl_osr.policy import Policy, load_policy
 
 schema.register()
 
@@ -47,9 +45,8 @@ def main(cfg: DictConfig) -> None:
         import_from_here()
     act: Act | None = None
     if Path(cfg.policy).exists():
-        trained = load_trained(cfg.policy)
-        env_id = env_id or str(trained.config.env.id)
-        act = policy_of(trained, env_id)
+        policy = load_policy(cfg.policy)
+        env_id, act = env_id or environment_of(policy), policy.act
     elif ":" in cfg.policy:
         act = imported(cfg.policy)
     elif cfg.policy != "random":
@@ -74,29 +71,19 @@ def main(cfg: DictConfig) -> None:
     print(f"  torchrl-osr train env.id={env_id} {loss}data=file data.path={path}")
 
 
-def policy_of(trained: TrainedRun, env_id: str) -> Act:
-    """Deterministic policy of a run, in the units of its environment.
+def environment_of(policy: Policy) -> str | None:
+    """Id of the environment that a policy was trained in, if it is known.
 
     Raises:
-        ValueError: if it is of an environment of other sizes or bounds.
+        ValueError: if it imports a package, which the policy may come with.
     """
-    spec, own = environment_spec(env_id), str(trained.config.env.id)
-    if spec != environment_spec(own):
+    env_id: str | None = policy.record["source"].get("env_id")
+    if env_id is not None and ":" in env_id:
         raise ValueError(
-            f"the policy of {trained.folder} acts in {own}, whose observations or "
-            f"actions are not those of {env_id}: leave out env.id."
+            f"the policy is of env.id={env_id}, which imports a package: if you know "
+            "it, give env.id yourself."
         )
-    policy = deterministic_policy(trained.actor, trained.observation_norm)
-
-    def unit_action(observation: NDArray[np.floating]) -> NDArray[np.floating]:
-        batch = torch.from_numpy(observation.astype(np.float32)).unsqueeze(0)
-        action: NDArray[np.floating] = policy(batch)[0].numpy()
-        return action
-
-    if spec.discrete:
-        return unit_action
-    low, high = np.array(spec.action_low), np.array(spec.action_high)
-    return lambda observation: low + (unit_action(observation) + 1) / 2 * (high - low)
+    return env_id
 
 
 def imported(name: str) -> Act:

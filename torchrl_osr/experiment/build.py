@@ -13,18 +13,12 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torchrl.objectives import LossModule
 
 from torchrl_osr._checks import check_choice
-from torchrl_osr.data import (
-    EnvironmentSpec,
-    ReferenceReturns,
-    environment_spec,
-    load_dataset,
-    reference_returns,
-)
+from torchrl_osr.data import ReferenceReturns, reference_returns
 from torchrl_osr.objectives.distributions import is_categorical
 
 
-def read_environment(cfg: DictConfig) -> EnvironmentSpec:
-    """Read the environment's sizes and action bounds, and keep the bounds with the run.
+def read_environment(cfg: DictConfig) -> None:
+    """Compare a run with its environment, and keep the action bounds with the run.
 
     Args:
         cfg: a whole configuration; ``env.action_low`` and ``env.action_high`` are set.
@@ -36,6 +30,8 @@ def read_environment(cfg: DictConfig) -> EnvironmentSpec:
             :func:`references_of` refuses the references.
         ImportError: a package that the environment needs is not installed.
     """
+    from torchrl_osr.data import environment_spec  # needs Gymnasium
+
     references_of(cfg)
     spec = environment_spec(cfg.env.id)
     actor = instantiate(cfg.network.actor, 1, 1, num_cells=[1])
@@ -54,7 +50,6 @@ def read_environment(cfg: DictConfig) -> EnvironmentSpec:
                 f"{read}: leave it out."
             )
         cfg.env[name] = read
-    return spec
 
 
 def references_of(cfg: DictConfig) -> ReferenceReturns | None:
@@ -71,6 +66,8 @@ def load_data(
     Rewards are the task's own: :mod:`~torchrl_osr.experiment.training_data` scales
     them.
     """
+    from torchrl_osr.data import load_dataset  # needs Gymnasium; networks do not
+
     return load_dataset(
         cfg.env.name,
         cfg.data.quality,

@@ -19,7 +19,6 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, OmegaConf
 
 from torchrl_osr import objectives
-from torchrl_osr.data.collect.environment import environment_name
 
 # File systems allow 255 bytes, and temporary names beside it need some of them.
 MAX_FOLDER_NAME = 200
@@ -178,6 +177,8 @@ class TrainerConfig:
         device: cpu or cuda.
         precision: of the losses' matrix products: float32 or bfloat16.
         matmul_precision: of float32 products, torch's: highest, high or medium.
+        record: repeat a recording of the losses' operations: the same bits in less
+            time, on a CPU.
         compile: run the losses through ``torch.compile``.
         cudagraph: run updates as a CUDA graph; needs ``device=cuda``.
         progress: show progress bars when on a terminal.
@@ -196,6 +197,7 @@ class TrainerConfig:
     device: str = MISSING
     precision: str = MISSING
     matmul_precision: str = MISSING
+    record: bool = MISSING
     compile: bool = MISSING
     cudagraph: bool = MISSING
     progress: bool = MISSING
@@ -323,6 +325,12 @@ def _config_type(annotation: Any) -> Any:
     return functools.reduce(operator.or_, kinds)
 
 
+def _environment_name(env_id: str) -> str:
+    from torchrl_osr.data.collect.environment import environment_name  # needs Gymnasium
+
+    return environment_name(env_id)
+
+
 def register() -> None:
     """Make schemas and resolvers known to Hydra.
 
@@ -337,7 +345,7 @@ def register() -> None:
     for name in set(objectives.__all__) - {"BaseLoss"}:
         schema = schema_of(getattr(objectives, name))
         store.store(group="schema", name=name, node=schema)
-    OmegaConf.register_new_resolver("environment_name", environment_name, replace=True)
+    OmegaConf.register_new_resolver("environment_name", _environment_name, replace=True)
     OmegaConf.register_new_resolver(
         "run_dir", lambda resume, fresh: resume or fresh, replace=True
     )
