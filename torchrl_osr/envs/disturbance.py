@@ -55,7 +55,7 @@ def bounded_box(space: gymnasium.Space[Any]) -> gymnasium.spaces.Box:
 
 
 def mujoco_task(env: gymnasium.Env[Any, Any], name: str) -> Any:
-    """The bare environment; raise NotPossible unless it is one of Gymnasium's MuJoCo.
+    """The bare environment; raise NotPossible unless it is Gymnasium's own MuJoCo task.
 
     Others, such as the mazes, have their simulation in another environment inside them.
     """

@@ -61,8 +61,8 @@ def record_episodes(
     if num_episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {num_episodes}.")
     if not 0 <= noise <= (1 if discrete else np.inf) or not np.isfinite(noise):
-        most = ", at most 1," if discrete else ""
-        raise ValueError(f"noise must be a number of at least 0{most} got {noise}.")
+        most = " and at most 1" if discrete else ""
+        raise ValueError(f"noise must be at least 0{most}, got {noise}.")
     rng = np.random.default_rng([seed, 1])  # not the environment's own numbers
     env.action_space.seed(int(rng.integers(2**31)))
     steps: list[tuple[Any, ...]] = []
@@ -72,11 +72,12 @@ def record_episodes(
         unit="episode",
         disable=None if progress else True,  # None: no bar off a terminal
     ):
-        observation, _ = env.reset(seed=seed + episode)
-        ended = False
+        state, _ = env.reset(seed=seed + episode)
+        observation, ended = np.array(state), False
         while not ended:
             action = _action(env.action_space, act, observation, noise, rng)
-            following, reward, terminated, truncated, _ = env.step(action)
+            state, reward, terminated, truncated, _ = env.step(action)
+            following = np.array(state)  # the environment may write into its own
             row = (observation, action, reward, terminated, truncated, following)
             steps.append((*row, episode))
             observation, ended = following, terminated or truncated
