@@ -16,13 +16,14 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 COMMANDS = {
     "data": "look at a log before anything is trained on it",
     "train": "train a policy on offline data, or continue a run",
+    "collect": "roll out a policy in any environment and keep the log",
     "evaluate": "disturb a trained policy: score lost, survival, way back",
     "film": "film a push and what follows",
     "report": "compare any number of runs on one page",
     "export": "write a trained policy to one file, for use elsewhere",
 }
 
-CONFIGURED = ("data", "train", "evaluate", "film")
+CONFIGURED = ("data", "train", "collect", "evaluate", "film")
 """Those that Hydra configures."""
 
 HELP = """\

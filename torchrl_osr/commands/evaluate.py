@@ -24,7 +24,9 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
 from torchrl import torchrl_logger
 
@@ -44,15 +46,18 @@ from torchrl_osr.evaluation import (
     deterministic_policy,
     evaluate_paired,
     evaluation_json,
+    impossible_disturbances,
+    measure_of,
     robustness_figure,
     robustness_table,
     summarize_disturbances,
 )
 from torchrl_osr.evaluation.robustness import aligned_columns
 from torchrl_osr.experiment import run_folder
-from torchrl_osr.experiment.build import load_data
+from torchrl_osr.experiment.build import load_data, references_of
 from torchrl_osr.experiment.suite import make_disturbances, register
 from torchrl_osr.experiment.trained_run import (
+    TrainedRun,
     checkpoints_of,
     load_trained,
     run_folder_of,
@@ -61,7 +66,6 @@ from torchrl_osr.report.runs import find_runs
 from torchrl_osr.trainers.progress import Progress
 
 JSON_FORMAT = 1
-SCORES = ("clean_score", "score")
 SEED_STRIDE = 1000  # between checkpoints: no two of them play the same episodes
 
 register()
@@ -110,6 +114,8 @@ def evaluate_run(cfg: DictConfig) -> tuple[Path, dict[str, Any]]:
     else:
         print(f"{path} is there already; force=true repeats it.")
     partial.unlink(missing_ok=True)
+    for name, reason in results.get("left_out", {}).items():
+        print(f"left out: {name}: {reason}")
     robustness_figure(
         results["summary"],
         results["evaluations"],
@@ -171,7 +177,9 @@ def evaluate_sweep(cfg: DictConfig) -> None:
         workers.shutdown(cancel_futures=True)
     header = ("run", "undisturbed", "disturbed")
     done = [(str(run), *rows[run]) for run in runs if run in rows]
-    print(f"\nsuite {cfg.suite.name}: normalised score, mean over its disturbances")
+    print(
+        f"\nsuite {cfg.suite.name}: score (return without references), mean over its disturbances"
+    )
     print("\n".join(aligned_columns([header, *done])))
     if failed:
         names = ", ".join(map(str, failed))
@@ -180,13 +188,15 @@ def evaluate_sweep(cfg: DictConfig) -> None:
 
 
 def evaluate_one_of_many(cfg: DictConfig, folder: Path) -> Sequence[str]:
-    """Evaluate one run of a sweep: its scores, undisturbed and disturbed."""
+    """Evaluate one run of a sweep: its mean score or return, and the disturbed one."""
     one = cfg.copy()
     one.checkpoint, one.progress = str(folder), False
     _, results = evaluate_run(one)
     rows = results["summary"]
-    scores = [sum(row[key] for row in rows) / len(rows) for key in SCORES]
-    return [f"{score:.1f}" for score in scores]
+    measure = measure_of(rows[0])
+    keys = f"clean_{measure}", measure
+    means = [sum(row[key] for row in rows) / len(rows) for key in keys]
+    return [f"{mean:.1f}" for mean in means]
 
 
 def requested(cfg: DictConfig, files: list[Path]) -> dict[str, Any]:
@@ -222,7 +232,8 @@ def evaluate(
     cfg: DictConfig, files: list[Path], partial: Path, request: dict[str, Any]
 ) -> dict[str, Any]:
     """Play all checkpoints of one run, except those that ``partial`` has already."""
-    run = load_trained(files[0]).config
+    first = load_trained(files[0])
+    run = first.config
     data, _ = load_data(run, progress=cfg.progress)
     distance = DataDistance(data, seed=run.data.seed)
     _, scale = observation_statistics(data)
@@ -230,7 +241,14 @@ def evaluate(
     evaluations = begun["evaluations"]
     if evaluations:
         print(f"{partial} has {len(evaluations)} of {len(files)} checkpoints already.")
-    plays = 1 + len(cfg.suite.disturbances)  # the clean episodes first
+    references = references_of(run)
+    left_out = impossible(cfg, first, scale.numpy())
+    suite = {
+        name: config
+        for name, config in cfg.suite.disturbances.items()
+        if name not in left_out
+    }
+    plays = 1 + len(suite)  # the clean episodes first
     progress = Progress(
         cfg.suite.name, len(files) * plays, bar=cfg.progress, unit="play"
     )
@@ -242,24 +260,38 @@ def evaluate(
             paired = evaluate_paired(
                 deterministic_policy(trained.actor, trained.observation_norm),
                 run.env.id,
-                make_disturbances(
-                    cfg.suite.disturbances, trained, scale.numpy(), seed=seed
-                ),
+                make_disturbances(suite, trained, scale.numpy(), seed=seed),
                 distance,
                 num_episodes=cfg.episodes,
                 seed=seed,
                 advance=lambda: progress.update(next(played)),
             )
-            evaluations.append(evaluation_json(trained.step, paired, run.env.name))
+            evaluations.append(evaluation_json(trained.step, paired, references))
             begun = checksummed(request | {"evaluations": evaluations})
             write_json(partial, begun)
     return {
         "env": run.env.name,
         "data": run.data.quality,
         "threshold": distance.threshold,
+        "left_out": left_out,
         "evaluations": evaluations,
         "summary": summarize_disturbances(evaluations),
     }
+
+
+def impossible(
+    cfg: DictConfig, trained: TrainedRun, scale: NDArray[np.floating]
+) -> dict[str, str]:
+    """Say which disturbances of the suite the environment lacks what it takes for."""
+    env_id = trained.config.env.id
+    suite = make_disturbances(cfg.suite.disturbances, trained, scale)
+    left_out = impossible_disturbances(env_id, suite)
+    if len(left_out) == len(suite):
+        raise ValueError(
+            f"no disturbance of suite={cfg.suite.name} is possible for {env_id}: "
+            "choose another suite."
+        )
+    return left_out
 
 
 if __name__ == "__main__":

@@ -1,11 +1,13 @@
-"""Train a policy with OSR on real MuJoCo transitions, from nothing, with one command.
+"""Train a policy with OSR on offline data, with one command.
 
     torchrl-osr train env=hopper
+    torchrl-osr train env.id=Pendulum-v1 data=file data.path=log.npz
     torchrl-osr train env=walker2d data=medium-expert seed=3 preset=paper
     torchrl-osr train -m env=hopper,walker2d seed=0,1,2 hydra/launcher=pool
     torchrl-osr train resume=outputs/hopper-medium-replay/osr-seed0-...
 
-The data are rolled out on this machine at the first run and cached. A run leaves
+Data of the built-in tasks are rolled out on this machine at the first run and cached;
+docs/any_environment.md is about all others. A run leaves
 ``curve.png``, ``returns.json``, ``inverse_dynamics.json``, ``config.yaml``,
 ``status.json``, CSV files and ``checkpoint/`` in its folder.
 """
@@ -31,20 +33,26 @@ from torchrl.record.loggers import Logger
 
 from torchrl_osr import StatePerturbation
 from torchrl_osr._files import write_json
-from torchrl_osr.commands import CONF
+from torchrl_osr.commands import CONF, import_from_here
 from torchrl_osr.commands.console import single_job
+from torchrl_osr.data import environment_spec
 from torchrl_osr.evaluation import (
     EpisodeEvaluator,
     describe_inverse_dynamics,
     deterministic_policy,
     inverse_dynamics_report,
     learning_curve,
+    measure_of,
     read_scalars,
     score_table,
     summarize,
 )
 from torchrl_osr.experiment import run_folder, schema
-from torchrl_osr.experiment.build import make_learner
+from torchrl_osr.experiment.build import (
+    make_learner,
+    read_environment,
+    references_of,
+)
 from torchrl_osr.experiment.loggers import log_outcome, make_loggers
 from torchrl_osr.experiment.run_config import read_yaml
 from torchrl_osr.experiment.training_data import load_training_data
@@ -66,13 +74,16 @@ def main() -> None:
 @hydra.main(version_base="1.3", config_path=CONF, config_name="train")
 @single_job
 def train(cfg: DictConfig) -> float:
-    """Do or continue one run in its folder; return its last score, for a sweeper."""
+    """Do or continue one run; return its last score or return, for a sweeper."""
     job = HydraConfig.get()
     folder = Path(job.runtime.output_dir)
+    if cfg.resume is not None:
+        cfg = run_folder.saved_config(folder, job.overrides.task)
+    if ":" in cfg.env.id:
+        import_from_here()
     if cfg.resume is None:
         run_folder.check_keys(cfg)
-    else:
-        cfg = run_folder.saved_config(folder, job.overrides.task)
+        read_environment(cfg)
     run_folder.claim(folder, cfg)
     with run_folder.status(folder):
         return run(cfg, folder)
@@ -89,7 +100,9 @@ def run(cfg: DictConfig, folder: Path) -> float:
     device, autocast = check_hardware(
         cfg.trainer.device, cfg.trainer.precision, cudagraph=cfg.trainer.cudagraph
     )
-    make_learner(cfg, 1, 1)  # a wrong option of the loss stops here, not after the data
+    spec, references = environment_spec(cfg.env.id), references_of(cfg)
+    sizes = spec.observation_size, spec.action_size
+    make_learner(cfg, *sizes)  # a wrong option of the loss stops here, not later
 
     # Transitions with standardised states. Each batch gets a perturbed state for every
     # state, which is the paper's mixed data set.
@@ -100,7 +113,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
     data.buffer.append_transform(perturbation)
 
     # Networks, and the policy's loss, which holds the inverse dynamics model.
-    actor, inverse_dynamics, loss = make_learner(cfg, *data.sizes, device)
+    actor, inverse_dynamics, loss = make_learner(cfg, *sizes, device)
 
     told = about(cfg, folder) if cfg.logger.kind == "wandb" else {}
     loggers = make_loggers(folder=folder, **cfg.logger, **told)
@@ -164,8 +177,8 @@ def run(cfg: DictConfig, folder: Path) -> float:
             folder=folder / "checkpoint" / "policy",
             seed=cfg.seed + 1,
             target_net_updater=SoftUpdate(loss, tau=cfg.optim.tau),
-            evaluate=lambda: summarize(play(policy), cfg.env.name),
-            metric=("score", "max"),
+            evaluate=lambda: summarize(play(policy), references),
+            metric=("return" if references is None else "score", "max"),
             eval_interval=cfg.trainer.eval_interval,
             description="policy",
             value_limits={"pred_value": limit, "target_value": limit},
@@ -174,7 +187,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
             adversary = instantiate(cfg.perturbation.adversary)
             trainer.register_op("process_optim_batch", partial(adversary, loss))
         trainer.train()
-    return report(cfg, folder, data.score, trainer, loggers)
+    return report(cfg, folder, data.mean, trainer, loggers)
 
 
 def code_versions() -> dict[str, str]:
@@ -206,16 +219,17 @@ def shuffle_next(batch: TensorDict) -> TensorDict:
 def report(
     cfg: DictConfig,
     folder: Path,
-    data_score: float | None,
+    data_mean: float | None,
     trainer: OfflineTrainer,
     loggers: list[Logger],
 ) -> float:
     """Write raw returns and the figure, print the table; return the last score."""
     history, best = trainer.history, trainer.best()
     assert best is not None  # there is an evaluation before the first update
+    measure = measure_of(best)
     results = {
         "versions": code_versions(),
-        "data_score": data_score,
+        f"data_{measure}": data_mean,
         "last": history[-1],
         "best": best,
     }
@@ -226,12 +240,12 @@ def report(
         read_scalars(folder / "csv" / "scalars" / "policy"),
         folder / "curve.png",
         title=f"{name}, {type(trainer.loss_module).__name__}, seed {cfg.seed}",
-        data_score=data_score,
+        data_mean=data_mean,
     )
     rows = {"last": history[-1], "best": best}
     log_outcome(loggers, cfg, rows, {"curve": folder / "curve.png"})
-    print("\n" + score_table(name, history, best, data_score, folder))
-    return float(history[-1]["score"])
+    print("\n" + score_table(name, history, best, data_mean, folder))
+    return float(history[-1][measure])
 
 
 if __name__ == "__main__":

@@ -31,13 +31,24 @@ class EnvConfig:
     """Which task.
 
     Attributes:
+        id: Gymnasium id of the environment that is evaluated; package:Name-v0 imports
+            the package first.
         name: short name of the task, which behaviour policies and reference scores
             have.
-        id: Gymnasium id of the environment that is evaluated.
+        random_return: mean return of a random policy, score 0; null with
+            expert_return: raw returns, unless the task is one of D4RL's.
+        expert_return: mean return of an expert, score 100.
+        action_low: lowest action in the environment's own units, read from it and kept
+            with the run; null if actions are discrete.
+        action_high: highest action, likewise.
     """
 
-    name: str = MISSING
     id: str = MISSING
+    name: str = "${environment_name:${env.id}}"
+    random_return: float | None = None
+    expert_return: float | None = None
+    action_low: list[float] | None = None
+    action_high: list[float] | None = None
 
 
 @dataclass
@@ -120,11 +131,13 @@ class NetworkConfig:
 
     Attributes:
         actor: the function that builds the policy, of the kind that the loss trains.
+        critic: the function that builds the critics, likewise.
         num_cells: width of each hidden layer.
         layer_norm: layer normalisation in the critics; steadier, not in the paper.
     """
 
     actor: TargetConfig = field(default_factory=TargetConfig)
+    critic: TargetConfig = field(default_factory=TargetConfig)
     num_cells: list[int] = MISSING
     layer_norm: bool = MISSING
 
@@ -284,6 +297,29 @@ class CheckDataConfig:
     progress: bool = MISSING
 
 
+@dataclass
+class CollectConfig:
+    """Everything that ``torchrl-osr collect`` reads.
+
+    Attributes:
+        env: which environment; of its keys ``id`` alone counts.
+        policy: random, a run's folder, or a function of a module.
+        path: of the log to write.
+        episodes: how many to play.
+        noise: on actions, see ``record_episodes``.
+        seed: of the first episode.
+        progress: a progress bar, when on a terminal.
+    """
+
+    env: EnvConfig = field(default_factory=EnvConfig)
+    policy: str = MISSING
+    path: str = MISSING
+    episodes: int = MISSING
+    noise: float = MISSING
+    seed: int = MISSING
+    progress: bool = MISSING
+
+
 def schema_of(target: type) -> type:
     """A structured config with the keyword options of ``target``.
 
@@ -344,21 +380,30 @@ def _config_type(annotation: Any) -> Any:
     return functools.reduce(operator.or_, kinds)
 
 
+def _environment_name(env_id: str) -> str:
+    from torchrl_osr.data.collect.environment import environment_name  # needs Gymnasium
+
+    return environment_name(env_id)
+
+
 def register() -> None:
     """Make schemas and resolvers known to Hydra.
 
-    ``train_schema``, ``check_data_schema``, and in the group ``schema`` one for each
-    class of :mod:`torchrl_osr.objectives`; ``run_dir``, by which ``resume=folder``
-    becomes the run's folder; ``hydra_dir``, by which a continued run keeps what Hydra
-    wrote when it began; and ``job_dir``, see :func:`job_folder`.
+    ``train_schema``, ``check_data_schema``, ``collect_schema``, and in the group
+    ``schema`` one for each class of :mod:`torchrl_osr.objectives`;
+    ``environment_name``, the short name of a task; ``run_dir``, by which
+    ``resume=folder`` becomes the run's folder; ``hydra_dir``, by which a continued run
+    keeps what Hydra wrote when it began; and ``job_dir``, see :func:`job_folder`.
     """
     store = ConfigStore.instance()
     store.store(name="train_schema", node=TrainConfig)
     store.store(name="check_data_schema", node=CheckDataConfig)
+    store.store(name="collect_schema", node=CollectConfig)
     for name in set(objectives.__all__) - {"BaseLoss"}:
         schema = schema_of(getattr(objectives, name))
         store.store(group="schema", name=name, node=schema)
     resolvers: dict[str, Callable[..., Any]] = {
+        "environment_name": _environment_name,
         "run_dir": lambda resume, fresh: resume or fresh,
         "hydra_dir": lambda resume: None if resume else ".hydra",
         "job_dir": job_folder,

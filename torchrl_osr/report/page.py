@@ -186,7 +186,7 @@ def _curves(tables: RunTables) -> Figure:
         }
         known = tables.runs["data_score"][tables.runs["data"] == data]
         panels.append(Panel(data, bands, sorted(known.dropna().round(1).unique())))
-    xlabel, ylabel = "thousand gradient steps", "normalised score"
+    xlabel, ylabel = "thousand gradient steps", tables.measure
     return draw_panels(panels, tables.methods, xlabel=xlabel, ylabel=ylabel)
 
 
@@ -219,7 +219,7 @@ def _profiles(tables: RunTables) -> Figure | None:
         if rows["data"].nunique() == len(tables.data)
     }
     panel = Panel("Runs, by the mean of their last evaluations", bands)
-    x, share = "normalised score τ", "share of runs above τ"
+    x, share = f"{tables.measure} τ", "share of runs above τ"
     return draw_panels([panel], list(bands), xlabel=x, ylabel=share) if bands else None
 
 
