@@ -177,9 +177,7 @@ def evaluate_sweep(cfg: DictConfig) -> None:
         workers.shutdown(cancel_futures=True)
     header = ("run", "undisturbed", "disturbed")
     done = [(str(run), *rows[run]) for run in runs if run in rows]
-    print(
-        f"\nsuite {cfg.suite.name}: score (return without references), mean over its disturbances"
-    )
+    print(f"\nsuite {cfg.suite.name}: score, or return, mean over its disturbances")
     print("\n".join(aligned_columns([header, *done])))
     if failed:
         names = ", ".join(map(str, failed))
