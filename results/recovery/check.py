@@ -1,6 +1,6 @@
 """Compare ``world.py`` with the Gymnasium environments: states, observations, ends.
 
-    python results/recovery/check.py
+python results/recovery/check.py
 """
 
 from __future__ import annotations
@@ -45,7 +45,9 @@ def main() -> None:
                 if terminated:
                     ends += 1
                     break
-        print(f"{system}: {steps} steps, {ends} ends alike, largest difference {worst:.1e}")
+        print(
+            f"{system}: {steps} steps, {ends} ends alike, largest difference {worst:.1e}"
+        )
 
 
 if __name__ == "__main__":

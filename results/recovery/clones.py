@@ -45,7 +45,9 @@ def clone(observation: np.ndarray, action: np.ndarray, seed: int) -> BehaviorPol
     target = torch.from_numpy(action)
     sizes = observation.shape[1], WIDTH, WIDTH, action.shape[1]
     layers = [nn.Linear(a, b) for a, b in zip(sizes[:-1], sizes[1:], strict=True)]
-    net = nn.Sequential(layers[0], nn.ReLU(), layers[1], nn.ReLU(), layers[2], nn.Tanh())
+    net = nn.Sequential(
+        layers[0], nn.ReLU(), layers[1], nn.ReLU(), layers[2], nn.Tanh()
+    )
     optimizer = torch.optim.Adam(net.parameters(), 1e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, UPDATES)
     for _ in range(UPDATES):
