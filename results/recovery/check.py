@@ -21,6 +21,7 @@ def put(world: World, row: np.ndarray) -> None:
 
 
 def main() -> None:
+    """Play each system with random actions, from states a little off its start."""
     for system in SYSTEMS:
         world = World(system)
         rng = np.random.default_rng(0)
@@ -46,7 +47,8 @@ def main() -> None:
                     ends += 1
                     break
         print(
-            f"{system}: {steps} steps, {ends} ends alike, largest difference {worst:.1e}"
+            f"{system}: {steps} steps, {ends} ends alike, largest difference "
+            f"{worst:.1e}"
         )
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +45,7 @@ def clone(observation: np.ndarray, action: np.ndarray, seed: int) -> BehaviorPol
     inputs = torch.from_numpy((observation - loc) / scale)
     target = torch.from_numpy(action)
     sizes = observation.shape[1], WIDTH, WIDTH, action.shape[1]
-    layers = [nn.Linear(a, b) for a, b in zip(sizes[:-1], sizes[1:], strict=True)]
+    layers = [nn.Linear(a, b) for a, b in pairwise(sizes)]
     net = nn.Sequential(
         layers[0], nn.ReLU(), layers[1], nn.ReLU(), layers[2], nn.Tanh()
     )
@@ -70,6 +71,7 @@ def clone(observation: np.ndarray, action: np.ndarray, seed: int) -> BehaviorPol
 
 
 def main() -> None:
+    """Train what is not there yet."""
     torch.set_num_threads(1)
     for system in sys.argv[1:] or SYSTEMS:
         for number in (*JURY, OUTSIDE):
@@ -79,7 +81,7 @@ def main() -> None:
             seed = 9_000 + number
             policy = clone(*rows_of(system, seed), seed)
             save_behavior_policy(path, policy, half=True)
-            print(json.dumps({"clone": str(path), "seed": seed}), flush=True)
+            print(json.dumps({"clone": f"{system}/{number}", "seed": seed}), flush=True)
 
 
 if __name__ == "__main__":

@@ -152,7 +152,7 @@ class Planner:
 
 
 def read_lines(folder: Path) -> list[dict]:
-    """All lines of the searches so far; one cut off at the end of a file is left out."""
+    """All lines of the searches so far, without one that was cut off."""
     lines = []
     for path in sorted(folder.glob("search-*.jsonl")):
         for line in path.read_text().splitlines():
@@ -175,6 +175,7 @@ def hard_states(world: World) -> list[tuple[int, int, Rows]]:
 
 
 def main() -> None:
+    """Search what is not saved yet."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("system")
     parser.add_argument("--stages", type=int, default=2, help="the first so many")

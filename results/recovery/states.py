@@ -180,7 +180,7 @@ def disturb(
 
 
 def states_of(world: World, number: int, std: Rows) -> list[tuple]:
-    """``(kind, strength, moment, before, after)`` of a walk; after is None if fallen."""
+    """``(kind, strength, moment, before, after)``; after is None if it has fallen."""
     players = PLAYERS[world.system]
     rows = walk(world, players[number // 2 % len(players)], number, WINDOW[1])
     rng = generator(world.system, number, 1)
@@ -223,24 +223,25 @@ def judge(world: World, walks: range, std: Rows) -> dict[str, np.ndarray]:
         before = np.stack([each[3] for each in found])
         unique, where = np.unique(before, axis=0, return_inverse=True)
         fine = world.play(unique, expert, world.steps).success[where.ravel()]
-        there = [bool(ok) and each[4] is not None for ok, each in zip(fine, found)]
+        standing = [each[4] is not None for each in found]
+        there = fine & np.array(standing)
         rows = np.stack([before[0] if x[4] is None else x[4] for x in found])
         jury = np.full((len(found), 2 + len(clones)), -1, np.int8)
 
-        def ask(member: Policy, who: int, which: np.ndarray) -> None:
-            jury[which, who] = world.play(rows[which], member, world.steps).success
+        def ask(member: Policy, which: np.ndarray, rows: Rows = rows) -> np.ndarray:
+            return world.play(rows[which], member, world.steps).success
 
         asked = np.flatnonzero(there)
-        ask(expert, 1, asked)
+        jury[asked, 1] = ask(expert, asked)
         if not world.is_maze:
             asked = asked[(jury[asked, 1] == 0) | (asked % 4 == 0)]
         player = players[number // 2 % len(players)]
         if player in ("expert", "controller"):
             jury[asked, 0] = jury[asked, 1]
         else:
-            ask(world.policy(player), 0, asked)
+            jury[asked, 0] = ask(world.policy(player), asked)
         for who, clone in enumerate(clones, 2):
-            ask(clone, who, asked)
+            jury[asked, who] = ask(clone, asked)
         nothing = np.full(before.shape[1], np.nan)
         for each, bit in zip(found, jury, strict=True):
             columns["walk"].append(number)
@@ -259,6 +260,7 @@ def hard(world_is_maze: bool, jury: np.ndarray) -> np.ndarray:
 
 
 def main() -> None:
+    """Judge the walks that were not yet."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("system", choices=list(DISTURBANCES))
     parser.add_argument("--walks", type=int, default=64)

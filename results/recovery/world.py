@@ -3,7 +3,8 @@
 A state is a row ``[time, qpos, qvel]``, in the maze followed by the goal. Steps, limits
 and observations are those of the Gymnasium environments; ``check.py`` compares them.
 
-Shapes: ``B`` rows, ``N`` entries of a row, ``S`` observation, ``A`` action, ``T`` steps.
+Shapes: ``B`` rows, ``N`` entries of a row, ``S`` observation, ``A`` action, ``T``
+steps.
 """
 
 from __future__ import annotations
@@ -132,7 +133,7 @@ class World:
             return finite
         height, angle = rows[:, 2], rows[:, 3]
         if self.system == "walker2d":
-            return finite & (0.8 < height) & (height < 2) & (np.abs(angle) < 1)
+            return finite & (height > 0.8) & (height < 2) & (np.abs(angle) < 1)
         inside = (np.abs(rows[:, 3 : self.size]) < 100).all(1)
         return finite & (height > 0.7) & (np.abs(angle) < 0.2) & inside
 
@@ -185,7 +186,7 @@ class World:
         return Played(alive, success, speed, rows, simulated)
 
     def changed(self, rows: Rows, std: Rows, rng: np.random.Generator) -> Rows:
-        """Rows with noise on positions and velocities, but not on x, where all is alike.
+        """Rows with noise on positions and velocities, but not on x, which nobody sees.
 
         Args:
             rows: ``[B, N]``.
@@ -200,7 +201,7 @@ class World:
         return rows
 
     def policy(self, name: str) -> Policy:
-        """Mean action of a policy that ships, or the maze's controller without noise."""
+        """Mean action of a policy that ships; the maze's controller without noise."""
         if not self.is_maze:
             return load_behavior_policy(self.system, name).deterministic
         sample = waypoint_sampler(self.maze)
