@@ -26,7 +26,10 @@ HOLD = 4
 """Steps for which an offset is held."""
 
 TAIL = 60
-"""Steps of the expert after the last offset that count in the search."""
+"""Steps of the expert after the last offset that count in the search.
+
+Until a candidate that gets so far fails later: from then on all steps count.
+"""
 
 CHANGES = (1e-3,) * 4 + (1e-2,) * 4
 """A witness also succeeds after these changes, in standard deviations."""
@@ -50,7 +53,7 @@ STAGES = (
     Stage(48, 4, 10),  # 192 rollouts
     Stage(96, 4, 15),  # 384
     Stage(144, 8, 15),  # 1152
-    Stage(288, 12, 15),  # 3456
+    Stage(288, 12, 25),  # 3456
 )
 
 
@@ -79,7 +82,9 @@ class Planner:
                 return False
         return True
 
-    def score(self, row: Rows, knots: np.ndarray, rng: np.random.Generator) -> Rows:
+    def score(
+        self, row: Rows, knots: np.ndarray, steps: int, rng: np.random.Generator
+    ) -> Rows:
         """Score of candidates ``[B, K, A]``, each from a start a little changed.
 
         Steps alive; less the steps to the goal; HalfCheetah's speed, and more if its
@@ -88,9 +93,6 @@ class Planner:
         rows = np.repeat(row[None], len(knots), axis=0)
         rows = self.world.changed(rows, TRIED_CHANGE * self.std, rng)
         offsets = np.repeat(knots, HOLD, axis=1)
-        steps = offsets.shape[1] + TAIL
-        if self.world.is_maze:
-            steps = self.world.steps
         played = self.world.play(rows, self.expert, steps, offsets)
         self.rollouts += len(rows)
         self.steps += played.steps
@@ -124,7 +126,7 @@ class Planner:
         shape = stage.knots, self.world.nu
         mean, spread = np.zeros(shape), np.full(shape, 0.5)
         best, best_score = mean, -np.inf
-        steps = stage.knots * HOLD + TAIL
+        steps = self.world.steps if self.world.is_maze else stage.knots * HOLD + TAIL
         for _ in range(stage.iterations):
             noise = rng.standard_normal((stage.candidates, *shape))
             knots = np.clip(mean + spread * noise, -2, 2)
@@ -135,8 +137,9 @@ class Planner:
                 warm = None
             # As they are stored: what is checked is what is kept.
             knots = np.round(knots, 4).astype(np.float32)
-            score = self.score(row, knots, rng)
-            for number in self.promising(score, steps):
+            score = self.score(row, knots, steps, rng)
+            promising = self.promising(score, steps)
+            for number in promising:
                 if self.holds(row, knots[number], rng):
                     return knots[number], True
             elite = np.argsort(-score, kind="stable")
@@ -146,8 +149,11 @@ class Planner:
             mean = knots[elite].mean(0)
             spread = np.maximum(0.1 * spread + 0.9 * knots[elite].std(0), 0.05)
             middle = np.round(mean, 4).astype(np.float32)
-            if len(self.promising(score, steps)) and self.holds(row, middle, rng):
-                return middle, True
+            if len(promising):
+                if self.holds(row, middle, rng):
+                    return middle, True
+                if steps < self.world.steps:
+                    steps, best_score = self.world.steps, -np.inf
         return np.asarray(best, dtype=np.float32), False
 
 
