@@ -93,14 +93,23 @@ class Planner:
         rows = np.repeat(row[None], len(knots), axis=0)
         rows = self.world.changed(rows, TRIED_CHANGE * self.std, rng)
         offsets = np.repeat(knots, HOLD, axis=1)
-        played = self.world.play(rows, self.expert, steps, offsets)
+        falls = self.world.system in ("hopper", "walker2d")
+        first = min(steps, offsets.shape[1] + TAIL) if falls else steps
+        played = self.world.play(rows, self.expert, first, offsets)
         self.rollouts += len(rows)
         self.steps += played.steps
         if self.world.is_maze:
             return -played.alive.astype(float)
         if self.world.system == "halfcheetah":
             return played.speed + self.world.least_speed * np.cos(played.rows[:, 3])
-        return played.alive.astype(float)
+        score = played.alive.astype(float)
+        # Twice the elite is enough to go on with.
+        up = np.flatnonzero(played.success)[: int(2 * ELITE * len(knots))]
+        if steps > first and len(up):
+            later = self.world.play(played.rows[up], self.expert, steps - first)
+            self.steps += later.steps
+            score[up] += later.alive
+        return score
 
     def promising(self, score: Rows, steps: int) -> np.ndarray:
         """Candidates worth a full check, the best three at most."""
