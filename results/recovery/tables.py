@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from clones import SYSTEMS
+from clones import OUTSIDE, SYSTEMS
 from search import HOLD, STAGES, read_lines
-from states import DISTURBANCES, PARTS, generator, hard, normal
+from states import DISTURBANCES, PARTS, generator, hard, load_clone, normal
 from tensordict import TensorDict
 from world import World
 
@@ -39,8 +39,7 @@ NEAR = (1.0, 2.0)
 def gather(world: World) -> dict[str, np.ndarray]:
     """All judged states of a system, with their group and witness.
 
-    ``group`` indexes GROUPS, or is -1: hard, and not searched in the first two stages
-    yet. ``stage`` is the one that saved it, or the last that did not.
+    ``group`` indexes GROUPS, or is -1: hard, and not searched yet.
     """
     folder = PARTS / world.system
     lines = {(x["part"], x["index"], x["stage"]): x for x in read_lines(folder)}
@@ -55,24 +54,17 @@ def gather(world: World) -> dict[str, np.ndarray]:
         count = len(jury)
         group = np.where((members == 1).all(1), 0, 1)
         group[is_hard] = -1
-        stage = np.full(count, -1)
         offsets = np.zeros((count, KNOTS, world.nu), np.float32)
         for index in np.flatnonzero(is_hard):
             for number in range(len(STAGES)):
                 line = lines.get((part, int(index), number))
                 if line is None:
                     break
-                stage[index] = number
+                group[index] = 2 if line["saved"] else 3
                 if line["saved"]:
                     knots = np.array(line["offsets"], np.float32)
                     offsets[index, : len(knots)] = knots
-                    group[index] = 2
-                elif number >= 1:
-                    group[index] = 3
-        columns.setdefault("part", []).append(np.full(count, part)[judged])
-        for name, value in {
-            **arrays, "group": group, "stage": stage, "offsets": offsets,
-        }.items():  # fmt: skip
+        for name, value in (arrays | {"group": group, "offsets": offsets}).items():
             columns.setdefault(name, []).append(value[judged])
     return {name: np.concatenate(value) for name, value in columns.items()}
 
@@ -154,9 +146,24 @@ def summary(world: World, found: dict[str, np.ndarray]) -> dict:
     return {
         "states": counts,
         "walks with recoverable states": walks,
+        "saved by a clone outside the jury": outside(world, found),
         "disturbances": disturbances,
         "budget": curve(world),
     }
+
+
+def outside(world: World, found: dict[str, np.ndarray]) -> dict[str, list[int]]:
+    """States of each group of the public half that a fifth clone does not fail from.
+
+    Their number, and that of all.
+    """
+    policy = load_clone(world.system, OUTSIDE).deterministic
+    shares = {}
+    for number, name in enumerate(GROUPS):
+        rows = found["state"][(found["walk"] % 2 == 0) & (found["group"] == number)]
+        back = world.play(rows, policy, world.steps).success if len(rows) else rows
+        shares[name] = [int(np.sum(back)), len(rows)]
+    return shares
 
 
 def pack(world: World, found: dict[str, np.ndarray]) -> dict:
