@@ -40,13 +40,13 @@ PLAYERS = {
 """Who walks, in turn; the walks ``2n`` and ``2n + 1`` have the same player."""
 
 LEGGED: dict[str, tuple[float, ...]] = {
-    "torque": (5, 10, 15),
-    "rest": (20, 30),
-    "push": (1, 2, 4),
-    "kick": (0.5, 1, 2),
-    "kick-root": (1, 2, 4),
+    "torque": (5, 10, 12),
+    "rest": (15, 20),
+    "push": (1, 2, 3),
+    "kick": (0.5, 1, 1.5),
+    "kick-root": (1, 2),
     "kick-joints": (1, 2),
-    "start": (0.1, 0.2),
+    "start": (0.1, 0.15),
 }
 DISTURBANCES: dict[str, dict[str, tuple[float, ...]]] = {
     "hopper": LEGGED,

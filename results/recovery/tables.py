@@ -137,7 +137,7 @@ def summary(world: World, found: dict[str, np.ndarray]) -> dict:
         {"kind": kind, "strength": strength}
         | {name: table[kind, strength, name] for name in groups}
         for kind in kinds
-        for strength in DISTURBANCES[world.system][kind]
+        for strength in sorted({each[1] for each in table if each[0] == kind})
     ]
     walks = {
         name: len(np.unique(found["walk"][(half == h) & (found["group"] == 2)]))
