@@ -14,6 +14,7 @@ from torchrl_osr.data.collect.environment import environment_id
 from torchrl_osr.evaluation.recoverable import (
     RecoverableStates,
     load_recoverable_states,
+    recovered_share,
     recovers,
 )
 
@@ -81,7 +82,7 @@ def test_who_falls_from_each_state_is_what_the_environment_says(load) -> None:
         env.reset()
         bare.set_state(qpos, qvel)
         observation = bare._get_obs()
-        for _ in range(60):
+        for _ in range(30):
             rows = torch.from_numpy(observation[None]).float()
             action = policy(rows)[0].numpy()
             observation, _, terminated, _, _ = env.step(action)
@@ -140,3 +141,42 @@ def test_no_states_are_no_answers(load) -> None:
     names = set(arrays) - {"env_name", "hold", "steps", "least_speed"}
     empty = arrays | {name: arrays[name][:0] for name in names}
     assert recovers(load(empty), still(3)).shape == (0,)
+
+
+def test_the_recovered_share_of_known_tables() -> None:
+    baseline = [[1, 0, 0, 0, 0, 0, 0, 0], [0, 0, 1, 0, 0, 0, 0, 0]]
+    method = [[1, 1, 0, 0, 0, 0, 0, 0], [1, 1, 1, 0, 0, 0, 0, 0]]
+    oracle, walk = np.ones(8), [0, 0, 1, 1, 2, 2, 3, 3]
+    assert recovered_share(np.ones((2, 8)), baseline, oracle, walk) == (1, 1, 1)
+    assert recovered_share(baseline, baseline, oracle, walk) == (0, 0, 0)
+    # 5 of 16 against 2 of 16.
+    assert recovered_share(method, baseline, oracle, walk)[0] == pytest.approx(3 / 14)
+    # With one walk the seeds alone vary: (2 - 1) / 7, (3 - 1) / 7, or between.
+    one = recovered_share(method, baseline, oracle, [7] * 8)
+    assert one == pytest.approx((3 / 14, 1 / 7, 2 / 7))
+    # With one seed the walks alone vary, the states of one together.
+    two = [0, 0, 0, 0, 1, 1, 1, 1]
+    single = recovered_share(method[:1], np.zeros((1, 8)), oracle, two)
+    assert single == pytest.approx((1 / 4, 0, 1 / 2))
+
+
+def test_the_interval_of_the_recovered_share_covers_the_truth() -> None:
+    """Seeds and walks differ; of 30 intervals of 95 % at least 25 hold the truth."""
+    rng, held = np.random.default_rng(0), 0
+    walk = np.repeat(np.arange(40), 3)
+    for _ in range(30):
+        seed = rng.normal(0, 0.05, (20, 1))
+        place = np.repeat(rng.normal(0, 0.1, 40), 3)
+        draws = rng.random((2, 20, 120))
+        baseline = draws[0] < np.clip(0.15 + seed + place, 0, 1)
+        method = draws[1] < np.clip(0.40 + seed + place, 0, 1)
+        _, low, high = recovered_share(method, baseline, np.ones(120), walk)
+        held += low <= 0.2902 <= high  # by 10^7 draws of the two shares
+    assert held >= 25
+
+
+def test_shares_without_a_difference_or_with_other_shapes_are_refused() -> None:
+    with pytest.raises(ValueError, match="no more states than the baseline"):
+        recovered_share([[1, 0]], [[1, 1]], [1, 1], [0, 1])
+    with pytest.raises(ValueError, match=r"got \[\(1, 2\), \(1, 3\), \(2,\)\]"):
+        recovered_share([[1, 0]], [[1, 1, 0]], [1, 1], [0, 1])
