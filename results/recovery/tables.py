@@ -1,16 +1,13 @@
-"""Pack what the searches found, and print how much of it there is.
+"""Pack what the searches found, and say how much of it there is.
 
-    python results/recovery/tables.py                 # tables alone
-    python results/recovery/tables.py --pack          # and states/<system>-<half>.npz
+    python results/recovery/tables.py
 
-The tables go into ``tables.json``; ``states/checksums.json`` has the SHA-256 of each
-packed file.
+Writes ``states/<system>-<half>.npz``, their SHA-256 in ``states/checksums.json``, and
+``tables.md``.
 """
 
 from __future__ import annotations
 
-import argparse
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +18,13 @@ from states import DISTURBANCES, PARTS, generator, hard, load_clone, normal
 from tensordict import TensorDict
 from world import World
 
-from torchrl_osr._files import read_arrays, sha256_of, whole_file, write_json
+from torchrl_osr._files import (
+    read_arrays,
+    sha256_of,
+    whole_file,
+    write_atomically,
+    write_json,
+)
 from torchrl_osr.data import collect_quality
 from torchrl_osr.evaluation import DataDistance
 
@@ -32,8 +35,6 @@ CONTROLS = 100
 """Easy and contested states of each half that are kept."""
 
 KNOTS = max(stage.knots for stage in STAGES)
-NEAR = (1.0, 2.0)
-"""Thresholds of the distance to the data, between strata."""
 
 
 def gather(world: World) -> dict[str, np.ndarray]:
@@ -105,96 +106,68 @@ def curve(world: World) -> list[dict]:
             {
                 "rollouts": stage.candidates * stage.iterations,
                 "tried": len(tried),
-                "saved_of_tried": round(share, 4),
-                "saved_of_hard": round(saved, 4),
-                "core_seconds": round(sum(x["seconds"] for x in tried)),
+                "saved": sum(x["saved"] for x in tried),
+                "share of hard states saved so far": f"{saved:.3f}",
+                "core seconds each": f"{np.mean([x['seconds'] for x in tried]):.1f}",
             }
         )
     return entries
 
 
-def summary(world: World, found: dict[str, np.ndarray]) -> dict:
-    """Numbers of states by half, and by disturbance and strength.
+def table(rows: list[dict]) -> str:
+    """Markdown table of rows with the same entries."""
+    names = list(rows[0])
+    lines = [
+        names,
+        ["---"] * len(names),
+        *([row[each] for each in names] for row in rows),
+    ]
+    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
+
+
+def by_disturbance(world: World, found: dict[str, np.ndarray]) -> list[dict]:
+    """Numbers of states of each group after each disturbance.
 
     A legged robot's state that the expert survives stands for four, see ``states.py``.
     """
     kinds = list(DISTURBANCES[world.system])
-    half = found["walk"] % 2
-    groups = [*GROUPS, "not searched"]  # which is -1
     weight = np.where((found["jury"][:, 1] == 1) & (not world.is_maze), 4, 1)
-    by_half: Counter = Counter()
-    table: Counter = Counter()
-    for number, (side, kind, strength, group) in enumerate(
-        zip(half, found["kind"], found["strength"], found["group"], strict=True)
-    ):
-        by_half[side, groups[group]] += int(weight[number])
-        table[kinds[kind], float(strength), groups[group]] += int(weight[number])
-    counts = {
-        name: {group: by_half[side, group] for group in groups}
-        for side, name in enumerate(HALVES)
-    }
-    disturbances = [
-        {"kind": kind, "strength": strength}
-        | {name: table[kind, strength, name] for name in groups}
-        for kind in kinds
-        for strength in sorted({each[1] for each in table if each[0] == kind})
-    ]
-    walks = {
-        name: len(np.unique(found["walk"][(half == h) & (found["group"] == 2)]))
-        for h, name in enumerate(HALVES)
-    }
-    return {
-        "states": counts,
-        "walks with recoverable states": walks,
-        "saved by a clone outside the jury": outside(world, found),
-        "disturbances": disturbances,
-        "budget": curve(world),
-    }
+    rows = []
+    for number, kind in enumerate(kinds):
+        of_kind = found["kind"] == number
+        for strength in np.unique(found["strength"][of_kind]):
+            here = of_kind & (found["strength"] == strength)
+            counts = {
+                name: int(weight[here & (found["group"] == group)].sum())
+                for group, name in [*enumerate(GROUPS), (-1, "not searched yet")]
+            }
+            rows.append({"disturbance": f"{kind} {strength:g}"} | counts)
+    return rows
 
 
-def outside(world: World, found: dict[str, np.ndarray]) -> dict[str, list[int]]:
-    """States of each group of the public half that a fifth clone does not fail from.
-
-    Their number, and that of all.
-    """
-    policy = load_clone(world.system, OUTSIDE).deterministic
-    shares = {}
-    for number, name in enumerate(GROUPS):
-        rows = found["state"][(found["walk"] % 2 == 0) & (found["group"] == number)]
-        back = world.play(rows, policy, world.steps).success if len(rows) else rows
-        shares[name] = [int(np.sum(back)), len(rows)]
-    return shares
-
-
-def pack(world: World, found: dict[str, np.ndarray]) -> dict:
-    """Write both halves; return the number of recoverable states by distance."""
+def pack(world: World, found: dict[str, np.ndarray]) -> list[dict]:
+    """Write both halves; return what is in them."""
     rng = generator(world.system, 3)
     kinds = np.array(list(DISTURBANCES[world.system]))
-    half = found["walk"] % 2
-    strata = {}
-    for number, name in enumerate(HALVES):
-        chosen = [np.flatnonzero((half == number) & (found["group"] == 2))]
+    clone = load_clone(world.system, OUTSIDE).deterministic
+    contents = []
+    for number, half in enumerate(HALVES):
+        inside = found["walk"] % 2 == number
+        chosen = [np.flatnonzero(inside & (found["group"] == 2))]
         for control in (0, 1):
-            there = np.flatnonzero((half == number) & (found["group"] == control))
+            there = np.flatnonzero(inside & (found["group"] == control))
             count = min(CONTROLS, len(there))
             chosen.append(np.sort(rng.choice(there, count, replace=False)))
         rows = np.concatenate(chosen)
         states = found["state"][rows]
+        group = np.array(GROUPS)[found["group"][rows]]
         distance = distances(world, states)
-        recoverable = distance[: len(chosen[0])]
-        strata[name] = {
-            "within the data": int((recoverable <= NEAR[0]).sum()),
-            "up to twice the threshold": int(
-                ((recoverable > NEAR[0]) & (recoverable <= NEAR[1])).sum()
-            ),
-            "further": int((recoverable > NEAR[1]).sum()),
-        }
         arrays = {
             "env_name": np.array(world.system),
             "qpos": states[:, 1 : 1 + world.nq],
             "qvel": states[:, 1 + world.nq : world.size],
             "goal": states[:, world.size :],
-            "group": np.array(GROUPS)[found["group"][rows]],
+            "group": group,
             "walk": found["walk"][rows].astype(np.int32),
             "moment": found["moment"][rows].astype(np.int32),
             "kind": kinds[found["kind"][rows]],
@@ -205,38 +178,51 @@ def pack(world: World, found: dict[str, np.ndarray]) -> dict:
             "steps": np.array(world.steps),
             "least_speed": np.array(world.least_speed or -np.inf),
         }
-        path = FOLDER / "states" / f"{world.system}-{name}.npz"
+        path = FOLDER / "states" / f"{world.system}-{half}.npz"
         path.parent.mkdir(exist_ok=True)
         with whole_file(path) as file:
             np.savez_compressed(file, **arrays)
-    return strata
+        there = group == "recoverable"
+        entry: dict = {"half": half, "recoverable": int(there.sum())}
+        entry["of walks"] = len(np.unique(arrays["walk"][there]))
+        for low, high, name in (
+            (0, 1, "in the data"), (1, 2, "up to 2"), (2, np.inf, "further"),
+        ):  # fmt: skip
+            entry[name] = int(((distance > low) & (distance <= high))[there].sum())
+        for control in GROUPS[:2]:
+            entry[control] = int((group == control).sum())
+        if half == "public":  # the other one is not looked at
+            back = world.play(states, clone, world.steps).success
+            for each in ("recoverable", "contested", "easy"):
+                of = group == each
+                entry[f"a clone saves of {each}"] = f"{back[of].sum()} of {of.sum()}"
+        else:
+            for each in ("recoverable", "contested", "easy"):
+                entry[f"a clone saves of {each}"] = ""
+        contents.append(entry)
+    return contents
 
 
 def main() -> None:
-    """Print, and write."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--pack", action="store_true")
-    given = parser.parse_args()
-    tables = {}
+    """Write everything."""
+    pages = ["# What is there", "Written by `tables.py`; the columns are explained in "
+             "[README.md](README.md#the-states)."]  # fmt: skip
     for system in SYSTEMS:
         if not list((PARTS / system).glob("states-*.npz")):
             continue
         world = World(system)
         normal(world)  # sets the least speed
         found = gather(world)
-        tables[system] = summary(world, found)
-        if given.pack:
-            tables[system]["distance to the data"] = pack(world, found)
-        print(system)
-        for name, counts in tables[system]["states"].items():
-            print(f"  {name}: {counts}")
-        for entry in tables[system]["budget"]:
-            print(f"  {entry}")
-    if given.pack:
-        files = sorted((FOLDER / "states").glob("*.npz"))
-        sums = {path.name: sha256_of(path) for path in files}
-        write_json(FOLDER / "states" / "checksums.json", sums)
-    write_json(FOLDER / "tables.json", tables)
+        pages += [
+            f"## {system}",
+            table(pack(world, found)),
+            table(curve(world) or [{"rollouts": 0}]),
+            table(by_disturbance(world, found)),
+        ]
+    files = sorted((FOLDER / "states").glob("*.npz"))
+    sums = {path.name: sha256_of(path) for path in files}
+    write_json(FOLDER / "states" / "checksums.json", sums)
+    write_atomically(FOLDER / "tables.md", "\n\n".join(pages) + "\n")
 
 
 if __name__ == "__main__":
