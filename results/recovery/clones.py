@@ -3,7 +3,8 @@
     python results/recovery/clones.py walker2d
 
 Each has rows, network and order of its own seed. They are stored as behaviour policies
-are, in ``clones/<system>/<number>.npz``; 0 to 3 are the jury.
+are, in ``clones/<system>/<number>.npz``; 0 to 3 are the jury. ``scores.json`` beside
+them has the undisturbed D4RL scores of ten episodes each; of the maze, successes.
 """
 
 from __future__ import annotations
@@ -17,8 +18,11 @@ import numpy as np
 import torch
 from torch import nn
 
-from torchrl_osr.data import collect_quality, save_behavior_policy
+from torchrl_osr._files import read_arrays, write_json
+from torchrl_osr.data import collect_quality, normalized_score, save_behavior_policy
 from torchrl_osr.data.collect.behavior import Affine, BehaviorPolicy
+from torchrl_osr.data.collect.environment import environment_id
+from torchrl_osr.evaluation import EpisodeEvaluator
 
 FOLDER = Path(__file__).parent / "clones"
 JURY, OUTSIDE = (0, 1, 2, 3), 4
@@ -70,8 +74,30 @@ def clone(observation: np.ndarray, action: np.ndarray, seed: int) -> BehaviorPol
     return BehaviorPolicy(hidden0, hidden1, head, silent)
 
 
+def load_clone(system: str, number: int) -> BehaviorPolicy:
+    """One of them."""
+    arrays = read_arrays(FOLDER / system / f"{number}.npz")
+    names = ("hidden0", "hidden1", "mean", "log_std")
+    layers = (
+        (arrays[f"{name}.{part}"].astype(np.float32) for part in ("weight", "bias"))
+        for name in names
+    )
+    return BehaviorPolicy(*(Affine(*layer) for layer in layers))
+
+
+def score(system: str, number: int) -> list[float]:
+    """Of ten undisturbed episodes."""
+    policy = load_clone(system, number).deterministic
+    evaluator = EpisodeEvaluator(environment_id(system), num_episodes=10, seed=100)
+    results = evaluator(lambda rows: torch.from_numpy(policy(rows.numpy())))
+    evaluator.close()
+    if results.successes is not None:
+        return results.successes.astype(float).tolist()
+    return np.round(normalized_score(system, results.returns), 1).tolist()
+
+
 def main() -> None:
-    """Train what is not there yet."""
+    """Train and play what is not there yet."""
     torch.set_num_threads(1)
     for system in sys.argv[1:] or SYSTEMS:
         for number in (*JURY, OUTSIDE):
@@ -82,6 +108,9 @@ def main() -> None:
             policy = clone(*rows_of(system, seed), seed)
             save_behavior_policy(path, policy, half=True)
             print(json.dumps({"clone": f"{system}/{number}", "seed": seed}), flush=True)
+        path = FOLDER / system / "scores.json"
+        if not path.exists():
+            write_json(path, {each: score(system, each) for each in (*JURY, OUTSIDE)})
 
 
 if __name__ == "__main__":

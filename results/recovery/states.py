@@ -14,13 +14,11 @@ import zlib
 from pathlib import Path
 
 import numpy as np
-from clones import FOLDER as CLONES
-from clones import JURY
+from clones import JURY, load_clone
 from world import SPEED_STEPS, Policy, Rows, World
 
-from torchrl_osr._files import read_arrays, read_json, whole_file, write_json
+from torchrl_osr._files import read_json, whole_file, write_json
 from torchrl_osr.data import load_behavior_policy
-from torchrl_osr.data.collect.behavior import Affine, BehaviorPolicy
 from torchrl_osr.data.collect.mazes import PLAY_CELLS, waypoint_sampler
 
 PARTS = Path(__file__).parent / "parts"
@@ -78,17 +76,6 @@ the maze: a random free place, with x standard deviations of velocity).
 """
 
 PUSH_STEPS = 5
-
-
-def load_clone(system: str, number: int) -> BehaviorPolicy:
-    """One of ``clones.py``'s."""
-    arrays = read_arrays(CLONES / system / f"{number}.npz")
-    names = ("hidden0", "hidden1", "mean", "log_std")
-    layers = (
-        (arrays[f"{name}.{part}"].astype(np.float32) for part in ("weight", "bias"))
-        for name in names
-    )
-    return BehaviorPolicy(*(Affine(*layer) for layer in layers))
 
 
 def generator(system: str, *numbers: int) -> np.random.Generator:

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from clones import OUTSIDE, SYSTEMS
+from clones import OUTSIDE, SYSTEMS, load_clone
 from search import HOLD, STAGES, read_lines
-from states import DISTURBANCES, PARTS, generator, hard, load_clone, normal
+from states import DISTURBANCES, PARTS, generator, hard, normal
 from tensordict import TensorDict
 from world import World
 
