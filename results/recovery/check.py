@@ -3,7 +3,8 @@
     python results/recovery/check.py
 
 States, observations and ends of random steps; then every packed witness, step by step
-in the environment: those that fail there are listed, and are no witnesses.
+in the environment: those that fail there are listed, and are no witnesses. At last each
+after eight changes that the search has not seen: it tried many ways on its own eight.
 """
 
 from __future__ import annotations
@@ -12,8 +13,9 @@ from pathlib import Path
 
 import numpy as np
 from clones import SYSTEMS
-from states import normal
-from world import SPEED_STEPS, World
+from search import CHANGES
+from states import generator, normal
+from world import SPEED_STEPS, Rows, World
 
 from torchrl_osr.evaluation.recoverable import (
     RecoverableStates,
@@ -83,6 +85,23 @@ def holds(world: World, states: RecoverableStates, number: int) -> bool:
     return not world.is_maze and np.mean(speeds[-SPEED_STEPS:]) >= states.least_speed
 
 
+def after_changes(world: World, states: RecoverableStates, numbers: np.ndarray) -> Rows:
+    """Share of eight new changes after which each witness succeeds, ``[M]``."""
+    goals = states.goal[numbers]
+    time = np.zeros((len(numbers), 1))
+    rows = np.hstack([time, states.qpos[numbers], states.qvel[numbers], goals])
+    offsets = np.repeat(states.offsets[numbers], states.hold, axis=1)
+    std, rng = normal(world)["std"], generator(world.system, 4)
+    expert = world.policy("expert")
+    back = [
+        world.play(
+            world.changed(rows, change * std, rng), expert, states.steps, offsets
+        ).success
+        for change in CHANGES
+    ]
+    return np.mean(back, axis=0)
+
+
 def main() -> None:
     """Both, for all systems."""
     for system in SYSTEMS:
@@ -92,8 +111,15 @@ def main() -> None:
         for path in sorted(STATES.glob(f"{system}-*.npz")):
             states = load_recoverable_states(path)
             numbers = np.flatnonzero(states.group == "recoverable")
+            if not len(numbers):
+                continue
             failed = [int(each) for each in numbers if not holds(world, states, each)]
-            print(f"{path.name}: {len(numbers)} witnesses, fail: {failed}", flush=True)
+            shares = after_changes(world, states, numbers)
+            print(
+                f"{path.name}: {len(numbers)} witnesses, fail: {failed}; after new "
+                f"changes {shares.mean():.3f} succeed, the worst {shares.min():.3f}",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":
