@@ -82,7 +82,7 @@ def test_who_falls_from_each_state_is_what_the_environment_says(load) -> None:
         env.reset()
         bare.set_state(qpos, qvel)
         observation = bare._get_obs()
-        for _ in range(30):
+        for _ in range(60):
             rows = torch.from_numpy(observation[None]).float()
             action = policy(rows)[0].numpy()
             observation, _, terminated, _, _ = env.step(action)
