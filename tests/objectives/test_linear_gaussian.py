@@ -115,3 +115,126 @@ def test_what_is_left_of_a_push_is_the_closed_form(behavior_std) -> None:
     # deterministic: there the data do not show how to come back.
     assert left == pytest.approx(NOISE_STD**2 / variance, abs=0.02)
     assert std == pytest.approx(behavior_std, abs=0.01)
+
+
+def pushed_rows(push: float, width: float = 1.0) -> TensorDict:
+    """64 rows of this world and their pushed states, second moments exact.
+
+    Here it is the action before the tanh that is linear in the state, so that linear
+    networks are of the right class.
+    """
+    state, behavior, noise, push_noise = exact_draws(64, 4).split(1, -1)
+    state = width * state
+    action = GAIN * state + BEHAVIOR_STD * behavior
+    next_state = A * state + B * action + NOISE_STD * noise
+    no = torch.zeros_like(state, dtype=torch.bool)
+    rows = {
+        "observation": state,
+        "action": BOUND * action.tanh(),
+        "next": {"observation": next_state, "done": no},
+        "perturbed": {"observation": state + push * push_noise},
+    }
+    return TensorDict(rows, [64])
+
+
+def most_likely_model(rows: TensorDict, states: list[torch.Tensor]) -> torch.nn.Module:
+    """Linear Gaussian model of ``(s, s')`` at the given states, by least squares."""
+    following = rows["next", "observation"]
+    inputs = torch.cat([torch.cat([state, following], -1) for state in states])
+    action = (rows["action"] / BOUND).atanh().repeat(len(states), 1)
+    solution = torch.linalg.lstsq(inputs, action).solution
+    std = (action - inputs @ solution).square().mean().sqrt()
+    model = linear_gaussian("observation", ("next", "observation"))
+    layer = model[0][0].module[0]
+    with torch.no_grad():
+        layer.weight.zero_()
+        layer.weight[0] = solution[:, 0]
+        layer.bias.copy_(torch.stack([torch.zeros_like(std), std.log()]))
+    return model
+
+
+def policy_gradient(actor: torch.nn.Module, loss: torch.Tensor) -> torch.Tensor:
+    """By the mean's weight and bias and by the standard deviation.
+
+    Not by the weight of the standard deviation, which depends on third moments.
+    """
+    layer = actor[0][0].module[0]
+    weight, bias = torch.autograd.grad(loss, [layer.weight, layer.bias])
+    return torch.cat([weight[0], bias])
+
+
+@pytest.mark.parametrize("push", [1e-3, 0.1, 0.5, 2.0])
+@pytest.mark.parametrize("shuffled", [False, True])
+def test_a_model_of_pushed_states_teaches_noisy_cloning(push, shuffled) -> None:
+    """For every push and every policy, and even with other rows' next states."""
+    rows = pushed_rows(push)
+    states = [rows["observation"], rows["perturbed", "observation"]]
+    if shuffled:
+        following = rows["next", "observation"]
+        rows["next", "observation"] = following[torch.randperm(len(rows))]
+    models = [most_likely_model(rows, states), most_likely_model(rows, states[:1])]
+    fit = InverseDynamicsLoss(models[0])(rows)["loss_inverse_dynamics"]
+    slopes = policy_gradient(models[0], fit)
+    assert slopes.abs().max() < 1e-9  # the package's own optimum
+    for _ in range(5):
+        actor = linear_gaussian("observation")
+        with torch.no_grad():
+            actor[0][0].module[0].weight[1] = 0  # one standard deviation
+        cloning = [
+            -actor.get_dist(TensorDict({"observation": state}, [64])).log_prob(
+                rows["action"]
+            )
+            for state in states
+        ]
+        expected = policy_gradient(actor, torch.cat(cloning).mean())
+        by_fitted, by_clean = (
+            policy_gradient(
+                actor,
+                StateRecoveryLoss(actor, model, recovery_weight=1.0)(rows)[
+                    "loss_recovery"
+                ],
+            )
+            for model in models
+        )
+        torch.testing.assert_close(by_fitted, expected, rtol=1e-9, atol=1e-9)
+        # So could a gradient that is zero or that does not see the model.
+        assert expected.abs().max() > 1e-2
+        if push >= 0.1 and not shuffled:
+            assert (by_clean - expected).abs().max() > 1e-4
+
+
+@pytest.mark.parametrize(
+    ("push", "width", "slope"),
+    [  # k - G (A + B k) push^2 / (width^2 + push^2), with G (A + B k) = 1.2 here
+        (1e-3, 1.0, -0.3000012),
+        (0.1, 1.0, -0.3118812),
+        (0.1, 0.1, -0.9),
+        (0.5, 1.0, -0.54),
+        (0.5, 0.1, -1.4538462),
+    ],
+)
+def test_a_clean_model_adds_a_multiple_of_the_way_to_the_data(
+    push, width, slope
+) -> None:
+    """Gain times the squared push times the score of the density of pushed states."""
+    rows = pushed_rows(push, width)
+    model = most_likely_model(rows, [rows["observation"]])
+    actor = linear_gaussian("observation")
+    loss = StateRecoveryLoss(
+        actor, model, recovery_weight=1.0, recovery_states="perturbed"
+    )
+    layer = actor[0][0].module[0]
+    with torch.no_grad():
+        layer.weight.copy_(torch.tensor([[slope], [0.0]]))
+        layer.bias.zero_()
+    weight, bias = torch.autograd.grad(
+        loss(rows)["loss_recovery"], [layer.weight, layer.bias]
+    )
+    # At its minimum, with a standard deviation of 1, but for the rounding of the slope.
+    assert abs(weight[0].item()) < 1e-6
+    assert abs(bias[0].item()) < 1e-6
+    with torch.no_grad():
+        layer.weight[0] = GAIN
+    moved = torch.autograd.grad(loss(rows)["loss_recovery"], layer.weight)[0][0]
+    expected = (GAIN - slope) * (width**2 + push**2)
+    assert moved.item() == pytest.approx(expected, abs=1e-6)
