@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_osr.commands import CONF, import_from_here
+from torchrl_osr.commands.console import single_job
 from torchrl_osr.data.collect.environment import open_environment
 from torchrl_osr.data.collect.record import (
     Act,
@@ -35,6 +36,7 @@ schema.register()
 
 
 @hydra.main(version_base="1.3", config_path=CONF, config_name="collect")
+@single_job
 def main(cfg: DictConfig) -> None:
     """Play the episodes, write the log, and say what is in it."""
     torch.set_num_threads(1)

@@ -4,7 +4,7 @@
     torchrl-osr train env.id=Pendulum-v1 data=file data.path=log.npz
     torchrl-osr train env=walker2d data=medium-expert seed=3 preset=paper
     torchrl-osr train -m env=hopper,walker2d seed=0,1,2 hydra/launcher=pool
-    torchrl-osr train resume=outputs/hopper-medium-replay/seed0-...
+    torchrl-osr train resume=outputs/hopper-medium-replay/osr-seed0-...
 
 Data of the built-in tasks are rolled out on this machine at the first run and cached;
 docs/any_environment.md is about all others. A run leaves
@@ -14,22 +14,27 @@ docs/any_environment.md is about all others. A run leaves
 
 from __future__ import annotations
 
+import logging
+import sys
 from contextlib import closing
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 from torchrl import torchrl_logger
 from torchrl.objectives import SoftUpdate
+from torchrl.record.loggers import Logger
 
 from torchrl_osr import StatePerturbation
 from torchrl_osr._files import write_json
 from torchrl_osr.commands import CONF, import_from_here
+from torchrl_osr.commands.console import single_job
 from torchrl_osr.data import environment_spec
 from torchrl_osr.evaluation import (
     EpisodeEvaluator,
@@ -48,17 +53,27 @@ from torchrl_osr.experiment.build import (
     read_environment,
     references_of,
 )
-from torchrl_osr.experiment.loggers import make_loggers
+from torchrl_osr.experiment.loggers import log_outcome, make_loggers
+from torchrl_osr.experiment.run_config import read_yaml
 from torchrl_osr.experiment.training_data import load_training_data
 from torchrl_osr.trainers import OfflineTrainer, check_hardware, largest_value
+
+log = logging.getLogger(__name__)
 
 EVALUATION_SEED = 10_000  # far from the seeds of the data's episodes
 
 schema.register()
 
 
+def main() -> None:
+    """Train as the command line says."""
+    sys.argv += schema.named_by_what_differs(sys.argv[1:])
+    train()
+
+
 @hydra.main(version_base="1.3", config_path=CONF, config_name="train")
-def main(cfg: DictConfig) -> float:
+@single_job
+def train(cfg: DictConfig) -> float:
     """Do or continue one run; return its last score or return, for a sweeper."""
     job = HydraConfig.get()
     folder = Path(job.runtime.output_dir)
@@ -77,6 +92,9 @@ def main(cfg: DictConfig) -> float:
 def run(cfg: DictConfig, folder: Path) -> float:
     """Data, networks, inverse dynamics model, policy, report."""
     torchrl_logger.setLevel("WARNING")
+    versions = ", ".join(f"{name} {each}" for name, each in code_versions().items())
+    log.info(f"{cfg.env.name} {cfg.data.quality}, seed {cfg.seed}, in {folder}")
+    log.info(versions)
     torch.set_num_threads(cfg.trainer.num_threads)
     torch.set_float32_matmul_precision(cfg.trainer.matmul_precision)
     device, autocast = check_hardware(
@@ -97,6 +115,9 @@ def run(cfg: DictConfig, folder: Path) -> float:
     # Networks, and the policy's loss, which holds the inverse dynamics model.
     actor, inverse_dynamics, loss = make_learner(cfg, *sizes, device)
 
+    told = about(cfg, folder) if cfg.logger.kind == "wandb" else {}
+    loggers = make_loggers(folder=folder, **cfg.logger, **told)
+
     # One step of a trainer: sample a batch, compute the losses, go backward on their
     # sum, step the optimizer, move the target networks; log, evaluate and write a
     # checkpoint at their intervals. Both phases have this in common:
@@ -104,7 +125,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
         OfflineTrainer,
         replay_buffer=data.buffer,
         components={"perturbation": perturbation, "observation_norm": data.norm},
-        loggers=make_loggers(folder=folder, **cfg.logger),
+        loggers=loggers,
         log_interval=cfg.trainer.log_interval,
         checkpoint_interval=cfg.trainer.checkpoint_interval,
         checkpoints_kept=cfg.trainer.checkpoints_kept,
@@ -166,7 +187,27 @@ def run(cfg: DictConfig, folder: Path) -> float:
             adversary = instantiate(cfg.perturbation.adversary)
             trainer.register_op("process_optim_batch", partial(adversary, loss))
         trainer.train()
-    return report(cfg, folder, data.mean, trainer)
+    return report(cfg, folder, data.mean, trainer, loggers)
+
+
+def code_versions() -> dict[str, str]:
+    """Versions of the packages, and the commit of a checkout."""
+    commit = run_folder.code_commit()
+    return run_folder.package_versions() | ({"commit": commit} if commit else {})
+
+
+def about(cfg: DictConfig, folder: Path) -> dict[str, Any]:
+    """What W&B shall know of the run: name, group of its seeds, tags, configuration."""
+    began = read_yaml(folder / ".hydra" / "hydra.yaml")["hydra"]
+    data, method = f"{cfg.env.name}-{cfg.data.quality}", began["runtime"]["choices"]
+    sweep = [folder.parent.name] if began["mode"] == "MULTIRUN" else []
+    settings: Any = OmegaConf.to_container(cfg, resolve=True)
+    return {
+        "name": f"{data} {method['loss']} seed{cfg.seed}",
+        "group": f"{data} {method['loss']}",
+        "tags": [cfg.env.name, cfg.data.quality, method["loss"], *sweep],
+        "config": settings | {"versions": code_versions()},
+    }
 
 
 def shuffle_next(batch: TensorDict) -> TensorDict:
@@ -176,14 +217,18 @@ def shuffle_next(batch: TensorDict) -> TensorDict:
 
 
 def report(
-    cfg: DictConfig, folder: Path, data_mean: float | None, trainer: OfflineTrainer
+    cfg: DictConfig,
+    folder: Path,
+    data_mean: float | None,
+    trainer: OfflineTrainer,
+    loggers: list[Logger],
 ) -> float:
     """Write raw returns and the figure, print the table; return the last score."""
     history, best = trainer.history, trainer.best()
     assert best is not None  # there is an evaluation before the first update
     measure = measure_of(best)
     results = {
-        "versions": run_folder.package_versions(),
+        "versions": code_versions(),
         f"data_{measure}": data_mean,
         "last": history[-1],
         "best": best,
@@ -197,6 +242,8 @@ def report(
         title=f"{name}, {type(trainer.loss_module).__name__}, seed {cfg.seed}",
         data_mean=data_mean,
     )
+    rows = {"last": history[-1], "best": best}
+    log_outcome(loggers, cfg, rows, {"curve": folder / "curve.png"})
     print("\n" + score_table(name, history, best, data_mean, folder))
     return float(history[-1][measure])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from tensordict import TensorDict
@@ -19,11 +20,20 @@ from torchrl_osr.data.collect.reference_scores import (
     REFERENCE_RETURNS,
     ReferenceReturns,
 )
+from torchrl_osr.data.read.column_checks import ActionBounds
+from torchrl_osr.data.read.recording import Recording
 from torchrl_osr.data.store.cache import CHUNK_ROWS
 from torchrl_osr.data.store.memmap import is_memmap_folder, load_memmap
 
 RECORDED = ("minari", "d4rl", "file")
 """What ``quality`` may be besides the qualities that are rolled out: our readers."""
+
+WRITTEN = (
+    "which write_memmap has written: its columns are known and its actions lie between "
+    "-1 and 1"
+)
+DISCRETE = "whose actions are numbers of the task's discrete ones"
+"""Why an option has no use."""
 
 
 def load_dataset(
@@ -33,6 +43,9 @@ def load_dataset(
     env_id: str | None = None,
     references: ReferenceReturns | None = None,
     path: str | None = None,
+    columns: Mapping[str, Any] | None = None,
+    action_bounds: ActionBounds | None = None,
+    clip_actions: bool = False,
     download: bool = False,
     progress: bool = True,
     on_disk: bool = False,
@@ -46,14 +59,20 @@ def load_dataset(
             or ``"minari"``, ``"d4rl"`` or ``"file"``, see the loaders of that name.
 
     Keyword Args:
-        env_id: Gymnasium id of the task. The actions of a ``"file"`` are then in its
-            units, and data that do not fit it are refused at once, not at the first
-            evaluation. Default: actions within -1 and 1, not compared.
+        env_id: Gymnasium id of the task; data that do not fit it are then refused at
+            once, not at the first evaluation. Default: not compared.
         references: what recorded episodes are scored by. Default: D4RL's of the name,
             if there are any.
         path: of recorded data: what the reader takes; with ``"file"`` also a folder
             that :func:`~torchrl_osr.data.write_memmap` has written. They are used
             whole.
+        columns: with ``"file"``, the names of the columns, see
+            :func:`~torchrl_osr.data.load_file`; with ``"minari"``, ``observation``
+            alone: the entries of a dictionary. Default: the usual names.
+        action_bounds: what the recording has for the task's lowest and highest action.
+            Default: of ``"minari"`` its action space; otherwise the task's own bounds,
+            or -1 and 1 without ``env_id``.
+        clip_actions: see :func:`~torchrl_osr.data.transitions_from_rows`.
         download: let the reader fetch a set that it knows by name. Default: ``False``.
         progress: show a progress bar when on a terminal. Default: ``True``.
         on_disk: leave the rows memory-mapped. At first use they are written into the
@@ -67,17 +86,19 @@ def load_dataset(
         ``None`` without reference returns or without a complete episode.
 
     Raises:
-        ValueError: a path is missing or has no use, a random share with recorded data,
-            a task of which there are no data to roll out, or data that do not fit it.
+        ValueError: an option is missing or has no use, there are no data of the task
+            to roll out, or the data do not fit it.
     """
+    given = {"columns": _named(columns), "action_bounds": action_bounds, "path": path}
     if quality not in RECORDED:
+        for option, value in given.items():
+            if value:
+                raise ValueError(
+                    f"data.{option}={value} has no use with data={quality}, which is "
+                    f"rolled out; it goes with data={', '.join(RECORDED)}."
+                )
         if env_id is not None:
             _check_rolled_out(env_name, env_id, quality)
-        if path is not None:
-            raise ValueError(
-                f"data.path={path} has no use with data={quality}, which is rolled "
-                f"out; it goes with data={', '.join(RECORDED)}."
-            )
         return load_local_dataset(
             env_name, quality, progress=progress, on_disk=on_disk, **recipe
         )
@@ -88,10 +109,24 @@ def load_dataset(
             f"data.random_share={recipe['random_share']} is for data that are rolled "
             f"out; with data={quality} it must be 0."
         )
-    spec = None if env_id is None else environment_spec(env_id)
-    data, manifest = _load_recorded(quality, path, download, progress, on_disk, spec)
-    if spec is not None and env_id is not None:
-        _check_fit(data, env_id, spec, path)
+    if quality == "file" and is_memmap_folder(path):
+        _refuse_options(path, given, WRITTEN)
+        data, manifest = load_memmap(path)
+        data = data if on_disk else data.clone()
+    else:
+        recording = open_recorded(
+            quality,
+            path,
+            env_id=env_id,
+            columns=columns,
+            action_bounds=action_bounds,
+            clip_actions=clip_actions,
+            download=download,
+            progress=progress and not on_disk,
+        )
+        data, manifest = recording.load(on_disk=on_disk, progress=progress)
+    if env_id is not None:
+        _check_fit(data, env_id, environment_spec(env_id), path)
     mean = (manifest.get("return") or {}).get("mean")
     references = references or REFERENCE_RETURNS.get(env_name)
     score = None if mean is None or references is None else references.score(mean)
@@ -100,6 +135,80 @@ def load_dataset(
         "quality": quality,
         "normalized_score": score,
     }
+
+
+def open_recorded(
+    quality: str,
+    path: str,
+    *,
+    env_id: str | None = None,
+    columns: Mapping[str, Any] | None = None,
+    action_bounds: ActionBounds | None = None,
+    clip_actions: bool = False,
+    download: bool = False,
+    progress: bool = True,
+) -> Recording:
+    """Open recorded data, none of whose rows is read yet; see :func:`load_dataset`."""
+    columns, clip = _named(columns), {"clip_actions": clip_actions}
+    # Each reader needs a library of its own, and only the one that is asked for.
+    if quality == "minari":
+        from torchrl_osr.data.read.minari import open_minari
+
+        if others := columns.keys() - {"observation"}:
+            raise ValueError(
+                f"data.columns.{others.pop()} has no use with data=minari, which has "
+                "its own names; data.columns.observation=[...] takes some entries of a "
+                "dictionary."
+            )
+        return open_minari(
+            path,
+            download=download,
+            observation_keys=columns.get("observation"),
+            action_bounds=action_bounds,
+            progress=progress,
+            **clip,
+        )
+    spec = None if env_id is None else environment_spec(env_id)
+    bounds = action_bounds or _action_bounds(spec)
+    if quality == "file":
+        from torchrl_osr.data.read.files import open_file
+
+        if spec is not None and spec.discrete:
+            _refuse_options(path, {"action_bounds": action_bounds}, DISCRETE)
+            return open_file(path, columns=columns, num_actions=spec.action_size)
+        return open_file(path, columns=columns, action_bounds=bounds, **clip)
+    from torchrl_osr.data.read.d4rl import open_d4rl
+
+    if columns:
+        raise ValueError(
+            "data.columns has no use with data=d4rl, which has D4RL's own names; "
+            "data=file reads HDF5 files with others."
+        )
+    return open_d4rl(
+        path, download=download, action_bounds=bounds, progress=progress, **clip
+    )
+
+
+def _named(columns: Mapping[str, Any] | None) -> dict[str, Any]:
+    """What the user has named; ``None`` stands for the usual names."""
+    return {part: name for part, name in (columns or {}).items() if name is not None}
+
+
+def _refuse_options(path: str, given: Mapping[str, Any], reason: str) -> None:
+    for option in ("columns", "action_bounds"):
+        if given.get(option):
+            raise ValueError(f"data.{option} has no use with {path}, {reason}.")
+
+
+def _action_bounds(spec: EnvironmentSpec | None) -> ActionBounds:
+    """Bounds of the task's actions in its own units; -1 and 1 without a task."""
+    if spec is None or spec.action_low is None or spec.action_high is None:
+        return -1.0, 1.0
+    # As numbers where they are the same for all: data of another size are told as such.
+    low, high = ({*bound} for bound in (spec.action_low, spec.action_high))
+    if len(low) == len(high) == 1:
+        return low.pop(), high.pop()
+    return spec.action_low, spec.action_high
 
 
 def _check_rolled_out(env_name: str, env_id: str, quality: str) -> None:
@@ -115,42 +224,6 @@ def _check_rolled_out(env_name: str, env_id: str, quality: str) -> None:
             f"data={quality} is rolled out for the task {name}: leave out "
             f"env.name={env_name}, or bring data of your own with data=file."
         )
-
-
-def _load_recorded(
-    quality: str,
-    path: str,
-    download: bool,
-    progress: bool,
-    on_disk: bool,
-    spec: EnvironmentSpec | None,
-) -> tuple[TensorDict, dict[str, Any]]:
-    # Each reader needs a library of its own, and only the one that is asked for.
-    if quality == "minari":
-        from torchrl_osr.data.read.minari import load_minari
-
-        return load_minari(path, download=download, progress=progress, on_disk=on_disk)
-    if quality == "d4rl":
-        from torchrl_osr.data.read.d4rl import load_d4rl
-
-        return load_d4rl(path, download=download, progress=progress, on_disk=on_disk)
-    if is_memmap_folder(path):
-        data, manifest = load_memmap(path)
-        return data if on_disk else data.clone(), manifest
-    from torchrl_osr.data.read.files import load_file
-
-    actions: dict[str, Any] = {}
-    if spec is not None and spec.discrete:
-        actions = {"num_actions": spec.action_size}
-    elif spec is not None:
-        # As numbers where all are alike: then what has another size is told as such.
-        low, high = (
-            bound[0] if len({*bound}) == 1 else bound
-            for bound in (spec.action_low, spec.action_high)
-            if bound is not None
-        )
-        actions = {"action_bounds": (low, high)}
-    return load_file(path, **actions, progress=progress, on_disk=on_disk)
 
 
 def _check_fit(data: TensorDict, env_id: str, spec: EnvironmentSpec, path: str) -> None:

@@ -10,12 +10,14 @@ from __future__ import annotations
 import functools
 import inspect
 import operator
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, make_dataclass
 from types import NoneType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from hydra.core.config_store import ConfigStore
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import MISSING, OmegaConf
 
 from torchrl_osr import objectives
@@ -50,6 +52,31 @@ class EnvConfig:
 
 
 @dataclass
+class ColumnsConfig:
+    """Names of a file's columns; null for the usual names, see docs/your_data.md.
+
+    Attributes:
+        observation: a name, a pattern such as ``obs_*``, or a list of names.
+        action: likewise.
+        reward: a name.
+        terminated: a name, or false if nothing ever ends the task.
+        truncated: a name.
+        episode: a name; the numbers or texts in it tell episodes apart.
+        step: a name; rows of an episode are sorted by it.
+        next_observation: as observation.
+    """
+
+    observation: Any = None
+    action: Any = None
+    reward: str | None = None
+    terminated: Any = None
+    truncated: str | None = None
+    episode: str | None = None
+    step: str | None = None
+    next_observation: Any = None
+
+
+@dataclass
 class DataConfig:
     """Which data set: rolled out from the packaged behaviour policies, or recorded.
 
@@ -57,6 +84,11 @@ class DataConfig:
         quality: of the behaviour: random, medium, medium-replay, medium-expert or
             expert; diverse or play in a maze; minari, d4rl or file for recorded data.
         path: recorded data to read, see docs/your_data.md.
+        columns: what the columns of a file are called.
+        action_bounds: lowest and highest action as the recording has them, two numbers
+            or two lists; null for those of the environment, or of a Minari set.
+        clip_actions: bring recorded actions that are outside of their bounds back to
+            them, as many environments do, rather than refuse them.
         download: fetch the set that path names.
         num_transitions: number of rows.
         seed: random seed of the roll-outs and of the held-out rows.
@@ -72,6 +104,9 @@ class DataConfig:
 
     quality: str = MISSING
     path: str | None = None
+    columns: ColumnsConfig = field(default_factory=ColumnsConfig)
+    action_bounds: Any = None
+    clip_actions: bool = MISSING
     download: bool = MISSING
     num_transitions: int = MISSING
     seed: int = MISSING
@@ -267,6 +302,24 @@ class CollectConfig:
     progress: bool = MISSING
 
 
+@dataclass
+class CheckDataConfig:
+    """Everything that ``torchrl-osr data`` reads.
+
+    Attributes:
+        env: the task that the data are of; none is needed.
+        data: which data, as in ``torchrl-osr train``.
+        picture: where the picture goes; null for ``<name of the data>-data.png`` in the
+            current folder.
+        progress: show progress bars when on a terminal.
+    """
+
+    env: EnvConfig = field(default_factory=EnvConfig)
+    data: DataConfig = field(default_factory=DataConfig)
+    picture: str | None = None
+    progress: bool = MISSING
+
+
 def schema_of(target: type) -> type:
     """A structured config with the keyword options of ``target``.
 
@@ -301,6 +354,8 @@ def _keyword_options(target: type) -> Iterator[tuple[inspect.Parameter, Any]]:
         parameters = inspect.signature(initialize).parameters.values()
         is_dataclass = "__dataclass_fields__" in vars(each)
         for parameter in parameters:
+            if parameter.name in ("action_spec", "gamma"):
+                continue  # An object of Python, and what every loss refuses.
             if parameter.kind is parameter.KEYWORD_ONLY or (
                 is_dataclass and parameter.default is not parameter.empty
             ):
@@ -334,23 +389,62 @@ def _environment_name(env_id: str) -> str:
 def register() -> None:
     """Make schemas and resolvers known to Hydra.
 
-    ``train_schema``, ``collect_schema``, and in the group ``schema`` one for each class
-    of :mod:`torchrl_osr.objectives`; ``environment_name``, the short name of a task;
-    ``run_dir``, by which ``resume=folder`` becomes the run's folder, and ``job_dir``,
-    which names a sweep's folders.
+    ``train_schema``, ``check_data_schema``, ``collect_schema``, and in the group
+    ``schema`` one for each class of :mod:`torchrl_osr.objectives`;
+    ``environment_name``, the short name of a task; ``run_dir``, by which
+    ``resume=folder`` becomes the run's folder; ``hydra_dir``, by which a continued run
+    keeps what Hydra wrote when it began; and ``job_dir``, see :func:`job_folder`.
     """
     store = ConfigStore.instance()
     store.store(name="train_schema", node=TrainConfig)
+    store.store(name="check_data_schema", node=CheckDataConfig)
     store.store(name="collect_schema", node=CollectConfig)
     for name in set(objectives.__all__) - {"BaseLoss"}:
         schema = schema_of(getattr(objectives, name))
         store.store(group="schema", name=name, node=schema)
-    OmegaConf.register_new_resolver("environment_name", _environment_name, replace=True)
-    OmegaConf.register_new_resolver(
-        "run_dir", lambda resume, fresh: resume or fresh, replace=True
-    )
-    OmegaConf.register_new_resolver(
-        "job_dir",
-        lambda number, overrides: f"{number}_{overrides}"[:MAX_FOLDER_NAME],
-        replace=True,
-    )
+    resolvers: dict[str, Callable[..., Any]] = {
+        "environment_name": _environment_name,
+        "run_dir": lambda resume, fresh: resume or fresh,
+        "hydra_dir": lambda resume: None if resume else ".hydra",
+        "job_dir": job_folder,
+    }
+    for name, resolver in resolvers.items():
+        OmegaConf.register_new_resolver(name, resolver, replace=True)
+
+
+def job_folder(number: int, overrides: str) -> str:
+    """Name of a sweep's job: its number, which is unique, and its overrides.
+
+    Letters, digits and ``._-`` alone: neither a shell nor Hydra needs quotes for it.
+
+    Examples:
+        >>> from torchrl_osr.experiment.schema import job_folder
+        >>> job_folder(3, "loss=cql,trainer.steps=200,seed=1")
+        '3_loss-cql_steps-200_seed-1'
+    """
+    last_keys = re.sub(r"[\w.]+\.(\w+=)", r"\1", overrides)
+    words = re.sub(r"[^A-Za-z0-9._=,-]+", " ", last_keys)
+    pairs = re.sub(r" *([=,]) *", r"\1", words).strip(" .=,-_")
+    plain = pairs.translate(str.maketrans("=, ", "-_-"))
+    return f"{number}_{plain}"[:MAX_FOLDER_NAME] if plain else str(number)
+
+
+def named_by_what_differs(arguments: Sequence[str]) -> list[str]:
+    """Override that leaves out of :func:`job_folder` what all jobs of a sweep share.
+
+    Args:
+        arguments: the command line.
+
+    Returns:
+        Nothing where there is no sweep.
+
+    Raises:
+        OverrideParseException: an override makes no sense.
+    """
+    if not {"-m", "--multirun"} & set(arguments):
+        return []
+    given = [each for each in arguments if "=" in each and not each.startswith("-")]
+    parsed = OverridesParser.create().parse_overrides(given)
+    shared = [each.key_or_group for each in parsed if not each.is_sweep_override()]
+    keys = [key for key in shared if not key.startswith("hydra")]
+    return [f"hydra.job.config.override_dirname.exclude_keys=[{','.join(keys)}]"]

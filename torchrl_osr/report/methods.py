@@ -14,6 +14,7 @@ from pathlib import Path
 import pandas as pd
 
 from torchrl_osr.report.runs import QUALITY, LeftOut, read_each
+from torchrl_osr.report.scores import counted
 
 IGNORED = (
     "resume",
@@ -206,7 +207,7 @@ def comparison_notes(tables: RunTables) -> list[str]:
             notes.append(f"Mixed versions: {', '.join(found)}.")
     silent = runs["versions"].str.len() == 0
     if silent.any():
-        notes.append(f"No versions are recorded of {silent.sum()} runs.")
+        notes.append(f"No versions are recorded of {counted(silent.sum(), 'run')}.")
     settings = comparable(tables.settings).assign(data_score=runs["data_score"])
     for data, group in runs.groupby("data", sort=False):
         facts = settings.loc[group.index]

@@ -28,6 +28,7 @@ from torchrl_osr.report.scores import (
     Estimate,
     WayBack,
     by_run,
+    counted,
     decimal,
     disturbed,
     estimate,
@@ -129,6 +130,7 @@ def write_report(
         lstrip_blocks=True,
     )
     environment.filters |= {"groups": groups, "slug": slug, "base64": _base64}
+    environment.filters["counted"] = counted
     folder.mkdir(parents=True, exist_ok=True)
     for name, picture in pictures.items():
         write_atomically(folder / f"{name}.png", picture)

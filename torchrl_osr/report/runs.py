@@ -108,7 +108,7 @@ def read_each(paths: Sequence[Path]) -> tuple[list[Run], list[LeftOut]]:
             runs.append(run)
             left_out.extend(run.unusable)
 
-    for folder in _folders(path for path in paths if not path.is_file()):
+    for folder in find_runs(path for path in paths if not path.is_file()):
         add(str(folder), partial(read_record, folder))
     for table in (path for path in paths if path.is_file()):
         try:
@@ -134,7 +134,7 @@ def pack_runs(folders: Iterable[Path], table: Path) -> int:
         ValueError: if there is no run, or one that is not finished or makes no sense,
             naming it.
     """
-    found = _folders(folders)
+    found = find_runs(folders)
     if not found:
         raise ValueError("there is no run in the folders.")
     above = os.path.commonpath([folder.absolute().parent for folder in found])
@@ -263,8 +263,12 @@ def parse_run(record: Mapping[str, Any]) -> Run:
     )
 
 
-def _folders(tops: Iterable[Path]) -> list[Path]:
-    """Folders of runs in or below the folders, each once, in the order of paths."""
+def find_runs(tops: Iterable[Path]) -> list[Path]:
+    """Folders of runs in or below the folders, each once, in the order of paths.
+
+    Raises:
+        FileNotFoundError: if one of the folders does not exist.
+    """
     found: dict[Path, Path] = {}
     for top in tops:
         if not top.exists():
