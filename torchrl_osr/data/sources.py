@@ -28,13 +28,6 @@ from torchrl_osr.data.store.memmap import is_memmap_folder, load_memmap
 RECORDED = ("minari", "d4rl", "file")
 """What ``quality`` may be besides the qualities that are rolled out: our readers."""
 
-WRITTEN = (
-    "which write_memmap has written: its columns are known and its actions lie between "
-    "-1 and 1"
-)
-DISCRETE = "whose actions are numbers of the task's discrete ones"
-"""Why an option has no use."""
-
 
 def load_dataset(
     env_name: str,
@@ -59,8 +52,9 @@ def load_dataset(
             or ``"minari"``, ``"d4rl"`` or ``"file"``, see the loaders of that name.
 
     Keyword Args:
-        env_id: Gymnasium id of the task; data that do not fit it are then refused at
-            once, not at the first evaluation. Default: not compared.
+        env_id: Gymnasium id of the task. The actions of a ``"file"`` are then in its
+            units, and data that do not fit it are refused at once, not at the first
+            evaluation. Default: actions within -1 and 1, not compared.
         references: what recorded episodes are scored by. Default: D4RL's of the name,
             if there are any.
         path: of recorded data: what the reader takes; with ``"file"`` also a folder
@@ -111,7 +105,7 @@ def load_dataset(
         )
     spec = None if env_id is None else environment_spec(env_id)
     if quality == "file" and is_memmap_folder(path):
-        _refuse_options(path, given, WRITTEN)
+        _refuse_options(path, given)
         data, manifest = load_memmap(path)
         data = data if on_disk else data.clone()
     else:
@@ -207,10 +201,13 @@ def _named(columns: Mapping[str, Any] | None) -> dict[str, Any]:
     return {part: name for part, name in (columns or {}).items() if name is not None}
 
 
-def _refuse_options(path: str, given: Mapping[str, Any], reason: str) -> None:
+def _refuse_options(path: str, given: Mapping[str, Any]) -> None:
     for option in ("columns", "action_bounds"):
-        if given.get(option):
-            raise ValueError(f"data.{option} has no use with {path}, {reason}.")
+        if given[option]:
+            raise ValueError(
+                f"data.{option} has no use with {path}, which write_memmap has "
+                "written: its columns are known and its actions lie between -1 and 1."
+            )
 
 
 def _actions(
