@@ -39,7 +39,7 @@ def test_version_names_what_decides_the_numbers(capsys):
 
 
 def test_unknown_command_is_told_which_there_are():
-    with pytest.raises(SystemExit, match=r"no command 'trian'; it has train, "):
+    with pytest.raises(SystemExit, match=r"no command 'trian'; it has data, train, "):
         main(["trian"])
 
 
