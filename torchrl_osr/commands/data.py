@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 from torchrl import torchrl_logger
 
-from torchrl_osr.commands import CONF
+from torchrl_osr.commands import CONF, import_from_here
 from torchrl_osr.commands.console import single_job
 from torchrl_osr.data import RECORDED, environment_spec, load_dataset, make_environment
 from torchrl_osr.data.overview import (
@@ -51,6 +51,8 @@ def main(cfg: DictConfig) -> None:
     run_folder.check_keys(cfg.data)
     env_id = None if OmegaConf.is_missing(cfg.env, "id") else str(cfg.env.id)
     env_name = None if env_id is None else cfg.env.get("name")
+    if env_id is not None and ":" in env_id:
+        import_from_here()
     options: Any = OmegaConf.to_container(cfg.data)
     read = ("columns", "action_bounds", "clip_actions", "download")
     reading = {name: options[name] for name in read}
