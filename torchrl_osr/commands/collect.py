@@ -2,7 +2,7 @@
 
     torchrl-osr collect env.id=Pendulum-v1 path=pendulum.npz
     torchrl-osr collect env.id=Pendulum-v1 policy=my_package:act path=pendulum.npz
-    torchrl-osr collect policy=outputs/Pendulum-v1-file/seed0-... path=better.parquet
+    torchrl-osr collect policy=outputs/Pendulum-v1-file/osr-seed0-... path=new.npz
 
 The log is what ``torchrl-osr train data=file`` reads. See docs/any_environment.md.
 """

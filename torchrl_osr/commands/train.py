@@ -77,11 +77,12 @@ def train(cfg: DictConfig) -> float:
     """Do or continue one run; return its last score or return, for a sweeper."""
     job = HydraConfig.get()
     folder = Path(job.runtime.output_dir)
-    if cfg.resume is not None:
+    fresh = cfg.resume is None
+    if not fresh:
         cfg = run_folder.saved_config(folder, job.overrides.task)
     if ":" in cfg.env.id:
         import_from_here()
-    if cfg.resume is None:
+    if fresh:
         run_folder.check_keys(cfg)
         read_environment(cfg)
     run_folder.claim(folder, cfg)
