@@ -12,7 +12,13 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from torchrl_osr.experiment import schema as config
-from torchrl_osr.experiment.run_config import check_targets, read_config, read_yaml
+from torchrl_osr.experiment.run_config import (
+    check_run,
+    check_targets,
+    read_config,
+    read_run,
+    read_yaml,
+)
 
 CONF = Path(__file__).parents[2] / "conf"
 OPTIONS = [
@@ -22,15 +28,48 @@ OPTIONS = [
 ]
 
 
-@pytest.mark.parametrize("option", OPTIONS)
-def test_every_configuration_of_ours_is_let_through(tmp_path, option):
+def composed(*overrides: str):
     config.register()
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        cfg = compose("train", [option])
-    OmegaConf.save(cfg, tmp_path / "config.yaml", resolve=True)
-    again = read_config(tmp_path / "config.yaml")
+        return compose("train", list(overrides))
+
+
+@pytest.mark.parametrize(
+    "option", [*OPTIONS, "+inverse_dynamics.network.low=-2.0", "preset=antmaze"]
+)
+def test_every_configuration_of_ours_is_let_through(tmp_path, option):
+    OmegaConf.save(composed(option), tmp_path / "config.yaml", resolve=True)
+    again = read_run(tmp_path / "config.yaml")
     assert again == OmegaConf.load(tmp_path / "config.yaml")
-    check_targets(again)
+
+
+@pytest.mark.parametrize(
+    "key", ["trainer.foo", "foo", "loss.recovery_wieght", "inverse_dynamics.loss.foo"]
+)
+def test_keys_that_were_added_are_refused(key):
+    with pytest.raises(ValueError, match=f"there is no key {key}: docs"):
+        check_run(composed(f"+{key}=1"))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "reason"),
+    [
+        ("trainer.steps", "many", "'many' of type 'str' could not be converted"),
+        ("trainer", 3, "int is not a subclass"),
+        ("seed", [1], "could not be converted to Integer"),
+        ("loss", 3, "loss must have options and a _target_, got 3"),
+        ("loss._target_", "torchrl_osr.objectives", "is none of"),
+        ("perturbation.adversary", "yes", "must have options and a _target_"),
+        ("env.id", "???", "it lacks env.id"),
+        ("data.held_out", float("nan"), "held_out must be between 0 and 1, got nan"),
+    ],
+)
+def test_what_is_wrong_with_somebodys_run_is_named(tmp_path, key, value, reason):
+    cfg = OmegaConf.create(OmegaConf.to_container(composed(), resolve=True))
+    OmegaConf.update(cfg, key, value, merge=False)
+    OmegaConf.save(cfg, tmp_path / "config.yaml")
+    with pytest.raises(ValueError, match=rf"config\.yaml: .*{reason}"):
+        read_run(tmp_path / "config.yaml")
 
 
 @pytest.mark.parametrize(

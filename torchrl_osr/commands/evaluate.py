@@ -43,6 +43,8 @@ from torchrl_osr.evaluation import (
 )
 from torchrl_osr.experiment import run_folder
 from torchrl_osr.experiment.build import load_data
+from torchrl_osr.experiment.limits import check_values
+from torchrl_osr.experiment.run_config import flatten
 from torchrl_osr.experiment.suite import make_disturbances, register
 from torchrl_osr.experiment.trained_run import (
     checkpoints_of,
@@ -59,6 +61,7 @@ register()
 @hydra.main(f"{CONF}/evaluation", "evaluate", version_base="1.3")
 def main(cfg: DictConfig) -> None:
     """Evaluate, unless the result is there already, and print the table."""
+    check_values(flatten(OmegaConf.to_container(cfg, resolve=True)))
     torchrl_logger.setLevel("WARNING")
     torch.set_num_threads(cfg.num_threads)
     if min(cfg.last, cfg.episodes - 1) < 1:
@@ -126,7 +129,7 @@ def evaluate(
     cfg: DictConfig, files: list[Path], partial: Path, request: dict[str, Any]
 ) -> dict[str, Any]:
     """Play all checkpoints of one run, except those that ``partial`` has already."""
-    run = load_trained(files[0]).config
+    run = load_trained(files[0], trust=cfg.trust).config
     data, _ = load_data(run, progress=cfg.progress)
     distance = DataDistance(data, seed=run.data.seed)
     _, scale = observation_statistics(data)
@@ -144,7 +147,7 @@ def evaluate(
     )
     with bar:
         for number in range(len(evaluations), len(files)):
-            trained = load_trained(files[number])
+            trained = load_trained(files[number], trust=cfg.trust)
             seed = cfg.seed + SEED_STRIDE * number
             paired = evaluate_paired(
                 deterministic_policy(trained.actor, trained.observation_norm),

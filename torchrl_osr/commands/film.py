@@ -47,6 +47,8 @@ from torchrl_osr.data import (
 from torchrl_osr.envs import ActionKnock, ExternalPush
 from torchrl_osr.evaluation import DataDistance, Policy, Wrap, deterministic_policy
 from torchrl_osr.experiment.build import load_data
+from torchrl_osr.experiment.limits import check_values
+from torchrl_osr.experiment.run_config import flatten
 from torchrl_osr.experiment.trained_run import TrainedRun, load_trained
 from torchrl_osr.film import (
     BEHAVIOR,
@@ -70,9 +72,10 @@ MODEL, RULES = "inverse dynamics, ", ("time", "nearest")
 @hydra.main(version_base="1.3", config_path=f"{CONF}/evaluation", config_name="film")
 def main(cfg: DictConfig) -> None:
     """Play all episodes with every controller, print the table, film one of them."""
+    check_values(flatten(OmegaConf.to_container(cfg, resolve=True)))
     torchrl_logger.setLevel("WARNING")
     torch.set_num_threads(cfg.num_threads)
-    trained = load_trained(cfg.checkpoint)
+    trained = load_trained(cfg.checkpoint, trust=cfg.trust)
     run = trained.config
     camera = Camera(make_environment(run.env.id), 224)  # fails before the work
     data, _ = load_data(run, progress=False)

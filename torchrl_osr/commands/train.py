@@ -39,8 +39,9 @@ from torchrl_osr.evaluation import (
     summarize,
 )
 from torchrl_osr.experiment import run_folder, schema
-from torchrl_osr.experiment.build import make_learner
+from torchrl_osr.experiment.build import check_parts, make_learner
 from torchrl_osr.experiment.loggers import make_loggers
+from torchrl_osr.experiment.run_config import check_run
 from torchrl_osr.experiment.training_data import load_training_data
 from torchrl_osr.trainers import OfflineTrainer, check_hardware, largest_value
 
@@ -54,10 +55,10 @@ def main(cfg: DictConfig) -> float:
     """Do or continue one run in its folder; return its last score, for a sweeper."""
     job = HydraConfig.get()
     folder = Path(job.runtime.output_dir)
-    if cfg.resume is None:
-        run_folder.check_keys(cfg)
-    else:
+    trust = cfg.trust  # by the command line, not by a run's folder
+    if cfg.resume is not None:
         cfg = run_folder.saved_config(folder, job.overrides.task)
+    check_run(cfg, trust)
     run_folder.claim(folder, cfg)
     with run_folder.status(folder):
         return run(cfg, folder)
@@ -71,7 +72,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
     device, autocast = check_hardware(
         cfg.trainer.device, cfg.trainer.precision, cudagraph=cfg.trainer.cudagraph
     )
-    make_learner(cfg, 1, 1)  # a wrong option of the loss stops here, not after the data
+    check_parts(cfg, 1, 1)
 
     # Transitions with standardised states. Each batch gets a perturbed state for every
     # state, which is the paper's mixed data set.
@@ -131,6 +132,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
         {"params": critic_params, "lr": cfg.optim.qvalue_lr},
         {"params": policy_params, "lr": cfg.optim.actor_lr},
     ]
+    targets = SoftUpdate(loss, tau=cfg.optim.tau) if loss.delay_qvalue else None
     limit = largest_value(data.largest_reward, cfg.optim.gamma)
     episodes = {"num_episodes": cfg.trainer.eval_episodes, "seed": EVALUATION_SEED}
     policy = deterministic_policy(actor, data.norm)
@@ -141,7 +143,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
             total_steps=cfg.trainer.steps,
             folder=folder / "checkpoint" / "policy",
             seed=cfg.seed + 1,
-            target_net_updater=SoftUpdate(loss, tau=cfg.optim.tau),
+            target_net_updater=targets,
             evaluate=lambda: summarize(play(policy), cfg.env.name),
             metric=("score", "max"),
             eval_interval=cfg.trainer.eval_interval,

@@ -210,6 +210,8 @@ class TrainConfig:
         seed: random seed of networks, sampling and noise.
         num_random: value of ``loss.num_random`` for the losses with CQL's term.
         resume: folder of a killed run to continue.
+        trust: modules of your own, whose losses, networks and environments may be
+            named, see docs/extend.md.
     """
 
     env: EnvConfig = field(default_factory=EnvConfig)
@@ -226,6 +228,7 @@ class TrainConfig:
     seed: int = MISSING
     num_random: int = MISSING
     resume: str | None = None
+    trust: list[str] = field(default_factory=list)
 
 
 def schema_of(target: type) -> type:
