@@ -114,7 +114,9 @@ def test_the_crafted_configuration_would_work(tmp_path):
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("a: &a [1, 1]\nb: [*a, *a]\n", "aliases"),
+        ("a: &a [1, 1]\nb: [*a, *a]\n", "tags or aliases"),
+        ("a: !!int ''", "tags or aliases"),
+        ("a: !!python/object/apply:os.system [x]", "tags or aliases"),
         ("loss: '${oc.create:\"{_target_: os.mkdir}\"}'", "has the interpolation"),
         ('loss: "\\x24{oc.env:HOME}"', "has the interpolation"),
         ("- a\n", "holds no mapping"),

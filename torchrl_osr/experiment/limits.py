@@ -18,7 +18,7 @@ from omegaconf import DictConfig
 
 from torchrl_osr._checks import check_choice
 
-LARGEST = 1e9
+LARGEST = 10**9
 """Largest magnitude of a number for which :data:`RANGES` has no other."""
 
 # NumPy's seeds, torch's and Gymnasium's all go that far.
@@ -78,11 +78,18 @@ CHOICES: dict[str, tuple[str | None, ...]] = {
 }
 """Words that a key may have as its value."""
 
+PATTERNS = {
+    "trainer.device": (r"cpu|cuda(:\d+)?", "cpu, cuda or cuda:<number>"),
+    "suite.name": (r"[\w.-]+", "a part of a file's name"),
+}
+"""What the value of a key must match, and in words."""
+
 
 def check_values(values: Mapping[str, Any]) -> None:
     """Raise a ValueError that names the key unless every value is one that it may have.
 
-    Numbers are finite and in :data:`RANGES`, words in :data:`CHOICES`.
+    Numbers are finite and in :data:`RANGES`, words in :data:`CHOICES` or as in
+    :data:`PATTERNS`.
 
     Args:
         values: by dotted key, see :func:`~torchrl_osr.experiment.run_config.flatten`.
@@ -104,10 +111,9 @@ def check_values(values: Mapping[str, Any]) -> None:
                 )
         if key in CHOICES:
             check_choice(key, value, CHOICES[key])
-        if key == "trainer.device" and not re.fullmatch(r"cpu|cuda(:\d+)?", value):
-            raise ValueError(
-                f"{key} must be cpu, cuda or cuda:<number>, got {value!r}."
-            )
+        pattern, meaning = PATTERNS.get(key, ("", ""))
+        if pattern and not re.fullmatch(pattern, value):
+            raise ValueError(f"{key} must be {meaning}, got {value!r}.")
 
 
 def check_networks(

@@ -136,23 +136,22 @@ def read_yaml(path: Path) -> Any:
     Raises:
         OSError: if it cannot be read.
         ValueError: naming the file, if it is no YAML, has more than 64 KiB or 32 levels
-            of nesting, or has aliases, which no run writes and a few of which can fill
-            the memory.
+            of nesting, or has tags or aliases, which no run writes and a few of which
+            can fill the memory.
     """
     text = read_text(path, max_bytes=MAX_CONFIG_BYTES)
     try:
         _check_yaml(text)
         return OmegaConf.to_container(OmegaConf.create(text))
-    # PyYAML's constructors raise what Python's own do: "!!bool x" is a KeyError.
-    except (yaml.YAMLError, OmegaConfBaseException, KeyError, ValueError) as error:
+    except (yaml.YAMLError, OmegaConfBaseException, ValueError) as error:
         raise ValueError(f"{path.name} {' '.join(str(error).split())}") from error
 
 
 def _check_yaml(text: str) -> None:
     depth = 0
     for event in yaml.parse(text):  # without recursion, and only as far as needed
-        if isinstance(event, yaml.AliasEvent):
-            raise ValueError("has YAML aliases, which no run writes")
+        if isinstance(event, yaml.AliasEvent) or getattr(event, "tag", None):
+            raise ValueError("has YAML tags or aliases, which no run writes")
         depth += isinstance(event, yaml.CollectionStartEvent)
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if depth > MAX_CONFIG_DEPTH:
