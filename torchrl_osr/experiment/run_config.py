@@ -21,7 +21,7 @@ from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
 
 from torchrl_osr._files import read_text
 from torchrl_osr.experiment.limits import check_values
-from torchrl_osr.experiment.schema import TrainConfig, schema_of
+from torchrl_osr.experiment.schema import TargetConfig, TrainConfig, schema_of
 
 # Those of our runs have 4 kB and four levels of nesting. PyYAML needs two seconds for
 # 64 kB, and deep nesting exhausts Python's stack.
@@ -90,9 +90,9 @@ def check_run(config: DictConfig, trust: Sequence[str] = ()) -> DictConfig:
 def _schema(config: DictConfig) -> DictConfig:
     """What a configuration must look like: a loss of ours has its own options."""
     schema: DictConfig = OmegaConf.structured(TrainConfig)
-    for key in ("network.actor", "inverse_dynamics.network"):
-        # Of a function only the name is in the schema.
-        OmegaConf.set_struct(OmegaConf.select(schema, key), False)
+    for node in (*schema.network.values(), *schema.inverse_dynamics.values()):
+        if OmegaConf.get_type(node) is TargetConfig:  # the function has keys of its own
+            OmegaConf.set_struct(node, False)
     for key in ("loss", "inverse_dynamics.loss", "perturbation.adversary"):
         options = OmegaConf.select(config, key)
         if options is None and key == "perturbation.adversary":
