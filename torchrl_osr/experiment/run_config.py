@@ -44,12 +44,12 @@ def read_run(path: Path, trust: Sequence[str] = ()) -> DictConfig:
         ValueError: naming the file, if :func:`read_config` or :func:`check_run` refuses
             it.
     """
-    config = read_config(path)
     try:
-        return check_run(config, trust)
+        return check_run(read_config(path), trust)
     except ValueError as error:
         raise ValueError(
-            f"{path}: {error} Take the file that torchrl-osr train has written."
+            f"{path}: {str(error).removesuffix('.')}. Take the file that torchrl-osr "
+            "train has written."
         ) from error
 
 
@@ -90,9 +90,11 @@ def check_run(config: DictConfig, trust: Sequence[str] = ()) -> DictConfig:
 def _schema(config: DictConfig) -> DictConfig:
     """What a configuration must look like: a loss of ours has its own options."""
     schema: DictConfig = OmegaConf.structured(TrainConfig)
-    for node in (*schema.network.values(), *schema.inverse_dynamics.values()):
-        if OmegaConf.get_type(node) is TargetConfig:  # the function has keys of its own
-            OmegaConf.set_struct(node, False)
+    for group in (schema.network, schema.inverse_dynamics):
+        for key in group:
+            if OmegaConf.get_type(group, key) is TargetConfig:
+                # The function has keys of its own.
+                OmegaConf.set_struct(group[key], False)
     for key in ("loss", "inverse_dynamics.loss", "perturbation.adversary"):
         options = OmegaConf.select(config, key)
         if options is None and key == "perturbation.adversary":

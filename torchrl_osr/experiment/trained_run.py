@@ -110,7 +110,10 @@ def load_trained(path: Path | str, *, trust: Sequence[str] = ()) -> TrainedRun:
     path = checkpoints_of(path)[-1] if Path(path).is_dir() else Path(path)
     damage = find_damage(path)
     if damage is not None:
-        raise CheckpointError(f"checkpoint {path} is damaged: {damage}.")
+        raise CheckpointError(
+            f"checkpoint {path} is damaged: {damage}. Take another one of the run, or "
+            "a whole copy."
+        )
     config = read_run(folder / CONFIG, trust)
     environment = make_environment(config.env.id)
     (observation_size,) = environment.observation_space.shape or (0,)
