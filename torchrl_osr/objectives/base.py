@@ -330,6 +330,12 @@ class BaseLoss(LossModule):
             f"{tuple(tensordict.batch_size)}."
         )
 
+    def _rows_weigh_alike(self, tensordict: TensorDictBase) -> bool:
+        """Whether a reduced loss has the same derivative by every row's term."""
+        masked = any(key in tensordict for key in self._loss_mask_keys())
+        weighted = self._weights(tensordict) is not None
+        return self.reduction != "none" and not (masked or weighted)
+
     def _reduce(
         self, value: Tensor, tensordict: TensorDictBase, valid: Tensor | None = None
     ) -> Tensor:

@@ -374,6 +374,8 @@ class OSRLoss(BaseLoss):
                 log_prob,
                 temperature=self.temperature,
                 chunk_size=self.chunk_size,
+                equal_rows=self.clip_diff_min == -math.inf
+                and self._rows_weigh_alike(step.tensordict),
             )
             return self._data_qvalue(step), soft_maximum
         # One pass of the critics for the data's action and all proposals.
