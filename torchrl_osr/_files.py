@@ -90,7 +90,7 @@ def read_text(path: Path, *, max_bytes: int = MAX_JSON_BYTES) -> str:
         OSError: it cannot be read.
         ValueError: it is too large, not UTF-8, or no file.
     """
-    refuse_pipe(path)
+    refuse_other_than_files(path)
     with path.open("rb") as file:
         # Not its size: a file may grow.
         content = file.read(max_bytes + 1)
@@ -102,13 +102,13 @@ def read_text(path: Path, *, max_bytes: int = MAX_JSON_BYTES) -> str:
         raise ValueError(f"{path.name} is no text: {error}") from error
 
 
-def refuse_pipe(path: Path) -> None:
-    """Raise a ValueError if a path is a named pipe or a device.
+def refuse_other_than_files(path: Path) -> None:
+    """Raise a ValueError if a path is a folder, a named pipe or a device.
 
-    To open one waits for its other end, perhaps for ever.
+    To open a pipe waits for its other end, perhaps for ever.
     """
-    if path.exists() and not path.is_file() and not path.is_dir():
-        raise ValueError(f"{path} is no file but a pipe or a device")
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{path} is a folder, a pipe or a device; a file was expected")
 
 
 def read_json(path: Path, *, max_bytes: int = MAX_JSON_BYTES) -> dict[str, Any]:
@@ -141,7 +141,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
             than :func:`check_unpacked_size` allows; the message names the file.
     """
     try:
-        refuse_pipe(path)
+        refuse_other_than_files(path)
         with path.open("rb") as file:
             if file.read(len(MAGIC_PREFIX)) == MAGIC_PREFIX:
                 raise ValueError("it is a single array")

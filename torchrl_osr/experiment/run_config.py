@@ -81,7 +81,13 @@ def check_run(config: DictConfig, trust: Sequence[str] = ()) -> DictConfig:
         what = str(error).split("\n")[0]
         raise ValueError(f"{error.full_key or 'a group'}: {what}.") from error
     assert isinstance(typed, DictConfig)
-    if missing := OmegaConf.missing_keys(typed):
+    # Of what a policy is not built from, a run of an older version may lack some.
+    missing = {
+        key
+        for key in OmegaConf.missing_keys(typed)
+        if not key.startswith(("trainer.", "logger."))
+    }
+    if missing:
         raise ValueError(f"it lacks {', '.join(sorted(missing))}.")
     check_values(flatten(OmegaConf.to_container(typed)))
     return typed

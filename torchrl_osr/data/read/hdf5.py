@@ -9,7 +9,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from torchrl_osr._files import check_unpacked_size, refuse_pipe
+from torchrl_osr._files import check_unpacked_size, refuse_other_than_files
 from torchrl_osr.data.read.recording import ReadRows
 
 try:
@@ -69,7 +69,7 @@ def check_hdf5(path: Path) -> None:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[h5py.File]:
-    refuse_pipe(path)
+    refuse_other_than_files(path)
     try:
         with h5py.File(path, "r") as file:
             yield file
