@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import time
 from pathlib import Path
 
@@ -98,6 +99,52 @@ def test_no_module_is_imported_for_an_environment():
     cfg = OmegaConf.create({"env": {"id": "mine.evil:Hopper-v5"}})
     with pytest.raises(ValueError, match=r"mine\.evil:Hopper-v5 imports a module"):
         check_targets(cfg)
+
+
+@pytest.fixture
+def module(tmp_path, monkeypatch):
+    """A module of the user's in the current folder, and what importing it leaves."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", sys.path.copy())
+    text = "from os import mkdir\ndef mine(): ...\ndef _hidden(): ...\n"
+    (tmp_path / "my_module.py").write_text(text)
+    yield tmp_path / "my_module.py"
+    sys.modules.pop("my_module", None)
+
+
+@pytest.mark.parametrize("name", ["mkdir", "_hidden", "absent", "os.mkdir"])
+def test_what_a_trusted_module_defines_may_be_called(module, name):
+    cfg = OmegaConf.create({"loss": {"_target_": "my_module.mine"}})
+    with pytest.raises(ValueError, match=r"allow it with trust=\[my_module\]"):
+        check_targets(cfg)
+    assert "my_module" not in sys.modules
+    check_targets(cfg, ["my_module"])
+    cfg.loss._target_ = f"my_module.{name}"
+    with pytest.raises(ValueError, match="is none of .*, my_module: a run"):
+        check_targets(cfg, ["my_module"])
+
+
+def test_a_trusted_module_says_itself_what_it_offers(module):
+    module.write_text("from os import mkdir\n__all__ = ['mkdir']\ndef mine(): ...\n")
+    cfg = OmegaConf.create({"loss": {"_target_": "my_module.mkdir"}})
+    check_targets(cfg, ["my_module"])
+    cfg.loss._target_ = "my_module.mine"
+    with pytest.raises(ValueError, match="no public function or class 'mine'"):
+        check_targets(cfg, ["my_module"])
+
+
+def test_a_trusted_module_may_bring_the_environment(module):
+    cfg = OmegaConf.create({"env": {"id": "my_module:Robot-v0"}})
+    with pytest.raises(ValueError, match=r"allow it with trust=\[my_module\]"):
+        check_targets(cfg)
+    check_targets(cfg, ["my_module"])
+    with pytest.raises(ValueError, match=r"trust=\[absent\] cannot be imported"):
+        check_targets(cfg, ["absent"])
+
+
+def test_no_file_of_the_current_folder_takes_the_place_of_a_library(module):
+    (module.parent / "tqdm.py").write_text("raise SystemExit")
+    check_targets(OmegaConf.create({}), ["tqdm", "my_module"])
 
 
 def test_the_crafted_configuration_would_work(tmp_path):
