@@ -69,10 +69,7 @@ def markdown(text: str) -> str:
 def meanings(cfg: DictConfig) -> dict[str, str]:
     """The meaning of every key, dotted."""
     found = described(schema.TrainConfig)
-    for name, field in schema.TrainConfig.__dataclass_fields__.items():
-        if inspect.isclass(field.default_factory):
-            group = described(field.default_factory)
-            found |= {f"{name}.{key}": text for key, text in group.items()}
+    found |= dict(meanings_of_groups(schema.TrainConfig))
     for name in ("loss", "inverse_dynamics.loss"):
         target = get_class(OmegaConf.select(cfg, f"{name}._target_"))
         for each in reversed(target.__mro__):
@@ -80,6 +77,16 @@ def meanings(cfg: DictConfig) -> dict[str, str]:
                 options = described(each)
                 found |= {f"{name}.{key}": text for key, text in options.items()}
     return found
+
+
+def meanings_of_groups(config: type, prefix: str = "") -> Iterator[tuple[str, str]]:
+    """The meaning of every key, dotted, of the groups in a dataclass."""
+    for name, field in config.__dataclass_fields__.items():
+        if inspect.isclass(field.default_factory):
+            group = field.default_factory
+            for key, text in described(group).items():
+                yield f"{prefix}{name}.{key}", text
+            yield from meanings_of_groups(group, f"{prefix}{name}.")
 
 
 def leaves(tree: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:

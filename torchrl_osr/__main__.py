@@ -10,6 +10,7 @@ from importlib import import_module
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 COMMANDS = {
+    "data": "look at a log before anything is trained on it",
     "train": "train a policy on offline data, or continue a run",
     "evaluate": "disturb a trained policy: score lost, survival, way back",
     "film": "film a push and what follows",

@@ -137,8 +137,9 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
     Raises:
         OSError: it cannot be read.
-        ValueError: it is no archive, damaged, holds objects, or would unpack to more
-            than :func:`check_unpacked_size` allows; the message names the file.
+        ValueError: it is no archive, damaged, holds objects, two arrays of one name, or
+            would unpack to more than :func:`check_unpacked_size` allows; the message
+            names the file.
     """
     try:
         refuse_other_than_files(path)
@@ -147,6 +148,9 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
                 raise ValueError("it is a single array")
         with zipfile.ZipFile(path) as archive:
             sizes = [member.file_size for member in archive.infolist()]
+            names = [name.removesuffix(".npy") for name in archive.namelist()]
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise ValueError(f"two arrays in it are called {twice[0]!r}")
         check_unpacked_size(path, sum(sizes))
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive}

@@ -143,8 +143,10 @@ def test_a_trusted_module_may_bring_the_environment(module):
 
 
 def test_no_file_of_the_current_folder_takes_the_place_of_a_library(module):
-    (module.parent / "tqdm.py").write_text("raise SystemExit")
-    check_targets(OmegaConf.create({}), ["tqdm", "my_module"])
+    (module.parent / "tabnanny.py").write_text("raise SystemExit('the wrong one')")
+    sys.modules.pop("tabnanny", None)
+    check_targets(OmegaConf.create({}), ["my_module", "tabnanny"])
+    assert Path(sys.modules["tabnanny"].__file__).parent != module.parent
 
 
 def test_the_crafted_configuration_would_work(tmp_path):

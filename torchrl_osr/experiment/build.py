@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import torch
 from hydra.utils import get_class, instantiate
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torchrl.objectives import LossModule
@@ -27,11 +27,15 @@ def load_data(
     """
     from torchrl_osr.data import load_dataset  # needs Gymnasium; networks do not
 
+    options: Any = OmegaConf.to_container(cfg.data)
     return load_dataset(
         cfg.env.name,
         cfg.data.quality,
         env_id=cfg.env.id,
         path=cfg.data.path,
+        columns=options["columns"],
+        action_bounds=options["action_bounds"],
+        clip_actions=cfg.data.clip_actions,
         download=cfg.data.download,
         random_share=cfg.data.random_share,
         num_transitions=cfg.data.num_transitions,

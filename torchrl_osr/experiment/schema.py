@@ -39,6 +39,31 @@ class EnvConfig:
 
 
 @dataclass
+class ColumnsConfig:
+    """Names of a file's columns; null for the usual names, see docs/your_data.md.
+
+    Attributes:
+        observation: a name, a pattern such as ``obs_*``, or a list of names.
+        action: likewise.
+        reward: a name.
+        terminated: a name, or false if nothing ever ends the task.
+        truncated: a name.
+        episode: a name; the numbers or texts in it tell episodes apart.
+        step: a name; rows of an episode are sorted by it.
+        next_observation: as observation.
+    """
+
+    observation: Any = None
+    action: Any = None
+    reward: str | None = None
+    terminated: Any = None
+    truncated: str | None = None
+    episode: str | None = None
+    step: str | None = None
+    next_observation: Any = None
+
+
+@dataclass
 class DataConfig:
     """Which data set: rolled out from the packaged behaviour policies, or recorded.
 
@@ -46,6 +71,11 @@ class DataConfig:
         quality: of the behaviour: random, medium, medium-replay, medium-expert or
             expert; diverse or play in a maze; minari, d4rl or file for recorded data.
         path: recorded data to read, see docs/your_data.md.
+        columns: what the columns of a file are called.
+        action_bounds: lowest and highest action as the recording has them, two numbers
+            or two lists; null for those of the environment, or of a Minari set.
+        clip_actions: bring recorded actions that are outside of their bounds back to
+            them, as many environments do, rather than refuse them.
         download: fetch the set that path names.
         num_transitions: number of rows.
         seed: random seed of the roll-outs and of the held-out rows.
@@ -61,6 +91,9 @@ class DataConfig:
 
     quality: str = MISSING
     path: str | None = None
+    columns: ColumnsConfig = field(default_factory=ColumnsConfig)
+    action_bounds: Any = None
+    clip_actions: bool = MISSING
     download: bool = MISSING
     num_transitions: int = MISSING
     seed: int = MISSING
@@ -234,6 +267,24 @@ class TrainConfig:
     trust: list[str] = field(default_factory=list)
 
 
+@dataclass
+class CheckDataConfig:
+    """Everything that ``torchrl-osr data`` reads.
+
+    Attributes:
+        env: the task that the data are of; none is needed.
+        data: which data, as in ``torchrl-osr train``.
+        picture: where the picture goes; null for ``<name of the data>-data.png`` in the
+            current folder.
+        progress: show progress bars when on a terminal.
+    """
+
+    env: EnvConfig = field(default_factory=EnvConfig)
+    data: DataConfig = field(default_factory=DataConfig)
+    picture: str | None = None
+    progress: bool = MISSING
+
+
 def schema_of(target: type) -> type:
     """A structured config with the keyword options of ``target``.
 
@@ -268,6 +319,8 @@ def _keyword_options(target: type) -> Iterator[tuple[inspect.Parameter, Any]]:
         parameters = inspect.signature(initialize).parameters.values()
         is_dataclass = "__dataclass_fields__" in vars(each)
         for parameter in parameters:
+            if parameter.name in ("action_spec", "gamma"):
+                continue  # An object of Python, and what every loss refuses.
             if parameter.kind is parameter.KEYWORD_ONLY or (
                 is_dataclass and parameter.default is not parameter.empty
             ):
@@ -295,12 +348,13 @@ def _config_type(annotation: Any) -> Any:
 def register() -> None:
     """Make schemas and resolvers known to Hydra.
 
-    ``train_schema``, and in the group ``schema`` one for each class of
-    :mod:`torchrl_osr.objectives`; ``run_dir``, by which ``resume=folder`` becomes the
-    run's folder, and ``job_dir``, which names a sweep's folders.
+    ``train_schema``, ``check_data_schema``, and in the group ``schema`` one for each
+    class of :mod:`torchrl_osr.objectives`; ``run_dir``, by which ``resume=folder``
+    becomes the run's folder, and ``job_dir``, which names a sweep's folders.
     """
     store = ConfigStore.instance()
     store.store(name="train_schema", node=TrainConfig)
+    store.store(name="check_data_schema", node=CheckDataConfig)
     for name in set(objectives.__all__) - {"BaseLoss"}:
         schema = schema_of(getattr(objectives, name))
         store.store(group="schema", name=name, node=schema)

@@ -95,9 +95,35 @@ def test_actions_beyond_their_bounds_are_refused_unless_told():
     data, manifest = transitions_from_rows(log(action=action), clip_actions=True)
     assert data["action"][3].item() == np.float32(-0.999)
     assert manifest["clipped_actions"] == 1
+    assert manifest["warnings"][0].startswith("1 rows had an action outside")
     for bounds in ((-np.inf, np.inf), (1, -1), ([-1, -1], 1)):
         with pytest.raises(ValueError, match=r"action.bounds"):
             transitions_from_rows(log(), action_bounds=bounds)
+
+
+def test_whole_numbers_are_forces_where_their_bounds_say_so():
+    action = np.array([[0], [1], [1], [0], [1], [0]])
+    data, _ = transitions_from_rows(log(action=action), action_bounds=(0, 1))
+    limit = np.float32(0.999)
+    assert data["action"][:, 0].tolist() == [-limit, limit, limit, -limit, limit]
+    data, _ = transitions_from_rows(log(action=2 * action - 1))
+    assert data["action"][:, 0].tolist() == [-limit, limit, limit, -limit, limit]
+
+
+def test_a_mask_that_hides_nothing_is_no_obstacle():
+    masked = np.ma.masked_equal(log()["observation"], -9999.0)
+    data, _ = transitions_from_rows(log(observation=masked))
+    assert (data == transitions_from_rows(log())[0]).all()
+
+
+def test_what_float32_makes_equal_is_said():
+    clock = 1.7e9 + 0.02 * np.arange(6)
+    observation = np.c_[log()["observation"][:, 0], clock]
+    _, manifest = transitions_from_rows(log(observation=observation))
+    (warning,) = manifest["warnings"]
+    assert "entry 1 of 'observation' changes 5 times" in warning
+    assert "5 of these changes vanish in float32" in warning
+    assert transitions_from_rows(log())[1]["warnings"] == []
 
 
 def test_rows_are_copied_and_columns_may_be_tall():
@@ -141,6 +167,15 @@ def with_value(name, row, value):
         ({"episode": np.linspace(0, 1, 6)}, "'episode' has type float64"),
         ({"terminated": None, "dones": [0] * 6}, "unknown columns 'dones'"),
         (
+            {"observation": np.ma.masked_equal(log()["observation"], 7.0)},
+            "'observation' is masked in row 3 of 6, and in 1 rows",
+        ),
+        (
+            {"action": np.array([[0], [1], [1], [0], [1], [0]])},
+            r"only the whole numbers 0 to 1, where .* \[-1.0\] and \[1.0\]: .*discrete",
+        ),
+        ({"action": np.eye(3)[[0, 1, 2, 0, 1, 1]]}, "look like numbers of discrete"),
+        (
             {"terminated": [0] * 6, "truncated": [1] * 6},
             "none of the 6 rows has a true next state",
         ),
@@ -183,7 +218,10 @@ def test_episodes_keep_their_last_observation():
             {"observation": np.ones((4, 5))},
             r"1: a row of 'observation' has shape \[5\]",
         ),
-        ({"observation": [[1.0], [2.0, 3.0]] * 2}, "episode 1 has rows of unequal"),
+        (
+            {"observation": [[1.0], [2.0, 3.0]] * 2},
+            "episode 1: 'observation' has rows of unequal",
+        ),
         ({"reward": 1.0}, "episode 1 has shapes"),
     ],
 )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import pickle
+import zipfile
 
 import numpy as np
 import pyarrow
@@ -68,8 +70,30 @@ def test_nothing_is_unpickled(tmp_path):
         np.save(file, np.ones(3))
     with pytest.raises(ValueError, match="it is a single array"):
         load_file(tmp_path / "log.npz")
-    with pytest.raises(ValueError, match=r"must end in one of \.npz, \.hdf5, \.h5"):
+    with pytest.raises(
+        ValueError, match=r"must end in one of \.csv, \.csv\.gz, \.parquet"
+    ):
         load_file(tmp_path / "log.pkl")
+
+
+def test_two_arrays_of_one_name_are_refused(tmp_path):
+    path = tmp_path / "log.npz"
+    np.savez(path, **make_columns(60))
+    content = io.BytesIO()
+    np.save(content, np.zeros(60))
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("reward", content.getvalue())
+    with pytest.raises(ValueError, match="two arrays in it are called 'reward'"):
+        load_file(path)
+
+
+def test_two_parquet_columns_of_one_name_are_refused(tmp_path):
+    columns = {k: list(v) if v.ndim > 1 else v for k, v in make_columns(60).items()}
+    table = pyarrow.table(columns)
+    table = table.append_column("reward", table["reward"])
+    parquet.write_table(table, tmp_path / "log.parquet")
+    with pytest.raises(ValueError, match="two columns are called 'reward'"):
+        load_file(tmp_path / "log.parquet")
 
 
 @pytest.mark.parametrize(
@@ -83,10 +107,10 @@ def test_nothing_is_unpickled(tmp_path):
         ),
         ("action", [[0.1, 0.2]] * 59 + [None], "'action' has no value in row 59"),
         ("reward", [1.0] * 59 + [None], "'reward' has no value in row 59"),
-        ("reward", ["a"] * 60, "'reward' has type object; expected numbers"),
-        ("action", [[]] * 60, "'action' has type object"),
+        ("reward", ["a"] * 60, "'reward' holds 'a' in row 0 of 60; expected"),
+        ("action", [[]] * 60, r"'action' holds \[\] in row 0 of 60; expected numbers"),
         ("action", pyarrow.array([[]] * 60, EMPTY), r"'action' has shape \[60, 0\]"),
-        ("action", [[["a"]]] * 60, r"'action' has type"),
+        ("action", [[["a"]]] * 60, r"'action' holds .* in row 0 of 60; expected numb"),
     ],
 )
 def test_what_only_parquet_can_hold_is_named(tmp_path, name, column, message):

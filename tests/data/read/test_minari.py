@@ -224,7 +224,9 @@ def damage_data(folder):
 )
 def test_a_damaged_set_is_an_error_that_says_what_to_do(damage):
     damage(make("test/set-v0").storage.data_path)
-    with pytest.raises(ValueError, match=r"Minari cannot read test/set-v0 .*delete it"):
+    with pytest.raises(
+        ValueError, match=r"Minari cannot read test/set-v0 .*Take a whole copy"
+    ):
         load_minari("test/set-v0")
 
 

@@ -10,11 +10,33 @@ from torchrl_osr.data import observation_statistics, sampled_observations
 from torchrl_osr.data.store import statistics
 
 
-def test_statistics_by_hand() -> None:
+@pytest.fixture
+def said(monkeypatch) -> list[str]:
+    """What was warned of."""
+    messages: list[str] = []
+    monkeypatch.setattr(statistics.torchrl_logger, "warning", messages.append)
+    return messages
+
+
+def test_statistics_by_hand(said) -> None:
     rows = torch.tensor([[1.0, 7.0, 0.0], [3.0, 7.0, 1e-5]])
     loc, scale = observation_statistics(TensorDict({"observation": rows}, [2]))
     torch.testing.assert_close(loc, torch.tensor([2.0, 7.0, 5e-6]))
     torch.testing.assert_close(scale, torch.tensor([1.0, 1e-3, 1e-3]))
+    (message,) = said
+    assert message.endswith("divided by 0.001 when standardised: 1 (0), 2 (5e-06).")
+
+
+def test_nothing_is_said_of_entries_that_move(said) -> None:
+    rows = torch.tensor([[1.0, 0.0], [3.0, 0.002]])
+    _, scale = observation_statistics(TensorDict({"observation": rows}, [2]))
+    torch.testing.assert_close(scale, torch.tensor([1.0, 1e-3]))
+    assert said == []
+
+
+def test_of_many_small_entries_some_are_named(said) -> None:
+    observation_statistics(TensorDict({"observation": torch.zeros(2, 9)}, [2]))
+    assert said[0].endswith("0 (0), 1 (0), 2 (0), 3 (0), 4 (0) and 4 more.")
 
 
 def test_statistics_survive_a_large_offset() -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tensordict import TensorDict
 
-from torchrl_osr.data.read.column_checks import ActionBounds
+from torchrl_osr.data.read.column_checks import ActionBounds, as_array
 from torchrl_osr.data.read.recording import Columns, Recording
 
 
@@ -47,13 +47,17 @@ def transitions_from_rows(
     Returns:
         The transitions in float32, see :func:`~torchrl_osr.data.check_dataset`, and a
         manifest: ``num_transitions``, ``dropped_rows``, ``terminal_rows_filled``,
-        ``clipped_actions`` (rows), ``action_limit``, and of the complete episodes
-        ``num_complete_episodes``, ``return``, ``episode_length``, ``episode_returns``
-        and ``episode_lengths``.
+        ``clipped_actions`` (rows), ``action_limit``, ``action_bounds``, ``num_actions``
+        (of discrete ones), the number of ``terminated_ends``, ``truncated_ends`` and
+        ``unmarked_ends``, of the complete episodes ``num_complete_episodes``,
+        ``return``, ``episode_length``, ``episode_returns`` and ``episode_lengths``, of
+        the others ``incomplete_returns`` and ``incomplete_lengths``, and ``warnings``,
+        which are logged, too: what the casts have changed.
 
     Raises:
-        ValueError: the columns are not as above, hold a NaN or an infinity, or a field
-            is zero everywhere. The message names the column and the row.
+        ValueError: the columns are not as above, hold a NaN or an infinity, are masked,
+            or a field is zero everywhere; the actions look like numbers of discrete
+            ones. The message names the column and the row.
 
     Examples:
         >>> import numpy as np
@@ -136,9 +140,9 @@ def _columns_of(number: int, episode: Mapping[str, ArrayLike]) -> dict[str, Any]
     if missing := [name for name in names if name not in episode]:
         raise ValueError(f"episode {number} lacks {', '.join(missing)}.")
     try:
-        columns = {name: np.asarray(values) for name, values in episode.items()}
+        columns = {name: as_array(name, values) for name, values in episode.items()}
     except ValueError as error:
-        raise ValueError(f"episode {number} has rows of unequal length.") from error
+        raise ValueError(f"episode {number}: {error}") from error
     shapes = {name: list(array.shape) for name, array in columns.items()}
     steps = columns["reward"].shape[0] if columns["reward"].ndim else -1
     if "next_observation" not in columns and len(columns["observation"]) == steps + 1:

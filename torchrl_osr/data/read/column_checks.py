@@ -9,7 +9,7 @@ Shapes: ``N`` rows, ``S`` observation, ``A`` action.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,40 +26,68 @@ OPTIONAL_COLUMNS = ("truncated", "episode", "next_observation")
 ROUNDING = 1e-5
 
 
+class Checked(NamedTuple):
+    """Columns as they are trained on, and what the casts have changed.
+
+    Attributes:
+        columns: in float32, bool and whole numbers.
+        clipped: rows whose action was clipped to ``ACTION_LIMIT``.
+        outside: those of them whose action was outside of its bounds.
+        changes: of ``observation`` and ``reward``, for each entry how often the number
+            changes from one row to the next, and how often it does so no more in
+            float32, ``[2, D]``.
+    """
+
+    columns: dict[str, NDArray[Any]]
+    clipped: int
+    outside: int
+    changes: dict[str, NDArray[np.int64]]
+
+
 def checked_columns(
-    rows: Mapping[str, ArrayLike], action_bounds: ActionBounds, clip_actions: bool
-) -> tuple[dict[str, NDArray[Any]], int]:
-    """Columns in float32, bool and whole numbers, and the number of clipped actions.
+    rows: Mapping[str, ArrayLike],
+    action_bounds: ActionBounds,
+    clip_actions: bool,
+    num_actions: int | None = None,
+) -> Checked:
+    """Check and cast the columns of some steps.
 
     Args:
         rows: the columns, see :func:`~torchrl_osr.data.transitions_from_rows`.
         action_bounds: as there.
         clip_actions: as there.
+        num_actions: see :func:`~torchrl_osr.data.load_file`.
 
     Raises:
         ValueError: a column is missing, unknown, of the wrong shape, length or type,
             or holds a value that it cannot hold.
     """
     _check_names(rows)
-    columns = {name: _as_array(name, values) for name, values in rows.items()}
+    columns = {name: _as_numbers(name, values) for name, values in rows.items()}
     count = len(columns["observation"]) if columns["observation"].ndim else 0
     if count == 0:
         raise ValueError("the data hold no rows; expected at least one transition.")
     for name in columns:
-        _check_shape(name, columns, count)
-    clipped = 0
+        _check_shape(name, columns, count, num_actions)
+    clipped = outside = 0
+    changes = {}
     for name, array in columns.items():
-        if name == "action":
-            columns[name], clipped = _unit_actions(array, action_bounds, clip_actions)
-        elif name in ("observation", "next_observation"):
+        if name == "action" and num_actions is not None:
+            columns[name] = _one_hot(array.reshape(count), num_actions)
+        elif name == "action":
+            columns[name], clipped, outside = _unit_actions(
+                array, action_bounds, clip_actions
+            )
+        elif name in ("observation", "next_observation", "reward"):
+            array = array if name != "reward" else array.reshape(count)
             columns[name] = _as_float32(name, array)
-        elif name == "reward":
-            columns[name] = _as_float32(name, array.reshape(count))
+            if name != "next_observation":
+                changes[name] = _changes(array, columns[name])
         elif name == "episode":
             columns[name] = _as_whole_numbers(name, array.reshape(count))
         else:
             columns[name] = _as_flags(name, array.reshape(count))
-    return columns, clipped
+    return Checked(columns, clipped, outside, changes)
 
 
 def _check_names(rows: Mapping[str, ArrayLike]) -> None:
@@ -78,19 +106,40 @@ def _check_names(rows: Mapping[str, ArrayLike]) -> None:
         raise ValueError(f"the data lack {', '.join(missing)}; {layout}")
 
 
-def _as_array(name: str, values: ArrayLike) -> NDArray[Any]:
+def as_array(name: str, values: ArrayLike) -> NDArray[Any]:
+    """Array of a column.
+
+    Raises:
+        ValueError: its rows are of unequal length, or entries of it are masked.
+    """
+    if isinstance(values, np.ma.MaskedArray) and values.mask.any():
+        rows = np.atleast_2d(np.ma.getmaskarray(values).T).any(0)
+        raise ValueError(
+            f"{name!r} is masked in row {int(rows.argmax())} of {rows.size}, and in "
+            f"{int(rows.sum())} rows: what is missing cannot be trained on; leave out "
+            "these rows, or fill them in."
+        )
     try:
-        array = np.asarray(values)
+        return np.asarray(values)
     except ValueError as error:
         raise ValueError(f"{name!r} has rows of unequal length.") from error
+
+
+def _as_numbers(name: str, values: ArrayLike) -> NDArray[Any]:
+    array = as_array(name, values)
     if array.dtype.kind not in "biuf":
         raise ValueError(f"{name!r} has type {array.dtype}; expected numbers.")
     return array
 
 
-def _check_shape(name: str, columns: Mapping[str, NDArray[Any]], count: int) -> None:
+def _check_shape(
+    name: str,
+    columns: Mapping[str, NDArray[Any]],
+    count: int,
+    num_actions: int | None,
+) -> None:
     shape = columns[name].shape
-    if name in ("observation", "action"):
+    if name == "observation" or (name == "action" and num_actions is None):
         right = len(shape) == 2 and shape[0] == count and shape[1] > 0
         expected = f"[{count}, D] with D > 0, one row for each observation."
     elif name == "next_observation":
@@ -117,10 +166,22 @@ def _as_float32(name: str, array: NDArray[Any]) -> NDArray[np.float32]:
     return cast
 
 
+def _changes(array: NDArray[Any], cast: NDArray[np.float32]) -> NDArray[np.int64]:
+    """See ``changes`` of :class:`Checked`; a column at a time, to spare memory."""
+    wide = array.reshape(len(array), -1)
+    found = np.zeros((2, wide.shape[1]), np.int64)
+    if array.dtype.kind != "b" and array.dtype.itemsize > 2:
+        for entry, narrow in enumerate(cast.reshape(wide.shape).T):
+            moved = wide[1:, entry] != wide[:-1, entry]
+            found[:, entry] = moved.sum(), (moved & (narrow[1:] == narrow[:-1])).sum()
+    return found
+
+
 def _as_whole_numbers(name: str, array: NDArray[Any]) -> NDArray[Any]:
-    if array.dtype.kind not in "iu":
+    whole = array.dtype.kind == "f" and bool((array == np.floor(array)).all())
+    if array.dtype.kind not in "iu" and not whole:
         raise ValueError(f"{name!r} has type {array.dtype}; expected whole numbers.")
-    return array
+    return array.astype(np.int64)
 
 
 def _as_flags(name: str, array: NDArray[Any]) -> NDArray[np.bool_]:
@@ -133,25 +194,37 @@ def _as_flags(name: str, array: NDArray[Any]) -> NDArray[np.bool_]:
     return np.asarray(array != 0)
 
 
+def _one_hot(action: NDArray[Any], num_actions: int) -> NDArray[np.float32]:
+    """Rows ``[N, num_actions]`` with a 1 at each action's number."""
+    known = (action >= 0) & (action < num_actions) & (action == np.floor(action))
+    wrong = np.flatnonzero(~known)
+    if len(wrong):
+        raise ValueError(
+            f"'action' holds {action[wrong[0]]} in row {wrong[0]} of {len(action)}; "
+            f"expected the number of a discrete action, from 0 to {num_actions - 1}."
+        )
+    return np.eye(num_actions, dtype=np.float32)[action.astype(np.int64)]
+
+
 def _unit_actions(
     action: NDArray[Any], bounds: ActionBounds, clip: bool
-) -> tuple[NDArray[np.float32], int]:
-    """Map ``bounds`` to -1 and 1, clip to ``ACTION_LIMIT``, count the clipped rows."""
-    try:
-        low, high = (
-            np.broadcast_to(np.asarray(bound, np.float64), action.shape[1])
-            for bound in bounds
-        )
-    except ValueError as error:
+) -> tuple[NDArray[np.float32], int, int]:
+    """Map ``bounds`` to -1 and 1, clip to ``ACTION_LIMIT``; count rows, see Checked."""
+    low, high = check_bounds(bounds)
+    if any(bound.shape not in ((), action.shape[1:]) for bound in (low, high)):
         raise ValueError(
-            f"action_bounds={bounds} for {action.shape[1]} actions."
-        ) from error
+            f"action_bounds={bounds} for {action.shape[1]} actions; expected two "
+            "numbers, or two lists with a number for each action (data.action_bounds)."
+        )
+    low, high = (np.broadcast_to(bound, action.shape[1:]) for bound in (low, high))
     if not (np.isfinite([low, high]).all() and (low < high).all()):
         raise ValueError(
             f"action bounds {low.tolist()} and {high.tolist()}; expected finite "
-            "numbers, the lower first: say what they are with action_bounds=(low, high)"
+            "numbers, the lower first: say what they are with action_bounds=[low,high] "
+            "(data.action_bounds=[low,high])."
         )
     unit = _as_float32("action", action)
+    _refuse_discrete(unit, low, high)
     # Bounds of -1 and 1 shall leave the numbers alone, bit by bit.
     if np.any(low != -1) or np.any(high != 1):
         mapped = (action.astype(np.float64) - low) / (high - low) * 2 - 1
@@ -162,8 +235,38 @@ def _unit_actions(
             f"'action' leaves its bounds in {len(outside)} of {len(action)} rows, "
             f"first in row {outside[0]}: {action[outside[0]].tolist()}, where they are "
             f"{low.tolist()} and {high.tolist()}. Give the true ones with "
-            "action_bounds=(low, high); if the environment itself clipped what it was "
-            "given, clip_actions=True."
+            "action_bounds=[low,high] (data.action_bounds=[low,high]); if the "
+            "environment itself clipped what it was given, clip_actions=True "
+            "(data.clip_actions=true)."
         )
     clipped = np.clip(unit, -ACTION_LIMIT, ACTION_LIMIT)
-    return clipped, int((clipped != unit).any(1).sum())
+    return clipped, int((clipped != unit).any(1).sum()), len(outside)
+
+
+def check_bounds(bounds: ActionBounds) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Lowest and highest action as arrays, if they are such; not whether they fit."""
+    try:
+        low, high = (np.asarray(bound, np.float64) for bound in bounds)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"action_bounds={bounds}; expected the lowest and the highest action: two "
+            "numbers, or two lists with a number for each action (data.action_bounds)."
+        ) from error
+    return low, high
+
+
+def _refuse_discrete(
+    action: NDArray[np.float32], low: NDArray[Any], high: NDArray[Any]
+) -> None:
+    """Raise if numbers of discrete actions, or one-hot rows, were taken for forces."""
+    whole = bool(((action >= 0) & (action == np.round(action))).all())
+    alone = action.shape[1] == 1 or bool((action.sum(1) == 1).all())
+    if whole and alone and (low < 0).all() and np.ptp(action) > 0:
+        raise ValueError(
+            f"'action' holds only the whole numbers {action.min():g} to "
+            f"{action.max():g}, where its bounds are {low.tolist()} and "
+            f"{high.tolist()}: they look like numbers of discrete actions, which a "
+            "loss for continuous ones would take for forces. Give the number of "
+            "discrete actions, num_actions= (env.id=... of their task), or the bounds "
+            "of the forces, action_bounds=[0,high] (data.action_bounds=[0,high])."
+        )

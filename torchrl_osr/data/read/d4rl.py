@@ -79,6 +79,25 @@ def load_d4rl(
         ValueError: unknown name, no D4RL file, one without ``timeouts``, or data that
             :func:`~torchrl_osr.data.transitions_from_rows` refuses.
     """
+    opened = open_d4rl(
+        source,
+        download=download,
+        action_bounds=action_bounds,
+        clip_actions=clip_actions,
+        progress=progress,
+    )
+    return opened.load(on_disk=on_disk, progress=progress)
+
+
+def open_d4rl(
+    source: str | Path,
+    *,
+    download: bool = False,
+    action_bounds: ActionBounds = (-1.0, 1.0),
+    clip_actions: bool = False,
+    progress: bool = True,
+) -> Recording:
+    """Open a D4RL data set, see :func:`load_d4rl`; of its rows none is read yet."""
     path = _located(source, download, progress)
     total, read_arrays = _open(path)
 
@@ -88,13 +107,13 @@ def load_d4rl(
 
     about = {"reader": "d4rl", "source": str(path)}
     parts = partial(whole_trajectories, read, total)
-    recording = Recording(parts, action_bounds, clip_actions, about, [path], total)
-    return recording.load(on_disk=on_disk, progress=progress)
+    return Recording(parts, action_bounds, clip_actions, about, [path], total)
 
 
 def _open(path: Path) -> tuple[int, ReadRows]:
     """Number of rows and what reads them; raise unless all arrays are there."""
-    total, read_arrays = open_hdf5(path, COLUMNS)
+    table = open_hdf5(path)
+    total, read_arrays = table.select([name for name in table.names if name in COLUMNS])
     arrays = read_arrays(0, 0)
     if missing := [name for name in REQUIRED if name not in arrays]:
         raise ValueError(f"{path} is no D4RL file: it lacks {', '.join(missing)}.")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from torchrl_osr._files import check_unpacked_size, refuse_other_than_files
 from torchrl_osr.data.read.recording import ReadRows
+from torchrl_osr.data.read.table import Table
 
 try:
     import h5py
@@ -20,37 +21,39 @@ except ImportError as error:
     ) from error
 
 
-def open_hdf5(path: Path, names: Iterable[str] | None = None) -> tuple[int, ReadRows]:
-    """Number of rows of an HDF5 file, and what reads the rows from one up to another.
-
-    Args:
-        path: the file.
-        names: which arrays to read if they are there. Default: all.
+def open_hdf5(path: Path) -> Table:
+    """Arrays at the root of an HDF5 file.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is no HDF5 file or damaged, something in it leads into another
-            file, or a name is no array; when rows are read, too if they have more than
-            both 4 GiB and the file's own size. Unequal lengths are not looked for.
+        ValueError: it is no HDF5 file or damaged, or something in it leads into another
+            file; when columns are selected, if one is no array; when rows are read, if
+            they have more than both 4 GiB and the file's own size. Unequal lengths are
+            not looked for.
     """
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}.")
     with _opened(path) as file:
         _check_links(path, file)
-        chosen = [name for name in file if names is None or name in names]
-        for name in chosen:
-            if not isinstance(file[name], h5py.Dataset) or not file[name].ndim:
-                raise ValueError(f"{path}: {name!r} is no array with rows.")
-        rows = max((len(file[name]) for name in chosen), default=0)
+        names = list(file)
 
-    def read(start: int, stop: int) -> dict[str, NDArray[Any]]:
+    def select(chosen: list[str]) -> tuple[int, ReadRows]:
         with _opened(path) as file:
-            arrays = [file[name] for name in chosen]
-            row_bytes = sum(each.nbytes // max(len(each), 1) for each in arrays)
-            check_unpacked_size(path, row_bytes * (stop - start))
-            return {name: file[name][start:stop] for name in chosen}
+            for name in chosen:
+                if not isinstance(file[name], h5py.Dataset) or not file[name].ndim:
+                    raise ValueError(f"{path}: {name!r} is no array with rows.")
+            rows = max((len(file[name]) for name in chosen), default=0)
 
-    return rows, read
+        def read(start: int, stop: int) -> dict[str, NDArray[Any]]:
+            with _opened(path) as file:
+                arrays = [file[name] for name in chosen]
+                row_bytes = sum(each.nbytes // max(len(each), 1) for each in arrays)
+                check_unpacked_size(path, row_bytes * (stop - start))
+                return {name: file[name][start:stop] for name in chosen}
+
+        return rows, read
+
+    return Table(names, select)
 
 
 def check_hdf5(path: Path) -> None:

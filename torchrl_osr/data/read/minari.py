@@ -8,7 +8,7 @@ episode, so that every row has its true next observation.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from functools import partial, reduce
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from tqdm.auto import tqdm
 from torchrl_osr._files import read_json
 from torchrl_osr.data.read.arrays import episode_parts
 from torchrl_osr.data.read.column_checks import ActionBounds
-from torchrl_osr.data.read.recording import Recording
+from torchrl_osr.data.read.recording import Columns, Recording
 from torchrl_osr.data.store.replay_buffer import make_replay_buffer
 
 try:
@@ -79,8 +79,8 @@ def load_minari(
     Returns:
         The transitions ``[N]``, and the manifest of
         :func:`~torchrl_osr.data.transitions_from_rows` with ``reader``, ``source``,
-        ``dataset_id``, ``env_id`` (or ``None``), ``minari_version``, ``action_bounds``
-        and ``observation_layout``, a list of names and sizes.
+        ``dataset_id``, ``env_id`` (or ``None``), ``minari_version`` and
+        ``observation_layout``, a list of names and sizes.
 
     Raises:
         FileNotFoundError: the set is not on this machine and ``download`` is false.
@@ -89,6 +89,27 @@ def load_minari(
             both 4 GiB and its own size or leads into other files, or data that
             :func:`~torchrl_osr.data.transitions_from_rows` refuses.
     """
+    opened = open_minari(
+        dataset,
+        download=download,
+        observation_keys=observation_keys,
+        action_bounds=action_bounds,
+        clip_actions=clip_actions,
+        progress=progress and not on_disk,
+    )
+    return opened.load(on_disk=on_disk, progress=progress)
+
+
+def open_minari(
+    dataset: str | Path,
+    *,
+    download: bool = False,
+    observation_keys: Sequence[str] | None = None,
+    action_bounds: ActionBounds | None = None,
+    clip_actions: bool = False,
+    progress: bool = True,
+) -> Recording:
+    """Open a Minari data set, see :func:`load_minari`; no episode is read yet."""
     opened = _open(str(dataset), download)
     actions = opened.action_space
     if not isinstance(actions, gymnasium.spaces.Box):
@@ -106,21 +127,23 @@ def load_minari(
         "dataset_id": opened.id,
         "env_id": None if spec is None else spec.id,
         "minari_version": opened.minari_version,
-        "action_bounds": [np.asarray(bound).tolist() for bound in bounds],
         "observation_layout": [
             ["/".join(name), int(np.prod(box.shape))] for name, box in leaves.items()
         ],
     }
     files = sorted(Path(opened.storage.data_path).rglob("*"))
-    episodes = _read_episodes(dataset, opened, leaves, progress and not on_disk)
+
+    def parts(rows: int) -> Iterator[Columns]:
+        return episode_parts(_read_episodes(dataset, opened, leaves, progress), rows)
+
     return Recording(
-        partial(episode_parts, episodes),
+        parts,
         bounds,
         clip_actions,
         about,
         [file for file in files if file.is_file()],
         int(opened.total_steps),
-    ).load(on_disk=on_disk, progress=progress)
+    )
 
 
 def minari_replay_buffer(
@@ -173,8 +196,9 @@ def _check_folder(folder: Path) -> None:
 
 def _damaged(dataset: str | Path, error: Exception) -> ValueError:
     return ValueError(
-        f"Minari cannot read {dataset} ({type(error).__name__}: {error}). If its "
-        "download was interrupted, delete it (minari delete) and fetch it again."
+        f"Minari cannot read {dataset} ({type(error).__name__}: {error}). Take a whole "
+        "copy in its place; one that was fetched can be fetched again "
+        "(data.download=true) once its folder is out of the way."
     )
 
 

@@ -21,9 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tensordict import TensorDict
+from torchrl import torchrl_logger
 
 from torchrl_osr._files import sha256_of
-from torchrl_osr.data.read.column_checks import ActionBounds
+from torchrl_osr.data.read.column_checks import ActionBounds, check_bounds
 from torchrl_osr.data.read.transitions import transitions_of
 from torchrl_osr.data.store.cache import CHUNK_ROWS, cache_root, load_or_write
 from torchrl_osr.data.store.statistics import describe_episodes
@@ -32,6 +33,13 @@ from torchrl_osr.data.store.validation import ACTION_LIMIT, check_dataset
 Columns = Mapping[str, NDArray[Any]]
 ReadRows = Callable[[int, int], Columns]
 """Columns of the rows from one number up to another."""
+
+# Raise it whenever what is read from a source, or said of it, changes: sets in the
+# cache are then converted anew.
+READER_VERSION = 2
+
+# One change in a hundred may be lost to rounding before it is said.
+VANISHED_SHARE = 0.01
 
 # A trajectory is in memory as a whole; without an end in so many rows, the flags are
 # more likely to be missing.
@@ -49,6 +57,7 @@ class Recording:
         about: JSON-compatible: what the manifest says of the source.
         files: what is read.
         total: rows of the source, for the progress bar.
+        num_actions: see :func:`~torchrl_osr.data.load_file`.
     """
 
     parts: Callable[[int], Iterator[Mapping[str, ArrayLike]]]
@@ -57,9 +66,14 @@ class Recording:
     about: dict[str, Any] = field(default_factory=dict)
     files: list[Path] = field(default_factory=list)
     total: int | None = None
+    num_actions: int | None = None
     _counts: Counter[str] = field(default_factory=Counter, init=False)
-    _returns: list[float] = field(default_factory=list, init=False)
-    _lengths: list[int] = field(default_factory=list, init=False)
+    _outside: int = field(default=0, init=False)
+    _changes: dict[str, NDArray[np.int64]] = field(default_factory=dict, init=False)
+    _episodes: list[NDArray[Any]] = field(default_factory=list, init=False)
+
+    def __post_init__(self) -> None:
+        check_bounds(self.action_bounds)
 
     def load(
         self, *, on_disk: bool = False, progress: bool = True
@@ -76,10 +90,14 @@ class Recording:
                 count from the beginning of the part that the message names.
         """
         if on_disk:
-            return self._load_or_write(progress)
-        (data,) = self._transitions(sys.maxsize)
-        check_dataset(data)
-        return data, {"num_transitions": len(data)} | self._manifest()
+            data, manifest = self._load_or_write(progress)
+        else:
+            (data,) = self._transitions(sys.maxsize)
+            check_dataset(data)
+            manifest = {"num_transitions": len(data)} | self._manifest()
+        for warning in manifest["warnings"]:
+            torchrl_logger.warning(warning)
+        return data, manifest
 
     def _load_or_write(self, progress: bool) -> tuple[TensorDict, dict[str, Any]]:
         # Sizes and times, not checksums: to read a large source at each start is slow.
@@ -89,9 +107,11 @@ class Recording:
         ]
         bounds = [np.asarray(bound).tolist() for bound in self.action_bounds]
         request = self.about | {
+            "reader_version": READER_VERSION,
             "source_files": files,
             "action_bounds": bounds,
             "clip_actions": self.clip_actions,
+            "num_actions": self.num_actions,
         }
         digest = sha256(json.dumps(request, sort_keys=True).encode()).hexdigest()[:16]
         return load_or_write(
@@ -109,7 +129,9 @@ class Recording:
         seen: set[int] = set()
         for columns in self.parts(rows):
             try:
-                part = transitions_of(columns, self.action_bounds, self.clip_actions)
+                part = transitions_of(
+                    columns, self.action_bounds, self.clip_actions, self.num_actions
+                )
                 if "episode" in columns:
                     last = _check_order(columns["episode"], seen, last)
             except ValueError as error:
@@ -118,10 +140,14 @@ class Recording:
             done += len(part.data) + part.counts["dropped_rows"]
             kept += len(part.data)
             self._counts.update(part.counts)
-            self._returns += part.returns.tolist()
-            self._lengths += part.lengths.tolist()
+            self._outside += part.outside
+            for name, changes in part.changes.items():
+                self._changes[name] = self._changes.get(name, 0) + changes
+            self._episodes.append(np.c_[part.returns, part.lengths, part.complete])
             if len(part.data):
                 yield part.data
+        if not done:
+            raise ValueError("the data hold no rows; expected at least one transition.")
         if not kept:
             raise ValueError(
                 f"none of the {done} rows has a true next state: each is the last of "
@@ -131,13 +157,38 @@ class Recording:
     def _manifest(self) -> dict[str, Any]:
         """What is known of the transitions once all have been read."""
         single = len(self.files) == 1
+        episodes = np.concatenate(self._episodes)
+        complete = episodes[:, 2] == 1
+        returns, lengths = episodes[complete, 0], episodes[complete, 1].astype(int)
+        bounds = [np.asarray(bound, np.float64) for bound in self.action_bounds]
         return {
             **self.about,
             **({"data_sha256": sha256_of(self.files[0])} if single else {}),
             **self._counts,
+            "num_actions": self.num_actions,
             "action_limit": ACTION_LIMIT,
-            **describe_episodes(self._returns, self._lengths),
+            "action_bounds": [bound.tolist() for bound in bounds],
+            **describe_episodes(returns, lengths),
+            "incomplete_returns": episodes[~complete, 0].tolist(),
+            "incomplete_lengths": episodes[~complete, 1].astype(int).tolist(),
+            "warnings": [*self._warnings()],
         }
+
+    def _warnings(self) -> Iterator[str]:
+        """Say what the casts and the clipping have changed."""
+        for name, (moved, lost) in self._changes.items():
+            for entry in np.flatnonzero(lost > VANISHED_SHARE * moved):
+                which = f"entry {entry} of {name!r}" if len(moved) > 1 else repr(name)
+                yield (
+                    f"{which} changes {moved[entry]:,} times from one row to the next, "
+                    f"and {lost[entry]:,} of these changes vanish in float32: subtract "
+                    "a constant (of a clock, its first value), or leave the entry out."
+                )
+        if self._outside:
+            yield (
+                f"{self._outside:,} rows had an action outside of its bounds, which "
+                "was clipped, as clip_actions says."
+            )
 
 
 def _check_order(column: ArrayLike, seen: set[int], last: int | None) -> int:

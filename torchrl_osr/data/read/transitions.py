@@ -3,7 +3,7 @@
 Which row ends a trajectory, which has a true next state, what is dropped for want of
 one, and how well the recorded behaviour did: the same for every reader.
 
-Shapes: ``N`` rows, ``E`` episodes that were recorded to their end.
+Shapes: ``N`` rows, ``E`` trajectories.
 """
 
 from __future__ import annotations
@@ -27,24 +27,36 @@ class Trajectories(NamedTuple):
 
     Attributes:
         data: flat tensordict ``[N]``; of a part of a data set, it may have no rows.
-        counts: dropped, filled and clipped rows, as the manifest names them.
-        returns, lengths: of the complete episodes, ``[E]``.
+        counts: dropped, filled and clipped rows, and kinds of ends, as the manifest
+            names them.
+        returns, lengths: of the trajectories, ``[E]``.
+        complete: which of these are known to have been recorded to their end, ``[E]``.
+        outside: rows whose action was outside of its bounds, and was clipped.
+        changes: see :class:`~torchrl_osr.data.read.column_checks.Checked`.
     """
 
     data: TensorDict
     counts: dict[str, int]
     returns: NDArray[np.float64]
     lengths: NDArray[np.int64]
+    complete: NDArray[np.bool_]
+    outside: int
+    changes: dict[str, NDArray[np.int64]]
 
 
 def transitions_of(
-    rows: Mapping[str, ArrayLike], action_bounds: ActionBounds, clip_actions: bool
+    rows: Mapping[str, ArrayLike],
+    action_bounds: ActionBounds,
+    clip_actions: bool,
+    num_actions: int | None = None,
 ) -> Trajectories:
     """Transitions of whole trajectories, of a data set or a part of one.
 
     The rule is that of :func:`~torchrl_osr.data.transitions_from_rows`.
     """
-    columns, clipped = checked_columns(rows, action_bounds, clip_actions)
+    columns, clipped, outside, changes = checked_columns(
+        rows, action_bounds, clip_actions, num_actions
+    )
     episode, terminated = columns.pop("episode", None), columns["terminated"]
     truncated = columns.get("truncated", np.zeros_like(terminated))
     flagged = terminated | truncated
@@ -61,8 +73,7 @@ def transitions_of(
         broken = np.r_[_jumps(columns) & ~ends[:-1], False]
         complete &= ~np.logical_or.reduceat(broken, starts)
     reward = np.asarray(rows["reward"], np.float64).reshape(-1)
-    returns = np.add.reduceat(reward, starts)[complete]
-    lengths = (stops - starts + 1)[complete]
+    returns, lengths = np.add.reduceat(reward, starts), stops - starts + 1
 
     keep, filled = np.ones_like(ends), 0
     if "next_observation" not in columns:
@@ -80,8 +91,12 @@ def transitions_of(
         "dropped_rows": int((~keep).sum()),
         "terminal_rows_filled": filled,
         "clipped_actions": clipped,
+        "terminated_ends": int(terminated[stops].sum()),
+        "truncated_ends": int((truncated & ~terminated)[stops].sum()),
+        "unmarked_ends": int((~flagged)[stops].sum()),
     }
-    return Trajectories(as_transitions(columns), counts, returns, lengths)
+    data = as_transitions(columns)
+    return Trajectories(data, counts, returns, lengths, complete, outside, changes)
 
 
 def _jumps(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:

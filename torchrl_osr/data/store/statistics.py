@@ -12,11 +12,14 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl import torchrl_logger
 
 # A constant observation entry would otherwise be divided by zero, and one that barely
 # moves would be blown up until it drowns the others. 1e-3 is what TD3+BC adds to the
 # standard deviation; as a floor it leaves all larger entries exactly unit-variance.
 MIN_OBSERVATION_SCALE = 1e-3
+
+ENTRIES_NAMED = 5
 
 # Copied to float64 at a time: 90 MB of hopper.
 ROWS_AT_A_TIME = 2**20
@@ -37,8 +40,9 @@ def observation_statistics(data: TensorDictBase) -> tuple[Tensor, Tensor]:
         data: transitions ``[N]`` with ``observation`` ``[N, S]``.
 
     Returns:
-        ``loc`` ``[S]`` and ``scale`` ``[S]``; the scale is at least
-        ``MIN_OBSERVATION_SCALE``.
+        ``loc`` ``[S]`` and ``scale`` ``[S]``. The scale is at least 0.001: what varies
+        less is divided by that and keeps a deviation below 1. A logged warning names
+        such entries, with their deviation.
 
     Examples:
         >>> import torch
@@ -60,7 +64,16 @@ def observation_statistics(data: TensorDictBase) -> tuple[Tensor, Tensor]:
         variance = (1 - share) * (variance + share * delta**2) + share * chunk_variance
         loc = loc + share * delta
         count = total
-    scale = variance.sqrt().clamp_min(MIN_OBSERVATION_SCALE)
+    scale = variance.sqrt()
+    if small := (scale < MIN_OBSERVATION_SCALE).nonzero()[:, 0].tolist():
+        named = [f"{entry} ({scale[entry]:.2g})" for entry in small[:ENTRIES_NAMED]]
+        rest = len(small) - len(named)
+        torchrl_logger.warning(
+            f"Observation entries have a standard deviation below "
+            f"{MIN_OBSERVATION_SCALE} and are divided by {MIN_OBSERVATION_SCALE} when "
+            f"standardised: {', '.join(named)}{f' and {rest} more' if rest else ''}."
+        )
+    scale = scale.clamp_min(MIN_OBSERVATION_SCALE)
     return loc.to(observation.dtype), scale.to(observation.dtype)
 
 
