@@ -209,7 +209,9 @@ def test_no_loading_touches_the_network(tmp_path, monkeypatch):
 def test_nobody_waits_for_the_other_end_of_a_pipe(tmp_path):
     path = tmp_path / "status.json"
     os.mkfifo(path)
-    with pytest.raises(ValueError, match=r"status\.json is a folder, a pipe or a device"):
+    with pytest.raises(
+        ValueError, match=r"status\.json is a folder, a pipe or a device"
+    ):
         read_json(path)
     with pytest.raises(ValueError, match="is a folder, a pipe or a device"):
         read_arrays(path)

@@ -174,7 +174,7 @@ def check_unpacked_size(path: Path, unpacked: int) -> None:
     if unpacked > most:
         raise ValueError(
             f"{path.name} would unpack to {unpacked:,} bytes; at most {most:,} are "
-            "read, more only without compression"
+            "read: store more without compression"
         )
 
 

@@ -70,17 +70,7 @@ def check_run(config: DictConfig, trust: Sequence[str] = ()) -> DictConfig:
     """
     plain = DictConfig(OmegaConf.to_container(config, resolve=True))
     check_targets(plain, trust)
-    try:
-        typed = OmegaConf.merge(_schema(plain), plain)
-    except ConfigKeyError as error:
-        raise ValueError(
-            f"there is no key {error.full_key}: docs/configuration.md has them all."
-        ) from error
-    except OmegaConfBaseException as error:
-        # The further lines are about OmegaConf's own types.
-        what = str(error).split("\n")[0]
-        raise ValueError(f"{error.full_key or 'a group'}: {what}.") from error
-    assert isinstance(typed, DictConfig)
+    typed = check_types(_schema(plain), plain)
     # Of what a policy is not built from, a run of an older version may lack some.
     missing = {
         key
@@ -90,6 +80,30 @@ def check_run(config: DictConfig, trust: Sequence[str] = ()) -> DictConfig:
     if missing:
         raise ValueError(f"it lacks {', '.join(sorted(missing))}.")
     check_values(flatten(OmegaConf.to_container(typed)))
+    return typed
+
+
+def check_types(schema: DictConfig, config: DictConfig) -> DictConfig:
+    """A configuration with the types of a schema.
+
+    Hydra refuses a mistyped ``key=value``, but adds ``+key=value`` even to a typed
+    group, where nothing would read it.
+
+    Raises:
+        ValueError: naming a key that the schema lacks or whose value is of another
+            type.
+    """
+    try:
+        typed = OmegaConf.merge(schema, config)
+    except ConfigKeyError as error:
+        raise ValueError(
+            f"there is no key {error.full_key}: docs/configuration.md has them all."
+        ) from error
+    except OmegaConfBaseException as error:
+        # The further lines are about OmegaConf's own types.
+        what = str(error).split("\n")[0]
+        raise ValueError(f"{error.full_key or 'a group'}: {what}.") from error
+    assert isinstance(typed, DictConfig)
     return typed
 
 
