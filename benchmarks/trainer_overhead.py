@@ -71,7 +71,13 @@ def main(rounds: int, steps: int, overrides: list[str]) -> dict[str, float | str
     loss = instantiate(
         cfg.loss,
         tanh_gaussian_actor(OBSERVATION, ACTION, num_cells=cells),
-        critic_ensemble(OBSERVATION, ACTION, num_qvalue_nets=number, **cfg.network),
+        critic_ensemble(
+            OBSERVATION,
+            ACTION,
+            num_qvalue_nets=number,
+            num_cells=cells,
+            layer_norm=cfg.network.layer_norm,
+        ),
         tanh_gaussian_inverse_dynamics(OBSERVATION, ACTION, num_cells=cells),
     )
     loss.make_value_estimator(gamma=cfg.optim.gamma)

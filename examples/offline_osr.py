@@ -6,7 +6,9 @@ The same as ``torchrl-osr train env=hopper``; :mod:`torchrl_osr.commands.train` 
 whole story: data, inverse dynamics model, policy, on TorchRL's trainer.
 """
 
-from torchrl_osr.commands.train import main
+import sys
+
+from torchrl_osr.__main__ import main
 
 if __name__ == "__main__":
-    main()
+    main(["train", *sys.argv[1:]])

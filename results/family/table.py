@@ -58,15 +58,15 @@ FAMILY = {
         "`kl_divergence` of torch",
     ),
     "Discrete OSR": (
-        "`DiscreteOSRLoss`, (11), 4.4", "`examples/discrete_osr.py`",
+        "`DiscreteOSRLoss`, (11), 4.4", "`loss=discrete_osr`",
         "action by action, `torch.distributions.Categorical`",
     ),
     "Discrete CQL(H)": (
-        "`DiscreteOSRLoss`, CQL (4)", "`examples/discrete_osr.py`",
+        "`DiscreteOSRLoss`, CQL (4)", "`loss=discrete_cql`",
         "action by action, `torch.distributions.Categorical`",
     ),
     "Discrete inverse dynamics": (
-        "`InverseDynamicsLoss`, 4.2", "`examples/discrete_osr.py`",
+        "`InverseDynamicsLoss`, 4.2", "`inverse_dynamics=categorical`",
         "`torch.distributions.Categorical`",
     ),
 }  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import socket
 from pathlib import Path
 
@@ -165,12 +166,16 @@ def test_every_suite_is_possible_for_other_environments(folder, env_id):
     [
         (["episodes=1"], ValueError, "episodes=1"),
         (["last=0"], ValueError, "last=0"),
+        (["sweep=runs"], ValueError, "either checkpoint=.* or sweep="),
+        (["checkpoint=null"], ValueError, "either checkpoint=.* or sweep="),
+        (["checkpoint=null", "sweep=."], ValueError, "no finished run in or below"),
         (["checkpoint=nowhere"], FileNotFoundError, "nowhere"),
         (["checkpoint=/"], FileNotFoundError, r"config\.yaml"),
         (["suite.disturbances.mass.kindd=a"], ConfigCompositionException, "kindd"),
     ],
 )
-def test_bad_input_is_named(folder, overrides, error, named):
+def test_bad_input_is_named(tmp_path, monkeypatch, folder, overrides, error, named):
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(error, match=named):
         example.main(composed(f"checkpoint={folder}", *overrides))
 
@@ -195,14 +200,40 @@ def test_attacks_need_standardised_networks_and_a_stochastic_policy(folder):
         make_disturbances(suite.disturbances, trained, np.full(11, 0.5))
 
 
-@pytest.mark.parametrize(("script", "groups"), [("evaluate", ["suite"]), ("film", [])])
-def test_help_offers_the_scripts_own_groups_alone(tmp_path, run, script, groups):
+@pytest.mark.parametrize("script", ["evaluate", "film"])
+def test_help_has_every_key_and_fits_a_screen(tmp_path, run, script):
     code, output = run(tmp_path, script, "--help")
     assert code == 0, output
-    offered = output.split("== Config ==")[0]
-    assert re.findall(r"(?m)^([\w/]+): \w", offered) == groups
-    assert "schema" not in output
-    assert "checkpoint: ???" in output
+    lines = output.strip().splitlines()
+    assert len(lines) <= 28
+    assert max(map(len, lines)) <= 80
+    told = output.split("Keys:")[1].split("--cfg job")[0]
+    config = OmegaConf.load(CONF / f"{script}.yaml")
+    keys = [*(set(config) - {"defaults", "hydra"}), *["suite"][: script == "evaluate"]]
+    assert set(re.findall(r"(?m)^  (\w+) ", told)) == set(keys)
+    if script == "evaluate":
+        named = re.search(r"suite +(.*?)\n  \w", told, re.DOTALL)[1]
+        assert sorted(re.split(r",\s+", named)) == SUITES
+
+
+def test_sweep_evaluates_every_finished_run(tmp_path, folder, run):
+    for name in ("0_good", "1_damaged", "2_running"):
+        shutil.copytree(folder, tmp_path / "sweep" / name)
+    (tmp_path / "sweep" / "2_running" / "status.json").write_text(
+        '{"status": "running"}'
+    )
+    damaged = tmp_path / "sweep" / "1_damaged"
+    for path in (damaged / "checkpoint" / "policy").glob("checkpoint-*"):
+        path.write_bytes(path.read_bytes()[:100])
+    options = ["sweep=sweep", "jobs=2", "suite=start", "episodes=2", "last=1"]
+    code, output = run(tmp_path, "evaluate", *options)
+    assert code == 1
+    lines = output.splitlines()
+    assert lines[0] == "left out: sweep/2_running: not finished, its status is running"
+    assert lines[-1] == "1 of 2 runs failed: sweep/1_damaged."
+    assert re.search(r"of 2: sweep/1_damaged: failed: checkpoint .* is damaged", output)
+    assert re.search(r"(?m)^  sweep/0_good +-?\d+\.\d +-?\d+\.\d$", output)
+    assert (tmp_path / "sweep" / "0_good" / "robustness-start.json").exists()
 
 
 def test_every_key_and_suite_is_documented():

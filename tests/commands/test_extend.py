@@ -1,4 +1,4 @@
-"""docs/extend.md as it is read: its files saved, its lines typed, in an empty folder."""
+"""docs/extend.md as it is read: its files saved, its lines typed, in a new folder."""
 
 from __future__ import annotations
 

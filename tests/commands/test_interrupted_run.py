@@ -65,11 +65,13 @@ def test_stopped_run_goes_on_to_the_same_bits(tmp_path, start, run, sizes):
     code, output = stop_in_policy_phase(process, tmp_path / "here", signal.SIGINT)
     assert code == 130, output
     assert "stopped by SIGINT at step" in output
-    assert f"resume={folder}" in output
+    assert f"Continue with: torchrl-osr train resume={folder}\n" in output
     assert status(folder) == "preempted"
+    began = {path: path.read_text() for path in (folder / ".hydra").iterdir()}
     code, output = run(tmp_path, SCRIPT, f"resume={folder}")
     assert code == 0, output
     assert status(folder) == "done"
+    assert all(path.read_text() == text for path, text in began.items())
     mine, theirs = tensors(folder), tensors(tmp_path / "undisturbed")
     assert len(mine) > 20
     assert all(torch.equal(a, b) for a, b in zip(mine, theirs, strict=True))

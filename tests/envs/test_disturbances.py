@@ -196,7 +196,9 @@ def test_another_simulation_is_refused_by_name(env_id, name):
         ON[name](env)
 
 
-@pytest.mark.parametrize("name", ["knock", "knock, paper", "action noise", "delay"])
+@pytest.mark.parametrize(
+    "name", ["knock, official", "knock, paper", "action noise", "delay"]
+)
 def test_actions_must_be_a_box(name):
     with pytest.raises(TypeError, match="expected a Box"):
         ON[name](gymnasium.make("CartPole-v1"))

@@ -10,14 +10,18 @@ import pytest
 import torch
 from torchrl.envs import ObservationNorm
 
+from torchrl_osr.data import reference_returns
 from torchrl_osr.evaluation import (
     EpisodeEvaluator,
     EpisodeResults,
     deterministic_policy,
+    measure_of,
     score_table,
     summarize,
 )
 from torchrl_osr.modules import tanh_gaussian_actor
+
+HOPPER = reference_returns("hopper")
 
 
 def linear_policy(observation: torch.Tensor) -> torch.Tensor:
@@ -76,7 +80,7 @@ def test_summary_is_json_and_normalised():
     results = EpisodeResults(
         np.array([3234.3, -20.272305]), np.array([1000, 20]), np.array([0, 1])
     )
-    summary = summarize(results, "hopper")
+    summary = summarize(results, HOPPER)
     assert summary["score"] == pytest.approx(50)
     assert summary["score_low"] == pytest.approx(0)
     assert summary["score_high"] == pytest.approx(100)
@@ -84,10 +88,24 @@ def test_summary_is_json_and_normalised():
     assert summary["length"] == 510
 
 
+def test_without_references_there_is_no_score():
+    returns = np.array([-900.0, -1100.0])
+    results = EpisodeResults(returns, np.full(2, 200), np.arange(2))
+    summary = summarize(results, None)
+    assert measure_of(summary) == "return"
+    assert summary["return"] == -1000
+    assert (summary["return_low"], summary["return_high"]) == (-1100, -900)
+    assert not [key for key in summary if "score" in key]
+    table = score_table("p", [summary], summary | {"step": 1}, -1200.0, Path("run"))
+    assert table.startswith("p: return [95 % interval]")
+    assert "-1200.0" in table
+    assert "expert" not in table
+
+
 def test_tasks_without_successes_have_none():
     results = EpisodeEvaluator("Hopper-v5", num_episodes=2)(linear_policy)
     assert results.successes is None
-    assert not [key for key in summarize(results, "hopper") if "success" in key]
+    assert not [key for key in summarize(results, HOPPER) if "success" in key]
 
 
 def test_successes_are_those_that_reached_the_goal():
@@ -110,7 +128,7 @@ def test_success_rate_has_wilsons_interval():
     results = EpisodeResults(
         successes.astype(float), np.full(4, 300), np.arange(4), successes
     )
-    summary = summarize(results, "pointmaze-umaze")
+    summary = summarize(results, reference_returns("pointmaze-umaze"))
     assert (summary["score"], summary["success_rate"]) == (50, 0.5)
     # By hand in test_statistics.
     interval = summary["success_low"], summary["success_high"]

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from torchrl_osr.data import reference_returns
 from torchrl_osr.evaluation import (
     Disturbance,
     DisturbanceResults,
@@ -79,7 +80,7 @@ def evaluations():
             DisturbanceResults(mass, episodes(*heavy), [0, 0, 0], None),
         ]
         paired = PairedResults(episodes(*clean), disturbed)
-        return evaluation_json(step, paired, "hopper")
+        return evaluation_json(step, paired, reference_returns("hopper"))
 
     return [
         evaluation(
@@ -129,6 +130,23 @@ def test_summary_is_over_all_checkpoints(evaluations):
     assert (
         mass["survival"] is mass["recovered_share"] is mass["recovery_median"] is None
     )
+
+
+def test_without_scores_it_is_returns(evaluations, tmp_path):
+    for played in evaluations:
+        for each in (played["clean"], *played["levels"]):
+            each["returns"] = [score - 1000 for score in each.pop("scores")]
+    knock, mass = summary = summarize_disturbances(evaluations)
+    assert knock["clean_return"] == pytest.approx(-945)
+    assert knock["return"] == pytest.approx(-955)
+    assert mass["decrease"] is None, "no percentage of what is below 0"
+    assert not [key for key in knock if "score" in key]
+    table = robustness_table("t", summary).splitlines()
+    assert table[1].split()[:3] == ["disturbance", "clean", "return"]
+    assert table[2].split()[:4] == ["knock", "-945.0", "-955.0", "-"]
+    path = tmp_path / "figure.png"
+    robustness_figure(summary, evaluations, path, title="t")
+    assert path.read_bytes().startswith(b"\x89PNG")
 
 
 def test_nobody_met_it(evaluations):

@@ -30,7 +30,7 @@ def test_scalars_are_read_as_logged_and_the_later_row_counts(tmp_path):
 def test_learning_curve_is_a_picture(tmp_path):
     path = tmp_path / "curve.png"
     scalars = {"loss_qvalue": [(0, 1.0), (10, 2.0)], "unknown": [(0, 1.0)]}
-    learning_curve(evaluations(1, 2), scalars, path, title="t", data_score=1.5)
+    learning_curve(evaluations(1, 2), scalars, path, title="t", data_mean=1.5)
     assert path.read_bytes().startswith(b"\x89PNG")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import get_class
 from torchrl.modules import TanhDelta, TanhNormal
@@ -35,6 +36,8 @@ def test_every_loss_is_built_and_trains_its_networks(name, make_batch) -> None:
     assert loss.value_estimator.gamma == 0.5
     SoftUpdate(loss, tau=0.1)
     batch = make_batch(10).apply(lambda x: x.float() if x.is_floating_point() else x)
+    if name.startswith("discrete"):
+        batch["action"] = torch.eye(2)[torch.arange(10) % 2]
     losses = [value for key, value in loss(batch).items() if key.startswith("loss_")]
     sum(losses).backward()
     # The actor is the loss's own: what is evaluated is what was trained.

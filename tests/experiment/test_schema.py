@@ -69,9 +69,17 @@ def test_groups_name_what_the_package_has():
     assert options("data") == sorted([*QUALITIES, *MAZE_QUALITIES, *RECORDED])
     assert options("env") == sorted([*load_behavior_card(), *MAZE_IDS])
     for name, env_id in MAZE_IDS.items():
-        assert composed(f"env={name}").env == {"name": name, "id": env_id}
+        env = composed(f"env={name}").env
+        assert (env.name, env.id) == (name, env_id)
     for name, entry in load_behavior_card().items():
-        assert composed(f"env={name}").env == {"name": name, "id": entry["env"]}
+        env = composed(f"env={name}").env
+        assert (env.name, env.id) == (name, entry["env"])
+
+
+def test_an_id_alone_is_enough():
+    assert composed("env.id=Pendulum-v1").env.name == "Pendulum-v1"
+    assert composed("env.id=robots:ns/Arm-v0").env.name == "ns-Arm-v0"
+    assert composed("env.id=Walker2d-v5").env.name == "walker2d"
 
 
 def test_presets_reach_the_values_and_the_command_line_wins():
@@ -210,6 +218,8 @@ LOSSES = {
     "edac_10": ("EDACLoss", {"num_qvalue_nets": 10}),
     "osr_v": ("OSRVLoss", {}),
     "td3_bc": ("TD3BCLoss", {}),
+    "discrete_osr": ("DiscreteOSRLoss", {}),
+    "discrete_cql": ("DiscreteOSRLoss", CQL),
 }
 
 

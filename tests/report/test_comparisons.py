@@ -39,7 +39,7 @@ def test_pairs_are_of_one_checkpoint_and_episode():
     assert not note
     found, note = pair(values.drop(("cql", 0, 2, 11)), "osr", "cql")
     assert not found
-    assert "1 episodes have no partner, the first of seed 0 at step 2 with" in note
+    assert "1 episode without a partner, the first of seed 0 at step 2 with" in note
 
 
 def both(folder, shift, *, seeds=SEEDS, env="hopper", **options):
@@ -133,7 +133,7 @@ def test_what_does_not_match_is_refused_or_said(tmp_path):
     assert (found.seeds, found.note) == (2, "only seeds that both have")
     (found,) = compare(tables, "later", "cql", score)
     assert found.verdict == "not paired"
-    assert "4 episodes have no partner, the first of seed 0 at step 5" in found.note
+    assert "4 episodes without a partner, the first of seed 0 at step 5" in found.note
     (found,) = compare(tables, "seedless", "cql", score)
     assert found.note == "they have no seed in common"
     assert compare(tables, "clean", "cql", under) == []

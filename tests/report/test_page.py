@@ -136,7 +136,7 @@ def test_the_verdict_comes_first_and_few_seeds_have_none(report):
     assert "▲ " not in "".join(cells(report.markup))
     assert any("Mixed versions: torch 2.12.0" in each for each in found)
     assert "osr (trainer.steps=9000)" in first
-    assert "2 runs or files" in first
+    assert "2 runs or files of runs" in first
 
 
 def test_what_is_left_out_is_named_with_the_reason(report):
@@ -231,10 +231,9 @@ def test_the_command_packs_runs_reports_on_them_and_says_what_is_missing(
 
     fakes.write_run(tmp_path / "runs" / "a", {1: [1.0, 2.0]})
     table, page = tmp_path / "runs.jsonl.gz", tmp_path / "page"
-    assert "1 runs in" in run(tmp_path / "runs", "--pack", table)
+    assert "1 run in" in run(tmp_path / "runs", "--pack", table)
     output = run(table, "--output", page)
     assert "note: Every method has one seed" in output
     assert (page / "report.html").exists()
-    with pytest.raises(SystemExit):
+    with pytest.raises(FileNotFoundError, match="nowhere does not exist"):
         run(tmp_path / "nowhere")
-    assert "nowhere does not exist" in capsys.readouterr().err

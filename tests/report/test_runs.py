@@ -28,6 +28,7 @@ def test_values_of_a_run_are_those_of_its_files(tmp_path):
         "data": "hopper medium-replay",
         "seed": 4,
         "steps": 2000,
+        "measure": "score",
         "data_score": 20,
         "overrides": "loss=osr seed=4",
         "versions": ["mujoco 4.0.0", "torch 2.13.0", "torchrl_osr 0.1.0"],

@@ -22,7 +22,8 @@ from tensordict import TensorDict
 from torchrl import torchrl_logger
 
 from torchrl_osr.commands import CONF
-from torchrl_osr.data import RECORDED, load_dataset, make_environment
+from torchrl_osr.commands.console import single_job
+from torchrl_osr.data import RECORDED, environment_spec, load_dataset, make_environment
 from torchrl_osr.data.overview import (
     PARTS,
     Entry,
@@ -45,6 +46,7 @@ schema.register()
 
 
 @hydra.main(version_base="1.3", config_path=CONF, config_name="check_data")
+@single_job
 def main(cfg: DictConfig) -> None:
     """Read the data, print what they are, draw them; nothing else is written."""
     torchrl_logger.setLevel("ERROR")  # warnings are among the findings
@@ -65,8 +67,9 @@ def main(cfg: DictConfig) -> None:
             raise ValueError(f"data={quality} needs its task, as in env=hopper.")
         if quality in RECORDED and path and not is_memmap_folder(path):
             # As it was recorded; also of a log that is then refused.
+            spec = None if env_id is None else environment_spec(env_id)
             log = open_recorded(
-                quality, path, env_id=env_id, progress=cfg.progress, **reading
+                quality, path, spec=spec, progress=cfg.progress, **reading
             )
             names = log.about.get("columns", {})
             entries = describe_entries(log.parts(CHUNK_ROWS), names)

@@ -1,26 +1,34 @@
 """Disturb a trained policy: score lost, survival, and time back to the data.
 
-    torchrl-osr evaluate checkpoint=outputs/hopper-medium-replay/seed0-...
+    torchrl-osr evaluate checkpoint=outputs/hopper-medium-replay/osr-seed0-...
     torchrl-osr evaluate checkpoint=<run's folder> suite=torque episodes=20
     torchrl-osr evaluate checkpoint=<run's folder>/checkpoint/policy/best.torchrl
+    torchrl-osr evaluate sweep=multirun/20260101-120000 jobs=4
 
 Each of the run's last checkpoints plays pairs of episodes, one of each pair disturbed.
 The run's folder gets ``robustness-<suite>.json`` with all raw results, and a figure of
-the same name. A killed evaluation continues after its last finished checkpoint. See
-``docs/robustness.md``.
+the same name. A killed evaluation continues after its last finished checkpoint.
+``sweep=`` does this for every run below a folder. See ``docs/robustness.md``.
 """
 
 from __future__ import annotations
 
+import functools
 import json
+import multiprocessing
+import signal
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import hydra
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
 from torchrl import torchrl_logger
-from tqdm.auto import tqdm
 
 from torchrl_osr._files import (
     CHECKSUM,
@@ -31,26 +39,33 @@ from torchrl_osr._files import (
     write_json,
 )
 from torchrl_osr.commands import CONF
+from torchrl_osr.commands.console import sentence, single_job
 from torchrl_osr.data import observation_statistics
 from torchrl_osr.evaluation import (
     DataDistance,
     deterministic_policy,
     evaluate_paired,
     evaluation_json,
+    impossible_disturbances,
+    measure_of,
     robustness_figure,
     robustness_table,
     summarize_disturbances,
 )
+from torchrl_osr.evaluation.robustness import aligned_columns
 from torchrl_osr.experiment import run_folder
-from torchrl_osr.experiment.build import load_data
+from torchrl_osr.experiment.build import load_data, references_of
 from torchrl_osr.experiment.limits import check_values
 from torchrl_osr.experiment.run_config import flatten
 from torchrl_osr.experiment.suite import make_disturbances, register
 from torchrl_osr.experiment.trained_run import (
+    TrainedRun,
     checkpoints_of,
     load_trained,
     run_folder_of,
 )
+from torchrl_osr.report.runs import find_runs
+from torchrl_osr.trainers.progress import Progress
 
 JSON_FORMAT = 1
 SEED_STRIDE = 1000  # between checkpoints: no two of them play the same episodes
@@ -59,16 +74,32 @@ register()
 
 
 @hydra.main(f"{CONF}/evaluation", "evaluate", version_base="1.3")
+@single_job
 def main(cfg: DictConfig) -> None:
-    """Evaluate, unless the result is there already, and print the table."""
+    """Evaluate, unless the results are there already, and print the table."""
     check_values(flatten(OmegaConf.to_container(cfg, resolve=True)))
+    if min(cfg.last, cfg.jobs, cfg.episodes - 1) < 1:
+        raise ValueError(
+            f"last and jobs must be at least 1 and episodes at least 2, got "
+            f"last={cfg.last}, jobs={cfg.jobs}, episodes={cfg.episodes}: one pair of "
+            "episodes has no interval."
+        )
+    if (cfg.checkpoint is None) == (cfg.sweep is None):
+        raise ValueError(
+            "give either checkpoint=<a run's folder> or sweep=<a folder above runs>."
+        )
+    if cfg.sweep is not None:
+        evaluate_sweep(cfg)
+        return
+    path, results = evaluate_run(cfg)
+    print("\n" + robustness_table(title(results), results["summary"]))
+    print(f"  files  {path}\n         {path.with_suffix('.png')}")
+
+
+def evaluate_run(cfg: DictConfig) -> tuple[Path, dict[str, Any]]:
+    """Evaluate one run or checkpoint: the file of the results, and what is in it."""
     torchrl_logger.setLevel("WARNING")
     torch.set_num_threads(cfg.num_threads)
-    if min(cfg.last, cfg.episodes - 1) < 1:
-        raise ValueError(
-            f"last must be at least 1 and episodes at least 2, got last={cfg.last}, "
-            f"episodes={cfg.episodes}: one pair of episodes has no interval."
-        )
     folder = run_folder_of(cfg.checkpoint)
     files, name = [Path(cfg.checkpoint)], f"robustness-{cfg.suite.name}"
     if files[0].is_dir():
@@ -86,14 +117,87 @@ def main(cfg: DictConfig) -> None:
     else:
         print(f"{path} is there already; force=true repeats it.")
     partial.unlink(missing_ok=True)
-    figure = path.with_suffix(".png")
-    title = (
-        f"{results['env']} {results['data']}, suite {cfg.suite.name}: "
-        f"{len(files)} x {cfg.episodes} pairs of episodes"
+    for name, reason in results.get("left_out", {}).items():
+        print(f"left out: {name}: {reason}")
+    robustness_figure(
+        results["summary"],
+        results["evaluations"],
+        path.with_suffix(".png"),
+        title=title(results),
     )
-    robustness_figure(results["summary"], results["evaluations"], figure, title=title)
-    print("\n" + robustness_table(title, results["summary"]))
-    print(f"  files  {path}\n         {figure}")
+    return path, results
+
+
+def title(results: dict[str, Any]) -> str:
+    """What was played."""
+    return (
+        f"{results['env']} {results['data']}, suite {results['suite']}: "
+        f"{len(results['evaluations'])} x {results['episodes']} pairs of episodes"
+    )
+
+
+def evaluate_sweep(cfg: DictConfig) -> None:
+    """Evaluate every finished run below a folder, ``jobs`` at once; print a table.
+
+    Raises:
+        ValueError: if there is no finished run, or, when all others are done, if some
+            could not be evaluated.
+    """
+    top = Path(cfg.sweep)
+    runs = []
+    for folder in find_runs([top]):
+        try:
+            status = read_json(folder / run_folder.STATUS)["status"]
+        except (OSError, ValueError, KeyError):
+            status = "unknown"
+        if status == "done":
+            runs.append(folder)
+        else:
+            print(f"left out: {folder}: not finished, its status is {status}")
+    if not runs:
+        raise ValueError(f"there is no finished run in or below {top}.")
+    rows: dict[Path, Sequence[str]] = {}
+    failed = []
+    # Spawned, for torch's threads do not survive a fork. Ctrl-C ends them in silence.
+    workers = ProcessPoolExecutor(
+        min(cfg.jobs, len(runs)),
+        multiprocessing.get_context("spawn"),
+        functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL),
+    )
+    jobs = {workers.submit(evaluate_one_of_many, cfg, run): run for run in runs}
+    try:
+        for number, job in enumerate(as_completed(jobs), start=1):
+            folder = jobs[job]
+            try:
+                rows[folder] = job.result()
+            except Exception as error:
+                failed.append(folder)
+                outcome = f"failed: {sentence(error)}"
+            else:
+                outcome = "undisturbed {}, disturbed {}".format(*rows[folder])
+            print(f"{number} of {len(runs)}: {folder}: {outcome}", flush=True)
+    finally:
+        workers.shutdown(cancel_futures=True)
+    header = ("run", "undisturbed", "disturbed")
+    done = [(str(run), *rows[run]) for run in runs if run in rows]
+    print(f"\nsuite {cfg.suite.name}: score, or return, mean over its disturbances")
+    print("\n".join(aligned_columns([header, *done])))
+    if failed:
+        names = ", ".join(map(str, failed))
+        raise ValueError(f"{len(failed)} of {len(runs)} runs failed: {names}.")
+    print(f"  next   torchrl-osr report {top}")
+
+
+def evaluate_one_of_many(cfg: DictConfig, folder: Path) -> Sequence[str]:
+    """Evaluate one run of a sweep: its mean score or return, and the disturbed one."""
+    one = cfg.copy()
+    one.checkpoint, one.progress = str(folder), False
+    _, results = evaluate_run(one)
+    rows = results["summary"]
+    measure = measure_of(rows[0])
+    keys = f"clean_{measure}", measure
+    means = [sum(row[key] for row in rows) / len(rows) for key in keys]
+    return [f"{mean:.1f}" for mean in means]
 
 
 def requested(cfg: DictConfig, files: list[Path]) -> dict[str, Any]:
@@ -129,7 +233,8 @@ def evaluate(
     cfg: DictConfig, files: list[Path], partial: Path, request: dict[str, Any]
 ) -> dict[str, Any]:
     """Play all checkpoints of one run, except those that ``partial`` has already."""
-    run = load_trained(files[0], trust=cfg.trust).config
+    first = load_trained(files[0], trust=cfg.trust)
+    run = first.config
     data, _ = load_data(run, progress=cfg.progress)
     distance = DataDistance(data, seed=run.data.seed)
     _, scale = observation_statistics(data)
@@ -137,39 +242,57 @@ def evaluate(
     evaluations = begun["evaluations"]
     if evaluations:
         print(f"{partial} has {len(evaluations)} of {len(files)} checkpoints already.")
-    plays = 1 + len(cfg.suite.disturbances)  # the clean episodes first
-    bar = tqdm(
-        initial=len(evaluations) * plays,
-        total=len(files) * plays,
-        desc=cfg.suite.name,
-        unit="play",
-        disable=None if cfg.progress else True,  # None: silent off a terminal
+    references = references_of(run)
+    left_out = impossible(cfg, first, scale.numpy())
+    suite = {
+        name: config
+        for name, config in cfg.suite.disturbances.items()
+        if name not in left_out
+    }
+    plays = 1 + len(suite)  # the clean episodes first
+    progress = Progress(
+        cfg.suite.name, len(files) * plays, bar=cfg.progress, unit="play"
     )
-    with bar:
+    played = count(len(evaluations) * plays + 1)
+    with progress.shown(len(evaluations) * plays):
         for number in range(len(evaluations), len(files)):
             trained = load_trained(files[number], trust=cfg.trust)
             seed = cfg.seed + SEED_STRIDE * number
             paired = evaluate_paired(
                 deterministic_policy(trained.actor, trained.observation_norm),
                 run.env.id,
-                make_disturbances(
-                    cfg.suite.disturbances, trained, scale.numpy(), seed=seed
-                ),
+                make_disturbances(suite, trained, scale.numpy(), seed=seed),
                 distance,
                 num_episodes=cfg.episodes,
                 seed=seed,
-                advance=bar.update,
+                advance=lambda: progress.update(next(played)),
             )
-            evaluations.append(evaluation_json(trained.step, paired, run.env.name))
+            evaluations.append(evaluation_json(trained.step, paired, references))
             begun = checksummed(request | {"evaluations": evaluations})
             write_json(partial, begun)
     return {
         "env": run.env.name,
         "data": run.data.quality,
         "threshold": distance.threshold,
+        "left_out": left_out,
         "evaluations": evaluations,
         "summary": summarize_disturbances(evaluations),
     }
+
+
+def impossible(
+    cfg: DictConfig, trained: TrainedRun, scale: NDArray[np.floating]
+) -> dict[str, str]:
+    """Say which disturbances of the suite the environment lacks what it takes for."""
+    env_id = trained.config.env.id
+    suite = make_disturbances(cfg.suite.disturbances, trained, scale)
+    left_out = impossible_disturbances(env_id, suite)
+    if len(left_out) == len(suite):
+        raise ValueError(
+            f"no disturbance of suite={cfg.suite.name} is possible for {env_id}: "
+            "choose another suite."
+        )
+    return left_out
 
 
 if __name__ == "__main__":

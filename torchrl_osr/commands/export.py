@@ -1,6 +1,6 @@
 """Write a trained policy to one file, and check the file against the policy.
 
-    torchrl-osr export outputs/hopper-medium-replay/seed0-... policy.safetensors
+    torchrl-osr export outputs/hopper-medium-replay/osr-seed0-... policy.safetensors
     torchrl-osr export policy.safetensors policy.onnx
     torchrl-osr export policy.safetensors value.onnx --output value
 

@@ -1,6 +1,6 @@
 """Film a recovery: who survives a push, and which states do they visit?
 
-    torchrl-osr film checkpoint=outputs/hopper-medium-replay/seed0-...
+    torchrl-osr film checkpoint=outputs/hopper-medium-replay/osr-seed0-...
     torchrl-osr film checkpoint=<run's folder> knock=5 rule=time
     torchrl-osr film checkpoint=<run's folder> push=1 film_seed=30004
 
@@ -40,6 +40,7 @@ from torchrl import torchrl_logger
 from torchrl_osr._checks import check_choice
 from torchrl_osr._files import write_json
 from torchrl_osr.commands import CONF
+from torchrl_osr.commands.console import single_job
 from torchrl_osr.data import (
     load_behavior_policy,
     make_environment,
@@ -92,6 +93,7 @@ ConfigStore.instance().store(name="film_schema", node=FilmConfig)
 
 
 @hydra.main(version_base="1.3", config_path=f"{CONF}/evaluation", config_name="film")
+@single_job
 def main(cfg: DictConfig) -> None:
     """Play all episodes with every controller, print the table, film one of them."""
     check_values(flatten(OmegaConf.to_container(cfg, resolve=True)))

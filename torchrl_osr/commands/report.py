@@ -19,12 +19,24 @@ import sys
 from pathlib import Path
 
 from torchrl_osr.report import comparison_notes, pack_runs, read_runs, write_report
+from torchrl_osr.report.scores import counted
+
+EXAMPLES = """\
+  torchrl-osr report outputs
+  torchrl-osr report multirun outputs --reference cql --output page
+  torchrl-osr report outputs --pack runs.jsonl.gz && torchrl-osr report runs.jsonl.gz
+
+The page is <output>/report.html; docs/report.md says how to read it.
+"""
 
 
 def main() -> None:
     """Read, report, and say what could not be."""
     parser = argparse.ArgumentParser(
-        prog=sys.argv[0], description=__doc__.split("\n")[0]
+        prog=sys.argv[0],
+        description=__doc__.split("\n")[0],
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
         "runs", nargs="+", type=Path, help="folders of runs, or above them, or tables"
@@ -35,22 +47,19 @@ def main() -> None:
     options = parser.parse_args()
 
     command = " ".join([sys.argv[0], shlex.join(sys.argv[1:])])
-    try:
-        if options.pack:
-            number = pack_runs(options.runs, options.pack)
-            print(f"{number} runs in {options.pack}")
-            return
-        tables = read_runs(options.runs)
-        for path, reason in tables.left_out:
-            print(f"left out: {path}: {reason}")
-        for note in comparison_notes(tables):
-            print(f"note: {note}")
-        page = write_report(
-            tables, options.output, reference=options.reference, command=command
-        )
-    except (OSError, ValueError) as error:
-        parser.exit(1, f"{error}\n")
-    print(f"{len(tables.runs)} runs in {page}")
+    if options.pack:
+        number = pack_runs(options.runs, options.pack)
+        print(f"{counted(number, 'run')} in {options.pack}")
+        return
+    tables = read_runs(options.runs)
+    for path, reason in tables.left_out:
+        print(f"left out: {path}: {reason}")
+    for note in comparison_notes(tables):
+        print(f"note: {note}")
+    page = write_report(
+        tables, options.output, reference=options.reference, command=command
+    )
+    print(f"{counted(len(tables.runs), 'run')} in {page}")
 
 
 if __name__ == "__main__":

@@ -1,64 +1,91 @@
-"""Train a policy with OSR on real MuJoCo transitions, from nothing, with one command.
+"""Train a policy with OSR on offline data, with one command.
 
     torchrl-osr train env=hopper
+    torchrl-osr train env.id=Pendulum-v1 data=file data.path=log.npz
     torchrl-osr train env=walker2d data=medium-expert seed=3 preset=paper
     torchrl-osr train -m env=hopper,walker2d seed=0,1,2 hydra/launcher=pool
-    torchrl-osr train resume=outputs/hopper-medium-replay/seed0-...
+    torchrl-osr train resume=outputs/hopper-medium-replay/osr-seed0-...
 
-The data are rolled out on this machine at the first run and cached. A run leaves
+Data of the built-in tasks are rolled out on this machine at the first run and cached;
+docs/any_environment.md is about all others. A run leaves
 ``curve.png``, ``returns.json``, ``inverse_dynamics.json``, ``config.yaml``,
 ``status.json``, CSV files and ``checkpoint/`` in its folder.
 """
 
 from __future__ import annotations
 
+import logging
+import sys
 from contextlib import closing
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 from torchrl import torchrl_logger
 from torchrl.objectives import SoftUpdate
+from torchrl.record.loggers import Logger
 
 from torchrl_osr import StatePerturbation
 from torchrl_osr._files import write_json
 from torchrl_osr.commands import CONF
+from torchrl_osr.commands.console import single_job
+from torchrl_osr.data import environment_spec
 from torchrl_osr.evaluation import (
     EpisodeEvaluator,
     describe_inverse_dynamics,
     deterministic_policy,
     inverse_dynamics_report,
     learning_curve,
+    measure_of,
     read_scalars,
     score_table,
     summarize,
 )
 from torchrl_osr.experiment import run_folder, schema
-from torchrl_osr.experiment.build import check_parts, make_learner
-from torchrl_osr.experiment.loggers import make_loggers
-from torchrl_osr.experiment.run_config import check_run
+from torchrl_osr.experiment.build import (
+    check_parts,
+    make_learner,
+    read_environment,
+    references_of,
+)
+from torchrl_osr.experiment.loggers import log_outcome, make_loggers
+from torchrl_osr.experiment.run_config import check_run, module_of, read_yaml
 from torchrl_osr.experiment.training_data import load_training_data
 from torchrl_osr.trainers import OfflineTrainer, check_hardware, largest_value
+
+log = logging.getLogger(__name__)
 
 EVALUATION_SEED = 10_000  # far from the seeds of the data's episodes
 
 schema.register()
 
 
+def main() -> None:
+    """Train as the command line says."""
+    sys.argv += schema.named_by_what_differs(sys.argv[1:])
+    train()
+
+
 @hydra.main(version_base="1.3", config_path=CONF, config_name="train")
-def main(cfg: DictConfig) -> float:
-    """Do or continue one run in its folder; return its last score, for a sweeper."""
+@single_job
+def train(cfg: DictConfig) -> float:
+    """Do or continue one run; return its last score or return, for a sweeper."""
     job = HydraConfig.get()
     folder = Path(job.runtime.output_dir)
-    trust = cfg.trust  # by the command line, not by a run's folder
+    trust = list(cfg.trust)  # by the command line, not by a run's folder
     if cfg.resume is not None:
         cfg = run_folder.saved_config(folder, job.overrides.task)
+    else:
+        trust += module_of(cfg.env.id)
     check_run(cfg, trust)
+    if cfg.resume is None:
+        read_environment(cfg)
     run_folder.claim(folder, cfg)
     with run_folder.status(folder):
         return run(cfg, folder)
@@ -67,12 +94,17 @@ def main(cfg: DictConfig) -> float:
 def run(cfg: DictConfig, folder: Path) -> float:
     """Data, networks, inverse dynamics model, policy, report."""
     torchrl_logger.setLevel("WARNING")
+    versions = ", ".join(f"{name} {each}" for name, each in code_versions().items())
+    log.info(f"{cfg.env.name} {cfg.data.quality}, seed {cfg.seed}, in {folder}")
+    log.info(versions)
     torch.set_num_threads(cfg.trainer.num_threads)
     torch.set_float32_matmul_precision(cfg.trainer.matmul_precision)
     device, autocast = check_hardware(
         cfg.trainer.device, cfg.trainer.precision, cudagraph=cfg.trainer.cudagraph
     )
-    check_parts(cfg, 1, 1)
+    spec, references = environment_spec(cfg.env.id), references_of(cfg)
+    sizes = spec.observation_size, spec.action_size
+    check_parts(cfg, *sizes)
 
     # Transitions with standardised states. Each batch gets a perturbed state for every
     # state, which is the paper's mixed data set.
@@ -83,7 +115,10 @@ def run(cfg: DictConfig, folder: Path) -> float:
     data.buffer.append_transform(perturbation)
 
     # Networks, and the policy's loss, which holds the inverse dynamics model.
-    actor, inverse_dynamics, loss = make_learner(cfg, *data.sizes, device)
+    actor, inverse_dynamics, loss = make_learner(cfg, *sizes, device)
+
+    told = about(cfg, folder) if cfg.logger.kind == "wandb" else {}
+    loggers = make_loggers(folder=folder, **cfg.logger, **told)
 
     # One step of a trainer: sample a batch, compute the losses, go backward on their
     # sum, step the optimizer, move the target networks; log, evaluate and write a
@@ -92,7 +127,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
         OfflineTrainer,
         replay_buffer=data.buffer,
         components={"perturbation": perturbation, "observation_norm": data.norm},
-        loggers=make_loggers(folder=folder, **cfg.logger),
+        loggers=loggers,
         log_interval=cfg.trainer.log_interval,
         checkpoint_interval=cfg.trainer.checkpoint_interval,
         checkpoints_kept=cfg.trainer.checkpoints_kept,
@@ -145,8 +180,8 @@ def run(cfg: DictConfig, folder: Path) -> float:
             folder=folder / "checkpoint" / "policy",
             seed=cfg.seed + 1,
             target_net_updater=targets,
-            evaluate=lambda: summarize(play(policy), cfg.env.name),
-            metric=("score", "max"),
+            evaluate=lambda: summarize(play(policy), references),
+            metric=("return" if references is None else "score", "max"),
             eval_interval=cfg.trainer.eval_interval,
             description="policy",
             value_limits={"pred_value": limit, "target_value": limit},
@@ -155,7 +190,27 @@ def run(cfg: DictConfig, folder: Path) -> float:
             adversary = instantiate(cfg.perturbation.adversary)
             trainer.register_op("process_optim_batch", partial(adversary, loss))
         trainer.train()
-    return report(cfg, folder, data.score, trainer)
+    return report(cfg, folder, data.mean, trainer, loggers)
+
+
+def code_versions() -> dict[str, str]:
+    """Versions of the packages, and the commit of a checkout."""
+    commit = run_folder.code_commit()
+    return run_folder.package_versions() | ({"commit": commit} if commit else {})
+
+
+def about(cfg: DictConfig, folder: Path) -> dict[str, Any]:
+    """What W&B shall know of the run: name, group of its seeds, tags, configuration."""
+    began = read_yaml(folder / ".hydra" / "hydra.yaml")["hydra"]
+    data, method = f"{cfg.env.name}-{cfg.data.quality}", began["runtime"]["choices"]
+    sweep = [folder.parent.name] if began["mode"] == "MULTIRUN" else []
+    settings: Any = OmegaConf.to_container(cfg, resolve=True)
+    return {
+        "name": f"{data} {method['loss']} seed{cfg.seed}",
+        "group": f"{data} {method['loss']}",
+        "tags": [cfg.env.name, cfg.data.quality, method["loss"], *sweep],
+        "config": settings | {"versions": code_versions()},
+    }
 
 
 def shuffle_next(batch: TensorDict) -> TensorDict:
@@ -165,14 +220,19 @@ def shuffle_next(batch: TensorDict) -> TensorDict:
 
 
 def report(
-    cfg: DictConfig, folder: Path, data_score: float | None, trainer: OfflineTrainer
+    cfg: DictConfig,
+    folder: Path,
+    data_mean: float | None,
+    trainer: OfflineTrainer,
+    loggers: list[Logger],
 ) -> float:
     """Write raw returns and the figure, print the table; return the last score."""
     history, best = trainer.history, trainer.best()
     assert best is not None  # there is an evaluation before the first update
+    measure = measure_of(best)
     results = {
-        "versions": run_folder.package_versions(),
-        "data_score": data_score,
+        "versions": code_versions(),
+        f"data_{measure}": data_mean,
         "last": history[-1],
         "best": best,
     }
@@ -183,10 +243,12 @@ def report(
         read_scalars(folder / "csv" / "scalars" / "policy"),
         folder / "curve.png",
         title=f"{name}, {type(trainer.loss_module).__name__}, seed {cfg.seed}",
-        data_score=data_score,
+        data_mean=data_mean,
     )
-    print("\n" + score_table(name, history, best, data_score, folder))
-    return float(history[-1]["score"])
+    rows = {"last": history[-1], "best": best}
+    log_outcome(loggers, cfg, rows, {"curve": folder / "curve.png"})
+    print("\n" + score_table(name, history, best, data_mean, folder))
+    return float(history[-1][measure])
 
 
 if __name__ == "__main__":

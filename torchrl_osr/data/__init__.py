@@ -29,6 +29,7 @@ from torchrl_osr.data.collect.reference_scores import (
     REFERENCE_RETURNS,
     ReferenceReturns,
     normalized_score,
+    reference_returns,
 )
 from torchrl_osr.data.store.replay_buffer import (
     check_memory,
@@ -43,7 +44,12 @@ from torchrl_osr.data.store.statistics import (
 from torchrl_osr.data.store.validation import ACTION_LIMIT, check_dataset
 
 if TYPE_CHECKING:
-    from torchrl_osr.data.collect.environment import MAZE_IDS, make_environment
+    from torchrl_osr.data.collect.environment import (
+        MAZE_IDS,
+        EnvironmentSpec,
+        environment_spec,
+        make_environment,
+    )
     from torchrl_osr.data.collect.local import load_local_dataset
     from torchrl_osr.data.collect.mazes import MAZE_QUALITIES
     from torchrl_osr.data.collect.qualities import (
@@ -69,12 +75,14 @@ if TYPE_CHECKING:
 
 _NEEDS_EXTRA = {
     "Collection": "collect.rollout",
+    "EnvironmentSpec": "collect.environment",
     "MAZE_IDS": "collect.environment",
     "MAZE_QUALITIES": "collect.mazes",
     "QUALITIES": "collect.qualities",
     "RECORDED": "sources",
     "collect_quality": "collect.qualities",
     "collect_transitions": "collect.rollout",
+    "environment_spec": "collect.environment",
     "export_minari": "read.minari_export",
     "load_d4rl": "read.d4rl",
     "load_dataset": "sources",
@@ -100,11 +108,13 @@ __all__ = [
     "REFERENCE_RETURNS",
     "BehaviorPolicy",
     "Collection",
+    "EnvironmentSpec",
     "ReferenceReturns",
     "check_dataset",
     "check_memory",
     "collect_quality",
     "collect_transitions",
+    "environment_spec",
     "export_minari",
     "held_out_rows",
     "is_memory_mapped",
@@ -124,6 +134,7 @@ __all__ = [
     "normalized_score",
     "observation_statistics",
     "quality_policies",
+    "reference_returns",
     "sampled_observations",
     "save_behavior_policy",
     "split_held_out",

@@ -25,6 +25,7 @@ except ImportError as error:
         f"disturbances need {error.name!r}: pip install torchrl-osr[train]"
     ) from error
 
+from torchrl_osr.envs.disturbance import NotPossible
 from torchrl_osr.envs.faults import (
     ActionDelay,
     ActionNoise,
@@ -41,6 +42,7 @@ __all__ = [
     "ActionNoise",
     "DynamicsChange",
     "ExternalPush",
+    "NotPossible",
     "ObservationNoise",
     "StartStateNoise",
     "StickyAction",

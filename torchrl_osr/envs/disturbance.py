@@ -18,6 +18,10 @@ Step: TypeAlias = tuple[Vector, Any, bool, bool, dict[str, Any]]
 """What ``step`` returns: observation, reward, terminated, truncated, info."""
 
 
+class NotPossible(TypeError):
+    """A disturbance needs what the environment lacks: MuJoCo, or real actions."""
+
+
 def check_strength(name: str, value: float) -> None:
     """Raise a ValueError unless ``value`` is finite and at least 0."""
     if not 0 <= value < math.inf:
@@ -32,9 +36,9 @@ def check_count(name: str, value: object, least: int) -> None:
 
 
 def vector_box(space: gymnasium.Space[Any], name: str) -> gymnasium.spaces.Box:
-    """The space itself; raise a TypeError unless it is a Box."""
+    """The space itself; raise NotPossible unless it is a Box."""
     if not isinstance(space, gymnasium.spaces.Box):
-        raise TypeError(f"The {name} are {space}; expected a Box of real numbers.")
+        raise NotPossible(f"The {name} are {space}; expected a Box of real numbers.")
     return space
 
 
@@ -51,12 +55,12 @@ def bounded_box(space: gymnasium.Space[Any]) -> gymnasium.spaces.Box:
 
 
 def mujoco_task(env: gymnasium.Env[Any, Any], name: str) -> Any:
-    """The bare environment; raise a TypeError unless it is Gymnasium's own MuJoCo task.
+    """The bare environment; raise NotPossible unless it is Gymnasium's own MuJoCo task.
 
     Others, such as the mazes, have their simulation in another environment inside them.
     """
     if not isinstance(env.unwrapped, MujocoEnv):
-        raise TypeError(
+        raise NotPossible(
             f"{name} acts on the simulation of Gymnasium's own MuJoCo tasks, "
             f"'Hopper-v5' for instance; got {env.unwrapped}."
         )

@@ -32,7 +32,7 @@ class ActionNoise(DisturbanceWrapper):
 
     Raises:
         ValueError: if ``std`` is negative or actions are unbounded.
-        TypeError: if actions are not a Box.
+        NotPossible: if actions are not a Box.
 
     Examples:
         >>> from torchrl_osr.data import make_environment
@@ -73,7 +73,7 @@ class ActionDelay(DisturbanceWrapper):
 
     Raises:
         ValueError: if ``steps`` is negative or no integer.
-        TypeError: if actions are not a Box.
+        NotPossible: if actions are not a Box.
 
     Examples:
         >>> from torchrl_osr.data import make_environment
@@ -169,7 +169,7 @@ class ObservationNoise(DisturbanceWrapper):
     Raises:
         ValueError: if ``std`` or a number of ``unit`` is negative, or ``unit`` of
             another shape.
-        TypeError: if observations are not a Box.
+        NotPossible: if observations are not a Box.
 
     Examples:
         >>> from torchrl_osr.data import make_environment

@@ -40,7 +40,7 @@ class DynamicsChange(DisturbanceWrapper):
 
     Raises:
         ValueError: if a factor is negative or infinite, or ``mass`` is 0.
-        TypeError: if it is another environment.
+        NotPossible: if it is another environment.
 
     Examples:
         >>> from torchrl_osr.data import make_environment
@@ -111,7 +111,7 @@ class StartStateNoise(DisturbanceWrapper):
 
     Raises:
         ValueError: if ``std`` is negative.
-        TypeError: if it is another environment.
+        NotPossible: if it is another environment.
 
     Examples:
         >>> from torchrl_osr.data import make_environment

@@ -23,6 +23,8 @@ from torchrl_osr.envs.disturbance import (
 At: TypeAlias = int | Literal["random"]
 """Steps of the agent before the disturbance; ``"random"`` averages over the gait."""
 
+EARTH_GRAVITY = 9.81
+
 SMALL = 1e-3
 """Magnitude of the benchmark's random actions, in units of the action."""
 
@@ -78,6 +80,7 @@ class ActionKnock(TimedDisturbance):
       ``steps`` steps, which count like all others. Sizes s, m, l: 5, 10, 20.
     * ``"torque"``: every entry of the action is at its lower or upper bound, each with
       probability 1/2 and drawn anew in every step. The steps count as in ``"paper"``.
+      Discrete actions are drawn uniformly.
 
     Actions as small as those of ``"official"`` make the robot limp, for ``steps`` times
     0.008 s (hopper, walker2d) or 0.05 s (halfcheetah). The knock is inside the agent's
@@ -91,7 +94,7 @@ class ActionKnock(TimedDisturbance):
     one, 1 for each replaced action in the other modes, 0 elsewhere.
 
     Args:
-        env: the environment, with real actions.
+        env: the environment, with real actions, or in ``"torque"`` mode discrete ones.
         steps: of the knock.
 
     Keyword Args:
@@ -104,7 +107,7 @@ class ActionKnock(TimedDisturbance):
         ValueError: if ``mode`` is unknown, ``steps`` below 1, a moment negative (or 0
             in ``"official"`` mode), the window empty, or actions unbounded
             (``"torque"``).
-        TypeError: if actions are not a Box.
+        NotPossible: if actions are neither.
 
     Examples:
         >>> from torchrl_osr.data import make_environment
@@ -131,9 +134,11 @@ class ActionKnock(TimedDisturbance):
         # The sampler knocks between two steps of the agent, never before the first.
         super().__init__(env, at=at, window=window, first=int(mode == "official"))
         self.steps, self.mode = steps, mode
-        self._box = vector_box(env.action_space, "actions")
-        if mode == "torque":
-            bounded_box(self._box)
+        self._actions = env.action_space
+        if mode != "torque":
+            vector_box(self._actions, "actions")
+        elif not isinstance(self._actions, gymnasium.spaces.Discrete):
+            bounded_box(self._actions)
 
     def reset(self, **options: Any) -> tuple[Vector, dict[str, Any]]:
         observation, info = super().reset(**options)
@@ -159,13 +164,16 @@ class ActionKnock(TimedDisturbance):
                 extra = self._generator.random(shape) * SMALL
                 observation, *_ = self.unwrapped.step(extra)
             space = self.unwrapped.observation_space
-            if isinstance(space, gymnasium.spaces.Dict):  # a vector in make_environment
-                observation = gymnasium.spaces.flatten(space, observation)
+            if not isinstance(space, gymnasium.spaces.Box):  # so does make_environment
+                observation = np.asarray(gymnasium.spaces.flatten(space, observation))
         flag(info, knocked)["knock_steps"] = np.int64(self.steps * knocked)
         return observation, reward, terminated, truncated, info
 
     def _random_action(self) -> Vector:
-        box = self._box
+        actions = self._actions
+        if isinstance(actions, gymnasium.spaces.Discrete):
+            return np.asarray(actions.start + self._generator.integers(actions.n))
+        box = vector_box(actions, "actions")
         if self.mode == "paper":
             action = SMALL * self._generator.standard_normal(box.shape)
             return action.astype(box.dtype)
@@ -178,13 +186,14 @@ class ExternalPush(TimedDisturbance):
 
     The arrow in the figures of the OSR paper, see :class:`ActionKnock`: a force along
     the world's x axis at the torso's centre of mass (MuJoCo's ``xfrc_applied``), for
-    ``duration`` steps of the agent. The sign is drawn for each episode. The agent acts
+    ``duration`` steps of the agent. A robot without a body ``torso`` is pushed at its
+    heaviest. The sign is drawn for each episode. The agent acts
     on, rewards and survival count.
 
     ``info["push_force"]`` is the force of a step in newtons, with its sign.
 
     Args:
-        env: one of Gymnasium's MuJoCo tasks, with a body ``torso``.
+        env: one of Gymnasium's MuJoCo tasks.
         force: in ``unit``; 0 is off.
 
     Keyword Args:
@@ -192,13 +201,14 @@ class ExternalPush(TimedDisturbance):
             for halfcheetah.
         at, window: moment, as in :class:`ActionKnock`. Default ``"random"``.
         unit: ``"newton"`` (default) or ``"body_weight"``, the weight of all bodies when
-            the model is wrapped. Hopper weighs 155 N, walker2d 232 N, halfcheetah
-            137 N; forces in units of the weight accelerate robots alike.
+            the model is wrapped, at 9.81 m/s² where the model has no gravity. Hopper
+            weighs 155 N, walker2d 232 N, halfcheetah 137 N; forces in units of the
+            weight accelerate robots alike.
 
     Raises:
         ValueError: if ``force`` is negative, ``duration`` below 1, the moment negative,
             the window empty, or ``unit`` unknown.
-        TypeError: if it is another environment.
+        NotPossible: if it is another environment.
 
     Examples:
         >>> from torchrl_osr.data import make_environment
@@ -227,9 +237,12 @@ class ExternalPush(TimedDisturbance):
         super().__init__(env, at=at, window=window)
         self._bare = mujoco_task(env, "ExternalPush")
         model = self._bare.model
-        self._torso = model.body("torso").id
+        names = [model.body(number).name for number in range(model.nbody)]
+        heaviest = int(model.body_mass.argmax())
+        self._torso = names.index("torso") if "torso" in names else heaviest
         if unit == "body_weight":
-            force *= model.body_mass.sum() * np.linalg.norm(model.opt.gravity)
+            gravity = np.linalg.norm(model.opt.gravity) or EARTH_GRAVITY
+            force *= model.body_mass.sum() * gravity
         self.force, self.duration = float(force), duration
         self._sign = 1.0
 

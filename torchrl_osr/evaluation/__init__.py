@@ -15,6 +15,7 @@ from torchrl_osr.evaluation.episodes import (
     Watch,
     Wrap,
     deterministic_policy,
+    measure_of,
     summarize,
 )
 from torchrl_osr.evaluation.inverse_dynamics_fit import (
@@ -38,6 +39,7 @@ from torchrl_osr.evaluation.robustness import (
     decrease_interval,
     evaluate_paired,
     evaluation_json,
+    impossible_disturbances,
     robustness_table,
     summarize_disturbances,
 )
@@ -84,10 +86,12 @@ __all__ = [
     "disturbed_at",
     "evaluate_paired",
     "evaluation_json",
+    "impossible_disturbances",
     "interquartile_mean",
     "inverse_dynamics_report",
     "learning_curve",
     "mean_interval",
+    "measure_of",
     "measure_recovery",
     "nested_resamples",
     "percentile_interval",

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 # Okabe and Ito's palette, which colour-blind readers can tell apart.
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 
+IN_WORDS = {"score": "normalised score", "return": "return"}
+"""What figures call the measure of an episode."""
+
 
 def new_figure(width: float, height: float, **options: Any) -> Figure:
     """Matplotlib figure, ``width`` x ``height`` inches, that draws in memory."""

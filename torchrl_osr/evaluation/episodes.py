@@ -5,7 +5,7 @@ Shapes: ``E`` episodes, ``S`` observation, ``A`` action.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -18,14 +18,19 @@ from torch import Tensor
 from torchrl.envs import ObservationNorm
 
 from torchrl_osr._checks import check_positive
-from torchrl_osr.data import make_environment, normalized_score
+from torchrl_osr.data import ReferenceReturns, make_environment
 from torchrl_osr.evaluation.statistics import mean_interval, wilson_interval
+from torchrl_osr.objectives.distributions import ONE_HOT
 
 if TYPE_CHECKING:
     import gymnasium
 
 Policy = Callable[[Tensor], Tensor]
-"""Maps observations ``[E, S]`` as the environment gives them to actions ``[E, A]``."""
+"""Maps observations ``[E, S]`` as the environment gives them to actions ``[E, A]``.
+
+Real actions are within -1 and 1, see :func:`~torchrl_osr.data.make_environment`;
+discrete ones are their numbers, ``[E]``.
+"""
 
 Wrap: TypeAlias = "Callable[[gymnasium.Env[Any, Any]], gymnasium.Env[Any, Any]]"
 """Puts wrappers around an environment."""
@@ -58,6 +63,8 @@ def deterministic_policy(
 ) -> Policy:
     """The actor's deterministic action as a function of raw observations.
 
+    Of discrete actions it is the number of the likeliest.
+
     Args:
         actor_network: reads ``"observation"``.
         observation_norm: how the training data were standardised
@@ -69,8 +76,9 @@ def deterministic_policy(
         if observation_norm is not None:
             observation = (observation - observation_norm.loc) / observation_norm.scale
         batch = TensorDict({"observation": observation}, [len(observation)])
-        action: Tensor = actor_network.get_dist(batch).deterministic_sample
-        return action
+        distribution = actor_network.get_dist(batch)
+        action: Tensor = distribution.deterministic_sample
+        return action.argmax(-1) if isinstance(distribution, ONE_HOT) else action
 
     return policy
 
@@ -166,25 +174,42 @@ class EpisodeEvaluator:
             environment.close()
 
 
-def summarize(results: EpisodeResults, env_name: str) -> dict[str, Any]:
-    """Normalised score, its interval and the raw results, JSON-compatible.
+def measure_of(row: Mapping[str, Any]) -> str:
+    """What a summary's episodes were judged by: ``"score"`` or ``"return"``.
+
+    Args:
+        row: of :func:`summarize` or
+            :func:`~torchrl_osr.evaluation.summarize_disturbances`.
+    """
+    return "score" if "score" in row else "return"
+
+
+def summarize(
+    results: EpisodeResults, references: ReferenceReturns | None
+) -> dict[str, Any]:
+    """Mean score or return, its interval and the raw results, JSON-compatible.
 
     Args:
         results: of ``E`` episodes.
-        env_name: short name with reference returns, ``"hopper"`` for instance.
+        references: what returns are normalised by, see
+            :func:`~torchrl_osr.data.reference_returns`; ``None`` for raw returns.
 
     Returns:
         ``"score"`` with its 95 % bootstrap interval ``"score_low"``, ``"score_high"``
-        over the episodes, ``"return"`` (mean), ``"length"`` (mean), and the lists
+        over the episodes, unless there are no references: then ``"return_low"`` and
+        ``"return_high"``; ``"return"`` (mean), ``"length"`` (mean), and the lists
         ``"returns"``, ``"lengths"`` and ``"seeds"``. Where the task reports successes,
         also their share ``"success_rate"`` with Wilson's 95 % interval
         ``"success_low"``, ``"success_high"``, and the list ``"successes"``.
     """
-    score, low, high = mean_interval(normalized_score(env_name, results.returns))
+    measure, values = "return", results.returns
+    if references is not None:
+        measure, values = "score", references.score(results.returns)
+    mean, low, high = mean_interval(values)
     summary = {
-        "score": score,
-        "score_low": low,
-        "score_high": high,
+        measure: mean,
+        f"{measure}_low": low,
+        f"{measure}_high": high,
         "return": float(results.returns.mean()),
         "length": float(results.lengths.mean()),
         "returns": results.returns.tolist(),

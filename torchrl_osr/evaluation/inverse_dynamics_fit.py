@@ -16,6 +16,8 @@ from tensordict.nn import (
     set_interaction_type,
 )
 
+from torchrl_osr.objectives.distributions import ONE_HOT
+
 NORMAL_QUANTILE_95 = 1.6448536269514722
 """A normal variable is within this many standard deviations with probability 0.9."""
 
@@ -28,13 +30,15 @@ def inverse_dynamics_report(
 
     Args:
         inverse_dynamics_network: reads states and next states, ends in a
-            :class:`~torchrl.modules.TanhNormal`.
+            :class:`~torchrl.modules.TanhNormal` or chooses one of the actions.
         data: held-out rows, ``[N]``; ``done`` rows are left out.
 
     Returns:
-        ``"nll"``, mean negative log-likelihood of the action in nats; ``"r2"``, share
-        of each action dimension's variance that the deterministic action explains,
-        ``A`` numbers, and their mean ``"r2_mean"``; ``"coverage_90"``, share of actions
+        Of discrete actions ``"nll"``, mean negative log-likelihood in nats,
+        ``"accuracy"``, share of the rows whose action is the likeliest, and ``"rows"``.
+        Of real ones ``"nll"`` and ``"rows"`` likewise; ``"r2"``, share of each action
+        dimension's variance that the deterministic action explains, ``A`` numbers, and
+        their mean ``"r2_mean"``; ``"coverage_90"``, share of actions
         inside the model's central 90 % interval, over all dimensions (0.9 is
         calibrated); ``"rows"``.
 
@@ -50,6 +54,12 @@ def inverse_dynamics_report(
             data.select(*inverse_dynamics_network.in_keys)
         )
     action = data.get("action")
+    if isinstance(distribution, ONE_HOT):
+        return {
+            "nll": -distribution.log_prob(action).mean().item(),
+            "accuracy": (distribution.mode * action).sum(-1).mean().item(),
+            "rows": len(data),
+        }
     error = (action - distribution.deterministic_sample).square().sum(0)
     spread = (action - action.mean(0)).square().sum(0)
     r2 = 1 - error / spread
@@ -70,8 +80,8 @@ def inverse_dynamics_report(
 
 def describe_inverse_dynamics(report: Mapping[str, Any]) -> str:
     """One line of text with the numbers of a report; ``None`` is a dash."""
+    head = f"inverse dynamics, {report['rows']} held-out rows: NLL {report['nll']:.2f}"
+    if "accuracy" in report:
+        return f"{head}, {100 * report['accuracy']:.0f} % of the actions"
     r2 = ", ".join("-" if each is None else f"{each:.2f}" for each in report["r2"])
-    return (
-        f"inverse dynamics, {report['rows']} held-out rows: NLL {report['nll']:.2f}, "
-        f"R2 {r2}, 90 % interval covers {100 * report['coverage_90']:.0f} %"
-    )
+    return f"{head}, R2 {r2}, 90 % interval covers {100 * report['coverage_90']:.0f} %"

@@ -17,13 +17,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from torchrl_osr._checks import check_positive
-from torchrl_osr.data import normalized_score
+from torchrl_osr.data import ReferenceReturns
 from torchrl_osr.evaluation.data_distance import DataDistance
 from torchrl_osr.evaluation.episodes import (
     EpisodeEvaluator,
     EpisodeResults,
     Policy,
     Wrap,
+    measure_of,
 )
 from torchrl_osr.evaluation.recovery import (
     STEPS_AFTER,
@@ -48,10 +49,11 @@ RECOVERY_ENTRIES = (
 )  # fmt: skip
 """Of a disturbance's JSON; ``None`` if it does not end."""
 
-TABLE_HEADER = (
-    "disturbance", "clean", "score", "loss %", "[95 %]", "met it",
-    f"alive +{STEPS_AFTER}", "(clean)", "back", "steps back",
+COLUMNS = (
+    "loss %", "[95 %]", "met it", f"alive +{STEPS_AFTER}", "(clean)", "back",
+    "steps back",
 )  # fmt: skip
+"""Of the table, behind the disturbance and the score or return without and with it."""
 
 
 @dataclass(frozen=True)
@@ -161,13 +163,33 @@ def check_disturbances(env_id: str, disturbances: Sequence[Disturbance]) -> None
     names = [each.name for each in disturbances]
     if len(set(names)) < len(names) or not names:
         raise ValueError(f"disturbances need one name each, got {names}.")
+    for name, reason in impossible_disturbances(env_id, disturbances).items():
+        raise ValueError(_not_possible(name, env_id, reason))
+
+
+def impossible_disturbances(
+    env_id: str, disturbances: Sequence[Disturbance]
+) -> dict[str, str]:
+    """Those that need what the environment lacks, and why, by name.
+
+    Raises:
+        ValueError: a disturbance is not what any environment could have.
+    """
+    from torchrl_osr.envs import NotPossible  # needs MuJoCo, and the rest does not
+
+    reasons = {}
     for each in disturbances:
         try:
             EpisodeEvaluator(env_id, num_episodes=1, wrap=each.wrap).close()
+        except NotPossible as error:
+            reasons[each.name] = str(error)
         except (TypeError, ValueError) as error:
-            raise ValueError(
-                f"disturbance {each.name!r} is not possible for {env_id}: {error}"
-            ) from error
+            raise ValueError(_not_possible(each.name, env_id, error)) from error
+    return reasons
+
+
+def _not_possible(name: str, env_id: str, reason: object) -> str:
+    return f"disturbance {name!r} is not possible for {env_id}: {reason}"
 
 
 def decrease_interval(
@@ -179,7 +201,7 @@ def decrease_interval(
     widen the interval.
 
     Args:
-        clean, disturbed: normalised scores of the pairs, ``[E]`` each.
+        clean, disturbed: scores or returns of the pairs, ``[E]`` each.
 
     Returns:
         ``100 (1 - mean(disturbed) / mean(clean))``, lower and upper end. All three are
@@ -204,33 +226,41 @@ def decrease_interval(
     return decrease, float(low), float(high)
 
 
-def evaluation_json(step: int, paired: PairedResults, env_name: str) -> dict[str, Any]:
+def evaluation_json(
+    step: int, paired: PairedResults, references: ReferenceReturns | None
+) -> dict[str, Any]:
     """Raw results of the checkpoint after ``step`` gradient steps, JSON-compatible.
 
-    Normalised by the reference returns of ``env_name``, ``"hopper"`` for instance.
+    Besides the returns ``"scores"`` that are normalised by the references, if any.
     """
     return {
         "step": step,
-        "clean": _episodes_json(paired.clean, env_name),
-        "levels": [_disturbance_json(each, env_name) for each in paired.disturbed],
+        "clean": _episodes_json(paired.clean, references),
+        "levels": [_disturbance_json(each, references) for each in paired.disturbed],
     }
 
 
-def _episodes_json(results: EpisodeResults, env_name: str) -> dict[str, Any]:
-    return {
+def _episodes_json(
+    results: EpisodeResults, references: ReferenceReturns | None
+) -> dict[str, Any]:
+    raw = {
         "returns": results.returns.tolist(),
         "lengths": results.lengths.tolist(),
         "seeds": results.seeds.tolist(),
-        "scores": normalized_score(env_name, results.returns).tolist(),
     }
+    if references is None:
+        return raw
+    return raw | {"scores": references.score(results.returns).tolist()}
 
 
-def _disturbance_json(results: DisturbanceResults, env_name: str) -> dict[str, Any]:
+def _disturbance_json(
+    results: DisturbanceResults, references: ReferenceReturns | None
+) -> dict[str, Any]:
     return {
         "name": results.disturbance.name,
         "kind": results.disturbance.kind,
         "strength": results.disturbance.strength,
-        **_episodes_json(results.results, env_name),
+        **_episodes_json(results.results, references),
         "disturbed_at": results.disturbed_at,
         **_recovery_json(results.recovery),
     }
@@ -281,33 +311,38 @@ def summarize_disturbances(
         ``"decrease_disturbed"``, the shares alive at its end (``"survived"``) and 100
         steps later (``"survival"``; ``"clean_survival"`` of the undisturbed ones),
         ``"recovered_share"`` and ``"recovery_median"``, steps until back in the data.
-        ``None`` where there is nothing to average, or the median is infinite.
+        ``None`` where there is nothing to average, or the median is infinite. Where
+        evaluations have returns alone, ``"clean_return"``, ``"return"`` and so on.
     """
     rows = []
+    measure = "score" if "scores" in evaluations[0]["clean"] else "return"
     for position, first in enumerate(evaluations[0]["levels"]):
         played = [each["levels"][position] for each in evaluations]
 
         def joined(key: str, played: Sequence[Mapping[str, Any]] = played) -> list[Any]:
             return [value for each in played for value in each[key] or ()]
 
-        clean = np.array([s for each in evaluations for s in each["clean"]["scores"]])
-        scores = np.array(joined("scores"))
+        key = f"{measure}s"
+        clean = np.array(
+            [value for each in evaluations for value in each["clean"][key]]
+        )
+        values = np.array(joined(key))
         hit = np.array([moment is not None for moment in joined("disturbed_at")])
-        score, low, high = mean_interval(scores)
+        mean, low, high = mean_interval(values)
         rows.append(
             {
                 "name": first["name"],
                 "kind": first["kind"],
                 "strength": first["strength"],
-                "clean_score": float(clean.mean()),
-                "score": score,
-                "score_low": low,
-                "score_high": high,
-                **_decrease("decrease", clean, scores),
+                f"clean_{measure}": float(clean.mean()),
+                measure: mean,
+                f"{measure}_low": low,
+                f"{measure}_high": high,
+                **_decrease("decrease", clean, values),
                 "disturbed_share": float(hit.mean()),
-                "clean_score_disturbed": _mean(clean[hit]),
-                "score_disturbed": _mean(scores[hit]),
-                **_decrease("decrease_disturbed", clean[hit], scores[hit]),
+                f"clean_{measure}_disturbed": _mean(clean[hit]),
+                f"{measure}_disturbed": _mean(values[hit]),
+                **_decrease("decrease_disturbed", clean[hit], values[hit]),
                 "survived": _share(joined("survived_knock")),
                 "survival": _share(joined("alive_after")),
                 "clean_survival": _share(joined("clean_alive_after")),
@@ -353,11 +388,12 @@ def robustness_table(title: str, summary: Sequence[Mapping[str, Any]]) -> str:
     def percent(value: float | None) -> str:
         return "-" if value is None else f"{100 * value:.0f} %"
 
+    measure = measure_of(summary[0])
     rows = [
         (
             row["name"],
-            number(row["clean_score"]),
-            number(row["score"]),
+            number(row[f"clean_{measure}"]),
+            number(row[measure]),
             number(row["decrease"]),
             f"[{number(row['decrease_low'])}, {number(row['decrease_high'])}]",
             percent(row["disturbed_share"]),
@@ -368,7 +404,8 @@ def robustness_table(title: str, summary: Sequence[Mapping[str, Any]]) -> str:
         )
         for row in summary
     ]
-    return "\n".join([title, *aligned_columns([TABLE_HEADER, *rows])])
+    header = ("disturbance", "clean", measure, *COLUMNS)
+    return "\n".join([title, *aligned_columns([header, *rows])])
 
 
 def aligned_columns(rows: Sequence[Sequence[str]]) -> list[str]:

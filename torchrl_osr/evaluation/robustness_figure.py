@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_osr.evaluation.drawing import BLUE, GREY, new_figure, save_figure
+from torchrl_osr.evaluation.drawing import (
+    BLUE,
+    GREY,
+    IN_WORDS,
+    new_figure,
+    save_figure,
+)
+from torchrl_osr.evaluation.episodes import measure_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,7 +33,7 @@ def robustness_figure(
 ) -> None:
     """Draw scores under disturbances and, after those that end, distances to the data.
 
-    Where each kind has several strengths, the score is drawn over the strength;
+    Without scores it draws returns: over the strength, where each kind has several;
     otherwise each disturbance has a line of its own.
 
     Args:
@@ -49,7 +56,7 @@ def robustness_figure(
         sum(map(len, strengths)) == len(summary)
     )
     (_over_strength if sweep else _one_by_one)(axes[0], series)
-    clean = summary[0]["clean_score"]
+    clean = summary[0][f"clean_{measure_of(summary[0])}"]
     line = axes[0].axhline if sweep else axes[0].axvline
     line(clean, color=GREY, linestyle="--", linewidth=1, label=UNDISTURBED)
     axes[0].legend(frameon=False, fontsize=8)
@@ -105,30 +112,37 @@ def _colors(start: float, end: float, number: int) -> NDArray[np.float64]:
 
 
 def _over_strength(axes: Axes, series: Mapping[str, list[Mapping[str, Any]]]) -> None:
+    every = [row for rows in series.values() for row in rows]
+    measure = measure_of(every[0])
+    low, high = f"{measure}_low", f"{measure}_high"
     colors = _colors(0.1, 0.8, len(series))
     for color, (kind, rows) in zip(colors, series.items(), strict=True):
         rows = sorted(rows, key=lambda row: float(row["strength"]))
         x = [row["strength"] for row in rows]
         axes.fill_between(
-            x, [row["score_low"] for row in rows], [row["score_high"] for row in rows],
+            x, [row[low] for row in rows], [row[high] for row in rows],
             color=color, alpha=0.15, linewidth=0,
         )  # fmt: skip
-        axes.plot(x, [row["score"] for row in rows], "o-", color=color, label=kind)
-    axes.set(
-        xlabel="strength", ylabel="normalised score (95 % interval)", ylim=(0, None)
-    )
+        axes.plot(x, [row[measure] for row in rows], "o-", color=color, label=kind)
+    axes.set(xlabel="strength", ylabel=f"{IN_WORDS[measure]} (95 % interval)")
+    if all(row[low] >= 0 for row in every):
+        axes.set_ylim(0)
 
 
 def _one_by_one(axes: Axes, series: Mapping[str, list[Mapping[str, Any]]]) -> None:
     rows = [row for each in series.values() for row in each][::-1]
-    score = np.array([row["score"] for row in rows])
-    ends = np.array([[row["score_low"], row["score_high"]] for row in rows]).T
+    measure = measure_of(rows[0])
+    mean = np.array([row[measure] for row in rows])
+    names = f"{measure}_low", f"{measure}_high"
+    ends = np.array([[row[name] for name in names] for row in rows]).T
     axes.errorbar(
-        score, range(len(rows)), xerr=np.abs(ends - score), fmt="o", color=BLUE,
+        mean, range(len(rows)), xerr=np.abs(ends - mean), fmt="o", color=BLUE,
         capsize=3, label="disturbed (mean, 95 % interval)",
     )  # fmt: skip
     axes.set_yticks(range(len(rows)), [row["name"] for row in rows])
-    axes.set(xlabel="normalised score", xlim=(min(0, ends.min()), None))
+    axes.set(xlabel=IN_WORDS[measure])
+    if ends.min() >= 0:
+        axes.set_xlim(0)
 
 
 def _draw_curves(

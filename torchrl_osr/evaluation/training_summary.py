@@ -9,7 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_osr.evaluation.drawing import BLUE, GREY, ORANGE, new_figure, save_figure
+from torchrl_osr.evaluation.drawing import (
+    BLUE,
+    GREY,
+    IN_WORDS,
+    ORANGE,
+    new_figure,
+    save_figure,
+)
+from torchrl_osr.evaluation.episodes import measure_of
 
 NUM_RECENT = 5
 """Evaluations in the mean of the last ones.
@@ -31,25 +39,27 @@ def score_table(
     title: str,
     history: Sequence[Mapping[str, Any]],
     best: Mapping[str, Any],
-    data_score: float | None,
+    data_mean: float | None,
     folder: Path,
 ) -> str:
-    """Text table of the data's and the policy's scores.
+    """Text table of the data's and the policy's scores, or returns without scores.
 
     Args:
         title: what was trained on what.
         history: all evaluations with their ``"step"``, see
             :func:`~torchrl_osr.evaluation.summarize`.
         best: the best of them; chosen by its own episodes, hence optimistic.
-        data_score: mean normalised score of the data's episodes, if known.
+        data_mean: mean score, or return, of the data's episodes, if known.
         folder: where the run's files are.
     """
+    measure = measure_of(best)
 
     def with_interval(row: Mapping[str, Any]) -> str:
-        return f"{row['score']:6.1f}  [{row['score_low']:.1f}, {row['score_high']:.1f}]"
+        mean, low, high = (row[f"{measure}{end}"] for end in ("", "_low", "_high"))
+        return f"{mean:6.1f}  [{low:.1f}, {high:.1f}]"
 
-    known = "unknown" if data_score is None else f"{data_score:6.1f}"
-    recent = [row["score"] for row in history[-NUM_RECENT:]]
+    known = "unknown" if data_mean is None else f"{data_mean:6.1f}"
+    recent = [row[measure] for row in history[-NUM_RECENT:]]
     rows = [
         ("data, mean episode", known),
         ("policy, last", with_interval(history[-1])),
@@ -63,7 +73,8 @@ def score_table(
         )
         said = f"{rate:6.1f}  [{low:.1f}, {high:.1f}]  % of {len(last['successes'])}"
         rows.insert(2, ("policy, last, success", f"{said} episodes, Wilson interval"))
-    lines = [f"{title}: normalised score, 0 random and 100 expert [95 % interval]"]
+    scale = ", 0 random and 100 expert" if measure == "score" else ""
+    lines = [f"{title}: {IN_WORDS[measure]}{scale} [95 % interval]"]
     lines += [f"  {label:<25}{value}" for label, value in rows]
     return "\n".join([*lines, f"  {'files':<26}{folder}"])
 
@@ -90,9 +101,9 @@ def learning_curve(
     path: Path | str,
     *,
     title: str,
-    data_score: float | None,
+    data_mean: float | None,
 ) -> None:
-    """Draw the score with its interval, and the losses, over gradient steps.
+    """Draw the score, or return, with its interval, and the losses.
 
     Args:
         history: see :func:`score_table`.
@@ -100,7 +111,7 @@ def learning_curve(
         path: the PNG to write.
 
     Keyword Args:
-        title, data_score: see :func:`score_table`.
+        title, data_mean: see :func:`score_table`.
     """
     panels = [name for name in PANELS if scalars.get(name)]
     figure = new_figure(9, 6.4, layout="constrained")
@@ -109,16 +120,19 @@ def learning_curve(
 
     axes = figure.add_subplot(grid[0, :])
     steps = [row["step"] for row in history]
-    low, high = ([row[f"score_{end}"] for row in history] for end in ("low", "high"))
+    measure = measure_of(history[0])
+    low, high = (
+        [row[f"{measure}_{end}"] for row in history] for end in ("low", "high")
+    )
     axes.fill_between(steps, low, high, color=BLUE, alpha=0.2, linewidth=0)
     axes.plot(
-        steps, [row["score"] for row in history], "o-", color=BLUE, markersize=4,
+        steps, [row[measure] for row in history], "o-", color=BLUE, markersize=4,
         label="policy (mean of the episodes, 95 % interval)",
     )  # fmt: skip
-    if data_score is not None:
+    if data_mean is not None:
         label = "data (mean episode)"
-        axes.axhline(data_score, color=ORANGE, linestyle="--", label=label)
-    axes.set(xlabel="gradient steps", ylabel="normalised score")
+        axes.axhline(data_mean, color=ORANGE, linestyle="--", label=label)
+    axes.set(xlabel="gradient steps", ylabel=IN_WORDS[measure])
     axes.legend(loc="upper left", frameon=False)
     for column, name in enumerate(panels):
         small = figure.add_subplot(grid[1, column])

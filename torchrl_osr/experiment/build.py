@@ -13,8 +13,50 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torchrl.objectives import LossModule
 
 from torchrl_osr._checks import check_choice
+from torchrl_osr.data import ReferenceReturns, reference_returns
 from torchrl_osr.experiment.limits import check_networks
-from torchrl_osr.modules import critic_ensemble
+from torchrl_osr.objectives.distributions import is_categorical
+
+
+def read_environment(cfg: DictConfig) -> None:
+    """Compare a run with its environment, and keep the action bounds with the run.
+
+    Args:
+        cfg: a whole configuration; ``env.action_low`` and ``env.action_high`` are set.
+
+    Raises:
+        ValueError: there is no such environment, or it cannot be acted in, see
+            :func:`~torchrl_osr.data.make_environment`; the policy's actions are of
+            another kind; the bounds are set to other numbers already; or
+            :func:`references_of` refuses the references.
+        ImportError: a package that the environment needs is not installed.
+    """
+    from torchrl_osr.data import environment_spec  # needs Gymnasium
+
+    references_of(cfg)
+    spec = environment_spec(cfg.env.id)
+    actor = instantiate(cfg.network.actor, 1, 1, num_cells=[1])
+    if is_categorical(actor) != spec.discrete:
+        kind = "discrete" if spec.discrete else "real"
+        other = "loss=discrete_osr" if spec.discrete else "loss=osr"
+        raise ValueError(
+            f"{cfg.env.id} has {kind} actions, and the policy of "
+            f"{cfg.loss._target_} has not: take {other}."
+        )
+    for name in ("action_low", "action_high"):
+        given, read = cfg.env[name], getattr(spec, name)
+        if given is not None and given != read:
+            raise ValueError(
+                f"env.{name}={given}, but it is read from {cfg.env.id}, where it is "
+                f"{read}: leave it out."
+            )
+        cfg.env[name] = read
+
+
+def references_of(cfg: DictConfig) -> ReferenceReturns | None:
+    """What a run's returns are normalised by, ``None`` if they stay as they are."""
+    given = cfg.env.get("random_return"), cfg.env.get("expert_return")
+    return reference_returns(cfg.env.name, *given)
 
 
 def load_data(
@@ -32,6 +74,7 @@ def load_data(
         cfg.env.name,
         cfg.data.quality,
         env_id=cfg.env.id,
+        references=references_of(cfg),
         path=cfg.data.path,
         columns=options["columns"],
         action_bounds=options["action_bounds"],
@@ -99,7 +142,8 @@ def make_learner(
     check_networks(cfg, observation_size, action_size, device)
     sizes, cells = (observation_size, action_size), list(cfg.network.num_cells)
     actor = instantiate(cfg.network.actor, *sizes, num_cells=cells).to(device)
-    critics = critic_ensemble(
+    critics = instantiate(
+        cfg.network.critic,
         *sizes,
         num_qvalue_nets=cfg.loss.get("num_qvalue_nets", 2),
         num_cells=cells,

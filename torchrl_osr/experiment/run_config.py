@@ -197,12 +197,12 @@ def check_targets(config: DictConfig, trust: Sequence[str] = ()) -> None:
     """
     trusted = {name: _imported(name) for name in trust}
     env_id = str(OmegaConf.select(config, "env.id", default=""))
-    module, colon, _ = env_id.rpartition(":")
-    if colon and module not in trusted:
-        raise ValueError(
-            f"env.id={env_id} imports a module, and a run may come from somebody else. "
-            f"If you know {module}, allow it with trust=[{module}]."
-        )
+    for module in module_of(env_id):
+        if module not in trusted:
+            raise ValueError(
+                f"env.id={env_id} imports a module, and a run may come from somebody "
+                f"else. If you know {module}, allow it with trust=[{module}]."
+            )
     ours = [import_module(name) for name in TARGET_PACKAGES]
     known = set().union(*map(_public_names, [*ours, *trusted.values()]))
     for key, target in _entries(OmegaConf.to_container(config)):
@@ -222,10 +222,29 @@ def check_targets(config: DictConfig, trust: Sequence[str] = ()) -> None:
         )
 
 
-def _imported(name: str) -> ModuleType:
-    # Behind all others: no file in the current folder takes the place of a library.
+def module_of(env_id: str) -> list[str]:
+    """The module that Gymnasium imports for an environment, if it does.
+
+    Examples:
+        >>> from torchrl_osr.experiment.run_config import module_of
+        >>> module_of("my_robots.arms:Arm-v0"), module_of("Hopper-v5")
+        (['my_robots.arms'], [])
+    """
+    module, colon, _ = env_id.rpartition(":")
+    return [module] if colon else []
+
+
+def import_from_here() -> None:
+    """Let modules that the user has named be imported from the current folder.
+
+    It comes last: no file in it takes the place of a package that is installed.
+    """
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
+
+
+def _imported(name: str) -> ModuleType:
+    import_from_here()
     try:
         return import_module(name)
     except (ImportError, TypeError, ValueError) as error:

@@ -7,7 +7,7 @@ import os
 import platform
 import re
 import shlex
-import sys
+import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
@@ -116,9 +116,11 @@ def _status(folder: Path) -> Iterator[None]:
         yield
     except Interrupted as error:
         write_json(folder / STATUS, {"status": "preempted", "reason": error.reason})
-        log.warning(f"Continue with: python {sys.argv[0]} {_resume(folder)}")
+        log.warning(_how_to_continue(folder))
         raise
     except BaseException as error:
+        if isinstance(error, KeyboardInterrupt):
+            log.warning(_how_to_continue(folder))
         reason = f"{type(error).__name__}: {error}"
         with suppress(OSError):  # on a full disk the error itself says more
             write_json(folder / STATUS, {"status": "failed", "error": reason})
@@ -126,14 +128,34 @@ def _status(folder: Path) -> Iterator[None]:
     write_json(folder / STATUS, {"status": "done"})
 
 
-def _resume(folder: Path) -> str:
-    """Override that continues a run, quoted for Hydra and for the shell."""
-    if re.fullmatch(r"[\w./+-]+", str(folder)):
-        return f"resume={folder}"
-    quoted = str(folder).replace("\\", "\\\\").replace("'", "\\'")
-    return shlex.quote(f"resume='{quoted}'")
+def _how_to_continue(folder: Path) -> str:
+    """Say which command continues a run, quoted for Hydra and for the shell."""
+    override = f"resume={folder}"
+    if not re.fullmatch(r"[\w./+-]+", str(folder)):
+        quoted = str(folder).replace("\\", "\\\\").replace("'", "\\'")
+        override = shlex.quote(f"resume='{quoted}'")
+    return f"Continue with: torchrl-osr train {override}"
 
 
 def package_versions() -> dict[str, str]:
     """Versions of :data:`PACKAGES`, by name with underscores."""
     return {package.replace("-", "_"): version(package) for package in PACKAGES}
+
+
+def code_commit() -> str | None:
+    """Commit of the checkout that the package is in, if it is in one.
+
+    ``-dirty`` is behind it where files were changed since.
+    """
+    root = Path(__file__).parents[2]
+    if not (root / ".git").exists():
+        return None
+    describe = "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(root), *describe],
+            capture_output=True, text=True, timeout=10, check=True,
+        )  # fmt: skip
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()

@@ -10,12 +10,14 @@ from __future__ import annotations
 import functools
 import inspect
 import operator
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, make_dataclass
 from types import NoneType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from hydra.core.config_store import ConfigStore
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import MISSING, OmegaConf
 
 from torchrl_osr import objectives
@@ -29,13 +31,24 @@ class EnvConfig:
     """Which task.
 
     Attributes:
+        id: Gymnasium id of the environment that is evaluated; package:Name-v0 imports
+            the package first.
         name: short name of the task, which behaviour policies and reference scores
             have.
-        id: Gymnasium id of the environment that is evaluated.
+        random_return: mean return of a random policy, score 0; null with
+            expert_return: raw returns, unless the task is one of D4RL's.
+        expert_return: mean return of an expert, score 100.
+        action_low: lowest action in the environment's own units, read from it and kept
+            with the run; null if actions are discrete.
+        action_high: highest action, likewise.
     """
 
-    name: str = MISSING
     id: str = MISSING
+    name: str = "${environment_name:${env.id}}"
+    random_return: float | None = None
+    expert_return: float | None = None
+    action_low: list[float] | None = None
+    action_high: list[float] | None = None
 
 
 @dataclass
@@ -118,11 +131,13 @@ class NetworkConfig:
 
     Attributes:
         actor: the function that builds the policy, of the kind that the loss trains.
+        critic: the function that builds the critics, likewise.
         num_cells: width of each hidden layer.
         layer_norm: layer normalisation in the critics; steadier, not in the paper.
     """
 
     actor: TargetConfig = field(default_factory=TargetConfig)
+    critic: TargetConfig = field(default_factory=TargetConfig)
     num_cells: list[int] = MISSING
     layer_norm: bool = MISSING
 
@@ -285,6 +300,31 @@ class CheckDataConfig:
     progress: bool = MISSING
 
 
+@dataclass
+class CollectConfig:
+    """Everything that ``torchrl-osr collect`` reads.
+
+    Attributes:
+        env: which environment; of its keys ``id`` alone counts.
+        policy: random, a run's folder, or a function of a module.
+        path: of the log to write.
+        episodes: how many to play.
+        noise: on actions, see ``record_episodes``.
+        seed: of the first episode.
+        progress: a progress bar, when on a terminal.
+        trust: modules of your own that a run may name, see docs/extend.md.
+    """
+
+    env: EnvConfig = field(default_factory=EnvConfig)
+    policy: str = MISSING
+    path: str = MISSING
+    episodes: int = MISSING
+    noise: float = MISSING
+    seed: int = MISSING
+    progress: bool = MISSING
+    trust: list[str] = field(default_factory=list)
+
+
 def schema_of(target: type) -> type:
     """A structured config with the keyword options of ``target``.
 
@@ -345,24 +385,71 @@ def _config_type(annotation: Any) -> Any:
     return functools.reduce(operator.or_, kinds)
 
 
+def _environment_name(env_id: str) -> str:
+    from torchrl_osr.data.collect.environment import environment_name  # needs Gymnasium
+
+    return environment_name(env_id)
+
+
 def register() -> None:
     """Make schemas and resolvers known to Hydra.
 
-    ``train_schema``, ``check_data_schema``, and in the group ``schema`` one for each
-    class of :mod:`torchrl_osr.objectives`; ``run_dir``, by which ``resume=folder``
-    becomes the run's folder, and ``job_dir``, which names a sweep's folders.
+    ``train_schema``, ``check_data_schema``, ``collect_schema``, and in the group
+    ``schema`` one for each class of :mod:`torchrl_osr.objectives`;
+    ``environment_name``, the short name of a task; ``run_dir``, by which
+    ``resume=folder`` becomes the run's folder; ``hydra_dir``, by which a continued run
+    keeps what Hydra wrote when it began; and ``job_dir``, see :func:`job_folder`.
     """
     store = ConfigStore.instance()
     store.store(name="train_schema", node=TrainConfig)
     store.store(name="check_data_schema", node=CheckDataConfig)
+    store.store(name="collect_schema", node=CollectConfig)
     for name in set(objectives.__all__) - {"BaseLoss"}:
         schema = schema_of(getattr(objectives, name))
         store.store(group="schema", name=name, node=schema)
-    OmegaConf.register_new_resolver(
-        "run_dir", lambda resume, fresh: resume or fresh, replace=True
-    )
-    OmegaConf.register_new_resolver(
-        "job_dir",
-        lambda number, overrides: f"{number}_{overrides}"[:MAX_FOLDER_NAME],
-        replace=True,
-    )
+    resolvers: dict[str, Callable[..., Any]] = {
+        "environment_name": _environment_name,
+        "run_dir": lambda resume, fresh: resume or fresh,
+        "hydra_dir": lambda resume: None if resume else ".hydra",
+        "job_dir": job_folder,
+    }
+    for name, resolver in resolvers.items():
+        OmegaConf.register_new_resolver(name, resolver, replace=True)
+
+
+def job_folder(number: int, overrides: str) -> str:
+    """Name of a sweep's job: its number, which is unique, and its overrides.
+
+    Letters, digits and ``._-`` alone: neither a shell nor Hydra needs quotes for it.
+
+    Examples:
+        >>> from torchrl_osr.experiment.schema import job_folder
+        >>> job_folder(3, "loss=cql,trainer.steps=200,seed=1")
+        '3_loss-cql_steps-200_seed-1'
+    """
+    last_keys = re.sub(r"[\w.]+\.(\w+=)", r"\1", overrides)
+    words = re.sub(r"[^A-Za-z0-9._=,-]+", " ", last_keys)
+    pairs = re.sub(r" *([=,]) *", r"\1", words).strip(" .=,-_")
+    plain = pairs.translate(str.maketrans("=, ", "-_-"))
+    return f"{number}_{plain}"[:MAX_FOLDER_NAME] if plain else str(number)
+
+
+def named_by_what_differs(arguments: Sequence[str]) -> list[str]:
+    """Override that leaves out of :func:`job_folder` what all jobs of a sweep share.
+
+    Args:
+        arguments: the command line.
+
+    Returns:
+        Nothing where there is no sweep.
+
+    Raises:
+        OverrideParseException: an override makes no sense.
+    """
+    if not {"-m", "--multirun"} & set(arguments):
+        return []
+    given = [each for each in arguments if "=" in each and not each.startswith("-")]
+    parsed = OverridesParser.create().parse_overrides(given)
+    shared = [each.key_or_group for each in parsed if not each.is_sweep_override()]
+    keys = [key for key in shared if not key.startswith("hydra")]
+    return [f"hydra.job.config.override_dirname.exclude_keys=[{','.join(keys)}]"]

@@ -65,6 +65,8 @@ class EvaluateConfig:
 
     Attributes:
         checkpoint: a run's folder, or one checkpoint's file in it.
+        sweep: in its place a folder: every finished run in or below it.
+        jobs: runs of a sweep that are evaluated at once.
         suite: the disturbances.
         episodes: pairs of episodes for each checkpoint and disturbance, at least 2.
         last: number of the run's newest checkpoints, or fewer if it has fewer.
@@ -76,7 +78,9 @@ class EvaluateConfig:
         trust: modules of your own that the run may name, see docs/extend.md.
     """
 
-    checkpoint: str = MISSING
+    checkpoint: str | None = None
+    sweep: str | None = None
+    jobs: int = MISSING
     suite: SuiteConfig = field(default_factory=SuiteConfig)
     episodes: int = MISSING
     last: int = MISSING

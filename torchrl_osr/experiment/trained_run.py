@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -200,9 +199,7 @@ def _check_whole(path: Path) -> None:
 
 
 def _environment_sizes(env_id: str) -> tuple[int, int]:
-    from torchrl_osr.data import make_environment  # needs Gymnasium
+    from torchrl_osr.data import environment_spec  # needs Gymnasium
 
-    with closing(make_environment(env_id)) as environment:
-        (observation_size,) = environment.observation_space.shape or (0,)
-        (action_size,) = environment.action_space.shape or (0,)
-    return observation_size, action_size
+    spec = environment_spec(env_id)
+    return spec.observation_size, spec.action_size

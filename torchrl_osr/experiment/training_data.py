@@ -22,7 +22,7 @@ from torchrl_osr.data import (
     observation_statistics,
     split_held_out,
 )
-from torchrl_osr.experiment.build import check_storage, load_data
+from torchrl_osr.experiment.build import check_storage, load_data, references_of
 
 MAX_HELD_OUT = 50_000
 """Held-out rows of a set on disk that are read into memory, at most."""
@@ -36,25 +36,20 @@ class TrainingData(NamedTuple):
         held_out: rows that are not in the buffer.
         norm: what standardises observations.
         largest_reward: the largest absolute reward, held-out rows included.
-        score: normalised score of the behaviour, if it is known.
+        mean: score of the behaviour, or return where there are no scores, if known.
     """
 
     buffer: ReplayBuffer
     held_out: TensorDict
     norm: ObservationNorm
     largest_reward: float
-    score: float | None
-
-    @property
-    def sizes(self) -> tuple[int, int]:
-        """``S`` and ``A``."""
-        return self.held_out["observation"].shape[-1], self.held_out["action"].shape[-1]
+    mean: float | None
 
 
 def load_training_data(cfg: DictConfig, device: torch.device) -> TrainingData:
     """Load a run's data, split and prepared, see ``data`` of its configuration.
 
-    Rewards become ``data.reward_scale * r + data.reward_shift``; the score is of the
+    Rewards become ``data.reward_scale * r + data.reward_shift``; the mean is of the
     task's own.
 
     Args:
@@ -91,5 +86,7 @@ def load_training_data(cfg: DictConfig, device: torch.device) -> TrainingData:
     else:
         rows, held_out = split_held_out(prepare(data), share, seed=seed)
         buffer = make_replay_buffer(rows, **options)
-    held_out, score = held_out.to(device), manifest["normalized_score"]
-    return TrainingData(buffer, held_out, norm().to(device), largest, score)
+    mean = manifest["normalized_score"]
+    if references_of(cfg) is None:
+        mean = (manifest.get("return") or {}).get("mean")
+    return TrainingData(buffer, held_out.to(device), norm().to(device), largest, mean)

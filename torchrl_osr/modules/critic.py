@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from tensordict import NestedKey
 from torch import nn
@@ -50,10 +51,7 @@ def critic_ensemble(
         >>> critic(TensorDict(batch, [4]))["state_action_value"].shape
         torch.Size([4, 1])
     """
-    norm = {
-        "norm_class": nn.LayerNorm,
-        "norm_kwargs": [{"normalized_shape": width} for width in num_cells],
-    }
+    norm = layer_norm_options(num_cells) if layer_norm else {}
     return [
         ValueOperator(
             MLP(
@@ -61,7 +59,7 @@ def critic_ensemble(
                 out_features=1,
                 num_cells=list(num_cells),
                 activation_class=activation_class,
-                **(norm if layer_norm else {}),
+                **norm,
             ),
             in_keys=[observation_key, action_key],
             # ValueOperator knows an action by the name "action" alone.
@@ -69,3 +67,9 @@ def critic_ensemble(
         )
         for _ in range(num_qvalue_nets)
     ]
+
+
+def layer_norm_options(num_cells: Sequence[int]) -> dict[str, Any]:
+    """Options of :class:`~torchrl.modules.MLP` that normalise each hidden layer."""
+    widths = [{"normalized_shape": width} for width in num_cells]
+    return {"norm_class": nn.LayerNorm, "norm_kwargs": widths}

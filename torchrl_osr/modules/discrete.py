@@ -10,6 +10,7 @@ from torch import nn
 from torchrl.modules import MLP, OneHotCategorical, ProbabilisticActor
 
 from torchrl_osr._entries import nested
+from torchrl_osr.modules.critic import layer_norm_options
 from torchrl_osr.modules.initial_weights import remember_weights
 
 
@@ -119,6 +120,7 @@ def discrete_critic_ensemble(
     num_cells: Sequence[int] = (256, 256),
     activation_class: type[nn.Module] = nn.ReLU,
     observation_key: NestedKey = "observation",
+    layer_norm: bool = False,
 ) -> list[TensorDictModule]:
     """Return Q networks of one observation that value all actions at once.
 
@@ -131,6 +133,7 @@ def discrete_critic_ensemble(
         num_cells: width of each hidden layer.
         activation_class: activation between the layers.
         observation_key: the state they read. Default ``"observation"``.
+        layer_norm: see :func:`~torchrl_osr.modules.critic_ensemble`. Default ``False``.
 
     Returns:
         ``N`` modules that write ``"action_value"``, ``[B, n]``.
@@ -143,6 +146,7 @@ def discrete_critic_ensemble(
         >>> critic(batch)["action_value"].shape
         torch.Size([3, 2])
     """
+    norm = layer_norm_options(num_cells) if layer_norm else {}
     return [
         TensorDictModule(
             MLP(
@@ -150,6 +154,7 @@ def discrete_critic_ensemble(
                 out_features=num_actions,
                 num_cells=list(num_cells),
                 activation_class=activation_class,
+                **norm,
             ),
             [observation_key],
             ["action_value"],

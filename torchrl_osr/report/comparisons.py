@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from torchrl_osr.evaluation import nested_resamples, percentile_interval
 from torchrl_osr.report.methods import RunTables
-from torchrl_osr.report.scores import Estimate, decimal, over_what, recent
+from torchrl_osr.report.scores import Estimate, counted, decimal, over_what, recent
 
 Array = NDArray[np.float64]
 
@@ -69,7 +69,7 @@ class Difference(NamedTuple):
         if self.estimate is None:
             return "not paired"
         if self.seeds < MIN_SEEDS:
-            return f"cannot be told: {self.seeds} seed{'s' if self.seeds > 1 else ''}"
+            return f"cannot be told: {counted(self.seeds, 'seed')}"
         if self.estimate.low <= 0 <= self.estimate.high:
             return "not told apart"
         return "better" if self.estimate.mean * self.quantity.sign > 0 else "worse"
@@ -174,8 +174,8 @@ def pair(values: pd.Series, method: str, reference: str) -> tuple[list[Array], s
     if len(alone):
         seed, step, episode = alone[0]
         return [], (
-            f"{len(alone)} episodes have no partner, the first of seed {seed} at step "
-            f"{step:,} with episode seed {episode}"
+            f"{counted(len(alone), 'episode')} without a partner, the first of seed "
+            f"{seed} at step {step:,} with episode seed {episode}"
         )
     less = (both[method] - both[reference]).groupby(["seed", "episode"]).mean()
     note = "only seeds that both have" if len(common) < len(seeds) else ""

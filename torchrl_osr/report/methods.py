@@ -14,6 +14,7 @@ from pathlib import Path
 import pandas as pd
 
 from torchrl_osr.report.runs import QUALITY, LeftOut, read_each
+from torchrl_osr.report.scores import counted
 
 IGNORED = (
     "resume",
@@ -47,7 +48,8 @@ class RunTables:
 
     Attributes:
         runs: a row for each run: ``folder``, ``method``, ``data``, ``seed``, ``steps``,
-            ``data_score`` (mean normalised score of the data's episodes),
+            ``measure`` (score, or return of an environment without references),
+            ``data_score`` (mean score, or return, of the data's episodes),
             ``overrides`` of the command line and ``versions`` of the packages.
         settings: its configuration as texts, a column for each dotted key.
         episodes: a row for each episode: ``run``, ``data``, ``method``, ``seed``,
@@ -79,6 +81,12 @@ class RunTables:
         return list(self.runs["data"].unique())
 
     @property
+    def measure(self) -> str:
+        """What episodes are measured in: normalised score, or return of what."""
+        measure = str(self.runs["measure"].iloc[0])
+        return "normalised score" if measure == "score" else measure
+
+    @property
     def suites(self) -> list[str]:
         """The suites, in the order of their first runs."""
         return [name for name in self.episodes["suite"].unique() if name]
@@ -106,6 +114,18 @@ def read_runs(paths: Sequence[Path]) -> RunTables:
             f"no finished run in {', '.join(map(str, paths))}.{reasons}\n"
             "Give folders of torchrl-osr train, or a table of such runs."
         )
+    # Returns of one environment and scores, or returns of another, have no mean.
+    measure = found[0].facts["measure"]
+    left_out += [
+        LeftOut(
+            run.facts["folder"],
+            f"it is measured in {run.facts['measure']}, and the page in {measure}: "
+            "report it alone, or train with env.random_return and env.expert_return",
+        )
+        for run in found
+        if run.facts["measure"] != measure
+    ]
+    found = [run for run in found if run.facts["measure"] == measure]
     # Runs of one name together: what it is told apart into is then below each other.
     names = [run.facts["method"] for run in found]
     found.sort(key=lambda run: names.index(run.facts["method"]))
@@ -187,7 +207,7 @@ def comparison_notes(tables: RunTables) -> list[str]:
             notes.append(f"Mixed versions: {', '.join(found)}.")
     silent = runs["versions"].str.len() == 0
     if silent.any():
-        notes.append(f"No versions are recorded of {silent.sum()} runs.")
+        notes.append(f"No versions are recorded of {counted(silent.sum(), 'run')}.")
     settings = comparable(tables.settings).assign(data_score=runs["data_score"])
     for data, group in runs.groupby("data", sort=False):
         facts = settings.loc[group.index]

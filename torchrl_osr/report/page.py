@@ -28,6 +28,7 @@ from torchrl_osr.report.scores import (
     Estimate,
     WayBack,
     by_run,
+    counted,
     decimal,
     disturbed,
     estimate,
@@ -129,6 +130,7 @@ def write_report(
         lstrip_blocks=True,
     )
     environment.filters |= {"groups": groups, "slug": slug, "base64": _base64}
+    environment.filters["counted"] = counted
     folder.mkdir(parents=True, exist_ok=True)
     for name, picture in pictures.items():
         write_atomically(folder / f"{name}.png", picture)
@@ -184,7 +186,7 @@ def _curves(tables: RunTables) -> Figure:
         }
         known = tables.runs["data_score"][tables.runs["data"] == data]
         panels.append(Panel(data, bands, sorted(known.dropna().round(1).unique())))
-    xlabel, ylabel = "thousand gradient steps", "normalised score"
+    xlabel, ylabel = "thousand gradient steps", tables.measure
     return draw_panels(panels, tables.methods, xlabel=xlabel, ylabel=ylabel)
 
 
@@ -217,7 +219,7 @@ def _profiles(tables: RunTables) -> Figure | None:
         if rows["data"].nunique() == len(tables.data)
     }
     panel = Panel("Runs, by the mean of their last evaluations", bands)
-    x, share = "normalised score τ", "share of runs above τ"
+    x, share = f"{tables.measure} τ", "share of runs above τ"
     return draw_panels([panel], list(bands), xlabel=x, ylabel=share) if bands else None
 
 

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from torchrl_osr._files import MAX_JSON_BYTES, parse_json, read_json, write_atomically
-from torchrl_osr.data import normalized_score
+from torchrl_osr.data import ReferenceReturns, reference_returns
 from torchrl_osr.experiment.run_config import flatten, read_yaml
 from torchrl_osr.experiment.run_folder import CONFIG, STATUS
 
@@ -72,8 +72,8 @@ class Run(NamedTuple):
     """One finished run.
 
     Attributes:
-        facts: ``folder``, ``method``, ``data``, ``seed``, ``steps``, ``data_score``,
-            ``overrides`` and ``versions``.
+        facts: ``folder``, ``method``, ``data``, ``seed``, ``steps``, ``measure``,
+            ``data_score``, ``overrides`` and ``versions``.
         settings: the configuration as texts, with dotted keys.
         protocols: how each suite was played; only like ones are compared.
         episodes: a row for each episode, see :class:`~torchrl_osr.report.RunTables`.
@@ -108,7 +108,7 @@ def read_each(paths: Sequence[Path]) -> tuple[list[Run], list[LeftOut]]:
             runs.append(run)
             left_out.extend(run.unusable)
 
-    for folder in _folders(path for path in paths if not path.is_file()):
+    for folder in find_runs(path for path in paths if not path.is_file()):
         add(str(folder), partial(read_record, folder))
     for table in (path for path in paths if path.is_file()):
         try:
@@ -134,7 +134,7 @@ def pack_runs(folders: Iterable[Path], table: Path) -> int:
         ValueError: if there is no run, or one that is not finished or makes no sense,
             naming it.
     """
-    found = _folders(folders)
+    found = find_runs(folders)
     if not found:
         raise ValueError("there is no run in the folders.")
     above = os.path.commonpath([folder.absolute().parent for folder in found])
@@ -214,17 +214,21 @@ def parse_run(record: Mapping[str, Any]) -> Run:
     config, returns = flatten(record["config"]), record["returns"]
     env, steps = config["env.name"], config["trainer.steps"]
     path, share = config["data.path"], config["data.random_share"]
-    score = returns["data_score"]
-    if score is not None and not abs(score) < LARGEST:
-        raise ValueError(f"data_score is {score}, no finite score")
-    episodes = [_training_episodes(returns["evaluations"], env, steps)]
+    references = reference_returns(
+        env, config.get("env.random_return"), config.get("env.expert_return")
+    )
+    measure = "return" if references is None else "score"
+    mean = returns[f"data_{measure}"]
+    if mean is not None and not abs(mean) < LARGEST:
+        raise ValueError(f"data_{measure} is {mean}, no finite {measure}")
+    episodes = [_training_episodes(returns["evaluations"], references, steps)]
     distances = [_table([], CURVE)]
     versions = [returns["versions"]]
     protocols: list[dict[str, str]] = []
     unusable = []
     for name, content in record["robustness"].items():
         try:
-            played, curves = _suite_episodes(content)
+            played, curves = _suite_episodes(content, f"{measure}s")
             suite = _protocol(content, steps)
             if suite["suite"] in [each["suite"] for each in protocols]:
                 raise ValueError(f"a second file of suite {suite['suite']!r}")
@@ -242,7 +246,8 @@ def parse_run(record: Mapping[str, Any]) -> Run:
         + (f", {100 * share:g} % random" if share else ""),
         "seed": int(config["seed"]),
         "steps": int(steps),
-        "data_score": None if score is None else float(score),
+        "measure": "score" if references else f"return of {env}",
+        "data_score": None if mean is None else float(mean),
         "overrides": " ".join(map(str, record["overrides"] or ())),
         "versions": sorted(
             {f"{name} {each}" for of in versions for name, each in (of or {}).items()}
@@ -258,8 +263,12 @@ def parse_run(record: Mapping[str, Any]) -> Run:
     )
 
 
-def _folders(tops: Iterable[Path]) -> list[Path]:
-    """Folders of runs in or below the folders, each once, in the order of paths."""
+def find_runs(tops: Iterable[Path]) -> list[Path]:
+    """Folders of runs in or below the folders, each once, in the order of paths.
+
+    Raises:
+        FileNotFoundError: if one of the folders does not exist.
+    """
     found: dict[Path, Path] = {}
     for top in tops:
         if not top.exists():
@@ -291,7 +300,9 @@ def _lines(table: Path) -> Iterator[tuple[str, str]]:
 
 
 def _training_episodes(
-    evaluations: Sequence[Mapping[str, Any]], env: str, steps: int
+    evaluations: Sequence[Mapping[str, Any]],
+    references: ReferenceReturns | None,
+    steps: int,
 ) -> pd.DataFrame:
     """Undisturbed episodes of the training's own evaluations."""
     at = [row["step"] for row in evaluations]
@@ -309,11 +320,18 @@ def _training_episodes(
         for row in evaluations
     ]
     episodes = _table(rows, EPISODE)
-    return episodes.assign(score=normalized_score(env, episodes["score"]))
+    if references is None:
+        return episodes
+    return episodes.assign(score=references.score(episodes["score"].to_numpy()))
 
 
-def _suite_episodes(content: Any) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Episodes of a robustness file, and the distance curves of its disturbances."""
+def _suite_episodes(content: Any, values: str) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Episodes of a robustness file, and the distance curves of its disturbances.
+
+    Args:
+        content: of the file.
+        values: which entry counts: scores or returns.
+    """
     if not isinstance(content, dict):
         raise ValueError(str(content))  # why it could not be read
     if content["format"] != ROBUSTNESS_FORMAT:
@@ -329,7 +347,7 @@ def _suite_episodes(content: Any) -> tuple[pd.DataFrame, pd.DataFrame]:
                 "disturbance": str(level["name"]),
                 "step": row["step"],
             }
-            numbers = {"episode": row["clean"]["seeds"], "score": level["scores"]}
+            numbers = {"episode": row["clean"]["seeds"], "score": level[values]}
             if level["recovery_steps"] is not None:  # it ends
                 numbers |= {name: level[key] for key, name in RECOVERY.items()}
                 curve = {

@@ -100,6 +100,11 @@ def decimal(value: float, sign: str = "") -> str:
     return f"{value:{sign}.1f}".replace("-", "\N{MINUS SIGN}")
 
 
+def counted(number: int, noun: str) -> str:
+    """A number of things: "1 run", "2 runs"."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
 def over_what(groups: Sequence[Sequence[object]]) -> str:
     """What an interval is over: seeds, if the group of each data set has several."""
     return "seeds" if min(map(len, groups)) > 1 else "episodes"

@@ -29,10 +29,14 @@ class Progress:
         description: names the phase.
         total: steps of the whole run.
         bar: show a progress bar when on a terminal.
+        unit: what a step is called. Default "step".
     """
 
-    def __init__(self, description: str, total: int, bar: bool) -> None:
+    def __init__(
+        self, description: str, total: int, bar: bool, unit: str = "step"
+    ) -> None:
         self._description, self._total, self._wanted = description, total, bar
+        self._unit = unit
         self._result = ""
 
     @contextmanager
@@ -42,7 +46,7 @@ class Progress:
             total=self._total,
             initial=step,
             desc=self._description,
-            unit="step",
+            unit=self._unit,
             # None: disabled where the output is not a terminal.
             disable=None if self._wanted else True,
         )
@@ -71,7 +75,6 @@ class Progress:
         pace = ""
         if rate:
             left = tqdm.format_interval((self._total - step) / rate)
-            pace = f", {rate:.3g} steps/s, {left} left"
-        log.info(
-            f"{self._description}: step {step} of {self._total}{pace}{self._result}"
-        )
+            pace = f", {rate:.3g} {self._unit}s/s, {left} left"
+        done = f"{self._unit} {step} of {self._total}"
+        log.info(f"{self._description}: {done}{pace}{self._result}")

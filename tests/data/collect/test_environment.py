@@ -10,9 +10,44 @@ from contextlib import closing
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium import spaces
 
-from torchrl_osr.data import MAZE_IDS, make_environment
-from torchrl_osr.data.collect.environment import environment_id
+from torchrl_osr.data import MAZE_IDS, environment_spec, make_environment
+from torchrl_osr.data.collect import environment
+from torchrl_osr.data.collect.environment import environment_id, environment_name
+
+PLANE = spaces.Box(-1, 1, (2,), np.float32)
+SPACES = {
+    "test/Endless-v0": (PLANE, spaces.Box(-np.inf, np.inf, (1,), np.float32)),
+    "test/Buttons-v0": (PLANE, spaces.MultiDiscrete([2, 2])),
+    "test/Shifted-v0": (PLANE, spaces.Discrete(3, start=-1)),
+    "test/Tuple-v0": (spaces.Tuple([PLANE, spaces.Discrete(3)]), PLANE),
+}
+
+
+class Bare(gymnasium.Env):
+    """Random observations for ever; the reward is the action."""
+
+    def __init__(self, observations, actions):
+        self.observation_space, self.action_space = observations, actions
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        return self.observation_space.sample(), float(action), False, False, {}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _bare_environments():
+    for env_id, (observations, actions) in SPACES.items():
+        kwargs = {"observations": observations, "actions": actions}
+        gymnasium.register(env_id, Bare, kwargs=kwargs)
+    yield
+    for env_id in SPACES:
+        del gymnasium.registry[env_id]
+
 
 WIDTHS = {"pointmaze": 8, "antmaze": 31}  # goal reached, goal wanted, point or ant
 
@@ -90,11 +125,26 @@ def test_robotics_is_imported_for_its_own_tasks_and_says_nothing():
     assert line.endswith("pip install torchrl-osr[mazes]")
 
 
-def test_unknown_ids_are_gymnasiums_errors():
-    with pytest.raises(gymnasium.error.NameNotFound, match="Hoper"):
-        make_environment("Hoper-v5")
-    with pytest.raises(gymnasium.error.VersionNotFound, match="v99"):
-        make_environment("Hopper-v99")
+@pytest.mark.parametrize(
+    ("env_id", "error", "message"),
+    [
+        ("Hoper-v5", ValueError, r"env.id=Hoper-v5 is no environment.*Hopper"),
+        ("Hopper-v99", ValueError, "v99"),
+        ("nowhere/Arm-v0", ValueError, "Namespace nowhere"),
+        ("not_there:Arm-v0", ImportError, "'not_there' first.*No module named"),
+        ("a:b:Arm-v0", ValueError, "two colons"),
+        ("FrozenLake-v1", ValueError, r"has observations Discrete\(16\)"),
+        ("Blackjack-v1", ValueError, "int64.*expected a vector of real numbers"),
+        ("test/Endless-v0", ValueError, "expected finite bounds"),
+        ("test/Buttons-v0", ValueError, r"has actions MultiDiscrete"),
+    ],
+)
+def test_what_cannot_be_acted_in_is_refused_in_a_sentence(env_id, error, message):
+    with pytest.raises(error, match=message):
+        make_environment(env_id)
+
+
+def test_unknown_names_list_the_known_ones():
     with pytest.raises(ValueError, match=r"'ant'.*hopper.*pointmaze-umaze"):
         environment_id("ant")
 
@@ -108,9 +158,50 @@ def test_other_action_bounds_are_rescaled():
         assert env.unwrapped.data.ctrl == pytest.approx([1.5])
 
 
-def test_tasks_without_vectors_are_refused():
-    with pytest.raises(ValueError, match=r"CartPole-v1 has actions Discrete\(2\)"):
-        make_environment("CartPole-v1")
+def test_discrete_actions_are_numbered_from_zero():
+    with closing(make_environment("CartPole-v1")) as env:
+        assert env.action_space == spaces.Discrete(2)
+    with closing(make_environment("test/Shifted-v0")) as env:
+        assert env.action_space == spaces.Discrete(3)
+        env.reset(seed=0)
+        assert env.step(np.int64(2))[1] == 1, "the reward is the action, -1 to 1"
+
+
+def test_tuples_become_vectors():
+    with closing(make_environment("test/Tuple-v0")) as env:
+        observation, _ = env.reset(seed=0)
+        assert env.observation_space.contains(observation)
+        assert observation.shape == (5,)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "spec"),
+    [
+        ("Pendulum-v1", (3, 1, [-2.0], [2.0])),
+        ("InvertedPendulum-v5", (4, 1, [-3.0], [3.0])),
+        ("CartPole-v1", (4, 2, None, None)),
+        ("test/Shifted-v0", (2, 3, None, None)),
+    ],
+)
+def test_spec_is_in_the_environments_own_units(env_id, spec):
+    assert environment_spec(env_id) == spec
+    assert environment_spec(env_id).discrete == (spec[2] is None)
+
+
+def test_an_episode_that_never_ends_is_not_waited_for(monkeypatch):
+    monkeypatch.setattr(environment, "MAX_EPISODE", 50)
+    with closing(make_environment("test/Shifted-v0")) as env:
+        for _ in range(2):  # it begins anew at each reset
+            env.reset(seed=0)
+            for _ in range(50):
+                env.step(np.int64(0))
+        with pytest.raises(RuntimeError, match="max_episode_steps"):
+            env.step(np.int64(0))
+
+
+@pytest.mark.parametrize("name", [*MAZE_IDS, "hopper", "halfcheetah"])
+def test_names_and_ids_of_built_in_tasks_belong_together(name):
+    assert environment_name(environment_id(name)) == name
 
 
 def test_nothing_is_left_in_the_working_folder(tmp_path, monkeypatch):

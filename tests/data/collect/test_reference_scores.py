@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from torchrl_osr.data import REFERENCE_RETURNS, normalized_score
+from torchrl_osr.data import REFERENCE_RETURNS, normalized_score, reference_returns
 
 
 def test_hand_computed_scores() -> None:
@@ -27,3 +27,26 @@ def test_arrays_keep_their_shape(env_name: str) -> None:
 def test_unknown_environment_lists_what_exists() -> None:
     with pytest.raises(ValueError, match=r"'ant'.*halfcheetah, hopper, .*walker2d"):
         normalized_score("ant", 1.0)
+
+
+def test_references_of_ones_own() -> None:
+    assert reference_returns("pendulum") is None, "raw returns"
+    assert reference_returns("hopper") == REFERENCE_RETURNS["hopper"]
+    own = reference_returns("pendulum", -1200.0, -200.0)
+    assert own is not None
+    assert [own.score(each) for each in (-1200.0, -200.0, -450.0)] == [0, 100, 75]
+
+
+@pytest.mark.parametrize(
+    ("name", "low", "high", "message"),
+    [
+        ("pendulum", -1200.0, None, "env.expert_return=None: expected two"),
+        ("pendulum", None, 0.0, "env.random_return=None"),
+        ("pendulum", 5.0, 5.0, "two different finite numbers"),
+        ("pendulum", 0.0, float("nan"), "two different finite numbers"),
+        ("hopper", 0.0, 1.0, "hopper is scored by D4RL's references"),
+    ],
+)
+def test_references_that_make_no_scale_are_refused(name, low, high, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        reference_returns(name, low, high)

@@ -14,6 +14,7 @@ percent. We take them for the point as well.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple, overload
 
 import numpy as np
@@ -21,10 +22,24 @@ from numpy.typing import NDArray
 
 
 class ReferenceReturns(NamedTuple):
-    """Mean undiscounted episode returns of D4RL's random and expert policies."""
+    """Mean undiscounted episode returns of a random and of an expert policy."""
 
     random: float
     expert: float
+
+    @overload
+    def score(self, episode_return: float) -> float: ...
+
+    @overload
+    def score(self, episode_return: NDArray[np.floating]) -> NDArray[np.float64]: ...
+
+    def score(
+        self, episode_return: float | NDArray[np.floating]
+    ) -> float | NDArray[np.float64]:
+        """Score in percent of returns, see :func:`normalized_score`."""
+        above = np.asarray(episode_return, dtype=np.float64) - self.random
+        score = 100.0 * above / (self.expert - self.random)
+        return float(score) if np.ndim(episode_return) == 0 else score
 
 
 REFERENCE_RETURNS: dict[str, ReferenceReturns] = {
@@ -38,7 +53,40 @@ REFERENCE_RETURNS: dict[str, ReferenceReturns] = {
     "antmaze-medium": ReferenceReturns(random=0.0, expert=1.0),
     "antmaze-large": ReferenceReturns(random=0.0, expert=1.0),
 }
-"""Reference returns by short environment name."""
+"""D4RL's reference returns by short environment name."""
+
+
+def reference_returns(
+    env_name: str,
+    random_return: float | None = None,
+    expert_return: float | None = None,
+) -> ReferenceReturns | None:
+    """What returns of a task are normalised by, ``None`` if there is nothing.
+
+    Args:
+        env_name: short name; D4RL's references count where there are some.
+        random_return, expert_return: of a task that has none of D4RL's: both, or
+            neither for raw returns (default).
+
+    Raises:
+        ValueError: only one is given, they are not two different finite numbers, or
+            the task has its own.
+    """
+    given = random_return, expert_return
+    if given == (None, None):
+        return REFERENCE_RETURNS.get(env_name)
+    if env_name in REFERENCE_RETURNS:
+        raise ValueError(
+            f"{env_name} is scored by D4RL's references: leave out env.random_return "
+            "and env.expert_return, or give another env.name."
+        )
+    low, high = given
+    if low is None or high is None or not 0 < abs(high - low) < math.inf:
+        raise ValueError(
+            f"env.random_return={low} and env.expert_return={high}: expected two "
+            "different finite numbers, or neither for raw returns."
+        )
+    return ReferenceReturns(low, high)
 
 
 @overload
@@ -76,6 +124,4 @@ def normalized_score(
             f"no reference returns for environment {env_name!r}; there are for: "
             f"{', '.join(sorted(REFERENCE_RETURNS))}."
         )
-    low, high = REFERENCE_RETURNS[env_name]
-    score = 100.0 * (np.asarray(episode_return, dtype=np.float64) - low) / (high - low)
-    return float(score) if np.ndim(episode_return) == 0 else score
+    return REFERENCE_RETURNS[env_name].score(episode_return)

@@ -266,7 +266,7 @@ def _refuse_discrete(
             f"'action' holds only the whole numbers {action.min():g} to "
             f"{action.max():g}, where its bounds are {low.tolist()} and "
             f"{high.tolist()}: they look like numbers of discrete actions, which a "
-            "loss for continuous ones would take for forces. Give the number of "
-            "discrete actions, num_actions= (env.id=... of their task), or the bounds "
-            "of the forces, action_bounds=[0,high] (data.action_bounds=[0,high])."
+            "loss for continuous ones would take for forces. Of discrete actions give "
+            "the number, num_actions= (env.id=... of their task); of forces the "
+            "bounds, action_bounds=[0,high] (data.action_bounds=[0,high])."
         )

@@ -1,0 +1,116 @@
+"""Roll out a policy in any Gymnasium environment and keep the steps as a log.
+
+    torchrl-osr collect env.id=Pendulum-v1 path=pendulum.npz
+    torchrl-osr collect env.id=Pendulum-v1 policy=my_package:act path=pendulum.npz
+    torchrl-osr collect policy=outputs/Pendulum-v1-file/seed0-... path=better.parquet
+
+The log is what ``torchrl-osr train data=file`` reads. See docs/any_environment.md.
+"""
+
+from __future__ import annotations
+
+from contextlib import closing
+from importlib import import_module
+from pathlib import Path
+
+import hydra
+import numpy as np
+import torch
+from gymnasium.spaces import Discrete
+from numpy.typing import NDArray
+from omegaconf import DictConfig, OmegaConf
+
+from torchrl_osr.commands import CONF
+from torchrl_osr.commands.console import single_job
+from torchrl_osr.data.collect.environment import open_environment
+from torchrl_osr.data.collect.record import (
+    Act,
+    check_log_path,
+    record_episodes,
+    write_log,
+)
+from torchrl_osr.experiment import schema
+from torchrl_osr.experiment.run_config import import_from_here
+from torchrl_osr.policy import Policy, load_policy
+
+schema.register()
+
+
+@hydra.main(version_base="1.3", config_path=CONF, config_name="collect")
+@single_job
+def main(cfg: DictConfig) -> None:
+    """Play the episodes, write the log, and say what is in it."""
+    torch.set_num_threads(1)
+    path = Path(cfg.path).expanduser()
+    check_log_path(path)
+    env_id = None if OmegaConf.is_missing(cfg.env, "id") else str(cfg.env.id)
+    if env_id is not None and ":" in env_id:
+        import_from_here()
+    act: Act | None = None
+    if Path(cfg.policy).exists():
+        policy = load_policy(cfg.policy, trust=cfg.trust)
+        env_id, act = env_id or environment_of(policy), policy.act
+    elif ":" in cfg.policy:
+        act = imported(cfg.policy)
+    elif cfg.policy != "random":
+        raise ValueError(
+            f"policy={cfg.policy} is neither random, nor the folder of a run, nor a "
+            "function as in policy=my_package:act."
+        )
+    if env_id is None:
+        raise ValueError("env.id is not given: say which environment to play.")
+    with closing(open_environment(env_id)) as env:
+        loss = "loss=discrete_osr " if isinstance(env.action_space, Discrete) else ""
+        columns = record_episodes(
+            env,
+            act,
+            cfg.episodes,
+            noise=cfg.noise,
+            seed=cfg.seed,
+            progress=cfg.progress,
+        )
+    write_log(path, columns)
+    print(description(path, columns))
+    print(f"  torchrl-osr train env.id={env_id} {loss}data=file data.path={path}")
+
+
+def environment_of(policy: Policy) -> str | None:
+    """Id of the environment that a policy was trained in, if it is known.
+
+    Raises:
+        ValueError: if it imports a package, which the policy may come with.
+    """
+    env_id: str | None = policy.record["source"].get("env_id")
+    if env_id is not None and ":" in env_id:
+        raise ValueError(
+            f"the policy is of env.id={env_id}, which imports a package: if you know "
+            "it, give env.id yourself."
+        )
+    return env_id
+
+
+def imported(name: str) -> Act:
+    """Function of a module, as in ``"my_package:act"``; the current folder counts."""
+    import_from_here()
+    module, _, function = name.partition(":")
+    try:
+        act: Act = getattr(import_module(module), function)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(
+            f"policy={name} cannot be imported: {error}. Give a function of a module "
+            "that is installed or in the current folder, as in policy=my_package:act."
+        ) from error
+    return act
+
+
+def description(path: Path, columns: dict[str, NDArray[np.generic]]) -> str:
+    """Text of what was recorded: steps, episodes and their returns."""
+    returns = np.bincount(columns["episode"], weights=columns["reward"])
+    return (
+        f"{path}: {len(columns['reward']):,} steps, {len(returns)} episodes, "
+        f"return {returns.mean():.1f} ({returns.min():.1f} to {returns.max():.1f})"
+    )
+
+
+if __name__ == "__main__":
+    main()
