@@ -204,3 +204,14 @@ def test_no_loading_touches_the_network(tmp_path, monkeypatch):
             load_dataset("hopper", quality, path=path)
     with pytest.raises(AssertionError, match="the network was asked for"):
         load_dataset("hopper", "d4rl", path="hopper-medium-v2", download=True)
+
+
+def test_nobody_waits_for_the_other_end_of_a_pipe(tmp_path):
+    path = tmp_path / "status.json"
+    os.mkfifo(path)
+    with pytest.raises(
+        ValueError, match=r"status\.json is a folder, a pipe or a device"
+    ):
+        read_json(path)
+    with pytest.raises(ValueError, match="is a folder, a pipe or a device"):
+        read_arrays(path)

@@ -88,10 +88,11 @@ def read_text(path: Path, *, max_bytes: int = MAX_JSON_BYTES) -> str:
 
     Raises:
         OSError: it cannot be read.
-        ValueError: it is too large, or not UTF-8.
+        ValueError: it is too large, not UTF-8, or no file.
     """
+    refuse_other_than_files(path)
     with path.open("rb") as file:
-        # Not its size: a pipe has none, and a file may grow.
+        # Not its size: a file may grow.
         content = file.read(max_bytes + 1)
     if len(content) > max_bytes:
         raise ValueError(f"{path.name} has more than {max_bytes:,} bytes")
@@ -99,6 +100,15 @@ def read_text(path: Path, *, max_bytes: int = MAX_JSON_BYTES) -> str:
         return content.decode("utf-8")
     except UnicodeDecodeError as error:
         raise ValueError(f"{path.name} is no text: {error}") from error
+
+
+def refuse_other_than_files(path: Path) -> None:
+    """Raise a ValueError if a path is a folder, a named pipe or a device.
+
+    To open a pipe waits for its other end, perhaps for ever.
+    """
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{path} is a folder, a pipe or a device; a file was expected")
 
 
 def read_json(path: Path, *, max_bytes: int = MAX_JSON_BYTES) -> dict[str, Any]:
@@ -132,6 +142,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
             names the file.
     """
     try:
+        refuse_other_than_files(path)
         with path.open("rb") as file:
             if file.read(len(MAGIC_PREFIX)) == MAGIC_PREFIX:
                 raise ValueError("it is a single array")
@@ -141,14 +152,19 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
         if twice := [name for name in names if names.count(name) > 1]:
             raise ValueError(f"two arrays in it are called {twice[0]!r}")
         check_unpacked_size(path, sum(sizes))
-        with np.load(path, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays}
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive}
+        # What is no array comes back as bytes.
+        if others := [name for name in arrays if isinstance(arrays[name], bytes)]:
+            raise ValueError(f"{others[0]!r} in it is no array")
+        return arrays
     except (
         *(EOFError, MemoryError, NotImplementedError, OverflowError),
         *(ValueError, zipfile.BadZipFile, zlib.error),
     ) as error:
         raise ValueError(
-            f"{path} is no NumPy archive of plain arrays, or damaged: {error}"
+            f"{path} is no NumPy archive of plain arrays, or damaged ({error}): take a "
+            "whole copy of it, written with numpy.savez"
         ) from error
 
 
@@ -158,7 +174,7 @@ def check_unpacked_size(path: Path, unpacked: int) -> None:
     if unpacked > most:
         raise ValueError(
             f"{path.name} would unpack to {unpacked:,} bytes; at most {most:,} are "
-            "read, more only without compression"
+            "read: store more without compression"
         )
 
 

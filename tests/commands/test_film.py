@@ -85,7 +85,7 @@ def test_knock_takes_the_place_of_the_push(script):
     [
         ("rule=next", "nearest"),
         ("window=[5,9]", "at 10 or later"),
-        ("after=1", "after"),
+        ("window=[20]", "end later still"),
     ],
 )
 def test_bad_input_is_named(script, option, named):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import time
 from pathlib import Path
 
@@ -12,7 +13,13 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from torchrl_osr.experiment import schema as config
-from torchrl_osr.experiment.run_config import check_targets, read_config, read_yaml
+from torchrl_osr.experiment.run_config import (
+    check_run,
+    check_targets,
+    read_config,
+    read_run,
+    read_yaml,
+)
 
 CONF = Path(__file__).parents[2] / "conf"
 OPTIONS = [
@@ -22,15 +29,48 @@ OPTIONS = [
 ]
 
 
-@pytest.mark.parametrize("option", OPTIONS)
-def test_every_configuration_of_ours_is_let_through(tmp_path, option):
+def composed(*overrides: str):
     config.register()
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        cfg = compose("train", [option])
-    OmegaConf.save(cfg, tmp_path / "config.yaml", resolve=True)
-    again = read_config(tmp_path / "config.yaml")
+        return compose("train", list(overrides))
+
+
+@pytest.mark.parametrize(
+    "option", [*OPTIONS, "+inverse_dynamics.network.low=-2.0", "preset=antmaze"]
+)
+def test_every_configuration_of_ours_is_let_through(tmp_path, option):
+    OmegaConf.save(composed(option), tmp_path / "config.yaml", resolve=True)
+    again = read_run(tmp_path / "config.yaml")
     assert again == OmegaConf.load(tmp_path / "config.yaml")
-    check_targets(again)
+
+
+@pytest.mark.parametrize(
+    "key", ["trainer.foo", "foo", "loss.recovery_wieght", "inverse_dynamics.loss.foo"]
+)
+def test_keys_that_were_added_are_refused(key):
+    with pytest.raises(ValueError, match=f"there is no key {key}: docs"):
+        check_run(composed(f"+{key}=1"))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "reason"),
+    [
+        ("trainer.steps", "many", "'many' of type 'str' could not be converted"),
+        ("trainer", 3, "int is not a subclass"),
+        ("seed", [1], "could not be converted to Integer"),
+        ("loss", 3, "loss must have options and a _target_, got 3"),
+        ("loss._target_", "torchrl_osr.objectives", "is none of"),
+        ("perturbation.adversary", "yes", "must have options and a _target_"),
+        ("env.id", "???", "it lacks env.id"),
+        ("data.held_out", float("nan"), "held_out must be between 0 and 1, got nan"),
+    ],
+)
+def test_what_is_wrong_with_somebodys_run_is_named(tmp_path, key, value, reason):
+    cfg = OmegaConf.create(OmegaConf.to_container(composed(), resolve=True))
+    OmegaConf.update(cfg, key, value, merge=False)
+    OmegaConf.save(cfg, tmp_path / "config.yaml")
+    with pytest.raises(ValueError, match=rf"config\.yaml: .*{reason}"):
+        read_run(tmp_path / "config.yaml")
 
 
 @pytest.mark.parametrize(
@@ -61,6 +101,54 @@ def test_no_module_is_imported_for_an_environment():
         check_targets(cfg)
 
 
+@pytest.fixture
+def module(tmp_path, monkeypatch):
+    """A module of the user's in the current folder, and what importing it leaves."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", sys.path.copy())
+    text = "from os import mkdir\ndef mine(): ...\ndef _hidden(): ...\n"
+    (tmp_path / "my_module.py").write_text(text)
+    yield tmp_path / "my_module.py"
+    sys.modules.pop("my_module", None)
+
+
+@pytest.mark.parametrize("name", ["mkdir", "_hidden", "absent", "os.mkdir"])
+def test_what_a_trusted_module_defines_may_be_called(module, name):
+    cfg = OmegaConf.create({"loss": {"_target_": "my_module.mine"}})
+    with pytest.raises(ValueError, match=r"allow it with trust=\[my_module\]"):
+        check_targets(cfg)
+    assert "my_module" not in sys.modules
+    check_targets(cfg, ["my_module"])
+    cfg.loss._target_ = f"my_module.{name}"
+    with pytest.raises(ValueError, match="is none of .*, my_module: a run"):
+        check_targets(cfg, ["my_module"])
+
+
+def test_a_trusted_module_says_itself_what_it_offers(module):
+    module.write_text("from os import mkdir\n__all__ = ['mkdir']\ndef mine(): ...\n")
+    cfg = OmegaConf.create({"loss": {"_target_": "my_module.mkdir"}})
+    check_targets(cfg, ["my_module"])
+    cfg.loss._target_ = "my_module.mine"
+    with pytest.raises(ValueError, match="no public function or class 'mine'"):
+        check_targets(cfg, ["my_module"])
+
+
+def test_a_trusted_module_may_bring_the_environment(module):
+    cfg = OmegaConf.create({"env": {"id": "my_module:Robot-v0"}})
+    with pytest.raises(ValueError, match=r"allow it with trust=\[my_module\]"):
+        check_targets(cfg)
+    check_targets(cfg, ["my_module"])
+    with pytest.raises(ValueError, match=r"trust=\[absent\] cannot be imported"):
+        check_targets(cfg, ["absent"])
+
+
+def test_no_file_of_the_current_folder_takes_the_place_of_a_library(module):
+    (module.parent / "tabnanny.py").write_text("raise SystemExit('the wrong one')")
+    sys.modules.pop("tabnanny", None)
+    check_targets(OmegaConf.create({}), ["my_module", "tabnanny"])
+    assert Path(sys.modules["tabnanny"].__file__).parent != module.parent
+
+
 def test_the_crafted_configuration_would_work(tmp_path):
     """What :func:`check_targets` is for."""
     marker = tmp_path / "marker"
@@ -75,7 +163,9 @@ def test_the_crafted_configuration_would_work(tmp_path):
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("a: &a [1, 1]\nb: [*a, *a]\n", "aliases"),
+        ("a: &a [1, 1]\nb: [*a, *a]\n", "tags or aliases"),
+        ("a: !!int ''", "tags or aliases"),
+        ("a: !!python/object/apply:os.system [x]", "tags or aliases"),
         ("loss: '${oc.create:\"{_target_: os.mkdir}\"}'", "has the interpolation"),
         ('loss: "\\x24{oc.env:HOME}"', "has the interpolation"),
         ("- a\n", "holds no mapping"),

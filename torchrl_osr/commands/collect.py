@@ -20,7 +20,7 @@ from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_osr.commands import CONF, import_from_here
+from torchrl_osr.commands import CONF
 from torchrl_osr.commands.console import single_job
 from torchrl_osr.data.collect.environment import open_environment
 from torchrl_osr.data.collect.record import (
@@ -30,6 +30,7 @@ from torchrl_osr.data.collect.record import (
     write_log,
 )
 from torchrl_osr.experiment import schema
+from torchrl_osr.experiment.run_config import import_from_here
 from torchrl_osr.policy import Policy, load_policy
 
 schema.register()
@@ -47,7 +48,7 @@ def main(cfg: DictConfig) -> None:
         import_from_here()
     act: Act | None = None
     if Path(cfg.policy).exists():
-        policy = load_policy(cfg.policy)
+        policy = load_policy(cfg.policy, trust=cfg.trust)
         env_id, act = env_id or environment_of(policy), policy.act
     elif ":" in cfg.policy:
         act = imported(cfg.policy)

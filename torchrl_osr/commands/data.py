@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 from torchrl import torchrl_logger
 
-from torchrl_osr.commands import CONF, import_from_here
+from torchrl_osr.commands import CONF
 from torchrl_osr.commands.console import single_job
 from torchrl_osr.data import RECORDED, environment_spec, load_dataset, make_environment
 from torchrl_osr.data.overview import (
@@ -36,7 +36,9 @@ from torchrl_osr.data.sources import open_recorded
 from torchrl_osr.data.store.cache import CHUNK_ROWS
 from torchrl_osr.data.store.memmap import is_memmap_folder
 from torchrl_osr.evaluation.data_figure import data_figure
-from torchrl_osr.experiment import run_folder, schema
+from torchrl_osr.experiment import schema
+from torchrl_osr.experiment.limits import check_values
+from torchrl_osr.experiment.run_config import check_types, flatten, import_from_here
 
 MOST_ENTRIES = 40  # in the table
 
@@ -48,7 +50,9 @@ schema.register()
 def main(cfg: DictConfig) -> None:
     """Read the data, print what they are, draw them; nothing else is written."""
     torchrl_logger.setLevel("ERROR")  # warnings are among the findings
-    run_folder.check_keys(cfg.data)
+    data_only = OmegaConf.create({"data": OmegaConf.to_container(cfg.data)})
+    check_types(OmegaConf.create({"data": schema.DataConfig}), data_only)
+    check_values(flatten(OmegaConf.to_container(data_only)))
     env_id = None if OmegaConf.is_missing(cfg.env, "id") else str(cfg.env.id)
     env_name = None if env_id is None else cfg.env.get("name")
     if env_id is not None and ":" in env_id:

@@ -55,6 +55,8 @@ from torchrl_osr.evaluation import (
 from torchrl_osr.evaluation.robustness import aligned_columns
 from torchrl_osr.experiment import run_folder
 from torchrl_osr.experiment.build import load_data, references_of
+from torchrl_osr.experiment.limits import check_values
+from torchrl_osr.experiment.run_config import flatten
 from torchrl_osr.experiment.suite import make_disturbances, register
 from torchrl_osr.experiment.trained_run import (
     TrainedRun,
@@ -75,6 +77,7 @@ register()
 @single_job
 def main(cfg: DictConfig) -> None:
     """Evaluate, unless the results are there already, and print the table."""
+    check_values(flatten(OmegaConf.to_container(cfg, resolve=True)))
     if min(cfg.last, cfg.jobs, cfg.episodes - 1) < 1:
         raise ValueError(
             f"last and jobs must be at least 1 and episodes at least 2, got "
@@ -230,7 +233,7 @@ def evaluate(
     cfg: DictConfig, files: list[Path], partial: Path, request: dict[str, Any]
 ) -> dict[str, Any]:
     """Play all checkpoints of one run, except those that ``partial`` has already."""
-    first = load_trained(files[0])
+    first = load_trained(files[0], trust=cfg.trust)
     run = first.config
     data, _ = load_data(run, progress=cfg.progress)
     distance = DataDistance(data, seed=run.data.seed)
@@ -253,7 +256,7 @@ def evaluate(
     played = count(len(evaluations) * plays + 1)
     with progress.shown(len(evaluations) * plays):
         for number in range(len(evaluations), len(files)):
-            trained = load_trained(files[number])
+            trained = load_trained(files[number], trust=cfg.trust)
             seed = cfg.seed + SEED_STRIDE * number
             paired = evaluate_paired(
                 deterministic_policy(trained.actor, trained.observation_norm),

@@ -53,11 +53,18 @@ def main() -> None:
         default="action",
         help="what a graph computes (default: %(default)s)",
     )
+    parser.add_argument(
+        "--trust",
+        action="append",
+        default=[],
+        metavar="MODULE",
+        help="of your own, that the run may name; may be repeated",
+    )
     options = parser.parse_args()
     if options.path.suffix not in (SUFFIX, *SUFFIXES):
         parser.error(f"the path must end in {SUFFIX}, {' or '.join(SUFFIXES)}.")
     try:
-        policy = load_policy(options.source)
+        policy = load_policy(options.source, trust=options.trust)
         if options.path.suffix == SUFFIX:
             policy.save(options.path)
         else:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import os
 import sys
+from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from typing import Any
@@ -32,7 +33,8 @@ except Exception as error:
 
 import hydra
 import torch
-from omegaconf import DictConfig, OmegaConf
+from hydra.core.config_store import ConfigStore
+from omegaconf import MISSING, DictConfig, OmegaConf
 from torchrl import torchrl_logger
 
 from torchrl_osr._checks import check_choice
@@ -48,6 +50,8 @@ from torchrl_osr.data import (
 from torchrl_osr.envs import ActionKnock, ExternalPush
 from torchrl_osr.evaluation import DataDistance, Policy, Wrap, deterministic_policy
 from torchrl_osr.experiment.build import load_data
+from torchrl_osr.experiment.limits import check_values
+from torchrl_osr.experiment.run_config import flatten
 from torchrl_osr.experiment.trained_run import TrainedRun, load_trained
 from torchrl_osr.film import (
     BEHAVIOR,
@@ -68,17 +72,38 @@ STEPS_BEFORE = 10  # in the film
 MODEL, RULES = "inverse dynamics, ", ("time", "nearest")
 
 
+@dataclass
+class FilmConfig:
+    """All keys of ``torchrl-osr film``; what they mean is beside their values."""
+
+    checkpoint: str = MISSING
+    push: float = MISSING
+    knock: int | None = None
+    window: list[int] = MISSING
+    after: int = MISSING
+    rule: str = MISSING
+    episodes: int = MISSING
+    seed: int = MISSING
+    film_seed: int | None = None
+    num_threads: int = MISSING
+    trust: list[str] = MISSING
+
+
+ConfigStore.instance().store(name="film_schema", node=FilmConfig)
+
+
 @hydra.main(version_base="1.3", config_path=f"{CONF}/evaluation", config_name="film")
 @single_job
 def main(cfg: DictConfig) -> None:
     """Play all episodes with every controller, print the table, film one of them."""
+    check_values(flatten(OmegaConf.to_container(cfg, resolve=True)))
     torchrl_logger.setLevel("WARNING")
     torch.set_num_threads(cfg.num_threads)
-    trained = load_trained(cfg.checkpoint)
+    event, duration, wrap = disturbance(cfg)
+    trained = load_trained(cfg.checkpoint, trust=cfg.trust)
     run = trained.config
     camera = Camera(make_environment(run.env.id), 224)  # fails before the work
     data, _ = load_data(run, progress=False)
-    event, duration, wrap = disturbance(cfg)
     played, ends = play_takeovers(
         run.env.id, behavior_of(trained), controllers(trained), wrap, duration=duration,
         latest=cfg.window[1], after=cfg.after, num_episodes=cfg.episodes, seed=cfg.seed,
@@ -155,10 +180,10 @@ def draw(
 def disturbance(cfg: DictConfig) -> tuple[str, int, Wrap]:
     """Name of the disturbance, its duration in steps, and its wrapper."""
     check_choice("rule", cfg.rule, RULES)
-    if cfg.window[0] < STEPS_BEFORE or cfg.after < 2:
+    if len(cfg.window) != 2 or not STEPS_BEFORE <= cfg.window[0] < cfg.window[1]:
         raise ValueError(
-            f"window must begin at {STEPS_BEFORE} or later and after be at least 2, "
-            f"got {cfg.window} and {cfg.after}."
+            f"window must begin at {STEPS_BEFORE} or later and end later still, got "
+            f"{cfg.window}."
         )
     moment: dict[str, Any] = {"at": "random", "window": tuple(cfg.window)}
     if cfg.knock is not None:

@@ -33,7 +33,7 @@ from torchrl.record.loggers import Logger
 
 from torchrl_osr import StatePerturbation
 from torchrl_osr._files import write_json
-from torchrl_osr.commands import CONF, import_from_here
+from torchrl_osr.commands import CONF
 from torchrl_osr.commands.console import single_job
 from torchrl_osr.data import environment_spec
 from torchrl_osr.evaluation import (
@@ -49,12 +49,13 @@ from torchrl_osr.evaluation import (
 )
 from torchrl_osr.experiment import run_folder, schema
 from torchrl_osr.experiment.build import (
+    check_parts,
     make_learner,
     read_environment,
     references_of,
 )
 from torchrl_osr.experiment.loggers import log_outcome, make_loggers
-from torchrl_osr.experiment.run_config import read_yaml
+from torchrl_osr.experiment.run_config import check_run, module_of, read_yaml
 from torchrl_osr.experiment.training_data import load_training_data
 from torchrl_osr.trainers import OfflineTrainer, check_hardware, largest_value
 
@@ -77,13 +78,14 @@ def train(cfg: DictConfig) -> float:
     """Do or continue one run; return its last score or return, for a sweeper."""
     job = HydraConfig.get()
     folder = Path(job.runtime.output_dir)
+    trust = list(cfg.trust)  # by the command line, not by a run's folder
     fresh = cfg.resume is None
-    if not fresh:
-        cfg = run_folder.saved_config(folder, job.overrides.task)
-    if ":" in cfg.env.id:
-        import_from_here()
     if fresh:
-        run_folder.check_keys(cfg)
+        trust += module_of(cfg.env.id)
+    else:
+        cfg = run_folder.saved_config(folder, job.overrides.task)
+    check_run(cfg, trust)
+    if fresh:
         read_environment(cfg)
     run_folder.claim(folder, cfg)
     with run_folder.status(folder):
@@ -103,7 +105,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
     )
     spec, references = environment_spec(cfg.env.id), references_of(cfg)
     sizes = spec.observation_size, spec.action_size
-    make_learner(cfg, *sizes)  # a wrong option of the loss stops here, not later
+    check_parts(cfg, *sizes)
 
     # Transitions with standardised states. Each batch gets a perturbed state for every
     # state, which is the paper's mixed data set.
@@ -167,6 +169,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
         {"params": critic_params, "lr": cfg.optim.qvalue_lr},
         {"params": policy_params, "lr": cfg.optim.actor_lr},
     ]
+    targets = SoftUpdate(loss, tau=cfg.optim.tau) if loss.delay_qvalue else None
     limit = largest_value(data.largest_reward, cfg.optim.gamma)
     episodes = {"num_episodes": cfg.trainer.eval_episodes, "seed": EVALUATION_SEED}
     policy = deterministic_policy(actor, data.norm)
@@ -177,7 +180,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
             total_steps=cfg.trainer.steps,
             folder=folder / "checkpoint" / "policy",
             seed=cfg.seed + 1,
-            target_net_updater=SoftUpdate(loss, tau=cfg.optim.tau),
+            target_net_updater=targets,
             evaluate=lambda: summarize(play(policy), references),
             metric=("return" if references is None else "score", "max"),
             eval_interval=cfg.trainer.eval_interval,

@@ -14,6 +14,7 @@ from torchrl.objectives import LossModule
 
 from torchrl_osr._checks import check_choice
 from torchrl_osr.data import ReferenceReturns, reference_returns
+from torchrl_osr.experiment.limits import check_networks
 from torchrl_osr.objectives.distributions import is_categorical
 
 
@@ -135,14 +136,16 @@ def make_learner(
         device: where they shall be. Default CPU.
 
     Raises:
-        ValueError: if an option of the loss is out of its range.
+        ValueError: if an option of the loss is out of its range, or the networks do not
+            fit into the memory.
     """
+    check_networks(cfg, observation_size, action_size, device)
     sizes, cells = (observation_size, action_size), list(cfg.network.num_cells)
     actor = instantiate(cfg.network.actor, *sizes, num_cells=cells).to(device)
     critics = instantiate(
         cfg.network.critic,
         *sizes,
-        num_qvalue_nets=cfg.loss.num_qvalue_nets,
+        num_qvalue_nets=cfg.loss.get("num_qvalue_nets", 2),
         num_cells=cells,
         layer_norm=cfg.network.layer_norm,
     )
@@ -157,3 +160,22 @@ def make_learner(
     loss = instantiate(cfg.loss, _partial_=True)(**given).to(device)
     loss.make_value_estimator(gamma=cfg.optim.gamma)
     return Learner(actor, model, loss)
+
+
+def check_parts(cfg: DictConfig, observation_size: int, action_size: int) -> None:
+    """Build once what a run will need, so that a wrong option stops before its data.
+
+    Args:
+        cfg: a whole configuration of ``torchrl-osr train``.
+        observation_size, action_size: of the data.
+
+    Raises:
+        ValueError: if an option is out of its range, or networks and batches do not fit
+            into the memory.
+    """
+    sizes = observation_size, action_size
+    check_networks(cfg, *sizes, cfg.trainer.device, training=True)
+    _, model, _ = make_learner(cfg, *sizes)
+    instantiate(cfg.inverse_dynamics.loss, _partial_=True)(model)
+    if cfg.perturbation.adversary is not None:
+        instantiate(cfg.perturbation.adversary)

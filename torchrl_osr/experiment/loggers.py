@@ -15,7 +15,7 @@ from torchrl.record.loggers.wandb import WandbLogger
 
 from torchrl_osr._checks import check_choice
 from torchrl_osr._files import write_atomically
-from torchrl_osr.experiment.run_folder import flatten
+from torchrl_osr.experiment.run_config import flatten
 
 
 def make_loggers(

@@ -8,16 +8,16 @@ import platform
 import re
 import shlex
 import subprocess
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_osr._files import read_json, write_atomically, write_json
+from torchrl_osr.experiment.run_config import flatten, read_config
 from torchrl_osr.trainers import Interrupted
 
 log = logging.getLogger(__name__)
@@ -27,33 +27,8 @@ CONFIG, STATUS, LOCK = "config.yaml", "status.json", ".lock"
 PACKAGES = ("torchrl-osr", "torch", "torchrl", "tensordict", "gymnasium", "mujoco")
 """Packages whose versions decide a run's numbers."""
 
-FREE_KEYS = ("resume", "trainer.progress")
+FREE_KEYS = ("resume", "trainer.progress", "trust")
 """Keys that may differ when a run is continued: no number depends on them."""
-
-
-def check_keys(config: DictConfig) -> None:
-    """Raise a ValueError if a composed configuration has keys that its schema lacks.
-
-    Hydra refuses a mistyped ``key=value``, but adds ``+key=value`` even to a typed
-    group, where nothing would read it.
-    """
-    unknown = list(_unknown_keys(config))
-    if unknown:
-        raise ValueError(
-            f"there is no key {', '.join(unknown)}: docs/configuration.md has them all."
-        )
-
-
-def _unknown_keys(node: DictConfig, prefix: str = "") -> Iterator[str]:
-    kind = OmegaConf.get_type(node)
-    # dataclasses.fields finds none in a class that was pickled in another process.
-    known = set(getattr(kind, "__dataclass_fields__", ()))
-    for key in map(str, node):
-        # A _target_ alone may be any function, which has its own keywords.
-        if known != {"_target_"} and key not in known:
-            yield f"{prefix}{key}"
-        elif isinstance(node[key], DictConfig):
-            yield from _unknown_keys(node[key], f"{prefix}{key}.")
 
 
 def claim(folder: Path, config: DictConfig) -> None:
@@ -69,7 +44,7 @@ def claim(folder: Path, config: DictConfig) -> None:
         write_atomically(path, OmegaConf.to_yaml(config, resolve=True))
         return
     here = flatten(OmegaConf.to_container(config, resolve=True))
-    there = flatten(OmegaConf.to_container(OmegaConf.load(path), resolve=True))
+    there = flatten(OmegaConf.to_container(read_config(path)))
     absent = "nothing"
     differences = [
         f"{key}: {there.get(key, absent)!r} there, {here.get(key, absent)!r} now"
@@ -89,13 +64,15 @@ def saved_config(folder: Path | str, overrides: Sequence[str]) -> DictConfig:
 
     Args:
         folder: of the run.
-        overrides: of the command line; only ``resume=`` may be among them.
+        overrides: of the command line; only ``resume=`` and ``trust=`` may be among
+            them.
 
     Raises:
         FileNotFoundError: if there is no run in ``folder``.
         ValueError: if the command line asks for more than to resume.
     """
-    more = [override for override in overrides if not override.startswith("resume=")]
+    free = ("resume=", "trust=")
+    more = [override for override in overrides if not override.startswith(free)]
     if more:
         raise ValueError(
             f"resume={folder} continues that run as it is; leave out {' '.join(more)}, "
@@ -106,9 +83,7 @@ def saved_config(folder: Path | str, overrides: Sequence[str]) -> DictConfig:
         raise FileNotFoundError(
             f"resume={folder}: there is no {CONFIG} in it; give the folder of a run."
         )
-    config = OmegaConf.load(path)
-    assert isinstance(config, DictConfig)
-    return config
+    return read_config(path)
 
 
 @contextmanager
@@ -184,13 +159,3 @@ def code_commit() -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip()
-
-
-def flatten(value: Any, prefix: str = "") -> dict[str, Any]:
-    """Nested mappings as one, with dotted keys."""
-    if not isinstance(value, Mapping):
-        return {prefix: value}
-    flat: dict[str, Any] = {}
-    for key, item in value.items():
-        flat |= flatten(item, f"{prefix}.{key}" if prefix else str(key))
-    return flat

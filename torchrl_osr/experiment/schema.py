@@ -261,6 +261,8 @@ class TrainConfig:
         seed: random seed of networks, sampling and noise.
         num_random: value of ``loss.num_random`` for the losses with CQL's term.
         resume: folder of a killed run to continue.
+        trust: modules of your own, whose losses, networks and environments may be
+            named, see docs/extend.md.
     """
 
     env: EnvConfig = field(default_factory=EnvConfig)
@@ -277,6 +279,7 @@ class TrainConfig:
     seed: int = MISSING
     num_random: int = MISSING
     resume: str | None = None
+    trust: list[str] = field(default_factory=list)
 
 
 @dataclass
@@ -309,6 +312,7 @@ class CollectConfig:
         noise: on actions, see ``record_episodes``.
         seed: of the first episode.
         progress: a progress bar, when on a terminal.
+        trust: modules of your own that a run may name, see docs/extend.md.
     """
 
     env: EnvConfig = field(default_factory=EnvConfig)
@@ -318,6 +322,7 @@ class CollectConfig:
     noise: float = MISSING
     seed: int = MISSING
     progress: bool = MISSING
+    trust: list[str] = field(default_factory=list)
 
 
 def schema_of(target: type) -> type:

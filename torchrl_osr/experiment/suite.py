@@ -75,6 +75,7 @@ class EvaluateConfig:
         force: repeat a finished evaluation.
         num_threads: torch threads; several fight where the machine is shared.
         progress: a progress bar, when on a terminal.
+        trust: modules of your own that the run may name, see docs/extend.md.
     """
 
     checkpoint: str | None = None
@@ -87,6 +88,7 @@ class EvaluateConfig:
     force: bool = MISSING
     num_threads: int = MISSING
     progress: bool = MISSING
+    trust: list[str] = field(default_factory=list)
 
 
 def register() -> None:

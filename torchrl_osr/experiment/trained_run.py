@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,8 +14,8 @@ from torchrl.checkpoint import CheckpointError
 from torchrl.envs import ObservationNorm
 from torchrl.objectives import LossModule
 
-from torchrl_osr.experiment.build import make_learner
-from torchrl_osr.experiment.run_config import check_targets, read_config
+from torchrl_osr.experiment.build import Learner, make_learner
+from torchrl_osr.experiment.run_config import read_run
 from torchrl_osr.experiment.run_folder import CONFIG
 from torchrl_osr.trainers.checkpoints import find_damage, safe_checkpoint
 
@@ -86,7 +87,10 @@ def checkpoints_of(folder: Path | str) -> list[Path]:
 
 
 def load_trained(
-    path: Path | str, *, sizes: tuple[int, int] | None = None
+    path: Path | str,
+    *,
+    sizes: tuple[int, int] | None = None,
+    trust: Sequence[str] = (),
 ) -> TrainedRun:
     """Load one checkpoint, weights only: no code from the file is run.
 
@@ -98,22 +102,23 @@ def load_trained(
     Keyword Args:
         sizes: of observation and action. Default: those of the run's environment,
             which is made for that.
+        trust: modules of your own that the run's configuration may name, see
+            :func:`~torchrl_osr.experiment.run_config.check_targets`. Default: none.
 
     Raises:
         FileNotFoundError: if there is no run or no checkpoint.
         CheckpointError: if the file is damaged, or does not fit the run's
             configuration; tensors of another shape are named.
-        ValueError: if the configuration names a ``_target_`` outside of this package,
-            see :func:`~torchrl_osr.experiment.run_config.check_targets`.
+        ValueError: if :func:`~torchrl_osr.experiment.run_config.read_run` refuses the
+            configuration, or no policy can be built from it.
     """
     folder = run_folder_of(path)
     path = checkpoints_of(path)[-1] if Path(path).is_dir() else Path(path)
     _check_whole(path)
-    config = read_config(folder / CONFIG)
-    check_targets(config)
+    config = read_run(folder / CONFIG, trust)
     observation_size, action_size = sizes or _environment_sizes(config.env.id)
     with torch.random.fork_rng(devices=[]):
-        actor, model, loss = make_learner(config, observation_size, action_size)
+        actor, model, loss = _learner(config, observation_size, action_size, folder)
     shape = (observation_size,) if config.data.standardize else ()
     norm = ObservationNorm(
         torch.zeros(shape), torch.ones(shape), in_keys=["observation"],
@@ -131,6 +136,20 @@ def load_trained(
     # The loss's parameters of the model are the model's own tensors.
     inverse_dynamics = model if hasattr(loss, "inverse_dynamics_network") else None
     return TrainedRun(config, actor, inverse_dynamics, loss, norm, step, path, folder)
+
+
+def _learner(
+    config: DictConfig, observation_size: int, action_size: int, folder: Path
+) -> Learner:
+    try:
+        return make_learner(config, observation_size, action_size)
+    # The file may name any of our functions in the place of any other.
+    except Exception as error:
+        raise ValueError(
+            f"no policy can be built from {folder / CONFIG} "
+            f"({type(error).__name__}: {error}). Take the file that torchrl-osr train "
+            "has written."
+        ) from error
 
 
 def saved_sizes(path: Path) -> tuple[int, int]:
@@ -173,7 +192,10 @@ class _State:
 def _check_whole(path: Path) -> None:
     damage = find_damage(path)
     if damage is not None:
-        raise CheckpointError(f"checkpoint {path} is damaged: {damage}.")
+        raise CheckpointError(
+            f"checkpoint {path} is damaged: {damage}. Take another one of the run, or "
+            "a whole copy."
+        )
 
 
 def _environment_sizes(env_id: str) -> tuple[int, int]:

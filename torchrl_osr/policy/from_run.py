@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from omegaconf import OmegaConf
@@ -16,11 +17,11 @@ from torchrl_osr.policy.from_loss import policy_from_loss
 from torchrl_osr.policy.policy import Policy
 
 
-def policy_from_run(path: Path) -> Policy:
+def policy_from_run(path: Path, trust: Sequence[str] = ()) -> Policy:
     """Policy of a run's folder or checkpoint, see :func:`~torchrl_osr.load_policy`."""
     folder = run_folder_of(path)
     path = checkpoints_of(folder)[-1] if path.is_dir() else path
-    trained = load_trained(path, sizes=saved_sizes(path))
+    trained = load_trained(path, sizes=saved_sizes(path), trust=trust)
     config = trained.config
     source = {
         "env_id": config.env.id,

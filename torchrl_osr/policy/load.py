@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from torchrl_osr.policy.policy import SUFFIX, Policy
 from torchrl_osr.policy.tensor_file import read_tensors
 
 
-def load_policy(path: Path | str) -> Policy:
+def load_policy(path: Path | str, *, trust: Sequence[str] = ()) -> Policy:
     """Policy of a file or of a run, on the CPU; nothing is unpickled.
 
     Args:
@@ -16,6 +17,10 @@ def load_policy(path: Path | str) -> Policy:
             only; a run's folder, for its last checkpoint, the one that tables show; or
             a checkpoint's file in it, ``checkpoint/policy/best.torchrl`` for the best
             evaluation. A run needs ``torchrl-osr[train]``, but no environment.
+
+    Keyword Args:
+        trust: modules of your own whose losses and networks a run may name, see
+            docs/extend.md. Default: none.
 
     Raises:
         FileNotFoundError: there is nothing, no run, or no checkpoint yet.
@@ -40,7 +45,7 @@ def load_policy(path: Path | str) -> Policy:
     """
     path = Path(path)
     if path.suffix != SUFFIX:
-        return _policy_of_run(path)
+        return _policy_of_run(path, trust)
     try:
         tensors, record = read_tensors(path)
         return Policy(record, tensors)
@@ -49,7 +54,7 @@ def load_policy(path: Path | str) -> Policy:
         raise ValueError(f"{path} cannot be read as a policy: {why}") from error
 
 
-def _policy_of_run(path: Path) -> Policy:
+def _policy_of_run(path: Path, trust: Sequence[str]) -> Policy:
     try:
         from torchrl_osr.policy.from_run import policy_from_run
     except ImportError as error:
@@ -57,4 +62,4 @@ def _policy_of_run(path: Path) -> Policy:
             f"a run's checkpoint needs {error.name!r}: pip install torchrl-osr[train], "
             "or load a file that Policy.save wrote."
         ) from error
-    return policy_from_run(path)
+    return policy_from_run(path, trust)

@@ -20,8 +20,8 @@ import pandas as pd
 
 from torchrl_osr._files import MAX_JSON_BYTES, parse_json, read_json, write_atomically
 from torchrl_osr.data import ReferenceReturns, reference_returns
-from torchrl_osr.experiment.run_config import read_yaml
-from torchrl_osr.experiment.run_folder import CONFIG, STATUS, flatten
+from torchrl_osr.experiment.run_config import flatten, read_yaml
+from torchrl_osr.experiment.run_folder import CONFIG, STATUS
 
 QUALITY = "data.quality"
 """Setting that names the quality of the data set."""

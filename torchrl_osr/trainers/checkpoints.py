@@ -25,7 +25,7 @@ from torchrl.checkpoint import (
     CheckpointRotation,
 )
 
-from torchrl_osr._files import check_disk_space, refuse_archive
+from torchrl_osr._files import check_disk_space, refuse_archive, refuse_other_than_files
 
 log = logging.getLogger(__name__)
 
@@ -113,6 +113,7 @@ def find_damage(path: Path) -> str | None:
     torchrl.checkpoint unpacks whatever the manifest lists.
     """
     try:
+        refuse_other_than_files(path)
         with zipfile.ZipFile(path) as archive:
             refuse_archive(archive)
             damaged = archive.testzip()

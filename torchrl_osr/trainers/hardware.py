@@ -12,7 +12,8 @@ def check_cudagraph(device: torch.device) -> None:
     if device.type != "cuda":
         raise ValueError(
             f"cudagraph=True needs a CUDA device, got device='{device}': use "
-            "device=cuda, or cudagraph=False."
+            "device=cuda (trainer.device=cuda), or cudagraph=False "
+            "(trainer.cudagraph=false)."
         )
 
 
@@ -41,18 +42,19 @@ def check_hardware(
     if where.type == "cuda" and not torch.cuda.is_available():
         raise ValueError(
             f"device={device!r}, but torch {torch.__version__} sees no CUDA device "
-            "here. Use device=cpu, or install a CUDA build of torch."
+            "here. Use device=cpu (trainer.device=cpu), or install a CUDA build of "
+            "torch."
         )
     if precision == "float32":
         return where, None
     if where.type == "cuda" and not torch.cuda.is_bf16_supported():
         raise ValueError(
             f"{torch.cuda.get_device_name(where)} does not compute in bfloat16: use "
-            "precision=float32."
+            "precision=float32 (trainer.precision=float32)."
         )
     if where.type == "cpu" and not torch.ops.mkldnn._is_mkldnn_bf16_supported():
         raise ValueError(
             "This CPU has no bfloat16 products (it would need AVX-512): use "
-            "precision=float32."
+            "precision=float32 (trainer.precision=float32)."
         )
     return where, torch.bfloat16

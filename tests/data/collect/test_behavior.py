@@ -123,5 +123,5 @@ def test_file_without_an_array_is_named(tmp_path) -> None:
     (tmp_path / "toy").mkdir()
     np.savez(tmp_path / "toy" / "medium.npz", **{"hidden0.weight": np.ones((2, 2))})
     update_behavior_card(tmp_path, "toy", "Toy-v0", {"medium": {}})
-    with pytest.raises(ValueError, match=r"lacks the arrays: hidden0\.bias"):
+    with pytest.raises(ValueError, match=r"lacks the arrays hidden0\.bias"):
         load_behavior_policy("toy", "medium", folder=tmp_path)

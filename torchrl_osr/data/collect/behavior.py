@@ -116,8 +116,25 @@ def load_behavior_card(folder: Path | str | None = None) -> dict[str, Any]:
 
     Args:
         folder: of the card. Default: the policies of the package.
+
+    Raises:
+        FileNotFoundError: there is no card.
+        ValueError: it is damaged, or not as above.
     """
-    return read_json(Path(folder or BEHAVIOR_POLICIES_DIR) / "card.json")
+    path = Path(folder or BEHAVIOR_POLICIES_DIR) / "card.json"
+    try:
+        card = read_json(path)
+        for name, entry in card.items():
+            if not isinstance(entry, dict) or not isinstance(
+                entry.get("policies"), dict
+            ):
+                raise ValueError(f"{name!r} in it has no policies")
+    except ValueError as error:
+        raise ValueError(
+            f"{path} is no card of behaviour policies, or damaged ({error}): take a "
+            "whole copy of the folder."
+        ) from error
+    return card
 
 
 def behavior_policy_path(
@@ -163,7 +180,10 @@ def load_behavior_policy(
         names = (f"{field.name}.weight", f"{field.name}.bias")
         missing = [name for name in names if name not in arrays]
         if missing:
-            raise ValueError(f"{path} lacks the arrays: {', '.join(missing)}.")
+            raise ValueError(
+                f"{path} lacks the arrays {', '.join(missing)}: take a file that "
+                "save_behavior_policy has written."
+            )
         layers[field.name] = Affine(
             *(arrays[name].astype(np.float32) for name in names)
         )

@@ -53,7 +53,9 @@ def _names(path: Path) -> list[str]:
         with opened(path, "rt", encoding="utf-8-sig", newline="") as file:
             names = next(csv.reader([file.readline(BLOCK)]), [])
     except (EOFError, OSError, UnicodeError, csv.Error) as error:
-        raise ValueError(f"{path} is no CSV file, or damaged: {error}") from error
+        raise ValueError(
+            f"{path} is no CSV file, or damaged: {error}. Take a whole copy of it."
+        ) from error
     names = [name.strip() for name in names]
     if len(names) < 2 or not all(names):
         raise ValueError(
@@ -66,7 +68,7 @@ def _names(path: Path) -> list[str]:
             "expected the names of the columns."
         )
     if twice := [name for name, count in Counter(names).items() if count > 1]:
-        raise ValueError(f"{path}: two columns are called {twice[0]!r}.")
+        raise ValueError(f"{path}: two columns are called {twice[0]!r}; rename one.")
     return names
 
 
@@ -99,7 +101,9 @@ def _frames(path: Path, names: list[str], chosen: list[str]) -> Iterator[pd.Data
         *(EOFError, OSError, UnicodeError),
         *(pd.errors.ParserError, pd.errors.EmptyDataError, pd.errors.ParserWarning),
     ) as error:
-        raise ValueError(f"{path} is no CSV file, or damaged: {error}") from error
+        raise ValueError(
+            f"{path} is no CSV file, or damaged: {error}. Take a whole copy of it."
+        ) from error
 
 
 def _reader(path: Path, names: list[str], chosen: list[str], rows: int) -> ReadRows:

@@ -19,6 +19,7 @@ from torchrl_osr.data.read.recording import (
     Columns,
     ReadRows,
     Recording,
+    naming,
     whole_trajectories,
 )
 from torchrl_osr.data.read.table import ColumnNames, Table, assemble, find_columns
@@ -113,9 +114,10 @@ def open_file(
     if not path.name.endswith(ENDINGS):
         raise ValueError(f"{path} must end in one of {', '.join(ENDINGS)}.")
     if not path.is_file():
-        raise FileNotFoundError(f"there is no file {path}.")
+        raise FileNotFoundError(f"there is no file {path}: give the path of a log.")
     table = _open_table(path)
-    layout = find_columns(table.names, columns or {})
+    with naming(str(path)):
+        layout = find_columns(table.names, columns or {})
     named = [name for each in layout.columns.values() for name in each]
     total, read_columns = table.select(named)
     episodes: dict[str, int] = {}

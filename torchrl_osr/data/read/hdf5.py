@@ -9,7 +9,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from torchrl_osr._files import check_unpacked_size
+from torchrl_osr._files import check_unpacked_size, refuse_other_than_files
 from torchrl_osr.data.read.recording import ReadRows
 from torchrl_osr.data.read.table import Table
 
@@ -32,7 +32,7 @@ def open_hdf5(path: Path) -> Table:
             not looked for.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"there is no file {path}.")
+        raise FileNotFoundError(f"there is no file {path}: give the path of one.")
     with _opened(path) as file:
         _check_links(path, file)
         names = list(file)
@@ -41,7 +41,9 @@ def open_hdf5(path: Path) -> Table:
         with _opened(path) as file:
             for name in chosen:
                 if not isinstance(file[name], h5py.Dataset) or not file[name].ndim:
-                    raise ValueError(f"{path}: {name!r} is no array with rows.")
+                    raise ValueError(
+                        f"{path}: {name!r} is no array with rows; expected one."
+                    )
             rows = max((len(file[name]) for name in chosen), default=0)
 
         def read(start: int, stop: int) -> dict[str, NDArray[Any]]:
@@ -72,11 +74,14 @@ def check_hdf5(path: Path) -> None:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[h5py.File]:
+    refuse_other_than_files(path)
     try:
         with h5py.File(path, "r") as file:
             yield file
     except (OSError, KeyError, RuntimeError) as error:
-        raise ValueError(f"{path} is no HDF5 file, or damaged: {error}") from error
+        raise ValueError(
+            f"{path} is no HDF5 file, or damaged ({error}): take a whole copy of it."
+        ) from error
 
 
 def _check_links(path: Path, file: h5py.File) -> None:
@@ -95,4 +100,7 @@ def _check_links(path: Path, file: h5py.File) -> None:
     file.visititems_links(look_at_link)
     file.visititems(look_at)
     if elsewhere:
-        raise ValueError(f"{path}: {elsewhere[0]!r} leads into another file.")
+        raise ValueError(
+            f"{path}: {elsewhere[0]!r} leads into another file; take a copy in which "
+            "the array itself is."
+        )

@@ -236,15 +236,15 @@ def _read_episodes(
 ) -> Iterator[dict[str, NDArray[Any]]]:
     """Read episode by episode; raise if some of what the set announces is missing."""
     steps = episodes = 0
-    # disable=None: no bar where the output is not a terminal.
-    bar = tqdm(
-        opened.iterate_episodes(),
-        "read",
-        opened.total_episodes,
-        unit="episode",
-        disable=None if progress else True,
-    )
     try:
+        # disable=None: no bar where the output is not a terminal.
+        bar = tqdm(
+            opened.iterate_episodes(),
+            "read",
+            opened.total_episodes,
+            unit="episode",
+            disable=None if progress else True,
+        )
         for number, episode in enumerate(bar):
             steps, episodes = steps + len(episode), episodes + 1
             yield {

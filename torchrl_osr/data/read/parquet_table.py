@@ -33,10 +33,12 @@ def open_parquet(path: Path) -> Table:
         file = parquet.ParquetFile(path)
         metadata = [file.metadata.row_group(i) for i in range(file.num_row_groups)]
     except (pyarrow.ArrowException, OSError, ValueError) as error:
-        raise ValueError(f"{path} is no Parquet file, or damaged: {error}") from error
+        raise ValueError(
+            f"{path} is no Parquet file, or damaged ({error}): take a whole copy of it."
+        ) from error
     names = file.schema_arrow.names
     if twice := [name for name in names if names.count(name) > 1]:
-        raise ValueError(f"{path}: two columns are called {twice[0]!r}.")
+        raise ValueError(f"{path}: two columns are called {twice[0]!r}; expected one.")
     bounds = np.cumsum([0, *(group.num_rows for group in metadata)])
 
     def select(chosen: list[str]) -> tuple[int, ReadRows]:
@@ -47,7 +49,9 @@ def open_parquet(path: Path) -> Table:
             try:
                 return file.read_row_group(number, columns=chosen)
             except (pyarrow.ArrowException, OSError) as error:
-                raise ValueError(f"{path} is damaged: {error}") from error
+                raise ValueError(
+                    f"{path} is damaged ({error}): take a whole copy of it."
+                ) from error
 
         def read(start: int, stop: int) -> dict[str, NDArray[Any]]:
             first = int(np.searchsorted(bounds, start, side="right")) - 1

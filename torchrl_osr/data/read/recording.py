@@ -13,6 +13,7 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
@@ -44,6 +45,17 @@ VANISHED_SHARE = 0.01
 # A trajectory is in memory as a whole; without an end in so many rows, the flags are
 # more likely to be missing.
 MAX_TRAJECTORY = 2_000_000
+
+
+@contextmanager
+def naming(source: str) -> Iterator[None]:
+    """Put what is read before a ValueError that does not name it."""
+    try:
+        yield
+    except ValueError as error:
+        if source in str(error):
+            raise
+        raise ValueError(f"{source}: {error}") from error
 
 
 @dataclass
@@ -89,12 +101,13 @@ class Recording:
             ValueError: see :func:`~torchrl_osr.data.transitions_from_rows`. Row numbers
                 count from the beginning of the part that the message names.
         """
-        if on_disk:
-            data, manifest = self._load_or_write(progress)
-        else:
-            (data,) = self._transitions(sys.maxsize)
-            check_dataset(data)
-            manifest = {"num_transitions": len(data)} | self._manifest()
+        with naming(self.about.get("source", "")):
+            if on_disk:
+                data, manifest = self._load_or_write(progress)
+            else:
+                (data,) = self._transitions(sys.maxsize)
+                check_dataset(data)
+                manifest = {"num_transitions": len(data)} | self._manifest()
         for warning in manifest["warnings"]:
             torchrl_logger.warning(warning)
         return data, manifest
