@@ -3,7 +3,7 @@
     torchrl-osr train env=hopper
     torchrl-osr train env=walker2d data=medium-expert seed=3 preset=paper
     torchrl-osr train -m env=hopper,walker2d seed=0,1,2 hydra/launcher=pool
-    torchrl-osr train resume=outputs/hopper-medium-replay/seed0-...
+    torchrl-osr train resume=outputs/hopper-medium-replay/seed0-... trainer.steps=40_000
 
 The data are rolled out on this machine at the first run and cached. A run leaves
 ``curve.png``, ``returns.json``, ``inverse_dynamics.json``, ``config.yaml``,
@@ -53,14 +53,15 @@ schema.register()
 def main(cfg: DictConfig) -> float:
     """Do or continue one run in its folder; return its last score, for a sweeper."""
     job = HydraConfig.get()
-    folder = Path(job.runtime.output_dir)
+    folder = Path(cfg.resume or job.runtime.output_dir).absolute()
     if cfg.resume is None:
         run_folder.check_keys(cfg)
     else:
-        cfg = run_folder.saved_config(folder, job.overrides.task)
-    run_folder.claim(folder, cfg)
-    with run_folder.status(folder):
-        return run(cfg, folder)
+        cfg = run_folder.resumed(folder, cfg, job.overrides.task)
+    with run_folder.lock(folder):
+        run_folder.claim(folder, cfg, job)
+        with run_folder.status(folder):
+            return run(cfg, folder)
 
 
 def run(cfg: DictConfig, folder: Path) -> float:
@@ -76,6 +77,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
     # Transitions with standardised states. Each batch gets a perturbed state for every
     # state, which is the paper's mixed data set.
     data = load_training_data(cfg, device)
+    run_folder.check_ours(folder)
     torch.manual_seed(cfg.seed)
     noise = {"std": cfg.perturbation.std, "noise": cfg.perturbation.noise}
     perturbation = StatePerturbation(**noise, seed=cfg.seed)
@@ -90,7 +92,11 @@ def run(cfg: DictConfig, folder: Path) -> float:
     new_trainer = partial(
         OfflineTrainer,
         replay_buffer=data.buffer,
-        components={"perturbation": perturbation, "observation_norm": data.norm},
+        components={
+            "perturbation": perturbation,
+            "observation_norm": data.norm,
+            "settings": run_folder.Settings(cfg),
+        },
         loggers=make_loggers(folder=folder, **cfg.logger),
         log_interval=cfg.trainer.log_interval,
         checkpoint_interval=cfg.trainer.checkpoint_interval,

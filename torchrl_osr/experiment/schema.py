@@ -209,7 +209,8 @@ class TrainConfig:
     Attributes:
         seed: random seed of networks, sampling and noise.
         num_random: value of ``loss.num_random`` for the losses with CQL's term.
-        resume: folder of a killed run to continue.
+        resume: folder of a run to continue, or to extend with more ``trainer.steps``.
+        force: continue although settings differ from those that the run was made with.
     """
 
     env: EnvConfig = field(default_factory=EnvConfig)
@@ -226,6 +227,7 @@ class TrainConfig:
     seed: int = MISSING
     num_random: int = MISSING
     resume: str | None = None
+    force: bool = False
 
 
 def schema_of(target: type) -> type:

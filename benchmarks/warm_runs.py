@@ -1,0 +1,150 @@
+"""Commands of the package in processes forked from one that has imported everything.
+
+Imports take seconds, a tiny run less than one: so hundreds of runs can be killed.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import traceback
+from collections import Counter
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+COMMANDS = ("train", "evaluate")
+LATER = ("pandas", "matplotlib.backends.backend_agg", "gymnasium.envs.mujoco")
+"""What the commands import when they need it."""
+
+TINY = (
+    "data=random", "data.num_transitions=600", "data.held_out=0.1",
+    "network.num_cells=[8]", "trainer.batch_size=8",
+    "trainer.inverse_dynamics_steps=40", "trainer.steps=60", "trainer.log_interval=10",
+    "trainer.eval_interval=30", "trainer.eval_episodes=1",
+    "trainer.checkpoint_interval=10", "trainer.checkpoints_kept=2",
+)  # fmt: skip
+"""Overrides of a run of a second."""
+
+
+class Rename(NamedTuple):
+    """A file put in its place.
+
+    Attributes:
+        name: of the file, below the folder that is watched.
+        nth: of the renames to this name in the life of the process, from 1.
+    """
+
+    name: str
+    nth: int
+
+
+def warm_up() -> None:
+    """Import what the commands need; torch is left with one thread, for forks."""
+    import torch
+
+    torch.set_num_threads(1)
+    for name in (*(f"torchrl_osr.commands.{each}" for each in COMMANDS), *LATER):
+        import_module(name)
+
+
+def start(
+    command: str,
+    *arguments: str,
+    output: Path,
+    watched: Path | None = None,
+    seen: Callable[[Rename, bool], None] = lambda rename, done: None,
+) -> int:
+    """Start a command in a process of its own and return the process's id.
+
+    Args:
+        command: name of the command.
+        *arguments: of its command line.
+
+    Keyword Args:
+        output: file to which both its streams are appended.
+        watched: folder below which renames are seen.
+        seen: called in the new process before and after each of them.
+    """
+    sys.stdout.flush()
+    sys.stderr.flush()
+    process = os.fork()
+    if process:
+        return process
+    code = 1
+    try:
+        stream = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+        os.dup2(stream, 1)
+        os.dup2(stream, 2)
+        if watched is not None:
+            _watch(watched, seen)
+        sys.argv = [f"torchrl-osr {command}", *arguments]
+        import_module(f"torchrl_osr.commands.{command}").main()
+        code = 0
+    except SystemExit as ended:
+        code = ended.code if isinstance(ended.code, int) else 1
+    except KeyboardInterrupt:
+        code = 128 + signal.SIGINT
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+
+
+def ended(process: int) -> int:
+    """Wait for a process; its exit code, as a shell has it."""
+    _, state = os.waitpid(process, 0)
+    code = os.waitstatus_to_exitcode(state)
+    return code if code >= 0 else 128 - code
+
+
+def killed_at(wanted: Rename, *, after: bool) -> Callable[[Rename, bool], None]:
+    """For ``seen`` of :func:`start`: kill the process just before or after a rename."""
+
+    def seen(rename: Rename, done: bool) -> None:
+        if rename == wanted and done == after:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    return seen
+
+
+def noted_in(path: Path) -> Callable[[Rename, bool], None]:
+    """For ``seen`` of :func:`start`: write every rename into a file, a line each."""
+
+    def seen(rename: Rename, done: bool) -> None:
+        if done:
+            with path.open("a") as file:
+                file.write(f"{rename.nth} {rename.name}\n")
+
+    return seen
+
+
+def read_renames(path: Path) -> list[Rename]:
+    """Renames that :func:`noted_in` has noted, in their order."""
+    lines = [line.split(" ", 1) for line in path.read_text().splitlines()]
+    return [Rename(name, int(nth)) for nth, name in lines]
+
+
+def _watch(folder: Path, seen: Callable[[Rename, bool], None]) -> None:
+    """Call ``seen`` around all renames to places below a folder."""
+    times: Counter[str] = Counter()
+
+    def watching(original: Callable[..., None]) -> Callable[..., None]:
+        def rename(source: Any, target: Any, **options: Any) -> None:
+            path = Path(os.fsdecode(target)).absolute()
+            if not path.is_relative_to(folder.absolute()):
+                return original(source, target, **options)
+            name = path.relative_to(folder.absolute()).as_posix()
+            times[name] += 1
+            seen(Rename(name, times[name]), False)
+            original(source, target, **options)
+            seen(Rename(name, times[name]), True)
+            return None
+
+        return rename
+
+    os.replace, os.rename = watching(os.replace), watching(os.rename)
