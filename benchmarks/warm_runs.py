@@ -16,7 +16,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 COMMANDS = ("train", "evaluate")
-LATER = ("pandas", "matplotlib.backends.backend_agg", "gymnasium.envs.mujoco")
+LATER = (
+    "pandas", "matplotlib.backends.backend_agg", "matplotlib.figure",
+    "matplotlib.layout_engine", "gymnasium.envs.mujoco.hopper_v5",
+)  # fmt: skip
 """What the commands import when they need it."""
 
 TINY = (
@@ -95,9 +98,18 @@ def start(
         os._exit(code)
 
 
-def ended(process: int) -> int:
-    """Wait for a process; its exit code, as a shell has it."""
-    _, state = os.waitpid(process, 0)
+def ended(process: int, *, wait: bool = True) -> int | None:
+    """Exit code of a process, as a shell has it; ``None`` if it lives, without waiting.
+
+    Args:
+        process: id of a child.
+
+    Keyword Args:
+        wait: for its end. Default ``True``.
+    """
+    there, state = os.waitpid(process, 0 if wait else os.WNOHANG)
+    if not there:
+        return None
     code = os.waitstatus_to_exitcode(state)
     return code if code >= 0 else 128 - code
 

@@ -330,6 +330,8 @@ class OfflineTrainer(Trainer):
             if isinstance(logger, CSVLogger):
                 folder = Path(logger.experiment.log_dir, "scalars", self.description)
                 cut_back(folder, step if path else -1)
+        if path and step < self.total_frames:
+            log.info(f"{self.description}: goes on from {path}")
         self.collected_frames = self._optim_count = self.collector.step = step
         self.nonfinite_check.restart(step, self._saved["skipped_updates"])
         return path
