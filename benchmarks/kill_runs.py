@@ -207,7 +207,8 @@ def main() -> None:
         if code:
             raise SystemExit(f"the run ended with {code}: {undisturbed.output}")
         noted += warm_runs.read_renames(path)
-    events = [(each, after) for each in dict.fromkeys(noted) for after in (False, True)]
+    places = warm_runs.met_in_turn(noted)
+    events = [(each, after) for each in places for after in (False, True)]
     print(f"{len(noted)} renames in an undisturbed run", flush=True)
 
     def repeat(kind, name: str, wanted: int, count: str) -> list[dict]:
@@ -224,7 +225,10 @@ def main() -> None:
 
     with multiprocessing.get_context("fork").Pool(options.jobs) as pool:
         named = repeat(
-            partial(kills_at_renames, events=events), "named", options.kills // 2, "killed"
+            partial(kills_at_renames, events=events),
+            "named",
+            options.kills // 2,
+            "killed",
         )
         left = options.kills - sum(len(each["killed"]) for each in named)
         at_random = partial(kills_at_random, longest=options.longest)
@@ -245,11 +249,15 @@ def main() -> None:
         "kills": len(killed) + sum(len(each["killed"]) for each in random_kills),
         "at_renames": len(killed),
         "runs": len(named) + len(random_kills),
-        "different": [each for one in named + random_kills for each in one["different"]],
+        "different": [
+            each for one in named + random_kills for each in one["different"]
+        ],
         "renames": dict(sorted(Counter(killed).items())),
         "at_random": [each["killed"] for each in random_kills],
     }
-    codes = Counter(f"{e['signal']} in {e['in']}: {e['code']}, {e['status']}" for e in ends)
+    codes = Counter(
+        f"{e['signal']} in {e['in']}: {e['code']}, {e['status']}" for e in ends
+    )
     stopped = {
         "interrupts": len(ends),
         "runs": len(interrupted),

@@ -1,12 +1,17 @@
 """Commands of the package in processes forked from one that has imported everything.
 
-Imports take seconds, a tiny run less than one: so hundreds of runs can be killed.
+Imports take seconds, the rest of a tiny run one: so hundreds of runs can be killed. As
+a script it starts what its input says, for those who cannot fork themselves, see
+:class:`Server`.
 """
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import signal
+import subprocess
 import sys
 import traceback
 from collections import Counter
@@ -141,6 +146,25 @@ def read_renames(path: Path) -> list[Rename]:
     return [Rename(name, int(nth)) for nth, name in lines]
 
 
+def met_in_turn(renames: Sequence[Rename]) -> list[Rename]:
+    """The same renames, as a run meets them that is killed at each in turn.
+
+    It goes on behind its last checkpoint, so that it writes ``best.torchrl`` for the
+    first time in that life where the undisturbed run did for the second.
+    """
+    names = [each.name for each in renames]
+    met = []
+    for place, name in enumerate(names):
+        folder = name.rpartition("/")[0]
+        begin = max(
+            (number + 1 for number, each in enumerate(names[:place])
+             if re.fullmatch(rf"{folder}/(checkpoint-\d+.torchrl|\..*.partial.json)", each)),
+            default=0,
+        )  # fmt: skip
+        met.append(Rename(name, names[begin : place + 1].count(name)))
+    return met
+
+
 def _watch(folder: Path, seen: Callable[[Rename, bool], None]) -> None:
     """Call ``seen`` around all renames to places below a folder."""
     times: Counter[str] = Counter()
@@ -160,3 +184,71 @@ def _watch(folder: Path, seen: Callable[[Rename, bool], None]) -> None:
         return rename
 
     os.replace, os.rename = watching(os.replace), watching(os.rename)
+
+
+class Server:
+    """A warm process that starts commands, for a parent that has threads.
+
+    Args:
+        environment: of the processes.
+    """
+
+    def __init__(self, environment: dict[str, str]) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, __file__],
+            env=environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def start(self, *command: str, output: Path, **request: Any) -> int:
+        """Start a command and return the process's id.
+
+        Args:
+            *command: its name and arguments.
+
+        Keyword Args:
+            output: file to which both its streams are appended.
+            **request: ``watched``, the folder whose renames are seen; ``noted_in``, the
+                file that gets them; ``killed_before``, a :class:`Rename`.
+        """
+        assert self._process.stdin is not None
+        line = json.dumps({"command": command, "output": str(output)} | request)
+        self._process.stdin.write(line + "\n")
+        self._process.stdin.flush()
+        return self._answer()
+
+    def ended(self) -> int:
+        """Wait for the process that was started last; its exit code."""
+        return self._answer()
+
+    def _answer(self) -> int:
+        assert self._process.stdout is not None
+        return int(self._process.stdout.readline())
+
+    def close(self) -> None:
+        """End the server."""
+        self._process.communicate()
+
+
+def serve() -> None:
+    """Start what each line of the input asks for; print its id, then its exit code."""
+    warm_up()
+    for line in sys.stdin:
+        request = json.loads(line)
+        watching: dict[str, Any] = {}
+        if "watched" in request:
+            watching["watched"] = Path(request["watched"])
+        if "noted_in" in request:
+            watching["seen"] = noted_in(Path(request["noted_in"]))
+        elif "killed_before" in request:
+            wanted = Rename(*request["killed_before"])
+            watching["seen"] = killed_at(wanted, after=False)
+        process = start(*request["command"], output=Path(request["output"]), **watching)
+        print(process, flush=True)
+        print(ended(process), flush=True)
+
+
+if __name__ == "__main__":
+    serve()

@@ -128,6 +128,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
         trainer.train()
         write_json(folder / "inverse_dynamics.json", trainer.history[-1])
         print(describe_inverse_dynamics(trainer.history[-1]))
+        run_folder.check_ours(folder)
 
     # Second phase: the policy, taught by the critics and by the frozen model.
     critic_params = list(loss.qvalue_network_params.parameters())

@@ -160,7 +160,9 @@ def claim(folder: Path, config: DictConfig, job: DictConfig) -> None:
     path, hydra = folder / CONFIG, folder / ".hydra" / "hydra.yaml"
     if path.exists():
         try:
-            Settings(config).load_state_dict(Settings(OmegaConf.load(path)).state_dict())
+            Settings(config).load_state_dict(
+                Settings(OmegaConf.load(path)).state_dict()
+            )
         except ValueError as error:
             raise ValueError(f"{folder} holds a run, and {error}") from error
     else:

@@ -195,18 +195,24 @@ class Checkpoints:
         self._write(self.best_path, components=names, metadata=metadata)
 
     def _write(self, path: Path, **options: Any) -> None:
-        # TorchRL would make the folder anew, and the run would end well with nothing.
-        if not self.folder.is_dir():
-            raise FileNotFoundError(
-                f"{self.folder} was removed or renamed while the run was going on: "
-                f"{path.name} has no place. Start the run again in a folder that stays."
-            )
+        self.check_folder()
         beside = path.with_name(f".{path.name}.new")
         with self.write_errors_explained():
             self._checkpoint.save(beside, **options)
             with beside.open("rb") as file:
                 os.fsync(file.fileno())
             os.replace(beside, path)
+
+    def check_folder(self) -> None:
+        """Raise a FileNotFoundError if the folder is gone.
+
+        TorchRL would make it anew, and the run would seem to end well.
+        """
+        if not self.folder.is_dir():
+            raise FileNotFoundError(
+                f"{self.folder} was removed or renamed while the run was going on. "
+                "Start the run again in a folder that stays."
+            )
 
     def _remove_outdated(self) -> None:
         """Keep the newest regular ones, and the newest of all.

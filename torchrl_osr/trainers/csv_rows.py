@@ -19,7 +19,10 @@ def cut_back(folder: Path, step: int) -> None:
             kept = 0
             for line in file:
                 number = line.split(b",")[0]
-                if not (line.endswith(b"\n") and number.isdigit()) or int(number) > step:
+                if (
+                    not (line.endswith(b"\n") and number.isdigit())
+                    or int(number) > step
+                ):
                     break
                 kept += len(line)
             file.truncate(kept)

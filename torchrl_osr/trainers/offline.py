@@ -436,6 +436,7 @@ class OfflineTrainer(Trainer):
 
     def _send(self, numbers: Mapping[str, float]) -> None:
         step = self.collected_frames
+        self.checkpoints.check_folder()
         with self.checkpoints.write_errors_explained("the log"):
             for logger in self.loggers:
                 for name, value in numbers.items():
