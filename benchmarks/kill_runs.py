@@ -1,4 +1,4 @@
-"""Kill and interrupt tiny runs, hundreds of times: is anything lost, is a bit different?
+"""Kill and interrupt tiny runs, hundreds of times: is anything lost, or different?
 
     nice python benchmarks/kill_runs.py --folder /tmp/kills
 
@@ -86,7 +86,9 @@ class Run:
         return [(phase, int(step)) for phase, step in found]
 
 
-def live(run: Run, signalled: signal.Signals | None, seconds: float, **watching: Any):
+def live(
+    run: Run, signalled: signal.Signals | None, seconds: float, **watching: Any
+) -> tuple[int, bool]:
     """Let a run live once; return its exit code, and whether the signal was sent.
 
     The signal comes so many seconds after the run has begun to train.
@@ -177,6 +179,11 @@ def end(run: Run) -> dict[str, Any]:
     return {"different": differences(other, run.folder, same_means=exactly)}
 
 
+def different(runs: list[dict[str, Any]]) -> list[str]:
+    """Return what is different in any of the runs."""
+    return [each for one in runs for each in one["different"]]
+
+
 def machine() -> dict[str, Any]:
     """Return where this was measured, and with which versions."""
     names = re.findall(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())
@@ -233,10 +240,8 @@ def main() -> None:
         left = options.kills - sum(len(each["killed"]) for each in named)
         at_random = partial(kills_at_random, longest=options.longest)
         random_kills = repeat(at_random, "random", left, "killed")
-        interrupted = repeat(
-            partial(interrupts, longest=options.longest),
-            "interrupted", options.interrupts, "ends",
-        )  # fmt: skip
+        stop = partial(interrupts, longest=options.longest)
+        interrupted = repeat(stop, "interrupted", options.interrupts, "ends")
     killed = [place for each in named for place in each["killed"]]
     ends = [each for one in interrupted for each in one["ends"]]
     common = machine() | {
@@ -262,7 +267,7 @@ def main() -> None:
         "interrupts": len(ends),
         "runs": len(interrupted),
         "wrong_ends": [each for each in ends if not each["right"]],
-        "different": [each for one in interrupted for each in one["different"]],
+        "different": different(interrupted),
         "ends": dict(sorted(codes.items())),
     }
     print(f"{time.perf_counter() - begin:.0f} s")

@@ -28,8 +28,8 @@ def differences(one: Path, other: Path, *, same_means: bool = False) -> list[str
         other: folder of another.
 
     Keyword Args:
-        same_means: compare the values of the log, too, not only their steps. The first
-            means after a checkpoint within a log interval are over the rest of it.
+        same_means: compare the values of the log, too, not only their steps. After an
+            interrupt the first means are over the rest of their interval.
     """
     names = file_names(one)
     different = [
