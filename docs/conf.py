@@ -15,7 +15,7 @@ copyright = "2026, The torchrl-osr authors"
 version = release = torchrl_osr.__version__
 
 extensions = [
-    "myst_parser",
+    "myst_nb",  # pages in Markdown, and the tutorials, which are executed
     "sphinx.ext.autodoc",
     "sphinx.ext.mathjax",
     "sphinx.ext.napoleon",
@@ -32,6 +32,11 @@ html_css_files = ["tables.css"]
 
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 2
+
+nb_execution_mode = "force"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 600
+nb_merge_streams = True
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"

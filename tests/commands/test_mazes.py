@@ -13,6 +13,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from minari.data_collector import EpisodeBuffer
 
+from torchrl_osr.commands import evaluate
 from torchrl_osr.data import load_minari, make_environment
 
 # Minari asks for an author's address, and more, whenever a set is made.
