@@ -152,16 +152,15 @@ def met_in_turn(renames: Sequence[Rename]) -> list[Rename]:
     It goes on behind its last checkpoint, so that it writes ``best.torchrl`` for the
     first time in that life where the undisturbed run did for the second.
     """
-    names = [each.name for each in renames]
-    met = []
-    for place, name in enumerate(names):
-        folder = name.rpartition("/")[0]
-        begin = max(
-            (number + 1 for number, each in enumerate(names[:place])
-             if re.fullmatch(rf"{folder}/(checkpoint-\d+.torchrl|\..*.partial.json)", each)),
-            default=0,
-        )  # fmt: skip
-        met.append(Rename(name, names[begin : place + 1].count(name)))
+    met: list[Rename] = []
+    since: dict[str, list[str]] = {}  # by folder: names since it goes on there
+    for name in (each.name for each in renames):
+        folder, _, file = name.rpartition("/")
+        names = since.setdefault(folder, [])
+        names.append(name)
+        met.append(Rename(name, names.count(name)))
+        if re.fullmatch(r"checkpoint-\d+\.torchrl|\..*\.partial\.json", file):
+            names.clear()
     return met
 
 

@@ -96,7 +96,7 @@ def test_every_file_is_renamed_into_its_place_or_appended_to(undisturbed, rename
 def test_killed_before_each_rename_it_ends_with_the_same_bits(
     runs, undisturbed, renames, tmp_path
 ):
-    """One run, killed anew at each place; also after the last steps, when it reports."""
+    """One run, killed anew at each place, also when it reports after the last step."""
     folder = tmp_path / "run"
     for place in met_in_turn(renames):
         # TorchRL's own renames, to a name from which we rename: benchmarks/kill_runs.py

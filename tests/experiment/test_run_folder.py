@@ -168,9 +168,12 @@ def test_a_full_disk_is_said_to_leave_the_status(tmp_path, monkeypatch, caplog):
     def full(_):
         raise OSError(28, "No space left on device")
 
-    with pytest.raises(ValueError, match="why"), run_folder.status(tmp_path):
+    def fail():
         monkeypatch.setattr(os, "fsync", full)
         raise ValueError("why")
+
+    with pytest.raises(ValueError, match="why"), run_folder.status(tmp_path):
+        fail()
     assert read_status(tmp_path)["status"] == "running"
     assert "No space left" in caplog.text
     assert "still says that the run is running" in caplog.text
@@ -181,11 +184,15 @@ def test_folder_that_is_gone_at_the_end_is_no_success(tmp_path, made_anew):
     folder, message = tmp_path / "run", "removed or renamed while the run was going on"
     folder.mkdir()
     other = {"status": "running", "pid": 1, "host": "elsewhere"}
-    with pytest.raises(FileNotFoundError, match=message), run_folder.status(folder):
+
+    def move():
         folder.rename(tmp_path / "elsewhere")
         if made_anew:
             folder.mkdir()
             run_folder.write_json(folder / "status.json", other)
+
+    with pytest.raises(FileNotFoundError, match=message), run_folder.status(folder):
+        move()
     if made_anew:
         assert read_status(folder) == other, "another run's"
     else:
@@ -196,9 +203,12 @@ def test_folder_that_is_gone_at_the_end_is_no_success(tmp_path, made_anew):
 def test_signal_outside_of_the_training_ends_the_run_in_order(
     tmp_path, caplog, name, code
 ):
-    with pytest.raises(Interrupted) as raised, run_folder.status(tmp_path):
+    def stop():
         os.kill(os.getpid(), signal.Signals[f"SIG{name}"])
         pytest.fail("not reached")
+
+    with pytest.raises(Interrupted) as raised, run_folder.status(tmp_path):
+        stop()
     assert raised.value.code == code
     assert read_status(tmp_path)["status"] == "preempted"
     assert f"stopped by SIG{name}" in read_status(tmp_path)["reason"]

@@ -145,7 +145,9 @@ def test_folder_that_is_removed_is_not_made_anew(tmp_path, make, runs, logged):
     assert not folder.exists()
 
 
-def test_what_a_kill_left_of_removing_an_old_checkpoint_goes(tmp_path, make, undisturbed):
+def test_what_a_kill_left_of_removing_an_old_checkpoint_goes(
+    tmp_path, make, undisturbed
+):
     wanted = {path.name for path in undisturbed.checkpoints.folder.iterdir()}
     oldest = undisturbed.checkpoints.folder / "checkpoint-000000000010.torchrl"
     shutil.copy(undisturbed.checkpoints.latest(), oldest)

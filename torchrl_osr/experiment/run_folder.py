@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
+from hydra.conf import HydraConf
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import Container, DictConfig, OmegaConf
 
@@ -144,7 +145,7 @@ def resumed(folder: Path, composed: DictConfig, overrides: Sequence[str]) -> Dic
     return there
 
 
-def claim(folder: Path, config: DictConfig, job: DictConfig) -> None:
+def claim(folder: Path, config: DictConfig, job: HydraConf) -> None:
     """Write a run's configuration into its folder, which is to be locked.
 
     Args:

@@ -148,7 +148,7 @@ def test_a_folder_of_somebody_else_is_not_touched(data, tmp_path, name, make, re
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_a_call_that_was_killed_while_it_claimed_the_folder_begins_again(data, tmp_path):
+def test_a_call_killed_before_its_first_file_begins_again(data, tmp_path):
     (tmp_path / ".set.partial").mkdir()
     (tmp_path / ".set.partial" / ".manifest.json.new").write_text("{")
     write(data, tmp_path / "set")
