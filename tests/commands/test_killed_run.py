@@ -196,4 +196,4 @@ def test_folder_that_is_removed_ends_the_run(runs, tmp_path):
     folder.rename(tmp_path / "elsewhere")
     assert runs.server.ended() == 1, runs.output
     assert "was removed or renamed while the run was going on" in runs.output
-    assert not folder.exists()
+    assert not (folder / "status.json").exists()

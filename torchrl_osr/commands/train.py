@@ -77,7 +77,6 @@ def run(cfg: DictConfig, folder: Path) -> float:
     # Transitions with standardised states. Each batch gets a perturbed state for every
     # state, which is the paper's mixed data set.
     data = load_training_data(cfg, device)
-    run_folder.check_ours(folder)
     torch.manual_seed(cfg.seed)
     noise = {"std": cfg.perturbation.std, "noise": cfg.perturbation.noise}
     perturbation = StatePerturbation(**noise, seed=cfg.seed)
@@ -107,6 +106,8 @@ def run(cfg: DictConfig, folder: Path) -> float:
         compile=cfg.trainer.compile,
         cudagraph=cfg.trainer.cudagraph,
     )
+    # At each log entry: in a folder that was removed nothing would be kept.
+    still_ours = partial(run_folder.check_ours, folder)
     adam = partial(torch.optim.Adam, fused=True, capturable=cfg.trainer.cudagraph)
 
     # First phase: which action leads from the perturbed state to the next state?
@@ -123,12 +124,12 @@ def run(cfg: DictConfig, folder: Path) -> float:
             eval_interval=cfg.trainer.inverse_dynamics_steps,
             description="inverse_dynamics",
         )
+        trainer.register_op("post_steps", still_ours)
         if cfg.inverse_dynamics.shuffle_next:
             trainer.register_op("process_optim_batch", shuffle_next)
         trainer.train()
         write_json(folder / "inverse_dynamics.json", trainer.history[-1])
         print(describe_inverse_dynamics(trainer.history[-1]))
-        run_folder.check_ours(folder)
 
     # Second phase: the policy, taught by the critics and by the frozen model.
     critic_params = list(loss.qvalue_network_params.parameters())
@@ -155,6 +156,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
             description="policy",
             value_limits={"pred_value": limit, "target_value": limit},
         )
+        trainer.register_op("post_steps", still_ours)
         if cfg.perturbation.adversary is not None:
             adversary = instantiate(cfg.perturbation.adversary)
             trainer.register_op("process_optim_batch", partial(adversary, loss))
