@@ -39,6 +39,9 @@ from torchrl_osr.experiment.run_folder import package_versions
 
 OUTPUT = Path(__file__).resolve().parents[1] / "results" / "reliability"
 EVALUATE = ("suite=torque", "last=2", "episodes=2", "progress=false")
+MOST_KILLS = 20
+"""Of one run at random: on a busy machine it might never end otherwise."""
+
 KILLED = 128 + signal.SIGKILL
 EXIT_CODES = {signal.SIGINT: 130, signal.SIGTERM: 75, signal.SIGHUP: 75}
 
@@ -129,9 +132,9 @@ def kills_at_renames(top: Path, events: list[tuple[warm_runs.Rename, bool]]) -> 
 
 
 def kills_at_random(top: Path, longest: float) -> dict:
-    """Kill one run at random moments until it ends."""
+    """Kill one run at random moments, a number of times at most, until it ends."""
     run, killed, rng = Run(top), [], random.Random(top.name)
-    while not run.finished:
+    while not run.finished and len(killed) < MOST_KILLS:
         code, _ = live(run, signal.SIGKILL, rng.uniform(0, longest))
         if code == KILLED:
             killed.append(f"after {max(run.newest().items(), default='nothing')}")
@@ -201,16 +204,17 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=300)
     parser.add_argument("--interrupts", type=int, default=200)
     parser.add_argument("--jobs", type=int, default=2, help="runs at once")
-    parser.add_argument("--longest", type=float, default=6.0, help="seconds of a life")
     parser.add_argument("--folder", type=Path, required=True)
     options = parser.parse_args()
     begin = time.perf_counter()
     warm_runs.warm_up()
-    undisturbed, noted = Run(options.folder / "undisturbed"), []
+    undisturbed, noted, longest = Run(options.folder / "undisturbed"), [], 0.0
     while not undisturbed.finished:
         path = undisturbed.top / f"renames{len(noted)}"
         watching = {"watched": undisturbed.top, "seen": warm_runs.noted_in(path)}
+        began = time.monotonic()
         code, _ = live(undisturbed, None, 0, **watching)
+        longest = longest or (time.monotonic() - began) / 2  # of the training
         if code:
             raise SystemExit(f"the run ended with {code}: {undisturbed.output}")
         noted += warm_runs.read_renames(path)
@@ -238,9 +242,9 @@ def main() -> None:
             "killed",
         )
         left = options.kills - sum(len(each["killed"]) for each in named)
-        at_random = partial(kills_at_random, longest=options.longest)
+        at_random = partial(kills_at_random, longest=longest)
         random_kills = repeat(at_random, "random", left, "killed")
-        stop = partial(interrupts, longest=options.longest)
+        stop = partial(interrupts, longest=longest)
         interrupted = repeat(stop, "interrupted", options.interrupts, "ends")
     killed = [place for each in named for place in each["killed"]]
     ends = [each for one in interrupted for each in one["ends"]]
@@ -272,6 +276,8 @@ def main() -> None:
     }
     print(f"{time.perf_counter() - begin:.0f} s")
     for name, result in (("kills", kills), ("interrupts", stopped)):
+        if not result[name]:
+            continue
         text = json.dumps(result | common, indent=1)
         (OUTPUT / f"{name}.json").write_text(f"{text}\n", encoding="utf-8")
         print({key: result[key] for key in list(result)[:4]})
