@@ -187,10 +187,12 @@ def lock(folder: Path) -> Iterator[None]:
         # Who looks whether the run is at work has the lock for an instant.
         held = FileLock(folder / LOCK).acquire(timeout=1)
     except Timeout as error:
-        there = read_json(folder / STATUS)
+        process = "another process"  # that has just begun
+        with suppress(OSError, ValueError):
+            process = _process(read_json(folder / STATUS))
         raise ValueError(
-            f"process {there.get('pid')} on {there.get('host')} is training in "
-            f"{folder}: wait for its end or stop it, or choose another folder."
+            f"{process} is training in {folder}: wait for its end or stop it, or "
+            "choose another folder."
         ) from error
     with held:
         yield
@@ -198,6 +200,10 @@ def lock(folder: Path) -> Iterator[None]:
 
 def _running() -> dict[str, Any]:
     return {"status": "running", "pid": os.getpid(), "host": platform.node()}
+
+
+def _process(said: Mapping[str, Any]) -> str:
+    return f"process {said.get('pid')} on {said.get('host')}"
 
 
 def read_status(folder: Path) -> dict[str, Any]:
@@ -216,7 +222,7 @@ def read_status(folder: Path) -> dict[str, Any]:
     said = read_json(folder / STATUS)
     if said.get("status") != "running" or "host" not in said:
         return said
-    process, free = f"process {said.get('pid')} on {said['host']}", True
+    process, free = _process(said), True
     try:
         if (folder / LOCK).exists():  # not in a copy; looking leaves no file behind
             FileLock(folder / LOCK).acquire(timeout=0).lock.release()
@@ -280,9 +286,9 @@ def _say_if_killed(folder: Path) -> None:
         said = read_json(folder / STATUS)
         if said.get("status") == "running":
             log.warning(
-                f"Process {said.get('pid')} on {said.get('host')} began this run and "
-                "did not end it. Its lock is free: it is gone, or on another machine "
-                "to which this file system does not pass on locks."
+                f"This run was begun by {_process(said)} and did not end. The lock is "
+                "free: that process is gone, or on another machine to which this file "
+                "system does not pass on locks."
             )
 
 
