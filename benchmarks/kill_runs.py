@@ -144,11 +144,11 @@ def kills_at_random(top: Path, longest: float) -> dict:
 
 
 def interrupts(top: Path, longest: float) -> dict:
-    """Interrupt one run at random moments of its training until it ends."""
+    """Interrupt one run at random moments of its training until that ends."""
     run, ends, rng = Run(top), [], random.Random(top.name)
     while run.status["status"] != "done":
         number = rng.choice(list(EXIT_CODES))
-        code, sent = live(run, number, rng.uniform(0, longest))
+        code, sent = live(run, number, rng.uniform(0, longest / 3))
         if sent:
             said = run.status
             phase = re.match(r"(\w+): stopped|stopped", said.get("reason", ""))
@@ -167,7 +167,7 @@ def interrupts(top: Path, longest: float) -> dict:
             )
         elif code != 0:
             raise SystemExit(f"a run ended with code {code}: {run.output}")
-    return end(run) | {"ends": ends}
+    return compared(run, same_means=False) | {"ends": ends}
 
 
 def end(run: Run) -> dict[str, Any]:
@@ -176,10 +176,16 @@ def end(run: Run) -> dict[str, Any]:
         code, _ = live(run, None, 0)
         if code:
             raise SystemExit(f"a run ended with code {code}: {run.output}")
-    other = run.top.parent / "undisturbed" / "run"
-    # Interrupted runs write checkpoints within log intervals.
-    exactly = not run.top.name.startswith("interrupted")
-    return {"different": differences(other, run.folder, same_means=exactly)}
+    return compared(run, same_means=True)
+
+
+def compared(run: Run, *, same_means: bool) -> dict[str, Any]:
+    """Compare a run with the undisturbed one, as far as it has come."""
+    undisturbed = run.top.parent / "undisturbed" / "run"
+    found = differences(undisturbed, run.folder, same_means=same_means)
+    if not run.finished:  # it was not evaluated
+        found = [each for each in found if not each.startswith("robustness")]
+    return {"different": found}
 
 
 def different(runs: list[dict[str, Any]]) -> list[str]:

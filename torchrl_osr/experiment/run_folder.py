@@ -108,7 +108,11 @@ class Settings:
                 "were, choose another folder, or go on all the same with force=true."
             )
         if refused:
-            log.warning(f"Goes on with other settings, by force=true: {refused}.")
+            log.warning(
+                f"Goes on with other settings, by force=true: {refused}. What the "
+                "checkpoint restores stays as it was: networks, learning rates, "
+                "discount, weights of the loss's terms, width of the noise."
+            )
 
 
 def resumed(folder: Path, composed: DictConfig, overrides: Sequence[str]) -> DictConfig:
