@@ -27,6 +27,7 @@ PACKAGES = [
         ".film",
         ".modules",
         ".objectives",
+        ".policy",
         ".report",
         ".trainers",
         ".transforms",

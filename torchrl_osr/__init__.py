@@ -14,6 +14,7 @@ from torchrl_osr.objectives import (
     StateRecoveryLoss,
     TD3BCLoss,
 )
+from torchrl_osr.policy import Policy, load_policy
 from torchrl_osr.transforms import StatePerturbation
 
 __version__ = "0.1.0"
@@ -25,8 +26,10 @@ __all__ = [
     "InverseDynamicsLoss",
     "OSRLoss",
     "OSRVLoss",
+    "Policy",
     "StatePerturbation",
     "StateRecoveryLoss",
     "TD3BCLoss",
     "__version__",
+    "load_policy",
 ]

@@ -14,6 +14,7 @@ COMMANDS = {
     "evaluate": "disturb a trained policy: score lost, survival, way back",
     "film": "film a push and what follows",
     "report": "compare any number of runs on one page",
+    "export": "write a trained policy to one file, for use elsewhere",
 }
 
 

@@ -27,6 +27,7 @@ CONF = Path(__file__).parents[2] / "conf"
 GROUPS = ["env", "data", "inverse_dynamics", "loss", "logger", "perturbation", "preset"]
 OBJECTIVES = sorted(set(objectives.__all__) - {"BaseLoss"})
 NETWORKS = {"actor_network", "qvalue_network", "inverse_dynamics_network"}
+NO_OPTIONS = {"action_spec", "gamma"}  # an object of Python, and what is refused
 
 
 @pytest.fixture(autouse=True)
@@ -99,7 +100,8 @@ def keyword_parameters(name: str) -> dict[str, inspect.Parameter]:
     if found.pop("options", None):
         base = inspect.signature(objectives.BaseLoss).parameters
         found |= {key: each for key, each in base.items() if key not in found}
-    return {key: each for key, each in found.items() if key not in NETWORKS}
+    left_out = NETWORKS | NO_OPTIONS
+    return {key: each for key, each in found.items() if key not in left_out}
 
 
 @pytest.mark.parametrize("name", OBJECTIVES)

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import zipfile
-from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torchrl.checkpoint import CheckpointError, CheckpointRotation
 from torchrl.envs import ObservationNorm
+from untrained_run import make_run
 
 from torchrl_osr.envs import critics_of
 from torchrl_osr.evaluation import deterministic_policy
-from torchrl_osr.experiment import schema as config
 from torchrl_osr.experiment.build import make_learner
 from torchrl_osr.experiment.trained_run import (
     CHECKPOINTS,
@@ -25,30 +23,6 @@ from torchrl_osr.experiment.trained_run import (
     run_folder_of,
 )
 from torchrl_osr.trainers.checkpoints import safe_checkpoint
-
-CONF = Path(__file__).parents[2] / "conf"
-
-
-def make_run(folder: Path, *overrides: str):
-    """Save two checkpoints and the best of an untrained policy, as the trainer does."""
-    config.register()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        cfg = compose("train", ["network.num_cells=[8]", *overrides])
-    folder.mkdir()
-    OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
-    actor, _, loss = make_learner(cfg, 11, 3)
-    norm = ObservationNorm(
-        torch.full((11,), 2.0), torch.full((11,), 3.0), in_keys=["observation"],
-        standard_normal=True,
-    )  # fmt: skip
-    checkpoint = safe_checkpoint(loss_module=loss, observation_norm=norm, history=[])
-    rotation = CheckpointRotation(folder / CHECKPOINTS, keep_last=2)
-    for step in (5, 10, 900):
-        rotation.save(checkpoint, step=step)
-    best = folder / CHECKPOINTS / "best.torchrl"
-    names = ("loss_module", "observation_norm")
-    checkpoint.save(best, components=names, metadata={"step": 10, "score": 1.0})
-    return deterministic_policy(actor, norm), loss
 
 
 @pytest.fixture(scope="module")

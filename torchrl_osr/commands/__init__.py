@@ -1,4 +1,4 @@
-"""The commands: ``torchrl-osr train``, ``evaluate``, ``film`` and ``report``."""
+"""The commands, one a file: ``torchrl-osr train`` is ``train.py``."""
 
 from __future__ import annotations
 

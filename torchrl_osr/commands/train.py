@@ -103,6 +103,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
         progress=cfg.trainer.progress,
         nonfinite=cfg.trainer.nonfinite,
         autocast_dtype=autocast,
+        record=cfg.trainer.record,
         compile=cfg.trainer.compile,
         cudagraph=cfg.trainer.cudagraph,
     )

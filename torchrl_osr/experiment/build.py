@@ -13,7 +13,6 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torchrl.objectives import LossModule
 
 from torchrl_osr._checks import check_choice
-from torchrl_osr.data import load_dataset
 from torchrl_osr.modules import critic_ensemble
 
 
@@ -25,6 +24,8 @@ def load_data(
     Rewards are the task's own: :mod:`~torchrl_osr.experiment.training_data` scales
     them.
     """
+    from torchrl_osr.data import load_dataset  # needs Gymnasium; networks do not
+
     return load_dataset(
         cfg.env.name,
         cfg.data.quality,

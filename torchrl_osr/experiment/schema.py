@@ -164,6 +164,8 @@ class TrainerConfig:
         device: cpu or cuda.
         precision: of the losses' matrix products: float32 or bfloat16.
         matmul_precision: of float32 products, torch's: highest, high or medium.
+        record: repeat a recording of the losses' operations: the same bits in less
+            time, on a CPU.
         compile: run the losses through ``torch.compile``.
         cudagraph: run updates as a CUDA graph; needs ``device=cuda``.
         progress: show progress bars when on a terminal.
@@ -182,6 +184,7 @@ class TrainerConfig:
     device: str = MISSING
     precision: str = MISSING
     matmul_precision: str = MISSING
+    record: bool = MISSING
     compile: bool = MISSING
     cudagraph: bool = MISSING
     progress: bool = MISSING
@@ -264,6 +267,8 @@ def _keyword_options(target: type) -> Iterator[tuple[inspect.Parameter, Any]]:
         parameters = inspect.signature(initialize).parameters.values()
         is_dataclass = "__dataclass_fields__" in vars(each)
         for parameter in parameters:
+            if parameter.name in ("action_spec", "gamma"):
+                continue  # An object of Python, and what every loss refuses.
             if parameter.kind is parameter.KEYWORD_ONLY or (
                 is_dataclass and parameter.default is not parameter.empty
             ):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+from contextlib import closing
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from omegaconf import DictConfig
@@ -13,7 +14,6 @@ from torchrl.checkpoint import CheckpointError
 from torchrl.envs import ObservationNorm
 from torchrl.objectives import LossModule
 
-from torchrl_osr.data import make_environment
 from torchrl_osr.experiment.build import make_learner
 from torchrl_osr.experiment.run_config import check_targets, read_config
 from torchrl_osr.experiment.run_folder import CONFIG
@@ -86,13 +86,19 @@ def checkpoints_of(folder: Path | str) -> list[Path]:
     return found
 
 
-def load_trained(path: Path | str) -> TrainedRun:
+def load_trained(
+    path: Path | str, *, sizes: tuple[int, int] | None = None
+) -> TrainedRun:
     """Load one checkpoint, weights only: no code from the file is run.
 
     torch's global generator is left as it was.
 
     Args:
         path: a checkpoint's file in its run's folder, or the folder for the newest.
+
+    Keyword Args:
+        sizes: of observation and action. Default: those of the run's environment,
+            which is made for that.
 
     Raises:
         FileNotFoundError: if there is no run or no checkpoint.
@@ -103,15 +109,10 @@ def load_trained(path: Path | str) -> TrainedRun:
     """
     folder = run_folder_of(path)
     path = checkpoints_of(path)[-1] if Path(path).is_dir() else Path(path)
-    damage = find_damage(path)
-    if damage is not None:
-        raise CheckpointError(f"checkpoint {path} is damaged: {damage}.")
+    _check_whole(path)
     config = read_config(folder / CONFIG)
     check_targets(config)
-    environment = make_environment(config.env.id)
-    (observation_size,) = environment.observation_space.shape or (0,)
-    (action_size,) = environment.action_space.shape or (0,)
-    environment.close()
+    observation_size, action_size = sizes or _environment_sizes(config.env.id)
     with torch.random.fork_rng(devices=[]):
         actor, model, loss = make_learner(config, observation_size, action_size)
     shape = (observation_size,) if config.data.standardize else ()
@@ -131,3 +132,55 @@ def load_trained(path: Path | str) -> TrainedRun:
     # The loss's parameters of the model are the model's own tensors.
     inverse_dynamics = model if hasattr(loss, "inverse_dynamics_network") else None
     return TrainedRun(config, actor, inverse_dynamics, loss, norm, step, path, folder)
+
+
+def saved_sizes(path: Path) -> tuple[int, int]:
+    """Sizes of observation and action that a checkpoint's networks were trained for.
+
+    Args:
+        path: of the checkpoint's file.
+
+    Raises:
+        CheckpointError: it is damaged, or holds no actor and critics.
+    """
+    _check_whole(path)
+    state = _State()
+    safe_checkpoint(loss_module=state).load(path, map_location="cpu")
+    weights = {
+        name: [
+            each for key, each in state.tensors.items()
+            if key.startswith(f"{name}_network_params.") and key.endswith(".weight")
+        ]
+        for name in ("actor", "qvalue")
+    }  # fmt: skip
+    if not all(weights.values()):
+        raise CheckpointError(f"{path} holds no actor, or no critics.")
+    observation_size = weights["actor"][0].shape[-1]
+    values, read = weights["qvalue"][-1].shape[-2], weights["qvalue"][0].shape[-1]
+    # Critics of discrete actions read none, and value all of them.
+    return observation_size, read - observation_size or values
+
+
+class _State:
+    """A component of a checkpoint as it was saved, of any shapes."""
+
+    def state_dict(self) -> dict[str, Any]:
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.tensors = state
+
+
+def _check_whole(path: Path) -> None:
+    damage = find_damage(path)
+    if damage is not None:
+        raise CheckpointError(f"checkpoint {path} is damaged: {damage}.")
+
+
+def _environment_sizes(env_id: str) -> tuple[int, int]:
+    from torchrl_osr.data import make_environment  # needs Gymnasium
+
+    with closing(make_environment(env_id)) as environment:
+        (observation_size,) = environment.observation_space.shape or (0,)
+        (action_size,) = environment.action_space.shape or (0,)
+    return observation_size, action_size

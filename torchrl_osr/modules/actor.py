@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import (
@@ -31,8 +32,10 @@ def tanh_gaussian_actor(
     activation_class: type[nn.Module] = nn.ReLU,
     low: float | Tensor = -1.0,
     high: float | Tensor = 1.0,
+    observation_key: NestedKey = "observation",
+    action_key: NestedKey = "action",
 ) -> ProbabilisticActor:
-    """Return a tanh-Gaussian actor that reads ``"observation"``.
+    """Return a tanh-Gaussian actor of one observation.
 
     Args:
         observation_dim: size of the observation, ``S``.
@@ -40,9 +43,11 @@ def tanh_gaussian_actor(
         num_cells: width of each hidden layer.
         activation_class: activation between the layers.
         low, high: action bounds, a number or ``[A]``.
+        observation_key: the state it reads. Default ``"observation"``.
+        action_key: the action it writes. Default ``"action"``.
 
     Returns:
-        An actor that writes ``"loc"``, ``"scale"`` (before the tanh) and ``"action"``,
+        An actor that writes ``"loc"``, ``"scale"`` (before the tanh) and the action,
         each ``[B, A]``, and ``"action_log_prob"``, ``[B]``.
 
     Examples:
@@ -62,9 +67,9 @@ def tanh_gaussian_actor(
         NormalParamExtractor(SCALE_MAPPING),
     )
     return ProbabilisticActor(
-        TensorDictModule(network, ["observation"], ["loc", "scale"]),
+        TensorDictModule(network, [observation_key], ["loc", "scale"]),
         in_keys=["loc", "scale"],
-        out_keys=["action"],
+        out_keys=[action_key],
         distribution_class=TanhNormal,
         distribution_kwargs={"low": low, "high": high},
         return_log_prob=True,
@@ -79,8 +84,10 @@ def deterministic_actor(
     activation_class: type[nn.Module] = nn.ReLU,
     low: float | Tensor = -1.0,
     high: float | Tensor = 1.0,
+    observation_key: NestedKey = "observation",
+    action_key: NestedKey = "action",
 ) -> ProbabilisticActor:
-    """Deterministic actor that reads ``"observation"``; its action ends in a tanh.
+    """Deterministic actor of one observation; its action ends in a tanh.
 
     Args:
         observation_dim: size of the observation, ``S``.
@@ -88,11 +95,13 @@ def deterministic_actor(
         num_cells: width of each hidden layer.
         activation_class: activation between the layers.
         low, high: action bounds, a number or ``[A]``.
+        observation_key: the state it reads. Default ``"observation"``.
+        action_key: the action it writes. Default ``"action"``.
 
     Returns:
         An actor that writes ``"param"`` (before the tanh, which
         :class:`~torchrl.modules.TanhDelta` takes of its sum with the center of the
-        bounds) and ``"action"``, each ``[B, A]``.
+        bounds) and the action, each ``[B, A]``.
 
     Examples:
         >>> import torch
@@ -108,9 +117,9 @@ def deterministic_actor(
         activation_class=activation_class,
     )
     return ProbabilisticActor(
-        TensorDictModule(network, ["observation"], ["param"]),
+        TensorDictModule(network, [observation_key], ["param"]),
         in_keys=["param"],
-        out_keys=["action"],
+        out_keys=[action_key],
         distribution_class=TanhDelta,
         distribution_kwargs={"low": low, "high": high, "safe": False},
     )

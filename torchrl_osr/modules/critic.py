@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from tensordict import NestedKey
 from torch import nn
 from torchrl.modules import MLP, ValueOperator
 
@@ -16,8 +17,10 @@ def critic_ensemble(
     num_cells: Sequence[int] = (256, 256),
     activation_class: type[nn.Module] = nn.ReLU,
     layer_norm: bool = False,
+    observation_key: NestedKey = "observation",
+    action_key: NestedKey = "action",
 ) -> list[ValueOperator]:
-    """Return Q networks that read ``"observation"`` and ``"action"``.
+    """Return Q networks of one observation and the action.
 
     A list, not one network to be copied by the loss: TorchRL 0.14.1 re-draws copies
     uniformly between the smallest and the largest weight, which is another
@@ -33,6 +36,8 @@ def critic_ensemble(
             the values of actions far from the data ("Efficient Online Reinforcement
             Learning with Offline Data", https://arxiv.org/abs/2302.02948). Not in the
             paper; default ``False``.
+        observation_key, action_key: the entries they read. Default ``"observation"``
+            and ``"action"``.
 
     Returns:
         ``N`` modules that write ``"state_action_value"``, ``[B, 1]``.
@@ -58,7 +63,9 @@ def critic_ensemble(
                 activation_class=activation_class,
                 **(norm if layer_norm else {}),
             ),
-            in_keys=["observation", "action"],
+            in_keys=[observation_key, action_key],
+            # ValueOperator knows an action by the name "action" alone.
+            out_keys=["state_action_value"],
         )
         for _ in range(num_qvalue_nets)
     ]

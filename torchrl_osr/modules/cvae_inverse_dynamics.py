@@ -9,12 +9,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+from tensordict import NestedKey
 from tensordict.nn import InteractionType, TensorDictModule
 from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal
 
+from torchrl_osr._entries import nested
 from torchrl_osr.modules.actor import SCALE_MAPPING
+from torchrl_osr.modules.initial_weights import remember_weights
 
 LATENT_LOG_SCALE_BOUNDS = (-4.0, 15.0)
 """Range of the latent's log standard deviation, that of BCQ's VAE
@@ -36,6 +39,8 @@ def cvae_inverse_dynamics(
     activation_class: type[nn.Module] = nn.ReLU,
     low: float | Tensor = -1.0,
     high: float | Tensor = 1.0,
+    observation_key: NestedKey = "observation",
+    action_key: NestedKey = "action",
 ) -> ProbabilisticActor:
     r"""Return the conditional VAE of the OSR authors' released code.
 
@@ -71,6 +76,9 @@ def cvae_inverse_dynamics(
             one twice; by default both are then as deep and wide as the authors'.
         activation_class: activation between the layers.
         low, high: action bounds, a number or ``[A]``.
+        observation_key: the state it reads, and the next state below ``"next"``.
+            Default ``"observation"``.
+        action_key: the action it writes. Default ``"action"``.
 
     Returns:
         A module that reads ``"observation"`` and ``("next", "observation")`` and
@@ -104,18 +112,19 @@ def cvae_inverse_dynamics(
         num_cells=list(num_cells),
         activation_class=activation_class,
     )
-    return ProbabilisticActor(
+    model = ProbabilisticActor(
         TensorDictModule(
             _ConditionalVAE(encoder, decoder),
-            ["observation", ("next", "observation")],
+            [observation_key, nested("next", observation_key)],
             ["loc", "scale", "latent_loc", "latent_scale"],
         ),
         in_keys=["loc", "scale"],
-        out_keys=["action"],
+        out_keys=[action_key],
         distribution_class=TanhNormal,
         distribution_kwargs={"low": low, "high": high},
         return_log_prob=True,
     )
+    return remember_weights(model)
 
 
 class _ConditionalVAE(nn.Module):

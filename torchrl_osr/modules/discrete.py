@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import MLP, OneHotCategorical, ProbabilisticActor
+
+from torchrl_osr._entries import nested
+from torchrl_osr.modules.initial_weights import remember_weights
 
 
 def categorical_actor(
@@ -15,8 +19,10 @@ def categorical_actor(
     *,
     num_cells: Sequence[int] = (256, 256),
     activation_class: type[nn.Module] = nn.ReLU,
+    observation_key: NestedKey = "observation",
+    action_key: NestedKey = "action",
 ) -> ProbabilisticActor:
-    """Return an actor that reads ``"observation"`` and chooses one of ``n`` actions.
+    """Return an actor of one observation that chooses one of ``n`` actions.
 
     Its actions are one-hot, as :class:`~torchrl.envs.GymEnv` gives and takes them
     unless it was made with ``categorical_action_encoding=True``.
@@ -26,9 +32,11 @@ def categorical_actor(
         num_actions: number of actions, ``n``.
         num_cells: width of each hidden layer.
         activation_class: activation between the layers.
+        observation_key: the state it reads. Default ``"observation"``.
+        action_key: the action it writes. Default ``"action"``.
 
     Returns:
-        An actor that writes ``"logits"`` and ``"action"``, each ``[B, n]``, and
+        An actor that writes ``"logits"`` and the action, each ``[B, n]``, and
         ``"action_log_prob"``, ``[B]``.
 
     Examples:
@@ -44,7 +52,8 @@ def categorical_actor(
         num_cells=list(num_cells),
         activation_class=activation_class,
     )
-    return _categorical(TensorDictModule(network, ["observation"], ["logits"]))
+    logits = TensorDictModule(network, [observation_key], ["logits"])
+    return _categorical(logits, action_key)
 
 
 def categorical_inverse_dynamics(
@@ -53,6 +62,8 @@ def categorical_inverse_dynamics(
     *,
     num_cells: Sequence[int] = (256, 256),
     activation_class: type[nn.Module] = nn.ReLU,
+    observation_key: NestedKey = "observation",
+    action_key: NestedKey = "action",
 ) -> ProbabilisticActor:
     r"""Return a categorical model of :math:`I(a \mid s, s')`.
 
@@ -61,6 +72,9 @@ def categorical_inverse_dynamics(
         num_actions: number of actions, ``n``.
         num_cells: width of each hidden layer.
         activation_class: activation between the layers.
+        observation_key: the state it reads, and the next state below ``"next"``.
+            Default ``"observation"``.
+        action_key: the action it writes. Default ``"action"``.
 
     Returns:
         A module that reads ``"observation"`` and ``("next", "observation")`` and
@@ -82,15 +96,16 @@ def categorical_inverse_dynamics(
         num_cells=list(num_cells),
         activation_class=activation_class,
     )
-    keys = ["observation", ("next", "observation")]
-    return _categorical(TensorDictModule(network, keys, ["logits"]))
+    keys = [observation_key, nested("next", observation_key)]
+    logits = TensorDictModule(network, keys, ["logits"])
+    return remember_weights(_categorical(logits, action_key))
 
 
-def _categorical(logits: TensorDictModule) -> ProbabilisticActor:
+def _categorical(logits: TensorDictModule, action_key: NestedKey) -> ProbabilisticActor:
     return ProbabilisticActor(
         logits,
         in_keys=["logits"],
-        out_keys=["action"],
+        out_keys=[action_key],
         distribution_class=OneHotCategorical,
         return_log_prob=True,
     )
@@ -103,8 +118,9 @@ def discrete_critic_ensemble(
     num_qvalue_nets: int = 2,
     num_cells: Sequence[int] = (256, 256),
     activation_class: type[nn.Module] = nn.ReLU,
+    observation_key: NestedKey = "observation",
 ) -> list[TensorDictModule]:
-    """Return Q networks that read ``"observation"`` and value all actions at once.
+    """Return Q networks of one observation that value all actions at once.
 
     A list, for the reason that :func:`~torchrl_osr.modules.critic_ensemble` gives.
 
@@ -114,6 +130,7 @@ def discrete_critic_ensemble(
         num_qvalue_nets: number of critics, ``N``.
         num_cells: width of each hidden layer.
         activation_class: activation between the layers.
+        observation_key: the state they read. Default ``"observation"``.
 
     Returns:
         ``N`` modules that write ``"action_value"``, ``[B, n]``.
@@ -134,7 +151,7 @@ def discrete_critic_ensemble(
                 num_cells=list(num_cells),
                 activation_class=activation_class,
             ),
-            ["observation"],
+            [observation_key],
             ["action_value"],
         )
         for _ in range(num_qvalue_nets)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from tensordict import NestedKey
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal
 
+from torchrl_osr._entries import nested
 from torchrl_osr.modules.actor import SCALE_MAPPING
+from torchrl_osr.modules.initial_weights import remember_weights
 
 
 def tanh_gaussian_inverse_dynamics(
@@ -19,6 +22,8 @@ def tanh_gaussian_inverse_dynamics(
     activation_class: type[nn.Module] = nn.ReLU,
     low: float | Tensor = -1.0,
     high: float | Tensor = 1.0,
+    observation_key: NestedKey = "observation",
+    action_key: NestedKey = "action",
 ) -> ProbabilisticActor:
     r"""Return a tanh-Gaussian model of :math:`I(a \mid s, s')`, section 4.2.
 
@@ -31,6 +36,9 @@ def tanh_gaussian_inverse_dynamics(
         num_cells: width of each hidden layer.
         activation_class: activation between the layers.
         low, high: action bounds, a number or ``[A]``.
+        observation_key: the state it reads, and the next state below ``"next"``.
+            Default ``"observation"``.
+        action_key: the action it writes. Default ``"action"``.
 
     Returns:
         A module that reads ``"observation"`` and ``("next", "observation")`` and
@@ -54,17 +62,18 @@ def tanh_gaussian_inverse_dynamics(
             num_cells=list(num_cells),
             activation_class=activation_class,
         ),
-        ["observation", ("next", "observation")],
+        [observation_key, nested("next", observation_key)],
         ["param"],
     )
     extractor = TensorDictModule(
         NormalParamExtractor(SCALE_MAPPING), ["param"], ["loc", "scale"]
     )
-    return ProbabilisticActor(
+    model = ProbabilisticActor(
         TensorDictSequential(joint_mlp, extractor),
         in_keys=["loc", "scale"],
-        out_keys=["action"],
+        out_keys=[action_key],
         distribution_class=TanhNormal,
         distribution_kwargs={"low": low, "high": high},
         return_log_prob=True,
     )
+    return remember_weights(model)

@@ -23,13 +23,16 @@ from tensordict.nn import (
     TensorDictParams,
 )
 from torch import Tensor, nn
+from torchrl.data import TensorSpec
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
 
 from torchrl_osr._checks import check_literals, check_positive
 from torchrl_osr._entries import nested
+from torchrl_osr.modules.initial_weights import digest_of_weights, initial_digest
 from torchrl_osr.objectives.distributions import (
     action_bounds,
+    check_action_spec,
     check_apart,
     check_same_bounds,
     check_same_size,
@@ -78,6 +81,8 @@ class BaseLoss(LossModule):
             ``"smooth_l1"``.
         delay_qvalue: use target networks, to be moved by
             :class:`~torchrl.objectives.SoftUpdate`. Default ``True``.
+        gamma: refused as in every loss of TorchRL; it is an argument of
+            ``make_value_estimator``.
         deactivate_vmap: run the critics one by one. Default ``False``.
         reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
         use_prioritized_weights: weigh rows by ``"priority_weight"``; ``"auto"``
@@ -105,12 +110,18 @@ class BaseLoss(LossModule):
         num_qvalue_nets: int = 2,
         loss_function: Literal["l2", "l1", "smooth_l1"] = "l2",
         delay_qvalue: bool = True,
+        gamma: None = None,
         deactivate_vmap: bool = False,
         reduction: Literal["none", "mean", "sum"] | None = None,
         use_prioritized_weights: bool | Literal["auto"] = "auto",
         scalar_output_mode: Literal["exclude", "non_tensor"] | None = None,
     ) -> None:
         check_literals(BaseLoss.__init__, locals())
+        if gamma is not None:
+            raise TypeError(
+                "gamma belongs to the value estimator: leave it out here and call "
+                f"loss.make_value_estimator(gamma={gamma}) afterwards."
+            )
         super().__init__()
         self._in_keys: list[NestedKey] | None = None
         self._out_keys: list[NestedKey] | None = None
@@ -141,6 +152,7 @@ class BaseLoss(LossModule):
         delay_actor: bool = False,
     ) -> None:
         """Hold an actor, critics (one to be copied, or a list) and a frozen model."""
+        self.delay_actor = delay_actor
         check_apart(
             actor_network=actor_network,
             qvalue_network=qvalue_network,
@@ -179,9 +191,12 @@ class BaseLoss(LossModule):
         self,
         network: TensorDictModuleBase,
         inverse_dynamics_network: TensorDictModuleBase | None = None,
+        action_spec: TensorSpec | None = None,
     ) -> None:
-        """Hold the bounds of a tanh-Gaussian actor, which are those of the model."""
+        """Hold a tanh-Gaussian actor's bounds, the model's and the environment's."""
         low, high = bounds = action_bounds(network, "actor_network")
+        if action_spec is not None:
+            check_action_spec(bounds, action_spec)
         self.register_buffer("action_low", low, persistent=False)
         self.register_buffer("action_high", high, persistent=False)
         if inverse_dynamics_network is not None:
@@ -199,26 +214,65 @@ class BaseLoss(LossModule):
         Its parameters become buffers, so that no optimizer that takes
         ``loss.parameters()`` can move them.
         """
+        self._initial_digest = initial_digest(network)
         self.convert_to_functional(network, "inverse_dynamics_network")
         frozen = self.inverse_dynamics_network_params.apply(
             lambda tensor: tensor.data, filter_empty=False
         )
         self.inverse_dynamics_network_params = TensorDictParams(frozen, no_convert=True)
 
+    def _check_model_is_trained(self) -> None:
+        """Warn, at the first call, of a model with the weights it was built with.
+
+        Not at construction: the weights may be loaded or trained until then. Networks
+        that this package did not build are not looked at.
+        """
+        if self._initial_digest is None or torch.compiler.is_compiling():
+            return
+        digest = digest_of_weights(self.inverse_dynamics_network_params)
+        if digest == self._initial_digest:
+            warnings.warn(
+                f"{type(self).__name__} uses an inverse dynamics model that was never "
+                "trained: its weights are those that it was built with. Train it with "
+                "InverseDynamicsLoss, or load its weights, before the policy.",
+                stacklevel=_first_frame_outside(),
+            )
+        self._initial_digest = None
+
     def _hold_temperature(
         self,
         alpha_init: float,
         fixed_alpha: bool,
         target_entropy: float | Literal["auto"],
+        min_alpha: float | None = None,
+        max_alpha: float | None = None,
     ) -> None:
         """Hold the logarithm of the entropy temperature, ``log_alpha``."""
         check_positive("alpha_init", alpha_init)
+        bounds = {"min_alpha": min_alpha, "max_alpha": max_alpha}
+        given = {name: bound for name, bound in bounds.items() if bound is not None}
+        for name, bound in given.items():
+            check_positive(name, bound)
+        if len(given) == 2:
+            check_positive("max_alpha", given["max_alpha"], minimum=min_alpha)
+        self._log_alpha_bounds = {
+            name.removesuffix("_alpha"): math.log(bound)
+            for name, bound in given.items()
+        }
         self.target_entropy = target_entropy
         log_alpha = torch.tensor(math.log(alpha_init))
         if fixed_alpha:
             self.register_buffer("log_alpha", log_alpha)
         else:
             self.log_alpha = nn.Parameter(log_alpha)
+
+    @property
+    def _alpha(self) -> Tensor:
+        """The entropy temperature, brought back within its bounds, detached."""
+        if self._log_alpha_bounds:
+            # The parameter itself: beyond a bound it would take long to come back.
+            self.log_alpha.data.clamp_(**self._log_alpha_bounds)
+        return self.log_alpha.detach().exp()
 
     def _make_vmap(self) -> None:
         if "qvalue_network" in self.__dict__:
@@ -330,6 +384,12 @@ class BaseLoss(LossModule):
             f"{tuple(tensordict.batch_size)}."
         )
 
+    def _rows_weigh_alike(self, tensordict: TensorDictBase) -> bool:
+        """Whether a reduced loss has the same derivative by every row's term."""
+        masked = any(key in tensordict for key in self._loss_mask_keys())
+        weighted = self._weights(tensordict) is not None
+        return self.reduction != "none" and not (masked or weighted)
+
     def _reduce(
         self, value: Tensor, tensordict: TensorDictBase, valid: Tensor | None = None
     ) -> Tensor:
@@ -403,7 +463,9 @@ def _first_frame_outside() -> int:
     frame, level = inspect.currentframe(), 0
     while frame is not None and (
         here in Path(frame.f_code.co_filename).parents
-        or frame.f_globals.get("__name__", "").startswith(("torchrl.", "tensordict."))
+        or frame.f_globals.get("__name__", "").startswith(
+            ("torch.", "torchrl.", "tensordict.")
+        )
     ):
         frame, level = frame.f_back, level + 1
     return level

@@ -186,6 +186,7 @@ def soft_maximum(
     *,
     temperature: float,
     chunk_size: int,
+    equal_rows: bool = False,
 ) -> Tensor:
     """Return :func:`~torchrl_osr.functional.soft_maximum` of the critics' values.
 
@@ -203,6 +204,8 @@ def soft_maximum(
         log_prob: log-density of each action, ``[M, B]``.
         temperature: of the log-sum-exp.
         chunk_size: states that go through the critics at a time.
+        equal_rows: the caller knows that all rows weigh the same, so that nothing has
+            to be decided by their weights; where they do not, the backward pass raises.
 
     Returns:
         ``[N, B]``.
@@ -213,15 +216,15 @@ def soft_maximum(
     rows = state.flatten(0, -2), action.flatten(1, -2), log_prob.flatten(1)
     arguments = (*rows, temperature, chunk_size, dtype, mlp)
     value: Tensor = _SoftMaximum.apply(  # type: ignore[no-untyped-call]
-        *arguments, *mlp.parameters(params)
+        equal_rows, *arguments, *mlp.parameters(params)
     )
     return value.reshape(-1, *state.shape[:-1])
 
 
 class _SoftMaximum(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, *arguments: Any) -> Any:
-        ctx.arguments = arguments
+    def forward(ctx: Any, equal_rows: bool, *arguments: Any) -> Any:
+        ctx.equal_rows, ctx.arguments = equal_rows, arguments
         with torch.autocast("cpu", enabled=False):  # it would cast once more
             value, gradient = _evaluate(None, *arguments)
         ctx.save_for_backward(*gradient)
@@ -237,11 +240,16 @@ class _SoftMaximum(torch.autograd.Function):
                 "second derivatives."
             )
         weight = upstream.flatten()[0]
-        if bool((upstream == weight).all()):
+        equal = (upstream == weight).all()
+        if ctx.equal_rows:
+            torch._assert_async(
+                equal, "Rows of one weight were promised, see equal_rows."
+            )
+        if ctx.equal_rows or bool(equal):
             gradient = list(torch._foreach_mul(ctx.saved_tensors, weight))
         else:
             _, gradient = _evaluate(upstream, *ctx.arguments)
-        return (*[None] * 7, *gradient)
+        return (*[None] * 8, *gradient)
 
 
 class _Chunk(NamedTuple):

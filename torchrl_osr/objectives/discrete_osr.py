@@ -231,7 +231,7 @@ class DiscreteOSRLoss(BaseLoss):
         if self.has_cql:
             losses["loss_cql"] = self.cql_loss(step, qvalue, pred_value)
         metrics = {
-            "alpha": self.log_alpha.detach().exp(),
+            "alpha": self._alpha,
             "entropy": step.mean(pi.entropy()),
             "pred_value": step.mean(pred_value),
             "target_value": step.mean(target_value),
@@ -267,7 +267,7 @@ class DiscreteOSRLoss(BaseLoss):
         # Detached: the policy's objective shall not train the critics.
         params = self.qvalue_network_params.detach()
         qvalue = self._action_values(step.at(self.actor_states), params, pi)
-        alpha = self.log_alpha.detach().exp()
+        alpha = self._alpha
         objective = functional.discrete_policy_value(pi.logits, qvalue, alpha)
         loss = step.reduce(objective.mean(0))
         if not self.has_recovery:

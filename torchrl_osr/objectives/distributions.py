@@ -15,6 +15,7 @@ from tensordict.nn import ProbabilisticTensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torch.distributions import Categorical
 from torch.distributions import OneHotCategorical as TorchOneHotCategorical
+from torchrl.data import Bounded, Composite, TensorSpec
 from torchrl.modules import (
     MaskedOneHotCategorical,
     NormalParamExtractor,
@@ -212,6 +213,41 @@ def check_same_bounds(
             f"inverse dynamics model low={other_low.tolist()}, "
             f"high={other_high.tolist()}. Pass the same low= and high= to both."
         )
+
+
+def check_action_spec(policy: tuple[Tensor, Tensor], action_spec: TensorSpec) -> None:
+    """Raise unless an environment's actions have the policy's bounds.
+
+    Args:
+        policy: bounds of the policy's distribution.
+        action_spec: of the environment; a :class:`~torchrl.data.Composite` must hold
+            one entry.
+
+    Raises:
+        ValueError: naming both bounds, or saying that the spec has none.
+    """
+    spec = action_spec
+    if isinstance(spec, Composite):
+        leaves = list(spec.values(True, True))
+        if len(leaves) != 1:
+            raise ValueError(
+                f"action_spec holds {len(leaves)} entries, expected the action alone: "
+                "pass env.action_spec."
+            )
+        spec = leaves[0]
+    if not isinstance(spec, Bounded):
+        raise ValueError(
+            f"action_spec must be a Bounded spec, as a TanhNormal needs, got {spec}."
+        )
+    for name, ours, theirs in zip(
+        ("low", "high"), policy, (spec.space.low, spec.space.high), strict=True
+    ):
+        if not bool((ours == theirs.to(ours)).all()):
+            raise ValueError(
+                f"the actor's {name} is {ours.tolist()}, but that of action_spec is "
+                f"{theirs.tolist()}: build actor and inverse dynamics model with "
+                f"{name}=env.action_spec.space.{name}."
+            )
 
 
 def check_apart(**networks: nn.Module | Sequence[nn.Module] | None) -> None:

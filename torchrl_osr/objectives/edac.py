@@ -151,7 +151,7 @@ class EDACLoss(BaseLoss):
         step.write_priority(pred_value, target_value)
         losses = {"loss_actor": actor, "loss_alpha": alpha, "loss_qvalue": qvalue}
         metrics = {
-            "alpha": self.log_alpha.detach().exp(),
+            "alpha": self._alpha,
             "entropy": -step.mean(log_prob),
             "pred_value": step.mean(pred_value),
             "target_value": step.mean(target_value),
@@ -165,7 +165,7 @@ class EDACLoss(BaseLoss):
         check_action(step.data_action, action.shape[-1], self.tensor_keys.action)
         params = self.qvalue_network_params.detach()
         qvalue = step.qvalue(step.at("clean"), action, params)
-        alpha = self.log_alpha.detach().exp()
+        alpha = self._alpha
         objective = functional.soft_policy_value(log_prob, qvalue, alpha)
         return step.reduce(objective.mean(0)), log_prob
 
@@ -197,7 +197,7 @@ class EDACLoss(BaseLoss):
         action, log_prob = rsample_and_log_prob(step.policy("next"))
         params = self.target_qvalue_network_params
         qvalue = step.qvalue(step.at("next"), action, params)
-        alpha = self.log_alpha.exp()
+        alpha = self._alpha
         next_value = functional.bootstrap_value(qvalue, log_prob, alpha)
         return step.td_target(next_value.squeeze(0))
 

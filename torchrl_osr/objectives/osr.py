@@ -19,6 +19,7 @@ from tensordict.nn import (
     dispatch,
 )
 from torch import Tensor, nn
+from torchrl.data import TensorSpec
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 
 from torchrl_osr import functional
@@ -99,8 +100,14 @@ class OSRLoss(BaseLoss):
             at ``lagrange_thresh``; adds ``loss_alpha_prime``. Default ``False``.
         lagrange_thresh: the tolerated gap, in units of the value. Default 0.0.
         alpha_init: initial entropy temperature :math:`\alpha_e`. Default 1.0.
+        min_alpha, max_alpha: bounds of the temperature. Default: none.
         fixed_alpha: keep the temperature. Default ``False``.
         target_entropy: in nats; ``"auto"`` (default) is minus the action's size.
+        action_spec: of the environment's actions, whose bounds must be the actor's.
+            Default: not compared.
+        delay_actor: the action in the TD target is that of a target actor, which
+            :class:`~torchrl.objectives.SoftUpdate` moves with the target critics.
+            Default ``False``.
         chunk_size: on a CPU, how many states go through the critics at a time, with
             all their sampled actions, if the critics are plain MLPs; ``None`` for all
             at once, as other networks go. Default 64. The mathematics is the same.
@@ -110,7 +117,7 @@ class OSRLoss(BaseLoss):
             :class:`~torchrl_osr.objectives.BaseLoss`.
 
     Raises:
-        TypeError: if a distribution is not a ``TanhNormal``.
+        TypeError: if a distribution is not a ``TanhNormal``, or ``gamma`` is given.
         ValueError: if bounds differ, an option is out of its range or the model is
             missing; in the call, if the batch is empty or holds several steps a row.
         KeyError: in the call, if the batch has no perturbed entry.
@@ -162,8 +169,12 @@ class OSRLoss(BaseLoss):
         with_lagrange: bool = False,
         lagrange_thresh: float = 0.0,
         alpha_init: float = 1.0,
+        min_alpha: float | None = None,
+        max_alpha: float | None = None,
         fixed_alpha: bool = False,
         target_entropy: float | Literal["auto"] = "auto",
+        action_spec: TensorSpec | None = None,
+        delay_actor: bool = False,
         chunk_size: int | None = 64,
         **options: Any,
     ) -> None:
@@ -189,13 +200,16 @@ class OSRLoss(BaseLoss):
             )
         super().__init__(**options)
         model = inverse_dynamics_network if needs_model else None
-        self._hold_action_bounds(actor_network, model)
+        self._hold_action_bounds(actor_network, model, action_spec)
         self._hold_actor_critic(
             actor_network,
             qvalue_network,
             inverse_dynamics_network=model,
+            delay_actor=delay_actor,
         )
-        self._hold_temperature(alpha_init, fixed_alpha, target_entropy)
+        self._hold_temperature(
+            alpha_init, fixed_alpha, target_entropy, min_alpha, max_alpha
+        )
         if with_lagrange:
             self.log_alpha_prime = nn.Parameter(torch.zeros(()))
         self.register_coeff_buffer("recovery_weight", float(recovery_weight))
@@ -258,7 +272,7 @@ class OSRLoss(BaseLoss):
         step.write_priority(pred_value, target_value)
         losses = {"loss_actor": actor, "loss_alpha": alpha, "loss_qvalue": qvalue} | cql
         metrics = {
-            "alpha": self.log_alpha.detach().exp(),
+            "alpha": self._alpha,
             "entropy": -step.mean(log_prob),
             "pred_value": step.mean(pred_value),
             "target_value": step.mean(target_value),
@@ -279,7 +293,7 @@ class OSRLoss(BaseLoss):
         # Detached: the policy's objective shall not train the critics.
         params = self.qvalue_network_params.detach()
         qvalue = step.qvalue(step.at(self.actor_states), action, params)
-        alpha = self.log_alpha.detach().exp()
+        alpha = self._alpha
         objective = functional.soft_policy_value(log_prob, qvalue, alpha)
         loss, metrics = step.reduce(objective.mean(0)), {}
         if self.has_recovery:
@@ -374,6 +388,8 @@ class OSRLoss(BaseLoss):
                 log_prob,
                 temperature=self.temperature,
                 chunk_size=self.chunk_size,
+                equal_rows=self.clip_diff_min == -math.inf
+                and self._rows_weigh_alike(step.tensordict),
             )
             return self._data_qvalue(step), soft_maximum
         # One pass of the critics for the data's action and all proposals.
@@ -388,7 +404,7 @@ class OSRLoss(BaseLoss):
     @torch.no_grad()
     def _target_value(self, step: Step) -> Tensor:
         """The TD target, ``[B]``, from an action of the policy at ``s'``."""
-        state, pi = step.at("next"), step.policy("next")
+        state, pi = step.at("next"), step.target_policy()
         number = (self.num_random,) if self.max_q_backup else ()
         action, log_prob = rsample_and_log_prob(pi, number)
         params = self.target_qvalue_network_params
@@ -398,7 +414,7 @@ class OSRLoss(BaseLoss):
         elif self.deterministic_backup:
             next_value = functional.bootstrap_value(qvalue)
         else:
-            alpha = self.log_alpha.exp()
+            alpha = self._alpha
             next_value = functional.bootstrap_value(qvalue, log_prob, alpha)
         return step.td_target(next_value.squeeze(0))
 

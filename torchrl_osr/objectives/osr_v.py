@@ -17,6 +17,7 @@ from tensordict.nn import (
     dispatch,
 )
 from torch import Tensor
+from torchrl.data import TensorSpec
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 
 from torchrl_osr import functional
@@ -24,6 +25,20 @@ from torchrl_osr._checks import check_literals, check_positive, check_weight
 from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
 from torchrl_osr.objectives.distributions import check_action, check_num_actions
 from torchrl_osr.objectives.step import Step, actor_critic_in_keys, uniform_actions
+
+_NO_CQL = "the constraint of weight recovery_weight stands in the place of CQL's term"
+_TARGET = (
+    "its TD target is that of the policy's own action, without entropy; OSRLoss has "
+    "other targets"
+)
+CQL_ARGUMENTS = {
+    "min_q_weight": _NO_CQL,
+    "with_lagrange": _NO_CQL,
+    "lagrange_thresh": _NO_CQL,
+    "max_q_backup": _TARGET,
+    "deterministic_backup": _TARGET,
+}
+"""Arguments of :class:`~torchrl.objectives.CQLLoss` that have no meaning here."""
 
 
 class OSRVLoss(BaseLoss):
@@ -62,15 +77,22 @@ class OSRVLoss(BaseLoss):
         num_random: ``K``, actions drawn of each kind. Default 1.
         temperature: of the log-sum-exp. Default 1.0.
         alpha_init: initial entropy temperature :math:`\alpha_e`. Default 1.0.
+        min_alpha, max_alpha: bounds of the temperature. Default: none.
         fixed_alpha: keep the temperature. Default ``False``.
         target_entropy: in nats; ``"auto"`` (default) is minus the action's size.
+        action_spec: of the environment's actions, whose bounds must be the actor's.
+            Default: not compared.
+        delay_actor: the action in the TD target is that of a target actor, which
+            :class:`~torchrl.objectives.SoftUpdate` moves with the target critics.
+            Default ``False``.
         options: of every loss: ``num_qvalue_nets``, ``loss_function``,
             ``delay_qvalue``, ``deactivate_vmap``, ``reduction``,
             ``use_prioritized_weights`` and ``scalar_output_mode``, see
             :class:`~torchrl_osr.objectives.BaseLoss`.
 
     Raises:
-        TypeError: if a distribution is not a ``TanhNormal``.
+        TypeError: if a distribution is not a ``TanhNormal``, or an argument belongs to
+            another loss, such as CQL's ``min_q_weight``.
         ValueError: if bounds differ or an option is out of its range; in the call, if
             the batch is empty or holds several steps a row.
         KeyError: in the call, if the batch has no perturbed entry.
@@ -112,24 +134,34 @@ class OSRVLoss(BaseLoss):
         num_random: int = 1,
         temperature: float = 1.0,
         alpha_init: float = 1.0,
+        min_alpha: float | None = None,
+        max_alpha: float | None = None,
         fixed_alpha: bool = False,
         target_entropy: float | Literal["auto"] = "auto",
+        action_spec: TensorSpec | None = None,
+        delay_actor: bool = False,
         **options: Any,
     ) -> None:
         check_literals(OSRVLoss.__init__, locals())
+        for name, advice in CQL_ARGUMENTS.items():
+            if name in options:
+                raise TypeError(f"OSRVLoss takes no {name}: {advice}.")
         if inverse_dynamics_network is None:
             raise ValueError("OSRVLoss needs an inverse_dynamics_network.")
         check_weight("recovery_weight", recovery_weight)
         check_positive("num_random", num_random, minimum=1)
         check_positive("temperature", temperature)
         super().__init__(**options)
-        self._hold_action_bounds(actor_network, inverse_dynamics_network)
+        self._hold_action_bounds(actor_network, inverse_dynamics_network, action_spec)
         self._hold_actor_critic(
             actor_network,
             qvalue_network,
             inverse_dynamics_network=inverse_dynamics_network,
+            delay_actor=delay_actor,
         )
-        self._hold_temperature(alpha_init, fixed_alpha, target_entropy)
+        self._hold_temperature(
+            alpha_init, fixed_alpha, target_entropy, min_alpha, max_alpha
+        )
         self.register_coeff_buffer("recovery_weight", float(recovery_weight))
         self.policy_values = policy_values
         self.num_random = num_random
@@ -162,7 +194,7 @@ class OSRVLoss(BaseLoss):
         step.write_priority(pred_value, target_value)
         losses = {"loss_actor": actor, "loss_alpha": alpha, "loss_qvalue": qvalue}
         metrics = {
-            "alpha": self.log_alpha.detach().exp(),
+            "alpha": self._alpha,
             "entropy": -step.mean(log_prob),
             "pred_value": step.mean(pred_value),
             "target_value": step.mean(target_value),
@@ -177,7 +209,7 @@ class OSRVLoss(BaseLoss):
         # Detached: the policy's objective shall not train the critics.
         params = self.qvalue_network_params.detach()
         qvalue = step.qvalue(step.at("both"), action, params)
-        alpha = self.log_alpha.detach().exp()
+        alpha = self._alpha
         objective = functional.soft_policy_value(log_prob, qvalue, alpha)
         return step.reduce(objective.mean(0)), log_prob
 
@@ -234,7 +266,7 @@ class OSRVLoss(BaseLoss):
     @torch.no_grad()
     def _target_value(self, step: Step) -> Tensor:
         """The TD target, ``[B]``, from an action of the policy at ``s'``."""
-        action, _ = rsample_and_log_prob(step.policy("next"))
+        action, _ = rsample_and_log_prob(step.target_policy())
         params = self.target_qvalue_network_params
         qvalue = step.qvalue(step.at("next"), action, params)
         return step.td_target(functional.bootstrap_value(qvalue).squeeze(0))

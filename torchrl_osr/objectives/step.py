@@ -82,6 +82,7 @@ def frozen_distribution(
         done: rows whose next state is not to be learnt from, bool ``[B]``.
         states: ``"both"``, ``"clean"`` or ``"perturbed"``.
     """
+    loss._check_model_is_trained()
     network = loss.inverse_dynamics_network
     batch = transitions(
         tensordict,
@@ -219,6 +220,15 @@ class Step:
             pi = self.loss.actor_network.build_dist_from_params(params)
             self._policies[states] = pi
         return self._policies[states]
+
+    def target_policy(self) -> Any:
+        """The policy at the next states that the TD target is of, ``[1, B]``."""
+        loss = self.loss
+        if not loss.delay_actor:
+            return self.policy("next")
+        network, params = loss.actor_network, loss.target_actor_network_params
+        found = distribution_params(network, params, self.at("next"))
+        return network.build_dist_from_params(found)
 
     def action(self, states: TensorDictBase, params: TensorDictParams) -> Tensor:
         """The action that a deterministic policy writes, ``[..., A]``."""

@@ -3,5 +3,12 @@
 from torchrl_osr.trainers.hardware import check_hardware
 from torchrl_osr.trainers.interruption import Interrupted
 from torchrl_osr.trainers.offline import OfflineTrainer, largest_value
+from torchrl_osr.trainers.replay_buffer_collector import ReplayBufferCollector
 
-__all__ = ["Interrupted", "OfflineTrainer", "check_hardware", "largest_value"]
+__all__ = [
+    "Interrupted",
+    "OfflineTrainer",
+    "ReplayBufferCollector",
+    "check_hardware",
+    "largest_value",
+]

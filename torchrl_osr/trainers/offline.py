@@ -38,6 +38,7 @@ from torchrl_osr.trainers.interruption import (
 )
 from torchrl_osr.trainers.nonfinite import NonfiniteCheck
 from torchrl_osr.trainers.progress import Progress
+from torchrl_osr.trainers.recording import LossGradients
 
 log = logging.getLogger(__name__)
 
@@ -89,14 +90,12 @@ class SumOfLosses(OptimizationStepper):
 
     Args:
         check: steps the optimizer, unless a loss or a gradient is not finite.
-        autocast_dtype: of the matrix products of the losses. Default: that of the
-            parameters.
+        gradients: maps a batch to its detached losses, and puts the gradients of their
+            sum where the optimizer looks.
     """
 
-    def __init__(
-        self, check: NonfiniteCheck, autocast_dtype: torch.dtype | None = None
-    ) -> None:
-        self.check, self.autocast_dtype = check, autocast_dtype
+    def __init__(self, check: NonfiniteCheck, gradients: LossGradients) -> None:
+        self.check, self.gradients = check, gradients
         self.run: Callable[[TensorDictBase], TensorDictBase] = self.update
 
     def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
@@ -105,15 +104,8 @@ class SumOfLosses(OptimizationStepper):
 
     def update(self, batch: TensorDictBase) -> TensorDictBase:
         """Losses of a batch, their gradients, and the optimizer's step."""
-        loss_module = self.check.loss_module
-        device = next(loss_module.parameters()).device.type
-        enabled = self.autocast_dtype is not None
-        with torch.autocast(device, self.autocast_dtype, enabled=enabled):
-            losses = loss_module(batch)
-        total = sum(value for key, value in losses.items() if key.startswith("loss_"))
         try:
-            total.backward()
-            return self.check.step(batch, losses.detach())
+            return self.check.step(batch, self.gradients(batch))
         finally:
             # Also after an error: the next backward must not add to these gradients.
             self.check.optimizer.zero_grad(set_to_none=True)
@@ -163,6 +155,10 @@ class OfflineTrainer(Trainer):
             every half minute. Default ``True``.
         autocast_dtype: compute the losses' matrix products in this precision
             (``torch.bfloat16``). Default: that of the parameters.
+        record: repeat a recording of the losses' tensor operations, and of their
+            gradients', from the 101st update on: the same bits in less time, on a CPU.
+            Python code in the losses, such as a hook, is not run again. Default
+            ``False``.
         compile: call the loss module through :func:`torch.compile`, in place. It draws
             other random numbers then. Default ``False``.
         cudagraph: replay each update, from the batch to the optimizer's step, as one
@@ -205,6 +201,7 @@ class OfflineTrainer(Trainer):
         description: str = "train",
         progress: bool = True,
         autocast_dtype: torch.dtype | None = None,
+        record: bool = False,
         compile: bool = False,
         cudagraph: bool = False,
         nonfinite: Literal["stop", "skip"] = "stop",
@@ -249,7 +246,9 @@ class OfflineTrainer(Trainer):
         self.nonfinite_check = NonfiniteCheck(
             loss_module, optimizer, nonfinite, self.checkpoints, description
         )
-        self._stepper = SumOfLosses(self.nonfinite_check, autocast_dtype)
+        record = record and not (compile or cudagraph)
+        gradients = LossGradients(loss_module, autocast_dtype, record=record)
+        self._stepper = SumOfLosses(self.nonfinite_check, gradients)
         super().__init__(
             collector=clock,
             total_frames=total_steps,

@@ -1,0 +1,64 @@
+"""Small policies of each kind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torchrl.envs import ObservationNorm
+
+from torchrl_osr import DiscreteOSRLoss, OSRLoss, Policy, TD3BCLoss
+from torchrl_osr.modules import (
+    categorical_actor,
+    critic_ensemble,
+    deterministic_actor,
+    discrete_critic_ensemble,
+    tanh_gaussian_actor,
+)
+from torchrl_osr.policy import policy_from_loss
+
+STATE, ACTION = 3, 2
+LOW, HIGH = [-2.0, 0.5], [4.0, 1.5]
+
+
+@pytest.fixture(scope="session")
+def make_loss() -> Callable[..., torch.nn.Module]:
+    """Return a factory of losses with untrained networks: osr, td3_bc or discrete."""
+
+    def make(kind: str, num_qvalue_nets: int = 2, layer_norm: bool = False):
+        torch.manual_seed(1)
+        cells = {"num_cells": [8, 4]}
+        many = cells | {"num_qvalue_nets": num_qvalue_nets}
+        if kind == "discrete":
+            actor = categorical_actor(STATE, ACTION, **cells)
+            critics = discrete_critic_ensemble(STATE, ACTION, **many)
+            return DiscreteOSRLoss(actor, critics, recovery_weight=0)
+        critics = critic_ensemble(STATE, ACTION, layer_norm=layer_norm, **many)
+        if kind == "td3_bc":
+            return TD3BCLoss(deterministic_actor(STATE, ACTION, **cells), critics)
+        actor = tanh_gaussian_actor(STATE, ACTION, **cells)
+        return OSRLoss(actor, critics, recovery_weight=0)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def norm() -> ObservationNorm:
+    return ObservationNorm(
+        torch.tensor([1.0, -2.0, 0.0]), torch.tensor([2.0, 0.5, 1.0]),
+        in_keys=["observation"], standard_normal=True,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def make_policy(make_loss, norm) -> Callable[..., Policy]:
+    """Return a factory of policies of those losses, with bounds of their own."""
+
+    def make(kind: str, **options) -> Policy:
+        bounds = {} if kind == "discrete" else {"low": LOW, "high": HIGH}
+        source = {"env_id": "Task-v0", "step": 7}
+        loss = make_loss(kind, **options)
+        return policy_from_loss(loss, norm, **bounds, source=source)
+
+    return make

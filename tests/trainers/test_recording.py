@@ -1,0 +1,132 @@
+"""A recording of losses and gradients against the losses themselves."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torchrl.objectives import SoftUpdate
+
+from torchrl_osr import (
+    EDACLoss,
+    InverseDynamicsLoss,
+    OSRLoss,
+    OSRVLoss,
+    TD3BCLoss,
+)
+from torchrl_osr.modules import (
+    critic_ensemble,
+    deterministic_actor,
+    tanh_gaussian_actor,
+    tanh_gaussian_inverse_dynamics,
+)
+from torchrl_osr.trainers import recording
+from torchrl_osr.trainers.recording import LossGradients
+
+SIZES = (3, 2)
+CELLS = {"num_cells": [8, 8]}
+
+
+def networks(actor=tanh_gaussian_actor, **options):
+    return actor(*SIZES, **CELLS), critic_ensemble(*SIZES, **CELLS, **options)
+
+
+def model():
+    return tanh_gaussian_inverse_dynamics(*SIZES, **CELLS)
+
+
+LOSSES = {
+    "osr": lambda: OSRLoss(*networks(layer_norm=True), model(), num_random=2),
+    "cql": lambda: OSRLoss(
+        *networks(), recovery_weight=0, actor_states="clean", with_lagrange=True
+    ),
+    "osr_v": lambda: OSRVLoss(*networks(), model(), num_random=2),
+    "edac": lambda: EDACLoss(*networks()),
+    "td3_bc": lambda: TD3BCLoss(*networks(deterministic_actor)),
+    "inverse_dynamics": lambda: InverseDynamicsLoss(model()),
+}
+
+
+@pytest.fixture(autouse=True)
+def _at_once(monkeypatch):
+    monkeypatch.setattr(recording, "WARM_UP", 0)
+
+
+def make(name):
+    loss = LOSSES[name]().double()
+    if name != "inverse_dynamics":
+        SoftUpdate(loss, tau=0.1)  # TorchRL warns of losses without one
+    return loss
+
+
+def results(gradients, loss, batch):
+    """Losses, gradients and what the loss has written, for one state of the noise."""
+    batch = batch.clone()
+    torch.manual_seed(3)
+    losses = gradients(batch)
+    found = [each.grad for each in loss.parameters()]
+    loss.zero_grad()
+    return losses, found, batch, torch.rand(())
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_a_recording_has_the_bits_of_what_was_recorded(name, make_batch):
+    loss = make(name)
+    eager, recorded = LossGradients(loss), LossGradients(loss, record=True)
+    recorded(make_batch(6, twin=True))
+    loss.zero_grad()
+    assert recorded._recording is not None
+    calls = []
+    loss.register_forward_pre_hook(lambda *_: calls.append(1))
+    for seed in (1, 2):
+        torch.manual_seed(seed)
+        batch = make_batch(6, twin=True)
+        with torch.no_grad():
+            for each in loss.parameters():
+                each.mul_(1.01)
+        expected = results(eager, loss, batch)
+        calls.clear()
+        given = results(recorded, loss, batch)
+        assert not calls  # the loss's own code was not run
+        torch.testing.assert_close(given[0], expected[0], rtol=0, atol=0)
+        for ours, theirs in zip(given[1], expected[1], strict=True):
+            assert (ours is None) == (theirs is None)
+            assert ours is None or torch.equal(ours, theirs)
+        assert (given[2] == expected[2]).all()
+        assert given[3] == expected[3]  # the generator moved on alike
+    assert all(each is not None for each in given[1])
+
+
+def test_another_kind_of_batch_or_option_runs_the_loss_itself(make_batch):
+    loss = make("osr")
+    recorded = LossGradients(loss, record=True)
+    recorded(make_batch(6, twin=True))
+    calls = []
+    loss.register_forward_pre_hook(lambda *_: calls.append(1))
+    recorded(make_batch(6, twin=True))
+    assert not calls
+    recorded(make_batch(5, twin=True))
+    assert calls == [1]
+    weighted = make_batch(6, twin=True)
+    weighted["priority_weight"] = torch.rand(6, dtype=torch.float64)
+    recorded(weighted)
+    assert calls == [1, 1]
+    loss.num_random = 3
+    recorded(make_batch(6, twin=True))
+    assert calls == [1, 1, 1]
+
+
+def test_a_loss_that_decides_by_numbers_is_run_as_it_is(make_batch, caplog):
+    class Deciding(OSRLoss):
+        def forward(self, tensordict):
+            if (tensordict["action"] > 0).any():
+                return super().forward(tensordict)
+            raise AssertionError
+
+    loss = Deciding(*networks(), recovery_weight=0, actor_states="clean").double()
+    SoftUpdate(loss, tau=0.1)
+    batch = make_batch(6)
+    for gradients in (LossGradients(loss, record=True), LossGradients(loss)):
+        losses, found, *_ = results(gradients, loss, batch)
+    assert "Deciding runs without a recording" in caplog.text
+    assert all(value.isfinite() for value in losses.values())
+    assert sum(each is not None for each in found) > 4

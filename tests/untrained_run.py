@@ -1,0 +1,41 @@
+"""A run's folder as the trainer leaves it, with networks that nothing has trained."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+from torchrl.checkpoint import CheckpointRotation
+from torchrl.envs import ObservationNorm
+
+from torchrl_osr.evaluation import deterministic_policy
+from torchrl_osr.experiment import schema as config
+from torchrl_osr.experiment.build import make_learner
+from torchrl_osr.experiment.trained_run import CHECKPOINTS
+from torchrl_osr.trainers.checkpoints import safe_checkpoint
+
+CONF = Path(__file__).parents[1] / "conf"
+
+
+def make_run(folder: Path, *overrides: str):
+    """Save two checkpoints and the best of an untrained policy, as the trainer does."""
+    config.register()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        cfg = compose("train", ["network.num_cells=[8]", *overrides])
+    folder.mkdir()
+    OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
+    actor, _, loss = make_learner(cfg, 11, 3)
+    norm = ObservationNorm(
+        torch.full((11,), 2.0), torch.full((11,), 3.0), in_keys=["observation"],
+        standard_normal=True,
+    )  # fmt: skip
+    checkpoint = safe_checkpoint(loss_module=loss, observation_norm=norm, history=[])
+    rotation = CheckpointRotation(folder / CHECKPOINTS, keep_last=2)
+    for step in (5, 10, 900):
+        rotation.save(checkpoint, step=step)
+    best = folder / CHECKPOINTS / "best.torchrl"
+    names = ("loss_module", "observation_norm")
+    checkpoint.save(best, components=names, metadata={"step": 10, "score": 1.0})
+    return deterministic_policy(actor, norm), loss

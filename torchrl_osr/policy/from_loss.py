@@ -1,0 +1,156 @@
+"""A policy that copies the networks of a loss.
+
+Shapes: ``S`` observation, ``A`` action.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from numpy.typing import ArrayLike
+from tensordict import TensorDict
+from tensordict.nn import ProbabilisticTensorDictSequential
+from torch import Tensor
+from torchrl.envs import ObservationNorm
+from torchrl.modules import MLP
+from torchrl.objectives import LossModule
+
+from torchrl_osr._checks import check_choice
+from torchrl_osr.policy.mlp import describe_mlp
+from torchrl_osr.policy.policy import DISTRIBUTIONS, Policy
+
+
+def policy_from_loss(
+    loss: LossModule,
+    observation_norm: ObservationNorm | None = None,
+    *,
+    low: ArrayLike = -1.0,
+    high: ArrayLike = 1.0,
+    source: Mapping[str, Any] | None = None,
+) -> Policy:
+    """Copy actor and critics of a loss into a policy.
+
+    Args:
+        loss: of this package or of TorchRL, with networks as
+            :mod:`torchrl_osr.modules` builds them: one :class:`~torchrl.modules.MLP`
+            each, actions in [-1, 1] or one-hot.
+        observation_norm: how the training data were standardised
+            (``standard_normal=True``). Default: not at all.
+
+    Keyword Args:
+        low, high: bounds of the environment's actions, which the networks' -1 and 1
+            stand for; a number or ``[A]``. Default -1 and 1.
+        source: JSON-compatible, kept in ``policy.record["source"]``. Default: only the
+            name of the loss's class.
+
+    Raises:
+        ValueError: the networks are of another kind.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_osr import OSRLoss
+        >>> from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
+        >>> networks = tanh_gaussian_actor(3, 1), critic_ensemble(3, 1)
+        >>> loss = OSRLoss(*networks, recovery_weight=0)
+        >>> policy = policy_from_loss(loss, low=-2.0, high=2.0)
+        >>> policy.act(np.zeros((4, 3))).shape, policy.value(np.zeros((4, 3))).shape
+        ((4, 1), (4,))
+    """
+    if not isinstance(loss.actor_network, ProbabilisticTensorDictSequential):
+        raise ValueError(
+            f"the actor of a policy ends in one of {DISTRIBUTIONS}, as those of "
+            "torchrl_osr.modules; this one has no distribution."
+        )
+    actor, prefix = _mlp(loss.actor_network)
+    distribution = loss.actor_network[-1].distribution_class.__name__
+    check_choice("the actor's distribution", distribution, DISTRIBUTIONS)
+    size = actor.out_features // (2 if distribution == "TanhNormal" else 1)
+    tensors = _weights(loss.actor_network_params, prefix, "actor")
+    critics = {"number": 0} | describe_mlp(actor)
+    if hasattr(loss, "qvalue_network"):
+        critic, prefix = _mlp(loss.qvalue_network)
+        each = loss.qvalue_network_params.unbind(0)
+        critics = {"number": len(each)} | describe_mlp(critic)
+        for number, params in enumerate(each):
+            tensors |= _weights(params, prefix, f"critics.{number}")
+    for name, default in (("loc", 0.0), ("scale", 1.0)):
+        value = torch.as_tensor(getattr(observation_norm, name, default))
+        tensors[name] = value.cpu().float().expand(actor.in_features).clone()
+    shape = (0,) if distribution == "OneHotCategorical" else (size,)
+    low, high = (torch.as_tensor(each).float().expand(shape) for each in (low, high))
+    record = {
+        "distribution": distribution,
+        "observation_size": actor.in_features,
+        "action_size": size,
+        "low": low.tolist(),
+        "high": high.tolist(),
+        "actor": describe_mlp(actor),
+        "critics": critics,
+        "source": {"loss": type(loss).__name__} | dict(source or {}),
+    }
+    policy = Policy(record, tensors)
+    _check_same(policy, loss)
+    return policy
+
+
+def _mlp(network: torch.nn.Module) -> tuple[MLP, str]:
+    """The only MLP in a network, and what its parameters' names begin with."""
+    found = [
+        (each, name) for name, each in network.named_modules() if isinstance(each, MLP)
+    ]
+    if len(found) != 1:
+        raise ValueError(
+            f"a network of a policy has one MLP, as those of torchrl_osr.modules; this "
+            f"one has {len(found)}."
+        )
+    return found[0]
+
+
+def _weights(params: TensorDict, prefix: str, name: str) -> dict[str, Tensor]:
+    flat = params.detach().flatten_keys(".").items()
+    start = f"{prefix}." if prefix else ""
+    return {
+        f"{name}.{key.removeprefix(start)}": value.cpu().float().clone()
+        for key, value in flat
+        if key.startswith(start)
+    }
+
+
+@torch.no_grad()
+def _check_same(policy: Policy, loss: LossModule) -> None:
+    """Raise unless the copies compute what the networks do.
+
+    Anything around an MLP would be left out: other layers, bounds, maps of the scale.
+    """
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.randn(16, policy.observation_size, generator=generator)
+    place = next(loss.parameters())
+    states = TensorDict({}, [len(rows)], device=place.device)
+    states.set(loss.actor_network.in_keys[0], rows.to(place))
+    with loss.actor_network_params.to_module(
+        loss.actor_network, preserve_module_state=False
+    ):
+        theirs = loss.actor_network.get_dist(states)
+    raw = policy.actor(rows)
+    pairs = [(policy.mode(raw), theirs.deterministic_sample)]
+    if policy.discrete:
+        pairs = [(raw.softmax(-1), theirs.probs)]
+    elif policy.distribution == "TanhNormal":
+        pairs += zip(policy.extractor(raw), (theirs.loc, theirs.scale), strict=True)
+    states.set(loss.tensor_keys.action, theirs.deterministic_sample)
+    for number, critic in enumerate(policy.critics):
+        with loss.qvalue_network_params[number].to_module(
+            loss.qvalue_network, preserve_module_state=False
+        ):
+            value = loss.qvalue_network(states)[loss.qvalue_network.out_keys[-1]]
+        given = (rows,) if policy.discrete else (rows, policy.mode(raw))
+        pairs.append((critic(*given), value))
+    for ours, wanted in pairs:
+        if not torch.allclose(ours, wanted.cpu().float(), rtol=1e-4, atol=1e-5):
+            raise ValueError(
+                f"the networks of this {type(loss).__name__} compute something else "
+                "than their MLPs and a distribution with bounds -1 and 1; a policy "
+                "takes networks as torchrl_osr.modules builds them."
+            )

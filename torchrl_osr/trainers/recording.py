@@ -1,0 +1,183 @@
+"""Losses and gradients as a recorded list of tensor operations.
+
+An update of small networks is some hundreds of short operations, and around each of
+them Python, TorchRL and autograd take longer than the operation itself. Which
+operations there are does not change from one batch to the next. So they are recorded
+once, by :func:`torch.fx.experimental.proxy_tensor.make_fx`, forward and backward, and
+repeated with the next batches: the same operations on the same numbers in the same
+order, hence the same bits, without a compiler.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torch.fx import GraphModule
+from torch.fx.experimental.proxy_tensor import make_fx
+from torchrl.objectives import LossModule
+
+log = logging.getLogger(__name__)
+
+WARM_UP = 100
+"""Updates before the recording, which takes as long as some hundreds of updates save:
+short runs do without."""
+
+
+class LossGradients:
+    """Losses of a batch; the gradients of their sum go where an optimizer looks.
+
+    Args:
+        loss_module: whose entries ``loss_*`` are summed.
+        autocast_dtype: of the matrix products. Default: that of the parameters.
+        record: repeat a recording from the 101st batch on, on a CPU. Python code in the
+            losses is not run again then: hooks, counters or prints in them stay silent.
+            A loss that decides by numbers cannot be recorded and runs as it is.
+    """
+
+    def __init__(
+        self,
+        loss_module: LossModule,
+        autocast_dtype: torch.dtype | None = None,
+        *,
+        record: bool = False,
+    ) -> None:
+        self.loss_module, self.autocast_dtype = loss_module, autocast_dtype
+        self.device = next(loss_module.parameters()).device
+        self.record = record and self.device.type == "cpu"
+        self._countdown = WARM_UP
+        self._recording: _Recording | None = None
+
+    def __call__(self, batch: TensorDictBase) -> TensorDictBase:
+        """Detached losses and metrics of a batch; adds to the parameters' ``grad``."""
+        if self._recording is not None and self._recording.fits(batch):
+            return self._recording(batch)
+        if self.record and self._recording is None:
+            self._countdown -= 1
+            if self._countdown < 0:
+                self.record = self._try_to_record(batch)
+        losses = self._losses(batch)
+        _total(losses).backward()
+        return losses.detach()
+
+    def _losses(self, batch: TensorDictBase) -> TensorDictBase:
+        enabled = self.autocast_dtype is not None
+        with torch.autocast(self.device.type, self.autocast_dtype, enabled=enabled):
+            losses: TensorDictBase = self.loss_module(batch)
+        return losses
+
+    def _try_to_record(self, batch: TensorDictBase) -> bool:
+        generator = torch.get_rng_state()
+        try:
+            self._recording = _Recording(self._losses, self.loss_module, batch)
+        except Exception as error:  # whatever a loss does that cannot be recorded
+            log.warning(
+                f"{type(self.loss_module).__name__} runs without a recording, slower: "
+                f"{type(error).__name__}: {str(error).splitlines()[0]}"
+            )
+        finally:
+            torch.set_rng_state(generator)
+        return self._recording is not None
+
+
+def _total(losses: TensorDictBase) -> Any:
+    return sum(value for key, value in losses.items() if key.startswith("loss_"))
+
+
+class _Recording:
+    """The operations of one update.
+
+    Args:
+        losses: of a batch, with their graph.
+        loss_module: its parameters, buffers and options are part of the recording.
+        batch: of the kind that is to come; a loss may write into it.
+    """
+
+    def __init__(
+        self, losses: Any, loss_module: LossModule, batch: TensorDictBase
+    ) -> None:
+        self.loss_module = loss_module
+        self.parameters = [
+            each for each in loss_module.parameters() if each.requires_grad
+        ]
+        self.keys: list[NestedKey] = list(batch.keys(True, True))
+        self.names: list[str] = []
+        self.written: list[NestedKey] = []
+        self.kind, self.options = self._kind(batch), _options(loss_module)
+        self.trained: list[nn.Parameter] = []
+
+        def update(*tensors: Tensor) -> list[Tensor]:
+            inputs = dict(zip(self.keys, tensors, strict=True))
+            own = TensorDict({}, batch.batch_size, device=batch.device)
+            for key, value in inputs.items():
+                own.set(key, value)
+            result = losses(own)
+            found = torch.autograd.grad(
+                _total(result), self.parameters, allow_unused=True
+            )
+            pairs = zip(self.parameters, found, strict=True)
+            given = [(each, value) for each, value in pairs if value is not None]
+            self.trained = [each for each, _ in given]
+            self.names = list(result.keys())
+            self.written = [
+                key for key, value in own.items(True, True)
+                if inputs.get(key) is not value
+            ]  # fmt: skip
+            return [
+                *(value.detach() for value in result.values()),
+                *(own.get(key) for key in self.written),
+                *(value for _, value in given),
+            ]
+
+        self.graph = _simplified(make_fx(update)(*self._tensors(batch)))
+
+    def fits(self, batch: TensorDictBase) -> bool:
+        """Whether batch and options are of the kind that was recorded."""
+        return (
+            self._kind(batch) == self.kind
+            and _options(self.loss_module) == self.options
+        )
+
+    @torch.no_grad()
+    def __call__(self, batch: TensorDictBase) -> TensorDictBase:
+        outputs = iter(self.graph(*self._tensors(batch)))
+        losses = TensorDict({name: next(outputs) for name in self.names}, [])
+        for key in self.written:
+            batch.set(key, next(outputs))
+        for parameter, gradient in zip(self.trained, outputs, strict=True):
+            grad = parameter.grad
+            parameter.grad = gradient if grad is None else grad + gradient
+        return losses
+
+    def _tensors(self, batch: TensorDictBase) -> list[Tensor]:
+        return [batch.get(key) for key in self.keys]
+
+    def _kind(self, batch: TensorDictBase) -> Any:
+        entries = {
+            key: (value.shape, value.dtype, value.requires_grad)
+            for key, value in batch.items(True, True)
+            if key in self.keys or key not in self.written
+        }
+        return batch.batch_size, entries
+
+
+def _options(loss_module: LossModule) -> dict[str, Any]:
+    """Numbers, words and flags of a loss: what Python may decide by."""
+    plain = (bool, int, float, str, type(None))
+    return {
+        name: value for name, value in vars(loss_module).items()
+        if isinstance(value, plain) and not name.startswith("_")
+    }  # fmt: skip
+
+
+def _simplified(graph: GraphModule) -> GraphModule:
+    """Leave out what has no effect without autograd, and what nobody reads."""
+    for node in graph.graph.nodes:
+        if node.target is torch.ops.aten.detach.default:
+            node.replace_all_uses_with(node.args[0])
+    graph.graph.eliminate_dead_code()
+    graph.recompile()
+    return graph
