@@ -82,10 +82,14 @@ class Run:
         found = sorted(self.folder.glob("checkpoint/*/checkpoint-*.torchrl"))
         return {each.parent.name: int(each.stem.split("-")[1]) for each in found}
 
+    def said(self) -> str:
+        """Return all that the run's processes have printed."""
+        return self.output.read_text() if self.output.exists() else ""
+
     def went_on(self) -> list[tuple[str, int]]:
         """Return phase and step of every checkpoint that was gone on from."""
-        text = self.output.read_text() if self.output.exists() else ""
-        found = re.findall(r"goes on from \S+/(\w+)/checkpoint-(\d+)", text)
+        pattern = r"goes on from \S+/(\w+)/checkpoint-(\d+)"
+        found = re.findall(pattern, self.said())
         return [(phase, int(step)) for phase, step in found]
 
 
@@ -94,16 +98,17 @@ def live(
 ) -> tuple[int, bool]:
     """Let a run live once; return its exit code, and whether the signal was sent.
 
-    The signal comes so many seconds after the run has begun to train.
+    The signal comes so many seconds after the process has got to work: SIGKILL after
+    its start, others after it has begun with updates.
     """
     before, times = run.newest(), len(run.went_on())
-    training = run.status["status"] != "done"
+    said = len(run.said())
     process, sent, code = run.start(**watching), False, None
-    begin = None
+    begin = None if signalled in EXIT_CODES else time.monotonic()
     while signalled is not None and code is None and not sent:
         time.sleep(0.002)
         code = warm_runs.ended(process, wait=False)
-        if begin is None and (not training or run.status.get("pid") == process):
+        if begin is None and re.search("goes on from|step 0 of", run.said()[said:]):
             begin = time.monotonic()
         if code is None and begin is not None and time.monotonic() > begin + seconds:
             os.kill(process, signalled)

@@ -53,6 +53,8 @@ def warm_up() -> None:
     """Import what the commands need; torch is left with one thread, for forks."""
     import torch
 
+    # A shell without job control has its background processes ignore Ctrl-C.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     torch.set_num_threads(1)
     for name in (*(f"torchrl_osr.commands.{each}" for each in COMMANDS), *LATER):
         import_module(name)
