@@ -663,8 +663,10 @@ class Watch:
 OWN_TEMPORARY = Path(gettempdir()) / f"torchrl-osr-own-{os.getpid()}"
 """What libraries unpack into, which is this process's own."""
 
-LIBRARIES = (sys.prefix, sys.base_prefix, "/proc", "/sys", "/dev/null",
-             str(OWN_TEMPORARY), str(Path(__file__).resolve().parents[1]), "/usr", "/lib")  # fmt: skip
+LIBRARIES = (
+    *(sys.prefix, sys.base_prefix, "/proc", "/sys", "/dev/null", "/usr", "/lib"),
+    *(str(OWN_TEMPORARY), str(Path(__file__).resolve().parents[1])),
+)
 
 
 def outcome(subject: Subject, folder: Path, file: Path, right: Any) -> tuple[str, str]:

@@ -14,35 +14,49 @@ NUMBERS = ("returns.json", "inverse_dynamics.json", "robustness-torque.json")
 
 
 def file_names(folder: Path) -> list[str]:
-    """Return what is compared of a run: its final checkpoints and its numbers."""
-    last = [
-        max(each.glob("checkpoint-*.torchrl"))
-        for each in sorted((folder / "checkpoint").iterdir())
-    ]
-    names = [str(each.relative_to(folder)) for each in last]
+    """Return what is compared of a run: checkpoints, numbers and rows of the log."""
+    found = [*folder.glob("checkpoint/*/*.torchrl"), *folder.glob("csv/*/*/*.csv")]
+    names = [path.relative_to(folder).as_posix() for path in sorted(found)]
     return names + [name for name in NUMBERS if (folder / name).exists()]
 
 
-def differences(one: Path, other: Path) -> list[str]:
-    """Return the names of files and components in which two runs differ."""
-    different = []
-    for name in file_names(one):
-        files = one / name, other / name
-        if not files[1].exists():
-            different.append(f"{name}: not there")
-        elif name.endswith(".json"):
-            mine, theirs = (json.loads(each.read_text()) for each in files)
-            # Checksums of whole archives: those have the time of writing in them.
-            mine.pop("checkpoints", None), theirs.pop("checkpoints", None)
-            different += [name] * (mine != theirs)
-        else:
-            mine, theirs = (states(each) for each in files)
-            different += [
-                f"{name}: {key}"
-                for key in sorted(mine.keys() | theirs.keys())
-                if not same(mine.get(key), theirs.get(key))
-            ]
+def differences(one: Path, other: Path, *, same_means: bool = False) -> list[str]:
+    """Return the names of files and components in which two runs differ.
+
+    Args:
+        one: folder of a run.
+        other: folder of another.
+
+    Keyword Args:
+        same_means: compare the values of the log, too, not only their steps. After an
+            interrupt the first means are over the rest of their interval.
+    """
+    names = file_names(one)
+    different = [
+        f"{name}: in one of them only" for name in set(names) ^ set(file_names(other))
+    ]
+    for name in [each for each in names if (other / each).exists()]:
+        mine, theirs = (read(folder / name, same_means) for folder in (one, other))
+        different += [
+            f"{name}: {key}"
+            for key in sorted(mine.keys() | theirs.keys())
+            if not same(mine.get(key), theirs.get(key))
+        ]
     return different
+
+
+def read(path: Path, same_means: bool) -> dict[str, Any]:
+    """Return what is compared of a file, by key."""
+    if path.suffix == ".torchrl":
+        return states(path)
+    if path.suffix == ".csv":
+        rows = path.read_text().splitlines()
+        return {"rows": rows if same_means else [row.split(",")[0] for row in rows]}
+    content: dict[str, Any] = json.loads(path.read_text())
+    # Checksums of whole archives: those have the time of writing in them.
+    content.pop("checkpoints", None)
+    content.pop("checksum", None)
+    return content
 
 
 def states(path: Path) -> dict[str, Any]:

@@ -7,6 +7,7 @@ values those of the two presets.
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import re
 from collections.abc import Iterator
@@ -82,7 +83,7 @@ def meanings(cfg: DictConfig) -> dict[str, str]:
 def meanings_of_groups(config: type, prefix: str = "") -> Iterator[tuple[str, str]]:
     """The meaning of every key, dotted, of the groups in a dataclass."""
     for name, field in config.__dataclass_fields__.items():
-        if inspect.isclass(field.default_factory):
+        if dataclasses.is_dataclass(field.default_factory):
             group = field.default_factory
             for key, text in described(group).items():
                 yield f"{prefix}{name}.{key}", text

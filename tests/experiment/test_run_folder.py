@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import platform
+import signal
 import subprocess
 import sys
 
@@ -13,50 +15,93 @@ from omegaconf import OmegaConf
 from torchrl_osr.experiment import run_folder
 from torchrl_osr.trainers import Interrupted
 
-CONFIG = {"seed": 0, "resume": None, "trainer": {"steps": 5, "progress": True}}
+CONFIG = {
+    "seed": 0,
+    "resume": None,
+    "force": False,
+    "logger": {"kind": "csv"},
+    "trainer": {"steps": 5, "progress": True},
+}
+JOB = OmegaConf.create({"overrides": {"task": ["seed=0"]}})
 
 
 def configured(**changes):
     return OmegaConf.merge(OmegaConf.create(CONFIG), changes)
 
 
+def claim(folder, **changes):
+    folder.mkdir(parents=True, exist_ok=True)
+    run_folder.claim(folder, configured(**changes), JOB)
+
+
+def resumed(folder, *overrides):
+    composed = configured(**OmegaConf.from_dotlist(list(overrides)))
+    return run_folder.resumed(folder, composed, [f"resume={folder}", *overrides])
+
+
 def test_configuration_is_written_and_read_back(tmp_path):
-    run_folder.claim(tmp_path / "new" / "run", configured())
-    overrides = ["resume=x", "trust=[mine]"]
-    assert run_folder.saved_config(tmp_path / "new" / "run", overrides) == CONFIG
+    claim(tmp_path / "run", resume="x", force=True)
+    assert OmegaConf.load(tmp_path / "run" / "config.yaml") == CONFIG
+    assert resumed(tmp_path / "run") == CONFIG
+    job = OmegaConf.load(tmp_path / "run" / ".hydra" / "hydra.yaml")
+    assert job == {"hydra": JOB}
 
 
-def test_same_configuration_may_continue(tmp_path):
-    run_folder.claim(tmp_path, configured())
-    run_folder.claim(tmp_path, configured())
-    # These change no number.
-    run_folder.claim(tmp_path, configured(resume="x", trainer={"progress": False}))
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"trainer": {"progress": False}}, {"trainer": {"steps": 6}},
+     {"logger": {"kind": "wandb"}}],
+)  # fmt: skip
+def test_what_changes_no_update_may_differ(tmp_path, changes):
+    claim(tmp_path)
+    claim(tmp_path, **changes)
+    claim(tmp_path, **changes, resume="x")
+    assert OmegaConf.load(tmp_path / "config.yaml") == configured(**changes)
 
 
-def test_another_configuration_is_refused_by_key(tmp_path):
-    run_folder.claim(tmp_path, configured())
-    with pytest.raises(ValueError, match=r"trainer\.steps: 5 there, 6 now") as error:
-        run_folder.claim(tmp_path, configured(trainer={"steps": 6}))
-    assert "seed" not in str(error.value)
-    assert run_folder.saved_config(tmp_path, []) == CONFIG
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"trainer": {"steps": 4}}, r"\(trainer\.steps: 5 there, 4 now\)"),
+        ({"seed": 1}, r"\(seed: 0 there, 1 now\)"),
+        ({"optim": {"tau": 0.1}}, r"\(optim\.tau: 'nothing' there, 0\.1 now\)"),
+    ],
+)
+def test_other_settings_are_refused_by_key_unless_forced(
+    tmp_path, caplog, changes, named
+):
+    claim(tmp_path)
+    changes = changes | {"logger": {"kind": "wandb"}}
+    with pytest.raises(ValueError, match=f"holds a run.*{named}.*force=true"):
+        claim(tmp_path, **changes)
+    assert OmegaConf.load(tmp_path / "config.yaml") == CONFIG
+    claim(tmp_path, **changes, force=True)
+    assert "by force=true" in caplog.text
+    assert OmegaConf.load(tmp_path / "config.yaml") == configured(**changes)
 
 
-def test_resuming_takes_no_other_override(tmp_path):
-    run_folder.claim(tmp_path, configured())
-    with pytest.raises(ValueError, match="leave out seed=1"):
-        run_folder.saved_config(tmp_path, ["resume=x", "seed=1"])
+def test_overrides_replace_settings_of_the_run(tmp_path):
+    claim(tmp_path, seed=3)
+    config = resumed(tmp_path, "trainer.steps=7")
+    assert (config.seed, config.trainer.steps) == (3, 7)
+
+
+def test_overrides_that_are_no_settings_are_refused(tmp_path):
+    claim(tmp_path)
+    with pytest.raises(ValueError, match="preset=paper is none of its settings"):
+        resumed(tmp_path, "preset=paper")
 
 
 def test_resuming_needs_a_run(tmp_path):
     with pytest.raises(FileNotFoundError, match="folder of a run"):
-        run_folder.saved_config(tmp_path, ["resume=x"])
+        resumed(tmp_path)
 
 
 @pytest.mark.parametrize("content", ["- a list", "a: &a [1]\nb: *a", "a: [", "\x00"])
 def test_damaged_configuration_is_named(tmp_path, content):
     (tmp_path / "config.yaml").write_text(content)
     with pytest.raises(ValueError, match=r"^config\.yaml "):
-        run_folder.saved_config(tmp_path, ["resume=x"])
+        resumed(tmp_path)
 
 
 def read_status(folder) -> dict:
@@ -83,25 +128,96 @@ HOLDER = """
 import sys
 from pathlib import Path
 from torchrl_osr.experiment import run_folder
-with run_folder.status(Path(sys.argv[1])):
+folder = Path(sys.argv[1])
+with run_folder.lock(folder), run_folder.status(folder):
     print("training", flush=True)
     sys.stdin.read()
 """
 
 
-def test_a_second_process_in_the_folder_is_told_who_is_there(tmp_path):
+def test_a_second_process_in_the_folder_is_told_who_is_there(tmp_path, caplog):
     arguments = [sys.executable, "-c", HOLDER, str(tmp_path)]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with subprocess.Popen(arguments, **pipes) as holder:
         assert holder.stdout.readline() == "training\n"
         message = f"process {holder.pid} on .* is training in .*choose another folder"
-        with pytest.raises(ValueError, match=message), run_folder.status(tmp_path):
+        with pytest.raises(ValueError, match=message), run_folder.lock(tmp_path):
             raise AssertionError("both would write the same files")
-        assert read_status(tmp_path)["pid"] == holder.pid, "left as it was"
+        said = read_status(tmp_path)
+        assert said["pid"] == holder.pid, "left as it was"
+        process = f"process {holder.pid} on {platform.node()}"
+        at_work = said | {"reason": f"{process} is at work"}
+        assert run_folder.read_status(tmp_path) == at_work
         holder.kill()
     # A lock does not outlive its process.
-    with run_folder.status(tmp_path):
+    killed = said | {"status": "killed", "reason": f"{process} is gone"}
+    assert run_folder.read_status(tmp_path) == killed
+    with run_folder.lock(tmp_path), run_folder.status(tmp_path):
         assert read_status(tmp_path)["pid"] == os.getpid()
+    assert f"was begun by {process} and did not end" in caplog.text
+
+
+def test_process_of_another_machine_is_not_guessed_about(tmp_path):
+    said = {"status": "running", "pid": os.getpid(), "host": "elsewhere"}
+    run_folder.write_json(tmp_path / "status.json", said)
+    found = run_folder.read_status(tmp_path)
+    assert found["status"] == "running"
+    here = platform.node()
+    assert found["reason"] == (
+        f"process {os.getpid()} on elsewhere, of which {here} cannot see more"
+    )
+    assert [path.name for path in tmp_path.iterdir()] == ["status.json"]
+
+
+def test_a_full_disk_is_said_to_leave_the_status(tmp_path, monkeypatch, caplog):
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    def fail():
+        monkeypatch.setattr(os, "fsync", full)
+        raise ValueError("why")
+
+    with pytest.raises(ValueError, match="why"), run_folder.status(tmp_path):
+        fail()
+    assert read_status(tmp_path)["status"] == "running"
+    assert "No space left" in caplog.text
+    assert "still says that the run is running" in caplog.text
+
+
+@pytest.mark.parametrize("made_anew", [False, True])
+def test_folder_that_is_gone_at_the_end_is_no_success(tmp_path, made_anew):
+    folder, message = tmp_path / "run", "removed or renamed while the run was going on"
+    folder.mkdir()
+    other = {"status": "running", "pid": 1, "host": "elsewhere"}
+
+    def move():
+        folder.rename(tmp_path / "elsewhere")
+        if made_anew:
+            folder.mkdir()
+            run_folder.write_json(folder / "status.json", other)
+
+    with pytest.raises(FileNotFoundError, match=message), run_folder.status(folder):
+        move()
+    if made_anew:
+        assert read_status(folder) == other, "another run's"
+    else:
+        assert not folder.exists()
+
+
+@pytest.mark.parametrize(("name", "code"), [("TERM", 75), ("HUP", 75), ("INT", 130)])
+def test_signal_outside_of_the_training_ends_the_run_in_order(
+    tmp_path, caplog, name, code
+):
+    def stop():
+        os.kill(os.getpid(), signal.Signals[f"SIG{name}"])
+        pytest.fail("not reached")
+
+    with pytest.raises(Interrupted) as raised, run_folder.status(tmp_path):
+        stop()
+    assert raised.value.code == code
+    assert read_status(tmp_path)["status"] == "preempted"
+    assert f"stopped by SIG{name}" in read_status(tmp_path)["reason"]
+    assert f"torchrl-osr train resume={tmp_path}" in caplog.text
 
 
 def test_interrupted_run_is_preempted_and_says_how_to_continue(tmp_path, caplog):

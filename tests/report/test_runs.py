@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import os
+import platform
 import runpy
 from pathlib import Path
 from types import SimpleNamespace
@@ -51,6 +52,17 @@ def test_without_a_finished_run_there_is_no_report(tmp_path):
     fakes.write_run(tmp_path / "a", CURVE, status="running")
     with pytest.raises(ValueError, match=r"no finished run(.|\n)*status is running"):
         read_runs([tmp_path])
+
+
+def test_a_run_whose_process_is_gone_is_left_out_as_killed(tmp_path):
+    folder = fakes.write_run(tmp_path / "bad", CURVE)
+    said = {"status": "running", "pid": 123, "host": platform.node()}
+    fakes.write_json(folder / "status.json", said)
+    fakes.write_run(tmp_path / "good", CURVE)
+    ((_, why),) = read_runs([tmp_path]).left_out
+    gone = f"process 123 on {platform.node()} is gone"
+    assert why == f"not finished, its status is killed: {gone}"
+    assert not (folder / ".lock").exists(), "to look leaves nothing behind"
 
 
 def break_returns(folder: Path, **entries: object) -> None:

@@ -6,6 +6,7 @@ import importlib.util
 import json
 import math
 import resource
+import shutil
 import zipfile
 from pathlib import Path
 
@@ -90,6 +91,68 @@ def test_finished_run_returns_at_once(make, undisturbed):
     again = make(undisturbed.checkpoints.folder, evaluate=pytest.fail)
     again.train()
     assert again.history == undisturbed.history
+
+
+@pytest.mark.parametrize("step", [7, 20])
+def test_longer_run_goes_on_as_one_that_was_so_from_the_start(
+    tmp_path, make, runs, undisturbed, step
+):
+    """Killed before, or finished; other intervals change no update."""
+    short = {"total_steps": 10, "eval_interval": 2, "checkpoint_interval": 3}
+    if step < 10:
+        stop_at(make(tmp_path, **short), step)
+    else:
+        make(tmp_path, **short).train()
+    longer = make(tmp_path)
+    longer.train()
+    networks = longer.loss_module.state_dict(), undisturbed.loss_module.state_dict()
+    runs.assert_same_bits(*(each.values() for each in networks))
+    assert longer.history[-1]["step"] == STEPS
+
+
+def test_fewer_steps_than_were_done_are_refused(make, undisturbed):
+    folder = undisturbed.checkpoints.folder
+    with pytest.raises(ValueError, match="is at step 20, beyond the 19 steps"):
+        make(folder, total_steps=19).train()
+    assert undisturbed.checkpoints.latest().name == "checkpoint-000000000020.torchrl"
+
+
+def test_shorter_run_is_evaluated_at_its_end(tmp_path, make):
+    stop_at(make(tmp_path, checkpoint_interval=7), 15)
+    shorter = make(tmp_path, total_steps=14, evaluate=lambda: {"score": 9.0})
+    shorter.train()
+    assert shorter.history[-1] == {"step": 14, "score": 9.0}
+    again = make(tmp_path, total_steps=14, evaluate=pytest.fail)
+    again.train()
+    assert again.history == shorter.history
+
+
+@pytest.mark.parametrize("logged", [False, True])
+def test_folder_that_is_removed_is_not_made_anew(tmp_path, make, runs, logged):
+    folder = tmp_path / "run"
+    trainer = make(folder, loggers=[runs.log_of([])] if logged else [])
+
+    def remove(batch):
+        if trainer.step == 7:
+            shutil.rmtree(folder)
+        return batch
+
+    trainer.register_op("process_optim_batch", remove)
+    message = f"^{folder} was removed or renamed while the run was going on"
+    with pytest.raises(FileNotFoundError, match=message):
+        trainer.train()
+    assert trainer.step < STEPS
+    assert not folder.exists()
+
+
+def test_what_a_kill_left_of_removing_an_old_checkpoint_goes(
+    tmp_path, make, undisturbed
+):
+    wanted = {path.name for path in undisturbed.checkpoints.folder.iterdir()}
+    oldest = undisturbed.checkpoints.folder / "checkpoint-000000000010.torchrl"
+    shutil.copy(undisturbed.checkpoints.latest(), oldest)
+    make(undisturbed.checkpoints.folder).train()
+    assert {path.name for path in undisturbed.checkpoints.folder.iterdir()} == wanted
 
 
 @pytest.mark.parametrize("kwargs", [{"seed": 1}, {"target_net_updater": None}])

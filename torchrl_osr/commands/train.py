@@ -4,7 +4,7 @@
     torchrl-osr train env.id=Pendulum-v1 data=file data.path=log.npz
     torchrl-osr train env=walker2d data=medium-expert seed=3 preset=paper
     torchrl-osr train -m env=hopper,walker2d seed=0,1,2 hydra/launcher=pool
-    torchrl-osr train resume=outputs/hopper-medium-replay/osr-seed0-...
+    torchrl-osr train resume=<folder of a run> trainer.steps=40_000
 
 Data of the built-in tasks are rolled out on this machine at the first run and cached;
 docs/any_environment.md is about all others. A run leaves
@@ -77,19 +77,20 @@ def main() -> None:
 def train(cfg: DictConfig) -> float:
     """Do or continue one run; return its last score or return, for a sweeper."""
     job = HydraConfig.get()
-    folder = Path(job.runtime.output_dir)
+    folder = Path(cfg.resume or job.runtime.output_dir).absolute()
     trust = list(cfg.trust)  # by the command line, not by a run's folder
     fresh = cfg.resume is None
     if fresh:
         trust += module_of(cfg.env.id)
     else:
-        cfg = run_folder.saved_config(folder, job.overrides.task)
+        cfg = run_folder.resumed(folder, cfg, job.overrides.task)
     check_run(cfg, trust)
     if fresh:
         read_environment(cfg)
-    run_folder.claim(folder, cfg)
-    with run_folder.status(folder):
-        return run(cfg, folder)
+    with run_folder.lock(folder):
+        run_folder.claim(folder, cfg, job)
+        with run_folder.status(folder):
+            return run(cfg, folder)
 
 
 def run(cfg: DictConfig, folder: Path) -> float:
@@ -127,7 +128,11 @@ def run(cfg: DictConfig, folder: Path) -> float:
     new_trainer = partial(
         OfflineTrainer,
         replay_buffer=data.buffer,
-        components={"perturbation": perturbation, "observation_norm": data.norm},
+        components={
+            "perturbation": perturbation,
+            "observation_norm": data.norm,
+            "settings": run_folder.Settings(cfg),
+        },
         loggers=loggers,
         log_interval=cfg.trainer.log_interval,
         checkpoint_interval=cfg.trainer.checkpoint_interval,
@@ -139,6 +144,8 @@ def run(cfg: DictConfig, folder: Path) -> float:
         compile=cfg.trainer.compile,
         cudagraph=cfg.trainer.cudagraph,
     )
+    # At each log entry: in a folder that was removed nothing would be kept.
+    still_ours = partial(run_folder.check_ours, folder)
     adam = partial(torch.optim.Adam, fused=True, capturable=cfg.trainer.cudagraph)
 
     # First phase: which action leads from the perturbed state to the next state?
@@ -155,6 +162,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
             eval_interval=cfg.trainer.inverse_dynamics_steps,
             description="inverse_dynamics",
         )
+        trainer.register_op("post_steps", still_ours)
         if cfg.inverse_dynamics.shuffle_next:
             trainer.register_op("process_optim_batch", shuffle_next)
         trainer.train()
@@ -187,6 +195,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
             description="policy",
             value_limits={"pred_value": limit, "target_value": limit},
         )
+        trainer.register_op("post_steps", still_ours)
         if cfg.perturbation.adversary is not None:
             adversary = instantiate(cfg.perturbation.adversary)
             trainer.register_op("process_optim_batch", partial(adversary, loss))

@@ -1,4 +1,4 @@
-"""The folder of a run: its configuration and its status."""
+"""The folder of a run: its lock, its settings and its status."""
 
 from __future__ import annotations
 
@@ -8,17 +8,21 @@ import platform
 import re
 import shlex
 import subprocess
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock, Timeout
-from omegaconf import DictConfig, OmegaConf
+from hydra.conf import HydraConf
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import Container, DictConfig, OmegaConf
 
 from torchrl_osr._files import read_json, write_atomically, write_json
 from torchrl_osr.experiment.run_config import flatten, read_config
 from torchrl_osr.trainers import Interrupted
+from torchrl_osr.trainers.interruption import signals_noted, signals_raised
 
 log = logging.getLogger(__name__)
 
@@ -27,63 +31,209 @@ CONFIG, STATUS, LOCK = "config.yaml", "status.json", ".lock"
 PACKAGES = ("torchrl-osr", "torch", "torchrl", "tensordict", "gymnasium", "mujoco")
 """Packages whose versions decide a run's numbers."""
 
-FREE_KEYS = ("resume", "trainer.progress", "trust")
-"""Keys that may differ when a run is continued: no number depends on them."""
+MAY_DIFFER = (
+    "data.download",
+    "logger.kind",
+    "logger.mode",
+    "logger.project",
+    "trainer.checkpoint_interval",
+    "trainer.checkpoints_kept",
+    "trainer.eval_interval",
+    "trainer.log_interval",
+    "trainer.nonfinite",
+    "trainer.num_threads",
+    "trainer.progress",
+    "trainer.record",
+    "trainer.steps",
+)
+"""Settings with which a run may go on though it began with others: more
+``trainer.steps``, and what decides where and how often something is written."""
 
 
-def claim(folder: Path, config: DictConfig) -> None:
-    """Write the run's configuration into its folder, or compare it with the one there.
+class Settings:
+    """Settings of a run, as a part of its checkpoints.
 
-    Raises:
-        ValueError: if the folder, which is made if need be, holds a run of another
-            configuration, naming what differs.
+    Args:
+        config: of the run. Its ``force`` lets it go on where the settings were others.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / CONFIG
-    if not path.exists():
-        write_atomically(path, OmegaConf.to_yaml(config, resolve=True))
-        return
-    here = flatten(OmegaConf.to_container(config, resolve=True))
-    there = flatten(OmegaConf.to_container(read_config(path)))
-    absent = "nothing"
-    differences = [
-        f"{key}: {there.get(key, absent)!r} there, {here.get(key, absent)!r} now"
-        for key in sorted(here.keys() | there.keys())
-        if here.get(key, absent) != there.get(key, absent) and key not in FREE_KEYS
-    ]
-    if differences:
-        raise ValueError(
-            f"{folder} holds a run of another configuration: "
-            f"{'; '.join(differences)}. Continue that run with resume={folder} and "
-            "nothing else, or choose another folder."
+
+    def __init__(self, config: Any) -> None:
+        self.values = flatten(OmegaConf.to_container(config, resolve=True))
+        # What is said of one start alone, not of the run.
+        for key in ("resume", "trust"):
+            self.values.pop(key, None)
+        self.force = self.values.pop("force", False)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the settings."""
+        return {"settings": self.values}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Raise a ValueError unless a run of the saved settings may go on with these.
+
+        What differs is named key by key, :data:`MAY_DIFFER` aside.
+        """
+        there, now = state_dict["settings"], self.values
+        fewer_steps = now.get("trainer.steps", 0) < there.get("trainer.steps", 0)
+        refused = "; ".join(
+            f"{key}: {there.get(key, 'nothing')!r} there, "
+            f"{now.get(key, 'nothing')!r} now"
+            for key in sorted(now.keys() | there.keys())
+            if now.get(key, ...) != there.get(key, ...)
+            and (key not in MAY_DIFFER or (key == "trainer.steps" and fewer_steps))
         )
+        if refused and not self.force:
+            raise ValueError(
+                f"it was made with other settings ({refused}). Leave these as they "
+                "were, choose another folder, or go on all the same with force=true."
+            )
+        if refused:
+            log.warning(
+                f"Goes on with other settings, by force=true: {refused}. What the "
+                "checkpoint restores stays as it was: networks, learning rates, "
+                "discount, weights of the loss's terms, width of the noise."
+            )
 
 
-def saved_config(folder: Path | str, overrides: Sequence[str]) -> DictConfig:
+def resumed(folder: Path, composed: DictConfig, overrides: Sequence[str]) -> DictConfig:
     """Configuration of a run that shall be continued.
 
     Args:
         folder: of the run.
-        overrides: of the command line; only ``resume=`` and ``trust=`` may be among
-            them.
+        composed: what Hydra has made of the command line.
+        overrides: of the command line. They replace settings of the run;
+            :func:`claim` says which of them may differ.
 
     Raises:
         FileNotFoundError: if there is no run in ``folder``.
-        ValueError: if the command line asks for more than to resume.
+        ValueError: if an override is no setting of the run.
     """
-    free = ("resume=", "trust=")
-    more = [override for override in overrides if not override.startswith(free)]
-    if more:
-        raise ValueError(
-            f"resume={folder} continues that run as it is; leave out {' '.join(more)}, "
-            "or start a new run without resume=."
-        )
-    path = Path(folder) / CONFIG
+    path = folder / CONFIG
     if not path.exists():
         raise FileNotFoundError(
             f"resume={folder}: there is no {CONFIG} in it; give the folder of a run."
         )
-    return read_config(path)
+    there = read_config(path)
+    for override in OverridesParser.create().parse_overrides(list(overrides)):
+        key, absent = override.key_or_group, object()
+        value = OmegaConf.select(composed, key, default=absent)
+        if absent in (value, OmegaConf.select(there, key, default=absent)):
+            raise ValueError(
+                f"resume={folder} continues that run, and {override.input_line} is "
+                "none of its settings: leave it out."
+            )
+        if isinstance(value, Container):
+            value = OmegaConf.to_container(value, resolve=True)
+        OmegaConf.update(there, key, value, merge=False)
+    return there
+
+
+def claim(folder: Path, config: DictConfig, job: HydraConf) -> None:
+    """Write a run's configuration into its folder, which is to be locked.
+
+    Args:
+        folder: of the run.
+        config: its configuration, without interpolations when it is read back.
+        job: Hydra's own part, with the overrides and the options of the groups; that of
+            the beginning stays.
+
+    Raises:
+        ValueError: if the folder holds a run of other settings, naming them.
+    """
+    path, hydra = folder / CONFIG, folder / ".hydra" / "hydra.yaml"
+    if path.exists():
+        try:
+            Settings(config).load_state_dict(Settings(read_config(path)).state_dict())
+        except ValueError as error:
+            raise ValueError(f"{folder} holds a run, and {error}") from error
+    else:
+        hydra.parent.mkdir(exist_ok=True)
+        write_atomically(hydra, OmegaConf.to_yaml({"hydra": job}))
+    # Last: this file makes the folder that of a run.
+    saved = OmegaConf.merge(config, {"resume": None, "force": False, "trust": []})
+    write_atomically(path, OmegaConf.to_yaml(saved, resolve=True))
+
+
+@contextmanager
+def lock(folder: Path) -> Iterator[None]:
+    """Keep other processes out of a run's folder, which is made if need be.
+
+    The lock goes with the process, however it ends.
+
+    Raises:
+        ValueError: if another process trains in the folder, naming it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        # Who looks whether the run is at work has the lock for an instant.
+        held = FileLock(folder / LOCK).acquire(timeout=1)
+    except Timeout as error:
+        process = "another process"  # that has just begun
+        with suppress(OSError, ValueError):
+            process = _process(read_json(folder / STATUS))
+        raise ValueError(
+            f"{process} is training in {folder}: wait for its end or stop it, or "
+            "choose another folder."
+        ) from error
+    with held:
+        yield
+
+
+def _running() -> dict[str, Any]:
+    return {"status": "running", "pid": os.getpid(), "host": platform.node()}
+
+
+def _process(said: Mapping[str, Any]) -> str:
+    return f"process {said.get('pid')} on {said.get('host')}"
+
+
+def read_status(folder: Path) -> dict[str, Any]:
+    """What ``status.json`` says, unless it says ``running`` and the process is gone.
+
+    Returns:
+        The file's content. Of a run that is not at work any more the status is
+        ``killed``. A process on another machine that does not hold the lock may be
+        gone, or the file system has no locks: ``running`` stays, and the ``reason``
+        says so.
+
+    Raises:
+        OSError: if the file cannot be read.
+        ValueError: if it is damaged.
+    """
+    said = read_json(folder / STATUS)
+    if said.get("status") != "running" or "host" not in said:
+        return said
+    process, free = _process(said), True
+    try:
+        if (folder / LOCK).exists():  # not in a copy; looking leaves no file behind
+            FileLock(folder / LOCK).acquire(timeout=0).lock.release()
+    except Timeout:
+        return said | {"reason": f"{process} is at work"}
+    except OSError:
+        free = False
+    if free and said["host"] == platform.node():
+        return said | {"status": "killed", "reason": f"{process} is gone"}
+    return said | {"reason": f"{process}, of which {platform.node()} cannot see more"}
+
+
+def check_ours(folder: Path) -> None:
+    """Raise unless a run's folder is there, and this process's.
+
+    Raises:
+        FileNotFoundError: if it was removed or renamed since :func:`status` began.
+    """
+    if not _is_ours(folder):
+        raise FileNotFoundError(
+            f"{folder} was removed or renamed while the run was going on. Start the "
+            "run again in a folder that stays."
+        )
+
+
+def _is_ours(folder: Path) -> bool:
+    try:
+        return read_json(folder / STATUS) == _running()
+    except (OSError, ValueError):
+        return False
 
 
 @contextmanager
@@ -91,41 +241,47 @@ def status(folder: Path) -> Iterator[None]:
     """Keep ``status.json`` true: running, then done, preempted, or failed and why.
 
     A run that a signal has stopped is ``preempted``; the command that continues it is
-    logged. One process at a time: the lock goes with the process, however it ends.
-
-    Raises:
-        ValueError: if another process trains in the folder, naming it.
+    logged. The folder is to be locked, see :func:`lock`.
     """
-    try:
-        lock = FileLock(folder / LOCK).acquire(timeout=0)
-    except Timeout as error:
-        there = read_json(folder / STATUS)
-        raise ValueError(
-            f"process {there.get('pid')} on {there.get('host')} is training in "
-            f"{folder}: wait for its end or stop it, or choose another folder."
-        ) from error
-    with lock, _status(folder):
-        yield
-
-
-@contextmanager
-def _status(folder: Path) -> Iterator[None]:
-    running = {"status": "running", "pid": os.getpid(), "host": platform.node()}
-    write_json(folder / STATUS, running)
-    try:
-        yield
-    except Interrupted as error:
-        write_json(folder / STATUS, {"status": "preempted", "reason": error.reason})
-        log.warning(_how_to_continue(folder))
-        raise
-    except BaseException as error:
-        if isinstance(error, KeyboardInterrupt):
+    with signals_raised():
+        _say_if_killed(folder)
+        write_json(folder / STATUS, _running())
+        try:
+            yield
+            check_ours(folder)
+            with signals_noted():
+                write_json(folder / STATUS, {"status": "done"})
+        except Interrupted as error:
+            _write_end(folder, {"status": "preempted", "reason": error.reason})
             log.warning(_how_to_continue(folder))
-        reason = f"{type(error).__name__}: {error}"
-        with suppress(OSError):  # on a full disk the error itself says more
-            write_json(folder / STATUS, {"status": "failed", "error": reason})
-        raise
-    write_json(folder / STATUS, {"status": "done"})
+            raise
+        except BaseException as error:
+            reason = f"{type(error).__name__}: {error}"
+            _write_end(folder, {"status": "failed", "error": reason})
+            raise
+
+
+def _say_if_killed(folder: Path) -> None:
+    """Warn of a process that has left the folder without a word."""
+    with suppress(OSError, ValueError):
+        said = read_json(folder / STATUS)
+        if said.get("status") == "running":
+            log.warning(
+                f"This run was begun by {_process(said)} and did not end. The lock is "
+                "free: that process is gone, or on another machine to which this file "
+                "system does not pass on locks."
+            )
+
+
+def _write_end(folder: Path, end: dict[str, Any]) -> None:
+    """Write how a run has ended badly, or warn that this cannot be written."""
+    if not _is_ours(folder):
+        return
+    try:
+        with signals_noted():
+            write_json(folder / STATUS, end)
+    except OSError as error:
+        log.warning(f"{error}: the file still says that the run is running.")
 
 
 def _how_to_continue(folder: Path) -> str:

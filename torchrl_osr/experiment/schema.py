@@ -260,7 +260,8 @@ class TrainConfig:
     Attributes:
         seed: random seed of networks, sampling and noise.
         num_random: value of ``loss.num_random`` for the losses with CQL's term.
-        resume: folder of a killed run to continue.
+        resume: folder of a run to continue, or to extend with more ``trainer.steps``.
+        force: continue although settings differ from those that the run was made with.
         trust: modules of your own, whose losses, networks and environments may be
             named, see docs/extend.md.
     """
@@ -279,6 +280,7 @@ class TrainConfig:
     seed: int = MISSING
     num_random: int = MISSING
     resume: str | None = None
+    force: bool = False
     trust: list[str] = field(default_factory=list)
 
 
@@ -397,8 +399,7 @@ def register() -> None:
     ``train_schema``, ``check_data_schema``, ``collect_schema``, and in the group
     ``schema`` one for each class of :mod:`torchrl_osr.objectives`;
     ``environment_name``, the short name of a task; ``run_dir``, by which
-    ``resume=folder`` becomes the run's folder; ``hydra_dir``, by which a continued run
-    keeps what Hydra wrote when it began; and ``job_dir``, see :func:`job_folder`.
+    ``resume=folder`` becomes the run's folder; and ``job_dir``, see :func:`job_folder`.
     """
     store = ConfigStore.instance()
     store.store(name="train_schema", node=TrainConfig)
@@ -410,7 +411,6 @@ def register() -> None:
     resolvers: dict[str, Callable[..., Any]] = {
         "environment_name": _environment_name,
         "run_dir": lambda resume, fresh: resume or fresh,
-        "hydra_dir": lambda resume: None if resume else ".hydra",
         "job_dir": job_folder,
     }
     for name, resolver in resolvers.items():

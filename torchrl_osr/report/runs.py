@@ -21,7 +21,7 @@ import pandas as pd
 from torchrl_osr._files import MAX_JSON_BYTES, parse_json, read_json, write_atomically
 from torchrl_osr.data import ReferenceReturns, reference_returns
 from torchrl_osr.experiment.run_config import flatten, read_yaml
-from torchrl_osr.experiment.run_folder import CONFIG, STATUS
+from torchrl_osr.experiment.run_folder import CONFIG, read_status
 
 QUALITY = "data.quality"
 """Setting that names the quality of the data set."""
@@ -175,7 +175,7 @@ def read_record(folder: Path) -> dict[str, Any]:
         ValueError: if a file is damaged, or the run is not finished.
     """
     config = read_yaml(folder / CONFIG)
-    status = read_json(folder / STATUS)
+    status = read_status(folder)
     if status["status"] != "done":
         why = "".join(
             f": {status[key]}" for key in ("error", "reason") if key in status

@@ -1,14 +1,16 @@
 """Checkpoints that are whole, and that cannot run code when loaded.
 
-They are :mod:`torchrl.checkpoint` archives: one ZIP file each, written under another
-name and renamed, every member with a checksum. Two things are added: a payload that is
-only ever read with ``weights_only=True`` (TorchRL 0.14.1 unpickles what it finds beside
-a memory-mapped tensordict), and a way back from a damaged newest file.
+They are :mod:`torchrl.checkpoint` archives: one ZIP file each, every member with a
+checksum. Three things are added: a payload that is only ever read with
+``weights_only=True`` (TorchRL 0.14.1 unpickles what it finds beside a memory-mapped
+tensordict), files that are synced before they are renamed and never away in between
+(TorchRL moves the old one aside first), and a way back from a damaged newest file.
 """
 
 from __future__ import annotations
 
 import logging
+import os
 import shutil
 import zipfile
 import zlib
@@ -22,7 +24,6 @@ from torchrl.checkpoint import (
     Checkpoint,
     CheckpointAdapter,
     CheckpointError,
-    CheckpointRotation,
 )
 
 from torchrl_osr._files import check_disk_space, refuse_archive, refuse_other_than_files
@@ -147,7 +148,8 @@ class Checkpoints:
 
     Keyword Args:
         interval: steps between two checkpoints.
-        kept: how many of the newest stay.
+        kept: how many of the newest stay, of those at multiples of ``interval``. The
+            newest of all stays too.
     """
 
     def __init__(
@@ -158,14 +160,17 @@ class Checkpoints:
         interval: int,
         kept: int,
     ) -> None:
-        self.folder, self.interval = Path(folder), interval
+        self.folder, self.interval, self.kept = Path(folder), interval, kept
         self.best_path = self.folder / "best.torchrl"
-        self._rotation = CheckpointRotation(self.folder, keep_last=kept)
         self._checkpoint = safe_checkpoint(**components)
 
     def latest(self) -> Path | None:
         """Path of the newest checkpoint, or ``None``."""
-        return self._rotation.latest()  # type: ignore[no-any-return]
+        return max(self._found(), default=None)
+
+    def _found(self) -> list[Path]:
+        """Checkpoints, oldest first."""
+        return sorted(self.folder.glob("checkpoint-*.torchrl"))
 
     def check_room(
         self, loss_module: torch.nn.Module, optimizer: torch.optim.Optimizer
@@ -176,35 +181,53 @@ class Checkpoints:
         # The networks, and Adam's two moments of what is trained.
         held = [*loss_module.parameters(), *loss_module.buffers(), *trained, *trained]
         size = sum(each.numel() * each.element_size() for each in held)
-        number = self._rotation.keep_last + 2  # the best, and one being written
+        # The best, the newest, and one being written.
+        number = self.kept + 3
         there = sum(path.stat().st_size for path in self.folder.glob("*.torchrl"))
         check_disk_space(self.folder, number * size - there, f"{number} checkpoints")
 
-    def save(self, step: int, *, extra: bool = False) -> None:
-        """Write the checkpoint of a step; the oldest one makes room.
-
-        An ``extra`` one, of an interrupted run, stays until the next regular one is
-        written: a continued run ends up with the files of an undisturbed one.
-        """
-        outdated = [
-            path for path in self._rotation.checkpoints()
-            if (saved := int(path.stem.rpartition("-")[2])) % self.interval
-            and saved != step
-        ]  # fmt: skip
-        kept = self._rotation.keep_last
-        self._rotation.keep_last += len(outdated) + extra
-        try:
-            with self.write_errors_explained():
-                self._rotation.save(self._checkpoint, step=step)
-        finally:
-            self._rotation.keep_last = kept
-        for path in outdated:
-            path.unlink()
+    def save(self, step: int) -> None:
+        """Write the checkpoint of a step, and remove those that are outdated."""
+        self._write(self.folder / f"checkpoint-{step:012d}.torchrl")
+        self._remove_outdated()
 
     def save_best(self, names: Collection[str], metadata: dict[str, Any]) -> None:
         """Write the components of these names to :attr:`best_path`."""
+        self._write(self.best_path, components=names, metadata=metadata)
+
+    def _write(self, path: Path, **options: Any) -> None:
+        self.check_folder()
+        beside = path.with_name(f".{path.name}.new")
         with self.write_errors_explained():
-            self._checkpoint.save(self.best_path, components=names, metadata=metadata)
+            self._checkpoint.save(beside, **options)
+            with beside.open("rb") as file:
+                os.fsync(file.fileno())
+            os.replace(beside, path)
+
+    def check_folder(self) -> None:
+        """Raise a FileNotFoundError if the folder is gone.
+
+        TorchRL would make it anew, and the run would seem to end well.
+        """
+        if not self.folder.is_dir():
+            raise FileNotFoundError(
+                f"{self.folder} was removed or renamed while the run was going on. "
+                "Start the run again in a folder that stays."
+            )
+
+    def _remove_outdated(self) -> None:
+        """Keep the newest regular ones, and the newest of all.
+
+        That of an interrupted run lies between two regular ones and stays until the
+        next: a continued run ends up with the files of an undisturbed one.
+        """
+        found = self._found()
+        regular = [
+            path for path in found
+            if int(path.stem.rpartition("-")[2]) % self.interval == 0
+        ]  # fmt: skip
+        for path in set(found) - {*regular[-self.kept :], *found[-1:]}:
+            path.unlink()
 
     def restore(self) -> Path | None:
         """Restore the newest undamaged checkpoint.
@@ -224,8 +247,8 @@ class Checkpoints:
                 shutil.rmtree(leftover)
             else:
                 leftover.unlink()
-        found = sorted(self.folder.glob("checkpoint-*.torchrl"), reverse=True)
-        for path in found:
+        found = self._found()
+        for path in reversed(found):
             damage = find_damage(path)
             if damage is not None:
                 log.warning(f"{path} is damaged ({damage}); trying the one before.")
@@ -239,6 +262,7 @@ class Checkpoints:
                     "folder.",
                     error.result,
                 ) from error
+            self._remove_outdated()  # a process may have died of a kill before it could
             return path
         if found:
             raise CheckpointError(

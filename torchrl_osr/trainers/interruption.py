@@ -11,9 +11,10 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any
 
 EXIT_CODES = {signal.SIGTERM: 75, signal.SIGINT: 130}
 """75 is ``EX_TEMPFAIL`` of ``sysexits.h``, "try again"; 130 is what shells have for
@@ -59,7 +60,8 @@ def signals_noted() -> Iterator[StopRequest]:
 
     A second Ctrl-C raises :class:`KeyboardInterrupt` at once. Handlers are installed in
     the main thread only, since Python runs them there, and only in place of Python's
-    defaults: a handler that somebody else has installed stays, such as submitit's.
+    defaults and of :func:`signals_raised`: a handler that somebody else has installed
+    stays, such as submitit's.
 
     Examples:
         >>> import os, signal
@@ -70,13 +72,6 @@ def signals_noted() -> Iterator[StopRequest]:
         'SIGTERM'
     """
     request = StopRequest()
-    defaults = dict.fromkeys(EXIT_CODES, signal.SIG_DFL)
-    defaults[signal.SIGINT] = signal.default_int_handler  # type: ignore[assignment]
-    in_main = threading.current_thread() is threading.main_thread()
-    ours = [
-        number for number, default in defaults.items()
-        if in_main and signal.getsignal(number) is default
-    ]  # fmt: skip
 
     def note(number: int, frame: FrameType | None) -> None:
         request.signal = request.signal or signal.Signals(number)
@@ -86,10 +81,44 @@ def signals_noted() -> Iterator[StopRequest]:
             message = "\nStopping after this update; Ctrl-C again stops at once.\n"
             os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, message.encode())
 
-    for number in ours:
-        signal.signal(number, note)
-    try:
+    with _handled_by(note):
         yield request
+
+
+@contextmanager
+def signals_raised() -> Iterator[None]:
+    """Raise :class:`Interrupted` at once on SIGTERM, SIGINT and SIGHUP.
+
+    For what can be repeated, around trainings that note the signals. Where handlers are
+    installed: see :func:`signals_noted`.
+    """
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        name = signal.Signals(number).name
+        raise Interrupted(
+            f"stopped by {name}, not while training. Run again to continue.",
+            EXIT_CODES[signal.Signals(number)],
+        )
+
+    with _handled_by(stop):
+        yield
+
+
+@contextmanager
+def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """Handle the signals of :data:`EXIT_CODES`, unless somebody else's handler does."""
+    before: dict[signal.Signals, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        before = {number: signal.getsignal(number) for number in EXIT_CODES}
+    defaults = (signal.SIG_DFL, signal.default_int_handler)
+    ours = {
+        number: there for number, there in before.items()
+        if there in defaults or getattr(there, "__module__", None) == __name__
+    }  # fmt: skip
+    for number in ours:
+        signal.signal(number, handler)
+    try:
+        yield
     finally:
-        for number in ours:
-            signal.signal(number, defaults[number])
+        for number, there in ours.items():
+            signal.signal(number, there)

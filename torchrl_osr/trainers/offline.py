@@ -21,12 +21,13 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.data import ReplayBuffer
 from torchrl.objectives import LossModule, TargetNetUpdater
-from torchrl.record.loggers import Logger
+from torchrl.record.loggers import CSVLogger, Logger
 from torchrl.trainers import OptimizationStepper, Trainer
 
 from torchrl_osr._checks import check_choice
 from torchrl_osr._files import finite_or_none
 from torchrl_osr.trainers.checkpoints import Checkpoints, GeneratorState
+from torchrl_osr.trainers.csv_rows import cut_back
 from torchrl_osr.trainers.cudagraph import captured, check_capturable
 from torchrl_osr.trainers.hardware import check_cudagraph
 from torchrl_osr.trainers.interruption import (
@@ -147,7 +148,8 @@ class OfflineTrainer(Trainer):
         log_interval: steps between log entries, which are means over them. Default 200.
         eval_interval: steps between evaluations. Default 5000.
         checkpoint_interval: steps between checkpoints. Default: ``eval_interval``.
-        checkpoints_kept: how many of the newest stay, beside the best. Default 2.
+        checkpoints_kept: how many of the newest regular ones stay, beside the newest of
+            all and the best. Default 2.
         description: names the phase in the progress bar and the logs. Default "train".
         progress: show a progress bar when on a terminal. Without one, a line is logged
             every half minute. Default ``True``.
@@ -169,12 +171,13 @@ class OfflineTrainer(Trainer):
 
     Raises:
         ValueError: if an option is unknown or needs another device or optimizer; while
-            training, if the results of ``evaluate`` lack the metric.
+            training, if the folder's checkpoint is beyond ``total_steps``, or the
+            results of ``evaluate`` lack the metric.
         FloatingPointError: while training, if a loss or a gradient is not finite.
         Interrupted: while training, after SIGTERM, SIGHUP or Ctrl-C, when a checkpoint
             is written.
         CheckpointError: if a checkpoint in ``folder`` does not fit.
-        OSError: if there is no room for the checkpoints.
+        OSError: if there is no room for the checkpoints, or their folder is removed.
     """
 
     def __init__(
@@ -285,7 +288,7 @@ class OfflineTrainer(Trainer):
     def train(self) -> None:
         """Run, or continue, to the last step; a finished run returns at once."""
         self.resume()
-        if self.step >= self.total_frames:
+        if self.step == self.total_frames and self._is_evaluated():
             return
         self.checkpoints.check_room(self.loss_module, self.optimizer)
         if self.cudagraph:  # only now: resuming has replaced the optimizer's tensors
@@ -299,13 +302,35 @@ class OfflineTrainer(Trainer):
             if not self.history:
                 self._evaluate()
             super().train()
+            if not self._is_evaluated():  # the last checkpoint is of a longer run
+                self._evaluate()
+                self._save(self.step)
         if self._stop_request.signal is not None:  # in the last evaluation
             raise self._interrupted(self.step)
 
+    def _is_evaluated(self) -> bool:
+        """Whether there is, or need be, no evaluation at this step any more."""
+        steps = [row["step"] for row in self.history]
+        return self.evaluate is None or self.step in steps
+
     def resume(self) -> Path | None:
-        """Restore the newest whole checkpoint of the folder, if there is one."""
+        """Restore the newest whole checkpoint of the folder, if there is one.
+
+        What a CSV logger wrote after it is cut off: these steps are done once more.
+        """
         path = self.checkpoints.restore()
         step = self._saved["step"]
+        if step > self.total_frames:
+            raise ValueError(
+                f"{path} is at step {step}, beyond the {self.total_frames} steps of "
+                "this run: ask for at least as many, or start in another folder."
+            )
+        for logger in self.loggers:
+            if isinstance(logger, CSVLogger):
+                folder = Path(logger.experiment.log_dir, "scalars", self.description)
+                cut_back(folder, step if path else -1)
+        if path and step < self.total_frames:
+            log.info(f"{self.description}: goes on from {path}")
         self.collected_frames = self._optim_count = self.collector.step = step
         self.nonfinite_check.restart(step, self._saved["skipped_updates"])
         return path
@@ -321,10 +346,10 @@ class OfflineTrainer(Trainer):
         if force_save or step % self.checkpoints.interval == 0:
             self._save(step)
 
-    def _save(self, step: int, *, extra: bool = False) -> None:
+    def _save(self, step: int) -> None:
         skipped = self.nonfinite_check.skipped
         self._saved.update(step=step, skipped_updates=skipped)
-        self.checkpoints.save(step, extra=extra)
+        self.checkpoints.save(step)
 
     def _sample(self, _: TensorDictBase) -> TensorDictBase:
         """Next batch; TorchRL's loop begins an update here, having counted it."""
@@ -343,7 +368,7 @@ class OfflineTrainer(Trainer):
         self._optim_count = self.collected_frames = step
         self.nonfinite_check.settle(whole=False)
         if step != self._saved["step"]:
-            self._save(step, extra=True)
+            self._save(step)
         reason = (
             f"{self.description}: stopped by {number.name} at step {step}; the last "
             f"checkpoint is {self.checkpoints.latest()}. Run again to continue."
@@ -410,6 +435,7 @@ class OfflineTrainer(Trainer):
 
     def _send(self, numbers: Mapping[str, float]) -> None:
         step = self.collected_frames
+        self.checkpoints.check_folder()
         with self.checkpoints.write_errors_explained("the log"):
             for logger in self.loggers:
                 for name, value in numbers.items():

@@ -148,6 +148,13 @@ def test_a_folder_of_somebody_else_is_not_touched(data, tmp_path, name, make, re
     assert sorted(tmp_path.rglob("*")) == before
 
 
+def test_a_call_killed_before_its_first_file_begins_again(data, tmp_path):
+    (tmp_path / ".set.partial").mkdir()
+    (tmp_path / ".set.partial" / ".manifest.json.new").write_text("{")
+    write(data, tmp_path / "set")
+    assert [path.name for path in tmp_path.iterdir()] == ["set"]
+
+
 def test_an_empty_folder_is_not_a_set_either(data, tmp_path):
     (tmp_path / "set").mkdir()
     with pytest.raises(FileExistsError, match="choose another folder"):

@@ -276,8 +276,10 @@ def _refuse_other_folders(folder: Path) -> None:
     reason = "it is no folder"
     if folder.is_dir() and not folder.is_symlink():
         names = {path.name for path in folder.iterdir()}
-        strangers = sorted(names - {MANIFEST, f".{MANIFEST}.new", *FILES})
-        if not strangers and (_is_ours(folder / MANIFEST) or names >= FILES.keys()):
+        unfinished = f".{MANIFEST}.new"  # alone: of a call that was killed right then
+        strangers = sorted(names - {MANIFEST, unfinished, *FILES})
+        complete = names >= FILES.keys() or names == {unfinished}
+        if not strangers and (_is_ours(folder / MANIFEST) or complete):
             return
         reason = f"it has no {MANIFEST} of a data set"
         if strangers:
