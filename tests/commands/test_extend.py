@@ -7,7 +7,6 @@ import re
 import shlex
 from pathlib import Path
 
-import pytest
 from mktestdocs import grab_code_blocks
 
 PAGE = (Path(__file__).parents[2] / "docs" / "extend.md").read_text(encoding="utf-8")
@@ -18,7 +17,11 @@ def save_files(folder: Path) -> None:
     blocks = re.findall(
         r"`([\w/.]+\.(?:py|yaml))`[^`]*:\n\n```\w+\n(.*?)```", PAGE, re.S
     )
-    assert [name for name, _ in blocks] == ["my_losses.py", "conf/loss/awac.yaml"]
+    assert [name for name, _ in blocks] == [
+        "my_losses.py",
+        "conf/loss/awac.yaml",
+        "point_mass.py",
+    ]
     for name, text in blocks:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text, encoding="utf-8")
@@ -31,31 +34,24 @@ def typed(command: str) -> list[str]:
     return shlex.split(line)[1:]
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory, run, tiny) -> Path:
-    folder = tmp_path_factory.mktemp("plug_in")
-    save_files(folder)
-    code, output = run(folder, *typed("torchrl-osr train"), *tiny("medium"))
-    assert code == 0, output
-    assert "Warning" not in output
-    return folder
+def test_your_algorithm_in_your_environment(tmp_path, run, tiny):
+    save_files(tmp_path)
 
+    def read(command: str, *sizes: str) -> str:
+        code, output = run(tmp_path, *typed(command), *sizes)
+        assert code == 0, output
+        assert "Warning" not in output
+        return output
 
-def test_it_trains(folder):
-    assert json.loads((folder / "runs/awac/status.json").read_text()) == {
-        "status": "done"
-    }
-    scalars = folder / "runs" / "awac" / "csv" / "scalars" / "policy"
-    assert {path.stem for path in scalars.glob("*")} >= {"loss_actor", "pred_value"}
-
-
-def test_it_is_evaluated_exported_and_reported(folder, run):
-    sizes = ["suite=start", "episodes=2", "last=1"]
-    code, output = run(folder, *typed("torchrl-osr evaluate"), *sizes)
-    assert code == 0, output
-    assert (folder / "runs" / "awac" / "robustness-start.json").exists()
-    code, output = run(folder, *typed("torchrl-osr export"))
-    assert code == 0, output
-    code, output = run(folder, *typed("torchrl-osr report"))
-    assert code == 0, output
-    assert "awac" in (folder / "report" / "report.html").read_text(encoding="utf-8")
+    read("torchrl-osr collect", "episodes=12")
+    read("torchrl-osr train", *tiny("file"))
+    folder = tmp_path / "runs" / "awac"
+    scalars = folder / "csv" / "scalars" / "policy"
+    assert {path.stem for path in scalars.iterdir()} >= {"loss_actor", "pred_value"}
+    read("torchrl-osr evaluate", "suite=observation_noise", "episodes=2", "last=1")
+    results = json.loads((folder / "robustness-observation_noise.json").read_text())
+    assert results["env"] == "PointMass-v0"
+    read("torchrl-osr report")
+    page = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
+    assert "awac" in page
+    assert "PointMass-v0" in page
