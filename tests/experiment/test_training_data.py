@@ -11,6 +11,7 @@ from hydra import compose, initialize_config_dir
 
 from torchrl_osr.commands import train
 from torchrl_osr.evaluation import DataDistance
+from torchrl_osr.experiment import run_folder
 from torchrl_osr.experiment import schema as config
 from torchrl_osr.experiment.build import load_data
 from torchrl_osr.experiment.training_data import load_training_data
@@ -89,7 +90,9 @@ def test_the_same_seed_gives_the_same_training(tmp_path):
     results = []
     for storage in ("memory", "disk"):
         cfg, folder = composed(f"data.storage={storage}"), tmp_path / storage
-        train.run(cfg, folder)
+        folder.mkdir()
+        with run_folder.status(folder):
+            train.run(cfg, folder)
         results.append(losses(folder))
     here, there = results
     assert len(here) > 5
@@ -118,6 +121,6 @@ def test_distances_are_those_of_memory():
     ],
 )
 def test_what_cannot_be_had_is_refused_before_the_data(overrides, message, monkeypatch):
-    monkeypatch.setattr("torchrl_osr.experiment.build.load_dataset", None)
+    monkeypatch.setattr("torchrl_osr.data.load_dataset", None)
     with pytest.raises(ValueError, match=message):
         load_training_data(composed(*overrides), CPU)

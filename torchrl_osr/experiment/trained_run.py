@@ -129,7 +129,8 @@ def load_trained(
         manifest = checkpoint.load(path, map_location="cpu").manifest
     except CheckpointError as error:
         raise CheckpointError(
-            f"{path} does not fit {folder / CONFIG}: {error}", error.result
+            f"{path} does not fit {folder / CONFIG}: {error} Take both from one run.",
+            error.result,
         ) from error
     numbered = re.fullmatch(r"checkpoint-(\d+)\.torchrl", path.name)
     step = int(numbered[1]) if numbered else int(manifest["metadata"]["step"])

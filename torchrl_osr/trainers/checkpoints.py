@@ -17,6 +17,7 @@ import zlib
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import torch
@@ -48,9 +49,17 @@ class WeightsOnlyAdapter(CheckpointAdapter):
         """Restore the component's state from the folder ``path``."""
         with zipfile.ZipFile(path / self.filename) as archive:
             refuse_archive(archive)
-        state = torch.load(
-            path / self.filename, map_location=map_location, weights_only=True
-        )
+        try:
+            state = torch.load(
+                path / self.filename, map_location=map_location, weights_only=True
+            )
+        except (
+            UnpicklingError
+        ) as error:  # its message says how to unpickle all the same
+            raise ValueError(
+                f"{self.filename} holds other things than tensors, which are never "
+                "unpickled"
+            ) from error
         if isinstance(component, torch.nn.Module):
             _check_fits(component.state_dict(), state)
         component.load_state_dict(state)
