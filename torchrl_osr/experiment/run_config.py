@@ -196,7 +196,8 @@ def check_targets(config: DictConfig, trust: Sequence[str] = ()) -> None:
         ValueError: naming the target or the id, or a trusted module that is not there.
     """
     trusted = {name: _imported(name) for name in trust}
-    env_id = str(OmegaConf.select(config, "env.id", default=""))
+    env = config.get("env")
+    env_id = str(env.get("id", "")) if isinstance(env, DictConfig) else ""
     for module in module_of(env_id):
         if module not in trusted:
             raise ValueError(
