@@ -40,14 +40,11 @@ def trained(folder: Path, *overrides: str) -> Path:
     """Train as the command does, which takes its folder from Hydra."""
     cfg = composed("train", "data=file", *TINY, *overrides)
     read_environment(cfg)
-    run_folder.claim(folder, cfg)
+    folder.mkdir()
+    record = {"overrides": {"task": []}, "runtime": {"choices": {"loss": "osr"}}}
+    run_folder.claim(folder, cfg, OmegaConf.create(record))
     with run_folder.status(folder):
         train.run(cfg, folder)
-    hydra = folder / ".hydra"
-    hydra.mkdir()
-    record = {"overrides": {"task": []}, "runtime": {"choices": {"loss": "osr"}}}
-    OmegaConf.save({"hydra": record}, hydra / "hydra.yaml")
-    OmegaConf.save(cfg, hydra / "config.yaml")
     return folder
 
 

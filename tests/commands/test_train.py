@@ -126,7 +126,7 @@ def test_multirun_names_the_failed_job(tmp_path, run, tiny):
     (failed,) = (name for name, each in status.items() if each["status"] == "failed")
     (done,) = (name for name, each in status.items() if each["status"] == "done")
     assert failed == "0_steps-0"
-    assert "at least 1" in status[failed]["error"]
+    assert "trainer.steps must be between 1 and" in status[failed]["error"]
     assert done == "1_steps-20"
 
 

@@ -19,6 +19,7 @@ CONFIG = {
     "seed": 0,
     "resume": None,
     "force": False,
+    "trust": [],
     "logger": {"kind": "csv"},
     "trainer": {"steps": 5, "progress": True},
 }
