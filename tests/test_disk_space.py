@@ -74,8 +74,8 @@ def make_trainer(folder, make_batch, **options) -> OfflineTrainer:
 
 def test_training_does_not_begin_without_room(tmp_path, make_batch, free):
     trainer = make_trainer(tmp_path, make_batch, checkpoints_kept=3)
-    # Each parameter with two moments, in four bytes; three kept, the newest, the best, one
-    # being written.
+    # Each parameter with two moments, in four bytes; three kept, the best, the
+    # newest, one being written.
     needed = 6 * sum(3 * 4 * each.numel() for each in trainer.loss_module.parameters())
     free(needed - 1)
     with pytest.raises(OSError, match="for 6 checkpoints"):

@@ -165,7 +165,7 @@ def test_every_suite_is_possible_for_other_environments(folder, env_id):
     ("overrides", "error", "named"),
     [
         (["episodes=1"], ValueError, "episodes=1"),
-        (["last=0"], ValueError, "last=0"),
+        (["last=0"], ValueError, "last must be between 1 and"),
         (["sweep=runs"], ValueError, "either checkpoint=.* or sweep="),
         (["checkpoint=null"], ValueError, "either checkpoint=.* or sweep="),
         (["checkpoint=null", "sweep=."], ValueError, "no finished run in or below"),

@@ -84,9 +84,10 @@ def train(cfg: DictConfig) -> float:
         trust += module_of(cfg.env.id)
     else:
         cfg = run_folder.resumed(folder, cfg, job.overrides.task)
-    check_run(cfg, trust)
-    if fresh:
-        read_environment(cfg)
+    with run_folder.refusal_noted(folder):
+        check_run(cfg, trust)
+        if fresh:
+            read_environment(cfg)
     with run_folder.lock(folder):
         run_folder.claim(folder, cfg, job)
         with run_folder.status(folder):

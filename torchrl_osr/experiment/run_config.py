@@ -116,7 +116,7 @@ def _schema(config: DictConfig) -> DictConfig:
                 # The function has keys of its own.
                 OmegaConf.set_struct(group[key], False)
     for key in ("loss", "inverse_dynamics.loss", "perturbation.adversary"):
-        options = OmegaConf.select(config, key)
+        options = _value(config, key)
         if options is None and key == "perturbation.adversary":
             continue
         if not isinstance(options, DictConfig) or "_target_" not in options:
@@ -127,6 +127,13 @@ def _schema(config: DictConfig) -> DictConfig:
             target = get_class(options._target_)
             OmegaConf.update(schema, key, OmegaConf.structured(schema_of(target)))
     return schema
+
+
+def _value(config: Any, key: str) -> Any:
+    """Value of a dotted key, ``None`` where there is none or its parent no mapping."""
+    for name in key.split("."):
+        config = config.get(name) if isinstance(config, DictConfig) else None
+    return config
 
 
 def read_config(path: Path) -> DictConfig:
@@ -196,8 +203,7 @@ def check_targets(config: DictConfig, trust: Sequence[str] = ()) -> None:
         ValueError: naming the target or the id, or a trusted module that is not there.
     """
     trusted = {name: _imported(name) for name in trust}
-    env = config.get("env")
-    env_id = str(env.get("id", "")) if isinstance(env, DictConfig) else ""
+    env_id = str(_value(config, "env.id") or "")
     for module in module_of(env_id):
         if module not in trusted:
             raise ValueError(

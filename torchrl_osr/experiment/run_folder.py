@@ -155,6 +155,22 @@ def claim(folder: Path, config: DictConfig, job: HydraConf) -> None:
 
 
 @contextmanager
+def refusal_noted(folder: Path) -> Iterator[None]:
+    """Write why a run does not begin, unless its folder holds one already.
+
+    Of a sweep's jobs, it says which one it was.
+    """
+    try:
+        yield
+    except Exception as error:
+        if not (folder / CONFIG).exists():
+            folder.mkdir(parents=True, exist_ok=True)
+            reason = f"{type(error).__name__}: {error}"
+            write_json(folder / STATUS, {"status": "failed", "error": reason})
+        raise
+
+
+@contextmanager
 def lock(folder: Path) -> Iterator[None]:
     """Keep other processes out of a run's folder, which is made if need be.
 

@@ -281,7 +281,7 @@ class TrainConfig:
     num_random: int = MISSING
     resume: str | None = None
     force: bool = False
-    trust: list[str] = field(default_factory=list)
+    trust: list[str] = MISSING
 
 
 @dataclass
@@ -324,7 +324,7 @@ class CollectConfig:
     noise: float = MISSING
     seed: int = MISSING
     progress: bool = MISSING
-    trust: list[str] = field(default_factory=list)
+    trust: list[str] = MISSING
 
 
 def schema_of(target: type) -> type:

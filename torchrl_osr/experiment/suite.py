@@ -88,7 +88,7 @@ class EvaluateConfig:
     force: bool = MISSING
     num_threads: int = MISSING
     progress: bool = MISSING
-    trust: list[str] = field(default_factory=list)
+    trust: list[str] = MISSING
 
 
 def register() -> None:
