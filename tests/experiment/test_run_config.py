@@ -169,6 +169,7 @@ def test_the_crafted_configuration_would_work(tmp_path):
         ("loss: '${oc.create:\"{_target_: os.mkdir}\"}'", "has the interpolation"),
         ('loss: "\\x24{oc.env:HOME}"', "has the interpolation"),
         ("- a\n", "holds no mapping"),
+        ("1", "holds a single value"),
         ("# " + "a" * 2**16, "more than 65,536 bytes"),
     ],
 )

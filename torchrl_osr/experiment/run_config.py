@@ -115,17 +115,14 @@ def _schema(config: DictConfig) -> DictConfig:
             if OmegaConf.get_type(group, key) is TargetConfig:
                 # The function has keys of its own.
                 OmegaConf.set_struct(group[key], False)
+    values = flatten(OmegaConf.to_container(config))
     for key in ("loss", "inverse_dynamics.loss", "perturbation.adversary"):
-        options = OmegaConf.select(config, key)
-        if options is None and key == "perturbation.adversary":
-            continue
-        if not isinstance(options, DictConfig) or "_target_" not in options:
-            raise ValueError(
-                f"{key} must have options and a _target_, got {options!r}."
-            )
-        if str(options._target_).startswith("torchrl_osr."):
-            target = get_class(options._target_)
-            OmegaConf.update(schema, key, OmegaConf.structured(schema_of(target)))
+        target, value = values.get(f"{key}._target_"), values.get(key)
+        if target is None and (value is not None or key != "perturbation.adversary"):
+            raise ValueError(f"{key} must have options and a _target_, got {value!r}.")
+        if str(target).startswith("torchrl_osr."):
+            options = OmegaConf.structured(schema_of(get_class(str(target))))
+            OmegaConf.update(schema, key, options)
     return schema
 
 
@@ -174,6 +171,8 @@ def _check_yaml(text: str) -> None:
     for event in yaml.parse(text):  # without recursion, and only as far as needed
         if isinstance(event, yaml.AliasEvent) or getattr(event, "tag", None):
             raise ValueError("has YAML tags or aliases, which no run writes")
+        if isinstance(event, yaml.ScalarEvent) and not depth:
+            raise ValueError("holds a single value")
         depth += isinstance(event, yaml.CollectionStartEvent)
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if depth > MAX_CONFIG_DEPTH:
@@ -196,7 +195,8 @@ def check_targets(config: DictConfig, trust: Sequence[str] = ()) -> None:
         ValueError: naming the target or the id, or a trusted module that is not there.
     """
     trusted = {name: _imported(name) for name in trust}
-    env_id = str(OmegaConf.select(config, "env.id", default=""))
+    content = OmegaConf.to_container(config)
+    env_id = str(flatten(content).get("env.id", ""))
     for module in module_of(env_id):
         if module not in trusted:
             raise ValueError(
@@ -205,7 +205,7 @@ def check_targets(config: DictConfig, trust: Sequence[str] = ()) -> None:
             )
     ours = [import_module(name) for name in TARGET_PACKAGES]
     known = set().union(*map(_public_names, [*ours, *trusted.values()]))
-    for key, target in _entries(OmegaConf.to_container(config)):
+    for key, target in _entries(content):
         if key != "_target_" or str(target) in known:
             continue
         module, _, name = str(target).rpartition(".")
