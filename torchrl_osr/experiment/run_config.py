@@ -19,6 +19,7 @@ from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
 
+from torchrl_osr import objectives
 from torchrl_osr._files import read_text
 from torchrl_osr.experiment.limits import check_values
 from torchrl_osr.experiment.schema import TargetConfig, TrainConfig, schema_of
@@ -28,8 +29,9 @@ from torchrl_osr.experiment.schema import TargetConfig, TrainConfig, schema_of
 MAX_CONFIG_BYTES = 2**16
 MAX_CONFIG_DEPTH = 32
 
-TARGET_PACKAGES = ("torchrl_osr", "torchrl_osr.modules", "torchrl_osr.objectives")
-"""Packages whose public names are allowed as ``_target_``."""
+TARGET_PACKAGES = ("torchrl_osr.modules", "torchrl_osr.objectives")
+"""Packages whose public names are allowed as ``_target_``: none of them reads a file or
+imports a module. A loss may be named as ``torchrl_osr``'s, too."""
 
 
 def read_run(path: Path, trust: Sequence[str] = ()) -> DictConfig:
@@ -180,7 +182,7 @@ def _check_yaml(text: str) -> None:
 
 
 def check_targets(config: DictConfig, trust: Sequence[str] = ()) -> None:
-    """Raise unless every ``_target_`` is a public name of this package.
+    """Raise unless every ``_target_`` is one of our networks or losses.
 
     Gymnasium imports the module that an environment's id begins with, as in
     ``"module:Name-v0"``; such an id is refused, too.
@@ -204,7 +206,8 @@ def check_targets(config: DictConfig, trust: Sequence[str] = ()) -> None:
                 f"else. If you know {module}, allow it with trust=[{module}]."
             )
     ours = [import_module(name) for name in TARGET_PACKAGES]
-    known = set().union(*map(_public_names, [*ours, *trusted.values()]))
+    known = {f"torchrl_osr.{name}" for name in objectives.__all__}
+    known = known.union(*map(_public_names, [*ours, *trusted.values()]))
     for key, target in _entries(content):
         if key != "_target_" or str(target) in known:
             continue
