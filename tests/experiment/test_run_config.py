@@ -79,6 +79,7 @@ def test_what_is_wrong_with_somebodys_run_is_named(tmp_path, key, value, reason)
         "os.mkdir",
         "torchrl_osr._files.os.mkdir",
         "torchrl_osr.data.load_file",
+        "torchrl_osr.load_policy",  # it takes a path, and modules to be trusted
         "torchrl_osr",
         "mine.Loss",
         "",
@@ -169,6 +170,7 @@ def test_the_crafted_configuration_would_work(tmp_path):
         ("loss: '${oc.create:\"{_target_: os.mkdir}\"}'", "has the interpolation"),
         ('loss: "\\x24{oc.env:HOME}"', "has the interpolation"),
         ("- a\n", "holds no mapping"),
+        ("1", "holds a single value"),
         ("# " + "a" * 2**16, "more than 65,536 bytes"),
     ],
 )

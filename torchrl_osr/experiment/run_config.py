@@ -19,6 +19,7 @@ from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
 
+from torchrl_osr import objectives
 from torchrl_osr._files import read_text
 from torchrl_osr.experiment.limits import check_values
 from torchrl_osr.experiment.schema import TargetConfig, TrainConfig, schema_of
@@ -28,8 +29,9 @@ from torchrl_osr.experiment.schema import TargetConfig, TrainConfig, schema_of
 MAX_CONFIG_BYTES = 2**16
 MAX_CONFIG_DEPTH = 32
 
-TARGET_PACKAGES = ("torchrl_osr", "torchrl_osr.modules", "torchrl_osr.objectives")
-"""Packages whose public names are allowed as ``_target_``."""
+TARGET_PACKAGES = ("torchrl_osr.modules", "torchrl_osr.objectives")
+"""Packages whose public names are allowed as ``_target_``: none of them reads a file or
+imports a module. A loss may be named as ``torchrl_osr``'s, too."""
 
 
 def read_run(path: Path, trust: Sequence[str] = ()) -> DictConfig:
@@ -115,25 +117,15 @@ def _schema(config: DictConfig) -> DictConfig:
             if OmegaConf.get_type(group, key) is TargetConfig:
                 # The function has keys of its own.
                 OmegaConf.set_struct(group[key], False)
+    values = flatten(OmegaConf.to_container(config))
     for key in ("loss", "inverse_dynamics.loss", "perturbation.adversary"):
-        options = _value(config, key)
-        if options is None and key == "perturbation.adversary":
-            continue
-        if not isinstance(options, DictConfig) or "_target_" not in options:
-            raise ValueError(
-                f"{key} must have options and a _target_, got {options!r}."
-            )
-        if str(options._target_).startswith("torchrl_osr."):
-            target = get_class(options._target_)
-            OmegaConf.update(schema, key, OmegaConf.structured(schema_of(target)))
+        target, value = values.get(f"{key}._target_"), values.get(key)
+        if target is None and (value is not None or key != "perturbation.adversary"):
+            raise ValueError(f"{key} must have options and a _target_, got {value!r}.")
+        if str(target).startswith("torchrl_osr."):
+            options = OmegaConf.structured(schema_of(get_class(str(target))))
+            OmegaConf.update(schema, key, options)
     return schema
-
-
-def _value(config: Any, key: str) -> Any:
-    """Value of a dotted key, ``None`` where there is none or its parent no mapping."""
-    for name in key.split("."):
-        config = config.get(name) if isinstance(config, DictConfig) else None
-    return config
 
 
 def read_config(path: Path) -> DictConfig:
@@ -181,6 +173,8 @@ def _check_yaml(text: str) -> None:
     for event in yaml.parse(text):  # without recursion, and only as far as needed
         if isinstance(event, yaml.AliasEvent) or getattr(event, "tag", None):
             raise ValueError("has YAML tags or aliases, which no run writes")
+        if isinstance(event, yaml.ScalarEvent) and not depth:
+            raise ValueError("holds a single value")
         depth += isinstance(event, yaml.CollectionStartEvent)
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if depth > MAX_CONFIG_DEPTH:
@@ -188,7 +182,7 @@ def _check_yaml(text: str) -> None:
 
 
 def check_targets(config: DictConfig, trust: Sequence[str] = ()) -> None:
-    """Raise unless every ``_target_`` is a public name of this package.
+    """Raise unless every ``_target_`` is one of our networks or losses.
 
     Gymnasium imports the module that an environment's id begins with, as in
     ``"module:Name-v0"``; such an id is refused, too.
@@ -203,7 +197,8 @@ def check_targets(config: DictConfig, trust: Sequence[str] = ()) -> None:
         ValueError: naming the target or the id, or a trusted module that is not there.
     """
     trusted = {name: _imported(name) for name in trust}
-    env_id = str(_value(config, "env.id") or "")
+    content = OmegaConf.to_container(config)
+    env_id = str(flatten(content).get("env.id", ""))
     for module in module_of(env_id):
         if module not in trusted:
             raise ValueError(
@@ -211,8 +206,9 @@ def check_targets(config: DictConfig, trust: Sequence[str] = ()) -> None:
                 f"else. If you know {module}, allow it with trust=[{module}]."
             )
     ours = [import_module(name) for name in TARGET_PACKAGES]
-    known = set().union(*map(_public_names, [*ours, *trusted.values()]))
-    for key, target in _entries(OmegaConf.to_container(config)):
+    known = {f"torchrl_osr.{name}" for name in objectives.__all__}
+    known = known.union(*map(_public_names, [*ours, *trusted.values()]))
+    for key, target in _entries(content):
         if key != "_target_" or str(target) in known:
             continue
         module, _, name = str(target).rpartition(".")

@@ -51,7 +51,10 @@ def load_policy(path: Path | str, *, trust: Sequence[str] = ()) -> Policy:
         return Policy(record, tensors)
     except (KeyError, TypeError, ValueError) as error:
         why = f"no {error} in it" if isinstance(error, KeyError) else error
-        raise ValueError(f"{path} cannot be read as a policy: {why}") from error
+        raise ValueError(
+            f"{path} cannot be read as a policy: {why}. Take a whole copy, or save it "
+            "again."
+        ) from error
 
 
 def _policy_of_run(path: Path, trust: Sequence[str]) -> Policy:

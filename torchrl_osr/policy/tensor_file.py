@@ -16,6 +16,7 @@ from torchrl_osr._files import (
     check_checksum,
     checksummed,
     parse_json,
+    refuse_other_than_files,
     write_atomically,
 )
 
@@ -55,6 +56,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             checksum is wrong.
     """
     library = _safetensors()
+    refuse_other_than_files(path)
     with path.open("rb") as file:
         header = int.from_bytes(file.read(8), "little")
     if header > MAX_HEADER_BYTES or path.stat().st_size > MAX_FILE_BYTES:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import gzip
 import warnings
+import zlib
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -52,7 +53,7 @@ def _names(path: Path) -> list[str]:
         opened = gzip.open if path.suffix == ".gz" else open
         with opened(path, "rt", encoding="utf-8-sig", newline="") as file:
             names = next(csv.reader([file.readline(BLOCK)]), [])
-    except (EOFError, OSError, UnicodeError, csv.Error) as error:
+    except (EOFError, OSError, UnicodeError, csv.Error, zlib.error) as error:
         raise ValueError(
             f"{path} is no CSV file, or damaged: {error}. Take a whole copy of it."
         ) from error
@@ -98,7 +99,7 @@ def _frames(path: Path, names: list[str], chosen: list[str]) -> Iterator[pd.Data
                 low_memory=False,
             )
     except (
-        *(EOFError, OSError, UnicodeError),
+        *(EOFError, OSError, UnicodeError, zlib.error),
         *(pd.errors.ParserError, pd.errors.EmptyDataError, pd.errors.ParserWarning),
     ) as error:
         raise ValueError(

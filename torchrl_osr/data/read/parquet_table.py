@@ -79,7 +79,7 @@ def _as_numpy(name: str, column: Any) -> NDArray[Any]:
     """Parquet column ``[N]``, or ``[N, D]`` if it holds lists."""
     if column.null_count:
         row = int(np.flatnonzero(column.is_null())[0])
-        raise ValueError(f"{name!r} has no value in row {row}.")
+        raise ValueError(f"{name!r} has no value in row {row}: repair or remove it.")
     kinds = pyarrow.types
     if not any(
         is_kind(column.type)
@@ -96,6 +96,7 @@ def _as_numpy(name: str, column: Any) -> NDArray[Any]:
     values = column.combine_chunks().flatten()
     if values.null_count:
         entry = int(np.flatnonzero(values.is_null())[0])
-        raise ValueError(f"{name!r} has no value in row {entry // int(sizes[0])}.")
+        row = entry // int(sizes[0])
+        raise ValueError(f"{name!r} has no value in row {row}: repair or remove it.")
     flat = np.asarray(values.to_numpy(zero_copy_only=False))
     return flat.reshape(len(column), -1) if len(column) else flat.reshape(0, 1)

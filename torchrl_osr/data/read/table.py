@@ -253,7 +253,10 @@ def _refuse_text(name: str, array: NDArray[Any]) -> None:
                 "numbers."
             ) from None
         if missing:
-            raise ValueError(f"{name!r} has no value in row {row} of {len(array)}.")
+            raise ValueError(
+                f"{name!r} has no value in row {row} of {len(array)}: repair or remove "
+                "it."
+            )
 
 
 def _listed(names: Sequence[str], most: int = 20) -> str:
