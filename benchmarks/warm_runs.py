@@ -95,6 +95,8 @@ def start(
         code = 0
     except SystemExit as ended:
         code = ended.code if isinstance(ended.code, int) else 1
+        if isinstance(ended.code, str):
+            print(ended.code, file=sys.stderr)
     except KeyboardInterrupt:
         code = 128 + signal.SIGINT
     except BaseException:

@@ -34,6 +34,7 @@ from torchrl_osr import StatePerturbation
 from torchrl_osr._files import write_json
 from torchrl_osr.data import make_environment
 from torchrl_osr.evaluation import EpisodeEvaluator, deterministic_policy, summarize
+from torchrl_osr.experiment.build import references_of
 from torchrl_osr.experiment.trained_run import TrainedRun, load_trained
 from torchrl_osr.experiment.training_data import load_training_data
 
@@ -140,6 +141,7 @@ def main(arguments: Sequence[str]) -> None:
         "seed": options.seed,
         "curve": [],
     }
+    references = references_of(run.config)
     evaluator = EpisodeEvaluator(run.config.env.id, num_episodes=options.episodes)
     policy = deterministic_policy(run.actor, run.observation_norm)
     trainer = make_trainer(run, options.frames, options.seed)
@@ -148,7 +150,7 @@ def main(arguments: Sequence[str]) -> None:
         frames = trainer.collected_frames
         if frames % options.interval:
             return
-        point = {"frames": frames, **summarize(evaluator(policy), record["env"])}
+        point = {"frames": frames, **summarize(evaluator(policy), references)}
         record["curve"].append(point)
         write_json(options.output / "online.json", record)
         draw(record, options.output / "online.png")

@@ -27,6 +27,7 @@ from torchrl_osr.data import (
     load_dataset,
     make_replay_buffer,
     observation_statistics,
+    reference_returns,
 )
 from torchrl_osr.data.collect.environment import environment_id
 from torchrl_osr.evaluation import EpisodeEvaluator, deterministic_policy, summarize
@@ -97,7 +98,9 @@ def main(cfg: DictConfig) -> None:
     )
     trainer.train()
     evaluator = EpisodeEvaluator(environment_id(cfg.env), num_episodes=cfg.episodes)
-    result = summarize(evaluator(deterministic_policy(actor, norm)), cfg.env)
+    result = summarize(
+        evaluator(deterministic_policy(actor, norm)), reference_returns(cfg.env)
+    )
     folder = Path(HydraConfig.get().runtime.output_dir)
     write_json(folder / "result.json", {"steps": cfg.steps, **result})
     print(f"score {result['score']:.1f}, return {result['return']:.0f}: {folder}")

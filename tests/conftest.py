@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import signal
 from types import SimpleNamespace
 
 import pytest
@@ -21,6 +22,12 @@ from torchrl.modules import (
 pytest_plugins = ["processes"]
 
 torch.set_num_threads(1)
+
+# What ignores them, such as nohup or a shell's "&", would be inherited by the runs that
+# tests send signals to.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+if hasattr(signal, "SIGHUP"):
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 OBSERVATION_DIM, ACTION_DIM = 3, 2
 

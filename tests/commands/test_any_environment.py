@@ -41,8 +41,8 @@ def trained(folder: Path, *overrides: str) -> Path:
     cfg = composed("train", "data=file", *TINY, *overrides)
     read_environment(cfg)
     folder.mkdir()
-    record = {"overrides": {"task": []}, "runtime": {"choices": {"loss": "osr"}}}
-    run_folder.claim(folder, cfg, OmegaConf.create(record))
+    job = {"overrides": {"task": []}, "runtime": {"choices": {"loss": "osr"}}}
+    run_folder.claim(folder, cfg, OmegaConf.create(job))
     with run_folder.status(folder):
         train.run(cfg, folder)
     return folder
