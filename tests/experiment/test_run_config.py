@@ -61,6 +61,8 @@ def test_keys_that_were_added_are_refused(key):
         ("loss", 3, "loss must have options and a _target_, got 3"),
         ("loss._target_", "torchrl_osr.objectives", "is none of"),
         ("perturbation.adversary", "yes", "must have options and a _target_"),
+        ("perturbation.adversary", {}, "must have options and a _target_"),
+        ("inverse_dynamics", [1], "inverse_dynamics.loss must have options"),
         ("env.id", "???", "it lacks env.id"),
         ("data.held_out", float("nan"), "held_out must be between 0 and 1, got nan"),
     ],

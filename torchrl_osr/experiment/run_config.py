@@ -281,8 +281,8 @@ def _entries(value: Any, key: Any = None) -> Iterator[tuple[Any, Any]]:
 
 
 def flatten(value: Any, prefix: str = "") -> dict[str, Any]:
-    """Nested mappings as one, with dotted keys."""
-    if not isinstance(value, Mapping):
+    """Nested mappings as one, with dotted keys; one that is empty stays a value."""
+    if not isinstance(value, Mapping) or not value:
         return {prefix: value}
     flat: dict[str, Any] = {}
     for key, item in value.items():
