@@ -68,7 +68,7 @@ def check_run(config: DictConfig, trust: Sequence[str] = ()) -> DictConfig:
     Raises:
         ValueError: naming the key, if there is no such key, one is missing or of the
             wrong type, or :func:`check_targets` or
-            :func:`~torchrl_osr.experiment.limits.check_values` refuses it.
+            ``limits.check_values`` refuses it.
     """
     plain = DictConfig(OmegaConf.to_container(config, resolve=True))
     check_targets(plain, trust)
