@@ -121,6 +121,13 @@ def live(
     return code, sent
 
 
+def was_killed(run: Run, code: int) -> bool:
+    """Whether a run died by the kill; it must else have come to its end."""
+    if code not in (0, KILLED):
+        raise SystemExit(f"a run ended with code {code}: {run.output}")
+    return code == KILLED
+
+
 def kills_at_renames(top: Path, events: list[tuple[warm_runs.Rename, bool]]) -> dict:
     """Let one run die at each of these places in turn; say at which it did."""
     run, killed = Run(top), []
@@ -128,11 +135,8 @@ def kills_at_renames(top: Path, events: list[tuple[warm_runs.Rename, bool]]) -> 
         if run.finished:
             break
         seen = warm_runs.killed_at(rename, after=after)
-        code, _ = live(run, None, 0, watched=top, seen=seen)
-        if code == KILLED:
+        if was_killed(run, live(run, None, 0, watched=top, seen=seen)[0]):
             killed.append(f"{'after' if after else 'before'} {rename.name}")
-        elif code != 0:
-            raise SystemExit(f"a run ended with code {code}: {run.output}")
     return end(run) | {"killed": killed}
 
 
@@ -140,11 +144,8 @@ def kills_at_random(top: Path, longest: float) -> dict:
     """Kill one run at random moments, a number of times at most, until it ends."""
     run, killed, rng = Run(top), [], random.Random(top.name)
     while not run.finished and len(killed) < MOST_KILLS:
-        code, _ = live(run, signal.SIGKILL, rng.uniform(0, longest))
-        if code == KILLED:
+        if was_killed(run, live(run, signal.SIGKILL, rng.uniform(0, longest))[0]):
             killed.append(f"after {max(run.newest().items(), default='nothing')}")
-        elif code != 0:
-            raise SystemExit(f"a run ended with code {code}: {run.output}")
     return end(run) | {"killed": killed}
 
 
@@ -170,8 +171,6 @@ def interrupts(top: Path, longest: float) -> dict:
                     "right": (code, said["status"]) == right,
                 }
             )
-        elif code != 0:
-            raise SystemExit(f"a run ended with code {code}: {run.output}")
     return compared(run, same_means=False) | {"ends": ends}
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import copy
 import json
-import os
 import sys
 import tempfile
 import zipfile
@@ -18,11 +17,12 @@ from tempfile import gettempdir
 
 import h5py
 import numpy as np
+import property_settings
 import pytest
 import torch
 import yaml
 from hydra import compose, initialize_config_dir
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from report.fakes import write_run
@@ -37,14 +37,7 @@ from torchrl_osr.report.runs import LeftOut, read_each
 from torchrl_osr.trainers.checkpoints import find_damage, safe_checkpoint
 
 CONF = Path(__file__).parents[1] / "conf"
-EXAMPLES = int(os.environ.get("TORCHRL_OSR_PROPERTY_EXAMPLES", "20"))
-tried = settings(
-    max_examples=EXAMPLES,
-    deadline=None,
-    database=None,
-    derandomize=True,
-    suppress_health_check=list(HealthCheck),
-)
+tried = property_settings.tried(20)
 
 WORDS = ["", "x", "torchrl_osr.OSRLoss", "os.system", "../x", "/etc/passwd", "${a}"]
 NUMBERS = [-1, 0, 3, 2**70, 1e300, float("nan"), float("inf"), True, None]

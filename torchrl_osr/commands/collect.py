@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from torchrl_osr.commands import CONF
 from torchrl_osr.commands.console import single_job
@@ -30,7 +30,11 @@ from torchrl_osr.data.collect.record import (
     write_log,
 )
 from torchrl_osr.experiment import schema
-from torchrl_osr.experiment.run_config import import_from_here
+from torchrl_osr.experiment.run_config import (
+    chosen_environment,
+    import_from_here,
+    module_of,
+)
 from torchrl_osr.policy import Policy, load_policy
 
 schema.register()
@@ -43,9 +47,7 @@ def main(cfg: DictConfig) -> None:
     torch.set_num_threads(1)
     path = Path(cfg.path).expanduser()
     check_log_path(path)
-    env_id = None if OmegaConf.is_missing(cfg.env, "id") else str(cfg.env.id)
-    if env_id is not None and ":" in env_id:
-        import_from_here()
+    env_id = chosen_environment(cfg)
     act: Act | None = None
     if Path(cfg.policy).exists():
         policy = load_policy(cfg.policy, trust=cfg.trust)
@@ -81,7 +83,7 @@ def environment_of(policy: Policy) -> str | None:
         ValueError: if it imports a package, which the policy may come with.
     """
     env_id: str | None = policy.record["source"].get("env_id")
-    if env_id is not None and ":" in env_id:
+    if env_id is not None and module_of(env_id):
         raise ValueError(
             f"the policy is of env.id={env_id}, which imports a package: if you know "
             "it, give env.id yourself."

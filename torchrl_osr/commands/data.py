@@ -38,7 +38,7 @@ from torchrl_osr.data.store.memmap import is_memmap_folder
 from torchrl_osr.evaluation.data_figure import data_figure
 from torchrl_osr.experiment import schema
 from torchrl_osr.experiment.limits import check_values
-from torchrl_osr.experiment.run_config import check_types, flatten, import_from_here
+from torchrl_osr.experiment.run_config import check_types, chosen_environment, flatten
 
 MOST_ENTRIES = 40  # in the table
 
@@ -53,10 +53,8 @@ def main(cfg: DictConfig) -> None:
     data_only = OmegaConf.create({"data": OmegaConf.to_container(cfg.data)})
     check_types(OmegaConf.create({"data": schema.DataConfig}), data_only)
     check_values(flatten(OmegaConf.to_container(data_only)))
-    env_id = None if OmegaConf.is_missing(cfg.env, "id") else str(cfg.env.id)
+    env_id = chosen_environment(cfg)
     env_name = None if env_id is None else cfg.env.get("name")
-    if env_id is not None and ":" in env_id:
-        import_from_here()
     options: Any = OmegaConf.to_container(cfg.data)
     read = ("columns", "action_bounds", "clip_actions", "download")
     reading = {name: options[name] for name in read}

@@ -237,6 +237,19 @@ def module_of(env_id: str) -> list[str]:
     return [module] if colon else []
 
 
+def chosen_environment(config: DictConfig) -> str | None:
+    """The ``env.id`` of a command line, if there is one.
+
+    A package that it names may lie in the current folder.
+    """
+    if OmegaConf.is_missing(config.env, "id"):
+        return None
+    env_id = str(config.env.id)
+    if module_of(env_id):
+        import_from_here()
+    return env_id
+
+
 def import_from_here() -> None:
     """Let modules that the user has named be imported from the current folder.
 

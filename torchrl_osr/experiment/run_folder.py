@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import os
 import platform
@@ -314,6 +315,7 @@ def package_versions() -> dict[str, str]:
     return {package.replace("-", "_"): version(package) for package in PACKAGES}
 
 
+@functools.cache  # of the code that runs: a later commit changes nothing in it
 def code_commit() -> str | None:
     """Commit of the checkout that the package is in, if it is in one.
 

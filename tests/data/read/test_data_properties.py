@@ -17,9 +17,10 @@ from unittest import mock
 
 import minari
 import numpy as np
+import property_settings
 import pytest
 from gymnasium import spaces
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from minari.data_collector import EpisodeBuffer
 from recorded_logs import save
@@ -34,16 +35,9 @@ from torchrl_osr.data import (
 )
 
 OUTCOMES: Counter[str] = Counter()
-EXAMPLES = int(os.environ.get("TORCHRL_OSR_PROPERTY_EXAMPLES", "40"))
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:minari")
-tried = settings(
-    max_examples=EXAMPLES,
-    deadline=None,
-    database=None,
-    derandomize=True,
-    suppress_health_check=list(HealthCheck),
-)
+tried = property_settings.tried(40)
 
 DTYPES = ["float16", "float32", "float64", "int32", ">f4"]
 SCALES = [1.0, 1.0, 1.0, 1e-3, 1e3, 1e-30, 1e-300, 1e30, 0.0]
