@@ -11,6 +11,7 @@ from torchrl_osr import (
     InverseDynamicsLoss,
     OSRLoss,
     OSRVLoss,
+    ReBRACLoss,
     TD3BCLoss,
 )
 from torchrl_osr.modules import (
@@ -42,6 +43,7 @@ LOSSES = {
     "osr_v": lambda: OSRVLoss(*networks(), model(), num_random=2),
     "edac": lambda: EDACLoss(*networks()),
     "td3_bc": lambda: TD3BCLoss(*networks(deterministic_actor)),
+    "rebrac": lambda: ReBRACLoss(*networks(deterministic_actor, layer_norm=True)),
     "inverse_dynamics": lambda: InverseDynamicsLoss(model()),
 }
 
