@@ -48,6 +48,18 @@ LOSSES = {
 }
 
 
+@pytest.fixture
+def make_batch(make_batch):
+    """Return a factory of batches that any loss can read."""
+
+    def make(*size, **options):
+        batch = make_batch(*size, **options)
+        batch["next", "action"] = batch["action"].flip(0)
+        return batch
+
+    return make
+
+
 @pytest.fixture(autouse=True)
 def _at_once(monkeypatch):
     monkeypatch.setattr(recording, "WARM_UP", 0)

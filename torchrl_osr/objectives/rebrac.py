@@ -82,8 +82,9 @@ class ReBRACLoss(BaseLoss):
         >>> no = torch.zeros(4, 1, dtype=torch.bool)
         >>> batch = TensorDict({
         ...     "observation": torch.randn(4, 11), "action": torch.rand(4, 3),
-        ...     "next": {"observation": torch.randn(4, 11), "action": torch.rand(4, 3),
-        ...              "reward": torch.ones(4, 1), "done": no, "terminated": no}}, [4])
+        ...     "next": {"observation": torch.randn(4, 11), "reward": torch.ones(4, 1),
+        ...              "done": no, "terminated": no, "action": torch.rand(4, 3)}
+        ... }, [4])
         >>> sorted(loss(batch).keys())
         ['cloning_error', 'loss_actor', 'loss_qvalue', 'pred_value', 'target_value']
     """

@@ -172,7 +172,7 @@ class TD3BCLoss(BaseLoss):
 def check_smoothing(
     policy_noise: float, noise_clip: float, low: float, high: float
 ) -> None:
-    """Raise a ValueError if an option of :func:`smoothed_action` is out of its range."""
+    """Raise a ValueError if :func:`smoothed_action` cannot have these options."""
     check_weight("policy_noise", policy_noise)
     check_positive("noise_clip", noise_clip, minimum=0)
     if not low < high:

@@ -16,7 +16,7 @@ ENDS = st.lists(st.integers(1, 6), min_size=1, max_size=6)
 
 
 def episodes(lengths) -> TensorDict:
-    """Episodes whose states and actions are numbered from 1 on, without a repetition."""
+    """Episodes whose states are numbered from 1 on, and actions after them."""
     rows, at = [], 0
     for episode, length in enumerate(lengths):
         state = torch.arange(at, at + length + 1.0).unsqueeze(-1) + 1
