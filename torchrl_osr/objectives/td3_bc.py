@@ -190,4 +190,5 @@ def smoothed_action(loss: Any, step: Step) -> Tensor:
     action = step.action(step.states[1], loss.target_actor_network_params)
     noise = loss.policy_noise * torch.randn_like(action)
     noise = noise.clamp(-loss.noise_clip, loss.noise_clip)
-    return (action + noise).clamp(loss.low, loss.high)
+    smoothed: Tensor = (action + noise).clamp(loss.low, loss.high)
+    return smoothed
