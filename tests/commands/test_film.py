@@ -110,7 +110,9 @@ def test_own_data_have_the_trained_policy_play_first(
 def test_a_policy_that_falls_by_itself_is_not_pushed(script, tmp_path, monkeypatch):
     run = own_run(tmp_path, "hopper", (11, 3))
     monkeypatch.setattr(script, "Camera", FakeCamera)
-    with pytest.raises(ValueError, match="the trained policy falls.* in all 2 episodes"):
+    with pytest.raises(
+        ValueError, match="the trained policy falls.* in all 2 episodes"
+    ):
         script.main(composed(run, "episodes=2"))
 
 
