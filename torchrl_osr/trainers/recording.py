@@ -133,7 +133,7 @@ class _Recording:
             return [
                 *(value.detach() for value in result.values()),
                 *(own.get(key) for key in self.written),
-                *(value for _, value in given),
+                *(_laid_out(value, like=each) for each, value in given),
             ]
 
         tensors = self._tensors(batch)
@@ -167,6 +167,16 @@ class _Recording:
             if key in self.keys or key not in self.written
         }
         return batch.batch_size, entries
+
+
+def _laid_out(gradient: Tensor, like: Tensor) -> Tensor:
+    """The gradient with the strides of its parameter, as ``backward`` leaves it.
+
+    Fused optimizers go through both by address and do not look at strides (torch 2.13).
+    """
+    if gradient.stride() == like.stride():
+        return gradient
+    return torch.empty_like(like).copy_(gradient)
 
 
 def _options(loss_module: LossModule) -> dict[str, Any]:
