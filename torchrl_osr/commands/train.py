@@ -28,7 +28,6 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 from torchrl import torchrl_logger
-from torchrl.objectives import SoftUpdate
 from torchrl.record.loggers import Logger
 
 from torchrl_osr import StatePerturbation
@@ -57,7 +56,12 @@ from torchrl_osr.experiment.build import (
 from torchrl_osr.experiment.loggers import log_outcome, make_loggers
 from torchrl_osr.experiment.run_config import check_run, module_of, read_yaml
 from torchrl_osr.experiment.training_data import load_training_data
-from torchrl_osr.trainers import OfflineTrainer, check_hardware, largest_value
+from torchrl_osr.trainers import (
+    OfflineTrainer,
+    SoftUpdate,
+    check_hardware,
+    largest_value,
+)
 
 log = logging.getLogger(__name__)
 
