@@ -59,8 +59,6 @@ def make_batch(make_batch):
     return make
 
 
-
-
 def make(name):
     loss = LOSSES[name]().double()
     if name != "inverse_dynamics":

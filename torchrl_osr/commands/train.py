@@ -107,7 +107,10 @@ def run(cfg: DictConfig, folder: Path) -> float:
     torch.set_num_threads(cfg.trainer.num_threads)
     torch.set_float32_matmul_precision(cfg.trainer.matmul_precision)
     device, autocast = check_hardware(
-        cfg.trainer.device, cfg.trainer.precision, cudagraph=cfg.trainer.cudagraph
+        cfg.trainer.device,
+        cfg.trainer.precision,
+        cudagraph=cfg.trainer.cudagraph,
+        policy_delay=cfg.optim.policy_delay,
     )
     spec, references = environment_spec(cfg.env.id), references_of(cfg)
     sizes = spec.observation_size, spec.action_size
@@ -194,6 +197,8 @@ def run(cfg: DictConfig, folder: Path) -> float:
             folder=folder / "checkpoint" / "policy",
             seed=cfg.seed + 1,
             target_net_updater=targets,
+            policy_delay=cfg.optim.policy_delay,
+            policy_params=policy_params,
             evaluate=lambda: summarize(play(policy), references),
             metric=("return" if references is None else "score", "max"),
             eval_interval=cfg.trainer.eval_interval,

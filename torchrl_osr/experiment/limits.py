@@ -45,6 +45,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "optim.inverse_dynamics_lr": (0, LARGEST),
     "optim.gamma": (0, 1),
     "optim.tau": (0, 1),
+    "optim.policy_delay": (1, 1000),
     "trainer.batch_size": _COUNT,
     "trainer.inverse_dynamics_steps": _COUNT,
     "trainer.steps": _COUNT,

@@ -185,6 +185,8 @@ class OptimConfig:
         inverse_dynamics_lr: learning rate of the inverse dynamics model.
         gamma: discount factor.
         tau: step of the target networks towards the critics, at each update.
+        policy_delay: updates of the critics for each of the policy, the entropy
+            temperature and the target networks.
     """
 
     actor_lr: float = MISSING
@@ -192,6 +194,7 @@ class OptimConfig:
     inverse_dynamics_lr: float = MISSING
     gamma: float = MISSING
     tau: float = MISSING
+    policy_delay: int = 1
 
 
 @dataclass
