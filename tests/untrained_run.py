@@ -29,7 +29,7 @@ def make_run(folder: Path, *overrides: str, sizes: tuple[int, int] = (11, 3)):
         cfg = compose("train", ["network.num_cells=[8]", *overrides])
     folder.mkdir()
     OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
-    actor, _, loss = make_learner(cfg, *sizes)
+    actor, _, loss, _ = make_learner(cfg, *sizes)
     norm = ObservationNorm(
         torch.full(sizes[:1], 2.0), torch.full(sizes[:1], 3.0), in_keys=["observation"],
         standard_normal=True,

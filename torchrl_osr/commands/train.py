@@ -124,8 +124,9 @@ def run(cfg: DictConfig, folder: Path) -> float:
     perturbation = StatePerturbation(**noise, seed=cfg.seed)
     data.buffer.append_transform(perturbation)
 
-    # Networks, and the policy's loss, which holds the inverse dynamics model.
-    actor, inverse_dynamics, loss = make_learner(cfg, *sizes, device)
+    # Networks, the policy's loss, and the objective: the loss, or with it a recovery
+    # term. Either holds the inverse dynamics model, if one is used.
+    actor, inverse_dynamics, loss, objective = make_learner(cfg, *sizes, device)
 
     told = about(cfg, folder) if cfg.logger.kind == "wandb" else {}
     loggers = make_loggers(folder=folder, **cfg.logger, **told)
@@ -157,7 +158,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
     adam = partial(torch.optim.Adam, fused=True, capturable=cfg.trainer.cudagraph)
 
     # First phase: which action leads from the perturbed state to the next state?
-    if hasattr(loss, "inverse_dynamics_network"):
+    if inverse_dynamics is not None:
         fit = instantiate(cfg.inverse_dynamics.loss, _partial_=True)(inverse_dynamics)
         trainer = new_trainer(
             fit,
@@ -180,7 +181,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
     # Second phase: the policy, taught by the critics and by the frozen model.
     critic_params = list(loss.qvalue_network_params.parameters())
     known = set(critic_params)
-    policy_params = [each for each in loss.parameters() if each not in known]
+    policy_params = [each for each in objective.parameters() if each not in known]
     groups = [
         {"params": critic_params, "lr": cfg.optim.qvalue_lr},
         {"params": policy_params, "lr": cfg.optim.actor_lr},
@@ -191,7 +192,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
     policy = deterministic_policy(actor, data.norm)
     with closing(EpisodeEvaluator(cfg.env.id, **episodes, device=device)) as play:
         trainer = new_trainer(
-            loss,
+            objective,
             adam(groups),
             total_steps=cfg.trainer.steps,
             folder=folder / "checkpoint" / "policy",
@@ -222,13 +223,14 @@ def code_versions() -> dict[str, str]:
 def about(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     """What W&B shall know of the run: name, group of its seeds, tags, configuration."""
     began = read_yaml(folder / ".hydra" / "hydra.yaml")["hydra"]
-    data, method = f"{cfg.env.name}-{cfg.data.quality}", began["runtime"]["choices"]
+    data = f"{cfg.env.name}-{cfg.data.quality}"
+    method = schema.method_name(began["runtime"]["choices"])
     sweep = [folder.parent.name] if began["mode"] == "MULTIRUN" else []
     settings: Any = OmegaConf.to_container(cfg, resolve=True)
     return {
-        "name": f"{data} {method['loss']} seed{cfg.seed}",
-        "group": f"{data} {method['loss']}",
-        "tags": [cfg.env.name, cfg.data.quality, method["loss"], *sweep],
+        "name": f"{data} {method} seed{cfg.seed}",
+        "group": f"{data} {method}",
+        "tags": [cfg.env.name, cfg.data.quality, method, *sweep],
         "config": settings | {"versions": code_versions()},
     }
 
@@ -258,11 +260,13 @@ def report(
     }
     write_json(folder / "returns.json", results | {"evaluations": history})
     name = f"{cfg.env.name} {cfg.data.quality}"
+    parts = [each for each in (cfg.loss, cfg.recovery) if each is not None]
+    method = " and ".join(each._target_.rpartition(".")[2] for each in parts)
     learning_curve(
         history,
         read_scalars(folder / "csv" / "scalars" / "policy"),
         folder / "curve.png",
-        title=f"{name}, {type(trainer.loss_module).__name__}, seed {cfg.seed}",
+        title=f"{name}, {method}, seed {cfg.seed}",
         data_mean=data_mean,
     )
     rows = {"last": history[-1], "best": best}

@@ -16,6 +16,7 @@ from torchrl_osr._checks import check_choice
 from torchrl_osr.data import ReferenceReturns, reference_returns
 from torchrl_osr.experiment.limits import check_networks
 from torchrl_osr.objectives.distributions import is_categorical
+from torchrl_osr.objectives.with_recovery import WithRecovery
 
 
 def read_environment(cfg: DictConfig) -> None:
@@ -109,14 +110,16 @@ class Learner(NamedTuple):
 
     Attributes:
         actor: the policy.
-        model: the inverse dynamics model, whether the loss uses it or not.
-        loss: holds the tensors of both, the model's frozen: what either learns, the
-            loss knows.
+        model: the inverse dynamics model, ``None`` if nothing uses it.
+        loss: holds the actor's tensors and the critics.
+        objective: what is trained: the loss, with the recovery term that is added to
+            it. Holds the model's tensors too, frozen: what it learns, this knows.
     """
 
     actor: ProbabilisticTensorDictSequential
-    model: ProbabilisticTensorDictSequential
+    model: ProbabilisticTensorDictSequential | None
     loss: LossModule
+    objective: LossModule
 
 
 def make_learner(
@@ -136,9 +139,10 @@ def make_learner(
         device: where they shall be. Default CPU.
 
     Raises:
-        ValueError: if an option of the loss is out of its range, or the networks do not
-            fit into the memory.
+        ValueError: if an option of a loss is out of its range, the loss has a recovery
+            term already, or the networks do not fit into the memory.
     """
+    _check_recovery(cfg)
     check_networks(cfg, observation_size, action_size, device)
     sizes, cells = (observation_size, action_size), list(cfg.network.num_cells)
     actor = instantiate(cfg.network.actor, *sizes, num_cells=cells).to(device)
@@ -155,11 +159,37 @@ def make_learner(
         "qvalue_network": critics,
         "inverse_dynamics_network": model.to(device),
     }
-    wanted = inspect.signature(get_class(cfg.loss._target_)).parameters
-    given = {name: each for name, each in networks.items() if name in wanted}
-    loss = instantiate(cfg.loss, _partial_=True)(**given).to(device)
+
+    def built(part: DictConfig) -> LossModule:
+        wanted = inspect.signature(get_class(part._target_)).parameters
+        given = {name: each for name, each in networks.items() if name in wanted}
+        loss: LossModule = instantiate(part, _partial_=True)(**given).to(device)
+        return loss
+
+    loss = objective = built(cfg.loss)
     loss.make_value_estimator(gamma=cfg.optim.gamma)
-    return Learner(actor, model, loss)
+    parts = [loss]
+    if cfg.recovery is not None:
+        if is_categorical(actor):
+            raise ValueError(
+                f"recovery=... is for real actions, and those of {cfg.loss._target_} "
+                "are discrete: take loss=discrete_osr, which has a term of its own."
+            )
+        parts.append(built(cfg.recovery))
+        objective = WithRecovery(*parts)
+    used = any(hasattr(each, "inverse_dynamics_network") for each in parts)
+    return Learner(actor, model if used else None, loss, objective)
+
+
+def _check_recovery(cfg: DictConfig) -> None:
+    """Raise a ValueError if a recovery term is added to a loss that has its own."""
+    own = cfg.loss.get("recovery_weight")
+    if cfg.recovery is not None and own:
+        raise ValueError(
+            f"{cfg.loss._target_} has a recovery term of its own "
+            f"(loss.recovery_weight={own}), to which recovery=... would add another: "
+            "leave out recovery=..., or set loss.recovery_weight=0."
+        )
 
 
 def check_parts(
@@ -180,9 +210,10 @@ def check_parts(
     """
     sizes = observation_size, action_size
     check_networks(cfg, *sizes, cfg.trainer.device, training=True)
-    _, model, loss = make_learner(cfg, *sizes)
-    instantiate(cfg.inverse_dynamics.loss, _partial_=True)(model)
+    learner = make_learner(cfg, *sizes)
+    if learner.model is not None:
+        instantiate(cfg.inverse_dynamics.loss, _partial_=True)(learner.model)
     if cfg.perturbation.adversary is not None:
         instantiate(cfg.perturbation.adversary)
-    in_keys: list[NestedKey] = loss.in_keys
+    in_keys: list[NestedKey] = learner.objective.in_keys
     return in_keys

@@ -71,6 +71,7 @@ CHOICES: dict[str, tuple[str | None, ...]] = {
     "perturbation.noise": ("gaussian", "uniform"),
     "inverse_dynamics.loss.reduction": _REDUCTIONS,
     "loss.reduction": _REDUCTIONS,
+    "recovery.reduction": _REDUCTIONS,
     "trainer.nonfinite": ("stop", "skip"),
     "trainer.precision": ("float32", "bfloat16"),
     "trainer.matmul_precision": ("highest", "high", "medium"),

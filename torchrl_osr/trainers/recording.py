@@ -189,13 +189,16 @@ def _laid_out(gradient: Tensor, like: Tensor) -> Tensor:
     return torch.empty_like(like).copy_(gradient)
 
 
-def _options(loss_module: LossModule) -> dict[str, Any]:
-    """Numbers, words and flags of a loss: what Python may decide by."""
+def _options(loss_module: LossModule) -> list[dict[str, Any]]:
+    """Numbers, words and flags of a loss and its parts: what Python may decide by."""
     plain = (bool, int, float, str, type(None))
-    return {
-        name: value for name, value in vars(loss_module).items()
-        if isinstance(value, plain) and not name.startswith("_")
-    }  # fmt: skip
+    parts = [each for each in loss_module.children() if isinstance(each, LossModule)]
+    return [
+        {
+            name: value for name, value in vars(each).items()
+            if isinstance(value, plain) and not name.startswith("_")
+        } for each in (loss_module, *parts)
+    ]  # fmt: skip
 
 
 def _simplified(graph: GraphModule) -> GraphModule:
