@@ -11,6 +11,7 @@ from torchrl_osr import (
     InverseDynamicsLoss,
     OSRLoss,
     OSRVLoss,
+    ReBRACLoss,
     TD3BCLoss,
 )
 from torchrl_osr.modules import (
@@ -41,8 +42,21 @@ LOSSES = {
     "osr_v": lambda: OSRVLoss(*networks(), model(), num_random=2),
     "edac": lambda: EDACLoss(*networks()),
     "td3_bc": lambda: TD3BCLoss(*networks(deterministic_actor)),
+    "rebrac": lambda: ReBRACLoss(*networks(deterministic_actor, layer_norm=True)),
     "inverse_dynamics": lambda: InverseDynamicsLoss(model()),
 }
+
+
+@pytest.fixture
+def make_batch(make_batch):
+    """Return a factory of batches that any loss can read."""
+
+    def make(*size, **options):
+        batch = make_batch(*size, **options)
+        batch["next", "action"] = batch["action"].flip(0)
+        return batch
+
+    return make
 
 
 def make(name):
@@ -126,3 +140,18 @@ def test_a_loss_that_decides_by_numbers_is_run_as_it_is(make_batch, caplog):
     assert "Deciding runs without a recording" in caplog.text
     assert all(value.isfinite() for value in losses.values())
     assert sum(each is not None for each in found) > 4
+
+
+def test_the_same_weights_are_trained_by_a_fused_optimizer(make_batch):
+    batch, trained = make_batch(6, twin=True), []
+    for record in (False, True):
+        torch.manual_seed(0)
+        loss = make("osr")
+        gradients = LossGradients(loss, record=record, warm_up=0)
+        optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2, fused=True)
+        for _ in range(3):
+            gradients(batch.clone())
+            optimizer.step()
+            optimizer.zero_grad()
+        trained.append(loss.state_dict().values())
+    assert all(torch.equal(*pair) for pair in zip(*trained, strict=True))

@@ -111,11 +111,11 @@ def run(cfg: DictConfig, folder: Path) -> float:
     )
     spec, references = environment_spec(cfg.env.id), references_of(cfg)
     sizes = spec.observation_size, spec.action_size
-    check_parts(cfg, *sizes)
+    in_keys = check_parts(cfg, *sizes)
 
     # Transitions with standardised states. Each batch gets a perturbed state for every
     # state, which is the paper's mixed data set.
-    data = load_training_data(cfg, device)
+    data = load_training_data(cfg, device, in_keys)
     torch.manual_seed(cfg.seed)
     noise = {"std": cfg.perturbation.std, "noise": cfg.perturbation.noise}
     perturbation = StatePerturbation(**noise, seed=cfg.seed)
