@@ -151,3 +151,18 @@ def test_a_loss_that_decides_by_numbers_is_run_as_it_is(make_batch, caplog):
     assert "Deciding runs without a recording" in caplog.text
     assert all(value.isfinite() for value in losses.values())
     assert sum(each is not None for each in found) > 4
+
+
+def test_the_same_weights_are_trained_by_a_fused_optimizer(make_batch):
+    batch, trained = make_batch(6, twin=True), []
+    for record in (False, True):
+        torch.manual_seed(0)
+        loss = make("osr")
+        gradients = LossGradients(loss, record=record, warm_up=0)
+        optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2, fused=True)
+        for _ in range(3):
+            gradients(batch.clone())
+            optimizer.step()
+            optimizer.zero_grad()
+        trained.append(loss.state_dict().values())
+    assert all(torch.equal(*pair) for pair in zip(*trained, strict=True))
