@@ -11,6 +11,7 @@ from torchrl_osr.objectives import (
     InverseDynamicsLoss,
     OSRLoss,
     OSRVLoss,
+    ReBRACLoss,
     StateRecoveryLoss,
     TD3BCLoss,
 )
@@ -27,6 +28,7 @@ __all__ = [
     "OSRLoss",
     "OSRVLoss",
     "Policy",
+    "ReBRACLoss",
     "StatePerturbation",
     "StateRecoveryLoss",
     "TD3BCLoss",

@@ -28,7 +28,6 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 from torchrl import torchrl_logger
-from torchrl.objectives import SoftUpdate
 from torchrl.record.loggers import Logger
 
 from torchrl_osr import StatePerturbation
@@ -57,7 +56,12 @@ from torchrl_osr.experiment.build import (
 from torchrl_osr.experiment.loggers import log_outcome, make_loggers
 from torchrl_osr.experiment.run_config import check_run, module_of, read_yaml
 from torchrl_osr.experiment.training_data import load_training_data
-from torchrl_osr.trainers import OfflineTrainer, check_hardware, largest_value
+from torchrl_osr.trainers import (
+    OfflineTrainer,
+    SoftUpdate,
+    check_hardware,
+    largest_value,
+)
 
 log = logging.getLogger(__name__)
 
@@ -107,11 +111,11 @@ def run(cfg: DictConfig, folder: Path) -> float:
     )
     spec, references = environment_spec(cfg.env.id), references_of(cfg)
     sizes = spec.observation_size, spec.action_size
-    check_parts(cfg, *sizes)
+    in_keys = check_parts(cfg, *sizes)
 
     # Transitions with standardised states. Each batch gets a perturbed state for every
     # state, which is the paper's mixed data set.
-    data = load_training_data(cfg, device)
+    data = load_training_data(cfg, device, in_keys)
     torch.manual_seed(cfg.seed)
     noise = {"std": cfg.perturbation.std, "noise": cfg.perturbation.noise}
     perturbation = StatePerturbation(**noise, seed=cfg.seed)

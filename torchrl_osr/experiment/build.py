@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
-from tensordict import TensorDict
+from tensordict import NestedKey, TensorDict
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torchrl.objectives import LossModule
 
@@ -162,12 +162,17 @@ def make_learner(
     return Learner(actor, model, loss)
 
 
-def check_parts(cfg: DictConfig, observation_size: int, action_size: int) -> None:
+def check_parts(
+    cfg: DictConfig, observation_size: int, action_size: int
+) -> list[NestedKey]:
     """Build once what a run will need, so that a wrong option stops before its data.
 
     Args:
         cfg: a whole configuration of ``torchrl-osr train``.
         observation_size, action_size: of the data.
+
+    Returns:
+        The entries that the policy's loss reads.
 
     Raises:
         ValueError: if an option is out of its range, or networks and batches do not fit
@@ -175,7 +180,9 @@ def check_parts(cfg: DictConfig, observation_size: int, action_size: int) -> Non
     """
     sizes = observation_size, action_size
     check_networks(cfg, *sizes, cfg.trainer.device, training=True)
-    _, model, _ = make_learner(cfg, *sizes)
+    _, model, loss = make_learner(cfg, *sizes)
     instantiate(cfg.inverse_dynamics.loss, _partial_=True)(model)
     if cfg.perturbation.adversary is not None:
         instantiate(cfg.perturbation.adversary)
+    in_keys: list[NestedKey] = loss.in_keys
+    return in_keys

@@ -27,15 +27,18 @@ from torchrl_osr.functional.divergences import (
     state_recovery,
 )
 from torchrl_osr.functional.policy import (
+    action_distance,
     bootstrap_value,
     cloning_error,
     discrete_policy_value,
+    rebrac_objective,
     soft_policy_value,
     td3_bc_objective,
     temperature_objective,
 )
 
 __all__ = [
+    "action_distance",
     "bootstrap_value",
     "categorical_kl",
     "cloning_error",
@@ -46,6 +49,7 @@ __all__ = [
     "gradient_diversity",
     "jeffreys_divergence",
     "lagrange_terms",
+    "rebrac_objective",
     "soft_maximum",
     "soft_policy_value",
     "state_recovery",
