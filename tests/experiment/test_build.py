@@ -32,9 +32,10 @@ def learner_of(*overrides: str):
 def test_every_loss_is_built_and_trains_its_networks(name, make_batch) -> None:
     cfg, (actor, _, loss, _) = learner_of(f"loss={name}")
     assert type(loss) is get_class(cfg.loss._target_)
-    assert loss.num_qvalue_nets == (10 if name.endswith("_10") else 2)
-    assert loss.value_estimator.gamma == 0.5
-    SoftUpdate(loss, tau=0.1)
+    if hasattr(loss, "qvalue_network"):
+        assert loss.num_qvalue_nets == (10 if name.endswith("_10") else 2)
+        assert loss.value_estimator.gamma == 0.5
+        SoftUpdate(loss, tau=0.1)
     batch = make_batch(10).apply(lambda x: x.float() if x.is_floating_point() else x)
     batch["next", "action"] = batch["action"].flip(0)
     if name.startswith("discrete"):
@@ -81,7 +82,7 @@ def test_recovery_is_added_to_a_loss_without_it(name, recovery, make_batch) -> N
     batch = make_batch(10).apply(lambda x: x.float() if x.is_floating_point() else x)
     batch["next", "action"] = batch["action"].flip(0)
     out = added.objective(batch)
-    assert set(out.keys()) > set(plain.loss.out_keys)
+    assert set(out.keys()) > set(added.loss.out_keys)
     grads = []
     for key in ("loss_actor", "loss_recovery"):
         out[key].backward(retain_graph=True)

@@ -179,14 +179,22 @@ def run(cfg: DictConfig, folder: Path) -> float:
         print(describe_inverse_dynamics(trainer.history[-1]))
 
     # Second phase: the policy, taught by the critics and by the frozen model.
-    critic_params = list(loss.qvalue_network_params.parameters())
+    critics = ("qvalue_network", "value_network")
+    critic_params = [
+        each
+        for name in critics
+        if hasattr(loss, name)
+        for each in getattr(loss, f"{name}_params").parameters()
+    ]
     known = set(critic_params)
     policy_params = [each for each in objective.parameters() if each not in known]
     groups = [
         {"params": critic_params, "lr": cfg.optim.qvalue_lr},
         {"params": policy_params, "lr": cfg.optim.actor_lr},
     ]
-    targets = SoftUpdate(loss, tau=cfg.optim.tau) if loss.delay_qvalue else None
+    groups = [each for each in groups if each["params"]]
+    has_targets = bool(critic_params) and loss.delay_qvalue
+    targets = SoftUpdate(loss, tau=cfg.optim.tau) if has_targets else None
     limit = largest_value(data.largest_reward, cfg.optim.gamma)
     episodes = {"num_episodes": cfg.trainer.eval_episodes, "seed": EVALUATION_SEED}
     policy = deterministic_policy(actor, data.norm)
