@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import logging
 import sys
+from collections.abc import Mapping
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -92,6 +93,7 @@ def train(cfg: DictConfig) -> float:
         check_run(cfg, trust)
         if fresh:
             read_environment(cfg)
+            note_defaults(job.runtime.choices)
     with run_folder.lock(folder):
         run_folder.claim(folder, cfg, job)
         with run_folder.status(folder):
@@ -215,11 +217,24 @@ def run(cfg: DictConfig, folder: Path) -> float:
             value_limits={"pred_value": limit, "target_value": limit},
         )
         trainer.register_op("post_steps", still_ours)
+        if hasattr(loss, "decay_uncertainty"):
+            trainer.register_op("post_optim", loss.decay_uncertainty)
         if cfg.perturbation.adversary is not None:
             adversary = instantiate(cfg.perturbation.adversary)
             trainer.register_op("process_optim_batch", partial(adversary, loss))
         trainer.train()
     return report(cfg, folder, data.mean, trainer, loggers)
+
+
+def note_defaults(choices: Mapping[str, str]) -> None:
+    """Log that a loss's authors have told settings for other data than a run's."""
+    loss, data = choices["loss"], f"{choices['env']}-{choices['data']}"
+    published = Path(CONF) / "published" / loss
+    if published.is_dir() and not (published / f"{data}.yaml").is_file():
+        log.warning(
+            f"There are no published settings of loss={loss} for {data}; its defaults "
+            f"are taken. There are some in {published}."
+        )
 
 
 def code_versions() -> dict[str, str]:
