@@ -93,7 +93,7 @@ def train(cfg: DictConfig) -> float:
         check_run(cfg, trust)
         if fresh:
             read_environment(cfg)
-            note_defaults(job.runtime.choices)
+            note_defaults(cfg, job.runtime.choices)
     with run_folder.lock(folder):
         run_folder.claim(folder, cfg, job)
         with run_folder.status(folder):
@@ -181,13 +181,9 @@ def run(cfg: DictConfig, folder: Path) -> float:
         print(describe_inverse_dynamics(trainer.history[-1]))
 
     # Second phase: the policy, taught by the critics and by the frozen model.
-    critics = ("qvalue_network", "value_network")
-    critic_params = [
-        each
-        for name in critics
-        if hasattr(loss, name)
-        for each in getattr(loss, f"{name}_params").parameters()
-    ]
+    names = [f"{kind}_network_params" for kind in ("qvalue", "value")]
+    critics = [getattr(loss, name) for name in names if hasattr(loss, name)]
+    critic_params = [each for critic in critics for each in critic.parameters()]
     known = set(critic_params)
     policy_params = [each for each in objective.parameters() if each not in known]
     groups = [
@@ -226,14 +222,14 @@ def run(cfg: DictConfig, folder: Path) -> float:
     return report(cfg, folder, data.mean, trainer, loggers)
 
 
-def note_defaults(choices: Mapping[str, str]) -> None:
-    """Log that a loss's authors have told settings for other data than a run's."""
-    loss, data = choices["loss"], f"{choices['env']}-{choices['data']}"
+def note_defaults(cfg: DictConfig, choices: Mapping[str, str]) -> None:
+    """Warn if a loss's authors have told settings for other data than a run's."""
+    loss, file = choices["loss"], f"{choices['env']}-{choices['data']}.yaml"
     published = Path(CONF) / "published" / loss
-    if published.is_dir() and not (published / f"{data}.yaml").is_file():
+    if published.is_dir() and not (published / file).is_file():
         log.warning(
-            f"There are no published settings of loss={loss} for {data}; its defaults "
-            f"are taken. There are some in {published}."
+            f"There are no published settings of loss={loss} for {cfg.env.name} "
+            f"{cfg.data.quality}: its defaults are taken. {published} has some."
         )
 
 
