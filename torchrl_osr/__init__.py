@@ -14,6 +14,7 @@ from torchrl_osr.objectives import (
     OSRLoss,
     OSRVLoss,
     ReBRACLoss,
+    RORLLoss,
     StateRecoveryLoss,
     TD3BCLoss,
 )
@@ -32,6 +33,7 @@ __all__ = [
     "OSRLoss",
     "OSRVLoss",
     "Policy",
+    "RORLLoss",
     "ReBRACLoss",
     "StatePerturbation",
     "StateRecoveryLoss",
