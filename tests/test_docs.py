@@ -151,6 +151,7 @@ def test_options_of_every_group_are_documented():
         "inverse_dynamics",
         "loss",
         "perturbation",
+        "recovery",
         "logger",
         "preset",
         "hydra/launcher",

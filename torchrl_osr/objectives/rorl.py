@@ -154,7 +154,7 @@ class RORLLoss(BaseLoss):
             setattr(self, name, value)
         self.num_samples, self.q_smooth_tau = num_samples, q_smooth_tau
         self.register_buffer("uncertainty_weight", torch.tensor(q_ood_uncertainty_reg))
-        self.register_buffer("num_updates", torch.tensor(0))
+        self.register_buffer("num_updates", torch.tensor(0.0))
         self.make_value_estimator()
 
     @torch.no_grad()
