@@ -6,9 +6,11 @@ Learning" (Jiang et al., NeurIPS 2023), https://openreview.net/forum?id=4gLWjSaw
 
 from torchrl_osr.objectives import (
     Adversary,
+    BCLoss,
     DiscreteOSRLoss,
     EDACLoss,
     InverseDynamicsLoss,
+    IQLLoss,
     OSRLoss,
     OSRVLoss,
     ReBRACLoss,
@@ -22,8 +24,10 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Adversary",
+    "BCLoss",
     "DiscreteOSRLoss",
     "EDACLoss",
+    "IQLLoss",
     "InverseDynamicsLoss",
     "OSRLoss",
     "OSRVLoss",

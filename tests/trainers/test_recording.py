@@ -12,6 +12,7 @@ from torchrl_osr import (
     OSRLoss,
     OSRVLoss,
     ReBRACLoss,
+    StateRecoveryLoss,
     TD3BCLoss,
 )
 from torchrl_osr.modules import (
@@ -20,6 +21,7 @@ from torchrl_osr.modules import (
     tanh_gaussian_actor,
     tanh_gaussian_inverse_dynamics,
 )
+from torchrl_osr.objectives.with_recovery import WithRecovery
 from torchrl_osr.trainers.recording import LossGradients
 
 SIZES = (3, 2)
@@ -34,6 +36,11 @@ def model():
     return tanh_gaussian_inverse_dynamics(*SIZES, **CELLS)
 
 
+def with_recovery(loss, recovery):
+    SoftUpdate(loss, tau=0.1)  # TorchRL warns of losses without one
+    return WithRecovery(loss, recovery)
+
+
 LOSSES = {
     "osr": lambda: OSRLoss(*networks(layer_norm=True), model(), num_random=2),
     "cql": lambda: OSRLoss(
@@ -43,6 +50,10 @@ LOSSES = {
     "edac": lambda: EDACLoss(*networks()),
     "td3_bc": lambda: TD3BCLoss(*networks(deterministic_actor)),
     "rebrac": lambda: ReBRACLoss(*networks(deterministic_actor, layer_norm=True)),
+    "rebrac+osr": lambda: with_recovery(
+        ReBRACLoss(actor := networks(deterministic_actor)[0], networks()[1]),
+        StateRecoveryLoss(actor, model()),
+    ),
     "inverse_dynamics": lambda: InverseDynamicsLoss(model()),
 }
 
@@ -61,7 +72,7 @@ def make_batch(make_batch):
 
 def make(name):
     loss = LOSSES[name]().double()
-    if name != "inverse_dynamics":
+    if name != "inverse_dynamics" and not isinstance(loss, WithRecovery):
         SoftUpdate(loss, tau=0.1)  # TorchRL warns of losses without one
     return loss
 

@@ -27,8 +27,10 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl import torchrl_logger
 from torchrl.record.loggers import Logger
+from torchrl.trainers import LRSchedulerHook
 
 from torchrl_osr import StatePerturbation
 from torchrl_osr._files import write_json
@@ -61,6 +63,7 @@ from torchrl_osr.trainers import (
     SoftUpdate,
     check_hardware,
     largest_value,
+    learning_rates,
 )
 
 log = logging.getLogger(__name__)
@@ -107,7 +110,10 @@ def run(cfg: DictConfig, folder: Path) -> float:
     torch.set_num_threads(cfg.trainer.num_threads)
     torch.set_float32_matmul_precision(cfg.trainer.matmul_precision)
     device, autocast = check_hardware(
-        cfg.trainer.device, cfg.trainer.precision, cudagraph=cfg.trainer.cudagraph
+        cfg.trainer.device,
+        cfg.trainer.precision,
+        cudagraph=cfg.trainer.cudagraph,
+        policy_delay=cfg.optim.policy_delay,
     )
     spec, references = environment_spec(cfg.env.id), references_of(cfg)
     sizes = spec.observation_size, spec.action_size
@@ -121,23 +127,25 @@ def run(cfg: DictConfig, folder: Path) -> float:
     perturbation = StatePerturbation(**noise, seed=cfg.seed)
     data.buffer.append_transform(perturbation)
 
-    # Networks, and the policy's loss, which holds the inverse dynamics model.
-    actor, inverse_dynamics, loss = make_learner(cfg, *sizes, device)
+    # Networks, the policy's loss, and the objective: the loss, or with it a recovery
+    # term. Either holds the inverse dynamics model, if one is used.
+    actor, inverse_dynamics, loss, objective = make_learner(cfg, *sizes, device)
 
     told = about(cfg, folder) if cfg.logger.kind == "wandb" else {}
     loggers = make_loggers(folder=folder, **cfg.logger, **told)
 
+    components = {
+        "perturbation": perturbation,
+        "observation_norm": data.norm,
+        "settings": run_folder.Settings(cfg),
+    }
     # One step of a trainer: sample a batch, compute the losses, go backward on their
     # sum, step the optimizer, move the target networks; log, evaluate and write a
     # checkpoint at their intervals. Both phases have this in common:
     new_trainer = partial(
         OfflineTrainer,
         replay_buffer=data.buffer,
-        components={
-            "perturbation": perturbation,
-            "observation_norm": data.norm,
-            "settings": run_folder.Settings(cfg),
-        },
+        components=components,
         loggers=loggers,
         log_interval=cfg.trainer.log_interval,
         checkpoint_interval=cfg.trainer.checkpoint_interval,
@@ -154,7 +162,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
     adam = partial(torch.optim.Adam, fused=True, capturable=cfg.trainer.cudagraph)
 
     # First phase: which action leads from the perturbed state to the next state?
-    if hasattr(loss, "inverse_dynamics_network"):
+    if inverse_dynamics is not None:
         fit = instantiate(cfg.inverse_dynamics.loss, _partial_=True)(inverse_dynamics)
         trainer = new_trainer(
             fit,
@@ -175,32 +183,62 @@ def run(cfg: DictConfig, folder: Path) -> float:
         print(describe_inverse_dynamics(trainer.history[-1]))
 
     # Second phase: the policy, taught by the critics and by the frozen model.
-    critic_params = list(loss.qvalue_network_params.parameters())
-    known = set(critic_params)
-    policy_params = [each for each in loss.parameters() if each not in known]
-    groups = [
-        {"params": critic_params, "lr": cfg.optim.qvalue_lr},
-        {"params": policy_params, "lr": cfg.optim.actor_lr},
+    critics = ("qvalue_network", "value_network")
+    critic_params = [
+        each
+        for name in critics
+        if hasattr(loss, name)
+        for each in getattr(loss, f"{name}_params").parameters()
     ]
-    targets = SoftUpdate(loss, tau=cfg.optim.tau) if loss.delay_qvalue else None
+    known = set(critic_params)
+    policy_params = [each for each in objective.parameters() if each not in known]
+    optim = cfg.optim
+    trained = [
+        (critic_params, optim.qvalue_lr, optim.qvalue_schedule),
+        (policy_params, optim.actor_lr, optim.actor_schedule),
+    ]
+    trained = [each for each in trained if each[0]]  # cloning has no critics
+    optimizer = adam([{"params": params, "lr": rate} for params, rate, _ in trained])
+    kinds = [kind for *_, kind in trained]
+    schedule = learning_rates(optimizer, kinds, cfg.trainer.steps)
+    # What is played, now and by all other commands.
+    share = optim.policy_average
+    average = AveragedModel(actor, multi_avg_fn=get_ema_multi_avg_fn(1 - share))
+    has_targets = bool(critic_params) and loss.delay_qvalue
+    targets = SoftUpdate(loss, tau=optim.tau) if has_targets else None
     limit = largest_value(data.largest_reward, cfg.optim.gamma)
     episodes = {"num_episodes": cfg.trainer.eval_episodes, "seed": EVALUATION_SEED}
-    policy = deterministic_policy(actor, data.norm)
+    policy = deterministic_policy(average.module, data.norm)
+    last_weights = deterministic_policy(actor, data.norm)
+    measure = "return" if references is None else "score"
     with closing(EpisodeEvaluator(cfg.env.id, **episodes, device=device)) as play:
+
+        def evaluate() -> dict[str, Any]:
+            results = summarize(play(policy), references)
+            if share < 1:
+                last = summarize(play(last_weights), references)
+                results[f"{measure}_of_last_weights"] = last[measure]
+            return results
+
         trainer = new_trainer(
-            loss,
-            adam(groups),
+            objective,
+            optimizer,
+            components=components | {"schedule": schedule, "policy_average": average},
             total_steps=cfg.trainer.steps,
             folder=folder / "checkpoint" / "policy",
             seed=cfg.seed + 1,
             target_net_updater=targets,
-            evaluate=lambda: summarize(play(policy), references),
-            metric=("return" if references is None else "score", "max"),
+            policy_delay=cfg.optim.policy_delay,
+            policy_params=policy_params,
+            evaluate=evaluate,
+            metric=(measure, "max"),
             eval_interval=cfg.trainer.eval_interval,
             description="policy",
             value_limits={"pred_value": limit, "target_value": limit},
         )
         trainer.register_op("post_steps", still_ours)
+        LRSchedulerHook(schedule, interval="optim").register(trainer)
+        trainer.register_op("post_optim", partial(average.update_parameters, actor))
         if cfg.perturbation.adversary is not None:
             adversary = instantiate(cfg.perturbation.adversary)
             trainer.register_op("process_optim_batch", partial(adversary, loss))
@@ -217,13 +255,14 @@ def code_versions() -> dict[str, str]:
 def about(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     """What W&B shall know of the run: name, group of its seeds, tags, configuration."""
     began = read_yaml(folder / ".hydra" / "hydra.yaml")["hydra"]
-    data, method = f"{cfg.env.name}-{cfg.data.quality}", began["runtime"]["choices"]
+    data = f"{cfg.env.name}-{cfg.data.quality}"
+    method = schema.method_name(began["runtime"]["choices"])
     sweep = [folder.parent.name] if began["mode"] == "MULTIRUN" else []
     settings: Any = OmegaConf.to_container(cfg, resolve=True)
     return {
-        "name": f"{data} {method['loss']} seed{cfg.seed}",
-        "group": f"{data} {method['loss']}",
-        "tags": [cfg.env.name, cfg.data.quality, method["loss"], *sweep],
+        "name": f"{data} {method} seed{cfg.seed}",
+        "group": f"{data} {method}",
+        "tags": [cfg.env.name, cfg.data.quality, method, *sweep],
         "config": settings | {"versions": code_versions()},
     }
 
@@ -253,11 +292,13 @@ def report(
     }
     write_json(folder / "returns.json", results | {"evaluations": history})
     name = f"{cfg.env.name} {cfg.data.quality}"
+    parts = [each for each in (cfg.loss, cfg.recovery) if each is not None]
+    method = " and ".join(each._target_.rpartition(".")[2] for each in parts)
     learning_curve(
         history,
         read_scalars(folder / "csv" / "scalars" / "policy"),
         folder / "curve.png",
-        title=f"{name}, {type(trainer.loss_module).__name__}, seed {cfg.seed}",
+        title=f"{name}, {method}, seed {cfg.seed}",
         data_mean=data_mean,
     )
     rows = {"last": history[-1], "best": best}

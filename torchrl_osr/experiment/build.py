@@ -10,12 +10,16 @@ from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 from tensordict import NestedKey, TensorDict
 from tensordict.nn import ProbabilisticTensorDictSequential
+from torchrl.modules import TanhNormal
 from torchrl.objectives import LossModule
 
 from torchrl_osr._checks import check_choice
 from torchrl_osr.data import ReferenceReturns, reference_returns
 from torchrl_osr.experiment.limits import check_networks
-from torchrl_osr.objectives.distributions import is_categorical
+from torchrl_osr.modules import state_value
+from torchrl_osr.objectives import BaseLoss
+from torchrl_osr.objectives.distributions import head_of, is_categorical
+from torchrl_osr.objectives.with_recovery import WithRecovery
 
 
 def read_environment(cfg: DictConfig) -> None:
@@ -109,14 +113,16 @@ class Learner(NamedTuple):
 
     Attributes:
         actor: the policy.
-        model: the inverse dynamics model, whether the loss uses it or not.
-        loss: holds the tensors of both, the model's frozen: what either learns, the
-            loss knows.
+        model: the inverse dynamics model, ``None`` if nothing uses it.
+        loss: holds the actor's tensors, and the critics if it has any.
+        objective: what is trained: the loss, with the recovery term that is added to
+            it. Holds the model's tensors too, frozen: what it learns, this knows.
     """
 
     actor: ProbabilisticTensorDictSequential
-    model: ProbabilisticTensorDictSequential
+    model: ProbabilisticTensorDictSequential | None
     loss: LossModule
+    objective: LossModule
 
 
 def make_learner(
@@ -128,7 +134,7 @@ def make_learner(
     """Networks and loss, drawn anew from torch's global generator.
 
     A loss is given those networks that its constructor names: ``actor_network``,
-    ``qvalue_network``, ``inverse_dynamics_network``.
+    ``qvalue_network``, ``value_network``, ``inverse_dynamics_network``.
 
     Args:
         cfg: a whole configuration of ``torchrl-osr train``.
@@ -136,9 +142,10 @@ def make_learner(
         device: where they shall be. Default CPU.
 
     Raises:
-        ValueError: if an option of the loss is out of its range, or the networks do not
-            fit into the memory.
+        ValueError: if an option of a loss is out of its range, the loss has a recovery
+            term already, or the networks do not fit into the memory.
     """
+    _check_recovery(cfg)
     check_networks(cfg, observation_size, action_size, device)
     sizes, cells = (observation_size, action_size), list(cfg.network.num_cells)
     actor = instantiate(cfg.network.actor, *sizes, num_cells=cells).to(device)
@@ -155,11 +162,58 @@ def make_learner(
         "qvalue_network": critics,
         "inverse_dynamics_network": model.to(device),
     }
-    wanted = inspect.signature(get_class(cfg.loss._target_)).parameters
-    given = {name: each for name, each in networks.items() if name in wanted}
-    loss = instantiate(cfg.loss, _partial_=True)(**given).to(device)
-    loss.make_value_estimator(gamma=cfg.optim.gamma)
-    return Learner(actor, model, loss)
+
+    def built(part: DictConfig) -> LossModule:
+        wanted = inspect.signature(get_class(part._target_)).parameters
+        if "value_network" in wanted:
+            networks["value_network"] = state_value(
+                observation_size, num_cells=cells, layer_norm=cfg.network.layer_norm
+            ).to(device)
+        given = {name: each for name, each in networks.items() if name in wanted}
+        loss: LossModule = instantiate(part, _partial_=True)(**given).to(device)
+        return loss
+
+    loss = objective = built(cfg.loss)
+    if hasattr(loss, "qvalue_network"):
+        loss.make_value_estimator(gamma=cfg.optim.gamma)
+    parts = [loss]
+    if cfg.recovery is not None:
+        if is_categorical(actor):
+            raise ValueError(
+                f"recovery=... is for real actions, and those of {cfg.loss._target_} "
+                "are discrete: take loss=discrete_osr, which has a term of its own."
+            )
+        parts.append(built(cfg.recovery))
+        objective = WithRecovery(*parts)
+    used = any(hasattr(each, "inverse_dynamics_network") for each in parts)
+    return Learner(actor, model if used else None, loss, objective)
+
+
+def _check_adversary(objective: str, learner: Learner) -> None:
+    """Raise a ValueError unless an adversary can ask a loss's networks."""
+    loss, head = learner.loss, head_of(learner.actor)[0]
+    if not (isinstance(loss, BaseLoss) and hasattr(loss, "qvalue_network")):
+        raise ValueError(
+            f"perturbation=adversarial asks a loss with critics and perturbed states, "
+            f"and {type(loss).__name__} has none: take perturbation=gaussian."
+        )
+    if objective == "action_diff" and head is not TanhNormal:
+        raise ValueError(
+            "perturbation.adversary.objective=action_diff compares tanh-Gaussian "
+            f"policies, and that of {type(loss).__name__} is none: take min_Q, or "
+            "perturbation=gaussian."
+        )
+
+
+def _check_recovery(cfg: DictConfig) -> None:
+    """Raise a ValueError if a recovery term is added to a loss that has its own."""
+    own = cfg.loss.get("recovery_weight")
+    if cfg.recovery is not None and own:
+        raise ValueError(
+            f"{cfg.loss._target_} has a recovery term of its own "
+            f"(loss.recovery_weight={own}), to which recovery=... would add another: "
+            "leave out recovery=..., or set loss.recovery_weight=0."
+        )
 
 
 def check_parts(
@@ -179,10 +233,22 @@ def check_parts(
             into the memory.
     """
     sizes = observation_size, action_size
+    falling = [
+        name for name in ("actor_schedule", "qvalue_schedule")
+        if cfg.optim[name] != "constant"
+    ]  # fmt: skip
+    if cfg.trainer.cudagraph and falling:
+        raise ValueError(
+            f"optim.{falling[0]}={cfg.optim[falling[0]]} cannot be had with "
+            "trainer.cudagraph=true: a CUDA graph repeats the learning rate that it "
+            "was captured with. Take constant, or trainer.cudagraph=false."
+        )
     check_networks(cfg, *sizes, cfg.trainer.device, training=True)
-    _, model, loss = make_learner(cfg, *sizes)
-    instantiate(cfg.inverse_dynamics.loss, _partial_=True)(model)
+    learner = make_learner(cfg, *sizes)
+    if learner.model is not None:
+        instantiate(cfg.inverse_dynamics.loss, _partial_=True)(learner.model)
     if cfg.perturbation.adversary is not None:
-        instantiate(cfg.perturbation.adversary)
-    in_keys: list[NestedKey] = loss.in_keys
+        adversary = instantiate(cfg.perturbation.adversary)
+        _check_adversary(adversary.objective, learner)
+    in_keys: list[NestedKey] = learner.objective.in_keys
     return in_keys

@@ -10,12 +10,13 @@ from typing import Any, NamedTuple
 import torch
 from omegaconf import DictConfig
 from tensordict.nn import ProbabilisticTensorDictSequential
+from torch.optim.swa_utils import AveragedModel
 from torchrl.checkpoint import CheckpointError
 from torchrl.envs import ObservationNorm
 from torchrl.objectives import LossModule
 
 from torchrl_osr.experiment.build import Learner, make_learner
-from torchrl_osr.experiment.run_config import read_run
+from torchrl_osr.experiment.run_config import read_config, read_run
 from torchrl_osr.experiment.run_folder import CONFIG
 from torchrl_osr.trainers.checkpoints import find_damage, safe_checkpoint
 
@@ -28,9 +29,9 @@ class TrainedRun(NamedTuple):
 
     Attributes:
         config: the run's configuration.
-        actor: the policy; shares its parameters with the loss.
-        inverse_dynamics: the model that taught the policy, with the loss's frozen
-            parameters; ``None`` if the loss has none, as CQL and SAC-N have not.
+        actor: the policy, with the average of its weights (``optim.policy_average``);
+        inverse_dynamics: the model that taught the policy, with its frozen
+            parameters; ``None`` if there was none, as in CQL and SAC-N.
         loss: holds the critics, too.
         observation_norm: standardisation of the networks' observations.
         step: gradient steps of the checkpoint.
@@ -118,13 +119,18 @@ def load_trained(
     config = read_run(folder / CONFIG, trust)
     observation_size, action_size = sizes or _environment_sizes(config.env.id)
     with torch.random.fork_rng(devices=[]):
-        actor, model, loss = _learner(config, observation_size, action_size, folder)
+        actor, model, loss, objective = _learner(
+            config, observation_size, action_size, folder
+        )
     shape = (observation_size,) if config.data.standardize else ()
     norm = ObservationNorm(
         torch.zeros(shape), torch.ones(shape), in_keys=["observation"],
         standard_normal=True,
     )  # fmt: skip
-    checkpoint = safe_checkpoint(loss_module=loss, observation_norm=norm)
+    average = AveragedModel(actor)
+    checkpoint = safe_checkpoint(
+        loss_module=objective, observation_norm=norm, policy_average=average
+    )
     try:
         manifest = checkpoint.load(path, map_location="cpu").manifest
     except CheckpointError as error:
@@ -132,11 +138,11 @@ def load_trained(
             f"{path} does not fit {folder / CONFIG}: {error} Take both from one run.",
             error.result,
         ) from error
+    actor.load_state_dict(average.module.state_dict())
     numbered = re.fullmatch(r"checkpoint-(\d+)\.torchrl", path.name)
     step = int(numbered[1]) if numbered else int(manifest["metadata"]["step"])
-    # The loss's parameters of the model are the model's own tensors.
-    inverse_dynamics = model if hasattr(loss, "inverse_dynamics_network") else None
-    return TrainedRun(config, actor, inverse_dynamics, loss, norm, step, path, folder)
+    # The objective's parameters of actor and model are their own tensors.
+    return TrainedRun(config, actor, model, loss, norm, step, path, folder)
 
 
 def _learner(
@@ -160,7 +166,7 @@ def saved_sizes(path: Path) -> tuple[int, int]:
         path: of the checkpoint's file.
 
     Raises:
-        CheckpointError: it is damaged, or holds no actor and critics.
+        CheckpointError: it is damaged, or holds no actor.
     """
     _check_whole(path)
     state = _State()
@@ -168,13 +174,18 @@ def saved_sizes(path: Path) -> tuple[int, int]:
     weights = {
         name: [
             each for key, each in state.tensors.items()
-            if key.startswith(f"{name}_network_params.") and key.endswith(".weight")
+            # Where a recovery term was added, the loss is a part of what was trained.
+            if key.removeprefix("loss.").startswith(f"{name}_network_params.")
+            and key.endswith(".weight")
         ]
         for name in ("actor", "qvalue")
     }  # fmt: skip
-    if not all(weights.values()):
-        raise CheckpointError(f"{path} holds no actor, or no critics.")
+    if not weights["actor"]:
+        raise CheckpointError(f"{path} holds no actor.")
     observation_size = weights["actor"][0].shape[-1]
+    if not weights["qvalue"]:  # as behaviour cloning, which is of real actions alone
+        env = read_config(run_folder_of(path) / CONFIG).env
+        return observation_size, len(env.action_low)
     values, read = weights["qvalue"][-1].shape[-2], weights["qvalue"][0].shape[-1]
     # Critics of discrete actions read none, and value all of them.
     return observation_size, read - observation_size or values

@@ -34,6 +34,8 @@ class LossGradients:
     Args:
         loss_module: whose entries ``loss_*`` are summed.
         autocast_dtype: of the matrix products. Default: that of the parameters.
+        parameters: that are given a gradient; losses and metrics stay the same.
+            Default: all of the loss module.
         record: repeat a recording, on a CPU. Python code in the losses is not run again
             then: hooks, counters or prints in them stay silent. A loss that decides by
             numbers cannot be recorded and runs as it is.
@@ -46,10 +48,12 @@ class LossGradients:
         loss_module: LossModule,
         autocast_dtype: torch.dtype | None = None,
         *,
+        parameters: Sequence[nn.Parameter] | None = None,
         record: bool = False,
         warm_up: int = 100,
     ) -> None:
         self.loss_module, self.autocast_dtype = loss_module, autocast_dtype
+        self.parameters = parameters
         self.device = next(loss_module.parameters()).device
         self.record = record and self.device.type == "cpu"
         self._countdown = warm_up
@@ -64,7 +68,7 @@ class LossGradients:
             if self._countdown < 0:
                 self.record = self._try_to_record(batch)
         losses = self._losses(batch)
-        _total(losses).backward()
+        _total(losses).backward(inputs=self.parameters)
         return losses.detach()
 
     def _losses(self, batch: TensorDictBase) -> TensorDictBase:
@@ -76,7 +80,9 @@ class LossGradients:
     def _try_to_record(self, batch: TensorDictBase) -> bool:
         generator = torch.get_rng_state()
         try:
-            self._recording = _Recording(self._losses, self.loss_module, batch)
+            self._recording = _Recording(
+                self._losses, self.loss_module, batch, self.parameters
+            )
         except Exception as error:  # whatever a loss does that cannot be recorded
             log.warning(
                 f"{type(self.loss_module).__name__} runs without a recording, slower: "
@@ -98,15 +104,19 @@ class _Recording:
         losses: of a batch, with their graph.
         loss_module: its parameters, buffers and options are part of the recording.
         batch: of the kind that is to come; a loss may write into it.
+        parameters: that are given a gradient; ``None`` for all.
     """
 
     def __init__(
-        self, losses: Any, loss_module: LossModule, batch: TensorDictBase
+        self,
+        losses: Any,
+        loss_module: LossModule,
+        batch: TensorDictBase,
+        parameters: Sequence[nn.Parameter] | None,
     ) -> None:
         self.loss_module = loss_module
-        self.parameters = [
-            each for each in loss_module.parameters() if each.requires_grad
-        ]
+        given = loss_module.parameters() if parameters is None else parameters
+        self.parameters = [each for each in given if each.requires_grad]
         self.keys: list[NestedKey] = list(batch.keys(True, True))
         self.names: list[str] = []
         self.written: list[NestedKey] = []
@@ -179,13 +189,16 @@ def _laid_out(gradient: Tensor, like: Tensor) -> Tensor:
     return torch.empty_like(like).copy_(gradient)
 
 
-def _options(loss_module: LossModule) -> dict[str, Any]:
-    """Numbers, words and flags of a loss: what Python may decide by."""
+def _options(loss_module: LossModule) -> list[dict[str, Any]]:
+    """Numbers, words and flags of a loss and its parts: what Python may decide by."""
     plain = (bool, int, float, str, type(None))
-    return {
-        name: value for name, value in vars(loss_module).items()
-        if isinstance(value, plain) and not name.startswith("_")
-    }  # fmt: skip
+    parts = [each for each in loss_module.children() if isinstance(each, LossModule)]
+    return [
+        {
+            name: value for name, value in vars(each).items()
+            if isinstance(value, plain) and not name.startswith("_")
+        } for each in (loss_module, *parts)
+    ]  # fmt: skip
 
 
 def _simplified(graph: GraphModule) -> GraphModule:
