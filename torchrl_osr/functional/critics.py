@@ -109,7 +109,10 @@ def value_constraint(
     Minimised over Q, it lowers actions with unknown consequences and raises those that
     lead to ``s'``. With ``log_prob`` the first expectation is a log-sum-exp over
     importance-weighted actions instead (:func:`soft_maximum`): an addition, not in the
-    paper, which puts the weight on the actions that Q overrates.
+    paper, which puts the weight on the actions that Q overrates. The printed
+    difference is linear in Q and has no minimum;
+    :math:`\log\int e^{Q} da - \mathbb E_I Q`, of which this is an estimate but for
+    :math:`\log M`, is bounded below by the model's entropy.
 
     Args:
         policy_qvalue: values of the sampled actions at ``s~``, ``[B, M]``.
