@@ -7,6 +7,7 @@ Learning" (Jiang et al., NeurIPS 2023), https://openreview.net/forum?id=4gLWjSaw
 from torchrl_osr.objectives import (
     Adversary,
     DiscreteOSRLoss,
+    DynamicsLoss,
     EDACLoss,
     InverseDynamicsLoss,
     OSRLoss,
@@ -22,6 +23,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Adversary",
     "DiscreteOSRLoss",
+    "DynamicsLoss",
     "EDACLoss",
     "InverseDynamicsLoss",
     "OSRLoss",

@@ -26,6 +26,12 @@ from torchrl_osr.functional.divergences import (
     jeffreys_divergence,
     state_recovery,
 )
+from torchrl_osr.functional.dynamics import (
+    bounded_log_variance,
+    disagreement,
+    gaussian_error,
+    largest_deviation,
+)
 from torchrl_osr.functional.policy import (
     bootstrap_value,
     cloning_error,
@@ -37,15 +43,19 @@ from torchrl_osr.functional.policy import (
 
 __all__ = [
     "bootstrap_value",
+    "bounded_log_variance",
     "categorical_kl",
     "cloning_error",
     "conservative_gap",
     "deterministic_recovery",
+    "disagreement",
     "discrete_policy_value",
+    "gaussian_error",
     "gaussian_kl",
     "gradient_diversity",
     "jeffreys_divergence",
     "lagrange_terms",
+    "largest_deviation",
     "soft_maximum",
     "soft_policy_value",
     "state_recovery",

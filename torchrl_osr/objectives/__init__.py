@@ -3,6 +3,7 @@
 from torchrl_osr.objectives.adversary import Adversary
 from torchrl_osr.objectives.base import BaseLoss
 from torchrl_osr.objectives.discrete_osr import DiscreteOSRLoss
+from torchrl_osr.objectives.dynamics import DynamicsLoss
 from torchrl_osr.objectives.edac import EDACLoss
 from torchrl_osr.objectives.inverse_dynamics import InverseDynamicsLoss
 from torchrl_osr.objectives.osr import OSRLoss
@@ -14,6 +15,7 @@ __all__ = [
     "Adversary",
     "BaseLoss",
     "DiscreteOSRLoss",
+    "DynamicsLoss",
     "EDACLoss",
     "InverseDynamicsLoss",
     "OSRLoss",
