@@ -54,9 +54,11 @@ from torchrl_osr.experiment.build import (
     read_environment,
     references_of,
 )
+from torchrl_osr.experiment.dynamics import dynamics_model, imagined_replay_buffer
 from torchrl_osr.experiment.loggers import log_outcome, make_loggers
 from torchrl_osr.experiment.run_config import check_run, module_of, read_yaml
 from torchrl_osr.experiment.training_data import load_training_data
+from torchrl_osr.imagination import ImaginedReplayBuffer
 from torchrl_osr.trainers import OfflineTrainer, check_hardware, largest_value
 
 log = logging.getLogger(__name__)
@@ -126,14 +128,15 @@ def run(cfg: DictConfig, folder: Path) -> float:
     # One step of a trainer: sample a batch, compute the losses, go backward on their
     # sum, step the optimizer, move the target networks; log, evaluate and write a
     # checkpoint at their intervals. Both phases have this in common:
+    components = {
+        "perturbation": perturbation,
+        "observation_norm": data.norm,
+        "settings": run_folder.Settings(cfg),
+    }
     new_trainer = partial(
         OfflineTrainer,
         replay_buffer=data.buffer,
-        components={
-            "perturbation": perturbation,
-            "observation_norm": data.norm,
-            "settings": run_folder.Settings(cfg),
-        },
+        components=components,
         loggers=loggers,
         log_interval=cfg.trainer.log_interval,
         checkpoint_interval=cfg.trainer.checkpoint_interval,
@@ -170,6 +173,15 @@ def run(cfg: DictConfig, folder: Path) -> float:
         write_json(folder / "inverse_dynamics.json", trainer.history[-1])
         print(describe_inverse_dynamics(trainer.history[-1]))
 
+    # A model of the dynamics, and batches in part of what the policy does in it.
+    buffer, imagined = data.buffer, None
+    if cfg.dynamics.use:
+        model = dynamics_model(cfg, data, folder, new_trainer, adam)
+        buffer = imagined = imagined_replay_buffer(
+            cfg, data, model, actor, perturbation
+        )
+        components |= {"imagined": imagined}
+
     # Second phase: the policy, taught by the critics and by the frozen model.
     critic_params = list(loss.qvalue_network_params.parameters())
     known = set(critic_params)
@@ -186,6 +198,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
         trainer = new_trainer(
             loss,
             adam(groups),
+            replay_buffer=buffer,
             total_steps=cfg.trainer.steps,
             folder=folder / "checkpoint" / "policy",
             seed=cfg.seed + 1,
@@ -197,6 +210,8 @@ def run(cfg: DictConfig, folder: Path) -> float:
             value_limits={"pred_value": limit, "target_value": limit},
         )
         trainer.register_op("post_steps", still_ours)
+        if imagined is not None:
+            trainer.register_op("post_steps", partial(log_imagined, trainer, imagined))
         if cfg.perturbation.adversary is not None:
             adversary = instantiate(cfg.perturbation.adversary)
             trainer.register_op("process_optim_batch", partial(adversary, loss))
@@ -222,6 +237,13 @@ def about(cfg: DictConfig, folder: Path) -> dict[str, Any]:
         "tags": [cfg.env.name, cfg.data.quality, method["loss"], *sweep],
         "config": settings | {"versions": code_versions()},
     }
+
+
+def log_imagined(trainer: OfflineTrainer, imagined: ImaginedReplayBuffer) -> None:
+    """Log what the rows are like that the policy learns from besides the data."""
+    for name, value in imagined.metrics().items():
+        for logger in trainer.loggers:
+            logger.log_scalar(f"policy/{name}", value, step=trainer.step)
 
 
 def shuffle_next(batch: TensorDict) -> TensorDict:

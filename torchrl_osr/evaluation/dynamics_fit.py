@@ -51,7 +51,7 @@ def dynamics_report(
     rows = held_out[has_next_state(held_out, model.in_keys[0])]
     if not len(rows):
         raise ValueError("No held-out row has a next state.")
-    inputs, targets = model.inputs_and_targets(rows)
+    _, targets = model.inputs_and_targets(rows)
     mean, scale = model.predict(*(rows[key] for key in model.in_keys))
     unit = model.target_scale
     mse = ((mean - targets) / unit).square().mean().item()

@@ -15,6 +15,9 @@ from torchrl.objectives import LossModule
 from torchrl_osr._checks import check_choice
 from torchrl_osr.data import ReferenceReturns, reference_returns
 from torchrl_osr.experiment.limits import check_networks
+from torchrl_osr.imagination import Termination, never, termination
+from torchrl_osr.imagination.replay_buffer import check_real_ratio
+from torchrl_osr.modules import DynamicsEnsemble
 from torchrl_osr.objectives.distributions import is_categorical
 
 
@@ -104,6 +107,29 @@ def check_storage(cfg: DictConfig) -> str:
     return storage
 
 
+def make_dynamics(
+    cfg: DictConfig, observation_size: int, action_size: int
+) -> DynamicsEnsemble:
+    """An untrained model as ``dynamics`` of a configuration has it."""
+    return DynamicsEnsemble(
+        observation_size,
+        action_size,
+        num_networks=cfg.dynamics.num_networks,
+        num_elites=cfg.dynamics.num_elites,
+        num_cells=list(cfg.dynamics.num_cells),
+    )
+
+
+def termination_of(cfg: DictConfig) -> Termination:
+    """The rule by which imagined episodes end.
+
+    Raises:
+        ValueError: none is known for the task, and ``dynamics.terminations`` is not
+            ``never``.
+    """
+    return never if cfg.dynamics.terminations == "never" else termination(cfg.env.id)
+
+
 class Learner(NamedTuple):
     """A policy's loss and the networks in it.
 
@@ -179,3 +205,7 @@ def check_parts(cfg: DictConfig, observation_size: int, action_size: int) -> Non
     instantiate(cfg.inverse_dynamics.loss, _partial_=True)(model)
     if cfg.perturbation.adversary is not None:
         instantiate(cfg.perturbation.adversary)
+    if cfg.dynamics.use:
+        make_dynamics(cfg, *sizes)
+        termination_of(cfg)
+        check_real_ratio(cfg.dynamics.real_ratio, cfg.trainer.batch_size)

@@ -1,4 +1,4 @@
-"""Transitions that a dynamics model imagines: when they end, roll-outs, batches of them.
+"""Transitions that a dynamics model imagines: roll-outs, their ends, their batches.
 
 * :func:`imagine` rolls a policy out in a
   :class:`~torchrl_osr.modules.DynamicsEnsemble`.

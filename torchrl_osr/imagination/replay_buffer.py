@@ -10,11 +10,22 @@ from copy import deepcopy
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import nn
 from torchrl.data import LazyTensorStorage, OfflineToOnlineReplayBuffer, ReplayBuffer
 
 from torchrl_osr._checks import check_positive
+from torchrl_osr.imagination.rollout import Imagined
+
+
+def check_real_ratio(real_ratio: float, batch_size: int) -> None:
+    """Raise a ValueError unless a batch has real rows and others."""
+    real = round(real_ratio * batch_size)
+    if not 0 < real < batch_size:
+        raise ValueError(
+            f"real_ratio={real_ratio} of {batch_size} rows are {real}; expected real "
+            "and imagined rows in each batch."
+        )
 
 
 class ImaginedReplayBuffer(OfflineToOnlineReplayBuffer):
@@ -31,8 +42,9 @@ class ImaginedReplayBuffer(OfflineToOnlineReplayBuffer):
     Args:
         real: the data, a buffer that has no batch size of its own.
         policy: as it is trained; copied for each generation.
-        rows_of: maps a policy to a generation of rows, with torch's global generator as
-            its only source of chance. The rows have the entries of the real ones.
+        rows_of: what a policy imagines, as :func:`~torchrl_osr.imagination.imagine`
+            returns it, with torch's global generator as its only source of chance. The
+            rows have the entries of the real ones.
 
     Keyword Args:
         real_ratio: share of real rows in a batch, above 0 and below 1.
@@ -50,14 +62,15 @@ class ImaginedReplayBuffer(OfflineToOnlineReplayBuffer):
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl.data import LazyTensorStorage, ReplayBuffer
-        >>> from torchrl_osr.imagination import ImaginedReplayBuffer
+        >>> from torchrl_osr.imagination import Imagined, ImaginedReplayBuffer
         >>> real = ReplayBuffer(storage=LazyTensorStorage(100))
-        >>> rows = real.extend(TensorDict({"observation": torch.zeros(100, 1)}, [100]))
-        >>> policy = torch.nn.Linear(1, 1)
+        >>> indices = real.extend(TensorDict({"state": torch.zeros(100, 1)}, [100]))
+        >>> def rows_of(policy):
+        ...     return Imagined(TensorDict({"state": torch.rand(9, 1) + 1}, [9]), 0)
         >>> buffer = ImaginedReplayBuffer(
-        ...     real, policy, lambda each: TensorDict({"observation": torch.rand(9, 1)}, [9]),
-        ...     real_ratio=0.25, batch_size=8, interval=1000, generations=5, seed=0)
-        >>> int((buffer.sample()["observation"] == 0).sum())
+        ...     real, torch.nn.Linear(1, 1), rows_of, real_ratio=0.25, batch_size=8,
+        ...     interval=1000, generations=5, seed=0)
+        >>> int((buffer.sample()["state"] == 0).sum())
         2
     """
 
@@ -65,7 +78,7 @@ class ImaginedReplayBuffer(OfflineToOnlineReplayBuffer):
         self,
         real: ReplayBuffer,
         policy: nn.Module,
-        rows_of: Callable[[nn.Module], TensorDict],
+        rows_of: Callable[[nn.Module], Imagined],
         *,
         real_ratio: float,
         batch_size: int,
@@ -76,11 +89,7 @@ class ImaginedReplayBuffer(OfflineToOnlineReplayBuffer):
     ) -> None:
         check_positive("interval", interval, minimum=1)
         check_positive("generations", generations, minimum=1)
-        if not 0 < round(real_ratio * batch_size) < batch_size:
-            raise ValueError(
-                f"real_ratio={real_ratio} of {batch_size} rows are "
-                f"{round(real_ratio * batch_size)}; expected real and imagined rows."
-            )
+        check_real_ratio(real_ratio, batch_size)
         super().__init__(
             real,
             online_capacity=1,
@@ -94,7 +103,7 @@ class ImaginedReplayBuffer(OfflineToOnlineReplayBuffer):
         self._rng: torch.Generator | None = None
         self._copy = deepcopy(policy).requires_grad_(False)
         self._policies: list[dict[str, Any]] = []
-        self._rows: list[TensorDict] = []
+        self._imagined: list[Imagined] = []
 
     def set_rng(self, generator: torch.Generator) -> None:
         """Let both parts draw their rows with this generator."""
@@ -109,29 +118,39 @@ class ImaginedReplayBuffer(OfflineToOnlineReplayBuffer):
             weights = {key: value.cpu().clone() for key, value in state.items()}
             self._policies = [*self._policies, weights][-self.generations :]
             latest = self._imagine(weights, self.drawn // self.interval)
-            self._hold([*self._rows, latest][-self.generations :])
+            self._hold([*self._imagined, latest][-self.generations :])
         self.drawn += 1
         return super().sample(batch_size)
 
-    def _imagine(self, weights: Mapping[str, Any], number: int) -> TensorDict:
+    def metrics(self) -> dict[str, float]:
+        """What the generations are like: share of refused rows, mean reward."""
+        refused = sum(each.refused for each in self._imagined)
+        rows = len(self._online_buffer)
+        reward = self._online_buffer[:]["next", "reward"]
+        return {
+            "imagined_refused": refused / (refused + rows),
+            "imagined_reward": reward.mean().item(),
+        }
+
+    def _imagine(self, weights: Mapping[str, Any], number: int) -> Imagined:
         """Rows of the policy with these weights, with the seed of this generation."""
         self._copy.load_state_dict(weights)
         device = next(self._copy.parameters()).device
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
             torch.manual_seed(self.seed + number)
-            rows = self.rows_of(self._copy)
-        if not len(rows):
+            found = self.rows_of(self._copy)
+        if not len(found.rows):
             raise ValueError(
                 "no imagined row was taken: the model knows none of the policy's "
                 "actions. Train it longer (dynamics.steps), or take its rows all the "
                 "same (dynamics.refuse=false)."
             )
-        return rows
+        return found
 
-    def _hold(self, generations: list[TensorDict]) -> None:
+    def _hold(self, generations: list[Imagined]) -> None:
         """Draw from these rows, in their order."""
-        self._rows = generations
-        rows = torch.cat(generations)
+        self._imagined = generations
+        rows = torch.cat([each.rows for each in generations])
         storage = LazyTensorStorage(len(rows), device=rows.device or "cpu")
         self._online_buffer = ReplayBuffer(storage=storage)
         if self._rng is not None:
@@ -148,6 +167,5 @@ class ImaginedReplayBuffer(OfflineToOnlineReplayBuffer):
         following = -(-self.drawn // self.interval)  # rounded up
         first = following - len(self._policies)
         numbers = range(first, following)
-        rows = map(self._imagine, self._policies, numbers)
         if self._policies:
-            self._hold(list(rows))
+            self._hold(list(map(self._imagine, self._policies, numbers)))

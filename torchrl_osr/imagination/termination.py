@@ -17,7 +17,9 @@ Termination = Callable[[Tensor], Tensor]
 
 def never(observation: Tensor) -> Tensor:
     """No state ends the task: ``False`` for each of ``[B, S]``."""
-    return torch.zeros(observation.shape[:-1], dtype=torch.bool, device=observation.device)
+    return torch.zeros(
+        observation.shape[:-1], dtype=torch.bool, device=observation.device
+    )
 
 
 def hopper(observation: Tensor) -> Tensor:

@@ -158,7 +158,7 @@ class DynamicsEnsemble(TensorDictModuleBase):
         return tensordict
 
     def disagreement(self, mean: Tensor) -> Tensor:
-        """How far the elites' predictions lie apart, in standard deviations of the data.
+        """How far the elites' predictions lie apart, in units of the targets' spread.
 
         Args:
             mean: of :meth:`predict`, ``[E, B, D]``.
@@ -232,7 +232,9 @@ class DynamicsEnsemble(TensorDictModuleBase):
             yield {"params": [layer.weight], "weight_decay": decay}
         yield {"params": [last.weight], "weight_decay": OUTPUT_WEIGHT_DECAY}
         weights = {id(layer.weight) for layer in (*hidden, last)}
-        yield {"params": [each for each in self.parameters() if id(each) not in weights]}
+        yield {
+            "params": [each for each in self.parameters() if id(each) not in weights]
+        }
 
 
 class _StackedLinear(nn.Module):
