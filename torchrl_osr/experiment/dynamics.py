@@ -77,12 +77,9 @@ def dynamics_model(
     """
     fits, settings = facts_of(cfg, data), settings_of(cfg)
     here, given = folder / FILE, cfg.dynamics.path
-    if here.exists():
-        model = load_dynamics(here, fits)
-    elif given is not None:
-        model = load_dynamics(Path(given), fits)
-        write_dynamics(here, model, fits)
-    else:
+    if not here.exists() and given is not None:
+        write_dynamics(here, load_dynamics(given, fits), fits)
+    elif not here.exists():
         everything = {"data": fits, "settings": settings}
         text = json.dumps(everything, sort_keys=True).encode()
         name = f"{cfg.env.name}-{cfg.data.quality}-{hashlib.sha256(text).hexdigest()}"
@@ -96,10 +93,14 @@ def dynamics_model(
             except (OSError, ValueError) as flaw:
                 if cached.exists():
                     log.warning(f"Training {cached} anew: {flaw}")
-                model = _trained(cfg, data, folder, new_trainer, adam)
+                # The rest of the run draws the same numbers with a model from a file.
+                with torch.random.fork_rng(devices=[]):
+                    model = _trained(cfg, data, folder, new_trainer, adam)
                 write_dynamics(cached, model, fits)
         write_dynamics(here, model, fits)
-    model = model.to(data.held_out.device or "cpu").requires_grad_(False)
+    # From the file in any case, so that a continued run has the very same model.
+    model = load_dynamics(here, fits).to(data.held_out.device or "cpu")
+    model.requires_grad_(False)
     report = dynamics_report(model, data.held_out, data.pieces)
     write_json(folder / REPORT, report)
     print(describe_dynamics(report))
@@ -141,10 +142,8 @@ def _trained(
     """Train a model; the weights of its best evaluation are taken."""
     options, held_out = cfg.dynamics, data.held_out
     sizes = held_out["observation"].shape[-1], held_out["action"].shape[-1]
-    # The rest of the run draws the same numbers whether it trains a model or has one.
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(cfg.seed)
-        model = make_dynamics(cfg, *sizes).to(held_out.device or "cpu")
+    torch.manual_seed(cfg.seed)
+    model = make_dynamics(cfg, *sizes).to(held_out.device or "cpu")
     rows = data.alone()
     rows.set_rng(torch.Generator(held_out.device or "cpu").manual_seed(cfg.seed))
     model.standardize_(rows.sample(ROWS_FOR_STATISTICS))
@@ -188,6 +187,8 @@ def load_dynamics(
 ) -> DynamicsEnsemble:
     """Load a model that a run has trained; nothing is unpickled.
 
+    torch's global generator is left as it was.
+
     Args:
         path: of the file, ``dynamics.safetensors`` in the folder of a run.
         facts: :func:`facts_of` the data that it has to fit. Default: any.
@@ -202,7 +203,8 @@ def load_dynamics(
         tensors, record = read_tensors(path)
         if record.get("kind") != KIND:
             raise ValueError("it holds no dynamics model")
-        model = _model_of(tensors)
+        with torch.random.fork_rng(devices=[]):
+            model = _model_of(tensors)
     except (KeyError, IndexError, RuntimeError, ValueError) as error:
         raise ValueError(
             f"{path}: {error}. Take {FILE} from the folder of a run."
