@@ -50,6 +50,10 @@ FAMILY = {
     "SAC-N": ("`OSRLoss`, SAC-N", "`loss=sac_10`", REST),
     "EDAC": ("`EDACLoss`, EDAC", "`loss=edac_10`", "all pairs of gradients"),
     "TD3+BC": ("`TD3BCLoss`, TD3+BC (3) to (5)", "`loss=td3_bc`", REST),
+    "Dynamics ensemble": (
+        "`DynamicsLoss`, MOPO's code", "`loss=mopo`, `dynamics=ensemble`",
+        "Gaussian by Gaussian, network by network",
+    ),
     "Adversary": (
         "`Adversary`, RORL", "`perturbation=adversarial`", "a loop over the same draws",
     ),

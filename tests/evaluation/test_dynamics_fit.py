@@ -40,7 +40,9 @@ def make_data(rows: int = 20_000, noise: float = NOISE) -> TensorDict:
     reward = path[:-1] + noise * torch.randn(rows, 1)
     after = {"observation": path[1:].clone(), "reward": reward}
     after |= {"done": no, "terminated": no.clone()}
-    return TensorDict({"observation": path[:-1], "action": action, "next": after}, [rows])
+    return TensorDict(
+        {"observation": path[:-1], "action": action, "next": after}, [rows]
+    )
 
 
 def test_report_of_the_true_model() -> None:

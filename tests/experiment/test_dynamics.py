@@ -20,8 +20,8 @@ from torchrl_osr.experiment.dynamics import (
     imagined_replay_buffer,
     load_dynamics,
 )
-from torchrl_osr.experiment.training_data import load_training_data
 from torchrl_osr.experiment.trained_run import load_trained
+from torchrl_osr.experiment.training_data import load_training_data
 from torchrl_osr.policy.tensor_file import read_tensors, write_tensors
 
 ROOT = Path(__file__).parents[2]
@@ -102,17 +102,15 @@ def test_run_leaves_model_report_and_numbers(finished) -> None:
 
 
 def test_a_run_that_was_stopped_ends_with_the_same_bits(finished, tmp_path) -> None:
-    """Within a generation, and where the next one is due."""
-    for stop in (5, 8):
-        folder = ran(tmp_path / str(stop), f"trainer.steps={stop}")
-        ran(folder)
-        assert load_trained(folder).step == 14
-        states = [load_trained(each).loss.state_dict() for each in (finished, folder)]
-        assert states[0].keys() == states[1].keys()
-        for key, value in states[0].items():
-            assert not torch.is_tensor(value) or torch.equal(value, states[1][key]), key
-        there = scalars(folder)["imagined_reward"]
-        assert there == scalars(finished)["imagined_reward"]
+    """In the middle of a generation, with a model from the cache."""
+    folder = ran(tmp_path / "run", "trainer.steps=5")
+    ran(folder)
+    assert load_trained(folder).step == 14
+    here, there = (load_trained(each).loss.state_dict() for each in (finished, folder))
+    assert here.keys() == there.keys()
+    for key, value in here.items():
+        assert not torch.is_tensor(value) or torch.equal(value, there[key]), key
+    assert scalars(folder)["imagined_reward"] == scalars(finished)["imagined_reward"]
 
 
 def test_a_model_is_trained_once(finished, tmp_path, capsys) -> None:
@@ -155,9 +153,7 @@ def test_a_given_model_is_taken_if_it_fits_the_data(finished, tmp_path) -> None:
     assert load_dynamics(folder / file.name).layers[0].weight.shape[-1] == 8
     for override, named in {
         "data.num_transitions=500": "rows: 540 there, 450 here",
-        "data.standardize=false": "observation scale: ",
-        "data.reward_scale=2.0": "reward scale: 1.0 there, 2.0 here",
-        "data.seed=1": "held-out rows: ",
+        "data.standardize=false": "observation scale: .*held-out rows: ",
     }.items():
         with pytest.raises(ValueError, match=f"was trained on other data.*{named}"):
             ran(tmp_path / override, *given, override)
@@ -170,7 +166,9 @@ def test_another_file_is_refused(finished, tmp_path, content) -> None:
         write_tensors(path, {"weight": torch.zeros(2)}, {"kind": "policy"})
     else:
         path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"model\.safetensors: .*dynamics\.safetensors"):
+    with pytest.raises(
+        ValueError, match=r"model\.safetensors: .*dynamics\.safetensors"
+    ):
         load_dynamics(path)
 
 

@@ -24,8 +24,9 @@ from torchrl_osr.experiment import schema as config
 from torchrl_osr.experiment.schema import schema_of
 
 CONF = Path(__file__).parents[2] / "conf"
-GROUPS = ["env", "data", "inverse_dynamics", "loss", "logger", "perturbation", "preset"]
-OBJECTIVES = sorted(set(objectives.__all__) - {"BaseLoss"})
+GROUPS = ["env", "data", "inverse_dynamics", "dynamics", "loss", "logger"]
+GROUPS += ["perturbation", "preset"]
+OBJECTIVES = sorted(set(objectives.__all__) - config.NOT_CHOSEN)
 NETWORKS = {"actor_network", "qvalue_network", "inverse_dynamics_network"}
 NO_OPTIONS = {"action_spec", "gamma"}  # an object of Python, and what is refused
 
@@ -215,6 +216,7 @@ LOSSES = {
     "osr_official": ("OSRLoss", OFFICIAL),
     "osr_10": ("OSRLoss", OSR_10),
     "sac_10": ("OSRLoss", OSR_10 | CQL),
+    "mopo": ("OSRLoss", CQL | {"min_q_weight": 0.0, "deterministic_backup": False}),
     "edac_10": ("EDACLoss", {"num_qvalue_nets": 10}),
     "osr_v": ("OSRVLoss", {}),
     "td3_bc": ("TD3BCLoss", {}),

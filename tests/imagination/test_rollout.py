@@ -41,9 +41,7 @@ def one(state: torch.Tensor) -> torch.Tensor:
 
 
 def test_rows_are_those_of_a_known_world() -> None:
-    rows, refused = imagine(
-        linear_world(), one, torch.tensor([[0.0], [10.0]]), steps=3
-    )
+    rows, refused = imagine(linear_world(), one, torch.tensor([[0.0], [10.0]]), steps=3)
     assert refused == 0
     assert rows["observation"].flatten().tolist() == [0, 10, 1, 11, 2, 12]
     after = rows["next", "observation"].flatten()

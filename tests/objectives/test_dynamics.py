@@ -39,7 +39,9 @@ def plain_loss(model: DynamicsEnsemble, batch, weight: float) -> torch.Tensor:
                 hidden = hidden * torch.sigmoid(hidden)
             last = model.layers[-1]
             out = last.weight[number].T @ hidden + last.bias[number, 0]
-            truth = torch.cat([after["observation"] - row["observation"], after["reward"]])
+            truth = torch.cat(
+                [after["observation"] - row["observation"], after["reward"]]
+            )
             truth = (truth - model.target_loc) / model.target_scale
             free = high - torch.log(1 + torch.exp(high - out[4:]))
             variance = torch.exp(low + torch.log(1 + torch.exp(free - low)))

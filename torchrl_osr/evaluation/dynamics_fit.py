@@ -6,14 +6,15 @@ Shapes: ``N`` rows, ``S`` observation, ``E`` networks, ``D = S + 1`` predicted e
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torch.distributions import Normal
 
+from torchrl_osr.functional import gaussian_error
 from torchrl_osr.modules.dynamics import DynamicsEnsemble, has_next_state
 
 HORIZONS = (1, 2, 5, 10, 20)
@@ -60,9 +61,9 @@ def dynamics_report(
     deviation = (mean - targets).abs() / scale
     wrong = mean.mean(0) - targets
     r2 = 1 - wrong.square().sum(0) / (targets - targets.mean(0)).square().sum(0)
-    log_prob = Normal(mean, scale).log_prob(targets)
+    twice_nll = gaussian_error(mean, 2 * scale.log(), targets) + math.log(2 * math.pi)
     report = {
-        "nll": -log_prob.sum(-1).mean().item(),
+        "nll": targets.shape[-1] * twice_nll.mean().item() / 2,
         "mse": mse,
         "r2_mean": r2.mean().item(),
         "r2": r2.tolist(),

@@ -28,6 +28,7 @@ from torch import Tensor
 from torchrl_osr import __version__
 from torchrl_osr._files import write_json
 from torchrl_osr.data.store.cache import cache_root
+from torchrl_osr.data.store.validation import DATASET_KEYS
 from torchrl_osr.evaluation import describe_dynamics, dynamics_report
 from torchrl_osr.experiment.build import make_dynamics, termination_of
 from torchrl_osr.experiment.training_data import TrainingData
@@ -73,8 +74,15 @@ def dynamics_model(
         adam: makes an optimizer from parameters.
 
     Raises:
-        ValueError: ``dynamics.path`` names another file, or a model of other data.
+        ValueError: ``dynamics.path`` names another file, or a model of other data; or
+            the rows have entries that imagined ones lack.
     """
+    others = set(data.held_out.keys(True, True)) - set(DATASET_KEYS)
+    if others:
+        raise ValueError(
+            f"{cfg.loss._target_} reads {others}, which no model of the dynamics "
+            "imagines: take dynamics=none."
+        )
     fits, settings = facts_of(cfg, data), settings_of(cfg)
     here, given = folder / FILE, cfg.dynamics.path
     if not here.exists() and given is not None:
@@ -99,8 +107,8 @@ def dynamics_model(
                 write_dynamics(cached, model, fits)
         write_dynamics(here, model, fits)
     # From the file in any case, so that a continued run has the very same model.
-    model = load_dynamics(here, fits).to(data.held_out.device or "cpu")
-    model.requires_grad_(False)
+    model = load_dynamics(here, fits)
+    model.to(data.held_out.device or "cpu").requires_grad_(False)
     report = dynamics_report(model, data.held_out, data.pieces)
     write_json(folder / REPORT, report)
     print(describe_dynamics(report))
@@ -111,7 +119,7 @@ def facts_of(cfg: DictConfig, data: TrainingData) -> dict[str, Any]:
     """What a model shares with the data that it was trained on, JSON-compatible."""
     digest = hashlib.sha256()
     held_out = data.held_out.cpu()
-    for key in sorted(held_out.keys(True, True), key=str):
+    for key in DATASET_KEYS:
         digest.update(held_out[key].contiguous().view(torch.uint8).numpy().tobytes())
     return {
         "environment": cfg.env.id,
@@ -143,7 +151,8 @@ def _trained(
     options, held_out = cfg.dynamics, data.held_out
     sizes = held_out["observation"].shape[-1], held_out["action"].shape[-1]
     torch.manual_seed(cfg.seed)
-    model = make_dynamics(cfg, *sizes).to(held_out.device or "cpu")
+    model = make_dynamics(cfg, *sizes)
+    model.to(held_out.device or "cpu")
     rows = data.alone()
     rows.set_rng(torch.Generator(held_out.device or "cpu").manual_seed(cfg.seed))
     model.standardize_(rows.sample(ROWS_FOR_STATISTICS))
@@ -275,7 +284,6 @@ def imagined_replay_buffer(
     """
     options, norm, ends = cfg.dynamics, data.norm, termination_of(cfg)
     real, scale = data.alone(), cfg.data.reward_scale
-    entries = list(data.held_out.keys(True, True))
     sizes = norm.scale.expand(model.observation_dim)
     units = torch.cat([sizes, sizes.new_tensor([1 / scale])])
     largest = float(model.largest_disagreement) if options.refuse else math.inf
@@ -301,7 +309,7 @@ def imagined_replay_buffer(
             units=units,
         )
         rows["next", "reward"] -= options.penalty * scale * rows["uncertainty"]
-        return Imagined(rows.select(*entries), refused)
+        return Imagined(rows.select(*DATASET_KEYS), refused)
 
     return ImaginedReplayBuffer(
         real,

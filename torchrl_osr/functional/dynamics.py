@@ -7,6 +7,7 @@ predicted entries.
 from __future__ import annotations
 
 from torch import Tensor
+from torch.linalg import vector_norm
 from torch.nn.functional import softplus
 
 
@@ -77,7 +78,8 @@ def disagreement(mean: Tensor) -> Tensor:
         >>> disagreement(torch.tensor([[1.0, 0.0], [3.0, 0.0]]))
         tensor(1.)
     """
-    return (mean - mean.mean(0)).norm(dim=-1).max(0).values
+    distance: Tensor = vector_norm(mean - mean.mean(0), dim=-1)
+    return distance.amax(0)
 
 
 def largest_deviation(scale: Tensor) -> Tensor:
@@ -95,4 +97,5 @@ def largest_deviation(scale: Tensor) -> Tensor:
     Returns:
         ``[B]``, in the unit of the predictions.
     """
-    return scale.norm(dim=-1).max(0).values
+    deviation: Tensor = vector_norm(scale, dim=-1)
+    return deviation.amax(0)
