@@ -17,7 +17,7 @@ from plain_reference import Batch, PlainOSR
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import CudaGraphModule
 from torchrl.data import ReplayBuffer
-from torchrl.objectives import LossModule, SoftUpdate
+from torchrl.objectives import LossModule
 from torchrl_cql import cql_loss, cql_update
 
 from torchrl_osr import OSRLoss, OSRVLoss, StatePerturbation
@@ -27,10 +27,12 @@ from torchrl_osr.modules import (
     tanh_gaussian_actor,
     tanh_gaussian_inverse_dynamics,
 )
+from torchrl_osr.trainers import SoftUpdate
+from torchrl_osr.trainers.recording import LossGradients
 
 Update = Callable[[Any], Iterator[str]]
 
-GAMMA, TAU, RATE, BATCH, NUM_RANDOM, ROWS = 0.99, 5e-3, 3e-4, 256, 10, 100_000
+GAMMA, TAU, RATE, ROWS = 0.99, 5e-3, 3e-4, 100_000
 OURS = ("OSR", "CQL(H)", "OSR-v", "OSR-10")
 TORCHRL, PLAIN, PRODUCTS, SAMPLING = (
     "TorchRL CQL",
@@ -38,6 +40,7 @@ TORCHRL, PLAIN, PRODUCTS, SAMPLING = (
     "products",
     "sampling",
 )
+EAGER = "OSR, not recorded"
 COMPILED, GRAPH, BOTH = "OSR, compiled", "OSR, graph", "OSR, graph and compiled"
 ON_GPU = (COMPILED, GRAPH, BOTH)
 """Those that take part on a GPU only."""
@@ -46,18 +49,36 @@ DIMENSIONS = {"hopper": (11, 3), "walker2d": (17, 6), "halfcheetah": (17, 6)}
 
 @dataclass(frozen=True)
 class Size:
-    """A task's dimensions and the hidden layers of all networks."""
+    """A task's dimensions, and the sizes of networks and batches.
+
+    Attributes:
+        observations, actions: of a transition.
+        cells: the hidden layers of all networks.
+        batch: transitions of an update.
+        num_random: ``K``, actions drawn of each kind.
+        layer_norm: whether the critics have layer normalisation.
+    """
 
     observations: int
     actions: int
     cells: tuple[int, ...]
+    batch: int = 256
+    num_random: int = 10
+    layer_norm: bool = False
 
     @classmethod
     def parse(cls, name: str) -> Size:
-        """Size of a name such as ``hopper-2x256``."""
+        """Size of a name such as ``hopper-2x256``, or ``hopper-quick``: that preset."""
         task, _, layers = name.partition("-")
+        if layers == "quick":
+            return cls(*DIMENSIONS[task], (128, 128), 128, 4, layer_norm=True)
         depth, width = (int(number) for number in layers.split("x"))
         return cls(*DIMENSIONS[task], (width,) * depth)
+
+    @property
+    def sizes(self) -> tuple[int, int, tuple[int, ...]]:
+        """Of an observation, an action and the hidden layers."""
+        return self.observations, self.actions, self.cells
 
 
 def make_buffer(size: Size, device: torch.device) -> ReplayBuffer:
@@ -76,7 +97,7 @@ def make_buffer(size: Size, device: torch.device) -> ReplayBuffer:
     }
     return make_replay_buffer(
         TensorDict(data, [ROWS]),
-        batch_size=BATCH,
+        batch_size=size.batch,
         seed=0,
         transform=StatePerturbation(1e-3, seed=0),
         device=device,
@@ -103,6 +124,7 @@ def our_loss(name: str, size: Size, device: torch.device) -> LossModule:
         size.observations,
         size.actions,
         num_qvalue_nets=10 if name == "OSR-10" else 2,
+        layer_norm=size.layer_norm,
         **options,
     )
     if device.type == "cuda":
@@ -114,10 +136,13 @@ def our_loss(name: str, size: Size, device: torch.device) -> LossModule:
     inverse_dynamics = tanh_gaussian_inverse_dynamics(
         size.observations, size.actions, **options
     )
+    number = {"num_random": size.num_random}
     if name == "OSR-v":
-        loss = OSRVLoss(actor, critics, inverse_dynamics)
+        loss = OSRVLoss(actor, critics, inverse_dynamics, **number)
     elif name == "CQL(H)":
-        loss = OSRLoss(actor, critics, recovery_weight=0, actor_states="clean")
+        loss = OSRLoss(
+            actor, critics, recovery_weight=0, actor_states="clean", **number
+        )
     elif name == "OSR-10":
         loss = OSRLoss(
             actor,
@@ -127,27 +152,32 @@ def our_loss(name: str, size: Size, device: torch.device) -> LossModule:
             deterministic_backup=False,
         )
     else:
-        loss = OSRLoss(actor, critics, inverse_dynamics)
+        loss = OSRLoss(actor, critics, inverse_dynamics, **number)
     return loss.to(device)
 
 
 def our_update(
-    loss: LossModule, device: torch.device, *, autocast: bool, capturable: bool = False
+    loss: LossModule,
+    device: torch.device,
+    *,
+    autocast: bool,
+    record: bool = True,
+    capturable: bool = False,
 ) -> Update:
-    """The update that the README shows: one backward, one optimizer."""
+    """The trainer's update: one backward, one optimizer, losses recorded on a CPU."""
     loss.make_value_estimator(gamma=GAMMA)
     updater = SoftUpdate(loss, tau=TAU)
     optimizer = torch.optim.Adam(
         loss.parameters(), lr=RATE, fused=True, capturable=capturable
     )
 
+    gradients = LossGradients(
+        loss, torch.bfloat16 if autocast else None, record=record, warm_up=2
+    )
+
     def update(batch: TensorDictBase) -> Iterator[str]:
-        with torch.autocast(device.type, torch.bfloat16, enabled=autocast):
-            losses = loss(batch.copy())
-        yield "forward"
-        terms = [value for key, value in losses.items() if key.startswith("loss_")]
-        sum(terms).backward()
-        yield "backward"
+        gradients(batch.copy())
+        yield "forward and backward"
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
         yield "optimizer"
@@ -183,11 +213,11 @@ def osr_products(
     that it takes is the one that has as many operations.
     """
     loss, batch = our_loss("OSR", size, device), make_buffer(size, device).sample()
-    update = our_update(loss, device, autocast=autocast)
+    update = our_update(loss, device, autocast=autocast, record=False)
     counted = count_flops(lambda: update(batch))
-    sizes = (size.observations, size.actions, size.cells)
+    counts = {"batch": size.batch, "num_random": size.num_random}
     ways = [
-        osr_passes(*sizes, batch=BATCH, num_random=NUM_RANDOM, chunk=chunk)
+        osr_passes(*size.sizes, **counts, chunk=chunk)
         for chunk in (None, loss.chunk_size)
     ]
     return min(ways, key=lambda way: abs(total_flops(way) - counted)), counted
@@ -199,7 +229,6 @@ def make_contender(
     """An update and the batches that it reads, the same for every name."""
     buffer = make_buffer(size, device)
     batches = [buffer.sample() for _ in range(8)]
-    sizes = (size.observations, size.actions, size.cells)
     if name == SAMPLING:
 
         def sample(_: object) -> Iterator[str]:
@@ -209,7 +238,11 @@ def make_contender(
         return sample, batches
     if name == PLAIN:
         plain = PlainOSR(
-            *sizes, num_random=NUM_RANDOM, device=device, autocast=autocast
+            *size.sizes,
+            num_random=size.num_random,
+            layer_norm=size.layer_norm,
+            device=device,
+            autocast=autocast,
         )
         return plain.update, [unpack(batch) for batch in batches]
     if name == PRODUCTS:
@@ -217,14 +250,17 @@ def make_contender(
         dtype = torch.bfloat16 if autocast else torch.float32
         return Products(passes, dtype, device).update, batches
     if name == TORCHRL:
-        loss = cql_loss(*sizes, num_random=NUM_RANDOM, device=device)
+        loss = cql_loss(*size.sizes, num_random=size.num_random, device=device)
         update = cql_update(loss, autocast=autocast)
     else:
         loss = our_loss(name, size, device)
         if name in (COMPILED, BOTH):
             loss.compile()
-        make_update = graph_update if name in (GRAPH, BOTH) else our_update
-        update = make_update(loss, device, autocast=autocast)
+        if name in (GRAPH, BOTH):
+            update = graph_update(loss, device, autocast=autocast)
+        else:
+            record = name != EAGER
+            update = our_update(loss, device, autocast=autocast, record=record)
     # What a loss does not read, it need not carry.
     if ("perturbed", "observation") not in loss.in_keys:
         batches = [batch.exclude("perturbed") for batch in batches]

@@ -134,7 +134,7 @@ def make_run(folder: Path) -> None:
     folder.mkdir(parents=True)
     OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
     torch.manual_seed(0)
-    _, _, loss = make_learner(cfg, 11, 3)
+    loss = make_learner(cfg, 11, 3).loss
     norm = ObservationNorm(
         torch.full((11,), 2.0), torch.full((11,), 3.0), in_keys=["observation"],
         standard_normal=True,

@@ -52,13 +52,15 @@ class Noise(NamedTuple):
     next: Tensor  # [BK, A]
 
 
-def mlp(inputs: int, outputs: int, cells: Sequence[int]) -> nn.Sequential:
-    """Linear layers with ReLU between them."""
-    widths = [inputs, *cells, outputs]
+def mlp(
+    inputs: int, outputs: int, cells: Sequence[int], *, layer_norm: bool = False
+) -> nn.Sequential:
+    """Linear layers with ReLU between them, and layer normalisation before it."""
     layers: list[nn.Module] = []
-    for before, after in pairwise(widths):
-        layers += [nn.Linear(before, after), nn.ReLU()]
-    return nn.Sequential(*layers[:-1])
+    for before, after in pairwise([inputs, *cells]):
+        norm = [nn.LayerNorm(after)] if layer_norm else []
+        layers += [nn.Linear(before, after), *norm, nn.ReLU()]
+    return nn.Sequential(*layers, nn.Linear(cells[-1], outputs))
 
 
 class Gaussian(nn.Module):
@@ -76,9 +78,16 @@ class Gaussian(nn.Module):
 class Critic(nn.Module):
     """One value a row."""
 
-    def __init__(self, observations: int, actions: int, cells: Sequence[int]) -> None:
+    def __init__(
+        self,
+        observations: int,
+        actions: int,
+        cells: Sequence[int],
+        *,
+        layer_norm: bool = False,
+    ) -> None:
         super().__init__()
-        self.net = mlp(observations + actions, 1, cells)
+        self.net = mlp(observations + actions, 1, cells, layer_norm=layer_norm)
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         return self.net(torch.cat([state, action], -1)).squeeze(-1)
@@ -98,6 +107,7 @@ class PlainOSR:
         observations, actions: sizes of a state and of an action.
         cells: widths of the hidden layers of all networks.
         num_random: ``K``, actions drawn of each kind.
+        layer_norm: whether the critics have layer normalisation.
         device: of all of it.
         autocast: whether losses are computed under bfloat16 autocast.
     """
@@ -111,6 +121,7 @@ class PlainOSR:
         cells: Sequence[int],
         *,
         num_random: int = 10,
+        layer_norm: bool = False,
         device: torch.device | str = "cpu",
         autocast: bool = False,
     ) -> None:
@@ -118,8 +129,10 @@ class PlainOSR:
         self.num_random, self.target_entropy = num_random, -float(actions)
         self.actor = Gaussian(observations, actions, cells).to(device)
         self.inverse_dynamics = Gaussian(2 * observations, actions, cells).to(device)
-        self.critic_1 = Critic(observations, actions, cells).to(device)
-        self.critic_2 = Critic(observations, actions, cells).to(device)
+        self.critic_1, self.critic_2 = (
+            Critic(observations, actions, cells, layer_norm=layer_norm).to(device)
+            for _ in range(2)
+        )
         self.target_1 = copy.deepcopy(self.critic_1).requires_grad_(False)
         self.target_2 = copy.deepcopy(self.critic_2).requires_grad_(False)
         self.log_alpha = torch.zeros((), device=device, requires_grad=True)

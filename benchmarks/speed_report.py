@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from contenders import OURS, PLAIN, PRODUCTS, SAMPLING, TORCHRL
+from contenders import EAGER, OURS, PLAIN, PRODUCTS, SAMPLING, TORCHRL
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -28,11 +28,12 @@ COLORS = {
     "CQL(H)": "#56B4E9",
     "OSR-v": "#009E73",
     "OSR-10": "#E69F00",
+    EAGER: "#F0E442",
     TORCHRL: "#D55E00",
     PLAIN: "#CC79A7",
     PRODUCTS: "#BBBBBB",
 }
-PARTS = ("forward", "backward", "optimizer", "targets")
+PARTS = ("forward", "backward", "forward and backward", "optimizer", "targets")
 
 
 def markdown(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
@@ -127,7 +128,7 @@ def write_tables(text: str, readme: Path) -> None:
 def draw_precision(axes: Axes, sizes: Mapping[str, Any], precision: str) -> None:
     """Draw a bar for each contender and size: its speed over the plain reference's."""
     # The plain reference is the line at 1, except under autocast.
-    drawn = [*OURS, TORCHRL, PRODUCTS] + [PLAIN] * (precision == "bfloat16")
+    drawn = [*OURS, EAGER, TORCHRL, PRODUCTS] + [PLAIN] * (precision == "bfloat16")
     names = [name for name in drawn if name in next(iter(sizes.values()))[precision]]
     width = 0.85 / len(names)
     for i, name in enumerate(names):

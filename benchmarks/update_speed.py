@@ -30,14 +30,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from contenders import ON_GPU, OURS, PLAIN, PRODUCTS, SAMPLING, TORCHRL, Size
+from contenders import EAGER, ON_GPU, OURS, PLAIN, PRODUCTS, SAMPLING, TORCHRL, Size
 from rounds import Contender
 from speed_report import draw, tables, write_tables
 from torchrl import torchrl_logger
 
-SIZES = "hopper-2x256,hopper-3x256,halfcheetah-2x256,halfcheetah-3x256"
+SIZES = "hopper-quick,hopper-2x256,hopper-3x256,halfcheetah-2x256,halfcheetah-3x256"
 PRECISIONS = {
-    "float32": (*OURS, TORCHRL, PLAIN, PRODUCTS, SAMPLING),
+    "float32": (*OURS, EAGER, TORCHRL, PLAIN, PRODUCTS, SAMPLING),
     "medium": (*OURS, TORCHRL, PLAIN, PRODUCTS),
     "bfloat16": (*OURS, PLAIN, PRODUCTS),
 }
@@ -156,7 +156,9 @@ def machine() -> dict[str, Any]:
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Options of the command line."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--sizes", default=SIZES, help="task-layersxwidth, by commas")
+    parser.add_argument(
+        "--sizes", default=SIZES, help="task-quick or task-layersxwidth, by commas"
+    )
     parser.add_argument(
         "--precisions", default=",".join(PRECISIONS), help="float32 among them"
     )

@@ -7,6 +7,7 @@ a script it starts what its input says, for those who cannot fork themselves, se
 
 from __future__ import annotations
 
+import atexit
 import json
 import os
 import re
@@ -64,6 +65,8 @@ def start(
     command: str,
     *arguments: str,
     output: Path,
+    folder: Path | None = None,
+    environment: dict[str, str] | None = None,
     watched: Path | None = None,
     seen: Callable[[Rename, bool], None] = lambda rename, done: None,
 ) -> int:
@@ -75,6 +78,8 @@ def start(
 
     Keyword Args:
         output: file to which both its streams are appended.
+        folder: in which it is called. Default: this process's.
+        environment: in the place of this process's, for what is read after imports.
         watched: folder below which renames are seen.
         seen: called in the new process before and after each of them.
     """
@@ -88,10 +93,15 @@ def start(
         stream = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
         os.dup2(stream, 1)
         os.dup2(stream, 2)
+        if folder is not None:
+            os.chdir(folder)
+            sys.path[0] = str(folder)  # as python -m has it
+        if environment is not None:
+            os.environ.clear()
+            os.environ.update(environment)
         if watched is not None:
             _watch(watched, seen)
-        sys.argv = [f"torchrl-osr {command}", *arguments]
-        import_module(f"torchrl_osr.commands.{command}").main()
+        import_module("torchrl_osr.__main__").main([command, *arguments])
         code = 0
     except SystemExit as ended:
         code = ended.code if isinstance(ended.code, int) else 1
@@ -102,6 +112,7 @@ def start(
     except BaseException:
         traceback.print_exc()
     finally:
+        atexit._run_exitfuncs()
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
@@ -213,8 +224,9 @@ class Server:
 
         Keyword Args:
             output: file to which both its streams are appended.
-            **request: ``watched``, the folder whose renames are seen; ``noted_in``, the
-                file that gets them; ``killed_before``, a :class:`Rename`.
+            **request: ``folder`` and ``environment``, see :func:`start`; ``watched``,
+                the folder whose renames are seen; ``noted_in``, the file that gets
+                them; ``killed_before``, a :class:`Rename`.
         """
         assert self._process.stdin is not None
         line = json.dumps({"command": command, "output": str(output)} | request)
@@ -240,7 +252,9 @@ def serve() -> None:
     warm_up()
     for line in sys.stdin:
         request = json.loads(line)
-        watching: dict[str, Any] = {}
+        watching: dict[str, Any] = {"environment": request.get("environment")}
+        if "folder" in request:
+            watching["folder"] = Path(request["folder"])
         if "watched" in request:
             watching["watched"] = Path(request["watched"])
         if "noted_in" in request:

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+
+try:
+    from warm_runs import Server
+except ModuleNotFoundError:
+    Server = None
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PRINTED = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
@@ -64,8 +70,11 @@ def start() -> Callable[..., subprocess.Popen]:
 
 
 @pytest.fixture(scope="session")
-def run() -> Callable[..., tuple[int, str]]:
-    """Return a function that runs one to its end: exit code and what it printed."""
+def run_fresh() -> Callable[..., tuple[int, str]]:
+    """Return a function that runs one to its end: exit code and what it printed.
+
+    It imports everything itself, which takes seconds: for what is read or said then.
+    """
 
     def run(cwd: Path, script: str, *arguments: str) -> tuple[int, str]:
         # On a timeout, unlike start's, the process is killed.
@@ -75,6 +84,30 @@ def run() -> Callable[..., tuple[int, str]]:
         return done.returncode, done.stdout
 
     return run
+
+
+@pytest.fixture(scope="session")
+def run(tmp_path_factory, run_fresh) -> Iterator[Callable[..., tuple[int, str]]]:
+    """Return the same function for commands in processes forked after the imports.
+
+    A source distribution, which has no benchmarks, has no such processes either.
+    """
+    if Server is None:
+        yield run_fresh
+        return
+    server = Server(os.environ | {"OMP_NUM_THREADS": "1"})
+    outputs = tmp_path_factory.mktemp("outputs")
+
+    def run(cwd: Path, script: str, *arguments: str) -> tuple[int, str]:
+        if script.endswith(".py"):
+            return run_fresh(cwd, script, *arguments)
+        output = outputs / f"{len(list(outputs.iterdir()))}.txt"
+        given = {"folder": str(cwd), "environment": dict(os.environ)}
+        server.start(script, *arguments, output=output, **given)
+        return server.ended(), output.read_text(encoding="utf-8")
+
+    yield run
+    server.close()
 
 
 @pytest.fixture(scope="session")

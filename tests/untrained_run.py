@@ -19,16 +19,19 @@ from torchrl_osr.trainers.checkpoints import safe_checkpoint
 CONF = Path(__file__).parents[1] / "conf"
 
 
-def make_run(folder: Path, *overrides: str):
-    """Save two checkpoints and the best of an untrained policy, as the trainer does."""
+def make_run(folder: Path, *overrides: str, sizes: tuple[int, int] = (11, 3)):
+    """Save two checkpoints and the best of an untrained policy, as the trainer does.
+
+    The sizes of observation and action are hopper's unless given.
+    """
     config.register()
     with initialize_config_dir(str(CONF), version_base="1.3"):
         cfg = compose("train", ["network.num_cells=[8]", *overrides])
     folder.mkdir()
     OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
-    actor, _, loss = make_learner(cfg, 11, 3)
+    actor, _, loss, _ = make_learner(cfg, *sizes)
     norm = ObservationNorm(
-        torch.full((11,), 2.0), torch.full((11,), 3.0), in_keys=["observation"],
+        torch.full(sizes[:1], 2.0), torch.full(sizes[:1], 3.0), in_keys=["observation"],
         standard_normal=True,
     )  # fmt: skip
     checkpoint = safe_checkpoint(loss_module=loss, observation_norm=norm, history=[])

@@ -12,6 +12,7 @@ from torchrl_osr.objectives import (
     InverseDynamicsLoss,
     OSRLoss,
     OSRVLoss,
+    ReBRACLoss,
     StateRecoveryLoss,
     TD3BCLoss,
 )
@@ -29,6 +30,7 @@ __all__ = [
     "OSRLoss",
     "OSRVLoss",
     "Policy",
+    "ReBRACLoss",
     "StatePerturbation",
     "StateRecoveryLoss",
     "TD3BCLoss",

@@ -27,7 +27,7 @@ NUMBERS = [
 
 
 @pytest.mark.parametrize("autocast", [False, True])
-@pytest.mark.parametrize("name", ["hopper-2x64", "halfcheetah-3x32"])
+@pytest.mark.parametrize("name", ["hopper-2x64", "halfcheetah-3x32", "hopper-quick"])
 def test_products_are_those_of_our_update(name, autocast) -> None:
     cpu = torch.device("cpu")
     passes, counted = osr_products(Size.parse(name), cpu, autocast=autocast)

@@ -40,10 +40,10 @@ def folder(tmp_path_factory, run, tiny) -> Path:
 
 
 @pytest.fixture(scope="module")
-def evaluated(folder, run) -> str:
+def evaluated(folder, run_fresh) -> str:
     """Run as a user would; the other tests take it from there."""
     options = ["checkpoint=run", "episodes=2", "last=2", "progress=false"]
-    code, output = run(folder.parent, "evaluate", *options)
+    code, output = run_fresh(folder.parent, "evaluate", *options)
     assert code == 0, output
     return output
 
@@ -181,23 +181,24 @@ def test_bad_input_is_named(tmp_path, monkeypatch, folder, overrides, error, nam
 
 
 def test_attacks_need_standardised_networks_and_a_stochastic_policy(folder):
-    suite = composed("suite=observation_attack", "checkpoint=none").suite
-    trained = load_trained(folder)
+    cfg = composed("suite=observation_attack", "checkpoint=none")
+    suite, trained = cfg.suite, load_trained(folder)
     deterministic = ProbabilisticActor(
         TensorDictModule(torch.nn.Linear(11, 3), ["observation"], ["param"]),
         in_keys=["param"],
         distribution_class=TanhDelta,
     )
-    with pytest.raises(ValueError, match=r"'action_diff-0.05' .* is a TanhDelta"):
-        make_disturbances(
-            suite.disturbances, trained._replace(actor=deterministic), np.full(11, 0.5)
-        )
+    scale = np.full(11, 0.5)
+    left_out = example.impossible(cfg, trained._replace(actor=deterministic), scale)
+    assert set(left_out) == {each for each in suite.disturbances if "diff" in each}
+    assert "the policy's is a TanhDelta" in left_out["action_diff-0.05"]
+    assert not example.impossible(cfg, trained, scale)
     trained.config.data.standardize = False
-    with pytest.raises(ValueError, match="data.standardize=false"):
-        make_disturbances(suite.disturbances, trained, np.full(11, 0.5))
+    with pytest.raises(ValueError, match="no disturbance .*data.standardize=false"):
+        example.impossible(cfg, trained, scale)
     suite.disturbances["random-0.05"].attack = None
     with pytest.raises(ValueError, match="'random-0.05' needs either wrap or attack"):
-        make_disturbances(suite.disturbances, trained, np.full(11, 0.5))
+        make_disturbances(suite.disturbances, trained, scale)
 
 
 @pytest.mark.parametrize("script", ["evaluate", "film"])

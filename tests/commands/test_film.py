@@ -1,4 +1,4 @@
-"""The film as a user makes it, of a run of a few steps."""
+"""The film as a user makes it, of a policy that nothing has trained."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ import os
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
+from untrained_run import make_run
 
 CONF = Path(__file__).parents[2] / "conf/evaluation"
-SHORT = ["checkpoint=run", "episodes=2", "window=[20,30]", "after=16"]
+SHORT = ["checkpoint=run", "episodes=2", "window=[20,30]", "after=8"]
 
 
 @pytest.fixture(scope="module")
@@ -30,11 +32,10 @@ def composed(*overrides: str):
         return compose("film", overrides=["checkpoint=run", *overrides])
 
 
-def test_film_leaves_pictures_numbers_and_a_table(tmp_path, run, tiny):
-    sizes = [*tiny("medium"), "hydra.run.dir=run"]
-    code, output = run(tmp_path, "train", *sizes)
-    assert code == 0, output
-    code, output = run(tmp_path, "film", *SHORT)
+def test_film_leaves_pictures_numbers_and_a_table(tmp_path, run_fresh):
+    rows = ["data=medium", "data.num_transitions=600", "data.held_out=0.1"]
+    make_run(tmp_path / "run", *rows)
+    code, output = run_fresh(tmp_path, "film", *SHORT)  # OpenGL is chosen in time
     if code != 0 and "OpenGL did not start" in output:
         pytest.skip(f"no OpenGL to draw with here: {output.splitlines()[-1]}")
     assert code == 0, output
@@ -51,12 +52,66 @@ def test_film_leaves_pictures_numbers_and_a_table(tmp_path, run, tiny):
     assert film_json["filmed"]["seed"] in film_json["seeds"]
     assert 25 <= film_json["filmed"]["push_over"] < 35
     names = ["behaviour policy", "inverse dynamics, time", "inverse dynamics, nearest"]
-    assert list(film_json["controllers"]) == [*names, "OSR policy"]
+    assert list(film_json["controllers"]) == [*names, "trained policy"]
     for name, numbers in film_json["controllers"].items():
         assert name in output
         assert len(numbers["returns"]) == len(numbers["alive"]) == 2
-        assert all(0 <= steps <= 16 for steps in numbers["alive"])
-    assert film_json["controllers"]["behaviour policy"]["alive_clean"] == [16, 16]
+        assert all(0 <= steps <= 8 for steps in numbers["alive"])
+    assert film_json["controllers"]["behaviour policy"]["alive_clean"] == [8, 8]
+
+
+class FakeCamera:
+    seconds = 0.008
+
+    def __init__(self, environment, size):
+        self._picture = np.zeros((8, 8, 3), np.uint8)
+
+    def __call__(self, pose):
+        return self._picture
+
+    def close(self): ...
+
+
+def own_run(folder: Path, env: str, sizes: tuple[int, int], loss: str = "osr") -> str:
+    """A run on a log, whose states need not be the robot's own."""
+    states = np.random.default_rng(0).normal(size=(60, sizes[0])).astype(np.float32)
+    np.savez(
+        folder / "log.npz", observation=states, action=np.tanh(states[:, : sizes[1]]),
+        reward=np.ones(60), terminated=np.zeros(60, bool),
+        truncated=np.arange(60) % 20 == 19,
+    )  # fmt: skip
+    own = ["data=file", f"data.path={folder / 'log.npz'}", "data.held_out=0.1"]
+    make_run(folder / "run", f"env={env}", f"loss={loss}", *own, sizes=sizes)
+    return f"checkpoint={folder / 'run'}"
+
+
+@pytest.mark.parametrize(
+    ("loss", "models"),
+    [
+        ("osr", ["inverse dynamics, time", "inverse dynamics, nearest"]),
+        ("cql", []),
+    ],
+)
+def test_own_data_have_the_trained_policy_play_first(
+    loss, models, script, tmp_path, monkeypatch, capsys
+):
+    run = own_run(tmp_path, "halfcheetah", (17, 6), loss)
+    monkeypatch.setattr(script, "Camera", FakeCamera)
+    script.main(composed(run, "episodes=2", "window=[10,12]", "after=4"))
+    printed = capsys.readouterr().out
+    assert "no behaviour policy to play first: the trained policy does" in printed
+    film_json = json.loads((tmp_path / "run" / "film.json").read_text())
+    assert list(film_json["controllers"]) == ["trained policy", *models]
+    assert film_json["controllers"]["trained policy"]["alive_clean"] == [4, 4]
+    pictures = {"film.png", "film.gif", "visited.png"}
+    assert pictures < {each.name for each in (tmp_path / "run").iterdir()}
+
+
+def test_a_policy_that_falls_by_itself_is_not_pushed(script, tmp_path, monkeypatch):
+    run = own_run(tmp_path, "hopper", (11, 3))
+    monkeypatch.setattr(script, "Camera", FakeCamera)
+    with pytest.raises(ValueError, match="trained policy falls.* in all 2 episodes"):
+        script.main(composed(run, "episodes=2"))
 
 
 def test_filmed_is_the_first_in_which_not_all_fare_alike(script):

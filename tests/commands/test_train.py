@@ -22,9 +22,9 @@ def sizes(tiny) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory, run, sizes) -> tuple[Path, str]:
+def finished(tmp_path_factory, run_fresh, sizes) -> tuple[Path, str]:
     cwd = tmp_path_factory.mktemp("finished")
-    code, output = run(cwd, SCRIPT, *sizes, "hydra.run.dir=run")
+    code, output = run_fresh(cwd, SCRIPT, *sizes, "hydra.run.dir=run")
     assert code == 0, output
     return cwd / "run", output
 
@@ -103,14 +103,14 @@ def test_bad_input_is_named_before_data_are_made(
 
 @pytest.mark.parametrize(("chosen", "found"), [(None, "PASSIVE"), ("active", "ACTIVE")])
 def test_waiting_threads_do_not_spin_unless_asked_to(
-    tmp_path, monkeypatch, run, chosen, found
+    tmp_path, monkeypatch, run_fresh, chosen, found
 ):
     # GNU's OpenMP says what it has read, when torch is imported.
     monkeypatch.setenv("OMP_DISPLAY_ENV", "true")
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
     if chosen is not None:
         monkeypatch.setenv("OMP_WAIT_POLICY", chosen)
-    code, printed = run(tmp_path, SCRIPT, "--cfg", "job")
+    code, printed = run_fresh(tmp_path, SCRIPT, "--cfg", "job")
     assert code == 0
     assert f"OMP_WAIT_POLICY = '{found}'" in printed
 

@@ -30,12 +30,13 @@ def learner_of(*overrides: str):
 
 @pytest.mark.parametrize("name", LOSSES)
 def test_every_loss_is_built_and_trains_its_networks(name, make_batch) -> None:
-    cfg, (actor, _, loss) = learner_of(f"loss={name}")
+    cfg, (actor, _, loss, _) = learner_of(f"loss={name}")
     assert type(loss) is get_class(cfg.loss._target_)
     assert loss.num_qvalue_nets == (10 if name.endswith("_10") else 2)
     assert loss.value_estimator.gamma == 0.5
     SoftUpdate(loss, tau=0.1)
     batch = make_batch(10).apply(lambda x: x.float() if x.is_floating_point() else x)
+    batch["next", "action"] = batch["action"].flip(0)
     if name.startswith("discrete"):
         batch["action"] = torch.eye(2)[torch.arange(10) % 2]
     losses = [value for key, value in loss(batch).items() if key.startswith("loss_")]
@@ -49,7 +50,7 @@ def test_every_loss_is_built_and_trains_its_networks(name, make_batch) -> None:
 def test_actor_is_of_the_kind_that_the_loss_trains() -> None:
     kinds = {}
     for name in ("osr", "td3_bc"):
-        _, (actor, _, loss) = learner_of(f"loss={name}")
+        _, (actor, _, loss, _) = learner_of(f"loss={name}")
         kinds[name] = actor[-1].distribution_class
     assert kinds == {"osr": TanhNormal, "td3_bc": TanhDelta}
     assert type(loss) is TD3BCLoss
@@ -57,11 +58,47 @@ def test_actor_is_of_the_kind_that_the_loss_trains() -> None:
 
 def test_a_loss_is_given_a_model_where_it_uses_one() -> None:
     for name, used in {"osr": True, "cql": False, "edac_10": False}.items():
-        _, (_, model, loss) = learner_of(f"loss={name}")
-        assert any(True for _ in model.parameters()), "it is trained in any case"
+        _, (_, model, loss, _) = learner_of(f"loss={name}")
+        assert (model is not None) == used
         assert ("inverse_dynamics_network" in loss.__dict__) == used
         held = {each.data_ptr() for each in loss.state_dict().values()}
-        assert {each.data_ptr() for each in model.parameters()} <= held or not used
+        assert not used or {each.data_ptr() for each in model.parameters()} <= held
+
+
+ALONE = sorted({"bc", "edac_10", "iql", "rebrac", "sac_10", "td3_bc"} & {*LOSSES})
+
+
+@pytest.mark.parametrize("recovery", ["osr", "noisy_bc"])
+@pytest.mark.parametrize("name", ALONE)
+def test_recovery_is_added_to_a_loss_without_it(name, recovery, make_batch) -> None:
+    plain, added = (
+        learner_of(f"loss={name}", f"recovery={each}")[1] for each in ("none", recovery)
+    )
+    assert plain.objective is plain.loss
+    assert (added.model is not None) == (recovery == "osr")
+    if hasattr(added.loss, "qvalue_network"):
+        SoftUpdate(added.loss, tau=0.1)
+    batch = make_batch(10).apply(lambda x: x.float() if x.is_floating_point() else x)
+    batch["next", "action"] = batch["action"].flip(0)
+    out = added.objective(batch)
+    assert set(out.keys()) > set(plain.loss.out_keys)
+    grads = []
+    for key in ("loss_actor", "loss_recovery"):
+        out[key].backward(retain_graph=True)
+        grads.append([each.grad.clone() for each in added.actor.parameters()])
+    assert not all(torch.equal(a, b) for a, b in zip(*grads, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["loss=osr"], r"OSRLoss has a recovery term of its own .*recovery_weight=0.5"),
+        (["loss=discrete_cql"], "for real actions.*take loss=discrete_osr"),
+    ],
+)
+def test_recovery_that_cannot_be_added_is_refused(overrides, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        learner_of(*overrides, "recovery=osr")
 
 
 def test_a_model_with_a_latent_is_built() -> None:

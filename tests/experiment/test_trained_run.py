@@ -85,7 +85,7 @@ def test_runs_without_standardisation_come_back(tmp_path, rows):
     with pytest.raises(CheckpointError, match=r"loc is \(11,\) in the file, \(\) here"):
         load_trained(folder)
     cfg = OmegaConf.load(folder / "config.yaml")
-    _, _, loss = make_learner(cfg, 11, 3)
+    loss = make_learner(cfg, 11, 3).loss
     norm = ObservationNorm(0.0, 1.0, in_keys=["observation"], standard_normal=True)
     checkpoint = safe_checkpoint(loss_module=loss, observation_norm=norm)
     CheckpointRotation(folder / CHECKPOINTS, keep_last=2).save(checkpoint, step=1000)

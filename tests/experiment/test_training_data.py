@@ -63,6 +63,32 @@ def test_the_same_seed_gives_the_same_batches(more):
         torch.testing.assert_close(other, batch, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.parametrize("held_out", [0.1, 0.5])
+def test_the_next_action_is_there_for_losses_that_read_it(held_out):
+    key = ("next", "action")
+    whole, _ = load_data(composed(), progress=False)
+    overrides = ["data.standardize=false", f"data.held_out={held_out}"]
+    here, there = (
+        load_training_data(composed(f"data.storage={each}", *overrides), CPU, [key])
+        for each in ("memory", "disk")
+    )
+    assert key not in load_training_data(composed(), CPU).buffer.sample().keys(True)
+    for _ in range(20):
+        batch, other = (each.buffer.sample() for each in (here, there))
+        torch.testing.assert_close(other, batch, rtol=1e-6, atol=1e-6)
+        for row in batch[~batch["next", "done"].squeeze(-1)]:
+            following = (whole["observation"] == row["next", "observation"]).all(-1)
+            assert torch.equal(whole["action"][following].squeeze(0), row[key])
+
+
+def test_without_an_order_the_next_action_is_refused():
+    cfg = composed("data=medium", "data.random_share=0.5", "loss=rebrac")
+    with pytest.raises(
+        ValueError, match="ReBRACLoss reads .*random_share=0.5 does not"
+    ):
+        load_training_data(cfg, CPU, [("next", "action")])
+
+
 def test_rewards_are_scaled_then_shifted():
     maze = ["env=pointmaze-umaze", "data=diverse"]
     bare = load_training_data(composed(*maze), CPU)

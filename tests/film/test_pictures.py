@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from torchrl_osr.data import make_environment
 from torchrl_osr.film import (
     GIF_STRIDE,
+    Camera,
     Take,
     film_gif,
     film_strip,
@@ -74,3 +76,8 @@ def test_plane_is_that_of_the_largest_variances():
     directions, shares = principal_plane(rows)
     np.testing.assert_allclose(directions, [[0, 1, 0], [0, 0, 1]], atol=0.05)
     np.testing.assert_allclose(shares, [16 / 21, 4 / 21], atol=0.02)
+
+
+def test_only_mujoco_tasks_have_poses_to_draw():
+    with pytest.raises(ValueError, match="MuJoCo tasks can be filmed.*Pendulum"):
+        Camera(make_environment("Pendulum-v1"), 8)

@@ -34,6 +34,7 @@ from torchrl_osr import (
     InverseDynamicsLoss,
     OSRLoss,
     OSRVLoss,
+    ReBRACLoss,
     StateRecoveryLoss,
     TD3BCLoss,
 )
@@ -161,6 +162,7 @@ ACTOR, CRITICS, MODEL = (
 NEXT, PERTURBED = ("next", "observation"), ("perturbed", "observation")
 TRANSITION = ["observation", "action", NEXT]
 TRANSITION += [("next", key) for key in ("reward", "done", "terminated")]
+NEXT_ACTION = ("next", "action")
 MODEL_KEYS = {key: key for key in ("action", "done", "perturbed")}
 RECOVERY_KEYS = MODEL_KEYS | {"priority_weight": "priority_weight"}
 CRITIC_KEYS = RECOVERY_KEYS | {
@@ -209,7 +211,7 @@ class Member:
             return ["inverse_dynamics"]
         if self.loss_class is StateRecoveryLoss:
             return ["actor", "inverse_dynamics"]
-        with_model = self.loss_class not in (EDACLoss, TD3BCLoss)
+        with_model = self.loss_class not in (EDACLoss, ReBRACLoss, TD3BCLoss)
         return ["actor", "critics", *["inverse_dynamics"] * with_model]
 
     @property
@@ -373,6 +375,15 @@ FAMILY = {
         CRITIC_KEYS,
         replace={"actor": partial(deterministic_actor, "module")},
     ),
+    "rebrac": Member(
+        ReBRACLoss,
+        {"loss_actor": ACTOR, "loss_qvalue": CRITICS},
+        ["cloning_error", "pred_value", "target_value"],
+        [*TRANSITION, NEXT_ACTION],
+        CRITIC_KEYS,
+        networks=RELU,
+        replace={"actor": partial(deterministic_actor, "module")},
+    ),
     "discrete": actor_critic(DiscreteOSRLoss, CQL, "recovery_kl"),
     "discrete-cql": actor_critic(
         DiscreteOSRLoss,
@@ -477,6 +488,8 @@ def family_batch(make_batch, make_discrete_batch):
         batch = make(*size, twin=perturbed)
         if member.index:
             batch["action"] = batch["action"].argmax(-1)
+        if NEXT_ACTION in member.in_keys:
+            batch[NEXT_ACTION] = batch["action"].flip(0)
         return batch
 
     return make

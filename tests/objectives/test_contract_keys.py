@@ -116,7 +116,7 @@ def renamed(batch: TensorDict) -> TensorDict:
         ("next", "observation"): below("next", STATE),
         ("perturbed", "observation"): below("noisy", STATE),
     }
-    for key in ("reward", "done", "terminated"):
+    for key in ("action", "reward", "done", "terminated"):
         names["next", key] = below("next", RENAMED[key])
     found = TensorDict({}, batch.batch_size)
     for key, value in batch.items(True, True):

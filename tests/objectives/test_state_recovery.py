@@ -6,12 +6,10 @@ import copy
 
 import pytest
 import torch
+from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
 from torch import Tensor, nn
 from torch.distributions import Normal, kl_divergence
-from torchrl.modules import (
-    MLP,
-    ValueOperator,
-)
+from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
 from torchrl.objectives import IQLLoss, SACLoss, SoftUpdate, TD3BCLoss
 
 from torchrl_osr import OSRLoss, StateRecoveryLoss
@@ -284,11 +282,92 @@ def test_action_of_a_plain_actor_can_have_another_name(
 
 
 @pytest.mark.parametrize("kind", ["delta", "actor", "module"])
-def test_deterministic_actor_is_told_to_take_the_reverse_direction(
+def test_direction_follows_from_the_actor(
     make_networks, make_deterministic_actor, kind
 ) -> None:
-    model = make_networks().inverse_dynamics
+    networks = make_networks()
+    model, actor = networks.inverse_dynamics, make_deterministic_actor(kind)
+    assert StateRecoveryLoss(networks.actor, model).recovery_direction == "forward"
+    assert StateRecoveryLoss(actor, model).recovery_direction == "reverse"
     with pytest.raises(
         ValueError, match="deterministic.*Pass recovery_direction='reverse'"
     ):
-        StateRecoveryLoss(make_deterministic_actor(kind), model)
+        StateRecoveryLoss(actor, model, recovery_direction="forward")
+
+
+def gaussian_actor() -> ProbabilisticActor:
+    """A Gaussian around a tanh, without one at its end, float64."""
+    torch.manual_seed(0)
+    network = nn.Sequential(
+        MLP(3, 2, num_cells=[8]), nn.Tanh(), AddStateIndependentNormalScale(2)
+    )
+    return ProbabilisticActor(
+        TensorDictModule(network, ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        out_keys=["action"],
+        distribution_class=IndependentNormal,
+    ).double()
+
+
+@pytest.mark.parametrize("states", STATES)
+def test_mean_of_a_gaussian_is_measured_before_its_tanh(
+    make_networks, make_batch, check, states
+) -> None:
+    network, batch = make_networks().inverse_dynamics, make_batch(10)
+    actor, plain = gaussian_actor(), gaussian_actor()
+    options = {"recovery_states": states, "recovery_weight": 0.75}
+    loss = StateRecoveryLoss(actor, network, **options).double()
+    restated = Restatement(batch, states)
+    model, x = restated.model(network), plain.module[0].module[0](restated.states)
+    expected = ((x - model.loc) ** 2 / (2 * model.scale**2)).sum(-1).mean()
+    mean = list(plain.module[0].module[0].parameters())
+    gradients = torch.autograd.grad(0.75 * expected, mean)
+    loss(batch)[KEY].backward()
+    got = [loss(batch)[KEY].detach()]
+    grads = [each.grad for each in loss.actor_network_params.parameters()]
+    got += [each for each in grads if each is not None]  # not of the scale
+    wanted = [0.75 * expected.detach(), *gradients]
+    check("State recovery alone", got, wanted, tolerance=1e-10)
+
+
+@pytest.mark.parametrize("kind", ["tanh", "gaussian", "delta", "actor", "module"])
+@pytest.mark.parametrize("states", STATES)
+@pytest.mark.parametrize("reduction", ["sum", "mean"])
+def test_the_datas_action_may_be_the_target(
+    make_networks, make_deterministic_actor, make_batch, check, kind, states, reduction
+) -> None:
+    make = {
+        "tanh": lambda: make_networks().actor,
+        "gaussian": gaussian_actor,
+    }.get(kind, lambda: make_deterministic_actor(kind))
+    actor, plain, batch = make(), make(), make_batch(10)
+    options = {"recovery_states": states, "action_reduction": reduction}
+    loss = StateRecoveryLoss(
+        actor, recovery_target="data", recovery_weight=0.75, **options
+    ).double()
+    restated = Restatement(batch, states)
+    kept = ~batch["next", "done"].squeeze(-1)
+    action = batch["action"][kept].expand(len(restated.states), -1, -1)
+    if kind == "tanh":
+        z = action.atanh()
+        density = Normal(*plain.module[0](restated.states)[1:])
+        expected = -(density.log_prob(z) - (1 - action**2).log()).sum(-1).mean()
+    elif kind == "gaussian":
+        density = Normal(*plain.module[0].module(restated.states))
+        expected = -density.log_prob(action).sum(-1).mean()
+    else:
+        mlp = plain.module[0].module if kind == "delta" else plain.module[0]
+        error = (torch.tanh(mlp(restated.states)) - action) ** 2
+        expected = getattr(error, reduction)(-1).mean()
+    gradients = torch.autograd.grad(0.75 * expected, list(plain.parameters()))
+    wanted = [0.75 * expected.detach(), *gradients, expected.detach()]
+    (metric,) = set(loss.out_keys) - {KEY}
+    assert metric == "recovery_" + ("nll" if kind in ("tanh", "gaussian") else "error")
+    got = [*value_and_gradients(loss, batch), loss(batch)[metric]]
+    check("Noisy cloning alone", got, wanted, tolerance=1e-10)
+    assert not [key for key in loss.in_keys if "next" in key and "done" not in key]
+
+
+def test_a_model_is_needed_unless_the_data_are_the_target(make_networks) -> None:
+    with pytest.raises(ValueError, match="needs an inverse_dynamics_network"):
+        StateRecoveryLoss(make_networks().actor)

@@ -83,6 +83,12 @@ def build_loss(name: str, *, layer_norm=False, cells=8, device="cpu", **options)
     return kind(actor, critics, inverse_dynamics, **options)
 
 
+def policy_params(loss) -> list[torch.nn.Parameter]:
+    """What a delay of the policy is about: all but the critics."""
+    critics = set(getattr(loss, "qvalue_network_params", loss).parameters())
+    return [each for each in loss.parameters() if each not in critics]
+
+
 def build_run(folder, name="OSR", *, device="cpu", loss_options=(), **options):
     """Return a fresh trainer; two of them are the same run up to their folders."""
     loss = build_loss(name, **dict(loss_options)).to(device)
@@ -91,6 +97,7 @@ def build_run(folder, name="OSR", *, device="cpu", loss_options=(), **options):
     options = {
         "total_steps": 12,
         "target_net_updater": SoftUpdate(loss, tau=0.1) if targets else None,
+        "policy_params": policy_params(loss),
         "components": {"perturbation": perturbation},
         "log_interval": 4,
         "eval_interval": 6,

@@ -11,6 +11,8 @@ from torchrl_osr import (
     InverseDynamicsLoss,
     OSRLoss,
     OSRVLoss,
+    ReBRACLoss,
+    StateRecoveryLoss,
     TD3BCLoss,
 )
 from torchrl_osr.modules import (
@@ -19,7 +21,7 @@ from torchrl_osr.modules import (
     tanh_gaussian_actor,
     tanh_gaussian_inverse_dynamics,
 )
-from torchrl_osr.trainers import recording
+from torchrl_osr.objectives.with_recovery import WithRecovery
 from torchrl_osr.trainers.recording import LossGradients
 
 SIZES = (3, 2)
@@ -34,6 +36,11 @@ def model():
     return tanh_gaussian_inverse_dynamics(*SIZES, **CELLS)
 
 
+def with_recovery(loss, recovery):
+    SoftUpdate(loss, tau=0.1)  # TorchRL warns of losses without one
+    return WithRecovery(loss, recovery)
+
+
 LOSSES = {
     "osr": lambda: OSRLoss(*networks(layer_norm=True), model(), num_random=2),
     "cql": lambda: OSRLoss(
@@ -42,18 +49,30 @@ LOSSES = {
     "osr_v": lambda: OSRVLoss(*networks(), model(), num_random=2),
     "edac": lambda: EDACLoss(*networks()),
     "td3_bc": lambda: TD3BCLoss(*networks(deterministic_actor)),
+    "rebrac": lambda: ReBRACLoss(*networks(deterministic_actor, layer_norm=True)),
+    "rebrac+osr": lambda: with_recovery(
+        ReBRACLoss(actor := networks(deterministic_actor)[0], networks()[1]),
+        StateRecoveryLoss(actor, model()),
+    ),
     "inverse_dynamics": lambda: InverseDynamicsLoss(model()),
 }
 
 
-@pytest.fixture(autouse=True)
-def _at_once(monkeypatch):
-    monkeypatch.setattr(recording, "WARM_UP", 0)
+@pytest.fixture
+def make_batch(make_batch):
+    """Return a factory of batches that any loss can read."""
+
+    def make(*size, **options):
+        batch = make_batch(*size, **options)
+        batch["next", "action"] = batch["action"].flip(0)
+        return batch
+
+    return make
 
 
 def make(name):
     loss = LOSSES[name]().double()
-    if name != "inverse_dynamics":
+    if name != "inverse_dynamics" and not isinstance(loss, WithRecovery):
         SoftUpdate(loss, tau=0.1)  # TorchRL warns of losses without one
     return loss
 
@@ -71,10 +90,10 @@ def results(gradients, loss, batch):
 @pytest.mark.parametrize("name", LOSSES)
 def test_a_recording_has_the_bits_of_what_was_recorded(name, make_batch):
     loss = make(name)
-    eager, recorded = LossGradients(loss), LossGradients(loss, record=True)
+    eager, recorded = LossGradients(loss), LossGradients(loss, record=True, warm_up=0)
     recorded(make_batch(6, twin=True))
     loss.zero_grad()
-    assert recorded._recording is not None
+    assert isinstance(recorded._recording.run, torch.jit.ScriptModule)
     calls = []
     loss.register_forward_pre_hook(lambda *_: calls.append(1))
     for seed in (1, 2):
@@ -91,6 +110,8 @@ def test_a_recording_has_the_bits_of_what_was_recorded(name, make_batch):
         for ours, theirs in zip(given[1], expected[1], strict=True):
             assert (ours is None) == (theirs is None)
             assert ours is None or torch.equal(ours, theirs)
+            # A fused optimizer goes through parameter and gradient by address.
+            assert ours is None or ours.is_contiguous()
         assert (given[2] == expected[2]).all()
         assert given[3] == expected[3]  # the generator moved on alike
     assert all(each is not None for each in given[1])
@@ -98,7 +119,7 @@ def test_a_recording_has_the_bits_of_what_was_recorded(name, make_batch):
 
 def test_another_kind_of_batch_or_option_runs_the_loss_itself(make_batch):
     loss = make("osr")
-    recorded = LossGradients(loss, record=True)
+    recorded = LossGradients(loss, record=True, warm_up=0)
     recorded(make_batch(6, twin=True))
     calls = []
     loss.register_forward_pre_hook(lambda *_: calls.append(1))
@@ -125,8 +146,23 @@ def test_a_loss_that_decides_by_numbers_is_run_as_it_is(make_batch, caplog):
     loss = Deciding(*networks(), recovery_weight=0, actor_states="clean").double()
     SoftUpdate(loss, tau=0.1)
     batch = make_batch(6)
-    for gradients in (LossGradients(loss, record=True), LossGradients(loss)):
+    for gradients in (LossGradients(loss, record=True, warm_up=0), LossGradients(loss)):
         losses, found, *_ = results(gradients, loss, batch)
     assert "Deciding runs without a recording" in caplog.text
     assert all(value.isfinite() for value in losses.values())
     assert sum(each is not None for each in found) > 4
+
+
+def test_the_same_weights_are_trained_by_a_fused_optimizer(make_batch):
+    batch, trained = make_batch(6, twin=True), []
+    for record in (False, True):
+        torch.manual_seed(0)
+        loss = make("osr")
+        gradients = LossGradients(loss, record=record, warm_up=0)
+        optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2, fused=True)
+        for _ in range(3):
+            gradients(batch.clone())
+            optimizer.step()
+            optimizer.zero_grad()
+        trained.append(loss.state_dict().values())
+    assert all(torch.equal(*pair) for pair in zip(*trained, strict=True))

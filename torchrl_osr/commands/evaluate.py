@@ -57,7 +57,11 @@ from torchrl_osr.experiment import run_folder
 from torchrl_osr.experiment.build import load_data, references_of
 from torchrl_osr.experiment.limits import check_values
 from torchrl_osr.experiment.run_config import flatten
-from torchrl_osr.experiment.suite import make_disturbances, register
+from torchrl_osr.experiment.suite import (
+    impossible_attacks,
+    make_disturbances,
+    register,
+)
 from torchrl_osr.experiment.trained_run import (
     TrainedRun,
     checkpoints_of,
@@ -283,14 +287,16 @@ def evaluate(
 def impossible(
     cfg: DictConfig, trained: TrainedRun, scale: NDArray[np.floating]
 ) -> dict[str, str]:
-    """Say which disturbances of the suite the environment lacks what it takes for."""
-    env_id = trained.config.env.id
-    suite = make_disturbances(cfg.suite.disturbances, trained, scale)
-    left_out = impossible_disturbances(env_id, suite)
-    if len(left_out) == len(suite):
+    """Say which disturbances environment or policy lack what it takes for, and why."""
+    env_id, configs = trained.config.env.id, cfg.suite.disturbances
+    left_out = impossible_attacks(configs, trained)
+    others = {name: each for name, each in configs.items() if name not in left_out}
+    made = make_disturbances(others, trained, scale)
+    left_out |= impossible_disturbances(env_id, made)
+    if len(left_out) == len(configs):
         raise ValueError(
-            f"no disturbance of suite={cfg.suite.name} is possible for {env_id}: "
-            "choose another suite."
+            f"no disturbance of suite={cfg.suite.name} is possible for {env_id}, "
+            f"{'; '.join(sorted(set(left_out.values())))}: choose another suite."
         )
     return left_out
 

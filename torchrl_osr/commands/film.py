@@ -5,9 +5,10 @@
     torchrl-osr film checkpoint=<run's folder> push=1 film_seed=30004
 
 Figure 3 of the paper: after a push, the behaviour policy, the inverse dynamics model as
-a controller and the trained policy go on from the same state. The run's folder gets
-``film.png``, ``film.gif``, ``visited.png`` and ``film.json``; the table counts all
-episodes that survive. See ``docs/film.md``.
+a controller and the trained policy go on from the same state. Data of your own have no
+behaviour policy that could play: the trained policy plays from the start. The run's
+folder gets ``film.png``, ``film.gif``, ``visited.png`` and ``film.json``; the table
+counts all episodes that survive. See ``docs/film.md``.
 """
 
 from __future__ import annotations
@@ -42,13 +43,13 @@ from torchrl_osr._files import write_json
 from torchrl_osr.commands import CONF
 from torchrl_osr.commands.console import single_job
 from torchrl_osr.data import (
+    QUALITIES,
     load_behavior_policy,
     make_environment,
-    quality_policies,
     sampled_observations,
 )
 from torchrl_osr.envs import ActionKnock, ExternalPush
-from torchrl_osr.evaluation import DataDistance, Policy, Wrap, deterministic_policy
+from torchrl_osr.evaluation import DataDistance, Wrap, deterministic_policy
 from torchrl_osr.experiment.build import load_data
 from torchrl_osr.experiment.limits import check_values
 from torchrl_osr.experiment.run_config import flatten
@@ -104,21 +105,24 @@ def main(cfg: DictConfig) -> None:
     run = trained.config
     camera = Camera(make_environment(run.env.id), 224)  # fails before the work
     data, _ = load_data(run, progress=False)
+    (first, policy), *others = players(trained).items()
     played, ends = play_takeovers(
-        run.env.id, behavior_of(trained), controllers(trained), wrap, duration=duration,
+        run.env.id, policy([]), dict(others), wrap, name=first, duration=duration,
         latest=cfg.window[1], after=cfg.after, num_episodes=cfg.episodes, seed=cfg.seed,
     )  # fmt: skip
 
     # An episode that ends without the push says nothing about it.
-    kept = played[BEHAVIOR].up_clean(ends, cfg.after)
+    kept = played[first].up_clean(ends, cfg.after)
     if not kept:
         raise ValueError(
-            f"in every episode the behaviour policy falls by itself, {cfg.after} steps "
-            f"after the {event} at the latest: choose an earlier window."
+            f"the {first} falls, or the episode ends, in all {cfg.episodes} episodes "
+            f"before {cfg.after} steps after the {event} are over, without the {event} "
+            "too: choose an earlier window or a smaller after."
         )
     measure = (kept, ends, DataDistance(data), (cfg.after // 2, cfg.after))
     results = {name: each.survival(*measure) for name, each in played.items()}
-    filmed = [BEHAVIOR, MODEL + cfg.rule, list(played)[-1]]
+    hidden = {MODEL + rule for rule in RULES} - {MODEL + cfg.rule}
+    filmed = [name for name in played if name not in hidden]
     episode, why = choose(cfg, kept, [results[name].up for name in filmed])
     end = int(ends[episode])
     takes = [
@@ -143,6 +147,11 @@ def main(cfg: DictConfig) -> None:
         f"{run.env.name} {run.data.quality}, {event}={strength:g}, {len(kept)} episodes"
     )
     print(survival_table(results))
+    if first != BEHAVIOR:
+        print(
+            f"  {run.data.quality} data have no behaviour policy to play first: the "
+            f"{first} does"
+        )
     print(f"  filmed: {one}\n  files:  {trained.folder}")
 
 
@@ -158,15 +167,16 @@ def draw(
 ) -> None:
     """Write the three pictures."""
     event, duration, _ = disturbance(cfg)
-    total = len(results[BEHAVIOR].alive)
+    first = takes[0].name
+    total = len(results[first].alive)
     up = "; ".join(f"{take.name} {sum(results[take.name].up)}" for take in takes)
     note = (
-        f"This is {one}. Until the {event} ends, the behaviour policy plays in all "
+        f"This is {one}. Until the {event} ends, the {first} plays in all "
         f"rows.\nOf {total} such episodes, up {cfg.after} steps later: {up}."
     )
-    first, folder = -duration - STEPS_BEFORE, trained.folder
+    start, folder = -duration - STEPS_BEFORE, trained.folder
     later = [round(share * cfg.after) for share in (0.125, 0.25, 0.5, 0.75, 1)]
-    columns, frames = [first, -duration, 0, *later], range(first, cfg.after + 1)
+    columns, frames = [start, -duration, 0, *later], range(start, cfg.after + 1)
     options = {"title": title, "event": event}
     film_strip(
         takes, camera, folder / "film.png", offsets=columns, note=note, **options
@@ -202,33 +212,28 @@ def in_words(cfg: DictConfig, force: float) -> str:
     return f"pushed {way} with {cfg.push:g} x body weight for {PUSH_STEPS} steps"
 
 
-def behavior_of(trained: TrainedRun) -> Policy:
-    """The last, hence best, behaviour policy of the run's data."""
-    run = trained.config
-    names = quality_policies(run.data.quality)
+def players(trained: TrainedRun) -> dict[str, Controller]:
+    """Controllers by name, the one that plays until the disturbance is over first.
+
+    It is the last, hence best, behaviour policy of the data; where there is none, the
+    trained policy.
+    """
+    run, norm = trained.config, trained.observation_norm
+    model, policy = trained.inverse_dynamics, deterministic_policy(trained.actor, norm)
+    learnt: dict[str, Controller] = {"trained policy": lambda _: policy}
+    driven: dict[str, Controller] = {}
+    if model is not None:
+        make = partial(InverseDynamicsController, model, observation_norm=norm)
+        driven = {MODEL + rule: partial(make, rule=rule) for rule in RULES}
+    names = QUALITIES.get(run.data.quality)
     if not names:
-        raise ValueError(f"{run.data.quality} data have no behaviour policy to film.")
-    policy = load_behavior_policy(run.env.name, names[-1])
-    return lambda states: torch.from_numpy(policy.deterministic(states.numpy()))
+        return learnt | driven
+    behavior = load_behavior_policy(run.env.name, names[-1])
 
+    def plays(states: torch.Tensor) -> torch.Tensor:
+        return torch.from_numpy(behavior.deterministic(states.numpy()))
 
-def controllers(trained: TrainedRun) -> dict[str, Controller]:
-    """Controllers that take over from the behaviour policy, the trained policy last."""
-    name = type(trained.loss).__name__.removesuffix("Loss")
-    if trained.inverse_dynamics is None:
-        raise ValueError(
-            f"the {name}Loss of {trained.folder} holds no inverse dynamics model, as "
-            "losses with recovery_weight=0 do not; take a run with loss=osr."
-        )
-    norm = trained.observation_norm
-    driven = partial(
-        InverseDynamicsController, trained.inverse_dynamics, observation_norm=norm
-    )
-    named: dict[str, Controller] = {
-        MODEL + rule: partial(driven, rule=rule) for rule in RULES
-    }
-    policy = deterministic_policy(trained.actor, norm)
-    return named | {f"{name} policy": lambda references: policy}
+    return {BEHAVIOR: lambda _: plays} | driven | learnt
 
 
 def choose(cfg: DictConfig, kept: list[int], up: list[list[bool]]) -> tuple[int, str]:
@@ -243,7 +248,7 @@ def choose(cfg: DictConfig, kept: list[int], up: list[list[bool]]) -> tuple[int,
     for episode, outcomes in zip(kept, zip(*up, strict=True), strict=True):
         if len(set(outcomes)) > 1:
             return episode, "the first with different outcomes"
-    return kept[0], "the first; all end alike"
+    return kept[0], "the first; all end alike" if len(up) > 1 else "the first"
 
 
 if __name__ == "__main__":

@@ -28,7 +28,6 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 from torchrl import torchrl_logger
-from torchrl.objectives import SoftUpdate
 from torchrl.record.loggers import Logger
 
 from torchrl_osr import StatePerturbation
@@ -59,7 +58,12 @@ from torchrl_osr.experiment.loggers import log_outcome, make_loggers
 from torchrl_osr.experiment.run_config import check_run, module_of, read_yaml
 from torchrl_osr.experiment.training_data import load_training_data
 from torchrl_osr.imagination import ImaginedReplayBuffer
-from torchrl_osr.trainers import OfflineTrainer, check_hardware, largest_value
+from torchrl_osr.trainers import (
+    OfflineTrainer,
+    SoftUpdate,
+    check_hardware,
+    largest_value,
+)
 
 log = logging.getLogger(__name__)
 
@@ -105,22 +109,26 @@ def run(cfg: DictConfig, folder: Path) -> float:
     torch.set_num_threads(cfg.trainer.num_threads)
     torch.set_float32_matmul_precision(cfg.trainer.matmul_precision)
     device, autocast = check_hardware(
-        cfg.trainer.device, cfg.trainer.precision, cudagraph=cfg.trainer.cudagraph
+        cfg.trainer.device,
+        cfg.trainer.precision,
+        cudagraph=cfg.trainer.cudagraph,
+        policy_delay=cfg.optim.policy_delay,
     )
     spec, references = environment_spec(cfg.env.id), references_of(cfg)
     sizes = spec.observation_size, spec.action_size
-    check_parts(cfg, *sizes)
+    in_keys = check_parts(cfg, *sizes)
 
     # Transitions with standardised states. Each batch gets a perturbed state for every
     # state, which is the paper's mixed data set.
-    data = load_training_data(cfg, device)
+    data = load_training_data(cfg, device, in_keys)
     torch.manual_seed(cfg.seed)
     noise = {"std": cfg.perturbation.std, "noise": cfg.perturbation.noise}
     perturbation = StatePerturbation(**noise, seed=cfg.seed)
     data.buffer.append_transform(perturbation)
 
-    # Networks, and the policy's loss, which holds the inverse dynamics model.
-    actor, inverse_dynamics, loss = make_learner(cfg, *sizes, device)
+    # Networks, the policy's loss, and the objective: the loss, or with it a recovery
+    # term. Either holds the inverse dynamics model, if one is used.
+    actor, inverse_dynamics, loss, objective = make_learner(cfg, *sizes, device)
 
     told = about(cfg, folder) if cfg.logger.kind == "wandb" else {}
     loggers = make_loggers(folder=folder, **cfg.logger, **told)
@@ -153,7 +161,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
     adam = partial(torch.optim.Adam, fused=True, capturable=cfg.trainer.cudagraph)
 
     # First phase: which action leads from the perturbed state to the next state?
-    if hasattr(loss, "inverse_dynamics_network"):
+    if inverse_dynamics is not None:
         fit = instantiate(cfg.inverse_dynamics.loss, _partial_=True)(inverse_dynamics)
         trainer = new_trainer(
             fit,
@@ -185,7 +193,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
     # Second phase: the policy, taught by the critics and by the frozen model.
     critic_params = list(loss.qvalue_network_params.parameters())
     known = set(critic_params)
-    policy_params = [each for each in loss.parameters() if each not in known]
+    policy_params = [each for each in objective.parameters() if each not in known]
     groups = [
         {"params": critic_params, "lr": cfg.optim.qvalue_lr},
         {"params": policy_params, "lr": cfg.optim.actor_lr},
@@ -196,13 +204,15 @@ def run(cfg: DictConfig, folder: Path) -> float:
     policy = deterministic_policy(actor, data.norm)
     with closing(EpisodeEvaluator(cfg.env.id, **episodes, device=device)) as play:
         trainer = new_trainer(
-            loss,
+            objective,
             adam(groups),
             replay_buffer=buffer,
             total_steps=cfg.trainer.steps,
             folder=folder / "checkpoint" / "policy",
             seed=cfg.seed + 1,
             target_net_updater=targets,
+            policy_delay=cfg.optim.policy_delay,
+            policy_params=policy_params,
             evaluate=lambda: summarize(play(policy), references),
             metric=("return" if references is None else "score", "max"),
             eval_interval=cfg.trainer.eval_interval,
@@ -228,13 +238,14 @@ def code_versions() -> dict[str, str]:
 def about(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     """What W&B shall know of the run: name, group of its seeds, tags, configuration."""
     began = read_yaml(folder / ".hydra" / "hydra.yaml")["hydra"]
-    data, method = f"{cfg.env.name}-{cfg.data.quality}", began["runtime"]["choices"]
+    data = f"{cfg.env.name}-{cfg.data.quality}"
+    method = schema.method_name(began["runtime"]["choices"])
     sweep = [folder.parent.name] if began["mode"] == "MULTIRUN" else []
     settings: Any = OmegaConf.to_container(cfg, resolve=True)
     return {
-        "name": f"{data} {method['loss']} seed{cfg.seed}",
-        "group": f"{data} {method['loss']}",
-        "tags": [cfg.env.name, cfg.data.quality, method["loss"], *sweep],
+        "name": f"{data} {method} seed{cfg.seed}",
+        "group": f"{data} {method}",
+        "tags": [cfg.env.name, cfg.data.quality, method, *sweep],
         "config": settings | {"versions": code_versions()},
     }
 
@@ -271,11 +282,13 @@ def report(
     }
     write_json(folder / "returns.json", results | {"evaluations": history})
     name = f"{cfg.env.name} {cfg.data.quality}"
+    parts = [each for each in (cfg.loss, cfg.recovery) if each is not None]
+    method = " and ".join(each._target_.rpartition(".")[2] for each in parts)
     learning_curve(
         history,
         read_scalars(folder / "csv" / "scalars" / "policy"),
         folder / "curve.png",
-        title=f"{name}, {type(trainer.loss_module).__name__}, seed {cfg.seed}",
+        title=f"{name}, {method}, seed {cfg.seed}",
         data_mean=data_mean,
     )
     rows = {"last": history[-1], "best": best}

@@ -31,6 +31,7 @@ from torchrl_osr.data.collect.reference_scores import (
     normalized_score,
     reference_returns,
 )
+from torchrl_osr.data.store.next_action import check_order, next_action
 from torchrl_osr.data.store.replay_buffer import (
     check_memory,
     is_memory_mapped,
@@ -117,6 +118,7 @@ __all__ = [
     "ReferenceReturns",
     "check_dataset",
     "check_memory",
+    "check_order",
     "collect_quality",
     "collect_transitions",
     "consecutive_rows",
@@ -137,6 +139,7 @@ __all__ = [
     "measure_policy",
     "minari_replay_buffer",
     "mix_datasets",
+    "next_action",
     "normalized_score",
     "observation_statistics",
     "quality_policies",

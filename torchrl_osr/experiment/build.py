@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
-from tensordict import TensorDict
+from tensordict import NestedKey, TensorDict
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torchrl.objectives import LossModule
 
@@ -19,6 +19,7 @@ from torchrl_osr.imagination import Termination, never, termination
 from torchrl_osr.imagination.replay_buffer import check_real_ratio
 from torchrl_osr.modules import DynamicsEnsemble
 from torchrl_osr.objectives.distributions import is_categorical
+from torchrl_osr.objectives.with_recovery import WithRecovery
 
 
 def read_environment(cfg: DictConfig) -> None:
@@ -135,14 +136,16 @@ class Learner(NamedTuple):
 
     Attributes:
         actor: the policy.
-        model: the inverse dynamics model, whether the loss uses it or not.
-        loss: holds the tensors of both, the model's frozen: what either learns, the
-            loss knows.
+        model: the inverse dynamics model, ``None`` if nothing uses it.
+        loss: holds the actor's tensors and the critics.
+        objective: what is trained: the loss, with the recovery term that is added to
+            it. Holds the model's tensors too, frozen: what it learns, this knows.
     """
 
     actor: ProbabilisticTensorDictSequential
-    model: ProbabilisticTensorDictSequential
+    model: ProbabilisticTensorDictSequential | None
     loss: LossModule
+    objective: LossModule
 
 
 def make_learner(
@@ -162,9 +165,10 @@ def make_learner(
         device: where they shall be. Default CPU.
 
     Raises:
-        ValueError: if an option of the loss is out of its range, or the networks do not
-            fit into the memory.
+        ValueError: if an option of a loss is out of its range, the loss has a recovery
+            term already, or the networks do not fit into the memory.
     """
+    _check_recovery(cfg)
     check_networks(cfg, observation_size, action_size, device)
     sizes, cells = (observation_size, action_size), list(cfg.network.num_cells)
     actor = instantiate(cfg.network.actor, *sizes, num_cells=cells).to(device)
@@ -181,19 +185,50 @@ def make_learner(
         "qvalue_network": critics,
         "inverse_dynamics_network": model.to(device),
     }
-    wanted = inspect.signature(get_class(cfg.loss._target_)).parameters
-    given = {name: each for name, each in networks.items() if name in wanted}
-    loss = instantiate(cfg.loss, _partial_=True)(**given).to(device)
+
+    def built(part: DictConfig) -> LossModule:
+        wanted = inspect.signature(get_class(part._target_)).parameters
+        given = {name: each for name, each in networks.items() if name in wanted}
+        loss: LossModule = instantiate(part, _partial_=True)(**given).to(device)
+        return loss
+
+    loss = objective = built(cfg.loss)
     loss.make_value_estimator(gamma=cfg.optim.gamma)
-    return Learner(actor, model, loss)
+    parts = [loss]
+    if cfg.recovery is not None:
+        if is_categorical(actor):
+            raise ValueError(
+                f"recovery=... is for real actions, and those of {cfg.loss._target_} "
+                "are discrete: take loss=discrete_osr, which has a term of its own."
+            )
+        parts.append(built(cfg.recovery))
+        objective = WithRecovery(*parts)
+    used = any(hasattr(each, "inverse_dynamics_network") for each in parts)
+    return Learner(actor, model if used else None, loss, objective)
 
 
-def check_parts(cfg: DictConfig, observation_size: int, action_size: int) -> None:
+def _check_recovery(cfg: DictConfig) -> None:
+    """Raise a ValueError if a recovery term is added to a loss that has its own."""
+    own = cfg.loss.get("recovery_weight")
+    if cfg.recovery is not None and own:
+        raise ValueError(
+            f"{cfg.loss._target_} has a recovery term of its own "
+            f"(loss.recovery_weight={own}), to which recovery=... would add another: "
+            "leave out recovery=..., or set loss.recovery_weight=0."
+        )
+
+
+def check_parts(
+    cfg: DictConfig, observation_size: int, action_size: int
+) -> list[NestedKey]:
     """Build once what a run will need, so that a wrong option stops before its data.
 
     Args:
         cfg: a whole configuration of ``torchrl-osr train``.
         observation_size, action_size: of the data.
+
+    Returns:
+        The entries that the policy's loss reads.
 
     Raises:
         ValueError: if an option is out of its range, or networks and batches do not fit
@@ -201,11 +236,19 @@ def check_parts(cfg: DictConfig, observation_size: int, action_size: int) -> Non
     """
     sizes = observation_size, action_size
     check_networks(cfg, *sizes, cfg.trainer.device, training=True)
-    _, model, _ = make_learner(cfg, *sizes)
-    instantiate(cfg.inverse_dynamics.loss, _partial_=True)(model)
+    learner = make_learner(cfg, *sizes)
+    if learner.model is not None:
+        instantiate(cfg.inverse_dynamics.loss, _partial_=True)(learner.model)
     if cfg.perturbation.adversary is not None:
         instantiate(cfg.perturbation.adversary)
+    in_keys: list[NestedKey] = learner.objective.in_keys
     if cfg.dynamics.use:
         make_dynamics(cfg, *sizes)
         termination_of(cfg)
         check_real_ratio(cfg.dynamics.real_ratio, cfg.trainer.batch_size)
+        if ("next", "action") in in_keys:
+            raise ValueError(
+                f"{cfg.loss._target_} reads the data's next action, which no imagined "
+                "row has: choose another loss, or dynamics=none."
+            )
+    return in_keys

@@ -74,15 +74,8 @@ def dynamics_model(
         adam: makes an optimizer from parameters.
 
     Raises:
-        ValueError: ``dynamics.path`` names another file, or a model of other data; or
-            the rows have entries that imagined ones lack.
+        ValueError: ``dynamics.path`` names another file, or a model of other data.
     """
-    others = set(data.held_out.keys(True, True)) - set(DATASET_KEYS)
-    if others:
-        raise ValueError(
-            f"{cfg.loss._target_} reads {others}, which no model of the dynamics "
-            "imagines: take dynamics=none."
-        )
     fits, settings = facts_of(cfg, data), settings_of(cfg)
     here, given = folder / FILE, cfg.dynamics.path
     if not here.exists() and given is not None:

@@ -118,9 +118,10 @@ def _schema(config: DictConfig) -> DictConfig:
                 # The function has keys of its own.
                 OmegaConf.set_struct(group[key], False)
     values = flatten(OmegaConf.to_container(config))
-    for key in ("loss", "inverse_dynamics.loss", "perturbation.adversary"):
+    optional = ("recovery", "perturbation.adversary")
+    for key in ("loss", "inverse_dynamics.loss", *optional):
         target, value = values.get(f"{key}._target_"), values.get(key)
-        if target is None and (value is not None or key != "perturbation.adversary"):
+        if target is None and (value is not None or key not in optional):
             raise ValueError(f"{key} must have options and a _target_, got {value!r}.")
         if str(target).startswith("torchrl_osr."):
             options = OmegaConf.structured(schema_of(get_class(str(target))))

@@ -11,7 +11,7 @@ import functools
 import inspect
 import operator
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, make_dataclass
 from types import NoneType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -236,6 +236,8 @@ class OptimConfig:
         inverse_dynamics_lr: learning rate of the inverse dynamics model.
         gamma: discount factor.
         tau: step of the target networks towards the critics, at each update.
+        policy_delay: updates of the critics for each of the policy, the entropy
+            temperature and the target networks.
     """
 
     actor_lr: float = MISSING
@@ -243,6 +245,7 @@ class OptimConfig:
     inverse_dynamics_lr: float = MISSING
     gamma: float = MISSING
     tau: float = MISSING
+    policy_delay: int = 1
 
 
 @dataclass
@@ -310,6 +313,8 @@ class TrainConfig:
 
     Attributes:
         seed: random seed of networks, sampling and noise.
+        recovery: options of ``StateRecoveryLoss``, whose term is added to a loss that
+            has none of its own; null for none.
         num_random: value of ``loss.num_random`` for the losses with CQL's term.
         resume: folder of a run to continue, or to extend with more ``trainer.steps``.
         force: continue although settings differ from those that the run was made with.
@@ -326,6 +331,7 @@ class TrainConfig:
     )
     dynamics: DynamicsConfig = field(default_factory=DynamicsConfig)
     loss: Any = MISSING  # derived from the class that _target_ names
+    recovery: Any = None  # likewise
     optim: OptimConfig = field(default_factory=OptimConfig)
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
     logger: LoggerConfig = field(default_factory=LoggerConfig)
@@ -451,7 +457,8 @@ def register() -> None:
     ``train_schema``, ``check_data_schema``, ``collect_schema``, and in the group
     ``schema`` one for each class of :mod:`torchrl_osr.objectives`;
     ``environment_name``, the short name of a task; ``run_dir``, by which
-    ``resume=folder`` becomes the run's folder; and ``job_dir``, see :func:`job_folder`.
+    ``resume=folder`` becomes the run's folder; ``method_name``, see
+    :func:`method_name`; and ``job_dir``, see :func:`job_folder`.
     """
     store = ConfigStore.instance()
     store.store(name="train_schema", node=TrainConfig)
@@ -463,10 +470,25 @@ def register() -> None:
     resolvers: dict[str, Callable[..., Any]] = {
         "environment_name": _environment_name,
         "run_dir": lambda resume, fresh: resume or fresh,
+        "method_name": lambda loss, recovery: method_name(
+            {"loss": loss, "recovery": recovery}
+        ),
         "job_dir": job_folder,
     }
     for name, resolver in resolvers.items():
         OmegaConf.register_new_resolver(name, resolver, replace=True)
+
+
+def method_name(choices: Mapping[str, str | None]) -> str:
+    """What a run's method is called, from its choices of Hydra's groups.
+
+    Examples:
+        >>> from torchrl_osr.experiment.schema import method_name
+        >>> method_name({"loss": "rebrac", "recovery": "osr"})
+        'rebrac+osr'
+    """
+    recovery = choices.get("recovery", "none")
+    return str(choices["loss"]) + (f"+{recovery}" if recovery != "none" else "")
 
 
 def job_folder(number: int, overrides: str) -> str:

@@ -115,10 +115,7 @@ def make_disturbances(
         seed: of the attacks' draws. Default 0.
 
     Raises:
-        ValueError: if a disturbance has both wrapper and attack, or neither, or an
-            attack is not possible: its unit is the data's standard deviation, but the
-            networks were trained on raw observations, or it compares distributions of a
-            deterministic policy.
+        ValueError: if a disturbance has both wrapper and attack, or neither.
     """
     made = []
     for name, config in configs.items():
@@ -130,12 +127,6 @@ def make_disturbances(
             if wrap.keywords.get("unit") == DATA_UNIT:
                 wrap = partial(wrap, unit=scale)
         else:
-            obstacle = _obstacle(config.attack.kind, trained)
-            if obstacle:
-                raise ValueError(
-                    f"disturbance {name!r} is not possible for {trained.folder}: "
-                    f"{obstacle}."
-                )
             policy = attacked_policy(
                 trained.actor.get_dist,
                 critics_of(trained.loss),
@@ -145,6 +136,18 @@ def make_disturbances(
             )
         made.append(Disturbance(name, config.kind, config.strength, wrap, policy))
     return made
+
+
+def impossible_attacks(
+    configs: Mapping[str, Any], trained: TrainedRun
+) -> dict[str, str]:
+    """Those attacks of a suite that a run's policy cannot meet, and why, by name."""
+    obstacles = {
+        name: _obstacle(config.attack.kind, trained)
+        for name, config in configs.items()
+        if config.attack is not None
+    }
+    return {name: obstacle for name, obstacle in obstacles.items() if obstacle}
 
 
 def _obstacle(kind: str, trained: TrainedRun) -> str:
@@ -159,6 +162,6 @@ def _obstacle(kind: str, trained: TrainedRun) -> str:
     if kind == "action_diff" and not isinstance(distribution, TanhNormal):
         return (
             "action_diff compares tanh-Gaussian distributions, and the policy's is a "
-            f"{type(distribution).__name__}; leave it out by ~suite.disturbances.<name>"
+            f"{type(distribution).__name__}"
         )
     return ""

@@ -29,8 +29,8 @@ class TrainedRun(NamedTuple):
     Attributes:
         config: the run's configuration.
         actor: the policy; shares its parameters with the loss.
-        inverse_dynamics: the model that taught the policy, with the loss's frozen
-            parameters; ``None`` if the loss has none, as CQL and SAC-N have not.
+        inverse_dynamics: the model that taught the policy, with its frozen
+            parameters; ``None`` if there was none, as in CQL and SAC-N.
         loss: holds the critics, too.
         observation_norm: standardisation of the networks' observations.
         step: gradient steps of the checkpoint.
@@ -118,13 +118,15 @@ def load_trained(
     config = read_run(folder / CONFIG, trust)
     observation_size, action_size = sizes or _environment_sizes(config.env.id)
     with torch.random.fork_rng(devices=[]):
-        actor, model, loss = _learner(config, observation_size, action_size, folder)
+        actor, model, loss, objective = _learner(
+            config, observation_size, action_size, folder
+        )
     shape = (observation_size,) if config.data.standardize else ()
     norm = ObservationNorm(
         torch.zeros(shape), torch.ones(shape), in_keys=["observation"],
         standard_normal=True,
     )  # fmt: skip
-    checkpoint = safe_checkpoint(loss_module=loss, observation_norm=norm)
+    checkpoint = safe_checkpoint(loss_module=objective, observation_norm=norm)
     try:
         manifest = checkpoint.load(path, map_location="cpu").manifest
     except CheckpointError as error:
@@ -134,9 +136,8 @@ def load_trained(
         ) from error
     numbered = re.fullmatch(r"checkpoint-(\d+)\.torchrl", path.name)
     step = int(numbered[1]) if numbered else int(manifest["metadata"]["step"])
-    # The loss's parameters of the model are the model's own tensors.
-    inverse_dynamics = model if hasattr(loss, "inverse_dynamics_network") else None
-    return TrainedRun(config, actor, inverse_dynamics, loss, norm, step, path, folder)
+    # The objective's parameters of actor and model are their own tensors.
+    return TrainedRun(config, actor, model, loss, norm, step, path, folder)
 
 
 def _learner(
@@ -168,7 +169,9 @@ def saved_sizes(path: Path) -> tuple[int, int]:
     weights = {
         name: [
             each for key, each in state.tensors.items()
-            if key.startswith(f"{name}_network_params.") and key.endswith(".weight")
+            # Where a recovery term was added, the loss is a part of what was trained.
+            if key.removeprefix("loss.").startswith(f"{name}_network_params.")
+            and key.endswith(".weight")
         ]
         for name in ("actor", "qvalue")
     }  # fmt: skip

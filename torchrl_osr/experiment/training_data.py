@@ -8,18 +8,21 @@ Shapes: ``S`` observation, ``A`` action.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from omegaconf import DictConfig
-from tensordict import TensorDict
+from tensordict import NestedKey, TensorDict
 from torchrl.data import ImmutableDatasetWriter, ReplayBuffer
 from torchrl.envs import Compose, ObservationNorm, RewardScaling
 
 from torchrl_osr.data import (
+    check_order,
     consecutive_rows,
     held_out_rows,
     make_replay_buffer,
+    next_action,
     observation_statistics,
     split_held_out,
 )
@@ -65,7 +68,9 @@ class TrainingData(NamedTuple):
         )
 
 
-def load_training_data(cfg: DictConfig, device: torch.device) -> TrainingData:
+def load_training_data(
+    cfg: DictConfig, device: torch.device, in_keys: Sequence[NestedKey] = ()
+) -> TrainingData:
     """Load a run's data, split and prepared, see ``data`` of its configuration.
 
     Rewards become ``data.reward_scale * r + data.reward_shift``; the mean is of the
@@ -74,13 +79,25 @@ def load_training_data(cfg: DictConfig, device: torch.device) -> TrainingData:
     Args:
         cfg: a whole configuration of ``torchrl-osr train``.
         device: where batches and networks are.
+        in_keys: what the loss reads: with ``("next", "action")`` among it batches have
+            the data's next action. Default: what every data set has.
 
     Raises:
-        ValueError: an option cannot be had with the others.
+        ValueError: an option cannot be had with the others, or the loss reads the next
+            action and the rows are in no order of time.
         MemoryError: the data do not fit into the GPU.
     """
     on_disk = check_storage(cfg) == "disk"
     data, manifest = load_data(cfg, progress=cfg.trainer.progress)
+    if with_next_action := ("next", "action") in in_keys:
+        try:
+            check_order(data)
+        except ValueError as error:
+            raise ValueError(
+                f"{cfg.loss._target_} reads the data's next action, and "
+                f"data={cfg.data.quality} with data.path={cfg.data.path} and "
+                f"data.random_share={cfg.data.random_share} does not tell it: {error}"
+            ) from error
     loc, scale = observation_statistics(data) if cfg.data.standardize else (0.0, 1.0)
     factor, addend = cfg.data.reward_scale, cfg.data.reward_shift
     extremes = torch.stack(data["next", "reward"].aminmax())
@@ -103,9 +120,15 @@ def load_training_data(cfg: DictConfig, device: torch.device) -> TrainingData:
         held_out = prepare(data[chosen[:MAX_HELD_OUT].sort().values])
         left_out, prepare = chosen.sort().values, prepare.to(device)
         buffer = make_replay_buffer(
-            data, left_out=left_out, transform=prepare, **options
+            data,
+            left_out=left_out,
+            transform=prepare,
+            with_next_action=with_next_action,
+            **options,
         )
     else:
+        if with_next_action:  # of the rows before some of them are held out
+            data["next", "action"] = next_action(data)
         data = prepare(data)
         if cfg.dynamics.use:
             pieces = consecutive_rows(data, chosen[:NUM_PIECES], PIECE)

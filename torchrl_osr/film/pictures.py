@@ -85,29 +85,43 @@ class Camera:
     """Draws poses of a MuJoCo robot from the side, without a window.
 
     Args:
-        environment: MuJoCo's, for the camera alone: the looks of its model are changed.
+        environment: one of Gymnasium's MuJoCo tasks, for the camera alone: the looks of
+            its model are changed. Without a camera 'track' it is seen as Gymnasium
+            sees it.
         size: of the square picture, in pixels.
 
     Attributes:
         seconds: duration of one step of the agent.
 
     Raises:
+        ValueError: if it is another environment.
         RuntimeError: if OpenGL does not start.
     """
 
     def __init__(self, environment: Any, size: int) -> None:
+        from gymnasium.envs.mujoco import MujocoEnv
         from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 
         simulation = environment.unwrapped
+        if not isinstance(simulation, MujocoEnv):
+            raise ValueError(
+                "only Gymnasium's own MuJoCo tasks can be filmed, 'Hopper-v5' for "
+                f"instance: {simulation} has no poses to draw."
+            )
         model, self.seconds = simulation.model, float(simulation.dt)
         # No mirror images and shadows: several times faster without a graphics card.
         model.mat_reflectance[:] = 0
         model.vis.quality.shadowsize = 0
         model.cam_fovy[:] = FIELD_OF_VIEW
         model.cam_poscom0[:, 2] += CAMERA_HEIGHT
-        self._simulation = simulation
+        self._simulation: Any = simulation
         self._renderer = MujocoRenderer(
-            model, simulation.data, None, size, size, camera_name="track"
+            model,
+            simulation.data,
+            simulation.mujoco_renderer.default_cam_config,
+            size,
+            size,
+            camera_name="track",
         )
         try:
             self._renderer.render("rgb_array")
@@ -154,11 +168,15 @@ def film_strip(
         event: name of the disturbance.
     """
     rows, columns = len(takes), len(offsets)
-    figure = new_figure(1.6 * columns + 1.9, 1.6 * rows + 1.6)
+    height = 1.6 * rows + 1.7
+    figure = new_figure(1.6 * columns + 1.9, height)
     cells = figure.subplots(rows, columns, squeeze=False)
-    figure.suptitle(title, fontsize=14, y=0.98)
-    figure.text(0.5, 0.02, note, ha="center", va="bottom", fontsize=10, color=GREY)
-    figure.subplots_adjust(0.13, 0.12, 0.995, 0.85, wspace=0.03, hspace=0.04)
+    low = 0.13 / height
+    figure.suptitle(title, fontsize=14, y=1 - low)
+    figure.text(0.5, low, note, ha="center", va="bottom", fontsize=10, color=GREY)
+    figure.subplots_adjust(
+        0.13, 0.75 / height, 0.995, 1 - 0.95 / height, wspace=0.03, hspace=0.04
+    )
     begin = takes[0].begin - takes[0].end
     for axes_row, take, color in zip(cells, takes, COLORS, strict=False):
         axes_row[0].set_ylabel(
@@ -221,7 +239,7 @@ def film_gif(
     """
     from PIL import Image  # comes with matplotlib
 
-    figure = new_figure(2.3 * len(takes), 3.1)
+    figure = new_figure(2.3 * max(len(takes), 2), 3.1)  # wide enough for the title
     canvas: Any = figure.canvas
     cells = figure.subplots(1, len(takes), squeeze=False)[0]
     figure.subplots_adjust(0.01, 0.01, 0.99, 0.70, wspace=0.03)
@@ -309,7 +327,7 @@ def visited_states(
     low = np.min([low, *(each.min(0) for each in trails)], axis=0) - 0.3
     high = np.max([high, *(each.max(0) for each in trails)], axis=0) + 0.3
     points = points[((points >= low) & (points <= high)).all(1)]
-    figure = new_figure(4.2 * len(takes) + 1, 5.2, layout="constrained")
+    figure = new_figure(4.2 * max(len(takes), 2) + 1, 5.2, layout="constrained")
     figure.suptitle(f"{title}\n{note}", fontsize=12)
     panels = figure.subplots(1, len(takes), sharey=True, squeeze=False)[0]
     for axes, take, trail, color in zip(panels, takes, trails, COLORS, strict=False):

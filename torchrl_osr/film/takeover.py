@@ -1,7 +1,7 @@
 """Several controllers that go on from the same state after a disturbance.
 
-The behaviour policy plays until the disturbance is over; then the controller that is
-tested takes over.
+One policy, the behaviour policy where there is one, plays until the disturbance is
+over; then the controller that is tested takes over.
 
 Shapes: ``E`` episodes, ``S`` observation, ``A`` action, ``Q`` joint positions.
 """
@@ -35,10 +35,10 @@ NEVER = torch.iinfo(torch.int64).max
 """Moment of the takeover in an episode without a disturbance."""
 
 BEHAVIOR = "behaviour policy"
-"""Name of the behaviour policy among the controllers: it goes on playing."""
+"""Name of the behaviour policy among the controllers."""
 
 Controller: TypeAlias = Callable[[list[Tensor]], Policy]
-"""Makes a policy for one evaluation from the behaviour policy's undisturbed episodes.
+"""Makes a policy for one evaluation from the first policy's undisturbed episodes.
 
 Of each, the raw observations ``[T, S]`` from the reset on.
 """
@@ -165,10 +165,11 @@ def hand_over(before: Policy, after: Policy, moments: Tensor) -> Policy:
 
 def play_takeovers(
     env_id: str,
-    behavior: Policy,
+    first: Policy,
     controllers: Mapping[str, Controller],
     disturbance: Wrap,
     *,
+    name: str = BEHAVIOR,
     duration: int,
     latest: int,
     after: int,
@@ -179,11 +180,12 @@ def play_takeovers(
 
     Args:
         env_id: a Gymnasium id of a MuJoCo task.
-        behavior: plays first, deterministic.
-        controllers: by name.
+        first: the policy that plays first, deterministic; it is a controller itself.
+        controllers: the others, by name.
         disturbance: wraps the environment, acts once an episode.
 
     Keyword Args:
+        name: of the first policy. Default: it is the behaviour policy.
         duration: of the disturbance, in steps.
         latest: step at which it begins at the latest.
         after: steps that are played after its end, at least.
@@ -191,9 +193,9 @@ def play_takeovers(
         seed: the episodes are seeded ``seed, seed + 1, ...``. Default 0.
 
     Returns:
-        Episodes by controller, the behaviour policy first as :data:`BEHAVIOR`; and the
-        entry after each episode's disturbance, at which the controller takes over,
-        int64 ``[E]``, :data:`NEVER` where the behaviour policy fell before.
+        Episodes by controller, those of the first policy first; and the entry after
+        each episode's disturbance, at which the controller takes over, int64 ``[E]``,
+        :data:`NEVER` where the first policy fell before.
     """
 
     def play(policy: Policy, wrap: Wrap) -> PoseRecorder:
@@ -210,17 +212,17 @@ def play_takeovers(
     def both(disturbed: Policy, clean: Policy) -> Takeover:
         return Takeover(play(disturbed, disturbance), play(clean, lambda env: env))
 
-    played = {BEHAVIOR: both(behavior, behavior)}
-    begins = map(disturbed_at, played[BEHAVIOR].disturbed.trajectories)
+    played = {name: both(first, first)}
+    begins = map(disturbed_at, played[name].disturbed.trajectories)
     moments = torch.tensor([NEVER if at is None else at + duration for at in begins])
     references = [
         torch.from_numpy(np.stack(each.observations))
-        for each in played[BEHAVIOR].clean.trajectories
+        for each in played[name].clean.trajectories
     ]
-    for name, make in controllers.items():
+    for other, make in controllers.items():
         # One policy for each evaluation: it may count its calls.
-        policies = [hand_over(behavior, make(references), moments) for _ in range(2)]
-        played[name] = both(*policies)
+        policies = [hand_over(first, make(references), moments) for _ in range(2)]
+        played[other] = both(*policies)
     return played, moments
 
 

@@ -33,15 +33,18 @@ from torchrl_osr.functional.dynamics import (
     largest_deviation,
 )
 from torchrl_osr.functional.policy import (
+    action_distance,
     bootstrap_value,
     cloning_error,
     discrete_policy_value,
+    rebrac_objective,
     soft_policy_value,
     td3_bc_objective,
     temperature_objective,
 )
 
 __all__ = [
+    "action_distance",
     "bootstrap_value",
     "bounded_log_variance",
     "categorical_kl",
@@ -56,6 +59,7 @@ __all__ = [
     "jeffreys_divergence",
     "lagrange_terms",
     "largest_deviation",
+    "rebrac_objective",
     "soft_maximum",
     "soft_policy_value",
     "state_recovery",

@@ -155,3 +155,49 @@ def td3_bc_objective(
         tensor([-4.5000])
     """
     return cloning_error - alpha / magnitude * qvalue
+
+
+def action_distance(action: Tensor, data_action: Tensor) -> Tensor:
+    r"""Squared distance of an action from the data's, in squared action units.
+
+    .. math::
+        \|a - a_D\|^2 = \sum_d (a_d - a_{D,d})^2
+
+    Args:
+        action: ``[B, A]``.
+        data_action: ``[B, A]``.
+
+    Returns:
+        ``[B]``.
+    """
+    return (action - data_action).square().sum(-1)
+
+
+def rebrac_objective(
+    qvalue: Tensor, distance: Tensor, magnitude: Tensor, weight: float
+) -> Tensor:
+    r"""ReBRAC objective of the policy, to be minimised.
+
+    .. math::
+        \beta_1 \|\pi(s) - a\|^2
+        - \frac{\min_i Q_i(s, \pi(s))}{\mathbb E_D |\min_i Q_i(s, \pi(s))|}
+
+    "Revisiting the Minimalist Approach to Offline Reinforcement Learning",
+    https://arxiv.org/abs/2305.09836, as its released code has it: the paper prints no
+    normaliser, and the code divides by it.
+
+    Args:
+        qvalue: the critics' smallest value of the policy's action, ``[B]``.
+        distance: of that action from the data's, see :func:`action_distance`, ``[B]``.
+        magnitude: the normaliser, a scalar without gradient.
+        weight: :math:`\beta_1`.
+
+    Returns:
+        ``[B]``.
+
+    Examples:
+        >>> one = torch.ones(1)
+        >>> rebrac_objective(4 * one, 3 * one, magnitude=2 * one, weight=0.5)
+        tensor([-0.5000])
+    """
+    return weight * distance - qvalue / magnitude

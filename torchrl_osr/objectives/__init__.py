@@ -8,6 +8,7 @@ from torchrl_osr.objectives.edac import EDACLoss
 from torchrl_osr.objectives.inverse_dynamics import InverseDynamicsLoss
 from torchrl_osr.objectives.osr import OSRLoss
 from torchrl_osr.objectives.osr_v import OSRVLoss
+from torchrl_osr.objectives.rebrac import ReBRACLoss
 from torchrl_osr.objectives.state_recovery import StateRecoveryLoss
 from torchrl_osr.objectives.td3_bc import TD3BCLoss
 
@@ -20,6 +21,7 @@ __all__ = [
     "InverseDynamicsLoss",
     "OSRLoss",
     "OSRVLoss",
+    "ReBRACLoss",
     "StateRecoveryLoss",
     "TD3BCLoss",
 ]

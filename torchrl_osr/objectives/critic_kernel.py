@@ -167,8 +167,11 @@ def qvalue(
     for index, layer in enumerate(layers):
         hidden = torch.baddbmm(layer.bias.unsqueeze(1), hidden, layer.weight.mT)
         if layer.norm:
-            # Not layer_norm's own scale and shift, which all critics would share.
-            hidden = layer_norm(hidden, hidden.shape[-1:], eps=mlp.eps[index])
+            # Its own scale and shift would be those of all critics. It is given ones,
+            # for without any torch 2.13 takes twice as long.
+            ones = layer.norm[0].new_ones(hidden.shape[-1])
+            zeros = torch.zeros_like(ones)
+            hidden = layer_norm(hidden, ones.shape, ones, zeros, mlp.eps[index])
             scale, shift = (each.unsqueeze(1) for each in layer.norm)
             hidden = torch.addcmul(shift, hidden, scale)
         if layer is not layers[-1]:

@@ -30,7 +30,7 @@ CATEGORICAL = (Categorical, *ONE_HOT)
 """Distributions over finitely many actions; those not in ``ONE_HOT`` are of indices."""
 
 
-def _head(network: TensorDictModuleBase) -> tuple[Any, dict[str, Any]]:
+def head_of(network: TensorDictModuleBase) -> tuple[Any, dict[str, Any]]:
     """Return the class of the distribution that a network ends in, and its options."""
     heads = [
         module
@@ -58,7 +58,7 @@ def action_bounds(network: TensorDictModuleBase, name: str) -> tuple[Tensor, Ten
         TypeError: if the network's distribution is not a
             :class:`~torchrl.modules.TanhNormal`.
     """
-    distribution, kwargs = _head(network)
+    distribution, kwargs = head_of(network)
     if not _is_a(distribution, TanhNormal):
         cure = "torchrl_osr.modules builds such networks."
         if _is_a(distribution, *CATEGORICAL):
@@ -76,7 +76,7 @@ def action_bounds(network: TensorDictModuleBase, name: str) -> tuple[Tensor, Ten
 
 def is_categorical(network: TensorDictModuleBase) -> bool:
     """Whether a network chooses among finitely many actions."""
-    return _is_a(_head(network)[0], *CATEGORICAL)
+    return _is_a(head_of(network)[0], *CATEGORICAL)
 
 
 def check_categorical(network: TensorDictModuleBase, name: str) -> None:
@@ -90,7 +90,7 @@ def check_categorical(network: TensorDictModuleBase, name: str) -> None:
         TypeError: if its distribution is not in :data:`CATEGORICAL`.
     """
     if not is_categorical(network):
-        distribution, _ = _head(network)
+        distribution, _ = head_of(network)
         cure = "torchrl_osr.modules builds such networks."
         if _is_a(distribution, TanhNormal):
             cure = "For continuous actions use OSRLoss."

@@ -7,29 +7,30 @@ Shapes: ``B`` batch (any leading dimensions), ``A`` action, ``D`` sets of states
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import (
-    ProbabilisticTensorDictModule,
     ProbabilisticTensorDictSequential,
     TensorDictModuleBase,
     dispatch,
 )
 from torch import Tensor
-from torchrl.modules import TanhDelta, TanhNormal
+from torchrl.modules import IndependentNormal, TanhDelta, TanhNormal
 from torchrl.modules.distributions.utils import safeatanh_noeps
 
 from torchrl_osr import functional
 from torchrl_osr._checks import check_literals, check_weight
-from torchrl_osr._entries import column, nested, state_keys
+from torchrl_osr._entries import column, entry, nested, state_keys
 from torchrl_osr.objectives.base import BaseLoss
 from torchrl_osr.objectives.distributions import (
     action_bounds,
+    check_action,
     check_num_actions,
     check_same_bounds,
     check_same_size,
+    head_of,
 )
 from torchrl_osr.objectives.mixed_states import States, transitions
 from torchrl_osr.objectives.step import frozen_distribution
@@ -52,21 +53,30 @@ class StateRecoveryLoss(BaseLoss):
     A deterministic actor (a :class:`~torchrl.modules.TanhDelta`, or a module that
     writes the action) is pulled to the model's mean, by
     :func:`~torchrl_osr.functional.deterministic_recovery`: an addition, not in the
-    paper. A module should squash its action itself, with a tanh at its end: beyond the
-    bounds the gradient is finite, but huge. Where that tanh has saturated there is no
-    gradient; with a ``TanhDelta`` there is.
+    paper. So is the mean of an :class:`~torchrl.modules.IndependentNormal`. A module
+    should squash its action itself, with a tanh at its end: beyond the bounds the
+    gradient is finite, but huge. Where that tanh has saturated there is no gradient;
+    with a ``TanhDelta`` there is.
+
+    With ``recovery_target="data"`` it is noisy behaviour cloning, which needs no model:
+    :math:`-\log\pi(a \mid \tilde s)`, and the squared distance
+    :math:`\|\pi(\tilde s) - a\|^2` of a deterministic actor.
 
     Args:
-        actor_network: ends in a :class:`~torchrl.modules.TanhNormal`, or deterministic.
+        actor_network: ends in a :class:`~torchrl.modules.TanhNormal` or an
+            :class:`~torchrl.modules.IndependentNormal`, or deterministic.
         inverse_dynamics_network: a *trained* model of ``I(a | s, s')`` with the
             actor's bounds (see :class:`~torchrl_osr.InverseDynamicsLoss`). Frozen here:
-            in the state dict, moved by ``.to()``, without gradient.
+            in the state dict, moved by ``.to()``, without gradient. Needed unless
+            ``recovery_target="data"``, which leaves it out.
 
     Keyword Args:
         recovery_weight: :math:`\lambda`. Default 0.5. May be assigned later.
-        recovery_direction: ``"forward"`` (default) is the paper's ``KL(I || pi)``,
-            ``"reverse"`` the ``KL(pi || I)`` of the authors' code, which a
-            deterministic actor needs.
+        recovery_target: what the policy is pulled to: ``"inverse_dynamics"`` (default)
+            or ``"data"``, the data's action.
+        recovery_direction: ``"forward"`` is the paper's ``KL(I || pi)``, ``"reverse"``
+            the ``KL(pi || I)`` of the authors' code. ``None`` (default) is forward for
+            a tanh-Gaussian actor and reverse for others, which have no forward one.
         action_reduction: ``"sum"`` (default) over action dimensions, or ``"mean"``.
         recovery_states: ``"both"`` (default) for D_tot, ``"perturbed"``, or
             ``"clean"``, which needs no perturbed entry.
@@ -76,9 +86,9 @@ class StateRecoveryLoss(BaseLoss):
 
     Raises:
         TypeError: if a distribution is another one.
-        ValueError: if bounds differ, the weight is negative, an option is unknown, or
-            a deterministic actor is not given ``recovery_direction="reverse"``; in the
-            call, if the batch is empty or holds several steps a row.
+        ValueError: if bounds differ, the weight is negative, an option is unknown, the
+            model is missing, or an actor has no forward direction; in the call, if the
+            batch is empty or holds several steps a row.
         KeyError: in the call, if the batch has no perturbed entry.
 
     Examples:
@@ -104,7 +114,8 @@ class StateRecoveryLoss(BaseLoss):
         """The tensordict entries that :meth:`set_keys` can rename.
 
         Attributes:
-            action: what a deterministic actor writes. Defaults to ``"action"``.
+            action: the data's action, and what an actor writes. Defaults to
+                ``"action"``.
             done: end of a trajectory, below ``"next"``. Defaults to ``"done"``.
             priority_weight: importance weight of a row. Defaults to
                 ``"priority_weight"``.
@@ -124,10 +135,11 @@ class StateRecoveryLoss(BaseLoss):
     def __init__(
         self,
         actor_network: TensorDictModuleBase,
-        inverse_dynamics_network: ProbabilisticTensorDictSequential,
+        inverse_dynamics_network: ProbabilisticTensorDictSequential | None = None,
         *,
         recovery_weight: float = 0.5,
-        recovery_direction: Literal["forward", "reverse"] = "forward",
+        recovery_target: Literal["inverse_dynamics", "data"] = "inverse_dynamics",
+        recovery_direction: Literal["forward", "reverse"] | None = None,
         recovery_states: States = "both",
         action_reduction: Literal["sum", "mean"] = "sum",
         reduction: Literal["none", "mean", "sum"] | None = None,
@@ -140,56 +152,84 @@ class StateRecoveryLoss(BaseLoss):
             use_prioritized_weights=use_prioritized_weights,
             scalar_output_mode="exclude",
         )
-        self.recovery_direction = recovery_direction
+        self.recovery_target = recovery_target
         self.recovery_states = recovery_states
         self.action_reduction = action_reduction
-        name = "inverse_dynamics_network"
-        low, high = bounds = action_bounds(inverse_dynamics_network, name)
-        self.register_buffer("action_low", low, persistent=False)
-        self.register_buffer("action_high", high, persistent=False)
-        self._check_actor(actor_network, bounds)
-        if not self.is_deterministic:
-            check_same_size(actor_network, inverse_dynamics_network)
+        self._note_head(actor_network, recovery_direction)
+        if recovery_target == "inverse_dynamics":
+            self._check_and_hold(actor_network, inverse_dynamics_network)
         self.convert_to_functional(actor_network, "actor_network")
-        self._hold_inverse_dynamics(inverse_dynamics_network)
         self.register_coeff_buffer("recovery_weight", float(recovery_weight))
 
-    def _check_actor(
-        self, network: TensorDictModuleBase, bounds: tuple[Tensor, Tensor]
-    ) -> None:
-        """Note what the actor ends in; raise unless the term is defined for it."""
-        kind = ProbabilisticTensorDictModule
-        heads = [module for module in network.modules() if isinstance(module, kind)]
-        self.has_distribution = bool(heads)
-        self.is_deterministic = not heads or heads[-1].distribution_class is TanhDelta
-        if self.is_deterministic and self.recovery_direction == "forward":
+    def _note_head(self, network: TensorDictModuleBase, direction: str | None) -> None:
+        """Note what the actor ends in, and the direction of the divergence."""
+        head, _ = head_of(network)
+        self.is_normal = head is IndependentNormal
+        self.is_deterministic = head in (None, TanhDelta)
+        self.has_distribution = head is not None
+        by_mean = self.is_deterministic or self.is_normal
+        self.recovery_direction: Any = direction or (
+            "reverse" if by_mean else "forward"
+        )
+        if by_mean and self.recovery_direction == "forward":
             raise ValueError(
-                "actor_network is deterministic, which is infinitely far from a "
-                "density in the forward direction. Pass recovery_direction='reverse': "
-                "it pulls the action to the mean of the inverse dynamics model."
+                "actor_network is deterministic, or a Gaussian without a tanh: the "
+                "divergence in the forward direction is infinite, or has no closed "
+                "form. Pass recovery_direction='reverse', or none: it pulls the action "
+                "to the mean of the inverse dynamics model."
             )
-        if not self.is_deterministic:
+        if not by_mean:
+            action_bounds(network, "actor_network")
+
+    def _check_and_hold(
+        self,
+        network: TensorDictModuleBase,
+        model: ProbabilisticTensorDictSequential | None,
+    ) -> None:
+        """Hold the model; raise unless it goes with the actor."""
+        if model is None:
+            raise ValueError(
+                "recovery_target='inverse_dynamics' needs an inverse_dynamics_network; "
+                "pass one, or recovery_target='data' for noisy behaviour cloning."
+            )
+        low, high = bounds = action_bounds(model, "inverse_dynamics_network")
+        self.register_buffer("action_low", low, persistent=False)
+        self.register_buffer("action_high", high, persistent=False)
+        if not (self.is_deterministic or self.is_normal):
             check_same_bounds(action_bounds(network, "actor_network"), bounds)
-        elif heads:
-            kwargs = {"low": -1.0, "high": 1.0} | heads[-1].distribution_kwargs
+            check_same_size(network, model)
+        elif self.has_distribution and not self.is_normal:
+            kwargs = {"low": -1.0, "high": 1.0} | head_of(network)[1]
             low, high = (torch.as_tensor(kwargs[key]) for key in ("low", "high"))
             check_same_bounds((low.to(bounds[0]), high.to(bounds[1])), bounds)
+        self._hold_inverse_dynamics(model)
 
     def _input_keys(self) -> list[NestedKey]:
         states = state_keys(self.actor_network.in_keys)
-        network_keys = self.inverse_dynamics_network.in_keys
+        network_keys = [self.tensor_keys.action]
+        if self.recovery_target == "inverse_dynamics":
+            network_keys = self.inverse_dynamics_network.in_keys
         keys = [*states, *network_keys, nested("next", self.tensor_keys.done)]
         if self.recovery_states != "clean":
-            states += state_keys(network_keys)
+            states += state_keys(network_keys, self.tensor_keys.action)
             keys += [nested(self.tensor_keys.perturbed, key) for key in states]
         return keys
 
     def _output_keys(self) -> tuple[list[NestedKey], list[NestedKey]]:
-        return ["loss_recovery"], ["recovery_kl"]
+        return ["loss_recovery"], [self._metric]
+
+    @property
+    def _metric(self) -> str:
+        if self.recovery_target == "inverse_dynamics":
+            return "recovery_kl"
+        return "recovery_error" if self.is_deterministic else "recovery_nll"
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return ``"loss_recovery"`` and its unweighted mean ``"recovery_kl"``.
+        """Return ``"loss_recovery"`` and its unweighted mean.
+
+        The latter is ``"recovery_kl"``; with ``recovery_target="data"``
+        ``"recovery_nll"``, or ``"recovery_error"`` of a deterministic actor.
 
         Args:
             tensordict: a batch ``[B]`` with the entries of :attr:`in_keys`.
@@ -197,9 +237,6 @@ class StateRecoveryLoss(BaseLoss):
         self._check_not_empty(tensordict)
         done = column(tensordict, nested("next", self.tensor_keys.done)).bool()
         states = self.recovery_states
-        model: TanhNormal = frozen_distribution(
-            self, tensordict, done=done, states=states
-        )
         mixed = transitions(
             tensordict,
             state_keys(self.actor_network.in_keys),
@@ -207,25 +244,31 @@ class StateRecoveryLoss(BaseLoss):
             perturbed=self.tensor_keys.perturbed,
             states=states,
         )
-        divergence = self._divergence(mixed, model).mean(0)
+        if self.recovery_target == "data":
+            action = entry(tensordict, self.tensor_keys.action)
+            divergence = self._cloning(mixed, action).mean(0)
+        else:
+            model: TanhNormal = frozen_distribution(
+                self, tensordict, done=done, states=states
+            )
+            divergence = self._divergence(mixed, model).mean(0)
         loss = self.recovery_weight * self._reduce(divergence, tensordict, ~done)
         mean = self._mean(divergence, tensordict, ~done)
-        return self._output(tensordict, {"loss_recovery": loss}, {"recovery_kl": mean})
+        return self._output(tensordict, {"loss_recovery": loss}, {self._metric: mean})
 
     def _divergence(self, states: TensorDictBase, model: TanhNormal) -> Tensor:
         """The recovery term (11) at ``states``, ``[D, B]``."""
-        with self.actor_network_params.to_module(
-            self.actor_network, preserve_module_state=False
-        ):
-            if self.has_distribution:
-                pi = self.actor_network.get_dist(states)
-                # Not TanhDelta's action, which may have saturated.
-                loc = pi.base_dist.param if self.is_deterministic else pi.loc
-            else:
-                loc = self._pre_tanh(self.actor_network(states))
+        pi = self._policy(states)
+        if not self.has_distribution:
+            loc = self._pre_tanh(pi)
+        elif self.is_normal:
+            loc = self._pre_tanh(pi.mean)
+        else:
+            # Not TanhDelta's action, which may have saturated.
+            loc = pi.base_dist.param if self.is_deterministic else pi.loc
         sizes = model.loc.shape[-1], loc.shape[-1]
         check_num_actions("inverse_dynamics_network", *sizes)
-        if self.is_deterministic:
+        if self.is_deterministic or self.is_normal:
             return functional.deterministic_recovery(
                 loc, model.loc, model.scale, action_reduction=self.action_reduction
             )
@@ -238,12 +281,32 @@ class StateRecoveryLoss(BaseLoss):
             action_reduction=self.action_reduction,
         )
 
-    def _pre_tanh(self, output: TensorDictBase) -> Tensor:
-        """The written action before the tanh, ``[D, B, A]``."""
-        key = self.tensor_keys.action
-        action = output.get(key, None)
+    def _cloning(self, states: TensorDictBase, data_action: Tensor) -> Tensor:
+        """How far the policy at ``states`` is from the data's action, ``[D, B]``."""
+        pi = self._policy(states)
+        if not self.is_deterministic:
+            mean = pi.deterministic_sample
+            check_action(data_action, mean.shape[-1], self.tensor_keys.action)
+            log_prob: Tensor = pi.log_prob(data_action.expand_as(mean))
+            return -log_prob
+        action = pi.deterministic_sample if self.has_distribution else pi
+        check_action(data_action, action.shape[-1], self.tensor_keys.action)
+        error = functional.action_distance(action, data_action)
+        return error if self.action_reduction == "sum" else error / action.shape[-1]
+
+    def _policy(self, states: TensorDictBase) -> Any:
+        """The policy's distribution at ``states``, or the action that it writes."""
+        network, key = self.actor_network, self.tensor_keys.action
+        with self.actor_network_params.to_module(network, preserve_module_state=False):
+            if self.has_distribution:
+                return network.get_dist(states)
+            action = network(states).get(key, None)
         if action is None:
             raise KeyError(f"The actor writes no {key!r}: call set_keys(action=...).")
+        return action
+
+    def _pre_tanh(self, action: Tensor) -> Tensor:
+        """An action before the tanh, ``[D, B, A]``."""
         width = self.action_high - self.action_low
         squashed = 2 * (action - self.action_low) / width - 1
         # Clamped a little inside the bounds, where the slope is finite.

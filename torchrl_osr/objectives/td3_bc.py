@@ -94,10 +94,7 @@ class TD3BCLoss(BaseLoss):
     ) -> None:
         check_literals(TD3BCLoss.__init__, locals())
         check_weight("alpha", alpha)
-        check_weight("policy_noise", policy_noise)
-        check_positive("noise_clip", noise_clip, minimum=0)
-        if not low < high:
-            raise ValueError(f"high must be above low={low}, got {high}.")
+        check_smoothing(policy_noise, noise_clip, low, high)
         super().__init__(**options)
         self._hold_actor_critic(
             actor_network,
@@ -160,11 +157,7 @@ class TD3BCLoss(BaseLoss):
     @torch.no_grad()
     def _target_value(self, step: Step) -> Tensor:
         """The TD target, ``[B]``, with target policy smoothing."""
-        state = step.states[1]
-        action = step.action(state, self.target_actor_network_params)
-        noise = self.policy_noise * torch.randn_like(action)
-        noise = noise.clamp(-self.noise_clip, self.noise_clip)
-        action = (action + noise).clamp(self.low, self.high)
+        state, action = step.states[1], smoothed_action(self, step)
         qvalue = step.qvalue(state, action, self.target_qvalue_network_params)
         return step.td_target(functional.bootstrap_value(qvalue))
 
@@ -174,3 +167,28 @@ class TD3BCLoss(BaseLoss):
         """Sum over critics of the TD distance."""
         distance = step.td_distance(pred_value, target_value)
         return step.reduce(distance)
+
+
+def check_smoothing(
+    policy_noise: float, noise_clip: float, low: float, high: float
+) -> None:
+    """Raise a ValueError if :func:`smoothed_action` cannot have these options."""
+    check_weight("policy_noise", policy_noise)
+    check_positive("noise_clip", noise_clip, minimum=0)
+    if not low < high:
+        raise ValueError(f"high must be above low={low}, got {high}.")
+
+
+def smoothed_action(loss: Any, step: Step) -> Tensor:
+    r"""TD3's target policy smoothing: :math:`\bar\pi(s') + \epsilon`, ``[B, A]``.
+
+    Args:
+        loss: holds the target actor, ``policy_noise``, ``noise_clip``, ``low`` and
+            ``high``.
+        step: of its batch.
+    """
+    action = step.action(step.states[1], loss.target_actor_network_params)
+    noise = loss.policy_noise * torch.randn_like(action)
+    noise = noise.clamp(-loss.noise_clip, loss.noise_clip)
+    smoothed: Tensor = (action + noise).clamp(loss.low, loss.high)
+    return smoothed

@@ -35,7 +35,10 @@ IGNORED = (
 IDENTITY = ("seed", "env.", QUALITY, "data.random_share", "data.path")
 """Settings that the report sorts runs by."""
 
-METHOD = ("loss.", "perturbation.", "inverse_dynamics.", "dynamics.", "num_random")
+METHOD = (
+    *("loss.", "recovery", "perturbation.", "inverse_dynamics.", "dynamics."),
+    "num_random",
+)
 """Settings in which methods differ by intent; all others should be equal."""
 
 NUM_NAMED, NAMED_WIDTH = 3, 40

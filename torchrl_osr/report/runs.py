@@ -22,6 +22,7 @@ from torchrl_osr._files import MAX_JSON_BYTES, parse_json, read_json, write_atom
 from torchrl_osr.data import ReferenceReturns, reference_returns
 from torchrl_osr.experiment.run_config import flatten, read_yaml
 from torchrl_osr.experiment.run_folder import CONFIG, read_status
+from torchrl_osr.experiment.schema import method_name
 
 QUALITY = "data.quality"
 """Setting that names the quality of the data set."""
@@ -199,7 +200,7 @@ def read_record(folder: Path) -> dict[str, Any]:
         "returns": read_json(folder / "returns.json"),
         "inverse_dynamics": read_json(model) if model.exists() else None,
         "robustness": robustness,
-        "method": above if in_layout else hydra["runtime"]["choices"]["loss"],
+        "method": above if in_layout else method_name(hydra["runtime"]["choices"]),
     }
 
 

@@ -7,8 +7,14 @@ import torch
 from torchrl_osr._checks import check_choice
 
 
-def check_cudagraph(device: torch.device) -> None:
+def check_cudagraph(device: torch.device, policy_delay: int = 1) -> None:
     """Raise a ValueError unless updates on ``device`` can be CUDA graphs."""
+    if policy_delay > 1:
+        raise ValueError(
+            "cudagraph=True repeats one update, and with "
+            f"policy_delay={policy_delay} there are two kinds: use policy_delay=1 "
+            "(optim.policy_delay=1), or cudagraph=False (trainer.cudagraph=false)."
+        )
     if device.type != "cuda":
         raise ValueError(
             f"cudagraph=True needs a CUDA device, got device='{device}': use "
@@ -18,7 +24,7 @@ def check_cudagraph(device: torch.device) -> None:
 
 
 def check_hardware(
-    device: str, precision: str, *, cudagraph: bool = False
+    device: str, precision: str, *, cudagraph: bool = False, policy_delay: int = 1
 ) -> tuple[torch.device, torch.dtype | None]:
     """Device and autocast type of a run, if this machine has them.
 
@@ -30,6 +36,7 @@ def check_hardware(
 
     Keyword Args:
         cudagraph: whether updates shall be CUDA graphs. Default ``False``.
+        policy_delay: of the :class:`~torchrl_osr.trainers.OfflineTrainer`. Default 1.
 
     Raises:
         ValueError: if there is no such device or precision, or the device does not
@@ -38,7 +45,7 @@ def check_hardware(
     check_choice("precision", precision, ("float32", "bfloat16"))
     where = torch.device(device)
     if cudagraph:
-        check_cudagraph(where)
+        check_cudagraph(where, policy_delay)
     if where.type == "cuda" and not torch.cuda.is_available():
         raise ValueError(
             f"device={device!r}, but torch {torch.__version__} sees no CUDA device "

@@ -96,7 +96,12 @@ class NonfiniteCheck:
         trained = [p for each in groups for p in each["params"] if p.grad is not None]
         # An eighth of the time of the largest magnitudes. A square that overflows is as
         # bad: it would be one of Adam's second moments.
-        norms = torch._foreach_norm([each.grad for each in trained])
+        norms = list(torch._foreach_norm([each.grad for each in trained]))
+        if self.deferred:
+            # As many numbers every time, also where not all parameters have their turn.
+            found = dict(zip(trained, norms, strict=True))
+            trained = [p for each in groups for p in each["params"]]
+            norms = [found.get(each, torch.zeros_like(norms[0])) for each in trained]
         values = torch.stack([*losses.values(), *norms])
         self._updates.add_(1)
         if not self.deferred and all(map(math.isfinite, values.tolist())):

@@ -12,19 +12,21 @@ import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import nn
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.data import ReplayBuffer
 from torchrl.objectives import LossModule, TargetNetUpdater
 from torchrl.record.loggers import CSVLogger, Logger
 from torchrl.trainers import OptimizationStepper, Trainer
 
-from torchrl_osr._checks import check_choice
+from torchrl_osr._checks import check_choice, check_positive
 from torchrl_osr._files import finite_or_none
 from torchrl_osr.trainers.checkpoints import Checkpoints, GeneratorState
 from torchrl_osr.trainers.csv_rows import cut_back
@@ -92,20 +94,39 @@ class SumOfLosses(OptimizationStepper):
         check: steps the optimizer, unless a loss or a gradient is not finite.
         gradients: maps a batch to its detached losses, and puts the gradients of their
             sum where the optimizer looks.
+        between: the same for the updates between those of ``gradients``. Default: those
+            are all.
+        delay: every how many updates ``gradients`` has its turn. Default 1.
     """
 
-    def __init__(self, check: NonfiniteCheck, gradients: LossGradients) -> None:
+    def __init__(
+        self,
+        check: NonfiniteCheck,
+        gradients: LossGradients,
+        between: LossGradients | None = None,
+        delay: int = 1,
+    ) -> None:
         self.check, self.gradients = check, gradients
+        self.between, self.delay = between, delay
         self.run: Callable[[TensorDictBase], TensorDictBase] = self.update
 
     def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
         """Run one update and return the detached losses and metrics."""
-        return self.run(sub_batch)
+        if self.between is None or self.is_whole(trainer):
+            return self.run(sub_batch)
+        return self.update(sub_batch, self.between)
 
-    def update(self, batch: TensorDictBase) -> TensorDictBase:
+    def is_whole(self, trainer: Trainer) -> bool:
+        """Whether the running update is one of ``gradients``."""
+        count: int = trainer._optim_count
+        return count % self.delay == 0
+
+    def update(
+        self, batch: TensorDictBase, gradients: LossGradients | None = None
+    ) -> TensorDictBase:
         """Losses of a batch, their gradients, and the optimizer's step."""
         try:
-            return self.check.step(batch, self.gradients(batch))
+            return self.check.step(batch, (gradients or self.gradients)(batch))
         finally:
             # Also after an error: the next backward must not add to these gradients.
             self.check.optimizer.zero_grad(set_to_none=True)
@@ -137,6 +158,10 @@ class OfflineTrainer(Trainer):
     Keyword Args:
         seed: of the sampling. Default 0.
         target_net_updater: stepped after each update. Default: none.
+        policy_delay: every how many updates ``policy_params`` and the target networks
+            move, the first time at the update of that number, as in TD3; in between
+            neither they nor their optimizer's state do. Default 1.
+        policy_params: see there. Default: none.
         evaluate: returns JSON-compatible results, of which numbers are logged and all
             are kept in ``history``, with their ``"step"``. Called before the first step
             of a new run, every ``eval_interval`` steps and at the end. Default: none.
@@ -190,6 +215,8 @@ class OfflineTrainer(Trainer):
         *,
         seed: int = 0,
         target_net_updater: TargetNetUpdater | None = None,
+        policy_delay: int = 1,
+        policy_params: Sequence[nn.Parameter] = (),
         evaluate: Callable[[], dict[str, Any]] | None = None,
         metric: tuple[str, Literal["min", "max"]] = ("score", "max"),
         components: Mapping[str, Any] | None = None,
@@ -216,8 +243,9 @@ class OfflineTrainer(Trainer):
         self._metric, best_is = metric
         check_choice("metric[1]", best_is, ("max", "min"))
         self._choose = max if best_is == "max" else min
+        check_positive("policy_delay", policy_delay, minimum=1)
         if cudagraph:
-            check_cudagraph(device)
+            check_cudagraph(device, policy_delay)
             check_capturable(optimizer)
         if compile:
             loss_module.compile()
@@ -247,8 +275,17 @@ class OfflineTrainer(Trainer):
             loss_module, optimizer, nonfinite, self.checkpoints, description
         )
         record = record and not (compile or cudagraph)
-        gradients = LossGradients(loss_module, autocast_dtype, record=record)
-        self._stepper = SumOfLosses(self.nonfinite_check, gradients)
+        new_gradients = partial(
+            LossGradients, loss_module, autocast_dtype, record=record
+        )
+        between = None
+        if policy_delay > 1:
+            delayed = set(policy_params)
+            rest = [each for each in loss_module.parameters() if each not in delayed]
+            between = new_gradients(parameters=rest)
+        self._stepper = SumOfLosses(
+            self.nonfinite_check, new_gradients(), between, policy_delay
+        )
         super().__init__(
             collector=clock,
             total_frames=total_steps,
@@ -269,7 +306,9 @@ class OfflineTrainer(Trainer):
 
         self.register_op("process_optim_batch", self._sample)
         if target_net_updater is not None:
-            self.register_op("post_optim", target_net_updater.step)
+            self.register_op(
+                "post_optim", self._move_targets, updater=target_net_updater
+            )
         self.register_op("post_optim_complete_log", self._log_losses)
         self.register_op("post_steps_log", self._evaluate_if_due)
 
@@ -357,6 +396,10 @@ class OfflineTrainer(Trainer):
             raise self._interrupted(self.step - 1)
         batch: TensorDictBase = self.buffer.sample()
         return batch
+
+    def _move_targets(self, updater: TargetNetUpdater) -> None:
+        if self._stepper.is_whole(self):
+            updater.step()
 
     def _interrupted(self, step: int) -> Interrupted:
         """Save a run that was asked to end after a step; return what to raise.

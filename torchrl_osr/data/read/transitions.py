@@ -16,10 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from tensordict import TensorDict
 
 from torchrl_osr.data.read.column_checks import ActionBounds, checked_columns
+from torchrl_osr.data.store.next_action import SAME_STATE
 from torchrl_osr.data.store.validation import as_transitions
-
-# Two recordings of one state may differ by rounding, relative to its entries.
-SAME_STATE = 1e-6
 
 
 class Trajectories(NamedTuple):

@@ -14,6 +14,8 @@ from torchrl.data import ImmutableDatasetWriter, LazyTensorStorage, ReplayBuffer
 from torchrl.data.replay_buffers.storages import Storage
 from torchrl.envs.transforms import Transform
 
+from torchrl_osr.data.store.next_action import next_action
+
 
 class MemmapStorage(Storage):
     """Rows of a memory-mapped set as the storage of a replay buffer, read-only.
@@ -25,6 +27,8 @@ class MemmapStorage(Storage):
         left_out: sorted numbers of rows that are not drawn. Default: none.
         device: where the batches are. The draws are made there too, so that they are
             those of a buffer that holds the rows on that device. Default: CPU.
+        with_next_action: rows have the entry ``("next", "action")``, see
+            :func:`~torchrl_osr.data.next_action`. Default ``False``.
     """
 
     def __init__(
@@ -33,10 +37,12 @@ class MemmapStorage(Storage):
         *,
         left_out: Tensor | None = None,
         device: torch.device | str = "cpu",
+        with_next_action: bool = False,
     ) -> None:
         left_out = torch.empty(0, dtype=torch.long) if left_out is None else left_out
         super().__init__(len(data) - len(left_out))
         self.data, self.device = data, torch.device(device)
+        self.with_next_action = with_next_action
         # Before row i of the rest lie as many of the left-out ones as have no more than
         # i rows of the rest before them.
         self._shifts = left_out - torch.arange(len(left_out))
@@ -48,7 +54,10 @@ class MemmapStorage(Storage):
     def get(self, index: Tensor) -> TensorDictBase:
         """Rows ``[B]``."""
         index = index.cpu()
-        batch = self.data[index + torch.searchsorted(self._shifts, index, right=True)]
+        rows = index + torch.searchsorted(self._shifts, index, right=True)
+        batch = self.data[rows]
+        if self.with_next_action:
+            batch["next", "action"] = next_action(self.data, rows)
         return batch if self.device.type == "cpu" else batch.to(self.device)
 
     def state_dict(self) -> dict[str, Any]:
@@ -67,6 +76,7 @@ def make_replay_buffer(
     left_out: Tensor | None = None,
     transform: Transform | None = None,
     device: torch.device | str | None = None,
+    with_next_action: bool = False,
 ) -> ReplayBuffer:
     """Replay buffer that samples a data set uniformly, with replacement.
 
@@ -85,9 +95,12 @@ def make_replay_buffer(
         transform: applied to each sampled batch. Default: none.
         device: where the rows are stored and sampled, or, of a memory-mapped set, where
             the batches are. Default: the device of ``data``, or CPU if it has none.
+        with_next_action: read also the next action of memory-mapped rows, see
+            :func:`next_action`. Default ``False``.
 
     Raises:
-        ValueError: ``data`` is not flat or has no rows.
+        ValueError: ``data`` is not flat or has no rows, or an option is for
+            memory-mapped data alone.
         MemoryError: it does not fit into the GPU that ``device`` is.
 
     Examples:
@@ -112,13 +125,23 @@ def make_replay_buffer(
     }
     if is_memory_mapped(data):
         return ReplayBuffer(
-            storage=MemmapStorage(data, left_out=left_out, device=device),
+            storage=MemmapStorage(
+                data,
+                left_out=left_out,
+                device=device,
+                with_next_action=with_next_action,
+            ),
             writer=ImmutableDatasetWriter(),
             collate_fn=lambda batch: batch,
             **options,
         )
     if left_out is not None:
         raise ValueError("left_out is for memory-mapped data: take split_held_out.")
+    if with_next_action:
+        raise ValueError(
+            "with_next_action is for memory-mapped data: set the entry ('next', "
+            "'action') to next_action(data) before any rows are left out."
+        )
     check_memory(data, device)
     buffer = ReplayBuffer(
         storage=LazyTensorStorage(data.shape[0], device=device), **options

@@ -1,0 +1,78 @@
+"""The data's next action, from memory and from disk, held-out rows or not."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from property_settings import tried
+from tensordict import TensorDict
+
+from torchrl_osr.data import check_order, make_replay_buffer, next_action, write_memmap
+
+ENDS = st.lists(st.integers(1, 6), min_size=1, max_size=6)
+"""Lengths of episodes."""
+
+
+def episodes(lengths) -> TensorDict:
+    """Episodes whose states are numbered from 1 on, and actions after them."""
+    rows, at = [], 0
+    for episode, length in enumerate(lengths):
+        state = torch.arange(at, at + length + 1.0).unsqueeze(-1) + 1
+        done = torch.arange(length).unsqueeze(-1) == length - 1
+        terminated = done & (episode % 2 == 0)
+        after = {"observation": state[1:], "reward": torch.ones(length, 1)}
+        after |= {
+            "done": done,
+            "terminated": terminated,
+            "truncated": done ^ terminated,
+        }
+        columns = {"observation": state[:-1], "action": 0.001 * state[:-1]}
+        rows.append(TensorDict(columns | {"next": after}, [length]))
+        at += length + 1
+    return torch.cat(rows)
+
+
+@tried(20)
+@given(ENDS)
+def test_it_is_what_the_episode_did_next(lengths) -> None:
+    data = episodes(lengths)
+    check_order(data)
+    wanted, row = [], 0
+    for length in lengths:
+        wanted += [data["action"][row + step].item() for step in range(1, length)] + [0]
+        row += length
+    assert next_action(data).squeeze(-1).tolist() == wanted
+
+
+@tried(20)
+@given(ENDS, st.randoms(use_true_random=False))
+def test_drawn_from_disk_it_is_the_same(tmp_path_factory, lengths, random) -> None:
+    data = episodes([*lengths, 3])
+    chosen = random.sample(range(len(data)), k=random.randrange(len(data)))
+    left_out = torch.tensor(sorted(chosen), dtype=torch.long)
+    stored, _ = write_memmap([data], tmp_path_factory.mktemp("set") / "data")
+    buffer = make_replay_buffer(
+        stored, batch_size=64, seed=0, left_out=left_out, with_next_action=True
+    )
+    data["next", "action"] = next_action(data)
+    batch = buffer.sample()
+    rows = (batch["observation"] == data["observation"].squeeze(-1)).int().argmax(-1)
+    assert not set(rows.tolist()) & set(chosen)
+    assert (batch == data[rows]).all()
+
+
+def test_rows_in_no_order_are_refused_by_number() -> None:
+    data = episodes([4, 5])
+    for wrong in (data[[0, 2, 3, 4, 5, 6, 7, 8]], data[[0, 2, 1, 3]]):
+        with pytest.raises(ValueError, match="row 0 the first, end no episode"):
+            check_order(wrong)
+    with pytest.raises(ValueError, match="1 of the 8 rows, row 7 the first"):
+        check_order(data[:-1])
+    check_order(data[4:])
+
+
+def test_in_memory_it_is_set_before_rows_are_held_out() -> None:
+    with pytest.raises(ValueError, match="before any rows are left out"):
+        make_replay_buffer(episodes([3]), batch_size=1, seed=0, with_next_action=True)
