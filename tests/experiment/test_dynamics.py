@@ -205,7 +205,7 @@ def test_penalty_and_units_are_those_of_the_task(finished, tmp_path) -> None:
         cfg = composed(f"dynamics.penalty={penalty}", "dynamics.rollout_steps=1")
         data = load_training_data(cfg, CPU)
         torch.manual_seed(0)
-        actor, _, _ = make_learner(cfg, 11, 3)
+        actor = make_learner(cfg, 11, 3).actor
         model = load_dynamics(finished / "dynamics.safetensors")
         buffer = imagined_replay_buffer(cfg, data, model, actor, lambda batch: batch)
         buffer.set_rng(torch.Generator().manual_seed(0))
