@@ -36,6 +36,7 @@ from minari.data_collector import EpisodeBuffer
 from omegaconf import OmegaConf
 from pyarrow import parquet
 from tensordict import TensorDict
+from torch.optim.swa_utils import AveragedModel
 from torchrl import torchrl_logger
 from torchrl.checkpoint import CheckpointRotation
 from torchrl.envs import ObservationNorm
@@ -134,12 +135,16 @@ def make_run(folder: Path) -> None:
     folder.mkdir(parents=True)
     OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
     torch.manual_seed(0)
-    loss = make_learner(cfg, 11, 3).loss
+    actor, _, loss, _ = make_learner(cfg, 11, 3)
     norm = ObservationNorm(
         torch.full((11,), 2.0), torch.full((11,), 3.0), in_keys=["observation"],
         standard_normal=True,
     )  # fmt: skip
-    checkpoint = safe_checkpoint(loss_module=loss, observation_norm=norm)
+    checkpoint = safe_checkpoint(
+        loss_module=loss,
+        observation_norm=norm,
+        policy_average=AveragedModel(actor),
+    )
     CheckpointRotation(folder / CHECKPOINTS, keep_last=2).save(checkpoint, step=5)
 
 

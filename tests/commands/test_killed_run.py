@@ -56,6 +56,7 @@ class Runs:
 def runs(tmp_path_factory, _cache, tiny):
     server = Server(dict(os.environ))
     sizes = tiny(steps=20, eval_interval=20, checkpoints_kept=1)
+    sizes += ["optim.policy_average=0.1"]  # has a state of its own
     yield Runs(server, tmp_path_factory.mktemp("outputs"), sizes)
     server.close()
 

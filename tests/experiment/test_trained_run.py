@@ -9,6 +9,7 @@ import torch
 from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
 from tensordict import TensorDict
+from torch.optim.swa_utils import AveragedModel
 from torchrl.checkpoint import CheckpointError, CheckpointRotation
 from torchrl.envs import ObservationNorm
 from untrained_run import make_run
@@ -85,9 +86,13 @@ def test_runs_without_standardisation_come_back(tmp_path, rows):
     with pytest.raises(CheckpointError, match=r"loc is \(11,\) in the file, \(\) here"):
         load_trained(folder)
     cfg = OmegaConf.load(folder / "config.yaml")
-    loss = make_learner(cfg, 11, 3).loss
+    actor, _, loss, _ = make_learner(cfg, 11, 3)
     norm = ObservationNorm(0.0, 1.0, in_keys=["observation"], standard_normal=True)
-    checkpoint = safe_checkpoint(loss_module=loss, observation_norm=norm)
+    checkpoint = safe_checkpoint(
+        loss_module=loss,
+        observation_norm=norm,
+        policy_average=AveragedModel(actor),
+    )
     CheckpointRotation(folder / CHECKPOINTS, keep_last=2).save(checkpoint, step=1000)
     trained = load_trained(folder)
     policy = deterministic_policy(trained.actor, trained.observation_norm)
@@ -151,3 +156,22 @@ def test_no_run_and_no_checkpoint_are_named(tmp_path):
     (tmp_path / "config.yaml").touch()
     with pytest.raises(FileNotFoundError, match="has no checkpoint of its policy"):
         checkpoints_of(tmp_path)
+
+
+def test_the_policy_is_the_average_of_its_weights(tmp_path):
+    make_run(tmp_path / "run")
+    folder = tmp_path / "run"
+    actor, _, loss, _ = make_learner(OmegaConf.load(folder / "config.yaml"), 11, 3)
+    average = AveragedModel(actor)
+    for parameter in average.module.parameters():
+        parameter.data.add_(1.0)
+    checkpoint = safe_checkpoint(
+        loss_module=loss,
+        observation_norm=load_trained(folder).observation_norm,
+        policy_average=average,
+    )
+    CheckpointRotation(folder / CHECKPOINTS, keep_last=2).save(checkpoint, step=1000)
+    trained = load_trained(folder)
+    for holder in (trained.actor, trained.loss.actor_network_params):
+        pairs = zip(holder.parameters(), average.module.parameters(), strict=True)
+        assert all(torch.equal(*pair) for pair in pairs)

@@ -27,8 +27,10 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl import torchrl_logger
 from torchrl.record.loggers import Logger
+from torchrl.trainers import LRSchedulerHook
 
 from torchrl_osr import StatePerturbation
 from torchrl_osr._files import write_json
@@ -63,6 +65,7 @@ from torchrl_osr.trainers import (
     SoftUpdate,
     check_hardware,
     largest_value,
+    learning_rates,
 )
 
 log = logging.getLogger(__name__)
@@ -133,14 +136,14 @@ def run(cfg: DictConfig, folder: Path) -> float:
     told = about(cfg, folder) if cfg.logger.kind == "wandb" else {}
     loggers = make_loggers(folder=folder, **cfg.logger, **told)
 
-    # One step of a trainer: sample a batch, compute the losses, go backward on their
-    # sum, step the optimizer, move the target networks; log, evaluate and write a
-    # checkpoint at their intervals. Both phases have this in common:
     components = {
         "perturbation": perturbation,
         "observation_norm": data.norm,
         "settings": run_folder.Settings(cfg),
     }
+    # One step of a trainer: sample a batch, compute the losses, go backward on their
+    # sum, step the optimizer, move the target networks; log, evaluate and write a
+    # checkpoint at their intervals. Both phases have this in common:
     new_trainer = partial(
         OfflineTrainer,
         replay_buffer=data.buffer,
@@ -198,23 +201,40 @@ def run(cfg: DictConfig, folder: Path) -> float:
         {"params": critic_params, "lr": cfg.optim.qvalue_lr},
         {"params": policy_params, "lr": cfg.optim.actor_lr},
     ]
+    optimizer = adam(groups)
+    kinds = (cfg.optim.qvalue_schedule, cfg.optim.actor_schedule)
+    schedule = learning_rates(optimizer, kinds, cfg.trainer.steps)
+    # What is played, now and by all other commands.
+    share = cfg.optim.policy_average
+    average = AveragedModel(actor, multi_avg_fn=get_ema_multi_avg_fn(1 - share))
     targets = SoftUpdate(loss, tau=cfg.optim.tau) if loss.delay_qvalue else None
     limit = largest_value(data.largest_reward, cfg.optim.gamma)
     episodes = {"num_episodes": cfg.trainer.eval_episodes, "seed": EVALUATION_SEED}
-    policy = deterministic_policy(actor, data.norm)
+    policy = deterministic_policy(average.module, data.norm)
+    last_weights = deterministic_policy(actor, data.norm)
+    measure = "return" if references is None else "score"
     with closing(EpisodeEvaluator(cfg.env.id, **episodes, device=device)) as play:
+
+        def evaluate() -> dict[str, Any]:
+            results = summarize(play(policy), references)
+            if share < 1:
+                last = summarize(play(last_weights), references)
+                results[f"{measure}_of_last_weights"] = last[measure]
+            return results
+
         trainer = new_trainer(
             objective,
-            adam(groups),
+            optimizer,
             replay_buffer=buffer,
+            components=components | {"schedule": schedule, "policy_average": average},
             total_steps=cfg.trainer.steps,
             folder=folder / "checkpoint" / "policy",
             seed=cfg.seed + 1,
             target_net_updater=targets,
             policy_delay=cfg.optim.policy_delay,
             policy_params=policy_params,
-            evaluate=lambda: summarize(play(policy), references),
-            metric=("return" if references is None else "score", "max"),
+            evaluate=evaluate,
+            metric=(measure, "max"),
             eval_interval=cfg.trainer.eval_interval,
             description="policy",
             value_limits={"pred_value": limit, "target_value": limit},
@@ -222,6 +242,8 @@ def run(cfg: DictConfig, folder: Path) -> float:
         trainer.register_op("post_steps", still_ours)
         if imagined is not None:
             trainer.register_op("post_steps", partial(log_imagined, trainer, imagined))
+        LRSchedulerHook(schedule, interval="optim").register(trainer)
+        trainer.register_op("post_optim", partial(average.update_parameters, actor))
         if cfg.perturbation.adversary is not None:
             adversary = instantiate(cfg.perturbation.adversary)
             trainer.register_op("process_optim_batch", partial(adversary, loss))

@@ -235,6 +235,16 @@ def check_parts(
             into the memory.
     """
     sizes = observation_size, action_size
+    falling = [
+        name for name in ("actor_schedule", "qvalue_schedule")
+        if cfg.optim[name] != "constant"
+    ]  # fmt: skip
+    if cfg.trainer.cudagraph and falling:
+        raise ValueError(
+            f"optim.{falling[0]}={cfg.optim[falling[0]]} cannot be had with "
+            "trainer.cudagraph=true: a CUDA graph repeats the learning rate that it "
+            "was captured with. Take constant, or trainer.cudagraph=false."
+        )
     check_networks(cfg, *sizes, cfg.trainer.device, training=True)
     learner = make_learner(cfg, *sizes)
     if learner.model is not None:

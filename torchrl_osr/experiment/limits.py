@@ -17,6 +17,7 @@ import torch
 from omegaconf import DictConfig
 
 from torchrl_osr._checks import check_choice
+from torchrl_osr.trainers.schedule import SCHEDULES
 
 LARGEST = 10**9
 """Largest magnitude of a number for which :data:`RANGES` has no other."""
@@ -58,6 +59,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "optim.gamma": (0, 1),
     "optim.tau": (0, 1),
     "optim.policy_delay": (1, 1000),
+    "optim.policy_average": (0, 1),
     "trainer.batch_size": _COUNT,
     "trainer.inverse_dynamics_steps": _COUNT,
     "trainer.steps": _COUNT,
@@ -85,6 +87,8 @@ CHOICES: dict[str, tuple[str | None, ...]] = {
     "inverse_dynamics.loss.reduction": _REDUCTIONS,
     "loss.reduction": _REDUCTIONS,
     "recovery.reduction": _REDUCTIONS,
+    "optim.actor_schedule": SCHEDULES,
+    "optim.qvalue_schedule": SCHEDULES,
     "trainer.nonfinite": ("stop", "skip"),
     "trainer.precision": ("float32", "bfloat16"),
     "trainer.matmul_precision": ("highest", "high", "medium"),

@@ -238,6 +238,12 @@ class OptimConfig:
         tau: step of the target networks towards the critics, at each update.
         policy_delay: updates of the critics for each of the policy, the entropy
             temperature and the target networks.
+        actor_schedule: constant, or cosine: actor_lr falls to 0 along half a cosine
+            over trainer.steps.
+        qvalue_schedule: the same of qvalue_lr.
+        policy_average: how much of their exponential average the policy's weights
+            replace at each update. The average is what is evaluated, filmed and
+            exported; with 1 it is the weights themselves.
     """
 
     actor_lr: float = MISSING
@@ -246,6 +252,9 @@ class OptimConfig:
     gamma: float = MISSING
     tau: float = MISSING
     policy_delay: int = 1
+    actor_schedule: str = "constant"
+    qvalue_schedule: str = "constant"
+    policy_average: float = 1.0
 
 
 @dataclass

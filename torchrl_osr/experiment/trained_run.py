@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from omegaconf import DictConfig
 from tensordict.nn import ProbabilisticTensorDictSequential
+from torch.optim.swa_utils import AveragedModel
 from torchrl.checkpoint import CheckpointError
 from torchrl.envs import ObservationNorm
 from torchrl.objectives import LossModule
@@ -28,7 +29,7 @@ class TrainedRun(NamedTuple):
 
     Attributes:
         config: the run's configuration.
-        actor: the policy; shares its parameters with the loss.
+        actor: the policy, with the average of its weights (``optim.policy_average``);
         inverse_dynamics: the model that taught the policy, with its frozen
             parameters; ``None`` if there was none, as in CQL and SAC-N.
         loss: holds the critics, too.
@@ -126,7 +127,10 @@ def load_trained(
         torch.zeros(shape), torch.ones(shape), in_keys=["observation"],
         standard_normal=True,
     )  # fmt: skip
-    checkpoint = safe_checkpoint(loss_module=objective, observation_norm=norm)
+    average = AveragedModel(actor)
+    checkpoint = safe_checkpoint(
+        loss_module=objective, observation_norm=norm, policy_average=average
+    )
     try:
         manifest = checkpoint.load(path, map_location="cpu").manifest
     except CheckpointError as error:
@@ -134,6 +138,7 @@ def load_trained(
             f"{path} does not fit {folder / CONFIG}: {error} Take both from one run.",
             error.result,
         ) from error
+    actor.load_state_dict(average.module.state_dict())
     numbered = re.fullmatch(r"checkpoint-(\d+)\.torchrl", path.name)
     step = int(numbered[1]) if numbered else int(manifest["metadata"]["step"])
     # The objective's parameters of actor and model are their own tensors.

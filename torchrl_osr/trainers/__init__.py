@@ -4,6 +4,7 @@ from torchrl_osr.trainers.hardware import check_hardware
 from torchrl_osr.trainers.interruption import Interrupted
 from torchrl_osr.trainers.offline import OfflineTrainer, largest_value
 from torchrl_osr.trainers.replay_buffer_collector import ReplayBufferCollector
+from torchrl_osr.trainers.schedule import learning_rates
 from torchrl_osr.trainers.soft_update import SoftUpdate
 
 __all__ = [
@@ -13,4 +14,5 @@ __all__ = [
     "SoftUpdate",
     "check_hardware",
     "largest_value",
+    "learning_rates",
 ]
