@@ -16,6 +16,8 @@ from torchrl_osr.experiment import run_folder
 from torchrl_osr.experiment import schema as config
 from torchrl_osr.experiment.build import check_parts, make_learner
 from torchrl_osr.experiment.dynamics import (
+    FILE,
+    dynamics_model,
     facts_of,
     imagined_replay_buffer,
     load_dynamics,
@@ -23,6 +25,7 @@ from torchrl_osr.experiment.dynamics import (
 from torchrl_osr.experiment.trained_run import load_trained
 from torchrl_osr.experiment.training_data import load_training_data
 from torchrl_osr.policy.tensor_file import read_tensors, write_tensors
+from torchrl_osr.trainers import OfflineTrainer
 
 ROOT = Path(__file__).parents[2]
 CPU = torch.device("cpu")
@@ -113,50 +116,59 @@ def test_a_run_that_was_stopped_ends_with_the_same_bits(finished, tmp_path) -> N
     assert scalars(folder)["imagined_reward"] == scalars(finished)["imagined_reward"]
 
 
-def test_a_model_is_trained_once(finished, tmp_path, capsys) -> None:
-    again = ran(tmp_path / "again", "loss.alpha_init=0.5")
-    assert not (again / "checkpoint" / "dynamics").exists()
+def modelled(folder: Path, *overrides: str) -> list[OfflineTrainer]:
+    """The phase of the model alone; returns its trainer, if one was needed."""
+    folder.mkdir(exist_ok=True)
+    cfg, trainers = composed(*overrides), []
+
+    def new_trainer(*arguments, **options) -> OfflineTrainer:
+        trainers.append(OfflineTrainer(*arguments, progress=False, **options))
+        return trainers[0]
+
+    data = load_training_data(cfg, CPU)
+    dynamics_model(cfg, data, folder, new_trainer, torch.optim.Adam)
+    return trainers
+
+
+def test_a_model_is_trained_once(finished, tmp_path) -> None:
+    assert not modelled(tmp_path / "again", "loss.alpha_init=0.5")
     trained, taken = (
-        (each / "dynamics.safetensors").read_bytes() for each in (finished, again)
+        (each / FILE).read_bytes() for each in (finished, tmp_path / "again")
     )
     assert trained == taken
-    other = ran(tmp_path / "other", "seed=1")
-    assert (other / "checkpoint" / "dynamics").exists()
-    assert (other / "dynamics.safetensors").read_bytes() != trained
+    assert modelled(tmp_path / "other", "seed=1")
+    assert (tmp_path / "other" / FILE).read_bytes() != trained
 
 
-def test_a_damaged_model_in_the_cache_is_trained_anew(finished, tmp_path) -> None:
-    (cached,) = (
-        path
-        for path in (cache_root() / "dynamics").glob("*.safetensors")
-        if path.read_bytes() == (finished / "dynamics.safetensors").read_bytes()
-    )
+def test_a_damaged_model_in_the_cache_is_trained_anew(tmp_path) -> None:
+    before = {*(cache_root() / "dynamics").glob("*.safetensors")}
+    assert modelled(tmp_path / "first", "seed=2")
+    (cached,) = {*(cache_root() / "dynamics").glob("*.safetensors")} - before
     whole = cached.read_bytes()
     cached.write_bytes(whole[:-3])
-    folder = ran(tmp_path / "run")
-    assert (folder / "checkpoint" / "dynamics").exists()
+    assert modelled(tmp_path / "second", "seed=2")
     assert cached.read_bytes() == whole
 
 
 def test_weights_are_those_of_the_best_evaluation(tmp_path) -> None:
-    folder = ran(tmp_path / "run", "dynamics.lr=0.3")
-    errors = [float(row[-1]) for row in scalars(folder, "dynamics")["mse"]]
-    report = json.loads((folder / "dynamics.json").read_text())
+    (trainer,) = modelled(tmp_path, "dynamics.lr=0.3")
+    errors = [row["mse"] for row in trainer.history]
+    report = json.loads((tmp_path / "dynamics.json").read_text())
     assert min(errors) < errors[-1]
     assert report["mse"] == pytest.approx(min(errors))
 
 
 def test_a_given_model_is_taken_if_it_fits_the_data(finished, tmp_path) -> None:
-    file = finished / "dynamics.safetensors"
-    given = [f"dynamics.path={file}", "trainer.steps=1", "dynamics.num_cells=[5]"]
-    folder = ran(tmp_path / "same", *given)
-    assert load_dynamics(folder / file.name).layers[0].weight.shape[-1] == 8
+    given = [f"dynamics.path={finished / FILE}", "dynamics.num_cells=[5]"]
+    assert not modelled(tmp_path / "same", *given)
+    model = load_dynamics(tmp_path / "same" / FILE)
+    assert model.layers[0].weight.shape[-1] == 8
     for override, named in {
         "data.num_transitions=500": "rows: 540 there, 450 here",
         "data.standardize=false": "observation scale: .*held-out rows: ",
     }.items():
         with pytest.raises(ValueError, match=f"was trained on other data.*{named}"):
-            ran(tmp_path / override, *given, override)
+            modelled(tmp_path / override, *given, override)
 
 
 @pytest.mark.parametrize("content", [b"", b"no tensors at all", None])
