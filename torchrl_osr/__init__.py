@@ -13,6 +13,7 @@ from torchrl_osr.objectives import (
     OSRLoss,
     OSRVLoss,
     ReBRACLoss,
+    SCASLoss,
     StateRecoveryLoss,
     TD3BCLoss,
 )
@@ -31,6 +32,7 @@ __all__ = [
     "OSRVLoss",
     "Policy",
     "ReBRACLoss",
+    "SCASLoss",
     "StatePerturbation",
     "StateRecoveryLoss",
     "TD3BCLoss",

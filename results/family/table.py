@@ -54,6 +54,10 @@ FAMILY = {
         "`DynamicsLoss`, MOPO's code", "`loss=mopo`, `dynamics=ensemble`",
         "Gaussian by Gaussian, network by network",
     ),
+    "SCAS": (
+        "`SCASLoss`, SCAS's released code and print", "`loss=scas`",
+        "critic by critic, row by row and network by network",
+    ),
     "Adversary": (
         "`Adversary`, RORL", "`perturbation=adversarial`", "a loop over the same draws",
     ),

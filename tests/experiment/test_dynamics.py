@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from tensordict import TensorDict
 
 from torchrl_osr.commands import train
 from torchrl_osr.data.store.cache import cache_root
@@ -246,6 +247,20 @@ def test_penalty_and_units_are_those_of_the_task(finished, tmp_path) -> None:
 def test_what_cannot_be_had_is_refused_before_the_data(overrides, message) -> None:
     with pytest.raises(ValueError, match=message):
         check_parts(composed(*overrides), 11, 3)
+
+
+def test_a_loss_has_the_trained_model_and_nothing_is_imagined(tmp_path) -> None:
+    folder = ran(tmp_path, "loss=scas", "dynamics.real_ratio=1", "trainer.steps=2")
+    assert "imagined_reward" not in scalars(folder)
+    model = load_dynamics(folder / FILE)
+    held = load_trained(folder).loss.dynamics_network_params
+    for key, value in TensorDict.from_module(model).items(True, True):
+        assert torch.equal(held[key], value), key
+    # No task needs a rule for its end, where nothing is imagined.
+    cfg = composed("loss=scas", "dynamics.real_ratio=1", "env=pointmaze-umaze")
+    check_parts(cfg, 11, 3)
+    with pytest.raises(ValueError, match="needs a model of the dynamics: take dyn"):
+        check_parts(composed("loss=scas", "dynamics=none"), 11, 3)
 
 
 def test_a_time_limit_alone_may_end_a_task() -> None:

@@ -28,6 +28,7 @@ GROUPS = ["env", "data", "inverse_dynamics", "dynamics", "loss", "logger"]
 GROUPS += ["perturbation", "preset"]
 OBJECTIVES = sorted(set(objectives.__all__) - config.NOT_CHOSEN)
 NETWORKS = {"actor_network", "qvalue_network", "inverse_dynamics_network"}
+NETWORKS |= {"dynamics_network"}
 NO_OPTIONS = {"action_spec", "gamma"}  # an object of Python, and what is refused
 
 
@@ -217,6 +218,7 @@ LOSSES = {
     "osr_10": ("OSRLoss", OSR_10),
     "sac_10": ("OSRLoss", OSR_10 | CQL),
     "mopo": ("OSRLoss", CQL | {"min_q_weight": 0.0, "deterministic_backup": False}),
+    "scas": ("SCASLoss", {"num_qvalue_nets": 4}),
     "edac_10": ("EDACLoss", {"num_qvalue_nets": 10}),
     "osr_v": ("OSRVLoss", {}),
     "td3_bc": ("TD3BCLoss", {}),

@@ -32,7 +32,7 @@ from torchrl import torchrl_logger
 from torchrl.record.loggers import Logger
 from torchrl.trainers import LRSchedulerHook
 
-from torchrl_osr import StatePerturbation
+from torchrl_osr import SCASLoss, StatePerturbation
 from torchrl_osr._files import write_json
 from torchrl_osr.commands import CONF
 from torchrl_osr.commands.console import single_job
@@ -188,6 +188,9 @@ def run(cfg: DictConfig, folder: Path) -> float:
     buffer, imagined = data.buffer, None
     if cfg.dynamics.use:
         model = dynamics_model(cfg, data, folder, new_trainer, adam)
+        if isinstance(loss, SCASLoss):
+            loss.load_dynamics(model)
+    if cfg.dynamics.use and cfg.dynamics.real_ratio < 1:
         buffer = imagined = imagined_replay_buffer(
             cfg, data, model, actor, perturbation
         )

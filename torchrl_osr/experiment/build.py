@@ -157,7 +157,7 @@ def make_learner(
     """Networks and loss, drawn anew from torch's global generator.
 
     A loss is given those networks that its constructor names: ``actor_network``,
-    ``qvalue_network``, ``inverse_dynamics_network``.
+    ``qvalue_network``, ``inverse_dynamics_network``, ``dynamics_network``.
 
     Args:
         cfg: a whole configuration of ``torchrl-osr train``.
@@ -188,6 +188,8 @@ def make_learner(
 
     def built(part: DictConfig) -> LossModule:
         wanted = inspect.signature(get_class(part._target_)).parameters
+        if "dynamics_network" in wanted:
+            networks["dynamics_network"] = make_dynamics(cfg, *sizes).to(device)
         given = {name: each for name, each in networks.items() if name in wanted}
         loss: LossModule = instantiate(part, _partial_=True)(**given).to(device)
         return loss
@@ -252,8 +254,14 @@ def check_parts(
     if cfg.perturbation.adversary is not None:
         instantiate(cfg.perturbation.adversary)
     in_keys: list[NestedKey] = learner.objective.in_keys
+    if hasattr(learner.loss, "dynamics_network") and not cfg.dynamics.use:
+        raise ValueError(
+            f"{cfg.loss._target_} needs a model of the dynamics: take "
+            "dynamics=ensemble."
+        )
     if cfg.dynamics.use:
         make_dynamics(cfg, *sizes)
+    if cfg.dynamics.use and cfg.dynamics.real_ratio < 1:
         termination_of(cfg)
         check_real_ratio(cfg.dynamics.real_ratio, cfg.trainer.batch_size)
         if ("next", "action") in in_keys:

@@ -199,7 +199,8 @@ class DynamicsConfig:
         rollout_starts: states of the data that roll-outs start from, each time.
         rollout_interval: gradient steps of the policy between roll-outs.
         generations: number of newest roll-outs that are trained on.
-        real_ratio: share of real rows in a batch of the policy's.
+        real_ratio: share of real rows in a batch of the policy's; with 1 nothing is
+            imagined.
         penalty: factor of the model's uncertainty, in the task's own units, that
             imagined rewards lose.
         refuse: leave out rows on which the elites disagree more than on any held-out

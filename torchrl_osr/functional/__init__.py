@@ -12,6 +12,7 @@ Symbols: ``pi`` policy, ``I`` inverse dynamics model, ``s`` clean state, ``s^``
 perturbed state, ``s~`` a state of the mixed data set (clean and perturbed).
 """
 
+from torchrl_osr.functional.correction import correction_error, value_gain_weight
 from torchrl_osr.functional.critics import (
     conservative_gap,
     gradient_diversity,
@@ -50,6 +51,7 @@ __all__ = [
     "categorical_kl",
     "cloning_error",
     "conservative_gap",
+    "correction_error",
     "deterministic_recovery",
     "disagreement",
     "discrete_policy_value",
@@ -66,4 +68,5 @@ __all__ = [
     "td3_bc_objective",
     "temperature_objective",
     "value_constraint",
+    "value_gain_weight",
 ]

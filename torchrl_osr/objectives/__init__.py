@@ -9,6 +9,7 @@ from torchrl_osr.objectives.inverse_dynamics import InverseDynamicsLoss
 from torchrl_osr.objectives.osr import OSRLoss
 from torchrl_osr.objectives.osr_v import OSRVLoss
 from torchrl_osr.objectives.rebrac import ReBRACLoss
+from torchrl_osr.objectives.scas import SCASLoss
 from torchrl_osr.objectives.state_recovery import StateRecoveryLoss
 from torchrl_osr.objectives.td3_bc import TD3BCLoss
 
@@ -22,6 +23,7 @@ __all__ = [
     "OSRLoss",
     "OSRVLoss",
     "ReBRACLoss",
+    "SCASLoss",
     "StateRecoveryLoss",
     "TD3BCLoss",
 ]
