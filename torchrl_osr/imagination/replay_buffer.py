@@ -125,10 +125,9 @@ class ImaginedReplayBuffer(OfflineToOnlineReplayBuffer):
     def metrics(self) -> dict[str, float]:
         """What the generations are like: share of refused rows, mean reward."""
         refused = sum(each.refused for each in self._imagined)
-        rows = len(self._online_buffer)
-        reward = self._online_buffer[:]["next", "reward"]
+        reward = torch.cat([each.rows["next", "reward"] for each in self._imagined])
         return {
-            "imagined_refused": refused / (refused + rows),
+            "imagined_refused": refused / (refused + len(reward)),
             "imagined_reward": reward.mean().item(),
         }
 

@@ -62,7 +62,7 @@ def consecutive_rows(data: TensorDictBase, starts: Tensor, length: int) -> Tenso
 
     Examples:
         >>> import torch
-        >>> from tensordict import TensorDict, TensorDictBase
+        >>> from tensordict import TensorDict
         >>> from torchrl_osr.data import consecutive_rows
         >>> state = torch.arange(4.0).unsqueeze(-1)
         >>> done = torch.tensor([[False], [True], [False], [False]])
