@@ -6,10 +6,12 @@ Learning" (Jiang et al., NeurIPS 2023), https://openreview.net/forum?id=4gLWjSaw
 
 from torchrl_osr.objectives import (
     Adversary,
+    BCLoss,
     DiscreteOSRLoss,
     DynamicsLoss,
     EDACLoss,
     InverseDynamicsLoss,
+    IQLLoss,
     OSRLoss,
     OSRVLoss,
     ReBRACLoss,
@@ -24,9 +26,11 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Adversary",
+    "BCLoss",
     "DiscreteOSRLoss",
     "DynamicsLoss",
     "EDACLoss",
+    "IQLLoss",
     "InverseDynamicsLoss",
     "OSRLoss",
     "OSRVLoss",

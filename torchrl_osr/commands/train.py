@@ -197,20 +197,29 @@ def run(cfg: DictConfig, folder: Path) -> float:
         components |= {"imagined": imagined}
 
     # Second phase: the policy, taught by the critics and by the frozen model.
-    critic_params = list(loss.qvalue_network_params.parameters())
+    critics = ("qvalue_network", "value_network")
+    critic_params = [
+        each
+        for name in critics
+        if hasattr(loss, name)
+        for each in getattr(loss, f"{name}_params").parameters()
+    ]
     known = set(critic_params)
     policy_params = [each for each in objective.parameters() if each not in known]
-    groups = [
-        {"params": critic_params, "lr": cfg.optim.qvalue_lr},
-        {"params": policy_params, "lr": cfg.optim.actor_lr},
+    optim = cfg.optim
+    trained = [
+        (critic_params, optim.qvalue_lr, optim.qvalue_schedule),
+        (policy_params, optim.actor_lr, optim.actor_schedule),
     ]
-    optimizer = adam(groups)
-    kinds = (cfg.optim.qvalue_schedule, cfg.optim.actor_schedule)
+    trained = [each for each in trained if each[0]]  # cloning has no critics
+    optimizer = adam([{"params": params, "lr": rate} for params, rate, _ in trained])
+    kinds = [kind for *_, kind in trained]
     schedule = learning_rates(optimizer, kinds, cfg.trainer.steps)
     # What is played, now and by all other commands.
-    share = cfg.optim.policy_average
+    share = optim.policy_average
     average = AveragedModel(actor, multi_avg_fn=get_ema_multi_avg_fn(1 - share))
-    targets = SoftUpdate(loss, tau=cfg.optim.tau) if loss.delay_qvalue else None
+    has_targets = bool(critic_params) and loss.delay_qvalue
+    targets = SoftUpdate(loss, tau=optim.tau) if has_targets else None
     limit = largest_value(data.largest_reward, cfg.optim.gamma)
     episodes = {"num_episodes": cfg.trainer.eval_episodes, "seed": EVALUATION_SEED}
     policy = deterministic_policy(average.module, data.norm)

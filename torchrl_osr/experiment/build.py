@@ -10,6 +10,7 @@ from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 from tensordict import NestedKey, TensorDict
 from tensordict.nn import ProbabilisticTensorDictSequential
+from torchrl.modules import TanhNormal
 from torchrl.objectives import LossModule
 
 from torchrl_osr._checks import check_choice
@@ -17,8 +18,9 @@ from torchrl_osr.data import ReferenceReturns, reference_returns
 from torchrl_osr.experiment.limits import check_networks
 from torchrl_osr.imagination import Termination, never, termination
 from torchrl_osr.imagination.replay_buffer import check_real_ratio
-from torchrl_osr.modules import DynamicsEnsemble
-from torchrl_osr.objectives.distributions import is_categorical
+from torchrl_osr.modules import DynamicsEnsemble, state_value
+from torchrl_osr.objectives import BaseLoss
+from torchrl_osr.objectives.distributions import head_of, is_categorical
 from torchrl_osr.objectives.with_recovery import WithRecovery
 
 
@@ -137,7 +139,7 @@ class Learner(NamedTuple):
     Attributes:
         actor: the policy.
         model: the inverse dynamics model, ``None`` if nothing uses it.
-        loss: holds the actor's tensors and the critics.
+        loss: holds the actor's tensors, and the critics if it has any.
         objective: what is trained: the loss, with the recovery term that is added to
             it. Holds the model's tensors too, frozen: what it learns, this knows.
     """
@@ -157,7 +159,8 @@ def make_learner(
     """Networks and loss, drawn anew from torch's global generator.
 
     A loss is given those networks that its constructor names: ``actor_network``,
-    ``qvalue_network``, ``inverse_dynamics_network``, ``dynamics_network``.
+    ``qvalue_network``, ``value_network``, ``inverse_dynamics_network``,
+    ``dynamics_network``.
 
     Args:
         cfg: a whole configuration of ``torchrl-osr train``.
@@ -190,12 +193,17 @@ def make_learner(
         wanted = inspect.signature(get_class(part._target_)).parameters
         if "dynamics_network" in wanted:
             networks["dynamics_network"] = make_dynamics(cfg, *sizes).to(device)
+        if "value_network" in wanted:
+            networks["value_network"] = state_value(
+                observation_size, num_cells=cells, layer_norm=cfg.network.layer_norm
+            ).to(device)
         given = {name: each for name, each in networks.items() if name in wanted}
         loss: LossModule = instantiate(part, _partial_=True)(**given).to(device)
         return loss
 
     loss = objective = built(cfg.loss)
-    loss.make_value_estimator(gamma=cfg.optim.gamma)
+    if hasattr(loss, "qvalue_network"):
+        loss.make_value_estimator(gamma=cfg.optim.gamma)
     parts = [loss]
     if cfg.recovery is not None:
         if is_categorical(actor):
@@ -207,6 +215,22 @@ def make_learner(
         objective = WithRecovery(*parts)
     used = any(hasattr(each, "inverse_dynamics_network") for each in parts)
     return Learner(actor, model if used else None, loss, objective)
+
+
+def _check_adversary(objective: str, learner: Learner) -> None:
+    """Raise a ValueError unless an adversary can ask a loss's networks."""
+    loss, head = learner.loss, head_of(learner.actor)[0]
+    if not (isinstance(loss, BaseLoss) and hasattr(loss, "qvalue_network")):
+        raise ValueError(
+            f"perturbation=adversarial asks a loss with critics and perturbed states, "
+            f"and {type(loss).__name__} has none: take perturbation=gaussian."
+        )
+    if objective == "action_diff" and head is not TanhNormal:
+        raise ValueError(
+            "perturbation.adversary.objective=action_diff compares tanh-Gaussian "
+            f"policies, and that of {type(loss).__name__} is none: take min_Q, or "
+            "perturbation=gaussian."
+        )
 
 
 def _check_recovery(cfg: DictConfig) -> None:
@@ -252,7 +276,8 @@ def check_parts(
     if learner.model is not None:
         instantiate(cfg.inverse_dynamics.loss, _partial_=True)(learner.model)
     if cfg.perturbation.adversary is not None:
-        instantiate(cfg.perturbation.adversary)
+        adversary = instantiate(cfg.perturbation.adversary)
+        _check_adversary(adversary.objective, learner)
     in_keys: list[NestedKey] = learner.objective.in_keys
     if hasattr(learner.loss, "dynamics_network") and not cfg.dynamics.use:
         raise ValueError(

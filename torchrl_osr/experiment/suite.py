@@ -159,6 +159,11 @@ def _obstacle(kind: str, trained: TrainedRun) -> str:
         )
     observation = torch.zeros_like(trained.observation_norm.loc)
     distribution = trained.actor.get_dist(TensorDict({"observation": observation}))
+    if kind == "min_Q" and not hasattr(trained.loss, "qvalue_network"):
+        return (
+            f"min_Q asks critics, and {type(trained.loss).__name__} has none; leave it "
+            "out by ~suite.disturbances.<name>"
+        )
     if kind == "action_diff" and not isinstance(distribution, TanhNormal):
         return (
             "action_diff compares tanh-Gaussian distributions, and the policy's is a "

@@ -16,7 +16,7 @@ from torchrl.envs import ObservationNorm
 from torchrl.objectives import LossModule
 
 from torchrl_osr.experiment.build import Learner, make_learner
-from torchrl_osr.experiment.run_config import read_run
+from torchrl_osr.experiment.run_config import read_config, read_run
 from torchrl_osr.experiment.run_folder import CONFIG
 from torchrl_osr.trainers.checkpoints import find_damage, safe_checkpoint
 
@@ -166,7 +166,7 @@ def saved_sizes(path: Path) -> tuple[int, int]:
         path: of the checkpoint's file.
 
     Raises:
-        CheckpointError: it is damaged, or holds no actor and critics.
+        CheckpointError: it is damaged, or holds no actor.
     """
     _check_whole(path)
     state = _State()
@@ -180,9 +180,12 @@ def saved_sizes(path: Path) -> tuple[int, int]:
         ]
         for name in ("actor", "qvalue")
     }  # fmt: skip
-    if not all(weights.values()):
-        raise CheckpointError(f"{path} holds no actor, or no critics.")
+    if not weights["actor"]:
+        raise CheckpointError(f"{path} holds no actor.")
     observation_size = weights["actor"][0].shape[-1]
+    if not weights["qvalue"]:  # as behaviour cloning, which is of real actions alone
+        env = read_config(run_folder_of(path) / CONFIG).env
+        return observation_size, len(env.action_low)
     values, read = weights["qvalue"][-1].shape[-2], weights["qvalue"][0].shape[-1]
     # Critics of discrete actions read none, and value all of them.
     return observation_size, read - observation_size or values

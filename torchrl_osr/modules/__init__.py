@@ -1,7 +1,11 @@
 """Networks: the actor, the critics, the dynamics and the inverse dynamics models."""
 
-from torchrl_osr.modules.actor import deterministic_actor, tanh_gaussian_actor
-from torchrl_osr.modules.critic import critic_ensemble
+from torchrl_osr.modules.actor import (
+    deterministic_actor,
+    gaussian_actor,
+    tanh_gaussian_actor,
+)
+from torchrl_osr.modules.critic import critic_ensemble, state_value
 from torchrl_osr.modules.cvae_inverse_dynamics import cvae_inverse_dynamics
 from torchrl_osr.modules.discrete import (
     categorical_actor,
@@ -19,6 +23,8 @@ __all__ = [
     "cvae_inverse_dynamics",
     "deterministic_actor",
     "discrete_critic_ensemble",
+    "gaussian_actor",
+    "state_value",
     "tanh_gaussian_actor",
     "tanh_gaussian_inverse_dynamics",
 ]

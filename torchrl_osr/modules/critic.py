@@ -1,4 +1,4 @@
-"""The critics: an ensemble of Q networks, each with its own initialisation."""
+"""The critics: an ensemble of Q networks, and a value network of states alone."""
 
 from __future__ import annotations
 
@@ -67,6 +67,43 @@ def critic_ensemble(
         )
         for _ in range(num_qvalue_nets)
     ]
+
+
+def state_value(
+    observation_dim: int,
+    *,
+    num_cells: Sequence[int] = (256, 256),
+    activation_class: type[nn.Module] = nn.ReLU,
+    layer_norm: bool = False,
+    observation_key: NestedKey = "observation",
+) -> ValueOperator:
+    """Return a value network of one observation, without an action.
+
+    Args:
+        observation_dim: size of the observation, ``S``.
+        num_cells: width of each hidden layer.
+        activation_class: activation between the layers.
+        layer_norm: as in :func:`critic_ensemble`. Default ``False``.
+        observation_key: the state it reads. Default ``"observation"``.
+
+    Returns:
+        A module that writes ``"state_value"``, ``[B, 1]``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> value, batch = state_value(11), {"observation": torch.zeros(4, 11)}
+        >>> value(TensorDict(batch, [4]))["state_value"].shape
+        torch.Size([4, 1])
+    """
+    network = MLP(
+        in_features=observation_dim,
+        out_features=1,
+        num_cells=list(num_cells),
+        activation_class=activation_class,
+        **(layer_norm_options(num_cells) if layer_norm else {}),
+    )
+    return ValueOperator(network, in_keys=[observation_key])
 
 
 def layer_norm_options(num_cells: Sequence[int]) -> dict[str, Any]:

@@ -17,16 +17,20 @@ from tensordict.nn import (
     dispatch,
 )
 from torch import Tensor
-from torchrl.modules import IndependentNormal, TanhDelta, TanhNormal
+from torchrl.modules import IndependentNormal, TanhNormal
 from torchrl.modules.distributions.utils import safeatanh_noeps
 
 from torchrl_osr import functional
 from torchrl_osr._checks import check_literals, check_weight
 from torchrl_osr._entries import column, entry, nested, state_keys
 from torchrl_osr.objectives.base import BaseLoss
+from torchrl_osr.objectives.cloning import (
+    cloning_distance,
+    is_deterministic,
+    policy_at,
+)
 from torchrl_osr.objectives.distributions import (
     action_bounds,
-    check_action,
     check_num_actions,
     check_same_bounds,
     check_same_size,
@@ -165,7 +169,7 @@ class StateRecoveryLoss(BaseLoss):
         """Note what the actor ends in, and the direction of the divergence."""
         head, _ = head_of(network)
         self.is_normal = head is IndependentNormal
-        self.is_deterministic = head in (None, TanhDelta)
+        self.is_deterministic = is_deterministic(network)
         self.has_distribution = head is not None
         by_mean = self.is_deterministic or self.is_normal
         self.recovery_direction: Any = direction or (
@@ -246,7 +250,10 @@ class StateRecoveryLoss(BaseLoss):
         )
         if self.recovery_target == "data":
             action = entry(tensordict, self.tensor_keys.action)
-            divergence = self._cloning(mixed, action).mean(0)
+            pi = self._policy(mixed)
+            divergence = cloning_distance(pi, action, self.tensor_keys.action).mean(0)
+            if self.is_deterministic and self.action_reduction == "mean":
+                divergence = divergence / action.shape[-1]
         else:
             model: TanhNormal = frozen_distribution(
                 self, tensordict, done=done, states=states
@@ -281,29 +288,10 @@ class StateRecoveryLoss(BaseLoss):
             action_reduction=self.action_reduction,
         )
 
-    def _cloning(self, states: TensorDictBase, data_action: Tensor) -> Tensor:
-        """How far the policy at ``states`` is from the data's action, ``[D, B]``."""
-        pi = self._policy(states)
-        if not self.is_deterministic:
-            mean = pi.deterministic_sample
-            check_action(data_action, mean.shape[-1], self.tensor_keys.action)
-            log_prob: Tensor = pi.log_prob(data_action.expand_as(mean))
-            return -log_prob
-        action = pi.deterministic_sample if self.has_distribution else pi
-        check_action(data_action, action.shape[-1], self.tensor_keys.action)
-        error = functional.action_distance(action, data_action)
-        return error if self.action_reduction == "sum" else error / action.shape[-1]
-
     def _policy(self, states: TensorDictBase) -> Any:
         """The policy's distribution at ``states``, or the action that it writes."""
-        network, key = self.actor_network, self.tensor_keys.action
-        with self.actor_network_params.to_module(network, preserve_module_state=False):
-            if self.has_distribution:
-                return network.get_dist(states)
-            action = network(states).get(key, None)
-        if action is None:
-            raise KeyError(f"The actor writes no {key!r}: call set_keys(action=...).")
-        return action
+        params, key = self.actor_network_params, self.tensor_keys.action
+        return policy_at(self.actor_network, params, states, key)
 
     def _pre_tanh(self, action: Tensor) -> Tensor:
         """An action before the tanh, ``[D, B, A]``."""

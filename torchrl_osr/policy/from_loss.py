@@ -35,7 +35,8 @@ def policy_from_loss(
     Args:
         loss: of this package or of TorchRL, with networks as
             :mod:`torchrl_osr.modules` builds them: one :class:`~torchrl.modules.MLP`
-            each, actions in [-1, 1] or one-hot.
+            each, actions in [-1, 1] or one-hot. Of
+            :func:`~torchrl_osr.modules.gaussian_actor` the mean is taken alone.
         observation_norm: how the training data were standardised
             (``standard_normal=True``). Default: not at all.
 
@@ -65,6 +66,8 @@ def policy_from_loss(
         )
     actor, prefix = _mlp(loss.actor_network)
     distribution = loss.actor_network[-1].distribution_class.__name__
+    # A policy acts by the mean of a Gaussian actor, which ends in a tanh.
+    distribution = {"IndependentNormal": "TanhDelta"}.get(distribution, distribution)
     check_choice("the actor's distribution", distribution, DISTRIBUTIONS)
     size = actor.out_features // (2 if distribution == "TanhNormal" else 1)
     tensors = _weights(loss.actor_network_params, prefix, "actor")

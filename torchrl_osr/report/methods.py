@@ -36,7 +36,13 @@ IDENTITY = ("seed", "env.", QUALITY, "data.random_share", "data.path")
 """Settings that the report sorts runs by."""
 
 METHOD = (
-    *("loss.", "recovery", "perturbation.", "inverse_dynamics.", "dynamics."),
+    "loss.",
+    "recovery",
+    "network.actor.",
+    "optim.policy_delay",
+    "perturbation.",
+    "inverse_dynamics.",
+    "dynamics.",
     "num_random",
 )
 """Settings in which methods differ by intent; all others should be equal."""
