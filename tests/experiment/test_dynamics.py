@@ -207,6 +207,8 @@ def test_from_disk_the_same_model_is_trained(finished) -> None:
     for each in rows:
         each.set_rng(torch.Generator().manual_seed(0))
     torch.testing.assert_close(*(each.sample() for each in rows))
+    numbers = torch.tensor([3, 500, 7])
+    torch.testing.assert_close(here.rows(numbers), there.rows(numbers))
     facts = [facts_of(composed(), data) for data in (here, there)]
     assert facts[0]["rows"] == facts[1]["rows"] == 540
 
@@ -247,6 +249,11 @@ def test_penalty_and_units_are_those_of_the_task(finished, tmp_path) -> None:
 def test_what_cannot_be_had_is_refused_before_the_data(overrides, message) -> None:
     with pytest.raises(ValueError, match=message):
         check_parts(composed(*overrides), 11, 3)
+
+
+def test_a_policy_learns_from_what_is_imagined_of_rows_on_disk(tmp_path) -> None:
+    folder = ran(tmp_path, "data.storage=disk", "trainer.steps=2")
+    assert len(scalars(folder)["imagined_reward"]) == 2
 
 
 def test_a_loss_has_the_trained_model_and_nothing_is_imagined(tmp_path) -> None:

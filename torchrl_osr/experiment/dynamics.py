@@ -291,7 +291,7 @@ def imagined_replay_buffer(
                 action: Tensor = policy(batch)["action"]
             return action
 
-        starts = real[torch.randint(len(real), [options.rollout_starts])]
+        starts = data.rows(torch.randint(len(real), [options.rollout_starts]))
         rows, refused = imagine(
             model,
             act,

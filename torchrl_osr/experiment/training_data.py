@@ -14,6 +14,7 @@ from typing import NamedTuple
 import torch
 from omegaconf import DictConfig
 from tensordict import NestedKey, TensorDict
+from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, ReplayBuffer
 from torchrl.envs import Compose, ObservationNorm, RewardScaling
 
@@ -56,6 +57,11 @@ class TrainingData(NamedTuple):
     mean: float | None
     pieces: TensorDict | None
     prepare: Compose | None
+
+    def rows(self, numbers: Tensor) -> TensorDict:
+        """Rows of :attr:`buffer` by their numbers ``[n]``, without its transforms."""
+        rows: TensorDict = self.buffer.storage.get(numbers)
+        return rows if self.prepare is None else self.prepare(rows)
 
     def alone(self, batch_size: int | None = None) -> ReplayBuffer:
         """The buffer's rows without what is appended to :attr:`buffer` later on."""
@@ -144,5 +150,5 @@ def load_training_data(
         largest,
         mean,
         None if pieces is None else pieces.to(device),
-        prepare if on_disk else None,
+        prepare.clone() if on_disk else None,  # the buffer's own may grow
     )
