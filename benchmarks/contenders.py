@@ -138,7 +138,7 @@ def our_loss(name: str, size: Size, device: torch.device) -> LossModule:
     )
     number = {"num_random": size.num_random}
     if name == "OSR-v":
-        loss = OSRVLoss(actor, critics, inverse_dynamics, **number)
+        loss = OSRVLoss(actor, critics, inverse_dynamics)
     elif name == "CQL(H)":
         loss = OSRLoss(
             actor, critics, recovery_weight=0, actor_states="clean", **number

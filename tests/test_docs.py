@@ -153,6 +153,7 @@ def test_options_of_every_group_are_documented():
         "dynamics",
         "loss",
         "perturbation",
+        "recovery",
         "logger",
         "preset",
         "hydra/launcher",

@@ -381,6 +381,35 @@ def test_value_constraint_weighs_actions_by_density(temperature, expected) -> No
     assert value.item() == pytest.approx(expected - 1, abs=1e-6)
 
 
+@given(
+    st.lists(st.tuples(st.floats(-30, 30), st.floats(-3, 3)), min_size=2, max_size=9)
+)
+def test_value_constraint_has_a_floor_with_the_logsumexp_alone(cells) -> None:
+    """Gibbs: log of the integral of exp(Q), less E_I Q, is no less than its entropy.
+
+    Actions are cells of width 2 / M, so that all integrals are sums.
+    """
+    qvalue, logits = torch.tensor(cells, dtype=torch.float64).T
+    model = Categorical(logits=logits)
+    density = math.log(len(cells) / 2)
+    floor = model.entropy().item() - density
+    # The mean over the model's actions, each as often as it is likely.
+    mean = (model.probs * qvalue).sum().expand(1)
+
+    def gap(qvalue, mean):
+        log_prob = torch.full_like(qvalue, density)
+        return functional.value_constraint(qvalue, mean, log_prob=log_prob).item()
+
+    assert gap(qvalue, mean) >= floor - 1e-9
+    best = model.logits + density  # the log-density itself
+    at_best = gap(best, (model.probs * best).sum().expand(1))
+    assert at_best == pytest.approx(floor, abs=1e-9)
+    # The printed one is linear: ten times the values, ten times the gap.
+    printed = functional.value_constraint(qvalue, mean)
+    tenfold = functional.value_constraint(10 * qvalue, 10 * mean)
+    torch.testing.assert_close(tenfold, 10 * printed)
+
+
 def test_bootstrap_value_is_the_lowest_critics_with_or_without_entropy() -> None:
     qvalue = torch.tensor([[1.0, 5.0], [2.0, -3.0]])
     torch.testing.assert_close(

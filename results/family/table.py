@@ -50,6 +50,22 @@ FAMILY = {
     "SAC-N": ("`OSRLoss`, SAC-N", "`loss=sac_10`", REST),
     "EDAC": ("`EDACLoss`, EDAC", "`loss=edac_10`", "all pairs of gradients"),
     "TD3+BC": ("`TD3BCLoss`, TD3+BC (3) to (5)", "`loss=td3_bc`", REST),
+    "ReBRAC": (
+        "`ReBRACLoss`, released code", "`loss=rebrac`",
+        "row by row and critic by critic",
+    ),
+    "IQL": (
+        "`IQLLoss` on TorchRL's, IQL (5) to (7)", "`loss=iql`",
+        "critic by critic, torch.distributions",
+    ),
+    "RORL": (
+        "`RORLLoss`, released code", "`loss=rorl`",
+        "draw by draw and critic by critic, torch.distributions",
+    ),
+    "Behaviour cloning": ("`BCLoss`", "`loss=bc`", "torch.distributions"),
+    "Noisy behaviour cloning": (
+        "`BCLoss(states=\"both\")`", "`loss=noisy_bc`", "torch.distributions",
+    ),
     "Dynamics ensemble": (
         "`DynamicsLoss`, MOPO's code", "`loss=mopo`, `dynamics=ensemble`",
         "Gaussian by Gaussian, network by network",
@@ -62,8 +78,10 @@ FAMILY = {
         "`Adversary`, RORL", "`perturbation=adversarial`", "a loop over the same draws",
     ),
     "State recovery alone": (
-        "`StateRecoveryLoss`, (11)", "`examples/iql_with_recovery.py`",
-        "`kl_divergence` of torch",
+        "`StateRecoveryLoss`, (11)", "`recovery=osr`", "`kl_divergence` of torch",
+    ),
+    "Noisy cloning alone": (
+        "`StateRecoveryLoss`, -log pi", "`recovery=noisy_bc`", "torch.distributions",
     ),
     "Discrete OSR": (
         "`DiscreteOSRLoss`, (11), 4.4", "`loss=discrete_osr`",

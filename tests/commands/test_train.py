@@ -132,15 +132,47 @@ def test_multirun_names_the_failed_job(tmp_path, run, tiny):
 
 def test_every_other_loss_runs_to_its_end(tmp_path, run, sizes):
     """One sweep over them; the main one has its own tests."""
-    losses = "cql,osr_v,osr_10,sac_10,edac_10"
+    losses = "cql,osr_v,osr_10,sac_10,edac_10,iql,rorl"
     arguments = [*sizes, f"loss={losses}", "hydra.sweep.dir=sweep"]
     code, output = run(tmp_path, SCRIPT, "-m", *arguments)
     assert code == 0, output
     assert "Warning" not in output
     folders = list((tmp_path / "sweep").glob("*/returns.json"))
-    assert len(folders) == 5
+    assert len(folders) == 7
     for path in folders:
         assert json.loads(path.read_text())["last"]["step"] == 40
+
+
+def test_recovery_is_added_to_another_loss_from_training_to_the_page(
+    tmp_path, run, sizes
+):
+    def read(*arguments: str) -> str:
+        code, output = run(tmp_path, *arguments)
+        assert code == 0, output
+        assert "Warning" not in output
+        return output
+
+    chosen = ["loss=rebrac", "recovery=osr", "trainer.steps=20"]
+    read(SCRIPT, *sizes, *chosen, "hydra.run.dir=run")
+    read(SCRIPT, "resume=run", "trainer.steps=40")
+    scalars = tmp_path / "run" / "csv" / "scalars" / "policy"
+    for name in ("loss_recovery", "recovery_kl", "loss_qvalue"):
+        assert (scalars / f"{name}.csv").read_text()
+    read("evaluate", "checkpoint=run", "suite=start", "episodes=2", "last=1")
+    read("export", "run", "policy.safetensors")
+    read("report", "run")
+    page = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
+    assert "rebrac+osr" in page
+
+
+def test_a_second_recovery_term_is_refused_before_data_are_made(
+    tmp_path, monkeypatch, run
+):
+    monkeypatch.setenv("TORCHRL_OSR_CACHE", str(tmp_path / "cache"))
+    code, output = run(tmp_path, SCRIPT, "loss=osr", "recovery=osr")
+    assert code != 0
+    assert "OSRLoss has a recovery term of its own" in output
+    assert not (tmp_path / "cache").exists()
 
 
 def test_adversary_chooses_the_perturbed_states(tmp_path, run, sizes):

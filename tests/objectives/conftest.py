@@ -35,6 +35,7 @@ from torchrl_osr import (
     OSRLoss,
     OSRVLoss,
     ReBRACLoss,
+    RORLLoss,
     StateRecoveryLoss,
     TD3BCLoss,
 )
@@ -211,7 +212,8 @@ class Member:
             return ["inverse_dynamics"]
         if self.loss_class is StateRecoveryLoss:
             return ["actor", "inverse_dynamics"]
-        with_model = self.loss_class not in (EDACLoss, ReBRACLoss, TD3BCLoss)
+        without = (EDACLoss, RORLLoss, ReBRACLoss, TD3BCLoss)
+        with_model = self.loss_class not in without
         return ["actor", "critics", *["inverse_dynamics"] * with_model]
 
     @property
@@ -259,6 +261,8 @@ PROPERTIES: dict[str, Callable[[Member], bool]] = {
     "perturbed": lambda member: PERTURBED in member.in_keys,
     "priority weight": lambda member: "priority_weight" in member.keys,
     "weights": lambda member: member.weights != {},
+    # Others are made of the same pieces, and take long to compile.
+    "pieces of its own": lambda member: member.loss_class not in (ReBRACLoss, RORLLoss),
 }
 
 
@@ -383,6 +387,16 @@ FAMILY = {
         CRITIC_KEYS,
         networks=RELU,
         replace={"actor": partial(deterministic_actor, "module")},
+    ),
+    "rorl": actor_critic(
+        RORLLoss,
+        {},
+        "policy_smoothness",
+        "value_smoothness",
+        "uncertainty_penalty",
+        perturbed=False,
+        networks={"num_critics": 3} | RELU,
+        num_samples=2,
     ),
     "discrete": actor_critic(DiscreteOSRLoss, CQL, "recovery_kl"),
     "discrete-cql": actor_critic(

@@ -13,7 +13,7 @@ import torch
 def test_a_loop_over_critics_equals_vmap(
     family, family_batch, record, assert_same, name, count
 ) -> None:
-    count = max(count, 2) if name == "edac" else count
+    count = max(count, 2) if name in ("edac", "rorl") else count
     looped, mapped = (
         record(
             family(
@@ -32,7 +32,7 @@ def test_a_loop_over_critics_equals_vmap(
 @pytest.mark.filterwarnings("ignore:.*autograd.function.Function:DeprecationWarning")
 @pytest.mark.filterwarnings("ignore:.*inline_inbuilt_nn_modules:FutureWarning")
 @pytest.mark.filterwarnings("ignore:Using lock_.. inside a compiled:UserWarning")
-@pytest.mark.losses
+@pytest.mark.losses(having="pieces of its own")
 def test_compiled_loss_equals_eager_without_graph_breaks(
     family, family_batch, seeded, record, assert_same, name
 ) -> None:
@@ -104,6 +104,8 @@ ENSEMBLE = {"min_q_weight": 0.0, "deterministic_backup": False}
         ("OSR-10", "osr", 10, ENSEMBLE, 40),
         (None, "osr", 10, ENSEMBLE | {"actor_states": "clean"}, 30),
         ("TD3+BC", "td3bc", 2, {}, 6),
+        ("ReBRAC", "rebrac", 2, {}, 6),
+        ("RORL", "rorl", 10, {"num_samples": 20}, 430),
         ("Discrete OSR", "discrete", 2, {}, 8),
         ("Discrete CQL(H)", "discrete-cql", 2, {}, 6),
     ],

@@ -152,7 +152,7 @@ def test_without_delay_the_online_critics_are_the_target(
 @pytest.mark.losses(having="critics")
 @pytest.mark.parametrize("count", [1, 3])
 def test_a_list_of_critics_keeps_its_weights(family, family_batch, name, count) -> None:
-    count = max(count, 2) if name == "edac" else count
+    count = max(count, 2) if name in ("edac", "rorl") else count
     critics = family.networks(name, num_critics=count).critics
     wanted = [list(critic.parameters()) for critic in critics]
     loss = family(name, family.networks(name, num_critics=count))

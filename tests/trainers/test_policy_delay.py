@@ -86,6 +86,22 @@ def test_recorded_it_has_the_same_bits_and_logs(tmp_path, make, runs, monkeypatc
     assert found[0][1] == found[1][1]
 
 
+def test_there_must_be_something_to_train_in_between(tmp_path, runs) -> None:
+    loss = runs.make_loss("inverse dynamics")
+    params = list(loss.parameters())
+    buffer = make_replay_buffer(runs.make_data("cpu"), batch_size=8, seed=0)
+    with pytest.raises(ValueError, match="policy_delay=2 leaves nothing to train"):
+        OfflineTrainer(
+            loss,
+            torch.optim.Adam(params),
+            buffer,
+            STEPS,
+            tmp_path,
+            policy_delay=2,
+            policy_params=params,
+        )
+
+
 def test_a_delay_below_one_is_refused(tmp_path, make) -> None:
     with pytest.raises(ValueError, match="policy_delay must be at least 1, got 0"):
         make(tmp_path, 0)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import logging
 import sys
+from collections.abc import Mapping
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -97,6 +98,7 @@ def train(cfg: DictConfig) -> float:
         check_run(cfg, trust)
         if fresh:
             read_environment(cfg)
+            note_defaults(cfg, job.runtime.choices)
     with run_folder.lock(folder):
         run_folder.claim(folder, cfg, job)
         with run_folder.status(folder):
@@ -197,13 +199,9 @@ def run(cfg: DictConfig, folder: Path) -> float:
         components |= {"imagined": imagined}
 
     # Second phase: the policy, taught by the critics and by the frozen model.
-    critics = ("qvalue_network", "value_network")
-    critic_params = [
-        each
-        for name in critics
-        if hasattr(loss, name)
-        for each in getattr(loss, f"{name}_params").parameters()
-    ]
+    names = [f"{kind}_network_params" for kind in ("qvalue", "value")]
+    critics = [getattr(loss, name) for name in names if hasattr(loss, name)]
+    critic_params = [each for critic in critics for each in critic.parameters()]
     known = set(critic_params)
     policy_params = [each for each in objective.parameters() if each not in known]
     optim = cfg.optim
@@ -256,11 +254,24 @@ def run(cfg: DictConfig, folder: Path) -> float:
             trainer.register_op("post_steps", partial(log_imagined, trainer, imagined))
         LRSchedulerHook(schedule, interval="optim").register(trainer)
         trainer.register_op("post_optim", partial(average.update_parameters, actor))
+        if hasattr(loss, "decay_uncertainty"):
+            trainer.register_op("post_optim", loss.decay_uncertainty)
         if cfg.perturbation.adversary is not None:
             adversary = instantiate(cfg.perturbation.adversary)
             trainer.register_op("process_optim_batch", partial(adversary, loss))
         trainer.train()
     return report(cfg, folder, data.mean, trainer, loggers)
+
+
+def note_defaults(cfg: DictConfig, choices: Mapping[str, str]) -> None:
+    """Warn if a loss's authors have told settings for other data than a run's."""
+    loss, file = choices["loss"], f"{choices['env']}-{choices['data']}.yaml"
+    published = Path(CONF) / "published" / loss
+    if published.is_dir() and not (published / file).is_file():
+        log.warning(
+            f"There are no published settings of loss={loss} for {cfg.env.name} "
+            f"{cfg.data.quality}: its defaults are taken. {published} has some."
+        )
 
 
 def code_versions() -> dict[str, str]:

@@ -323,9 +323,9 @@ class TrainConfig:
 
     Attributes:
         seed: random seed of networks, sampling and noise.
+        num_random: value of ``loss.num_random`` for the losses with CQL's term.
         recovery: options of ``StateRecoveryLoss``, whose term is added to a loss that
             has none of its own; null for none.
-        num_random: value of ``loss.num_random`` for the losses with CQL's term.
         resume: folder of a run to continue, or to extend with more ``trainer.steps``.
         force: continue although settings differ from those that the run was made with.
         trust: modules of your own, whose losses, networks and environments may be
@@ -341,12 +341,12 @@ class TrainConfig:
     )
     dynamics: DynamicsConfig = field(default_factory=DynamicsConfig)
     loss: Any = MISSING  # derived from the class that _target_ names
-    recovery: Any = None  # likewise
     optim: OptimConfig = field(default_factory=OptimConfig)
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     seed: int = MISSING
     num_random: int = MISSING
+    recovery: Any = None  # derived like loss
     resume: str | None = None
     force: bool = False
     trust: list[str] = MISSING

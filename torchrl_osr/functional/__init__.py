@@ -18,7 +18,9 @@ from torchrl_osr.functional.critics import (
     gradient_diversity,
     lagrange_terms,
     soft_maximum,
+    uncertainty_penalty,
     value_constraint,
+    value_smoothness,
 )
 from torchrl_osr.functional.divergences import (
     categorical_kl,
@@ -67,6 +69,8 @@ __all__ = [
     "state_recovery",
     "td3_bc_objective",
     "temperature_objective",
+    "uncertainty_penalty",
     "value_constraint",
     "value_gain_weight",
+    "value_smoothness",
 ]

@@ -109,7 +109,10 @@ def value_constraint(
     Minimised over Q, it lowers actions with unknown consequences and raises those that
     lead to ``s'``. With ``log_prob`` the first expectation is a log-sum-exp over
     importance-weighted actions instead (:func:`soft_maximum`): an addition, not in the
-    paper, which puts the weight on the actions that Q overrates.
+    paper, which puts the weight on the actions that Q overrates. The printed
+    difference is linear in Q and has no minimum;
+    :math:`\log\int e^{Q} da - \mathbb E_I Q`, of which this is an estimate but for
+    :math:`\log M`, is bounded below by the model's entropy.
 
     Args:
         policy_qvalue: values of the sampled actions at ``s~``, ``[B, M]``.
@@ -151,3 +154,49 @@ def gradient_diversity(action_gradients: Tensor) -> Tensor:
     # All pairs at once: |sum_i g_i|^2 - sum_i |g_i|^2, with |g_i| = 1.
     pairs = unit.sum(0).square().sum(-1) - unit.square().sum((0, -1))
     return pairs / (number - 1)
+
+
+def value_smoothness(difference: Tensor, tau: float = 0.2) -> Tensor:
+    r"""RORL penalty of a change of the values around a state, to be minimised.
+
+    .. math::
+        \max_j \frac1N \sum_i (1 - \tau) \max(d_{ij}, 0)^2 + \tau \min(d_{ij}, 0)^2,
+        \quad d_{ij} = Q_i(\hat s_j, a) - Q_i(s, a)
+
+    "RORL: Robust Offline Reinforcement Learning via Conservative Smoothing" (Yang et
+    al. 2022), https://arxiv.org/abs/2206.02829, as its released code has it.
+
+    Args:
+        difference: :math:`d_{ij}` of ``M`` perturbed states, ``[N, M, B]``.
+        tau: weight of values that fall, against those that rise.
+
+    Returns:
+        ``[B]``.
+
+    Examples:
+        >>> value_smoothness(torch.tensor([[[1.0], [-1.0]]])).tolist()
+        [0.800000011920929]
+    """
+    rise, fall = difference.clamp(min=0).square(), difference.clamp(max=0).square()
+    return ((1 - tau) * rise + tau * fall).mean(0).amax(0)
+
+
+def uncertainty_penalty(qvalue: Tensor, weight: Tensor | float) -> Tensor:
+    r"""RORL penalty of actions that the critics do not agree on, to be minimised.
+
+    .. math::
+        \frac1N \sum_i \big( Q_i - [Q_i - \lambda\, \text{std}_i Q_i] \big)^2
+
+    where what is in brackets is a target without gradient: each critic is pulled down,
+    by the more the larger the deviation of all is. Source: see
+    :func:`value_smoothness`.
+
+    Args:
+        qvalue: ``[N, B]``, ``N >= 2``.
+        weight: :math:`\lambda`.
+
+    Returns:
+        ``[B]``.
+    """
+    target = (qvalue - weight * qvalue.std(0)).detach()
+    return (qvalue - target).square().mean(0)

@@ -11,6 +11,7 @@ from torchrl_osr.objectives.iql import IQLLoss
 from torchrl_osr.objectives.osr import OSRLoss
 from torchrl_osr.objectives.osr_v import OSRVLoss
 from torchrl_osr.objectives.rebrac import ReBRACLoss
+from torchrl_osr.objectives.rorl import RORLLoss
 from torchrl_osr.objectives.scas import SCASLoss
 from torchrl_osr.objectives.state_recovery import StateRecoveryLoss
 from torchrl_osr.objectives.td3_bc import TD3BCLoss
@@ -26,6 +27,7 @@ __all__ = [
     "InverseDynamicsLoss",
     "OSRLoss",
     "OSRVLoss",
+    "RORLLoss",
     "ReBRACLoss",
     "SCASLoss",
     "StateRecoveryLoss",

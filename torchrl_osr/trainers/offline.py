@@ -282,6 +282,11 @@ class OfflineTrainer(Trainer):
         if policy_delay > 1:
             delayed = set(policy_params)
             rest = [each for each in loss_module.parameters() if each not in delayed]
+            if not rest:
+                raise ValueError(
+                    f"policy_delay={policy_delay} leaves nothing to train in between, "
+                    "without critics: use policy_delay=1 (optim.policy_delay=1)."
+                )
             between = new_gradients(parameters=rest)
         self._stepper = SumOfLosses(
             self.nonfinite_check, new_gradients(), between, policy_delay

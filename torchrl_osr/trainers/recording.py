@@ -249,8 +249,8 @@ def _without_python(graph: GraphModule, tensors: list[Tensor]) -> Run:
 
         for node in graph.graph.nodes:
             if node.target is torch.ops.aten.native_layer_norm_backward.default:
-                *node.args, wanted = node.args
-                node.target = of_all if all(wanted) else of_input
+                node.target = of_all if all(node.args[-1]) else of_input
+                node.args = node.args[:-1]
         with warnings.catch_warnings(), torch.no_grad():
             warnings.simplefilter("ignore")  # of deprecation, and of fixed shapes
             graph.recompile()
