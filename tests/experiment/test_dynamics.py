@@ -294,3 +294,11 @@ def test_roll_outs_are_as_published_for_a_data_set() -> None:
         "given": (2, 3.0),
     }
     assert not composed("dynamics=none").dynamics.use
+
+
+def test_defaults_are_said(caplog) -> None:
+    choices = {"loss": "mopo", "env": "hopper", "data": "random"}
+    train.note_defaults(composed(), choices)
+    assert not caplog.records
+    train.note_defaults(composed("env.id=Pendulum-v1"), choices)
+    assert "rollout_steps=5 and dynamics.penalty=2.5 are taken" in caplog.text

@@ -272,6 +272,13 @@ def note_defaults(cfg: DictConfig, choices: Mapping[str, str]) -> None:
             f"There are no published settings of loss={loss} for {cfg.env.name} "
             f"{cfg.data.quality}: its defaults are taken. {published} has some."
         )
+    known, name = cfg.dynamics.published, f"{cfg.env.name}-{cfg.data.quality}"
+    if known and name not in known:
+        log.warning(
+            f"There are no published roll-outs of loss={loss} for {name}: "
+            f"dynamics.rollout_steps={cfg.dynamics.rollout_steps} and "
+            f"dynamics.penalty={cfg.dynamics.penalty} are taken."
+        )
 
 
 def code_versions() -> dict[str, str]:
