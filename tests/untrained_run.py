@@ -30,13 +30,13 @@ def make_run(folder: Path, *overrides: str, sizes: tuple[int, int] = (11, 3)):
         cfg = compose("train", ["network.num_cells=[8]", *overrides])
     folder.mkdir()
     OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
-    actor, _, loss, _ = make_learner(cfg, *sizes)
+    actor, _, loss, objective = make_learner(cfg, *sizes)
     norm = ObservationNorm(
         torch.full(sizes[:1], 2.0), torch.full(sizes[:1], 3.0), in_keys=["observation"],
         standard_normal=True,
     )  # fmt: skip
     checkpoint = safe_checkpoint(
-        loss_module=loss,
+        loss_module=objective,
         observation_norm=norm,
         policy_average=AveragedModel(actor),
         history=[],

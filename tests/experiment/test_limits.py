@@ -87,7 +87,8 @@ def test_values_of_the_right_type_are_refused_by_key(composed, key, value):
 
 def test_limits_are_of_keys_that_exist(composed):
     known = flatten(OmegaConf.to_container(composed())).keys()
-    elsewhere = {"inverse_dynamics.network.latent_dim", "recovery.reduction"}
+    elsewhere = {"inverse_dynamics.network.latent_dim", "loss.num_samples"}
+    elsewhere |= {"recovery.reduction"}
     for name in ("evaluate", "film"):
         elsewhere |= OmegaConf.load(CONF / "evaluation" / f"{name}.yaml").keys()
     assert {*RANGES, *CHOICES} <= known | elsewhere

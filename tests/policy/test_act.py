@@ -64,10 +64,10 @@ def test_against_hand_calculation():
     assert given == pytest.approx([-4.0, -6.0])
 
 
-@pytest.mark.parametrize("loss", ["osr", "td3_bc"])
+@pytest.mark.parametrize("loss", ["osr", "td3_bc", "iql", "rebrac recovery=osr"])
 def test_a_run_acts_as_in_its_evaluation(tmp_path, loss):
     folder = tmp_path / "run"
-    evaluated, networks = make_run(folder, f"loss={loss}")
+    evaluated, networks = make_run(folder, *f"loss={loss}".split())
     policy, rows = load_policy(folder), 2 + 3 * torch.randn(6, 11)
     actions = evaluated(rows)
     torch.testing.assert_close(policy.act(rows), actions, atol=2e-6, rtol=0)
@@ -80,6 +80,15 @@ def test_a_run_acts_as_in_its_evaluation(tmp_path, loss):
     assert source["data"]["quality"] == "medium-replay"
     best = load_policy(folder / "checkpoint/policy/best.torchrl")
     assert best.record["source"]["step"] == 10
+
+
+def test_a_run_without_critics_acts_and_has_no_values(tmp_path):
+    folder, bounds = tmp_path / "run", "[-1.0,-1.0,-1.0]"
+    evaluated, _ = make_run(folder, "loss=bc", f"env.action_low={bounds}")
+    policy, rows = load_policy(folder), 2 + 3 * torch.randn(6, 11)
+    torch.testing.assert_close(policy.act(rows), evaluated(rows), atol=2e-6, rtol=0)
+    with pytest.raises(ValueError, match="no critics"):
+        policy.value(rows)
 
 
 def test_bounds_of_the_runs_environment(tmp_path):

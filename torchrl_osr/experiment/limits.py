@@ -52,6 +52,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "perturbation.adversary.num_steps": (1, 10_000),
     "loss.num_qvalue_nets": (1, 1000),
     "loss.num_random": (1, 10_000),
+    "loss.num_samples": (1, 10_000),
     "loss.clip_diff_min": (-math.inf, LARGEST),
     "optim.actor_lr": (0, LARGEST),
     "optim.qvalue_lr": (0, LARGEST),

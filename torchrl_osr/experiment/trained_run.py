@@ -166,7 +166,7 @@ def saved_sizes(path: Path) -> tuple[int, int]:
         path: of the checkpoint's file.
 
     Raises:
-        CheckpointError: it is damaged, or holds no actor.
+        CheckpointError: it is damaged, holds no actor, or tells no size of actions.
     """
     _check_whole(path)
     state = _State()
@@ -183,9 +183,11 @@ def saved_sizes(path: Path) -> tuple[int, int]:
     if not weights["actor"]:
         raise CheckpointError(f"{path} holds no actor.")
     observation_size = weights["actor"][0].shape[-1]
-    if not weights["qvalue"]:  # as behaviour cloning, which is of real actions alone
-        env = read_config(run_folder_of(path) / CONFIG).env
-        return observation_size, len(env.action_low)
+    if not weights["qvalue"]:  # as in behaviour cloning
+        low = read_config(run_folder_of(path) / CONFIG).env.action_low
+        if low is None:
+            raise CheckpointError(f"{path} holds no critics, and its run no bounds.")
+        return observation_size, len(low)
     values, read = weights["qvalue"][-1].shape[-2], weights["qvalue"][0].shape[-1]
     # Critics of discrete actions read none, and value all of them.
     return observation_size, read - observation_size or values
