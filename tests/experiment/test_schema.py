@@ -24,11 +24,13 @@ from torchrl_osr.experiment import schema as config
 from torchrl_osr.experiment.schema import schema_of
 
 CONF = Path(__file__).parents[2] / "conf"
-GROUPS = ["env", "data", "inverse_dynamics", "dynamics", "loss", "logger"]
+GROUPS = ["env", "data", "inverse_dynamics", "dynamics", "loss", "recovery", "logger"]
 GROUPS += ["perturbation", "preset"]
 OBJECTIVES = sorted(set(objectives.__all__) - config.NOT_CHOSEN)
-NETWORKS = {"actor_network", "qvalue_network", "inverse_dynamics_network"}
-NETWORKS |= {"dynamics_network"}
+NETWORKS = {
+    f"{part}_network"
+    for part in ("actor", "qvalue", "value", "inverse_dynamics", "dynamics")
+}
 NO_OPTIONS = {"action_spec", "gamma"}  # an object of Python, and what is refused
 
 
@@ -222,6 +224,12 @@ LOSSES = {
     "edac_10": ("EDACLoss", {"num_qvalue_nets": 10}),
     "osr_v": ("OSRVLoss", {}),
     "td3_bc": ("TD3BCLoss", {}),
+    # For the default data, Hopper's medium-replay, its authors' settings.
+    "rebrac": ("ReBRACLoss", {"actor_bc_coef": 0.05, "critic_bc_coef": 0.5}),
+    "rorl": ("RORLLoss", {"num_qvalue_nets": 10}),
+    "iql": ("IQLLoss", {}),
+    "bc": ("BCLoss", {}),
+    "noisy_bc": ("BCLoss", {"states": "both"}),
     "discrete_osr": ("DiscreteOSRLoss", {}),
     "discrete_cql": ("DiscreteOSRLoss", CQL),
 }
