@@ -185,13 +185,24 @@ def test_another_file_is_refused(finished, tmp_path, content) -> None:
         load_dynamics(path)
 
 
-def test_a_file_whose_elites_are_none_is_refused(finished, tmp_path) -> None:
-    tensors, record = read_tensors(finished / "dynamics.safetensors")
-    tensors["elites"] += 2
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("elites", torch.tensor([1, 3]), "elites are none of its networks"),
+        ("input_loc", torch.zeros(10**5), "layers do not fit together"),
+        ("layers.0.weight", torch.zeros(10**5, 1), "layers do not fit together"),
+        ("target_loc", torch.zeros(3), "size mismatch"),
+    ],
+)
+def test_a_file_that_makes_no_model_is_refused(
+    finished, tmp_path, name, value, message
+) -> None:
+    tensors, record = read_tensors(finished / FILE)
+    tensors[name] = value
     stamps = ("checksum", "tensors_sha256", "format")
     record = {key: value for key, value in record.items() if key not in stamps}
     write_tensors(tmp_path / "model.safetensors", tensors, record)
-    with pytest.raises(ValueError, match="elites are none of its networks"):
+    with pytest.raises(ValueError, match=message):
         load_dynamics(tmp_path / "model.safetensors")
 
 

@@ -215,7 +215,8 @@ def run(cfg: DictConfig, folder: Path) -> float:
     schedule = learning_rates(optimizer, kinds, cfg.trainer.steps)
     # What is played, now and by all other commands.
     share = optim.policy_average
-    average = AveragedModel(actor, multi_avg_fn=get_ema_multi_avg_fn(1 - share))
+    averaging = get_ema_multi_avg_fn(1 - share)  # type: ignore[no-untyped-call]
+    average = AveragedModel(actor, multi_avg_fn=averaging)
     has_targets = bool(critic_params) and loss.delay_qvalue
     targets = SoftUpdate(loss, tau=optim.tau) if has_targets else None
     limit = largest_value(data.largest_reward, cfg.optim.gamma)

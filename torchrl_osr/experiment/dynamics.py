@@ -11,6 +11,7 @@ import json
 import logging
 import math
 from collections.abc import Callable, Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -233,12 +234,19 @@ def _model_of(tensors: Mapping[str, Tensor]) -> DynamicsEnsemble:
         for name, each in sorted(tensors.items(), key=lambda item: _layer(item[0]))
         if name.endswith(".weight")
     ]
+    networks, inputs = len(weights[0]), len(tensors["input_loc"])
+    widths = [inputs, *(each.shape[-1] for each in weights)]
+    # Before it is built: a small file shall not ask for a large model.
+    if [tuple(each.shape) for each in weights] != [
+        (networks, *sizes) for sizes in pairwise(widths)
+    ]:
+        raise ValueError("its layers do not fit together")
     model = DynamicsEnsemble(
         observation_dim,
-        len(tensors["input_loc"]) - observation_dim,
-        num_networks=len(weights[0]),
+        inputs - observation_dim,
+        num_networks=networks,
         num_elites=len(tensors["elites"]),
-        num_cells=[each.shape[-1] for each in weights[:-1]],
+        num_cells=widths[1:-1],
     )
     model.load_state_dict(tensors)
     if not bool(((model.elites >= 0) & (model.elites < model.num_networks)).all()):
