@@ -7,17 +7,22 @@ import torch
 from torchrl.objectives import SoftUpdate
 
 from torchrl_osr import (
+    BCLoss,
     EDACLoss,
     InverseDynamicsLoss,
+    IQLLoss,
     OSRLoss,
     OSRVLoss,
     ReBRACLoss,
+    RORLLoss,
     StateRecoveryLoss,
     TD3BCLoss,
 )
 from torchrl_osr.modules import (
     critic_ensemble,
     deterministic_actor,
+    gaussian_actor,
+    state_value,
     tanh_gaussian_actor,
     tanh_gaussian_inverse_dynamics,
 )
@@ -54,6 +59,9 @@ LOSSES = {
         ReBRACLoss(actor := networks(deterministic_actor)[0], networks()[1]),
         StateRecoveryLoss(actor, model()),
     ),
+    "iql": lambda: IQLLoss(*networks(gaussian_actor), state_value(SIZES[0], **CELLS)),
+    "rorl": lambda: RORLLoss(*networks(), num_samples=2),
+    "bc": lambda: BCLoss(networks()[0], states="both"),
     "inverse_dynamics": lambda: InverseDynamicsLoss(model()),
 }
 
@@ -72,7 +80,7 @@ def make_batch(make_batch):
 
 def make(name):
     loss = LOSSES[name]().double()
-    if name != "inverse_dynamics" and not isinstance(loss, WithRecovery):
+    if hasattr(loss, "qvalue_network"):
         SoftUpdate(loss, tau=0.1)  # TorchRL warns of losses without one
     return loss
 
