@@ -98,7 +98,7 @@ def train(cfg: DictConfig) -> float:
         check_run(cfg, trust)
         if fresh:
             read_environment(cfg)
-            note_defaults(cfg, job.runtime.choices)
+            check_published(cfg, job.runtime.choices)
     with run_folder.lock(folder):
         run_folder.claim(folder, cfg, job)
         with run_folder.status(folder):
@@ -264,14 +264,24 @@ def run(cfg: DictConfig, folder: Path) -> float:
     return report(cfg, folder, data.mean, trainer, loggers)
 
 
-def note_defaults(cfg: DictConfig, choices: Mapping[str, str]) -> None:
-    """Warn if a loss's authors have told settings for other data than a run's."""
+def check_published(cfg: DictConfig, choices: Mapping[str, str]) -> None:
+    """Warn if a loss's authors have told settings for other data than a run's.
+
+    Raises:
+        ValueError: if those of another task would be taken.
+    """
     loss, file = choices["loss"], f"{choices['env']}-{choices['data']}.yaml"
     published = Path(CONF) / "published" / loss
     if published.is_dir() and not (published / file).is_file():
         log.warning(
             f"There are no published settings of loss={loss} for {cfg.env.name} "
             f"{cfg.data.quality}: its defaults are taken. {published} has some."
+        )
+    elif published.is_dir() and cfg.env.name != choices["env"]:
+        raise ValueError(
+            f"loss={loss} would take the settings that were published for "
+            f"{choices['env']}, but env.id={cfg.env.id} is {cfg.env.name}: give "
+            f"env={cfg.env.name}."
         )
     known, name = cfg.dynamics.published, f"{cfg.env.name}-{cfg.data.quality}"
     if known and name not in known:
