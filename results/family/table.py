@@ -66,6 +66,14 @@ FAMILY = {
     "Noisy behaviour cloning": (
         "`BCLoss(states=\"both\")`", "`loss=noisy_bc`", "torch.distributions",
     ),
+    "Dynamics ensemble": (
+        "`DynamicsLoss`, MOPO's code", "`loss=mopo`, `dynamics=ensemble`",
+        "Gaussian by Gaussian, network by network",
+    ),
+    "SCAS": (
+        "`SCASLoss`, SCAS's released code and print", "`loss=scas`",
+        "critic by critic, row by row and network by network",
+    ),
     "Adversary": (
         "`Adversary`, RORL", "`perturbation=adversarial`", "a loop over the same draws",
     ),

@@ -8,8 +8,10 @@ writes ``osr_v.png`` and prints the scores.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
+from statistics import mean
 from typing import Any
 
 from torchrl_osr._files import read_json
@@ -26,6 +28,7 @@ from torchrl_osr.report import read_records
 HERE = Path(__file__).parent
 COLORS = {"osr": GREEN, "cql": GREY, "osr_v": ORANGE}
 LABELS = {"osr": "OSR", "cql": "CQL(H)", "osr_v": "OSR-v as printed"}
+TRIED = (BLUE, "black", "#A0457E")
 DATA = ("hopper-medium-expert", "walker2d-medium-expert")
 
 
@@ -43,9 +46,25 @@ def tried() -> Iterator[tuple[str, str, tuple[list[int], list[float]]]]:
         yield data, record["folder"], curve(record)
 
 
+def ablation() -> dict[tuple[str, str], list[tuple[list[int], list[float]]]]:
+    """Curves of the ablation's seeds, by data and method."""
+    curves = defaultdict(list)
+    for record in read_records(HERE.parent / "oos" / "runs.jsonl.gz"):
+        data, method, _ = record["folder"].split("/")
+        if method in COLORS:
+            curves[data, method].append(curve(record))
+    return curves
+
+
 def main() -> None:
     """Draw a panel for the constraint and one for each data set."""
-    figure = new_figure(12, 4, layout="constrained")
+    known = ablation()
+    print("ablation, means over seeds: best evaluation, last five")
+    for (data, method), seeds in known.items():
+        best = mean(max(scores) for _, scores in seeds)
+        last = mean(mean(scores[-5:]) for _, scores in seeds)
+        print(f"  {data:22} {method:6} {best:5.0f} {last:5.0f}")
+    figure = new_figure(12, 4.6, layout="constrained")
     alone, *panels = figure.subplots(1, 1 + len(DATA))
     bound = read_json(HERE / "bound.json")
     steps = [bound["every"] * number for number in range(len(bound["curves"]["mean"]))]
@@ -57,20 +76,20 @@ def main() -> None:
     )  # fmt: skip
     alone.set(title="the constraint alone", xlabel="gradient steps", ylabel="gap")
     alone.set_yscale("symlog", linthresh=2)
-    alone.legend(frameon=False)
+    alone.legend(frameon=False, fontsize=8, loc="upper right")
 
     for axes, data in zip(panels, DATA, strict=True):
-        for record in read_records(HERE.parent / "oos" / "runs.jsonl.gz"):
-            quality, method, seed = record["folder"].split("/")
-            if quality == data and method in COLORS:
-                label = LABELS[method] if seed == "seed0" else None
-                axes.plot(*curve(record), color=COLORS[method], alpha=0.5, label=label)
-        for quality, name, points in tried():
-            print(quality, name, *(f"{score:.1f}" for score in points[1]))
-            if quality == data:
-                axes.plot(*points, "o-", label=name)
+        for method, color in COLORS.items():
+            for number, points in enumerate(known[data, method]):
+                label = LABELS[method] if number == 0 else None
+                axes.plot(*points, color=color, alpha=0.5, label=label)
+        here = [(name, points) for quality, name, points in tried() if quality == data]
+        for (name, points), color in zip(here, TRIED, strict=False):
+            print(f"  {data:22} {name}:", *(f"{score:.1f}" for score in points[1]))
+            axes.plot(*points, "o-", color=color, label=name)
         axes.set(title=data, xlabel="updates", ylabel="normalised score")
-        axes.legend(frameon=False, fontsize=8)
+        place = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.15)}
+        axes.legend(frameon=False, fontsize=8, ncols=2, **place)
     save_figure(figure, HERE / "osr_v.png", dpi=110)
 
 

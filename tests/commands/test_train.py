@@ -85,17 +85,18 @@ def refused(folder: Path, run, arguments: list[str], named: list[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("override", "named"),
+    ("overrides", "named"),
     [
-        ("loss.chunk_size=0", "chunk_size must be at least 1, got 0"),
-        ("trainer.cudagraph=true", "cudagraph=True needs a CUDA device"),
+        (["loss.chunk_size=0"], "chunk_size must be at least 1, got 0"),
+        (["loss=rebrac", "env.id=Walker2d-v5"], "is walker2d: give env=walker2d."),
+        (["trainer.cudagraph=true"], "cudagraph=True needs a CUDA device"),
     ],
 )
 def test_bad_input_is_named_before_data_are_made(
-    tmp_path, monkeypatch, run, override, named
+    tmp_path, monkeypatch, run, overrides, named
 ):
     monkeypatch.setenv("TORCHRL_OSR_CACHE", str(tmp_path / "cache"))
-    code, output = run(tmp_path, SCRIPT, override)
+    code, output = run(tmp_path, SCRIPT, *overrides)
     assert code != 0
     assert named in output
     assert not (tmp_path / "cache").exists()

@@ -33,7 +33,8 @@ def test_every_loss_is_built_and_trains_its_networks(name, make_batch) -> None:
     cfg, (actor, _, loss, _) = learner_of(f"loss={name}")
     assert type(loss) is get_class(cfg.loss._target_)
     if hasattr(loss, "qvalue_network"):
-        assert loss.num_qvalue_nets == (10 if name.endswith("_10") else 2)
+        ten = name == "rorl" or name.endswith("_10")
+        assert loss.num_qvalue_nets == (4 if name == "scas" else 10 if ten else 2)
         assert loss.value_estimator.gamma == 0.5
         SoftUpdate(loss, tau=0.1)
     batch = make_batch(10).apply(lambda x: x.float() if x.is_floating_point() else x)

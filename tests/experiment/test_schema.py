@@ -24,12 +24,11 @@ from torchrl_osr.experiment import schema as config
 from torchrl_osr.experiment.schema import schema_of
 
 CONF = Path(__file__).parents[2] / "conf"
-GROUPS = ["env", "data", "inverse_dynamics", "loss", "recovery", "logger"]
+GROUPS = ["env", "data", "inverse_dynamics", "dynamics", "loss", "recovery", "logger"]
 GROUPS += ["perturbation", "preset"]
-OBJECTIVES = sorted(set(objectives.__all__) - {"BaseLoss"})
-NETWORKS = {
-    f"{part}_network" for part in ("actor", "qvalue", "value", "inverse_dynamics")
-}
+OBJECTIVES = sorted(set(objectives.__all__) - config.NOT_CHOSEN)
+PARTS = ("actor", "qvalue", "value", "inverse_dynamics", "dynamics")
+NETWORKS = {f"{part}_network" for part in PARTS}
 NO_OPTIONS = {"action_spec", "gamma"}  # an object of Python, and what is refused
 
 
@@ -218,6 +217,8 @@ LOSSES = {
     "osr_official": ("OSRLoss", OFFICIAL),
     "osr_10": ("OSRLoss", OSR_10),
     "sac_10": ("OSRLoss", OSR_10 | CQL),
+    "mopo": ("OSRLoss", CQL | {"min_q_weight": 0.0, "deterministic_backup": False}),
+    "scas": ("SCASLoss", {"num_qvalue_nets": 4}),
     "edac_10": ("EDACLoss", {"num_qvalue_nets": 10}),
     "osr_v": ("OSRVLoss", {}),
     "td3_bc": ("TD3BCLoss", {}),

@@ -33,7 +33,7 @@ from torchrl import torchrl_logger
 from torchrl.record.loggers import Logger
 from torchrl.trainers import LRSchedulerHook
 
-from torchrl_osr import StatePerturbation
+from torchrl_osr import SCASLoss, StatePerturbation
 from torchrl_osr._files import write_json
 from torchrl_osr.commands import CONF
 from torchrl_osr.commands.console import single_job
@@ -56,9 +56,11 @@ from torchrl_osr.experiment.build import (
     read_environment,
     references_of,
 )
+from torchrl_osr.experiment.dynamics import dynamics_model, imagined_replay_buffer
 from torchrl_osr.experiment.loggers import log_outcome, make_loggers
 from torchrl_osr.experiment.run_config import check_run, module_of, read_yaml
 from torchrl_osr.experiment.training_data import load_training_data
+from torchrl_osr.imagination import ImaginedReplayBuffer
 from torchrl_osr.trainers import (
     OfflineTrainer,
     SoftUpdate,
@@ -96,7 +98,7 @@ def train(cfg: DictConfig) -> float:
         check_run(cfg, trust)
         if fresh:
             read_environment(cfg)
-            note_defaults(cfg, job.runtime.choices)
+            check_published(cfg, job.runtime.choices)
     with run_folder.lock(folder):
         run_folder.claim(folder, cfg, job)
         with run_folder.status(folder):
@@ -184,6 +186,18 @@ def run(cfg: DictConfig, folder: Path) -> float:
         write_json(folder / "inverse_dynamics.json", trainer.history[-1])
         print(describe_inverse_dynamics(trainer.history[-1]))
 
+    # A model of the dynamics, and batches in part of what the policy does in it.
+    buffer, imagined = data.buffer, None
+    if cfg.dynamics.use:
+        model = dynamics_model(cfg, data, folder, new_trainer, adam)
+        if isinstance(loss, SCASLoss):
+            loss.load_dynamics(model)
+    if cfg.dynamics.use and cfg.dynamics.real_ratio < 1:
+        buffer = imagined = imagined_replay_buffer(
+            cfg, data, model, actor, perturbation
+        )
+        components |= {"imagined": imagined}
+
     # Second phase: the policy, taught by the critics and by the frozen model.
     names = [f"{kind}_network_params" for kind in ("qvalue", "value")]
     critics = [getattr(loss, name) for name in names if hasattr(loss, name)]
@@ -201,7 +215,8 @@ def run(cfg: DictConfig, folder: Path) -> float:
     schedule = learning_rates(optimizer, kinds, cfg.trainer.steps)
     # What is played, now and by all other commands.
     share = optim.policy_average
-    average = AveragedModel(actor, multi_avg_fn=get_ema_multi_avg_fn(1 - share))
+    averaging = get_ema_multi_avg_fn(1 - share)  # type: ignore[no-untyped-call]
+    average = AveragedModel(actor, multi_avg_fn=averaging)
     has_targets = bool(critic_params) and loss.delay_qvalue
     targets = SoftUpdate(loss, tau=optim.tau) if has_targets else None
     limit = largest_value(data.largest_reward, cfg.optim.gamma)
@@ -221,6 +236,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
         trainer = new_trainer(
             objective,
             optimizer,
+            replay_buffer=buffer,
             components=components | {"schedule": schedule, "policy_average": average},
             total_steps=cfg.trainer.steps,
             folder=folder / "checkpoint" / "policy",
@@ -235,6 +251,8 @@ def run(cfg: DictConfig, folder: Path) -> float:
             value_limits={"pred_value": limit, "target_value": limit},
         )
         trainer.register_op("post_steps", still_ours)
+        if imagined is not None:
+            trainer.register_op("post_steps", partial(log_imagined, trainer, imagined))
         LRSchedulerHook(schedule, interval="optim").register(trainer)
         trainer.register_op("post_optim", partial(average.update_parameters, actor))
         if hasattr(loss, "decay_uncertainty"):
@@ -246,14 +264,31 @@ def run(cfg: DictConfig, folder: Path) -> float:
     return report(cfg, folder, data.mean, trainer, loggers)
 
 
-def note_defaults(cfg: DictConfig, choices: Mapping[str, str]) -> None:
-    """Warn if a loss's authors have told settings for other data than a run's."""
+def check_published(cfg: DictConfig, choices: Mapping[str, str]) -> None:
+    """Warn if a loss's authors have told settings for other data than a run's.
+
+    Raises:
+        ValueError: if those of another task would be taken.
+    """
     loss, file = choices["loss"], f"{choices['env']}-{choices['data']}.yaml"
     published = Path(CONF) / "published" / loss
     if published.is_dir() and not (published / file).is_file():
         log.warning(
             f"There are no published settings of loss={loss} for {cfg.env.name} "
             f"{cfg.data.quality}: its defaults are taken. {published} has some."
+        )
+    elif published.is_dir() and cfg.env.name != choices["env"]:
+        raise ValueError(
+            f"loss={loss} would take the settings that were published for "
+            f"{choices['env']}, but env.id={cfg.env.id} is {cfg.env.name}: give "
+            f"env={cfg.env.name}."
+        )
+    known, name = cfg.dynamics.published, f"{cfg.env.name}-{cfg.data.quality}"
+    if known and name not in known:
+        log.warning(
+            f"There are no published roll-outs of loss={loss} for {name}: "
+            f"dynamics.rollout_steps={cfg.dynamics.rollout_steps} and "
+            f"dynamics.penalty={cfg.dynamics.penalty} are taken."
         )
 
 
@@ -276,6 +311,13 @@ def about(cfg: DictConfig, folder: Path) -> dict[str, Any]:
         "tags": [cfg.env.name, cfg.data.quality, method, *sweep],
         "config": settings | {"versions": code_versions()},
     }
+
+
+def log_imagined(trainer: OfflineTrainer, imagined: ImaginedReplayBuffer) -> None:
+    """Log what the rows are like that the policy learns from besides the data."""
+    for name, value in imagined.metrics().items():
+        for logger in trainer.loggers:
+            logger.log_scalar(f"policy/{name}", value, step=trainer.step)
 
 
 def shuffle_next(batch: TensorDict) -> TensorDict:

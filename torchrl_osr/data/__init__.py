@@ -37,7 +37,12 @@ from torchrl_osr.data.store.replay_buffer import (
     is_memory_mapped,
     make_replay_buffer,
 )
-from torchrl_osr.data.store.splits import held_out_rows, mix_datasets, split_held_out
+from torchrl_osr.data.store.splits import (
+    consecutive_rows,
+    held_out_rows,
+    mix_datasets,
+    split_held_out,
+)
 from torchrl_osr.data.store.statistics import (
     observation_statistics,
     sampled_observations,
@@ -116,6 +121,7 @@ __all__ = [
     "check_order",
     "collect_quality",
     "collect_transitions",
+    "consecutive_rows",
     "environment_spec",
     "export_minari",
     "held_out_rows",

@@ -16,7 +16,9 @@ from torchrl.objectives import LossModule
 from torchrl_osr._checks import check_choice
 from torchrl_osr.data import ReferenceReturns, reference_returns
 from torchrl_osr.experiment.limits import check_networks
-from torchrl_osr.modules import state_value
+from torchrl_osr.imagination import Termination, never, termination
+from torchrl_osr.imagination.replay_buffer import check_real_ratio
+from torchrl_osr.modules import DynamicsEnsemble, state_value
 from torchrl_osr.objectives import BaseLoss
 from torchrl_osr.objectives.distributions import head_of, is_categorical
 from torchrl_osr.objectives.with_recovery import WithRecovery
@@ -108,6 +110,29 @@ def check_storage(cfg: DictConfig) -> str:
     return storage
 
 
+def make_dynamics(
+    cfg: DictConfig, observation_size: int, action_size: int
+) -> DynamicsEnsemble:
+    """An untrained model as ``dynamics`` of a configuration has it."""
+    return DynamicsEnsemble(
+        observation_size,
+        action_size,
+        num_networks=cfg.dynamics.num_networks,
+        num_elites=cfg.dynamics.num_elites,
+        num_cells=list(cfg.dynamics.num_cells),
+    )
+
+
+def termination_of(cfg: DictConfig) -> Termination:
+    """The rule by which imagined episodes end.
+
+    Raises:
+        ValueError: none is known for the task, and ``dynamics.terminations`` is not
+            ``never``.
+    """
+    return never if cfg.dynamics.terminations == "never" else termination(cfg.env.id)
+
+
 class Learner(NamedTuple):
     """A policy's loss and the networks in it.
 
@@ -134,7 +159,8 @@ def make_learner(
     """Networks and loss, drawn anew from torch's global generator.
 
     A loss is given those networks that its constructor names: ``actor_network``,
-    ``qvalue_network``, ``value_network``, ``inverse_dynamics_network``.
+    ``qvalue_network``, ``value_network``, ``inverse_dynamics_network``,
+    ``dynamics_network``.
 
     Args:
         cfg: a whole configuration of ``torchrl-osr train``.
@@ -165,6 +191,8 @@ def make_learner(
 
     def built(part: DictConfig) -> LossModule:
         wanted = inspect.signature(get_class(part._target_)).parameters
+        if "dynamics_network" in wanted:
+            networks["dynamics_network"] = make_dynamics(cfg, *sizes).to(device)
         if "value_network" in wanted:
             networks["value_network"] = state_value(
                 observation_size, num_cells=cells, layer_norm=cfg.network.layer_norm
@@ -251,4 +279,19 @@ def check_parts(
         adversary = instantiate(cfg.perturbation.adversary)
         _check_adversary(adversary.objective, learner)
     in_keys: list[NestedKey] = learner.objective.in_keys
+    if hasattr(learner.loss, "dynamics_network") and not cfg.dynamics.use:
+        raise ValueError(
+            f"{cfg.loss._target_} needs a model of the dynamics: take "
+            "dynamics=ensemble."
+        )
+    if cfg.dynamics.use:
+        make_dynamics(cfg, *sizes)
+    if cfg.dynamics.use and cfg.dynamics.real_ratio < 1:
+        termination_of(cfg)
+        check_real_ratio(cfg.dynamics.real_ratio, cfg.trainer.batch_size)
+        if ("next", "action") in in_keys:
+            raise ValueError(
+                f"{cfg.loss._target_} reads the data's next action, which no imagined "
+                "row has: choose another loss, or dynamics=none."
+            )
     return in_keys

@@ -25,6 +25,9 @@ from torchrl_osr import objectives
 # File systems allow 255 bytes, and temporary names beside it need some of them.
 MAX_FOLDER_NAME = 200
 
+NOT_CHOSEN = {"BaseLoss", "DynamicsLoss"}
+"""Classes of :mod:`torchrl_osr.objectives` that no configuration names."""
+
 
 @dataclass
 class EnvConfig:
@@ -176,6 +179,55 @@ class InverseDynamicsConfig:
 
 
 @dataclass
+class DynamicsConfig:
+    """A model of the dynamics, and what the policy learns from its roll-outs.
+
+    Attributes:
+        use: train a model, and the policy on its roll-outs besides the data.
+        num_networks: networks of the ensemble.
+        num_elites: how many of them are rolled out, the best on held-out rows.
+        num_cells: width of each hidden layer.
+        lr: learning rate of the model.
+        batch_size: rows of a gradient step, for each network.
+        steps: gradient steps of the model; the weights of its best evaluation are
+            taken.
+        path: a trained model to take, dynamics.safetensors of a run with the same data;
+            null for one of the same settings in the cache, or a new one.
+        terminations: auto for the rule by which the task ends, never for tasks that a
+            time limit alone ends.
+        rollout_steps: steps of a roll-out.
+        rollout_starts: states of the data that roll-outs start from, each time.
+        rollout_interval: gradient steps of the policy between roll-outs.
+        generations: number of newest roll-outs that are trained on.
+        real_ratio: share of real rows in a batch of the policy's; with 1 nothing is
+            imagined.
+        penalty: factor of the model's uncertainty, in the task's own units, that
+            imagined rewards lose.
+        refuse: leave out rows on which the elites disagree more than on any held-out
+            row.
+        published: rollout_steps and penalty by data set, where a method has them.
+    """
+
+    use: bool = MISSING
+    num_networks: int = MISSING
+    num_elites: int = MISSING
+    num_cells: list[int] = MISSING
+    lr: float = MISSING
+    batch_size: int = MISSING
+    steps: int = MISSING
+    path: str | None = None
+    terminations: str = MISSING
+    rollout_steps: int = MISSING
+    rollout_starts: int = MISSING
+    rollout_interval: int = MISSING
+    generations: int = MISSING
+    real_ratio: float = MISSING
+    penalty: float = MISSING
+    refuse: bool = MISSING
+    published: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
 class OptimConfig:
     """Adam's learning rates and what moves with them.
 
@@ -287,6 +339,7 @@ class TrainConfig:
     inverse_dynamics: InverseDynamicsConfig = field(
         default_factory=InverseDynamicsConfig
     )
+    dynamics: DynamicsConfig = field(default_factory=DynamicsConfig)
     loss: Any = MISSING  # derived from the class that _target_ names
     optim: OptimConfig = field(default_factory=OptimConfig)
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
@@ -421,7 +474,7 @@ def register() -> None:
     store.store(name="train_schema", node=TrainConfig)
     store.store(name="check_data_schema", node=CheckDataConfig)
     store.store(name="collect_schema", node=CollectConfig)
-    for name in set(objectives.__all__) - {"BaseLoss"}:
+    for name in set(objectives.__all__) - NOT_CHOSEN:
         schema = schema_of(getattr(objectives, name))
         store.store(group="schema", name=name, node=schema)
     resolvers: dict[str, Callable[..., Any]] = {

@@ -14,11 +14,13 @@ from typing import NamedTuple
 import torch
 from omegaconf import DictConfig
 from tensordict import NestedKey, TensorDict
-from torchrl.data import ReplayBuffer
+from torch import Tensor
+from torchrl.data import ImmutableDatasetWriter, ReplayBuffer
 from torchrl.envs import Compose, ObservationNorm, RewardScaling
 
 from torchrl_osr.data import (
     check_order,
+    consecutive_rows,
     held_out_rows,
     make_replay_buffer,
     next_action,
@@ -30,6 +32,9 @@ from torchrl_osr.experiment.build import check_storage, load_data, references_of
 MAX_HELD_OUT = 50_000
 """Held-out rows of a set on disk that are read into memory, at most."""
 
+NUM_PIECES, PIECE = 500, 20
+"""Pieces of trajectories to judge a dynamics model by, at most, and their rows."""
+
 
 class TrainingData(NamedTuple):
     """The rows to train on and to judge by, prepared and on the device.
@@ -40,6 +45,9 @@ class TrainingData(NamedTuple):
         norm: what standardises observations.
         largest_reward: the largest absolute reward, held-out rows included.
         mean: score of the behaviour, or return where there are no scores, if known.
+        pieces: of trajectories, each from a held-out row on, ``[n, 20]``; the rows that
+            follow may be trained on. ``None`` if there is no dynamics model.
+        prepare: what is done to rows from disk; ``None`` if those in memory are ready.
     """
 
     buffer: ReplayBuffer
@@ -47,6 +55,23 @@ class TrainingData(NamedTuple):
     norm: ObservationNorm
     largest_reward: float
     mean: float | None
+    pieces: TensorDict | None
+    prepare: Compose | None
+
+    def rows(self, numbers: Tensor) -> TensorDict:
+        """Rows of :attr:`buffer` by their numbers ``[n]``, without its transforms."""
+        rows: TensorDict = self.buffer.storage.get(numbers)
+        return rows if self.prepare is None else self.prepare(rows)
+
+    def alone(self, batch_size: int | None = None) -> ReplayBuffer:
+        """The buffer's rows without what is appended to :attr:`buffer` later on."""
+        return ReplayBuffer(
+            storage=self.buffer.storage,
+            writer=ImmutableDatasetWriter(),
+            collate_fn=lambda batch: batch,
+            transform=None if self.prepare is None else self.prepare.clone(),
+            batch_size=batch_size,
+        )
 
 
 def load_training_data(
@@ -93,8 +118,11 @@ def load_training_data(
         prepare.append(RewardScaling(addend, factor, in_keys=[("next", "reward")]))
     options = {"batch_size": cfg.trainer.batch_size, "seed": 0, "device": device}
     share, seed = cfg.data.held_out, cfg.data.seed
+    chosen = held_out_rows(len(data), share, seed=seed)
+    pieces = None
     if on_disk:
-        chosen = held_out_rows(len(data), share, seed=seed)
+        if cfg.dynamics.use:
+            pieces = prepare(consecutive_rows(data, chosen[:NUM_PIECES], PIECE))
         held_out = prepare(data[chosen[:MAX_HELD_OUT].sort().values])
         left_out, prepare = chosen.sort().values, prepare.to(device)
         buffer = make_replay_buffer(
@@ -107,9 +135,20 @@ def load_training_data(
     else:
         if with_next_action:  # of the rows before some of them are held out
             data["next", "action"] = next_action(data)
-        rows, held_out = split_held_out(prepare(data), share, seed=seed)
+        data = prepare(data)
+        if cfg.dynamics.use:
+            pieces = consecutive_rows(data, chosen[:NUM_PIECES], PIECE)
+        rows, held_out = split_held_out(data, share, seed=seed)
         buffer = make_replay_buffer(rows, **options)
     mean = manifest["normalized_score"]
     if references_of(cfg) is None:
         mean = (manifest.get("return") or {}).get("mean")
-    return TrainingData(buffer, held_out.to(device), norm().to(device), largest, mean)
+    return TrainingData(
+        buffer,
+        held_out.to(device),
+        norm().to(device),
+        largest,
+        mean,
+        None if pieces is None else pieces.to(device),
+        prepare.clone() if on_disk else None,  # the buffer's own may grow
+    )

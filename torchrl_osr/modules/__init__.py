@@ -1,4 +1,4 @@
-"""Networks: the actor, the critics and the inverse dynamics models."""
+"""Networks: the actor, the critics, the dynamics and the inverse dynamics models."""
 
 from torchrl_osr.modules.actor import (
     deterministic_actor,
@@ -12,9 +12,11 @@ from torchrl_osr.modules.discrete import (
     categorical_inverse_dynamics,
     discrete_critic_ensemble,
 )
+from torchrl_osr.modules.dynamics import DynamicsEnsemble
 from torchrl_osr.modules.inverse_dynamics import tanh_gaussian_inverse_dynamics
 
 __all__ = [
+    "DynamicsEnsemble",
     "categorical_actor",
     "categorical_inverse_dynamics",
     "critic_ensemble",

@@ -42,6 +42,7 @@ METHOD = (
     "optim.policy_delay",
     "perturbation.",
     "inverse_dynamics.",
+    "dynamics.",
     "num_random",
 )
 """Settings in which methods differ by intent; all others should be equal."""

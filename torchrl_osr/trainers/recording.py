@@ -254,8 +254,10 @@ def _without_python(graph: GraphModule, tensors: list[Tensor]) -> Run:
         with warnings.catch_warnings(), torch.no_grad():
             warnings.simplefilter("ignore")  # of deprecation, and of fixed shapes
             graph.recompile()
-            traced: Run = torch.jit.trace(graph, tuple(tensors), check_trace=False)
-        return traced
+            run: Run = torch.jit.trace(  # type: ignore[no-untyped-call]
+                graph, tuple(tensors), check_trace=False
+            )
+        return run
     except Exception as error:
         log.info(f"updates are repeated from Python, which is slower: {error}")
         return graph

@@ -1,4 +1,4 @@
-"""Which rows of a data set are used: held-out rows, and mixtures of two sets.
+"""Which rows of a data set are used: held-out and consecutive rows, mixtures of sets.
 
 Shapes: ``N`` transitions.
 """
@@ -6,7 +6,7 @@ Shapes: ``N`` transitions.
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 
@@ -46,6 +46,40 @@ def split_held_out(
     mask[held_out_rows(len(data), held_out, seed=seed)] = True
     mask = mask.to(data.device or "cpu")
     return data[~mask], data[mask]
+
+
+def consecutive_rows(data: TensorDictBase, starts: Tensor, length: int) -> TensorDict:
+    """Pieces of trajectories: each row is followed by the one that came after it.
+
+    Args:
+        data: transitions ``[N]`` in the order in which they were recorded.
+        starts: numbers of the first rows. Those that are not followed by enough rows
+            of the same trajectory are left out.
+        length: rows of a piece, ``L``.
+
+    Returns:
+        Transitions ``[n, L]``; of ``starts``, ``n`` are left.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_osr.data import consecutive_rows
+        >>> state = torch.arange(4.0).unsqueeze(-1)
+        >>> done = torch.tensor([[False], [True], [False], [False]])
+        >>> data = TensorDict({"observation": state,
+        ...     "next": {"observation": state + 1, "done": done}}, [4])
+        >>> consecutive_rows(data, torch.tensor([0, 1, 2, 3]), 2)["observation"][..., 0]
+        tensor([[0., 1.],
+                [2., 3.]])
+    """
+    starts = starts[starts + length <= len(data)]
+    numbers = starts.unsqueeze(-1) + torch.arange(length, device=starts.device)
+    rows = data[numbers.flatten()].reshape(len(starts), length)
+    before, after = rows[:, :-1], rows[:, 1:]
+    follows = before["next", "observation"] == after["observation"]
+    follows &= ~before["next", "done"]
+    whole: TensorDict = rows[follows.flatten(1).all(1)]
+    return whole
 
 
 def mix_datasets(

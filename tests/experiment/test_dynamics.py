@@ -1,0 +1,315 @@
+"""A run with a dynamics model: trained once, kept with what it fits, resumed."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from tensordict import TensorDict
+
+from torchrl_osr.commands import train
+from torchrl_osr.data.store.cache import cache_root
+from torchrl_osr.experiment import run_folder
+from torchrl_osr.experiment import schema as config
+from torchrl_osr.experiment.build import check_parts, make_learner
+from torchrl_osr.experiment.dynamics import (
+    FILE,
+    dynamics_model,
+    facts_of,
+    imagined_replay_buffer,
+    load_dynamics,
+)
+from torchrl_osr.experiment.trained_run import load_trained
+from torchrl_osr.experiment.training_data import load_training_data
+from torchrl_osr.policy.tensor_file import read_tensors, write_tensors
+from torchrl_osr.trainers import OfflineTrainer
+
+ROOT = Path(__file__).parents[2]
+CPU = torch.device("cpu")
+TINY = [
+    "loss=mopo",
+    "data=random",
+    "data.num_transitions=600",
+    "data.held_out=0.1",
+    "network.num_cells=[8]",
+    "dynamics.num_networks=3",
+    "dynamics.num_elites=2",
+    "dynamics.num_cells=[8]",
+    "dynamics.batch_size=8",
+    "dynamics.steps=20",
+    "dynamics.rollout_starts=20",
+    "dynamics.rollout_interval=4",
+    "dynamics.generations=2",
+    "dynamics.real_ratio=0.25",
+    "trainer.batch_size=8",
+    "trainer.steps=14",
+    "trainer.log_interval=1",
+    "trainer.eval_interval=100",
+    "trainer.eval_episodes=1",
+    "trainer.checkpoint_interval=7",
+    "trainer.progress=false",
+]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _cache(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TORCHRL_OSR_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+def composed(*overrides: str):
+    config.register()
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        return compose("train", overrides=[*TINY, *overrides])
+
+
+def ran(folder: Path, *overrides: str) -> Path:
+    folder.mkdir(exist_ok=True)
+    cfg = composed(*overrides)
+    run_folder.claim(folder, cfg, {})
+    with run_folder.status(folder):
+        train.run(cfg, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    return ran(tmp_path_factory.mktemp("finished") / "run")
+
+
+def scalars(folder: Path, phase: str = "policy") -> dict[str, list[list[str]]]:
+    found = {}
+    for path in sorted((folder / "csv" / "scalars" / phase).glob("*.csv")):
+        with path.open() as file:
+            found[path.stem] = list(csv.reader(file))
+    return found
+
+
+def test_run_leaves_model_report_and_numbers(finished) -> None:
+    report = json.loads((finished / "dynamics.json").read_text())
+    assert [each["steps"] for each in report["rollout"]] == [1, 2, 5, 10, 20]
+    model = load_dynamics(finished / "dynamics.safetensors")
+    assert (model.observation_dim, model.action_dim, model.num_networks) == (11, 3, 3)
+    assert len(model.elites) == 2
+    assert model.largest_disagreement.item() == pytest.approx(
+        report["largest_disagreement"]
+    )
+    assert {"imagined_refused", "imagined_reward"} <= scalars(finished).keys()
+    assert not (finished / "inverse_dynamics.json").exists()
+    # What evaluates a run needs no model.
+    assert load_trained(finished).config.dynamics.use
+
+
+def test_a_run_that_was_stopped_ends_with_the_same_bits(finished, tmp_path) -> None:
+    """In the middle of a generation, with a model from the cache."""
+    folder = ran(tmp_path / "run", "trainer.steps=5")
+    ran(folder)
+    assert load_trained(folder).step == 14
+    here, there = (load_trained(each).loss.state_dict() for each in (finished, folder))
+    assert here.keys() == there.keys()
+    for key, value in here.items():
+        assert not torch.is_tensor(value) or torch.equal(value, there[key]), key
+    assert scalars(folder)["imagined_reward"] == scalars(finished)["imagined_reward"]
+
+
+def modelled(folder: Path, *overrides: str) -> list[OfflineTrainer]:
+    """The phase of the model alone; returns its trainer, if one was needed."""
+    folder.mkdir(exist_ok=True)
+    cfg, trainers = composed(*overrides), []
+
+    def new_trainer(*arguments, **options) -> OfflineTrainer:
+        trainers.append(OfflineTrainer(*arguments, progress=False, **options))
+        return trainers[0]
+
+    data = load_training_data(cfg, CPU)
+    dynamics_model(cfg, data, folder, new_trainer, torch.optim.Adam)
+    return trainers
+
+
+def test_a_model_is_trained_once(finished, tmp_path) -> None:
+    assert not modelled(tmp_path / "again", "loss.alpha_init=0.5")
+    trained, taken = (
+        (each / FILE).read_bytes() for each in (finished, tmp_path / "again")
+    )
+    assert trained == taken
+    assert modelled(tmp_path / "other", "seed=1")
+    assert (tmp_path / "other" / FILE).read_bytes() != trained
+
+
+def test_a_damaged_model_in_the_cache_is_trained_anew(tmp_path) -> None:
+    before = {*(cache_root() / "dynamics").glob("*.safetensors")}
+    assert modelled(tmp_path / "first", "seed=2")
+    (cached,) = {*(cache_root() / "dynamics").glob("*.safetensors")} - before
+    whole = cached.read_bytes()
+    cached.write_bytes(whole[:-3])
+    assert modelled(tmp_path / "second", "seed=2")
+    assert cached.read_bytes() == whole
+
+
+def test_weights_are_those_of_the_best_evaluation(tmp_path) -> None:
+    (trainer,) = modelled(tmp_path, "dynamics.lr=0.3")
+    errors = [row["mse"] for row in trainer.history]
+    report = json.loads((tmp_path / "dynamics.json").read_text())
+    assert min(errors) < errors[-1]
+    assert report["mse"] == pytest.approx(min(errors))
+
+
+def test_a_given_model_is_taken_if_it_fits_the_data(finished, tmp_path) -> None:
+    given = [f"dynamics.path={finished / FILE}", "dynamics.num_cells=[5]"]
+    assert not modelled(tmp_path / "same", *given)
+    model = load_dynamics(tmp_path / "same" / FILE)
+    assert model.layers[0].weight.shape[-1] == 8
+    for override, named in {
+        "data.num_transitions=500": "rows: 540 there, 450 here",
+        "data.standardize=false": "observation scale: .*held-out rows: ",
+    }.items():
+        with pytest.raises(ValueError, match=f"was trained on other data.*{named}"):
+            modelled(tmp_path / override, *given, override)
+
+
+@pytest.mark.parametrize("content", [b"", b"no tensors at all", None])
+def test_another_file_is_refused(finished, tmp_path, content) -> None:
+    path = tmp_path / "model.safetensors"
+    if content is None:
+        write_tensors(path, {"weight": torch.zeros(2)}, {"kind": "policy"})
+    else:
+        path.write_bytes(content)
+    with pytest.raises(
+        ValueError, match=r"model\.safetensors: .*dynamics\.safetensors"
+    ):
+        load_dynamics(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("elites", torch.tensor([1, 3]), "elites are none of its networks"),
+        ("input_loc", torch.zeros(10**5), "layers do not fit together"),
+        ("layers.0.weight", torch.zeros(10**5, 1), "layers do not fit together"),
+        ("target_loc", torch.zeros(3), "size mismatch"),
+    ],
+)
+def test_a_file_that_makes_no_model_is_refused(
+    finished, tmp_path, name, value, message
+) -> None:
+    tensors, record = read_tensors(finished / FILE)
+    tensors[name] = value
+    stamps = ("checksum", "tensors_sha256", "format")
+    record = {key: value for key, value in record.items() if key not in stamps}
+    write_tensors(tmp_path / "model.safetensors", tensors, record)
+    with pytest.raises(ValueError, match=message):
+        load_dynamics(tmp_path / "model.safetensors")
+
+
+def test_from_disk_the_same_model_is_trained(finished) -> None:
+    here, there = (
+        load_training_data(composed(f"data.storage={storage}"), CPU)
+        for storage in ("memory", "disk")
+    )
+    torch.testing.assert_close(here.pieces, there.pieces)
+    for data in (here, there):
+        data.buffer.sample()  # which has a generator of its own
+    rows = [data.alone(8) for data in (here, there)]
+    for each in rows:
+        each.set_rng(torch.Generator().manual_seed(0))
+    torch.testing.assert_close(*(each.sample() for each in rows))
+    numbers = torch.tensor([3, 500, 7])
+    torch.testing.assert_close(here.rows(numbers), there.rows(numbers))
+    facts = [facts_of(composed(), data) for data in (here, there)]
+    assert facts[0]["rows"] == facts[1]["rows"] == 540
+
+
+def test_penalty_and_units_are_those_of_the_task(finished, tmp_path) -> None:
+    """Imagined rewards lose the penalty in the task's units, whatever the data's."""
+    found = {}
+    for penalty in (0.0, 1.5):
+        cfg = composed(f"dynamics.penalty={penalty}", "dynamics.rollout_steps=1")
+        data = load_training_data(cfg, CPU)
+        torch.manual_seed(0)
+        actor = make_learner(cfg, 11, 3).actor
+        model = load_dynamics(finished / "dynamics.safetensors")
+        buffer = imagined_replay_buffer(cfg, data, model, actor, lambda batch: batch)
+        buffer.set_rng(torch.Generator().manual_seed(0))
+        buffer.sample()
+        found[penalty] = buffer.online_buffer[:]
+    free, lowered = found.values()
+    assert torch.equal(free["next", "observation"], lowered["next", "observation"])
+    _, scale = model.predict(free["observation"], free["action"])
+    scale[..., :-1] *= data.norm.scale
+    wanted = scale.square().sum(-1).sqrt().max(0).values
+    lost = (free["next", "reward"] - lowered["next", "reward"]).squeeze(-1)
+    torch.testing.assert_close(lost, 1.5 * wanted, rtol=1e-4, atol=1e-5)
+    state = free["next", "observation"] * data.norm.scale + data.norm.loc
+    fallen = (state[:, 0] <= 0.7) | (state[:, 1].abs() >= 0.2)
+    assert torch.equal(free["next", "terminated"].squeeze(-1), fallen)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["env=pointmaze-umaze", "data=diverse"], "no rule is known by which Point"),
+        (["dynamics.num_elites=9"], "num_elites must be between 1 and num_networks=3"),
+        (["dynamics.real_ratio=0.01"], "real_ratio=0.01 of 8 rows are 0"),
+    ],
+)
+def test_what_cannot_be_had_is_refused_before_the_data(overrides, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        check_parts(composed(*overrides), 11, 3)
+
+
+def test_a_policy_learns_from_what_is_imagined_of_rows_on_disk(tmp_path) -> None:
+    folder = ran(tmp_path, "data.storage=disk", "trainer.steps=2")
+    assert len(scalars(folder)["imagined_reward"]) == 2
+
+
+def test_a_loss_has_the_trained_model_and_nothing_is_imagined(tmp_path) -> None:
+    folder = ran(tmp_path, "loss=scas", "dynamics.real_ratio=1", "trainer.steps=2")
+    assert "imagined_reward" not in scalars(folder)
+    model = load_dynamics(folder / FILE)
+    held = load_trained(folder).loss.dynamics_network_params
+    for key, value in TensorDict.from_module(model).items(True, True):
+        assert torch.equal(held[key], value), key
+    # No task needs a rule for its end, where nothing is imagined.
+    cfg = composed("loss=scas", "dynamics.real_ratio=1", "env=pointmaze-umaze")
+    check_parts(cfg, 11, 3)
+    with pytest.raises(ValueError, match="needs a model of the dynamics: take dyn"):
+        check_parts(composed("loss=scas", "dynamics=none"), 11, 3)
+
+
+def test_a_time_limit_alone_may_end_a_task() -> None:
+    check_parts(
+        composed("env=pointmaze-umaze", "data=diverse", "dynamics.terminations=never"),
+        11, 3,
+    )  # fmt: skip
+
+
+def test_roll_outs_are_as_published_for_a_data_set() -> None:
+    found = {
+        name: (cfg.dynamics.rollout_steps, cfg.dynamics.penalty)
+        for name, cfg in {
+            "replay": composed("data=medium-replay", "env=walker2d"),
+            "by id": composed("data=medium", "env.id=HalfCheetah-v5"),
+            "another": composed("env.id=my:Arm-v0.1"),
+            "given": composed("dynamics.penalty=3", "dynamics.rollout_steps=2"),
+        }.items()
+    }
+    assert found == {
+        "replay": (1, 2.5),
+        "by id": (5, 0.5),
+        "another": (5, 2.5),
+        "given": (2, 3.0),
+    }
+    assert not composed("dynamics=none").dynamics.use
+
+
+def test_defaults_are_said(caplog) -> None:
+    choices = {"loss": "mopo", "env": "hopper", "data": "random"}
+    train.note_defaults(composed(), choices)
+    assert not caplog.records
+    train.note_defaults(composed("env.id=Pendulum-v1"), choices)
+    assert "rollout_steps=5 and dynamics.penalty=2.5 are taken" in caplog.text

@@ -1,0 +1,20 @@
+"""Transitions that a dynamics model imagines: roll-outs, their ends, their batches.
+
+* :func:`imagine` rolls a policy out in a
+  :class:`~torchrl_osr.modules.DynamicsEnsemble`.
+* :func:`termination` has the rule by which a task ends.
+* :class:`ImaginedReplayBuffer` mixes real rows with imagined ones.
+"""
+
+from torchrl_osr.imagination.replay_buffer import ImaginedReplayBuffer
+from torchrl_osr.imagination.rollout import Imagined, imagine
+from torchrl_osr.imagination.termination import Termination, never, termination
+
+__all__ = [
+    "Imagined",
+    "ImaginedReplayBuffer",
+    "Termination",
+    "imagine",
+    "never",
+    "termination",
+]

@@ -1,0 +1,128 @@
+"""Roll-outs of a policy in a dynamics model.
+
+Shapes: ``B`` starts, ``S`` observation, ``A`` action, ``E`` networks, ``D = S + 1``
+predicted entries, ``n`` imagined rows, at most ``B`` times the steps.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from torchrl_osr._checks import check_positive
+from torchrl_osr.functional import largest_deviation
+from torchrl_osr.imagination.termination import Termination, never
+from torchrl_osr.modules.dynamics import DynamicsEnsemble
+
+
+class Imagined(NamedTuple):
+    """What roll-outs have given.
+
+    Attributes:
+        rows: transitions ``[n]`` with the entries of a data set, and ``"step"`` of the
+            roll-out, ``"disagreement"`` and ``"uncertainty"``, ``[n, 1]``.
+        refused: number of rows that were not taken and ended their roll-outs.
+    """
+
+    rows: TensorDict
+    refused: int
+
+
+@torch.no_grad()
+def imagine(
+    model: DynamicsEnsemble,
+    policy: Callable[[Tensor], Tensor],
+    starts: Tensor,
+    *,
+    steps: int,
+    terminated: Termination = never,
+    max_disagreement: float = math.inf,
+    units: Tensor | None = None,
+) -> Imagined:
+    r"""Transitions of a policy in a model, from given states on.
+
+    At each step and for each row, one of the elites is drawn, and the next state and
+    reward from its Gaussian, with torch's global generator. A roll-out ends where
+    ``terminated`` says so; the row that leads there is kept.
+
+    Args:
+        model: of the dynamics.
+        policy: maps states ``[B, S]`` to actions ``[B, A]``.
+        starts: first states ``[B, S]``, in the units of the model's data.
+
+    Keyword Args:
+        steps: number of steps, at most.
+        terminated: of next states in the units of the model's data, see
+            :func:`~torchrl_osr.imagination.termination` for rules in the task's own.
+            Default: never.
+        max_disagreement: rows whose
+            :meth:`~torchrl_osr.modules.DynamicsEnsemble.disagreement` is above that are
+            refused: nobody knows what follows. Rows that are not finite are refused,
+            too. Default: infinity.
+        units: factors ``[D]`` that bring predictions to the units in which
+            ``"uncertainty"`` is measured. Default: 1, those of the model's data.
+
+    Returns:
+        The rows; ``"uncertainty"`` is
+        :func:`~torchrl_osr.functional.largest_deviation` of all networks, MOPO's
+        penalty.
+
+    Raises:
+        ValueError: ``steps`` is not at least 1, or there is no start.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_osr.imagination import imagine, termination
+        >>> from torchrl_osr.modules import DynamicsEnsemble
+        >>> model = DynamicsEnsemble(11, 3, num_networks=2, num_elites=2)
+        >>> starts = torch.zeros(4, 11)
+        >>> starts[:, 0] = 1.25
+        >>> rows, refused = imagine(
+        ...     model, lambda state: torch.rand(len(state), 3), starts, steps=5,
+        ...     terminated=termination("Hopper-v5"))
+        >>> rows["next", "observation"].shape[-1], refused
+        (11, 0)
+    """
+    check_positive("steps", steps, minimum=1)
+    if not len(starts):
+        raise ValueError("There is no state to start from.")
+    state, refused, taken = starts, 0, []
+    for step in range(steps):
+        action = policy(state)
+        mean, scale = model.predict(state, action)
+        apart = model.disagreement(mean)
+        uncertainty = largest_deviation(scale if units is None else scale * units)
+        drawn = torch.randint(len(model.elites), (len(state),), device=state.device)
+        chosen = model.elites[drawn], torch.arange(len(state), device=state.device)
+        sample = mean[chosen] + scale[chosen] * torch.randn_like(mean[chosen])
+        following, reward = state + sample[:, :-1], sample[:, -1:]
+        ended = terminated(following).unsqueeze(-1)
+        row = TensorDict(
+            {
+                "observation": state,
+                "action": action,
+                "next": {
+                    "observation": following,
+                    "reward": reward,
+                    "done": ended,
+                    "terminated": ended,
+                    "truncated": torch.zeros_like(ended),
+                },
+                "step": torch.full_like(ended, step, dtype=torch.long),
+                "disagreement": apart.unsqueeze(-1),
+                "uncertainty": uncertainty.unsqueeze(-1),
+            },
+            [len(state)],
+        )
+        known = (apart <= max_disagreement) & sample.isfinite().all(-1)
+        refused += int((~known).sum())
+        taken.append(row[known])
+        state = following[known & ~ended.squeeze(-1)]
+        if not len(state):
+            break
+    return Imagined(torch.cat(taken), refused)
