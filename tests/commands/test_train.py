@@ -227,8 +227,8 @@ def test_help_offers_the_groups_of_this_script_and_fits_a_screen(tmp_path, run):
     offered = output.split("Groups, ")[1].split("Any key ")[0]
     names = set(re.findall(r"[\w-]+(?=[,\n])", offered))
     groups = (
-        *("env", "data", "inverse_dynamics", "loss", "perturbation"),
-        *("logger", "preset"),
+        *("env", "data", "inverse_dynamics", "dynamics", "loss", "recovery"),
+        *("perturbation", "logger", "preset"),
     )
     files = {path.stem for group in groups for path in conf.glob(f"{group}/*.yaml")}
     assert names - {"basic"} == files | {"pool", "cluster"}
