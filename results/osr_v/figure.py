@@ -28,7 +28,7 @@ from torchrl_osr.report import read_records
 HERE = Path(__file__).parent
 COLORS = {"osr": GREEN, "cql": GREY, "osr_v": ORANGE}
 LABELS = {"osr": "OSR", "cql": "CQL(H)", "osr_v": "OSR-v as printed"}
-TRIED = (BLUE, "black", "#A0457E")
+TRIED = (BLUE, "black", "#A0457E", "#E69F00", "#56B4E9")
 DATA = ("hopper-medium-expert", "walker2d-medium-expert")
 
 
@@ -84,7 +84,7 @@ def main() -> None:
                 label = LABELS[method] if number == 0 else None
                 axes.plot(*points, color=color, alpha=0.5, label=label)
         here = [(name, points) for quality, name, points in tried() if quality == data]
-        for (name, points), color in zip(here, TRIED, strict=False):
+        for (name, points), color in zip(here, TRIED[: len(here)], strict=True):
             print(f"  {data:22} {name}:", *(f"{score:.1f}" for score in points[1]))
             axes.plot(*points, "o-", color=color, label=name)
         axes.set(title=data, xlabel="updates", ylabel="normalised score")
