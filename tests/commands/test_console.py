@@ -58,7 +58,7 @@ def composition_error(*overrides: str) -> Exception:
     [
         ("sed=1", "there is no key 'sed'; --cfg job prints all that are."),
         ("loss.sed=1", "there is no key 'loss.sed'; --cfg job prints all that are."),
-        ("loss=sql", r"loss has no option 'sql'; it has cql, .*osr, .*td3_bc\."),
+        ("loss=sql", r"loss has no option 'sql'; it has .*cql, .*osr, .*td3_bc\."),
         ("seed=a", "Error merging override seed=a: Value 'a' .* to Integer"),
         ("outputs/run", r"cannot read 'outputs/run' as key=value: missing EQUAL .*\."),
     ],

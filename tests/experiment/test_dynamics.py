@@ -309,7 +309,7 @@ def test_roll_outs_are_as_published_for_a_data_set() -> None:
 
 def test_defaults_are_said(caplog) -> None:
     choices = {"loss": "mopo", "env": "hopper", "data": "random"}
-    train.note_defaults(composed(), choices)
+    train.check_published(composed(), choices)
     assert not caplog.records
-    train.note_defaults(composed("env.id=Pendulum-v1"), choices)
+    train.check_published(composed("env.id=Pendulum-v1"), choices)
     assert "rollout_steps=5 and dynamics.penalty=2.5 are taken" in caplog.text
