@@ -119,6 +119,7 @@ def run_missing(options: argparse.Namespace) -> None:
             subprocess.run(command, check=True, env=environment, stdout=sys.stderr)
             run = {"method": method, "env": env, "seed": seed, "overrides": overrides}
             run |= {"load": os.getloadavg()[0], "evaluations": json.load(answer)}
+        RESULTS.mkdir(exist_ok=True)
         with (RESULTS / "runs.jsonl").open("a") as file:
             file.write(json.dumps(run) + "\n")
         print(method, env, seed, f"{last_five(run):.1f}", flush=True)
