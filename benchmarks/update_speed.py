@@ -183,16 +183,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for name in ("precisions", "rounds", "seconds", "threads", "device")
     }
     given = sys.argv[1:] if arguments is None else arguments
-    results = {
+    results: dict[str, Any] = {
         "command": shlex.join(["python", "benchmarks/update_speed.py", *given]),
         "machine": machine() | settings,
-        "sizes": {name: measure(name, **settings) for name in options.sizes.split(",")},
+        "sizes": {},
     }
+    options.output.mkdir(parents=True, exist_ok=True)
+
+    def write() -> None:
+        text = json.dumps(results, indent=1) + "\n"
+        (options.output / "speed.json").write_text(text)
+
+    for name in options.sizes.split(","):
+        results["sizes"][name] = measure(name, **settings)
+        write()  # at once: there are minutes of work in it
     # Last, for nothing may touch a GPU in the process that forks.
     if options.device == "cuda":
         results["machine"]["gpu"] = torch.cuda.get_device_name()
-    options.output.mkdir(parents=True, exist_ok=True)
-    (options.output / "speed.json").write_text(json.dumps(results, indent=1) + "\n")
+        write()
     draw(results, options.output / "speed.png")
     text = tables(results)
     write_tables(text, options.output / "README.md")
