@@ -170,8 +170,5 @@ def draw(results: Mapping[str, Any], path: Path) -> None:
     panels = figure.subplots(len(precisions), 1, squeeze=False)[:, 0]
     for axes, precision in zip(panels, precisions, strict=True):
         draw_precision(axes, results["sizes"], precision)
-    figure.supylabel(
-        "speed of an update; plain reference, measured in the same rounds, = 1",
-        fontsize=10,
-    )
+    figure.supylabel("times the plain reference's speed", fontsize=10)
     figure.savefig(path, dpi=130)
