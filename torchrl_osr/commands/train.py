@@ -33,7 +33,7 @@ from torchrl import torchrl_logger
 from torchrl.record.loggers import Logger
 from torchrl.trainers import LRSchedulerHook
 
-from torchrl_osr import SCASLoss, StatePerturbation
+from torchrl_osr import StatePerturbation
 from torchrl_osr._files import write_json
 from torchrl_osr.commands import CONF
 from torchrl_osr.commands.console import single_job
@@ -190,7 +190,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
     buffer, imagined = data.buffer, None
     if cfg.dynamics.use:
         model = dynamics_model(cfg, data, folder, new_trainer, adam)
-        if isinstance(loss, SCASLoss):
+        if hasattr(loss, "load_dynamics"):
             loss.load_dynamics(model)
     if cfg.dynamics.use and cfg.dynamics.real_ratio < 1:
         buffer = imagined = imagined_replay_buffer(
@@ -219,7 +219,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
     average = AveragedModel(actor, multi_avg_fn=averaging)
     has_targets = bool(critic_params) and loss.delay_qvalue
     targets = SoftUpdate(loss, tau=optim.tau) if has_targets else None
-    limit = largest_value(data.largest_reward, cfg.optim.gamma)
+    limit = largest_value(data.largest_reward, optim.gamma)
     episodes = {"num_episodes": cfg.trainer.eval_episodes, "seed": EVALUATION_SEED}
     policy = deterministic_policy(average.module, data.norm)
     last_weights = deterministic_policy(actor, data.norm)
@@ -242,7 +242,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
             folder=folder / "checkpoint" / "policy",
             seed=cfg.seed + 1,
             target_net_updater=targets,
-            policy_delay=cfg.optim.policy_delay,
+            policy_delay=optim.policy_delay,
             policy_params=policy_params,
             evaluate=evaluate,
             metric=(measure, "max"),

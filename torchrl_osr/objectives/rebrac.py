@@ -20,7 +20,7 @@ from torchrl_osr._entries import entry
 from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
 from torchrl_osr.objectives.distributions import check_action
 from torchrl_osr.objectives.step import Step, actor_critic_in_keys
-from torchrl_osr.objectives.td3_bc import check_smoothing, smoothed_action
+from torchrl_osr.objectives.td3_bc import check_smoothing, smoothed_action_and_value
 
 
 class ReBRACLoss(BaseLoss):
@@ -163,9 +163,7 @@ class ReBRACLoss(BaseLoss):
         params = self.qvalue_network_params.detach()
         qvalue = step.qvalue(step.states[0], action, params).min(0).values
         distance = functional.action_distance(action, step.data_action)
-        magnitude = step.mean(qvalue.abs())
-        # 0 over no row, or of critics that start at 0: there is nothing to divide.
-        magnitude = torch.where(magnitude == 0, torch.ones_like(magnitude), magnitude)
+        magnitude = step.magnitude(qvalue)
         objective = functional.rebrac_objective(
             qvalue, distance, magnitude, self.actor_bc_coef
         )
@@ -174,9 +172,7 @@ class ReBRACLoss(BaseLoss):
     @torch.no_grad()
     def _target_value(self, step: Step) -> Tensor:
         """The TD target, ``[B]``: smoothed, and less the penalty."""
-        state, action = step.states[1], smoothed_action(self, step)
-        qvalue = step.qvalue(state, action, self.target_qvalue_network_params)
-        next_value = functional.bootstrap_value(qvalue)
+        action, next_value = smoothed_action_and_value(self, step)
         if self.has_penalty:
             (key,) = self._next_keys("action")
             data_action = entry(step.tensordict, key)

@@ -21,7 +21,7 @@ from torchrl_osr.modules.dynamics import DynamicsEnsemble
 from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
 from torchrl_osr.objectives.distributions import check_action
 from torchrl_osr.objectives.step import Step, actor_critic_in_keys
-from torchrl_osr.objectives.td3_bc import check_smoothing, smoothed_action
+from torchrl_osr.objectives.td3_bc import check_smoothing, smoothed_action_and_value
 
 
 class SCASLoss(BaseLoss):
@@ -209,9 +209,7 @@ class SCASLoss(BaseLoss):
         params = self.qvalue_network_params.detach()
         qvalues = step.qvalue(clean, action, params)
         qvalue = qvalues.min(0).values
-        magnitude = step.mean(qvalue.abs())
-        # 0 over no row, or of critics that start at 0: there is nothing to divide.
-        magnitude = torch.where(magnitude == 0, torch.ones_like(magnitude), magnitude)
+        magnitude = step.magnitude(qvalue)
         weight = self._weight(step, qvalues.detach().mean(0))
         if self.correction_action == "perturbed":
             action = step.action(perturbed, self.actor_network_params)
@@ -252,6 +250,5 @@ class SCASLoss(BaseLoss):
     @torch.no_grad()
     def _target_value(self, step: Step) -> Tensor:
         """The TD target, ``[B]``: smoothed, with the critics' smallest value."""
-        state, action = step.states[1], smoothed_action(self, step)
-        qvalue = step.qvalue(state, action, self.target_qvalue_network_params)
-        return step.td_target(functional.bootstrap_value(qvalue))
+        _, next_value = smoothed_action_and_value(self, step)
+        return step.td_target(next_value)

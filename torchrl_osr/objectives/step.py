@@ -308,6 +308,14 @@ class Step:
         valid = ~self.done if transitions else None
         return self.loss._reduce(value, self.tensordict, valid)
 
+    def magnitude(self, value: Tensor) -> Tensor:
+        """The mean magnitude of values ``[B]``, detached; 1 where it is 0.
+
+        To divide by: of no row, or of critics that start at 0, it would be 0.
+        """
+        mean = self.mean(value.abs())
+        return torch.where(mean == 0, torch.ones_like(mean), mean)
+
     def mean(self, value: Tensor, *, transitions: bool = False) -> Tensor:
         """The mean of a metric ``[..., B]``, detached."""
         valid = ~self.done if transitions else None

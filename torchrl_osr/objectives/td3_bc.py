@@ -146,9 +146,7 @@ class TD3BCLoss(BaseLoss):
         params = self.qvalue_network_params.detach()
         qvalue = step.qvalue(step.states[0], action, params)[0]
         cloning_error = functional.cloning_error(action, step.data_action)
-        magnitude = step.mean(qvalue.abs())
-        # 0 over no row, or of critics that start at 0: there is nothing to divide.
-        magnitude = torch.where(magnitude == 0, torch.ones_like(magnitude), magnitude)
+        magnitude = step.magnitude(qvalue)
         objective = functional.td3_bc_objective(
             qvalue, cloning_error, magnitude, self.alpha
         )
@@ -157,9 +155,8 @@ class TD3BCLoss(BaseLoss):
     @torch.no_grad()
     def _target_value(self, step: Step) -> Tensor:
         """The TD target, ``[B]``, with target policy smoothing."""
-        state, action = step.states[1], smoothed_action(self, step)
-        qvalue = step.qvalue(state, action, self.target_qvalue_network_params)
-        return step.td_target(functional.bootstrap_value(qvalue))
+        _, next_value = smoothed_action_and_value(self, step)
+        return step.td_target(next_value)
 
     def qvalue_loss(
         self, step: Step, pred_value: Tensor, target_value: Tensor
@@ -172,23 +169,29 @@ class TD3BCLoss(BaseLoss):
 def check_smoothing(
     policy_noise: float, noise_clip: float, low: float, high: float
 ) -> None:
-    """Raise a ValueError if :func:`smoothed_action` cannot have these options."""
+    """Raise a ValueError unless target policy smoothing can have these options."""
     check_weight("policy_noise", policy_noise)
     check_positive("noise_clip", noise_clip, minimum=0)
     if not low < high:
         raise ValueError(f"high must be above low={low}, got {high}.")
 
 
-def smoothed_action(loss: Any, step: Step) -> Tensor:
-    r"""TD3's target policy smoothing: :math:`\bar\pi(s') + \epsilon`, ``[B, A]``.
+def smoothed_action_and_value(loss: Any, step: Step) -> tuple[Tensor, Tensor]:
+    r"""TD3's target policy smoothing, and what the target critics say of it.
 
     Args:
-        loss: holds the target actor, ``policy_noise``, ``noise_clip``, ``low`` and
+        loss: holds the target networks, ``policy_noise``, ``noise_clip``, ``low`` and
             ``high``.
         step: of its batch.
+
+    Returns:
+        :math:`\bar\pi(s') + \epsilon`, ``[B, A]``, and the smallest of its values,
+        ``[B]``.
     """
-    action = step.action(step.states[1], loss.target_actor_network_params)
+    state = step.states[1]
+    action = step.action(state, loss.target_actor_network_params)
     noise = loss.policy_noise * torch.randn_like(action)
     noise = noise.clamp(-loss.noise_clip, loss.noise_clip)
-    smoothed: Tensor = (action + noise).clamp(loss.low, loss.high)
-    return smoothed
+    action = (action + noise).clamp(loss.low, loss.high)
+    qvalue = step.qvalue(state, action, loss.target_qvalue_network_params)
+    return action, functional.bootstrap_value(qvalue)
