@@ -261,8 +261,6 @@ PROPERTIES: dict[str, Callable[[Member], bool]] = {
     "perturbed": lambda member: PERTURBED in member.in_keys,
     "priority weight": lambda member: "priority_weight" in member.keys,
     "weights": lambda member: member.weights != {},
-    # Others are made of the same pieces, and take long to compile.
-    "pieces of its own": lambda member: member.loss_class not in (ReBRACLoss, RORLLoss),
 }
 
 
