@@ -31,7 +31,8 @@ class LookAheadPolicy:
     it is the tail of every plan. The score is the number of steps survived, and the
     value of the last state in the same unit. The cross-entropy method searches the
     offsets. The policy itself (no offsets) is the first candidate, and is kept unless
-    another one scores more.
+    another one scores more. Without a value, nothing is searched where the policy
+    survives until the horizon in every elite: nothing scores more.
 
     Such H-step look-ahead is known from "Model-Based Offline Planning" (MBOP,
     https://arxiv.org/abs/2008.05556) and "Learning Off-Policy with Online Planning"
@@ -149,8 +150,18 @@ class LookAheadPolicy:
     @torch.no_grad()
     def plan(self, observation: Tensor) -> Tensor:
         """The best offsets ``[B, K, A]`` that were found for each of ``[B, S]``."""
+        nothing = self.noise.new_zeros(len(observation), *self.noise.shape[2:])
+        if self.value is not None:
+            return self._search(observation, nothing)
+        alone = self.scores(observation, nothing.unsqueeze(1)).squeeze(1)
+        falls = alone < self.planning_horizon
+        if falls.any():
+            nothing[falls] = self._search(observation[falls], nothing[falls])
+        return nothing
+
+    def _search(self, observation: Tensor, mean: Tensor) -> Tensor:
+        """Cross-entropy method around offsets ``[B, K, A]``."""
         rows = torch.arange(len(observation), device=observation.device)
-        mean = self.noise.new_zeros(len(rows), *self.noise.shape[2:])
         std = torch.full_like(mean, self.std)
         best, highest = mean, mean.new_full(rows.shape, -torch.inf)
         for noise in self.noise:
@@ -192,7 +203,7 @@ class LookAheadPolicy:
     def _of_all(self, function: Callable[[Tensor], Tensor], state: Tensor) -> Tensor:
         """A function of rows, of the states ``[E, n, S]`` of all networks."""
         value = function(state.flatten(0, 1))
-        return value.view(*state.shape[:2], *value.shape[1:])
+        return value.reshape(*state.shape[:2], *value.shape[1:])
 
     def _following(self, state: Tensor, action: Tensor) -> Tensor:
         """Each network's mean prediction for its own states, ``[E, n, S]``."""
