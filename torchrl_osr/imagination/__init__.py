@@ -3,9 +3,11 @@
 * :func:`imagine` rolls a policy out in a
   :class:`~torchrl_osr.modules.DynamicsEnsemble`.
 * :func:`termination` has the rule by which a task ends.
+* :class:`LookAheadPolicy` plans in one, where it is far from its data.
 * :class:`ImaginedReplayBuffer` mixes real rows with imagined ones.
 """
 
+from torchrl_osr.imagination.look_ahead import LookAheadPolicy
 from torchrl_osr.imagination.replay_buffer import ImaginedReplayBuffer
 from torchrl_osr.imagination.rollout import Imagined, imagine
 from torchrl_osr.imagination.termination import Termination, never, termination
@@ -13,6 +15,7 @@ from torchrl_osr.imagination.termination import Termination, never, termination
 __all__ = [
     "Imagined",
     "ImaginedReplayBuffer",
+    "LookAheadPolicy",
     "Termination",
     "imagine",
     "never",
