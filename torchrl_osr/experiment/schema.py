@@ -21,6 +21,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import MISSING, OmegaConf
 
 from torchrl_osr import objectives
+from torchrl_osr.experiment.published import register_published
 
 # File systems allow 255 bytes, and temporary names beside it need some of them.
 MAX_FOLDER_NAME = 200
@@ -465,7 +466,7 @@ def register() -> None:
     """Make schemas and resolvers known to Hydra.
 
     ``train_schema``, ``check_data_schema``, ``collect_schema``, and in the group
-    ``schema`` one for each class of :mod:`torchrl_osr.objectives`;
+    ``schema`` one for each class of :mod:`torchrl_osr.objectives`; published settings;
     ``environment_name``, the short name of a task; ``run_dir``, by which
     ``resume=folder`` becomes the run's folder; ``method_name``, see
     :func:`method_name`; and ``job_dir``, see :func:`job_folder`.
@@ -477,6 +478,7 @@ def register() -> None:
     for name in set(objectives.__all__) - NOT_CHOSEN:
         schema = schema_of(getattr(objectives, name))
         store.store(group="schema", name=name, node=schema)
+    register_published()
     resolvers: dict[str, Callable[..., Any]] = {
         "environment_name": _environment_name,
         "run_dir": lambda resume, fresh: resume or fresh,
