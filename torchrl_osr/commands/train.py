@@ -198,7 +198,7 @@ def report(
         data_mean=data_mean,
     )
     rows = {"last": history[-1], "best": best}
-    log_outcome(loggers, cfg, rows, {"curve": folder / "curve.png"})
+    log_outcome(loggers, rows, {"curve": folder / "curve.png"})
     print("\n" + score_table(name, history, best, data_mean, folder))
     return float(history[-1][measure])
 
