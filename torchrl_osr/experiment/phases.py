@@ -68,7 +68,6 @@ def trainer_maker(
         checkpoint_interval=cfg.trainer.checkpoint_interval,
         checkpoints_kept=cfg.trainer.checkpoints_kept,
         progress=cfg.trainer.progress,
-        nonfinite=cfg.trainer.nonfinite,
         autocast_dtype=autocast,
         record=cfg.trainer.record,
         compile=cfg.trainer.compile,

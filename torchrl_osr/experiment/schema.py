@@ -272,7 +272,6 @@ class TrainerConfig:
         eval_episodes: complete episodes in an evaluation.
         checkpoint_interval: steps between checkpoints.
         checkpoints_kept: number of newest checkpoints that stay, beside the best.
-        nonfinite: at a loss or gradient that is not finite, stop or skip the update.
         num_threads: torch threads; 1 where several runs share the machine.
         device: cpu or cuda.
         precision: of the losses' matrix products: float32 or bfloat16.
@@ -292,7 +291,6 @@ class TrainerConfig:
     eval_episodes: int = MISSING
     checkpoint_interval: int = MISSING
     checkpoints_kept: int = MISSING
-    nonfinite: str = MISSING
     num_threads: int = MISSING
     device: str = MISSING
     precision: str = MISSING
