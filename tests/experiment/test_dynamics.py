@@ -23,6 +23,7 @@ from torchrl_osr.experiment.dynamics import (
     imagined_replay_buffer,
     load_dynamics,
 )
+from torchrl_osr.experiment.published import check_published
 from torchrl_osr.experiment.trained_run import load_trained
 from torchrl_osr.experiment.training_data import load_training_data
 from torchrl_osr.policy.tensor_file import read_tensors, write_tensors
@@ -309,7 +310,7 @@ def test_roll_outs_are_as_published_for_a_data_set() -> None:
 
 def test_defaults_are_said(caplog) -> None:
     choices = {"loss": "mopo", "env": "hopper", "data": "random"}
-    train.check_published(composed(), choices)
+    check_published(composed(), choices)
     assert not caplog.records
-    train.check_published(composed("env.id=Pendulum-v1"), choices)
+    check_published(composed("env.id=Pendulum-v1"), choices)
     assert "rollout_steps=5 and dynamics.penalty=2.5 are taken" in caplog.text

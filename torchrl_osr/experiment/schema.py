@@ -21,6 +21,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import MISSING, OmegaConf
 
 from torchrl_osr import objectives
+from torchrl_osr.experiment.published import register_published
 
 # File systems allow 255 bytes, and temporary names beside it need some of them.
 MAX_FOLDER_NAME = 200
@@ -271,7 +272,6 @@ class TrainerConfig:
         eval_episodes: complete episodes in an evaluation.
         checkpoint_interval: steps between checkpoints.
         checkpoints_kept: number of newest checkpoints that stay, beside the best.
-        nonfinite: at a loss or gradient that is not finite, stop or skip the update.
         num_threads: torch threads; 1 where several runs share the machine.
         device: cpu or cuda.
         precision: of the losses' matrix products: float32 or bfloat16.
@@ -291,7 +291,6 @@ class TrainerConfig:
     eval_episodes: int = MISSING
     checkpoint_interval: int = MISSING
     checkpoints_kept: int = MISSING
-    nonfinite: str = MISSING
     num_threads: int = MISSING
     device: str = MISSING
     precision: str = MISSING
@@ -465,7 +464,7 @@ def register() -> None:
     """Make schemas and resolvers known to Hydra.
 
     ``train_schema``, ``check_data_schema``, ``collect_schema``, and in the group
-    ``schema`` one for each class of :mod:`torchrl_osr.objectives`;
+    ``schema`` one for each class of :mod:`torchrl_osr.objectives`; published settings;
     ``environment_name``, the short name of a task; ``run_dir``, by which
     ``resume=folder`` becomes the run's folder; ``method_name``, see
     :func:`method_name`; and ``job_dir``, see :func:`job_folder`.
@@ -477,6 +476,7 @@ def register() -> None:
     for name in set(objectives.__all__) - NOT_CHOSEN:
         schema = schema_of(getattr(objectives, name))
         store.store(group="schema", name=name, node=schema)
+    register_published()
     resolvers: dict[str, Callable[..., Any]] = {
         "environment_name": _environment_name,
         "run_dir": lambda resume, fresh: resume or fresh,
