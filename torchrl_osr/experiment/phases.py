@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from copy import deepcopy
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -36,6 +35,7 @@ from torchrl_osr.imagination import ImaginedReplayBuffer
 from torchrl_osr.trainers import (
     OfflineTrainer,
     SoftUpdate,
+    WeightAverage,
     largest_value,
     learning_rates,
 )
@@ -135,11 +135,12 @@ def train_policy(
     targets = None
     if critics and loss.delay_qvalue:  # cloning has no critics
         targets = SoftUpdate(loss, tau=cfg.optim.tau)
-    average, follow = _average_of(actor, cfg.optim.policy_average)
+    # What is played, now and by all other commands.
+    average = WeightAverage(actor, cfg.optim.policy_average)
     limit = largest_value(data.largest_reward, cfg.optim.gamma)
     components = new_trainer.keywords["components"] | {
         "schedule": schedule,
-        "policy_average": average,
+        "policy_average": average.network,
     }
     if imagined is not None:
         components["imagined"] = imagined
@@ -155,7 +156,9 @@ def train_policy(
             target_net_updater=targets,
             policy_delay=cfg.optim.policy_delay,
             policy_params=policy,
-            evaluate=partial(_evaluation, cfg, episodes, average, actor, data.norm),
+            evaluate=partial(
+                _evaluation, cfg, episodes, average.network, actor, data.norm
+            ),
             metric=("return" if references_of(cfg) is None else "score", "max"),
             eval_interval=cfg.trainer.eval_interval,
             description="policy",
@@ -165,7 +168,7 @@ def train_policy(
         if imagined is not None:
             trainer.register_op("post_steps", partial(_log_imagined, trainer, imagined))
         LRSchedulerHook(schedule, interval="optim").register(trainer)
-        trainer.register_op("post_optim", follow)
+        trainer.register_op("post_optim", lambda: average.update(trainer.step))
         if hasattr(loss, "decay_uncertainty"):
             trainer.register_op("post_optim", loss.decay_uncertainty)
         if cfg.perturbation.adversary is not None:
@@ -203,20 +206,6 @@ def _optimizer_of(
     optimizer = adam_of(cfg)(groups)
     kinds = [kind for *_, kind in trained]
     return optimizer, learning_rates(optimizer, kinds, cfg.trainer.steps)
-
-
-def _average_of(
-    actor: ProbabilisticTensorDictSequential, share: float
-) -> tuple[ProbabilisticTensorDictSequential, Callable[[], object]]:
-    """The average of an actor's weights, and what moves it by a share towards them.
-
-    It is what is played, now and by all other commands. The arithmetic is that of
-    torch.optim.swa_utils.AveragedModel, without its search for the parameters at every
-    update.
-    """
-    average = deepcopy(actor)
-    weights = list(average.parameters()), list(actor.parameters())
-    return average, torch.no_grad()(partial(torch._foreach_lerp_, *weights, share))
 
 
 def _episodes_of(cfg: DictConfig) -> EpisodeEvaluator:

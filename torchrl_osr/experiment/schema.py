@@ -244,8 +244,9 @@ class OptimConfig:
             over trainer.steps.
         qvalue_schedule: the same of qvalue_lr.
         policy_average: how much of their exponential average the policy's weights
-            replace at each update. The average is what is evaluated, filmed and
-            exported; with 1 it is the weights themselves.
+            replace at each update, more in the first ones, so that it is never of more
+            than about the last tenth of a run. The average is what is evaluated, filmed
+            and exported; with 1 it is the weights themselves.
     """
 
     actor_lr: float = MISSING
