@@ -19,21 +19,18 @@ from tensordict import TensorDict
 from torchrl.data import ReplayBuffer
 from tqdm.auto import tqdm
 
+from torchrl_osr._extras import needed_by
 from torchrl_osr._files import read_json
 from torchrl_osr.data.read.arrays import episode_parts
 from torchrl_osr.data.read.column_checks import ActionBounds
 from torchrl_osr.data.read.recording import Columns, Recording
 from torchrl_osr.data.store.replay_buffer import make_replay_buffer
 
-try:
+with needed_by("Minari data sets need", "minari"):
     import minari
     from minari.storage import get_dataset_path, hosting
 
     from torchrl_osr.data.read.hdf5 import check_hdf5
-except ImportError as error:
-    raise ImportError(
-        f"Minari data sets need {error.name!r}: pip install torchrl-osr[minari]"
-    ) from error
 
 # What a damaged set makes Minari's storages raise.
 DAMAGE = (
