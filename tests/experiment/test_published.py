@@ -2,25 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
-from hydra import compose, initialize_config_dir
+from composed import composed
 
 from torchrl_osr import ReBRACLoss, RORLLoss
-from torchrl_osr.experiment import schema
 from torchrl_osr.experiment.published import published_settings
 
-CONF = Path(__file__).parents[2] / "conf"
 LOSSES = {"rebrac": ReBRACLoss, "rorl": RORLLoss}
 ENVS = {"hopper", "walker2d", "halfcheetah"}
 DATA = {"random", "medium", "medium-replay", "medium-expert", "expert"}
-
-
-def loss_of(*overrides: str):
-    schema.register()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("train", overrides=list(overrides)).loss
 
 
 def test_there_is_one_for_each_method_robot_and_quality() -> None:
@@ -65,5 +55,5 @@ def test_they_are_options_of_the_loss_within_their_ranges(loss, make_networks) -
     ],
 )
 def test_they_are_taken_by_robot_and_data(overrides, wanted) -> None:
-    loss = loss_of(*overrides)
+    loss = composed("train", *overrides).loss
     assert {key: loss[key] for key in wanted} == wanted
