@@ -106,6 +106,8 @@ ENSEMBLE = {"min_q_weight": 0.0, "deterministic_backup": False}
         ("TD3+BC", "td3bc", 2, {}, 6),
         ("ReBRAC", "rebrac", 2, {}, 6),
         ("RORL", "rorl", 10, {"num_samples": 20}, 430),
+        ("SCAS", "scas", 4, {}, 16),
+        ("SDC", "sdc", 2, {"num_random": 10}, 66),
         ("Discrete OSR", "discrete", 2, {}, 8),
         ("Discrete CQL(H)", "discrete-cql", 2, {}, 6),
     ],

@@ -53,9 +53,11 @@ from torchrl_osr.experiment import run_folder, schema
 from torchrl_osr.experiment.build import (
     check_parts,
     make_learner,
+    make_transition_vae,
     read_environment,
     references_of,
 )
+from torchrl_osr.experiment.conditional_vae import train_vae
 from torchrl_osr.experiment.dynamics import dynamics_model, imagined_replay_buffer
 from torchrl_osr.experiment.loggers import log_outcome, make_loggers
 from torchrl_osr.experiment.run_config import check_run, module_of, read_yaml
@@ -190,8 +192,12 @@ def run(cfg: DictConfig, folder: Path) -> float:
     buffer, imagined = data.buffer, None
     if cfg.dynamics.use:
         model = dynamics_model(cfg, data, folder, new_trainer, adam)
-        if hasattr(loss, "load_dynamics"):
-            loss.load_dynamics(model)
+        if hasattr(loss, "dynamics_network"):
+            loss.load_network("dynamics_network", model)
+        if hasattr(loss, "transition_network"):
+            vae = make_transition_vae(cfg, sizes[0])
+            train_vae(vae, cfg, data, folder, new_trainer, adam)
+            loss.load_network("transition_network", vae)
     if cfg.dynamics.use and cfg.dynamics.real_ratio < 1:
         buffer = imagined = imagined_replay_buffer(
             cfg, data, model, actor, perturbation

@@ -18,7 +18,7 @@ from torchrl_osr.data import ReferenceReturns, reference_returns
 from torchrl_osr.experiment.limits import check_networks
 from torchrl_osr.imagination import Termination, never, termination
 from torchrl_osr.imagination.replay_buffer import check_real_ratio
-from torchrl_osr.modules import DynamicsEnsemble, state_value
+from torchrl_osr.modules import ConditionalVAE, DynamicsEnsemble, state_value
 from torchrl_osr.objectives import BaseLoss
 from torchrl_osr.objectives.distributions import head_of, is_categorical
 from torchrl_osr.objectives.with_recovery import WithRecovery
@@ -133,6 +133,18 @@ def termination_of(cfg: DictConfig) -> Termination:
     return never if cfg.dynamics.terminations == "never" else termination(cfg.env.id)
 
 
+def make_transition_vae(cfg: DictConfig, observation_size: int) -> ConditionalVAE:
+    """An untrained model of the states that follow a state in the data."""
+    return ConditionalVAE(
+        observation_size,
+        observation_size,
+        condition_key="observation",
+        target_key=("next", "observation"),
+        change=True,
+        num_cells=list(cfg.dynamics.vae_num_cells),
+    )
+
+
 class Learner(NamedTuple):
     """A policy's loss and the networks in it.
 
@@ -160,7 +172,7 @@ def make_learner(
 
     A loss is given those networks that its constructor names: ``actor_network``,
     ``qvalue_network``, ``value_network``, ``inverse_dynamics_network``,
-    ``dynamics_network``.
+    ``dynamics_network``, ``transition_network``.
 
     Args:
         cfg: a whole configuration of ``torchrl-osr train``.
@@ -193,6 +205,9 @@ def make_learner(
         wanted = inspect.signature(get_class(part._target_)).parameters
         if "dynamics_network" in wanted:
             networks["dynamics_network"] = make_dynamics(cfg, *sizes).to(device)
+        if "transition_network" in wanted:
+            vae = make_transition_vae(cfg, observation_size)
+            networks["transition_network"] = vae.to(device)
         if "value_network" in wanted:
             networks["value_network"] = state_value(
                 observation_size, num_cells=cells, layer_norm=cfg.network.layer_norm

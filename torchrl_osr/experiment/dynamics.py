@@ -32,7 +32,7 @@ from torchrl_osr.data.store.cache import cache_root
 from torchrl_osr.data.store.validation import DATASET_KEYS
 from torchrl_osr.evaluation import describe_dynamics, dynamics_report
 from torchrl_osr.experiment.build import make_dynamics, termination_of
-from torchrl_osr.experiment.training_data import TrainingData
+from torchrl_osr.experiment.training_data import ROWS_FOR_STATISTICS, TrainingData
 from torchrl_osr.imagination import (
     Imagined,
     ImaginedReplayBuffer,
@@ -53,9 +53,6 @@ KIND = "dynamics model"
 
 FITTED = ("num_networks", "num_elites", "num_cells", "lr", "batch_size", "steps")
 """Settings of ``dynamics`` that decide what a trained model is."""
-
-ROWS_FOR_STATISTICS = 50_000
-"""Rows from which inputs and targets are standardised."""
 
 
 def dynamics_model(

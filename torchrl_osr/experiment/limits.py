@@ -41,6 +41,8 @@ RANGES: dict[str, tuple[float, float]] = {
     "dynamics.lr": (0, LARGEST),
     "dynamics.batch_size": _COUNT,
     "dynamics.steps": _COUNT,
+    "dynamics.vae_num_cells": _WIDTH,
+    "dynamics.vae_steps": _COUNT,
     "dynamics.rollout_steps": (1, 10_000),
     "dynamics.rollout_starts": _COUNT,
     "dynamics.rollout_interval": _COUNT,

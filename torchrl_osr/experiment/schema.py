@@ -25,7 +25,7 @@ from torchrl_osr import objectives
 # File systems allow 255 bytes, and temporary names beside it need some of them.
 MAX_FOLDER_NAME = 200
 
-NOT_CHOSEN = {"BaseLoss", "DynamicsLoss"}
+NOT_CHOSEN = {"BaseLoss", "ConditionalVAELoss", "DynamicsLoss"}
 """Classes of :mod:`torchrl_osr.objectives` that no configuration names."""
 
 
@@ -191,6 +191,9 @@ class DynamicsConfig:
         batch_size: rows of a gradient step, for each network.
         steps: gradient steps of the model; the weights of its best evaluation are
             taken.
+        vae_num_cells: width of each hidden layer of the conditional autoencoder of
+            loss=sdc or dynamics=reverse.
+        vae_steps: gradient steps of that autoencoder, with lr and batch_size.
         path: a trained model to take, dynamics.safetensors of a run with the same data;
             null for one of the same settings in the cache, or a new one.
         terminations: auto for the rule by which the task ends, never for tasks that a
@@ -215,6 +218,8 @@ class DynamicsConfig:
     lr: float = MISSING
     batch_size: int = MISSING
     steps: int = MISSING
+    vae_num_cells: list[int] = MISSING
+    vae_steps: int = MISSING
     path: str | None = None
     terminations: str = MISSING
     rollout_steps: int = MISSING

@@ -32,6 +32,9 @@ from torchrl_osr.experiment.build import check_storage, load_data, references_of
 MAX_HELD_OUT = 50_000
 """Held-out rows of a set on disk that are read into memory, at most."""
 
+ROWS_FOR_STATISTICS = 50_000
+"""Rows from which a model's inputs and targets are standardised."""
+
 NUM_PIECES, PIECE = 500, 20
 """Pieces of trajectories to judge a dynamics model by, at most, and their rows."""
 

@@ -12,7 +12,11 @@ Symbols: ``pi`` policy, ``I`` inverse dynamics model, ``s`` clean state, ``s^``
 perturbed state, ``s~`` a state of the mixed data set (clean and perturbed).
 """
 
-from torchrl_osr.functional.correction import correction_error, value_gain_weight
+from torchrl_osr.functional.correction import (
+    correction_error,
+    maximum_mean_discrepancy,
+    value_gain_weight,
+)
 from torchrl_osr.functional.critics import (
     conservative_gap,
     gradient_diversity,
@@ -63,6 +67,7 @@ __all__ = [
     "jeffreys_divergence",
     "lagrange_terms",
     "largest_deviation",
+    "maximum_mean_discrepancy",
     "rebrac_objective",
     "soft_maximum",
     "soft_policy_value",

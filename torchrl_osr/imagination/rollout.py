@@ -94,12 +94,10 @@ def imagine(
     state, refused, taken = starts, 0, []
     for step in range(steps):
         action = policy(state)
-        mean, scale = model.predict(state, action)
+        mean, scale = prediction = model.predict(state, action)
         apart = model.disagreement(mean)
         uncertainty = largest_deviation(scale if units is None else scale * units)
-        drawn = torch.randint(len(model.elites), (len(state),), device=state.device)
-        chosen = model.elites[drawn], torch.arange(len(state), device=state.device)
-        sample = mean[chosen] + scale[chosen] * torch.randn_like(mean[chosen])
+        sample = model.sample(prediction)
         following, reward = state + sample[:, :-1], sample[:, -1:]
         ended = terminated(following).unsqueeze(-1)
         row = TensorDict(
