@@ -220,6 +220,8 @@ LOSSES = {
     "sac_10": ("OSRLoss", OSR_10 | CQL),
     "mopo": ("OSRLoss", CQL | {"min_q_weight": 0.0, "deterministic_backup": False}),
     "scas": ("SCASLoss", {"num_qvalue_nets": 4}),
+    "rambo": ("OSRLoss", CQL | {"min_q_weight": 0.0, "deterministic_backup": False}),
+    "romi": ("OSRLoss", CQL),
     "sdc": ("SDCLoss", {}),
     "edac_10": ("EDACLoss", {"num_qvalue_nets": 10}),
     "osr_v": ("OSRVLoss", {}),

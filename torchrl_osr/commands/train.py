@@ -53,16 +53,21 @@ from torchrl_osr.experiment import run_folder, schema
 from torchrl_osr.experiment.build import (
     check_parts,
     make_learner,
+    make_reverse_vae,
     make_transition_vae,
     read_environment,
     references_of,
 )
 from torchrl_osr.experiment.conditional_vae import train_vae
-from torchrl_osr.experiment.dynamics import dynamics_model, imagined_replay_buffer
+from torchrl_osr.experiment.dynamics import (
+    dynamics_model,
+    imagined_replay_buffer,
+    model_adversary,
+)
 from torchrl_osr.experiment.loggers import log_outcome, make_loggers
 from torchrl_osr.experiment.run_config import check_run, module_of, read_yaml
 from torchrl_osr.experiment.training_data import load_training_data
-from torchrl_osr.imagination import ImaginedReplayBuffer
+from torchrl_osr.imagination import ImaginedReplayBuffer, ModelAdversary
 from torchrl_osr.trainers import (
     OfflineTrainer,
     SoftUpdate,
@@ -188,10 +193,12 @@ def run(cfg: DictConfig, folder: Path) -> float:
         write_json(folder / "inverse_dynamics.json", trainer.history[-1])
         print(describe_inverse_dynamics(trainer.history[-1]))
 
-    # A model of the dynamics, and batches in part of what the policy does in it.
-    buffer, imagined = data.buffer, None
+    # A model of the dynamics, and batches in part of what is imagined in it.
+    buffer, imagined, adversary = data.buffer, None, None
     if cfg.dynamics.use:
-        model = dynamics_model(cfg, data, folder, new_trainer, adam)
+        reverse = cfg.dynamics.reverse_policy
+        of_model = data if reverse is None else data.reverse()
+        model = dynamics_model(cfg, of_model, folder, new_trainer, adam)
         if hasattr(loss, "dynamics_network"):
             loss.load_network("dynamics_network", model)
         if hasattr(loss, "transition_network"):
@@ -199,8 +206,16 @@ def run(cfg: DictConfig, folder: Path) -> float:
             train_vae(vae, cfg, data, folder, new_trainer, adam)
             loss.load_network("transition_network", vae)
     if cfg.dynamics.use and cfg.dynamics.real_ratio < 1:
+        imagining: torch.nn.Module = actor
+        if reverse == "cvae":
+            imagining = make_reverse_vae(cfg, *sizes)
+            train_vae(imagining, cfg, data, folder, new_trainer, adam)
+        if cfg.dynamics.adversarial_steps:
+            adversary = model_adversary(cfg, data, model, actor, loss, adam)
+            # Before the roll-outs, which are of a copy of it.
+            components |= {"adversary": adversary}
         buffer = imagined = imagined_replay_buffer(
-            cfg, data, model, actor, perturbation
+            cfg, data, model, imagining, perturbation, adversary
         )
         components |= {"imagined": imagined}
 
@@ -258,7 +273,8 @@ def run(cfg: DictConfig, folder: Path) -> float:
         )
         trainer.register_op("post_steps", still_ours)
         if imagined is not None:
-            trainer.register_op("post_steps", partial(log_imagined, trainer, imagined))
+            log_both = partial(log_imagined, trainer, imagined, adversary)
+            trainer.register_op("post_steps", log_both)
         LRSchedulerHook(schedule, interval="optim").register(trainer)
         trainer.register_op("post_optim", partial(average.update_parameters, actor))
         if hasattr(loss, "decay_uncertainty"):
@@ -290,11 +306,13 @@ def check_published(cfg: DictConfig, choices: Mapping[str, str]) -> None:
             f"env={cfg.env.name}."
         )
     known, name = cfg.dynamics.published, f"{cfg.env.name}-{cfg.data.quality}"
-    if known and name not in known:
+    if known and not {name, cfg.env.name} & set(known):
+        taken = [
+            f"dynamics.{key}={cfg.dynamics[key]}" for key in next(iter(known.values()))
+        ]
         log.warning(
             f"There are no published roll-outs of loss={loss} for {name}: "
-            f"dynamics.rollout_steps={cfg.dynamics.rollout_steps} and "
-            f"dynamics.penalty={cfg.dynamics.penalty} are taken."
+            f"{' and '.join(taken)} are taken."
         )
 
 
@@ -319,9 +337,14 @@ def about(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     }
 
 
-def log_imagined(trainer: OfflineTrainer, imagined: ImaginedReplayBuffer) -> None:
+def log_imagined(
+    trainer: OfflineTrainer,
+    imagined: ImaginedReplayBuffer,
+    adversary: ModelAdversary | None,
+) -> None:
     """Log what the rows are like that the policy learns from besides the data."""
-    for name, value in imagined.metrics().items():
+    of_model = {} if adversary is None else adversary.metrics
+    for name, value in (imagined.metrics() | of_model).items():
         for logger in trainer.loggers:
             logger.log_scalar(f"policy/{name}", value, step=trainer.step)
 

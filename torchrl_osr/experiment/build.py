@@ -145,6 +145,20 @@ def make_transition_vae(cfg: DictConfig, observation_size: int) -> ConditionalVA
     )
 
 
+def make_reverse_vae(
+    cfg: DictConfig, observation_size: int, action_size: int
+) -> ConditionalVAE:
+    """An untrained model of the actions that led to a state of the data."""
+    return ConditionalVAE(
+        observation_size,
+        action_size,
+        condition_key=("next", "observation"),
+        target_key="action",
+        latent_bound=0.5,
+        num_cells=list(cfg.dynamics.vae_num_cells),
+    )
+
+
 class Learner(NamedTuple):
     """A policy's loss and the networks in it.
 
@@ -259,6 +273,22 @@ def _check_recovery(cfg: DictConfig) -> None:
         )
 
 
+def _check_model_adversary(cfg: DictConfig, loss: LossModule) -> None:
+    """Raise a ValueError unless a model can be trained against a loss's policy."""
+    steps = f"dynamics.adversarial_steps={cfg.dynamics.adversarial_steps}"
+    if cfg.dynamics.reverse_policy or cfg.dynamics.real_ratio == 1:
+        raise ValueError(
+            f"{steps} trains the model that the policy is rolled out in, and here none "
+            "is: set it to 0, or take dynamics=ensemble and dynamics.real_ratio below "
+            "1."
+        )
+    if not (isinstance(loss, BaseLoss) and hasattr(loss, "qvalue_network")):
+        raise ValueError(
+            f"{steps} asks for the values of critics, and {type(loss).__name__} has "
+            "none: set it to 0."
+        )
+
+
 def check_parts(
     cfg: DictConfig, observation_size: int, action_size: int
 ) -> list[NestedKey]:
@@ -299,6 +329,14 @@ def check_parts(
             f"{cfg.loss._target_} needs a model of the dynamics: take "
             "dynamics=ensemble."
         )
+    if hasattr(learner.loss, "dynamics_network") and cfg.dynamics.reverse_policy:
+        raise ValueError(
+            f"{cfg.loss._target_} asks where actions lead, and a model with "
+            f"dynamics.reverse_policy={cfg.dynamics.reverse_policy} knows where states "
+            "came from: take dynamics=ensemble."
+        )
+    if cfg.dynamics.use and cfg.dynamics.adversarial_steps:
+        _check_model_adversary(cfg, learner.loss)
     if cfg.dynamics.use:
         make_dynamics(cfg, *sizes)
     if cfg.dynamics.use and cfg.dynamics.real_ratio < 1:

@@ -43,6 +43,9 @@ RANGES: dict[str, tuple[float, float]] = {
     "dynamics.steps": _COUNT,
     "dynamics.vae_num_cells": _WIDTH,
     "dynamics.vae_steps": _COUNT,
+    "dynamics.adversarial_steps": (0, LARGEST),
+    "dynamics.adversarial_weight": (0, LARGEST),
+    "dynamics.adversarial_lr": (0, LARGEST),
     "dynamics.rollout_steps": (1, 10_000),
     "dynamics.rollout_starts": _COUNT,
     "dynamics.rollout_interval": _COUNT,
@@ -86,6 +89,7 @@ _REDUCTIONS = (None, "mean", "sum")  # a trainer goes backward from one number
 CHOICES: dict[str, tuple[str | None, ...]] = {
     "data.storage": ("memory", "disk"),
     "dynamics.terminations": ("auto", "never"),
+    "dynamics.reverse_policy": (None, "cvae", "uniform"),
     "perturbation.noise": ("gaussian", "uniform"),
     "inverse_dynamics.loss.reduction": _REDUCTIONS,
     "loss.reduction": _REDUCTIONS,

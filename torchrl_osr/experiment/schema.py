@@ -198,6 +198,13 @@ class DynamicsConfig:
             null for one of the same settings in the cache, or a new one.
         terminations: auto for the rule by which the task ends, never for tasks that a
             time limit alone ends.
+        reverse_policy: cvae or uniform, by which actions a reverse model rolls out from
+            states of the data to where they came from: those of a conditional
+            autoencoder of the data, or any; null for the policy's, forwards.
+        adversarial_steps: gradient steps, before each further roll-out, by which the
+            model is trained on the data and against the policy; 0 for none.
+        adversarial_weight: of the policy's advantage in that training.
+        adversarial_lr: learning rate of that training.
         rollout_steps: steps of a roll-out.
         rollout_starts: states of the data that roll-outs start from, each time.
         rollout_interval: gradient steps of the policy between roll-outs.
@@ -208,7 +215,7 @@ class DynamicsConfig:
             imagined rewards lose.
         refuse: leave out rows on which the elites disagree more than on any held-out
             row.
-        published: rollout_steps and penalty by data set, where a method has them.
+        published: settings by data set or task, where a method has them.
     """
 
     use: bool = MISSING
@@ -222,6 +229,10 @@ class DynamicsConfig:
     vae_steps: int = MISSING
     path: str | None = None
     terminations: str = MISSING
+    reverse_policy: str | None = None
+    adversarial_steps: int = MISSING
+    adversarial_weight: float = MISSING
+    adversarial_lr: float = MISSING
     rollout_steps: int = MISSING
     rollout_starts: int = MISSING
     rollout_interval: int = MISSING

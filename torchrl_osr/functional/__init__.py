@@ -34,6 +34,7 @@ from torchrl_osr.functional.divergences import (
     state_recovery,
 )
 from torchrl_osr.functional.dynamics import (
+    adversarial_objective,
     bounded_log_variance,
     disagreement,
     gaussian_error,
@@ -52,6 +53,7 @@ from torchrl_osr.functional.policy import (
 
 __all__ = [
     "action_distance",
+    "adversarial_objective",
     "bootstrap_value",
     "bounded_log_variance",
     "categorical_kl",
