@@ -122,7 +122,7 @@ def test_completion_offers_commands_first(monkeypatch, capsys, line, offered):
 
 
 COMPLETE = """
-eval "$(torchrl-osr -sc install=bash)"
+eval "$INSTALLED"
 complete -p torchrl-osr
 COMP_LINE="torchrl-osr evaluate suite=to"
 COMP_WORDS=($COMP_LINE) COMP_CWORD=2 COMP_POINT=${#COMP_LINE} COMPREPLY=()
@@ -131,16 +131,19 @@ echo "${COMPREPLY[*]}"
 """
 
 
-def test_bash_completes_a_commands_groups(tmp_path):
+def test_bash_completes_a_commands_groups(tmp_path, run):
+    code, installed = run(tmp_path, "-sc", "install=bash")
+    assert code == 0, installed
     program = tmp_path / "torchrl-osr"
     program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m torchrl_osr "$@"\n')
     program.chmod(0o755)
     done = subprocess.run(
         ["bash", "-c", COMPLETE], cwd=tmp_path, capture_output=True, text=True,
-        timeout=240, env=os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}"},
-        check=False,
+        timeout=240, check=False,
+        env=os.environ
+        | {"PATH": f"{tmp_path}:{os.environ['PATH']}", "INSTALLED": installed},
     )  # fmt: skip
     assert done.stderr == ""
-    installed, completed = done.stdout.splitlines()
-    assert installed.endswith("-F hydra_bash_completion torchrl-osr")
+    defined, completed = done.stdout.splitlines()
+    assert defined.endswith("-F hydra_bash_completion torchrl-osr")
     assert completed == "suite=torque"

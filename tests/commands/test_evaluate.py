@@ -40,10 +40,10 @@ def folder(tmp_path_factory, run, tiny) -> Path:
 
 
 @pytest.fixture(scope="module")
-def evaluated(folder, run_fresh) -> str:
+def evaluated(folder, run) -> str:
     """Run as a user would; the other tests take it from there."""
     options = ["checkpoint=run", "episodes=2", "last=2", "progress=false"]
-    code, output = run_fresh(folder.parent, "evaluate", *options)
+    code, output = run(folder.parent, "evaluate", *options)
     assert code == 0, output
     return output
 

@@ -302,10 +302,6 @@ PROPERTIES: dict[str, Callable[[Member], bool]] = {
         PROPERTIES["priority weight"](member)
         and PROPERTIES["rows that count alike"](member)
     ),
-    # Others are made of the same pieces, and take long to compile.
-    "pieces of its own": lambda member: (
-        member.loss_class not in (ReBRACLoss, RORLLoss, SDCLoss)
-    ),
 }
 
 

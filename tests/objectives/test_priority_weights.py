@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_settings import tried
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -67,11 +68,7 @@ numbers = st.lists(
 
 @pytest.mark.losses("osr", "osrv", "recovery", "cloning", "discrete", "edac", "td3bc")
 @given(numbers, st.one_of(st.none(), flags), flags, st.booleans())
-@settings(
-    deadline=None,
-    max_examples=20,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
+@tried(8)
 def test_no_weight_mask_or_end_spoils_a_value_or_a_gradient(
     family, family_batch, record, terms, name, weight, mask, done, column
 ) -> None:

@@ -18,6 +18,7 @@ import logging
 import sys
 from collections.abc import Mapping
 from contextlib import closing
+from copy import deepcopy
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,6 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl import torchrl_logger
 from torchrl.record.loggers import Logger
 from torchrl.trainers import LRSchedulerHook
@@ -235,14 +235,16 @@ def run(cfg: DictConfig, folder: Path) -> float:
     kinds = [kind for *_, kind in trained]
     schedule = learning_rates(optimizer, kinds, cfg.trainer.steps)
     # What is played, now and by all other commands.
-    share = optim.policy_average
-    averaging = get_ema_multi_avg_fn(1 - share)  # type: ignore[no-untyped-call]
-    average = AveragedModel(actor, multi_avg_fn=averaging)
+    share, average = optim.policy_average, deepcopy(actor)
+    weights = list(average.parameters()), list(actor.parameters())
+    # The arithmetic of torch.optim.swa_utils.AveragedModel, without its search for the
+    # parameters at every update.
+    follow = torch.no_grad()(partial(torch._foreach_lerp_, *weights, share))
     has_targets = bool(critic_params) and loss.delay_qvalue
     targets = SoftUpdate(loss, tau=optim.tau) if has_targets else None
     limit = largest_value(data.largest_reward, optim.gamma)
     episodes = {"num_episodes": cfg.trainer.eval_episodes, "seed": EVALUATION_SEED}
-    policy = deterministic_policy(average.module, data.norm)
+    policy = deterministic_policy(average, data.norm)
     last_weights = deterministic_policy(actor, data.norm)
     measure = "return" if references is None else "score"
     with closing(EpisodeEvaluator(cfg.env.id, **episodes, device=device)) as play:
@@ -276,7 +278,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
             log_both = partial(log_imagined, trainer, imagined, adversary)
             trainer.register_op("post_steps", log_both)
         LRSchedulerHook(schedule, interval="optim").register(trainer)
-        trainer.register_op("post_optim", partial(average.update_parameters, actor))
+        trainer.register_op("post_optim", follow)
         if hasattr(loss, "decay_uncertainty"):
             trainer.register_op("post_optim", loss.decay_uncertainty)
         if cfg.perturbation.adversary is not None:
