@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -37,6 +39,8 @@ TINY = [
     "dynamics.num_cells=[8]",
     "dynamics.batch_size=8",
     "dynamics.steps=20",
+    "dynamics.vae_num_cells=[8]",
+    "dynamics.vae_steps=10",
     "dynamics.rollout_starts=20",
     "dynamics.rollout_interval=4",
     "dynamics.generations=2",
@@ -51,6 +55,19 @@ pytestmark = pytest.mark.usefixtures("own_cache")
 
 def small(*overrides: str):
     return composed("train", *TINY, *overrides)
+
+
+def trained_model(folder: Path) -> dict[str, torch.Tensor]:
+    """The dynamics model in a run's newest checkpoint."""
+    path = max((folder / "checkpoint" / "policy").glob("checkpoint-*.torchrl"))
+    with zipfile.ZipFile(path) as archive:
+        (name,) = (
+            each for each in archive.namelist()
+            if "adversary" in each and each.endswith(".pt")
+        )  # fmt: skip
+        content = io.BytesIO(archive.read(name))
+    model: dict[str, torch.Tensor] = torch.load(content, weights_only=True)["model"]
+    return model
 
 
 def ran(folder: Path, *overrides: str) -> Path:
@@ -90,16 +107,61 @@ def test_run_leaves_model_report_and_numbers(finished) -> None:
     assert load_trained(finished).config.dynamics.use
 
 
-def test_a_run_that_was_stopped_ends_with_the_same_bits(finished, tmp_path) -> None:
-    """In the middle of a generation, with a model from the cache."""
-    folder = ran(tmp_path / "run", "trainer.steps=5")
-    ran(folder)
-    assert load_trained(folder).step == 14
-    here, there = (load_trained(each).loss.state_dict() for each in (finished, folder))
-    assert here.keys() == there.keys()
+RAMBO = ["loss=rambo", "dynamics.adversarial_steps=7", "dynamics.adversarial_weight=1"]
+RECOVERY = ["recovery=osr", "trainer.inverse_dynamics_steps=3"]
+
+
+def test_a_model_in_training_is_continued_with_the_same_bits(tmp_path) -> None:
+    """Stopped in the middle of a generation, with OSR's recovery term added."""
+    whole, folder = tmp_path / "whole", tmp_path / "run"
+    ran(whole, *RAMBO, *RECOVERY)
+    ran(folder, *RAMBO, *RECOVERY, "trainer.steps=6")
+    ran(folder, *RAMBO, *RECOVERY)
+    names = ("loss_qvalue", "loss_recovery", "imagined_reward", "adversary_objective")
+    for name in names:
+        assert scalars(folder)[name] == scalars(whole)[name], name
+    models = [trained_model(each) for each in (whole, folder)]
+    assert all(map(torch.equal, *(each.values() for each in models)))
+    before = load_dynamics(whole / FILE).state_dict()
+    assert not torch.equal(models[0]["layers.0.weight"], before["layers.0.weight"])
+    here, there = (load_trained(each).loss.state_dict() for each in (whole, folder))
     for key, value in here.items():
         assert not torch.is_tensor(value) or torch.equal(value, there[key]), key
-    assert scalars(folder)["imagined_reward"] == scalars(finished)["imagined_reward"]
+
+
+def test_recovery_is_added_to_mopo(tmp_path) -> None:
+    found = scalars(ran(tmp_path, *RECOVERY, "trainer.steps=2"))
+    assert {"loss_recovery", "recovery_kl", "imagined_reward"} <= found.keys()
+
+
+def test_rows_that_lead_into_the_data_are_imagined_backwards(tmp_path) -> None:
+    romi = ["loss=romi", "dynamics.reverse_policy=cvae", "trainer.steps=2"]
+    folder = ran(tmp_path, *romi)
+    assert "imagined_reward" in scalars(folder)
+    assert len(scalars(folder, "vae")["loss_vae"]) == 10
+    # A model of one direction of time is none of the other.
+    given = f"dynamics.path={folder / FILE}"
+    with pytest.raises(ValueError, match="direction of time: backward there, forward"):
+        modelled(tmp_path / "forward", given)
+    cfg = small("loss=romi")
+    data, model = load_training_data(cfg, CPU), load_dynamics(folder / FILE)
+    actor = make_learner(cfg, 11, 3).actor
+    buffer = imagined_replay_buffer(cfg, data, model, actor, lambda batch: batch)
+    buffer.sample()
+    rows = buffer.online_buffer[:]
+    # The first generation's first rows, with any action, end in states of the data.
+    ends, known = rows["next", "observation"][:20], data.rows(torch.arange(540))
+    same = (ends.unsqueeze(1) == known["observation"]).all(-1)
+    assert same.any(1).all()
+    assert rows["action"].abs().max() <= 1
+    assert not rows["next", "terminated"].any()
+
+
+def test_states_are_corrected_by_a_trained_autoencoder(tmp_path) -> None:
+    folder = ran(tmp_path, "loss=sdc", "dynamics.real_ratio=1", "trainer.steps=2")
+    assert {"deviation", "multiplier"} <= scalars(folder).keys()
+    held = load_trained(folder).loss.transition_network_params
+    assert held["target_scale"].ne(1).all()
 
 
 def modelled(folder: Path, *overrides: str) -> list[OfflineTrainer]:
@@ -240,6 +302,13 @@ def test_penalty_and_units_are_those_of_the_task(finished, tmp_path) -> None:
         (["env=pointmaze-umaze", "data=diverse"], "no rule is known by which Point"),
         (["dynamics.num_elites=9"], "num_elites must be between 1 and num_networks=3"),
         (["dynamics.real_ratio=0.01"], "real_ratio=0.01 of 8 rows are 0"),
+        (["loss=scas", "dynamics=reverse"], "asks where actions lead, and a model"),
+        (["loss=romi", "dynamics.adversarial_steps=9"], "here none is: set it to 0"),
+        ([*RAMBO, "dynamics.real_ratio=1"], "adversarial_steps=7 trains the model"),
+        (
+            ["loss=bc", "dynamics=ensemble", RAMBO[1]],
+            "asks for the values of critics, and BCLoss has none",
+        ),
     ],
 )
 def test_what_cannot_be_had_is_refused_before_the_data(overrides, message) -> None:
@@ -290,6 +359,10 @@ def test_roll_outs_are_as_published_for_a_data_set() -> None:
         "given": (2, 3.0),
     }
     assert not small("dynamics=none").dynamics.use
+    plain = small("loss=rambo", "data=medium", "env=walker2d").dynamics
+    assert (plain.rollout_steps, plain.adversarial_weight) == (5, 0.0)
+    reverse = small("loss=romi", "env=halfcheetah").dynamics
+    assert (reverse.rollout_steps, reverse.reverse_policy) == (1, "cvae")
 
 
 def test_defaults_are_said(caplog) -> None:

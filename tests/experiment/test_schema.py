@@ -26,7 +26,7 @@ from torchrl_osr.experiment.schema import schema_of
 GROUPS = ["env", "data", "inverse_dynamics", "dynamics", "loss", "recovery", "logger"]
 GROUPS += ["perturbation", "preset"]
 OBJECTIVES = sorted(set(objectives.__all__) - config.NOT_CHOSEN)
-PARTS = ("actor", "qvalue", "value", "inverse_dynamics", "dynamics")
+PARTS = ("actor", "qvalue", "value", "inverse_dynamics", "dynamics", "transition")
 NETWORKS = {f"{part}_network" for part in PARTS}
 NO_OPTIONS = {"action_spec", "gamma"}  # an object of Python, and what is refused
 
@@ -105,9 +105,10 @@ def keyword_parameters(name: str) -> dict[str, inspect.Parameter]:
     """What a user can give to a class besides networks, read from its signature."""
     target = getattr(objectives, name)
     found = dict(inspect.signature(target).parameters)
-    if found.pop("options", None):
-        base = inspect.signature(objectives.BaseLoss).parameters
-        found |= {key: each for key, each in base.items() if key not in found}
+    for each in target.__mro__[1:]:
+        if not found.pop("options", None):
+            break
+        found = inspect.signature(each).parameters | found
     left_out = NETWORKS | NO_OPTIONS
     return {key: each for key, each in found.items() if key not in left_out}
 
@@ -207,6 +208,9 @@ LOSSES = {
     "sac_10": ("OSRLoss", OSR_10 | CQL),
     "mopo": ("OSRLoss", CQL | {"min_q_weight": 0.0, "deterministic_backup": False}),
     "scas": ("SCASLoss", {"num_qvalue_nets": 4}),
+    "rambo": ("OSRLoss", CQL | {"min_q_weight": 0.0, "deterministic_backup": False}),
+    "romi": ("OSRLoss", CQL),
+    "sdc": ("SDCLoss", {}),
     "edac_10": ("EDACLoss", {"num_qvalue_nets": 10}),
     "osr_v": ("OSRVLoss", {}),
     "td3_bc": ("TD3BCLoss", {}),

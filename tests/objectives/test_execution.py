@@ -10,9 +10,18 @@ from torch._dynamo.exc import InternalTorchDynamoError
 
 # One loss for each path that is traced; tracing takes seconds. With ReLU critics: osr,
 # and in cql-options all of CQL that is off by default. Critics that are vmapped: with
-# CQL's term in noisy-cloning, in osrv and in edac.
+# CQL's term in noisy-cloning, in osrv and in edac. In scas a model of the dynamics.
 TRACED = (
-    *("osr", "cql-options", "noisy-cloning", "osrv", "edac", "td3bc", "discrete"),
+    *(
+        "osr",
+        "cql-options",
+        "noisy-cloning",
+        "osrv",
+        "edac",
+        "td3bc",
+        "scas",
+        "discrete",
+    ),
     *("recovery", "recovery-delta", "idm", "cvae"),
 )
 
@@ -119,6 +128,8 @@ ENSEMBLE = {"min_q_weight": 0.0, "deterministic_backup": False}
         ("TD3+BC", "td3bc", 2, {}, 6),
         ("ReBRAC", "rebrac", 2, {}, 6),
         ("RORL", "rorl", 10, {"num_samples": 20}, 430),
+        ("SCAS", "scas", 4, {}, 16),
+        ("SDC", "sdc", 2, {"num_random": 10}, 66),
         ("Discrete OSR", "discrete", 2, {}, 8),
         ("Discrete CQL(H)", "discrete-cql", 2, {}, 6),
     ],

@@ -31,7 +31,7 @@ def counts(batch: TensorDict, weight: Tensor, key: str) -> Tensor:
     return weight * (mask & ~ended).squeeze(-1)
 
 
-@pytest.mark.losses(having="priority weight")
+@pytest.mark.losses(having="weights of rows")
 @pytest.mark.parametrize("shape", [(10,), (10, 1)])
 def test_rows_weigh_as_much_as_their_priority_weight(
     family, family_batch, seeded, terms, name, shape

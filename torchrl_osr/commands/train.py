@@ -43,10 +43,9 @@ from torchrl_osr.experiment.build import (
     make_learner,
     read_environment,
 )
-from torchrl_osr.experiment.dynamics import dynamics_model, imagined_replay_buffer
 from torchrl_osr.experiment.loggers import log_outcome, make_loggers
 from torchrl_osr.experiment.phases import (
-    adam_of,
+    train_dynamics,
     train_inverse_dynamics,
     train_policy,
     trainer_maker,
@@ -116,17 +115,12 @@ def run(cfg: DictConfig, folder: Path) -> float:
     new_trainer = trainer_maker(cfg, data, components, loggers, autocast)
     if learner.model is not None:
         train_inverse_dynamics(cfg, folder, data, learner.model, new_trainer)
-    imagined = None
+    imagined = adversary = None
     if cfg.dynamics.use:
-        model = dynamics_model(cfg, data, folder, new_trainer, adam_of(cfg))
-        if hasattr(learner.loss, "load_dynamics"):
-            learner.loss.load_dynamics(model)
-        if cfg.dynamics.real_ratio < 1:
-            # Batches are in part of what the policy does in the model.
-            imagined = imagined_replay_buffer(
-                cfg, data, model, learner.actor, perturbation
-            )
-    trainer = train_policy(cfg, folder, data, learner, imagined, new_trainer)
+        imagined, adversary = train_dynamics(
+            cfg, folder, data, learner, perturbation, sizes, new_trainer
+        )
+    trainer = train_policy(cfg, folder, data, learner, imagined, adversary, new_trainer)
     return report(cfg, folder, data.mean, trainer, loggers)
 
 

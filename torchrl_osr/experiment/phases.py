@@ -13,12 +13,13 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from tensordict import TensorDict
 from tensordict.nn import ProbabilisticTensorDictSequential
-from torch.nn import Parameter
+from torch.nn import Module, Parameter
 from torch.optim.lr_scheduler import LambdaLR
 from torchrl.envs import ObservationNorm
 from torchrl.record.loggers import Logger
 from torchrl.trainers import LRSchedulerHook
 
+from torchrl_osr import StatePerturbation
 from torchrl_osr._files import write_json
 from torchrl_osr.evaluation import (
     EpisodeEvaluator,
@@ -29,9 +30,20 @@ from torchrl_osr.evaluation import (
     summarize,
 )
 from torchrl_osr.experiment import run_folder
-from torchrl_osr.experiment.build import Learner, references_of
+from torchrl_osr.experiment.build import (
+    Learner,
+    make_reverse_vae,
+    make_transition_vae,
+    references_of,
+)
+from torchrl_osr.experiment.conditional_vae import train_vae
+from torchrl_osr.experiment.dynamics import (
+    dynamics_model,
+    imagined_replay_buffer,
+    model_adversary,
+)
 from torchrl_osr.experiment.training_data import TrainingData
-from torchrl_osr.imagination import ImaginedReplayBuffer
+from torchrl_osr.imagination import ImaginedReplayBuffer, ModelAdversary
 from torchrl_osr.trainers import (
     OfflineTrainer,
     SoftUpdate,
@@ -111,12 +123,58 @@ def train_inverse_dynamics(
     print(describe_inverse_dynamics(trainer.history[-1]))
 
 
+def train_dynamics(
+    cfg: DictConfig,
+    folder: Path,
+    data: TrainingData,
+    learner: Learner,
+    perturbation: StatePerturbation,
+    sizes: tuple[int, int],
+    new_trainer: NewTrainer,
+) -> tuple[ImaginedReplayBuffer | None, ModelAdversary | None]:
+    """Train a run's models of the dynamics, and give them to its loss.
+
+    Args:
+        cfg, folder, data, learner, new_trainer: as in :func:`train_policy`.
+        perturbation: what batches of the data get.
+        sizes: of an observation and an action.
+
+    Returns:
+        What draws batches that are in part imagined, and what trains the model on
+        against the policy; ``None`` for what the run has not.
+    """
+    actor, _, loss, _ = learner
+    adam, reverse = adam_of(cfg), cfg.dynamics.reverse_policy
+    of_model = data if reverse is None else data.reverse()
+    model = dynamics_model(cfg, of_model, folder, new_trainer, adam)
+    if hasattr(loss, "dynamics_network"):
+        loss.load_network("dynamics_network", model)
+    if hasattr(loss, "transition_network"):
+        vae = make_transition_vae(cfg, sizes[0])
+        train_vae(vae, cfg, data, folder, new_trainer, adam)
+        loss.load_network("transition_network", vae)
+    if cfg.dynamics.real_ratio == 1:
+        return None, None
+    imagining: Module = actor
+    if reverse == "cvae":
+        imagining = make_reverse_vae(cfg, *sizes)
+        train_vae(imagining, cfg, data, folder, new_trainer, adam)
+    adversary = None
+    if cfg.dynamics.adversarial_steps:
+        adversary = model_adversary(cfg, data, model, actor, loss, adam)
+    imagined = imagined_replay_buffer(
+        cfg, data, model, imagining, perturbation, adversary
+    )
+    return imagined, adversary
+
+
 def train_policy(
     cfg: DictConfig,
     folder: Path,
     data: TrainingData,
     learner: Learner,
     imagined: ImaginedReplayBuffer | None,
+    adversary: ModelAdversary | None,
     new_trainer: NewTrainer,
 ) -> OfflineTrainer:
     """Train the policy, by the critics and frozen models; its trainer, at the end.
@@ -127,6 +185,7 @@ def train_policy(
         data: what it trains on.
         learner: networks and objective.
         imagined: draws the batches in the place of the data's buffer, if there is one.
+        adversary: trains the model of the dynamics on, if there is one.
         new_trainer: of :func:`trainer_maker`.
     """
     actor, _, loss, objective = learner
@@ -142,6 +201,8 @@ def train_policy(
         "schedule": schedule,
         "policy_average": average.network,
     }
+    if adversary is not None:  # before the roll-outs, which are of a copy of it
+        components["adversary"] = adversary
     if imagined is not None:
         components["imagined"] = imagined
     with closing(_episodes_of(cfg)) as episodes:
@@ -166,14 +227,15 @@ def train_policy(
         )
         _stop_if_removed(trainer, folder)
         if imagined is not None:
-            trainer.register_op("post_steps", partial(_log_imagined, trainer, imagined))
+            log_both = partial(_log_imagined, trainer, imagined, adversary)
+            trainer.register_op("post_steps", log_both)
         LRSchedulerHook(schedule, interval="optim").register(trainer)
         trainer.register_op("post_optim", lambda: average.update(trainer.step))
         if hasattr(loss, "decay_uncertainty"):
             trainer.register_op("post_optim", loss.decay_uncertainty)
         if cfg.perturbation.adversary is not None:
-            adversary = instantiate(cfg.perturbation.adversary)
-            trainer.register_op("process_optim_batch", partial(adversary, loss))
+            attack = instantiate(cfg.perturbation.adversary)
+            trainer.register_op("process_optim_batch", partial(attack, loss))
         trainer.train()
     return trainer
 
@@ -235,9 +297,14 @@ def _evaluation(
     return results
 
 
-def _log_imagined(trainer: OfflineTrainer, imagined: ImaginedReplayBuffer) -> None:
+def _log_imagined(
+    trainer: OfflineTrainer,
+    imagined: ImaginedReplayBuffer,
+    adversary: ModelAdversary | None,
+) -> None:
     """Log what the rows are like that the policy learns from besides the data."""
-    for name, value in imagined.metrics().items():
+    of_model = {} if adversary is None else adversary.metrics
+    for name, value in (imagined.metrics() | of_model).items():
         for logger in trainer.loggers:
             logger.log_scalar(f"policy/{name}", value, step=trainer.step)
 

@@ -63,9 +63,12 @@ def check_published(cfg: DictConfig, choices: Mapping[str, str]) -> None:
             f"{choices['env']}, but env.id={cfg.env.id} is {cfg.env.name}: give "
             f"env={cfg.env.name}."
         )
-    if (known := cfg.dynamics.published) and name not in known:
+    known = cfg.dynamics.published
+    if known and not {name, cfg.env.name} & set(known):
+        taken = [
+            f"dynamics.{key}={cfg.dynamics[key]}" for key in next(iter(known.values()))
+        ]
         log.warning(
             f"There are no published roll-outs of loss={loss} for {name}: "
-            f"dynamics.rollout_steps={cfg.dynamics.rollout_steps} and "
-            f"dynamics.penalty={cfg.dynamics.penalty} are taken."
+            f"{' and '.join(taken)} are taken."
         )

@@ -26,7 +26,7 @@ from torchrl_osr.experiment.published import register_published
 # File systems allow 255 bytes, and temporary names beside it need some of them.
 MAX_FOLDER_NAME = 200
 
-NOT_CHOSEN = {"BaseLoss", "DynamicsLoss"}
+NOT_CHOSEN = {"BaseLoss", "ConditionalVAELoss", "DynamicsLoss"}
 """Classes of :mod:`torchrl_osr.objectives` that no configuration names."""
 
 
@@ -192,10 +192,20 @@ class DynamicsConfig:
         batch_size: rows of a gradient step, for each network.
         steps: gradient steps of the model; the weights of its best evaluation are
             taken.
+        vae_num_cells: width of each hidden layer of the conditional autoencoder of
+            loss=sdc or dynamics=reverse.
+        vae_steps: gradient steps of that autoencoder, with lr and batch_size.
         path: a trained model to take, dynamics.safetensors of a run with the same data;
             null for one of the same settings in the cache, or a new one.
         terminations: auto for the rule by which the task ends, never for tasks that a
             time limit alone ends.
+        reverse_policy: cvae or uniform, by which actions a reverse model rolls out from
+            states of the data to where they came from: those of a conditional
+            autoencoder of the data, or any; null for the policy's, forwards.
+        adversarial_steps: gradient steps, before each further roll-out, by which the
+            model is trained on the data and against the policy; 0 for none.
+        adversarial_weight: of the policy's advantage in that training.
+        adversarial_lr: learning rate of that training.
         rollout_steps: steps of a roll-out.
         rollout_starts: states of the data that roll-outs start from, each time.
         rollout_interval: gradient steps of the policy between roll-outs.
@@ -206,7 +216,7 @@ class DynamicsConfig:
             imagined rewards lose.
         refuse: leave out rows on which the elites disagree more than on any held-out
             row.
-        published: rollout_steps and penalty by data set, where a method has them.
+        published: settings by data set or task, where a method has them.
     """
 
     use: bool = MISSING
@@ -216,8 +226,14 @@ class DynamicsConfig:
     lr: float = MISSING
     batch_size: int = MISSING
     steps: int = MISSING
+    vae_num_cells: list[int] = MISSING
+    vae_steps: int = MISSING
     path: str | None = None
     terminations: str = MISSING
+    reverse_policy: str | None = None
+    adversarial_steps: int = MISSING
+    adversarial_weight: float = MISSING
+    adversarial_lr: float = MISSING
     rollout_steps: int = MISSING
     rollout_starts: int = MISSING
     rollout_interval: int = MISSING
