@@ -51,8 +51,8 @@ def bits_of(line: dict, states: RecoverableStates) -> NDArray[np.float64]:
 
 TITLE = """# Which method saves any?
 
-Written by `methods.py`: share of the states saved, mean over seeds, with 95 % percentile
-intervals over seeds and walks."""
+Written by `methods.py`: share of the states saved, mean over seeds, with 95 %
+percentile intervals over seeds and walks; with one seed, over walks alone."""
 
 
 class Draws:
