@@ -176,7 +176,7 @@ def test_it_is_a_policy_for_torchrl() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"planning_horizon": 19}, "planning_horizon=19 is shorter than 5 offsets"),
+        ({"planning_horizon": 19}, "planning_horizon must be at least 20"),
         ({"top_k": 64}, "top_k must be between 1 and num_candidates - 1 = 63, got 64"),
         ({"hold": 0}, "hold must be at least 1"),
         ({"std": 0.0}, "std must be above 0"),

@@ -101,11 +101,7 @@ class LookAheadPolicy:
         check_positive("hold", hold, minimum=1)
         check_positive("optim_steps", optim_steps, minimum=1)
         check_positive("std", std)
-        if planning_horizon < num_offsets * hold:
-            raise ValueError(
-                f"planning_horizon={planning_horizon} is shorter than {num_offsets} "
-                f"offsets of {hold} steps; expected {num_offsets * hold} at least."
-            )
+        check_positive("planning_horizon", planning_horizon, minimum=num_offsets * hold)
         if not 1 <= top_k < num_candidates:
             raise ValueError(
                 f"top_k must be between 1 and num_candidates - 1 = "
@@ -121,9 +117,8 @@ class LookAheadPolicy:
         self.top_k, self.std = top_k, std
         generator = generator or torch.Generator().manual_seed(0)
         shape = optim_steps, num_candidates, num_offsets, model.action_dim
-        # TorchRL's CEMPlanner plans all actions from nothing: it has no policy to start
-        # from and to go on with, no value of the last state, and torch's global
-        # generator; and it returns the elite's mean, which nobody has tried.
+        # TorchRL's CEMPlanner has no policy to plan around and to go on with, no value
+        # of the last state, torch's global generator, and returns an untried mean.
         noise = torch.randn(shape, generator=generator, device=generator.device)
         self.noise = noise.to(model.target_loc.device)
 
