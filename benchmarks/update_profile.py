@@ -4,8 +4,8 @@
 
 For OSR as the trainer runs it, for OSR called anew for every batch, and for the plain
 reference, by default at the sizes of the quick preset. Times are those of PyTorch's
-profiler, which slows short operations down: read them as shares. The real ones are those
-of ``update_speed.py``.
+profiler, which slows short operations down: read them as shares. ``update_speed.py``
+has the real ones.
 """
 
 from __future__ import annotations
