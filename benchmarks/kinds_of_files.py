@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from pathlib import Path
 from typing import Any, NamedTuple
 from unittest.mock import patch
@@ -36,7 +37,6 @@ from minari.data_collector import EpisodeBuffer
 from omegaconf import OmegaConf
 from pyarrow import parquet
 from tensordict import TensorDict
-from torch.optim.swa_utils import AveragedModel
 from torchrl import torchrl_logger
 from torchrl.checkpoint import CheckpointRotation
 from torchrl.envs import ObservationNorm
@@ -143,7 +143,7 @@ def make_run(folder: Path) -> None:
     checkpoint = safe_checkpoint(
         loss_module=loss,
         observation_norm=norm,
-        policy_average=AveragedModel(actor),
+        policy_average=deepcopy(actor),
     )
     CheckpointRotation(folder / CHECKPOINTS, keep_last=2).save(checkpoint, step=5)
 

@@ -58,6 +58,7 @@ def train_here(overrides: Sequence[str]) -> list[dict[str, float]]:
     """Train in this process; steps, processor seconds and scores of its evaluations."""
     from torchrl_osr.commands import train
     from torchrl_osr.evaluation import EpisodeEvaluator
+    from torchrl_osr.experiment import phases
 
     began, paused = 0.0, 0.0
     seconds: list[float] = []
@@ -78,7 +79,7 @@ def train_here(overrides: Sequence[str]) -> list[dict[str, float]]:
             paused += time.process_time() - before
             return results
 
-    train.load_training_data, train.EpisodeEvaluator = load_training_data, Paused
+    train.load_training_data, phases.EpisodeEvaluator = load_training_data, Paused
     with tempfile.TemporaryDirectory() as folder:
         sys.argv = ["train", *overrides, f"hydra.run.dir={folder}/run"]
         train.main()

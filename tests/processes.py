@@ -60,16 +60,6 @@ def tiny() -> Callable[..., list[str]]:
 
 
 @pytest.fixture(scope="session")
-def start() -> Callable[..., subprocess.Popen]:
-    """Return a function that starts an example in a process, as a user does."""
-
-    def start(cwd: Path, script: str, *arguments: str) -> subprocess.Popen:
-        return subprocess.Popen(command(script, *arguments), cwd=cwd, **PRINTED)
-
-    return start
-
-
-@pytest.fixture(scope="session")
 def run_fresh() -> Callable[..., tuple[int, str]]:
     """Return a function that runs one to its end: exit code and what it printed.
 
@@ -77,7 +67,6 @@ def run_fresh() -> Callable[..., tuple[int, str]]:
     """
 
     def run(cwd: Path, script: str, *arguments: str) -> tuple[int, str]:
-        # On a timeout, unlike start's, the process is killed.
         done = subprocess.run(
             command(script, *arguments), cwd=cwd, timeout=240, check=False, **PRINTED
         )
@@ -87,15 +76,22 @@ def run_fresh() -> Callable[..., tuple[int, str]]:
 
 
 @pytest.fixture(scope="session")
-def run(tmp_path_factory, run_fresh) -> Iterator[Callable[..., tuple[int, str]]]:
-    """Return the same function for commands in processes forked after the imports.
+def server() -> Iterator[Server | None]:
+    """A process that has imported everything and forks commands.
 
-    A source distribution, which has no benchmarks, has no such processes either.
+    A source distribution has no benchmarks, and so no such process.
     """
-    if Server is None:
-        yield run_fresh
-        return
-    server = Server(os.environ | {"OMP_NUM_THREADS": "1"})
+    server = Server and Server(os.environ | {"OMP_NUM_THREADS": "1"})
+    yield server
+    if server:
+        server.close()
+
+
+@pytest.fixture(scope="session")
+def run(tmp_path_factory, server, run_fresh) -> Callable[..., tuple[int, str]]:
+    """Return the same function for commands in processes forked after the imports."""
+    if server is None:
+        return run_fresh
     outputs = tmp_path_factory.mktemp("outputs")
 
     def run(cwd: Path, script: str, *arguments: str) -> tuple[int, str]:
@@ -106,8 +102,7 @@ def run(tmp_path_factory, run_fresh) -> Iterator[Callable[..., tuple[int, str]]]
         server.start(script, *arguments, output=output, **given)
         return server.ended(), output.read_text(encoding="utf-8")
 
-    yield run
-    server.close()
+    return run
 
 
 @pytest.fixture(scope="session")

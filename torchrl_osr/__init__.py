@@ -7,6 +7,7 @@ Learning" (Jiang et al., NeurIPS 2023), https://openreview.net/forum?id=4gLWjSaw
 from torchrl_osr.objectives import (
     Adversary,
     BCLoss,
+    ConditionalVAELoss,
     DiscreteOSRLoss,
     DynamicsLoss,
     EDACLoss,
@@ -17,6 +18,7 @@ from torchrl_osr.objectives import (
     ReBRACLoss,
     RORLLoss,
     SCASLoss,
+    SDCLoss,
     StateRecoveryLoss,
     TD3BCLoss,
 )
@@ -28,6 +30,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Adversary",
     "BCLoss",
+    "ConditionalVAELoss",
     "DiscreteOSRLoss",
     "DynamicsLoss",
     "EDACLoss",
@@ -39,6 +42,7 @@ __all__ = [
     "RORLLoss",
     "ReBRACLoss",
     "SCASLoss",
+    "SDCLoss",
     "StatePerturbation",
     "StateRecoveryLoss",
     "TD3BCLoss",

@@ -74,6 +74,16 @@ FAMILY = {
         "`SCASLoss`, SCAS's released code and print", "`loss=scas`",
         "critic by critic, row by row and network by network",
     ),
+    "RAMBO": (
+        "`ModelAdversary`, RAMBO's code", "`loss=rambo`",
+        "row by row and network by network",
+    ),
+    "SDC": (
+        "`SDCLoss`, our reading", "`loss=sdc`", "pair by pair and network by network",
+    ),
+    "Conditional VAE": (
+        "`ConditionalVAELoss`, BCQ's code", "`loss=sdc`, `loss=romi`", "row by row",
+    ),
     "Adversary": (
         "`Adversary`, RORL", "`perturbation=adversarial`", "a loop over the same draws",
     ),

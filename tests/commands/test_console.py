@@ -6,18 +6,14 @@ import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
+from composed import composed
 from omegaconf import OmegaConf
 
 from torchrl_osr import __version__
 from torchrl_osr.__main__ import COMMANDS, main
 from torchrl_osr.commands.console import sentence
-from torchrl_osr.experiment import schema
-
-CONF = Path(__file__).parents[2] / "conf"
 
 
 def test_help_names_every_command_and_fits_a_screen(capsys):
@@ -44,12 +40,10 @@ def test_unknown_command_is_told_which_there_are():
 
 
 def composition_error(*overrides: str) -> Exception:
-    schema.register()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        try:
-            compose("train", list(overrides))
-        except Exception as error:
-            return error
+    try:
+        composed("train", *overrides)
+    except Exception as error:
+        return error
     raise AssertionError("it was accepted")
 
 
@@ -122,7 +116,7 @@ def test_completion_offers_commands_first(monkeypatch, capsys, line, offered):
 
 
 COMPLETE = """
-eval "$(torchrl-osr -sc install=bash)"
+eval "$INSTALLED"
 complete -p torchrl-osr
 COMP_LINE="torchrl-osr evaluate suite=to"
 COMP_WORDS=($COMP_LINE) COMP_CWORD=2 COMP_POINT=${#COMP_LINE} COMPREPLY=()
@@ -131,16 +125,19 @@ echo "${COMPREPLY[*]}"
 """
 
 
-def test_bash_completes_a_commands_groups(tmp_path):
+def test_bash_completes_a_commands_groups(tmp_path, run):
+    code, installed = run(tmp_path, "-sc", "install=bash")
+    assert code == 0, installed
     program = tmp_path / "torchrl-osr"
     program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m torchrl_osr "$@"\n')
     program.chmod(0o755)
     done = subprocess.run(
         ["bash", "-c", COMPLETE], cwd=tmp_path, capture_output=True, text=True,
-        timeout=240, env=os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}"},
-        check=False,
+        timeout=240, check=False,
+        env=os.environ
+        | {"PATH": f"{tmp_path}:{os.environ['PATH']}", "INSTALLED": installed},
     )  # fmt: skip
     assert done.stderr == ""
-    installed, completed = done.stdout.splitlines()
-    assert installed.endswith("-F hydra_bash_completion torchrl-osr")
+    defined, completed = done.stdout.splitlines()
+    assert defined.endswith("-F hydra_bash_completion torchrl-osr")
     assert completed == "suite=torque"

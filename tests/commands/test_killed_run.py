@@ -33,6 +33,7 @@ class Runs:
 
     def start(self, *command: str, **request) -> int:
         self.path = next(self.outputs)
+        request["environment"] = dict(os.environ)
         return self.server.start(*command, output=self.path, **request)
 
     @property
@@ -53,12 +54,10 @@ class Runs:
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory, _cache, tiny):
-    server = Server(dict(os.environ))
+def runs(tmp_path_factory, server, tiny) -> Runs:
     sizes = tiny(steps=20, eval_interval=20, checkpoints_kept=1)
     sizes += ["optim.policy_average=0.1"]  # has a state of its own
-    yield Runs(server, tmp_path_factory.mktemp("outputs"), sizes)
-    server.close()
+    return Runs(server, tmp_path_factory.mktemp("outputs"), sizes)
 
 
 @pytest.fixture(scope="module")
@@ -200,3 +199,27 @@ def test_folder_that_is_removed_ends_the_run(runs, tmp_path):
     assert runs.server.ended() == 1, runs.output
     assert "was removed or renamed while the run was going on" in runs.output
     assert not (folder / "status.json").exists()
+
+
+def test_second_sweep_continues_what_is_not_done(runs, tiny, tmp_path):
+    sizes = tiny(steps=100, eval_interval=100, checkpoint_interval=25, record="false")
+    sweep = ["-m", *sizes, "loss=cql", "seed=0,1", "hydra.sweep.dir=sweep"]
+    command, request = ["train", *sweep], {"folder": str(tmp_path)}
+    process = runs.start(*command, **request)
+    pattern = "sweep/*/checkpoint/policy/checkpoint-*"
+    while not list(tmp_path.glob(f"{pattern}25.torchrl")):
+        os.kill(process, 0)  # it lives
+        time.sleep(0.001)
+    os.kill(process, signal.SIGTERM)
+    assert runs.server.ended() == 75, runs.output
+    (folder,) = (path.parent for path in tmp_path.glob("sweep/*/status.json"))
+    assert status(folder)["status"] == "preempted"
+    assert runs.run(*command, **request) == 0, runs.output
+    written = {path: path.stat().st_mtime_ns for path in tmp_path.glob(pattern)}
+    assert len(list(tmp_path.glob("sweep/*/returns.json"))) == 2
+    # And once more, when all is done: nothing is trained.
+    assert runs.run(*command, **request) == 0, runs.output
+    again = {path: path.stat().st_mtime_ns for path in tmp_path.glob(pattern)}
+    assert again == written
+    for path in tmp_path.glob("sweep/*/status.json"):
+        assert status(path.parent) == {"status": "done"}

@@ -17,14 +17,18 @@ SCRIPT = "train"
 def sizes(tiny) -> list[str]:
     return tiny(
         inverse_dynamics_steps=30, steps=40, eval_interval=20, eval_episodes=2,
-        checkpoint_interval=5,
+        checkpoint_interval=20,
     )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory, run_fresh, sizes) -> tuple[Path, str]:
     cwd = tmp_path_factory.mktemp("finished")
-    code, output = run_fresh(cwd, SCRIPT, *sizes, "hydra.run.dir=run")
+    with pytest.MonkeyPatch.context() as patch:
+        # GNU's OpenMP says what it has read, when torch is imported.
+        patch.setenv("OMP_DISPLAY_ENV", "true")
+        patch.delenv("OMP_WAIT_POLICY", raising=False)
+        code, output = run_fresh(cwd, SCRIPT, *sizes, "hydra.run.dir=run")
     assert code == 0, output
     return cwd / "run", output
 
@@ -59,23 +63,12 @@ def test_log_has_a_line_for_each_evaluation(finished):
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["+trainer.stepz=3"], ["there is no key trainer.stepz"]),
         (["resume=nowhere"], ["nowhere", "folder of a run"]),
         (["resume=run", "seed=3"], ["holds a run", "seed: 0 there, 3 now"]),
     ],
 )
 def test_bad_input_is_named(finished, run, arguments, named):
     folder, _ = finished
-    refused(folder, run, arguments, named)
-
-
-def test_another_configuration_in_the_same_folder_is_refused(finished, run, sizes):
-    folder, _ = finished
-    arguments = ["hydra.run.dir=run", *sizes, "seed=3"]
-    refused(folder, run, arguments, ["holds a run", "seed: 0 there"])
-
-
-def refused(folder: Path, run, arguments: list[str], named: list[str]) -> None:
     code, output = run(folder.parent, SCRIPT, *arguments)
     assert code != 0
     for word in named:
@@ -102,18 +95,8 @@ def test_bad_input_is_named_before_data_are_made(
     assert not (tmp_path / "cache").exists()
 
 
-@pytest.mark.parametrize(("chosen", "found"), [(None, "PASSIVE"), ("active", "ACTIVE")])
-def test_waiting_threads_do_not_spin_unless_asked_to(
-    tmp_path, monkeypatch, run_fresh, chosen, found
-):
-    # GNU's OpenMP says what it has read, when torch is imported.
-    monkeypatch.setenv("OMP_DISPLAY_ENV", "true")
-    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
-    if chosen is not None:
-        monkeypatch.setenv("OMP_WAIT_POLICY", chosen)
-    code, printed = run_fresh(tmp_path, SCRIPT, "--cfg", "job")
-    assert code == 0
-    assert f"OMP_WAIT_POLICY = '{found}'" in printed
+def test_waiting_threads_do_not_spin(finished):
+    assert "OMP_WAIT_POLICY = 'PASSIVE'" in finished[1]
 
 
 def test_multirun_names_the_failed_job(tmp_path, run, tiny):
@@ -132,14 +115,14 @@ def test_multirun_names_the_failed_job(tmp_path, run, tiny):
 
 
 def test_every_other_loss_runs_to_its_end(tmp_path, run, sizes):
-    """One sweep over them; the main one has its own tests."""
-    losses = "cql,osr_v,osr_10,sac_10,edac_10,iql,rorl"
+    """One sweep over the classes that no other test here trains."""
+    losses = "osr_v,edac_10,iql,rorl"
     arguments = [*sizes, f"loss={losses}", "hydra.sweep.dir=sweep"]
     code, output = run(tmp_path, SCRIPT, "-m", *arguments)
     assert code == 0, output
     assert "Warning" not in output
     folders = list((tmp_path / "sweep").glob("*/returns.json"))
-    assert len(folders) == 7
+    assert len(folders) == 4
     for path in folders:
         assert json.loads(path.read_text())["last"]["step"] == 40
 

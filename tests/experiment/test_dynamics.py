@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
+import zipfile
 from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
+from composed import SMALL, composed
 from tensordict import TensorDict
 
 from torchrl_osr.commands import train
 from torchrl_osr.data.store.cache import cache_root
 from torchrl_osr.experiment import run_folder
-from torchrl_osr.experiment import schema as config
 from torchrl_osr.experiment.build import check_parts, make_learner
 from torchrl_osr.experiment.dynamics import (
     FILE,
@@ -23,54 +24,55 @@ from torchrl_osr.experiment.dynamics import (
     imagined_replay_buffer,
     load_dynamics,
 )
+from torchrl_osr.experiment.published import check_published
 from torchrl_osr.experiment.trained_run import load_trained
 from torchrl_osr.experiment.training_data import load_training_data
 from torchrl_osr.policy.tensor_file import read_tensors, write_tensors
 from torchrl_osr.trainers import OfflineTrainer
 
-ROOT = Path(__file__).parents[2]
 CPU = torch.device("cpu")
 TINY = [
+    *SMALL,
     "loss=mopo",
-    "data=random",
-    "data.num_transitions=600",
-    "data.held_out=0.1",
-    "network.num_cells=[8]",
     "dynamics.num_networks=3",
     "dynamics.num_elites=2",
     "dynamics.num_cells=[8]",
     "dynamics.batch_size=8",
     "dynamics.steps=20",
+    "dynamics.vae_num_cells=[8]",
+    "dynamics.vae_steps=10",
     "dynamics.rollout_starts=20",
     "dynamics.rollout_interval=4",
     "dynamics.generations=2",
     "dynamics.real_ratio=0.25",
-    "trainer.batch_size=8",
     "trainer.steps=14",
-    "trainer.log_interval=1",
     "trainer.eval_interval=100",
-    "trainer.eval_episodes=1",
     "trainer.checkpoint_interval=7",
-    "trainer.progress=false",
 ]
 
-
-@pytest.fixture(scope="module", autouse=True)
-def _cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TORCHRL_OSR_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
+pytestmark = pytest.mark.usefixtures("own_cache")
 
 
-def composed(*overrides: str):
-    config.register()
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return compose("train", overrides=[*TINY, *overrides])
+def small(*overrides: str):
+    return composed("train", *TINY, *overrides)
+
+
+def trained_model(folder: Path) -> dict[str, torch.Tensor]:
+    """The dynamics model in a run's newest checkpoint."""
+    path = max((folder / "checkpoint" / "policy").glob("checkpoint-*.torchrl"))
+    with zipfile.ZipFile(path) as archive:
+        (name,) = (
+            each for each in archive.namelist()
+            if "adversary" in each and each.endswith(".pt")
+        )  # fmt: skip
+        content = io.BytesIO(archive.read(name))
+    model: dict[str, torch.Tensor] = torch.load(content, weights_only=True)["model"]
+    return model
 
 
 def ran(folder: Path, *overrides: str) -> Path:
     folder.mkdir(exist_ok=True)
-    cfg = composed(*overrides)
+    cfg = small(*overrides)
     run_folder.claim(folder, cfg, {})
     with run_folder.status(folder):
         train.run(cfg, folder)
@@ -78,7 +80,7 @@ def ran(folder: Path, *overrides: str) -> Path:
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory) -> Path:
+def finished(tmp_path_factory, own_cache) -> Path:
     return ran(tmp_path_factory.mktemp("finished") / "run")
 
 
@@ -105,22 +107,67 @@ def test_run_leaves_model_report_and_numbers(finished) -> None:
     assert load_trained(finished).config.dynamics.use
 
 
-def test_a_run_that_was_stopped_ends_with_the_same_bits(finished, tmp_path) -> None:
-    """In the middle of a generation, with a model from the cache."""
-    folder = ran(tmp_path / "run", "trainer.steps=5")
-    ran(folder)
-    assert load_trained(folder).step == 14
-    here, there = (load_trained(each).loss.state_dict() for each in (finished, folder))
-    assert here.keys() == there.keys()
+RAMBO = ["loss=rambo", "dynamics.adversarial_steps=7", "dynamics.adversarial_weight=1"]
+RECOVERY = ["recovery=osr", "trainer.inverse_dynamics_steps=3"]
+
+
+def test_a_model_in_training_is_continued_with_the_same_bits(tmp_path) -> None:
+    """Stopped in the middle of a generation, with OSR's recovery term added."""
+    whole, folder = tmp_path / "whole", tmp_path / "run"
+    ran(whole, *RAMBO, *RECOVERY)
+    ran(folder, *RAMBO, *RECOVERY, "trainer.steps=6")
+    ran(folder, *RAMBO, *RECOVERY)
+    names = ("loss_qvalue", "loss_recovery", "imagined_reward", "adversary_objective")
+    for name in names:
+        assert scalars(folder)[name] == scalars(whole)[name], name
+    models = [trained_model(each) for each in (whole, folder)]
+    assert all(map(torch.equal, *(each.values() for each in models)))
+    before = load_dynamics(whole / FILE).state_dict()
+    assert not torch.equal(models[0]["layers.0.weight"], before["layers.0.weight"])
+    here, there = (load_trained(each).loss.state_dict() for each in (whole, folder))
     for key, value in here.items():
         assert not torch.is_tensor(value) or torch.equal(value, there[key]), key
-    assert scalars(folder)["imagined_reward"] == scalars(finished)["imagined_reward"]
+
+
+def test_recovery_is_added_to_mopo(tmp_path) -> None:
+    found = scalars(ran(tmp_path, *RECOVERY, "trainer.steps=2"))
+    assert {"loss_recovery", "recovery_kl", "imagined_reward"} <= found.keys()
+
+
+def test_rows_that_lead_into_the_data_are_imagined_backwards(tmp_path) -> None:
+    romi = ["loss=romi", "dynamics.reverse_policy=cvae", "trainer.steps=2"]
+    folder = ran(tmp_path, *romi)
+    assert "imagined_reward" in scalars(folder)
+    assert len(scalars(folder, "vae")["loss_vae"]) == 10
+    # A model of one direction of time is none of the other.
+    given = f"dynamics.path={folder / FILE}"
+    with pytest.raises(ValueError, match="direction of time: backward there, forward"):
+        modelled(tmp_path / "forward", given)
+    cfg = small("loss=romi")
+    data, model = load_training_data(cfg, CPU), load_dynamics(folder / FILE)
+    actor = make_learner(cfg, 11, 3).actor
+    buffer = imagined_replay_buffer(cfg, data, model, actor, lambda batch: batch)
+    buffer.sample()
+    rows = buffer.online_buffer[:]
+    # The first generation's first rows, with any action, end in states of the data.
+    ends, known = rows["next", "observation"][:20], data.rows(torch.arange(540))
+    same = (ends.unsqueeze(1) == known["observation"]).all(-1)
+    assert same.any(1).all()
+    assert rows["action"].abs().max() <= 1
+    assert not rows["next", "terminated"].any()
+
+
+def test_states_are_corrected_by_a_trained_autoencoder(tmp_path) -> None:
+    folder = ran(tmp_path, "loss=sdc", "dynamics.real_ratio=1", "trainer.steps=2")
+    assert {"deviation", "multiplier"} <= scalars(folder).keys()
+    held = load_trained(folder).loss.transition_network_params
+    assert held["target_scale"].ne(1).all()
 
 
 def modelled(folder: Path, *overrides: str) -> list[OfflineTrainer]:
     """The phase of the model alone; returns its trainer, if one was needed."""
     folder.mkdir(exist_ok=True)
-    cfg, trainers = composed(*overrides), []
+    cfg, trainers = small(*overrides), []
 
     def new_trainer(*arguments, **options) -> OfflineTrainer:
         trainers.append(OfflineTrainer(*arguments, progress=False, **options))
@@ -208,7 +255,7 @@ def test_a_file_that_makes_no_model_is_refused(
 
 def test_from_disk_the_same_model_is_trained(finished) -> None:
     here, there = (
-        load_training_data(composed(f"data.storage={storage}"), CPU)
+        load_training_data(small(f"data.storage={storage}"), CPU)
         for storage in ("memory", "disk")
     )
     torch.testing.assert_close(here.pieces, there.pieces)
@@ -220,7 +267,7 @@ def test_from_disk_the_same_model_is_trained(finished) -> None:
     torch.testing.assert_close(*(each.sample() for each in rows))
     numbers = torch.tensor([3, 500, 7])
     torch.testing.assert_close(here.rows(numbers), there.rows(numbers))
-    facts = [facts_of(composed(), data) for data in (here, there)]
+    facts = [facts_of(small(), data) for data in (here, there)]
     assert facts[0]["rows"] == facts[1]["rows"] == 540
 
 
@@ -228,7 +275,7 @@ def test_penalty_and_units_are_those_of_the_task(finished, tmp_path) -> None:
     """Imagined rewards lose the penalty in the task's units, whatever the data's."""
     found = {}
     for penalty in (0.0, 1.5):
-        cfg = composed(f"dynamics.penalty={penalty}", "dynamics.rollout_steps=1")
+        cfg = small(f"dynamics.penalty={penalty}", "dynamics.rollout_steps=1")
         data = load_training_data(cfg, CPU)
         torch.manual_seed(0)
         actor = make_learner(cfg, 11, 3).actor
@@ -255,11 +302,18 @@ def test_penalty_and_units_are_those_of_the_task(finished, tmp_path) -> None:
         (["env=pointmaze-umaze", "data=diverse"], "no rule is known by which Point"),
         (["dynamics.num_elites=9"], "num_elites must be between 1 and num_networks=3"),
         (["dynamics.real_ratio=0.01"], "real_ratio=0.01 of 8 rows are 0"),
+        (["loss=scas", "dynamics=reverse"], "asks where actions lead, and a model"),
+        (["loss=romi", "dynamics.adversarial_steps=9"], "here none is: set it to 0"),
+        ([*RAMBO, "dynamics.real_ratio=1"], "adversarial_steps=7 trains the model"),
+        (
+            ["loss=bc", "dynamics=ensemble", RAMBO[1]],
+            "asks for the values of critics, and BCLoss has none",
+        ),
     ],
 )
 def test_what_cannot_be_had_is_refused_before_the_data(overrides, message) -> None:
     with pytest.raises(ValueError, match=message):
-        check_parts(composed(*overrides), 11, 3)
+        check_parts(small(*overrides), 11, 3)
 
 
 def test_a_policy_learns_from_what_is_imagined_of_rows_on_disk(tmp_path) -> None:
@@ -275,15 +329,15 @@ def test_a_loss_has_the_trained_model_and_nothing_is_imagined(tmp_path) -> None:
     for key, value in TensorDict.from_module(model).items(True, True):
         assert torch.equal(held[key], value), key
     # No task needs a rule for its end, where nothing is imagined.
-    cfg = composed("loss=scas", "dynamics.real_ratio=1", "env=pointmaze-umaze")
+    cfg = small("loss=scas", "dynamics.real_ratio=1", "env=pointmaze-umaze")
     check_parts(cfg, 11, 3)
     with pytest.raises(ValueError, match="needs a model of the dynamics: take dyn"):
-        check_parts(composed("loss=scas", "dynamics=none"), 11, 3)
+        check_parts(small("loss=scas", "dynamics=none"), 11, 3)
 
 
 def test_a_time_limit_alone_may_end_a_task() -> None:
     check_parts(
-        composed("env=pointmaze-umaze", "data=diverse", "dynamics.terminations=never"),
+        small("env=pointmaze-umaze", "data=diverse", "dynamics.terminations=never"),
         11, 3,
     )  # fmt: skip
 
@@ -292,10 +346,10 @@ def test_roll_outs_are_as_published_for_a_data_set() -> None:
     found = {
         name: (cfg.dynamics.rollout_steps, cfg.dynamics.penalty)
         for name, cfg in {
-            "replay": composed("data=medium-replay", "env=walker2d"),
-            "by id": composed("data=medium", "env.id=HalfCheetah-v5"),
-            "another": composed("env.id=my:Arm-v0.1"),
-            "given": composed("dynamics.penalty=3", "dynamics.rollout_steps=2"),
+            "replay": small("data=medium-replay", "env=walker2d"),
+            "by id": small("data=medium", "env.id=HalfCheetah-v5"),
+            "another": small("env.id=my:Arm-v0.1"),
+            "given": small("dynamics.penalty=3", "dynamics.rollout_steps=2"),
         }.items()
     }
     assert found == {
@@ -304,12 +358,16 @@ def test_roll_outs_are_as_published_for_a_data_set() -> None:
         "another": (5, 2.5),
         "given": (2, 3.0),
     }
-    assert not composed("dynamics=none").dynamics.use
+    assert not small("dynamics=none").dynamics.use
+    plain = small("loss=rambo", "data=medium", "env=walker2d").dynamics
+    assert (plain.rollout_steps, plain.adversarial_weight) == (5, 0.0)
+    reverse = small("loss=romi", "env=halfcheetah").dynamics
+    assert (reverse.rollout_steps, reverse.reverse_policy) == (1, "cvae")
 
 
 def test_defaults_are_said(caplog) -> None:
     choices = {"loss": "mopo", "env": "hopper", "data": "random"}
-    train.check_published(composed(), choices)
+    check_published(small(), choices)
     assert not caplog.records
-    train.check_published(composed("env.id=Pendulum-v1"), choices)
+    check_published(small("env.id=Pendulum-v1"), choices)
     assert "rollout_steps=5 and dynamics.penalty=2.5 are taken" in caplog.text

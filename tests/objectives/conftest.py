@@ -9,7 +9,7 @@ the name says.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -36,10 +36,16 @@ from torchrl_osr import (
     OSRVLoss,
     ReBRACLoss,
     RORLLoss,
+    SCASLoss,
+    SDCLoss,
     StateRecoveryLoss,
     TD3BCLoss,
 )
-from torchrl_osr.modules import cvae_inverse_dynamics
+from torchrl_osr.modules import (
+    ConditionalVAE,
+    DynamicsEnsemble,
+    cvae_inverse_dynamics,
+)
 
 NUM_ACTIONS = 4
 
@@ -157,6 +163,24 @@ def latent_model(*, observation, action, seed: int):
     return model
 
 
+def dynamics_ensemble(*, observation, action, seed: int) -> DynamicsEnsemble:
+    """A model of the dynamics, float64, whose networks are far apart."""
+    torch.manual_seed(seed)
+    keys = {"observation_key": observation, "action_key": action}
+    model = DynamicsEnsemble(3, 2, num_networks=2, num_elites=2, num_cells=[6], **keys)
+    for each in model.parameters():
+        nn.init.normal_(each, std=0.5)
+    return model.double()
+
+
+def transition_vae(*, observation, action, seed: int) -> ConditionalVAE:
+    """A model of the states that follow, float64; ``action`` is none of its entries."""
+    torch.manual_seed(seed)
+    following = unravel_key(("next", observation))
+    keys = {"condition_key": observation, "target_key": following}
+    return ConditionalVAE(3, 3, change=True, num_cells=[6], **keys).double()
+
+
 ACTOR, CRITICS, MODEL = (
     f"{network}_network_params" for network in ("actor", "qvalue", "inverse_dynamics")
 )
@@ -212,9 +236,20 @@ class Member:
             return ["inverse_dynamics"]
         if self.loss_class is StateRecoveryLoss:
             return ["actor", "inverse_dynamics"]
+        if self.loss_class in (SCASLoss, SDCLoss):
+            models = [each for each in self.replace if each != "actor"]
+            return ["actor", "critics", *models]
         without = (EDACLoss, RORLLoss, ReBRACLoss, TD3BCLoss)
         with_model = self.loss_class not in without
         return ["actor", "critics", *["inverse_dynamics"] * with_model]
+
+    @property
+    def frozen(self) -> list[str]:
+        """The parameters that it holds and does not train, but for targets."""
+        models = {*self.parts} - {"actor", "critics"}
+        if not PROPERTIES["model"](self):
+            models -= {"inverse_dynamics"}
+        return [f"{model}_network_params" for model in sorted(models)]
 
     @property
     def index(self) -> bool:
@@ -261,8 +296,12 @@ PROPERTIES: dict[str, Callable[[Member], bool]] = {
     "perturbed": lambda member: PERTURBED in member.in_keys,
     "priority weight": lambda member: "priority_weight" in member.keys,
     "weights": lambda member: member.weights != {},
-    # Others are made of the same pieces, and take long to compile.
-    "pieces of its own": lambda member: member.loss_class not in (ReBRACLoss, RORLLoss),
+    # SCAS has in one loss a term of all rows and one of those with a next state.
+    "rows that count alike": lambda member: member.loss_class is not SCASLoss,
+    "weights of rows": lambda member: (
+        PROPERTIES["priority weight"](member)
+        and PROPERTIES["rows that count alike"](member)
+    ),
 }
 
 
@@ -397,6 +436,30 @@ FAMILY = {
         perturbed=False,
         networks={"num_critics": 3} | RELU,
         num_samples=2,
+    ),
+    "scas": Member(
+        SCASLoss,
+        {"loss_actor": ACTOR, "loss_qvalue": CRITICS},
+        ["correction_error", "pred_value", "target_value"],
+        [*TRANSITION, PERTURBED],
+        CRITIC_KEYS,
+        networks=RELU,
+        replace={
+            "actor": partial(deterministic_actor, "module"),
+            "dynamics": dynamics_ensemble,
+        },
+    ),
+    "sdc": replace(
+        actor_critic(
+            SDCLoss,
+            CQL | {"loss_deviation": ACTOR, "loss_multiplier": "log_multiplier"},
+            "deviation",
+            "multiplier",
+            networks=RELU,
+            num_random=3,
+            num_samples=2,
+        ),
+        replace={"dynamics": dynamics_ensemble, "transition": transition_vae},
     ),
     "discrete": actor_critic(DiscreteOSRLoss, CQL, "recovery_kl"),
     "discrete-cql": actor_critic(

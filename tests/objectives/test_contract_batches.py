@@ -16,7 +16,7 @@ def flag(batch, key: str) -> torch.Tensor:
     return batch["next", key].squeeze(-1)
 
 
-@pytest.mark.losses
+@pytest.mark.losses(having="rows that count alike")
 @pytest.mark.parametrize("size", [(10,), (2, 5)])
 def test_reductions_agree(family, family_batch, seeded, terms, name, size) -> None:
     batch = family_batch(name, *size)
@@ -96,7 +96,7 @@ def test_padding_changes_neither_losses_nor_gradients(
         assert_same(record(loss, spoiled), wanted)
 
 
-@pytest.mark.losses
+@pytest.mark.losses(having="rows that count alike")
 def test_mean_is_over_unmasked_rows(family, family_batch, terms, name) -> None:
     batch = family_batch(name, 10)
     valid = torch.arange(10) < 6

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_settings import tried
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -30,7 +31,7 @@ def counts(batch: TensorDict, weight: Tensor, key: str) -> Tensor:
     return weight * (mask & ~ended).squeeze(-1)
 
 
-@pytest.mark.losses(having="priority weight")
+@pytest.mark.losses(having="weights of rows")
 @pytest.mark.parametrize("shape", [(10,), (10, 1)])
 def test_rows_weigh_as_much_as_their_priority_weight(
     family, family_batch, seeded, terms, name, shape
@@ -67,11 +68,7 @@ numbers = st.lists(
 
 @pytest.mark.losses("osr", "osrv", "recovery", "cloning", "discrete", "edac", "td3bc")
 @given(numbers, st.one_of(st.none(), flags), flags, st.booleans())
-@settings(
-    deadline=None,
-    max_examples=20,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
+@tried(8)
 def test_no_weight_mask_or_end_spoils_a_value_or_a_gradient(
     family, family_batch, record, terms, name, weight, mask, done, column
 ) -> None:

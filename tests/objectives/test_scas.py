@@ -163,6 +163,7 @@ def test_the_versions_differ(networks, make_batch) -> None:
 
 def test_the_model_is_frozen_and_can_be_given_later(networks, make_batch) -> None:
     loss, batch = make_loss(networks, "released"), make_batch(10)
+    loss(batch)
     held = {each.data_ptr() for each in loss.parameters()}
     names = [key for key in loss.state_dict() if "dynamics" in key]
     assert any(key.endswith("weight") for key in names)
@@ -172,12 +173,14 @@ def test_the_model_is_frozen_and_can_be_given_later(networks, make_batch) -> Non
     other = make_model()
     with torch.no_grad():
         other.layers[-1].bias += 1
-    loss.load_dynamics(other)
+    loss.load_network("dynamics_network", other)
     assert loss(batch)["correction_error"] != before
-    loss.load_dynamics(make_model())
+    loss.load_network("dynamics_network", make_model())
     assert loss(batch)["correction_error"] == before
     with pytest.raises(ValueError, match="other sizes"):
-        loss.load_dynamics(DynamicsEnsemble(3, 2, num_cells=[6]).double())
+        loss.load_network(
+            "dynamics_network", DynamicsEnsemble(3, 2, num_cells=[6]).double()
+        )
 
 
 def test_next_states_after_an_end_are_not_read(networks, make_batch) -> None:

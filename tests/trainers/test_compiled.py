@@ -14,17 +14,11 @@ pytestmark = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("name", "loss_options"),
-    [
-        ("OSR", {}),
-        ("OSR-v", {}),
-        ("OSR", {"layer_norm": True, "deactivate_vmap": True}),
-    ],
-)
-def test_loss_is_traced_once_and_whole(tmp_path, runs, name, loss_options, monkeypatch):
+def test_loss_is_traced_once_and_whole(tmp_path, runs, monkeypatch):
+    # A loop over critics with normalised layers, which no test of the losses traces.
+    loss_options = {"layer_norm": True, "deactivate_vmap": True}
     options = {"total_steps": 5, "loss_options": loss_options}
-    plain = runs.make(tmp_path / "plain", name, **options)
+    plain = runs.make(tmp_path / "plain", "OSR", **options)
     plain.train()
     wanted = runs.state(plain)
     graphs, original = CompileCounter(), torch.nn.Module.compile
@@ -34,7 +28,7 @@ def test_loss_is_traced_once_and_whole(tmp_path, runs, name, loss_options, monke
         "compile",
         lambda module: original(module, backend=graphs, fullgraph=True),
     )
-    trainer = runs.make(tmp_path / "compiled", name, compile=True, **options)
+    trainer = runs.make(tmp_path / "compiled", "OSR", compile=True, **options)
     assert graphs.frame_count == 0
     trainer.train()
     assert graphs.frame_count == 1

@@ -18,7 +18,7 @@ from torchrl_osr.data import ReferenceReturns, reference_returns
 from torchrl_osr.experiment.limits import check_networks
 from torchrl_osr.imagination import Termination, never, termination
 from torchrl_osr.imagination.replay_buffer import check_real_ratio
-from torchrl_osr.modules import DynamicsEnsemble, state_value
+from torchrl_osr.modules import ConditionalVAE, DynamicsEnsemble, state_value
 from torchrl_osr.objectives import BaseLoss
 from torchrl_osr.objectives.distributions import head_of, is_categorical
 from torchrl_osr.objectives.with_recovery import WithRecovery
@@ -133,6 +133,32 @@ def termination_of(cfg: DictConfig) -> Termination:
     return never if cfg.dynamics.terminations == "never" else termination(cfg.env.id)
 
 
+def make_transition_vae(cfg: DictConfig, observation_size: int) -> ConditionalVAE:
+    """An untrained model of the states that follow a state in the data."""
+    return ConditionalVAE(
+        observation_size,
+        observation_size,
+        condition_key="observation",
+        target_key=("next", "observation"),
+        change=True,
+        num_cells=list(cfg.dynamics.vae_num_cells),
+    )
+
+
+def make_reverse_vae(
+    cfg: DictConfig, observation_size: int, action_size: int
+) -> ConditionalVAE:
+    """An untrained model of the actions that led to a state of the data."""
+    return ConditionalVAE(
+        observation_size,
+        action_size,
+        condition_key=("next", "observation"),
+        target_key="action",
+        latent_bound=0.5,
+        num_cells=list(cfg.dynamics.vae_num_cells),
+    )
+
+
 class Learner(NamedTuple):
     """A policy's loss and the networks in it.
 
@@ -160,7 +186,7 @@ def make_learner(
 
     A loss is given those networks that its constructor names: ``actor_network``,
     ``qvalue_network``, ``value_network``, ``inverse_dynamics_network``,
-    ``dynamics_network``.
+    ``dynamics_network``, ``transition_network``.
 
     Args:
         cfg: a whole configuration of ``torchrl-osr train``.
@@ -193,6 +219,9 @@ def make_learner(
         wanted = inspect.signature(get_class(part._target_)).parameters
         if "dynamics_network" in wanted:
             networks["dynamics_network"] = make_dynamics(cfg, *sizes).to(device)
+        if "transition_network" in wanted:
+            vae = make_transition_vae(cfg, observation_size)
+            networks["transition_network"] = vae.to(device)
         if "value_network" in wanted:
             networks["value_network"] = state_value(
                 observation_size, num_cells=cells, layer_norm=cfg.network.layer_norm
@@ -244,6 +273,22 @@ def _check_recovery(cfg: DictConfig) -> None:
         )
 
 
+def _check_model_adversary(cfg: DictConfig, loss: LossModule) -> None:
+    """Raise a ValueError unless a model can be trained against a loss's policy."""
+    steps = f"dynamics.adversarial_steps={cfg.dynamics.adversarial_steps}"
+    if cfg.dynamics.reverse_policy or cfg.dynamics.real_ratio == 1:
+        raise ValueError(
+            f"{steps} trains the model that the policy is rolled out in, and here none "
+            "is: set it to 0, or take dynamics=ensemble and dynamics.real_ratio below "
+            "1."
+        )
+    if not (isinstance(loss, BaseLoss) and hasattr(loss, "qvalue_network")):
+        raise ValueError(
+            f"{steps} asks for the values of critics, and {type(loss).__name__} has "
+            "none: set it to 0."
+        )
+
+
 def check_parts(
     cfg: DictConfig, observation_size: int, action_size: int
 ) -> list[NestedKey]:
@@ -284,6 +329,14 @@ def check_parts(
             f"{cfg.loss._target_} needs a model of the dynamics: take "
             "dynamics=ensemble."
         )
+    if hasattr(learner.loss, "dynamics_network") and cfg.dynamics.reverse_policy:
+        raise ValueError(
+            f"{cfg.loss._target_} asks where actions lead, and a model with "
+            f"dynamics.reverse_policy={cfg.dynamics.reverse_policy} knows where states "
+            "came from: take dynamics=ensemble."
+        )
+    if cfg.dynamics.use and cfg.dynamics.adversarial_steps:
+        _check_model_adversary(cfg, learner.loss)
     if cfg.dynamics.use:
         make_dynamics(cfg, *sizes)
     if cfg.dynamics.use and cfg.dynamics.real_ratio < 1:

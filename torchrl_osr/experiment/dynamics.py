@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Mapping
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from filelock import FileLock
@@ -24,7 +24,7 @@ from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     set_interaction_type,
 )
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchrl_osr import __version__
 from torchrl_osr._files import write_json
@@ -32,14 +32,17 @@ from torchrl_osr.data.store.cache import cache_root
 from torchrl_osr.data.store.validation import DATASET_KEYS
 from torchrl_osr.evaluation import describe_dynamics, dynamics_report
 from torchrl_osr.experiment.build import make_dynamics, termination_of
-from torchrl_osr.experiment.training_data import TrainingData
+from torchrl_osr.experiment.training_data import ROWS_FOR_STATISTICS, TrainingData
 from torchrl_osr.imagination import (
     Imagined,
     ImaginedReplayBuffer,
+    ModelAdversary,
+    Termination,
     imagine,
+    imagine_backwards,
 )
-from torchrl_osr.modules import DynamicsEnsemble
-from torchrl_osr.objectives import DynamicsLoss
+from torchrl_osr.modules import ConditionalVAE, DynamicsEnsemble
+from torchrl_osr.objectives import BaseLoss, DynamicsLoss
 from torchrl_osr.policy.tensor_file import read_tensors, write_tensors
 from torchrl_osr.trainers import OfflineTrainer
 from torchrl_osr.trainers.checkpoints import safe_checkpoint
@@ -53,9 +56,6 @@ KIND = "dynamics model"
 
 FITTED = ("num_networks", "num_elites", "num_cells", "lr", "batch_size", "steps")
 """Settings of ``dynamics`` that decide what a trained model is."""
-
-ROWS_FOR_STATISTICS = 50_000
-"""Rows from which inputs and targets are standardised."""
 
 
 def dynamics_model(
@@ -123,6 +123,7 @@ def facts_of(cfg: DictConfig, data: TrainingData) -> dict[str, Any]:
         "reward scale": cfg.data.reward_scale,
         "reward shift": cfg.data.reward_shift,
         "held-out rows": digest.hexdigest(),
+        "direction of time": "backward" if data.backwards else "forward",
     }
 
 
@@ -271,41 +272,50 @@ def imagined_replay_buffer(
     cfg: DictConfig,
     data: TrainingData,
     model: DynamicsEnsemble,
-    actor: ProbabilisticTensorDictSequential,
+    policy: nn.Module,
     transform: Callable[[TensorDictBase], TensorDictBase],
+    adversary: ModelAdversary | None = None,
 ) -> ImaginedReplayBuffer:
     """Batches of ``trainer.batch_size`` rows, of which ``dynamics.real_ratio`` real.
 
     Args:
         cfg: a whole configuration of ``torchrl-osr train``.
         data: what the run trains on.
-        model: of the dynamics.
-        actor: the policy; actions are drawn from it.
+        model: of the dynamics, or with ``dynamics.reverse_policy`` of their reverse.
+        policy: whose actions are drawn: an actor, or of a reverse model a
+            :class:`~torchrl_osr.modules.ConditionalVAE`.
         transform: applied to each batch.
+        adversary: trains the model before each generation. Default: nobody.
     """
     options, norm, ends = cfg.dynamics, data.norm, termination_of(cfg)
     real, scale = data.alone(), cfg.data.reward_scale
     sizes = norm.scale.expand(model.observation_dim)
     units = torch.cat([sizes, sizes.new_tensor([1 / scale])])
     largest = float(model.largest_disagreement) if options.refuse else math.inf
+    backwards = options.reverse_policy is not None
 
-    def terminated(state: Tensor) -> Tensor:
-        return ends(state * norm.scale + norm.loc)
+    def rows_of(copied: nn.Module) -> Imagined:
+        # What is trained is copied, for a generation can be imagined again.
+        policy, inside = (copied, model) if adversary is None else copied.children()
 
-    def rows_of(policy: torch.nn.Module) -> Imagined:
         def act(state: Tensor) -> Tensor:
+            if options.reverse_policy == "uniform":
+                size = len(state), model.action_dim
+                return 2 * torch.rand(size, device=state.device) - 1
+            if isinstance(policy, ConditionalVAE):
+                return policy.sample(state)
             batch = TensorDict({"observation": state}, state.shape[:-1])
             with set_interaction_type(InteractionType.RANDOM):
                 action: Tensor = policy(batch)["action"]
             return action
 
         starts = data.rows(torch.randint(len(real), [options.rollout_starts]))
-        rows, refused = imagine(
-            model,
+        rows, refused = (imagine_backwards if backwards else imagine)(
+            cast(DynamicsEnsemble, inside),
             act,
             starts["observation"],
             steps=options.rollout_steps,
-            terminated=terminated,
+            terminated=_in_units_of(data, ends),
             max_disagreement=largest,
             units=units,
         )
@@ -314,7 +324,7 @@ def imagined_replay_buffer(
 
     return ImaginedReplayBuffer(
         real,
-        actor,
+        policy if adversary is None else nn.ModuleList([policy, model]),
         rows_of,
         real_ratio=options.real_ratio,
         batch_size=cfg.trainer.batch_size,
@@ -322,4 +332,45 @@ def imagined_replay_buffer(
         generations=options.generations,
         seed=cfg.seed,
         transform=transform,
+        before=adversary,
     )
+
+
+def model_adversary(
+    cfg: DictConfig,
+    data: TrainingData,
+    model: DynamicsEnsemble,
+    actor: ProbabilisticTensorDictSequential,
+    loss: BaseLoss,
+    adam: Callable[..., torch.optim.Optimizer],
+) -> ModelAdversary:
+    """What trains a run's model against its policy, as ``dynamics`` has it.
+
+    Args:
+        cfg: a whole configuration of ``torchrl-osr train``.
+        data: what the run trains on.
+        model: of the dynamics.
+        actor: the policy.
+        loss: the policy's, with critics.
+        adam: makes an optimizer from parameters.
+    """
+    options = cfg.dynamics
+    return ModelAdversary(
+        model,
+        loss,
+        actor,
+        data.alone(),
+        adam(model.parameter_groups(), lr=options.adversarial_lr),
+        steps=options.adversarial_steps,
+        weight=options.adversarial_weight,
+        rollout_steps=options.rollout_steps,
+        batch_size=options.batch_size,
+        gamma=cfg.optim.gamma,
+        terminated=_in_units_of(data, termination_of(cfg)),
+        seed=cfg.seed,
+    )
+
+
+def _in_units_of(data: TrainingData, ends: Termination) -> Termination:
+    """A rule for the task's own units, as one for those of the data."""
+    return lambda state: ends(state * data.norm.scale + data.norm.loc)

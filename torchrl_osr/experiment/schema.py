@@ -21,11 +21,12 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import MISSING, OmegaConf
 
 from torchrl_osr import objectives
+from torchrl_osr.experiment.published import register_published
 
 # File systems allow 255 bytes, and temporary names beside it need some of them.
 MAX_FOLDER_NAME = 200
 
-NOT_CHOSEN = {"BaseLoss", "DynamicsLoss"}
+NOT_CHOSEN = {"BaseLoss", "ConditionalVAELoss", "DynamicsLoss"}
 """Classes of :mod:`torchrl_osr.objectives` that no configuration names."""
 
 
@@ -191,10 +192,20 @@ class DynamicsConfig:
         batch_size: rows of a gradient step, for each network.
         steps: gradient steps of the model; the weights of its best evaluation are
             taken.
+        vae_num_cells: width of each hidden layer of the conditional autoencoder of
+            loss=sdc or dynamics=reverse.
+        vae_steps: gradient steps of that autoencoder, with lr and batch_size.
         path: a trained model to take, dynamics.safetensors of a run with the same data;
             null for one of the same settings in the cache, or a new one.
         terminations: auto for the rule by which the task ends, never for tasks that a
             time limit alone ends.
+        reverse_policy: cvae or uniform, by which actions a reverse model rolls out from
+            states of the data to where they came from: those of a conditional
+            autoencoder of the data, or any; null for the policy's, forwards.
+        adversarial_steps: gradient steps, before each further roll-out, by which the
+            model is trained on the data and against the policy; 0 for none.
+        adversarial_weight: of the policy's advantage in that training.
+        adversarial_lr: learning rate of that training.
         rollout_steps: steps of a roll-out.
         rollout_starts: states of the data that roll-outs start from, each time.
         rollout_interval: gradient steps of the policy between roll-outs.
@@ -205,7 +216,7 @@ class DynamicsConfig:
             imagined rewards lose.
         refuse: leave out rows on which the elites disagree more than on any held-out
             row.
-        published: rollout_steps and penalty by data set, where a method has them.
+        published: settings by data set or task, where a method has them.
     """
 
     use: bool = MISSING
@@ -215,8 +226,14 @@ class DynamicsConfig:
     lr: float = MISSING
     batch_size: int = MISSING
     steps: int = MISSING
+    vae_num_cells: list[int] = MISSING
+    vae_steps: int = MISSING
     path: str | None = None
     terminations: str = MISSING
+    reverse_policy: str | None = None
+    adversarial_steps: int = MISSING
+    adversarial_weight: float = MISSING
+    adversarial_lr: float = MISSING
     rollout_steps: int = MISSING
     rollout_starts: int = MISSING
     rollout_interval: int = MISSING
@@ -243,8 +260,9 @@ class OptimConfig:
             over trainer.steps.
         qvalue_schedule: the same of qvalue_lr.
         policy_average: how much of their exponential average the policy's weights
-            replace at each update. The average is what is evaluated, filmed and
-            exported; with 1 it is the weights themselves.
+            replace at each update, more in the first ones, so that it is never of more
+            than about the last tenth of a run. The average is what is evaluated, filmed
+            and exported; with 1 it is the weights themselves.
     """
 
     actor_lr: float = MISSING
@@ -271,7 +289,6 @@ class TrainerConfig:
         eval_episodes: complete episodes in an evaluation.
         checkpoint_interval: steps between checkpoints.
         checkpoints_kept: number of newest checkpoints that stay, beside the best.
-        nonfinite: at a loss or gradient that is not finite, stop or skip the update.
         num_threads: torch threads; 1 where several runs share the machine.
         device: cpu or cuda.
         precision: of the losses' matrix products: float32 or bfloat16.
@@ -291,7 +308,6 @@ class TrainerConfig:
     eval_episodes: int = MISSING
     checkpoint_interval: int = MISSING
     checkpoints_kept: int = MISSING
-    nonfinite: str = MISSING
     num_threads: int = MISSING
     device: str = MISSING
     precision: str = MISSING
@@ -465,7 +481,7 @@ def register() -> None:
     """Make schemas and resolvers known to Hydra.
 
     ``train_schema``, ``check_data_schema``, ``collect_schema``, and in the group
-    ``schema`` one for each class of :mod:`torchrl_osr.objectives`;
+    ``schema`` one for each class of :mod:`torchrl_osr.objectives`; published settings;
     ``environment_name``, the short name of a task; ``run_dir``, by which
     ``resume=folder`` becomes the run's folder; ``method_name``, see
     :func:`method_name`; and ``job_dir``, see :func:`job_folder`.
@@ -477,6 +493,7 @@ def register() -> None:
     for name in set(objectives.__all__) - NOT_CHOSEN:
         schema = schema_of(getattr(objectives, name))
         store.store(group="schema", name=name, node=schema)
+    register_published()
     resolvers: dict[str, Callable[..., Any]] = {
         "environment_name": _environment_name,
         "run_dir": lambda resume, fresh: resume or fresh,

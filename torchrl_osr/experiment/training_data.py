@@ -28,9 +28,13 @@ from torchrl_osr.data import (
     split_held_out,
 )
 from torchrl_osr.experiment.build import check_storage, load_data, references_of
+from torchrl_osr.imagination import turned
 
 MAX_HELD_OUT = 50_000
 """Held-out rows of a set on disk that are read into memory, at most."""
+
+ROWS_FOR_STATISTICS = 50_000
+"""Rows from which a model's inputs and targets are standardised."""
 
 NUM_PIECES, PIECE = 500, 20
 """Pieces of trajectories to judge a dynamics model by, at most, and their rows."""
@@ -48,6 +52,7 @@ class TrainingData(NamedTuple):
         pieces: of trajectories, each from a held-out row on, ``[n, 20]``; the rows that
             follow may be trained on. ``None`` if there is no dynamics model.
         prepare: what is done to rows from disk; ``None`` if those in memory are ready.
+        backwards: whether :meth:`alone`, held-out rows and pieces are turned around.
     """
 
     buffer: ReplayBuffer
@@ -57,6 +62,7 @@ class TrainingData(NamedTuple):
     mean: float | None
     pieces: TensorDict | None
     prepare: Compose | None
+    backwards: bool = False
 
     def rows(self, numbers: Tensor) -> TensorDict:
         """Rows of :attr:`buffer` by their numbers ``[n]``, without its transforms."""
@@ -65,12 +71,23 @@ class TrainingData(NamedTuple):
 
     def alone(self, batch_size: int | None = None) -> ReplayBuffer:
         """The buffer's rows without what is appended to :attr:`buffer` later on."""
-        return ReplayBuffer(
+        alone = ReplayBuffer(
             storage=self.buffer.storage,
             writer=ImmutableDatasetWriter(),
             collate_fn=lambda batch: batch,
             transform=None if self.prepare is None else self.prepare.clone(),
             batch_size=batch_size,
+        )
+        if self.backwards:
+            alone.append_transform(turned)
+        return alone
+
+    def reverse(self) -> TrainingData:
+        """The same transitions against the direction of time, for a reverse model."""
+        return self._replace(
+            held_out=turned(self.held_out),
+            pieces=None if self.pieces is None else turned(self.pieces.flip(1)),
+            backwards=True,
         )
 
 

@@ -12,7 +12,11 @@ Symbols: ``pi`` policy, ``I`` inverse dynamics model, ``s`` clean state, ``s^``
 perturbed state, ``s~`` a state of the mixed data set (clean and perturbed).
 """
 
-from torchrl_osr.functional.correction import correction_error, value_gain_weight
+from torchrl_osr.functional.correction import (
+    correction_error,
+    maximum_mean_discrepancy,
+    value_gain_weight,
+)
 from torchrl_osr.functional.critics import (
     conservative_gap,
     gradient_diversity,
@@ -30,6 +34,7 @@ from torchrl_osr.functional.divergences import (
     state_recovery,
 )
 from torchrl_osr.functional.dynamics import (
+    adversarial_objective,
     bounded_log_variance,
     disagreement,
     gaussian_error,
@@ -48,6 +53,7 @@ from torchrl_osr.functional.policy import (
 
 __all__ = [
     "action_distance",
+    "adversarial_objective",
     "bootstrap_value",
     "bounded_log_variance",
     "categorical_kl",
@@ -63,6 +69,7 @@ __all__ = [
     "jeffreys_divergence",
     "lagrange_terms",
     "largest_deviation",
+    "maximum_mean_discrepancy",
     "rebrac_objective",
     "soft_maximum",
     "soft_policy_value",

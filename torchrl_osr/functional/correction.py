@@ -1,6 +1,7 @@
 """State correction: actions that a dynamics model takes back to the data.
 
-Shapes: ``B`` batch (any leading dimensions), ``S`` observation.
+Shapes: ``B`` batch (any leading dimensions), ``S`` observation, ``n`` and ``m``
+numbers of samples.
 """
 
 from __future__ import annotations
@@ -53,3 +54,37 @@ def correction_error(predicted: Tensor, target: Tensor, weight: Tensor) -> Tenso
         ``[B]``.
     """
     return weight * (predicted - target).square().mean(-1)
+
+
+def maximum_mean_discrepancy(first: Tensor, second: Tensor, width: float) -> Tensor:
+    r"""Squared maximum mean discrepancy of two samples, with a Gaussian kernel.
+
+    .. math::
+        \frac1{n^2} \sum_{i,j} k(x_i, x_j) + \frac1{m^2} \sum_{i,j} k(y_i, y_j)
+        - \frac2{nm} \sum_{i,j} k(x_i, y_j), \quad
+        k(x, y) = \exp\Big(-\frac{\|x - y\|^2}{2 h^2 S}\Big)
+
+    "A Kernel Two-Sample Test", https://jmlr.org/papers/v13/gretton12a.html, the biased
+    estimate. Samples much further apart than the width have no gradient.
+
+    Args:
+        first: :math:`x`, ``[n, B, S]``.
+        second: :math:`y`, ``[m, B, S]``.
+        width: :math:`h`, in units of one entry.
+
+    Returns:
+        ``[B]``, each entry between 0 and 2.
+
+    Examples:
+        >>> import torch
+        >>> here, there = torch.zeros(3, 1), torch.full((3, 1), 2.0)
+        >>> maximum_mean_discrepancy(here, there, width=1.0).item()
+        1.7293294...
+    """
+
+    def kernel(x: Tensor, y: Tensor) -> Tensor:
+        """Mean over all pairs, ``[B]``."""
+        distance = (x.unsqueeze(1) - y.unsqueeze(0)).square().mean(-1)
+        return (distance / (-2 * width**2)).exp().mean((0, 1))
+
+    return kernel(first, first) + kernel(second, second) - 2 * kernel(first, second)

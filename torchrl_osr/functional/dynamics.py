@@ -6,6 +6,8 @@ predicted entries.
 
 from __future__ import annotations
 
+import math
+
 from torch import Tensor
 from torch.linalg import vector_norm
 from torch.nn.functional import softplus
@@ -99,3 +101,24 @@ def largest_deviation(scale: Tensor) -> Tensor:
     """
     deviation: Tensor = vector_norm(scale, dim=-1)
     return deviation.amax(0)
+
+
+def adversarial_objective(log_prob: Tensor, advantage: Tensor) -> Tensor:
+    r"""RAMBO's gradient of a model against the policy's value, to be minimised.
+
+    .. math::
+        \frac{A - \bar A}{\operatorname{std} A + 10^{-6}}\,
+        \log \frac1E \sum_{i=1}^{E} p_i(s', r \mid s, a)
+
+    "RAMBO-RL", https://arxiv.org/abs/2204.12581, equation (9) and its code
+    (marc-rigter/rambo): transitions of a small advantage become more likely.
+
+    Args:
+        log_prob: of a sampled transition by each network, ``[E, B]``.
+        advantage: :math:`A` of the transition, without gradient, ``[B]``.
+
+    Returns:
+        ``[B]``.
+    """
+    standardized = (advantage - advantage.mean()) / (advantage.std() + 1e-6)
+    return standardized * (log_prob.logsumexp(0) - math.log(len(log_prob)))

@@ -2,22 +2,34 @@
 
 * :func:`imagine` rolls a policy out in a
   :class:`~torchrl_osr.modules.DynamicsEnsemble`.
+* :func:`imagine_backwards` rolls one out into given states, in a model of turned
+  rows (:func:`turned`).
+* :class:`ModelAdversary` trains a model against the policy.
 * :func:`termination` has the rule by which a task ends.
 * :class:`LookAheadPolicy` plans in one, where it is far from its data.
 * :class:`ImaginedReplayBuffer` mixes real rows with imagined ones.
 """
 
+from torchrl_osr.imagination.adversary import ModelAdversary
 from torchrl_osr.imagination.look_ahead import LookAheadPolicy
 from torchrl_osr.imagination.replay_buffer import ImaginedReplayBuffer
-from torchrl_osr.imagination.rollout import Imagined, imagine
+from torchrl_osr.imagination.rollout import (
+    Imagined,
+    imagine,
+    imagine_backwards,
+    turned,
+)
 from torchrl_osr.imagination.termination import Termination, never, termination
 
 __all__ = [
     "Imagined",
     "ImaginedReplayBuffer",
     "LookAheadPolicy",
+    "ModelAdversary",
     "Termination",
     "imagine",
+    "imagine_backwards",
     "never",
     "termination",
+    "turned",
 ]

@@ -53,6 +53,8 @@ class ImaginedReplayBuffer(OfflineToOnlineReplayBuffer):
         generations: how many of the newest are drawn from.
         seed: of the first generation; the next one has the next seed.
         transform: applied to each batch. Default: none.
+        before: called with the number of each generation but the first, 0, before the
+            policy is copied. Default: nothing.
 
     Raises:
         ValueError: an option is out of its range, or leaves a batch without real or
@@ -86,6 +88,7 @@ class ImaginedReplayBuffer(OfflineToOnlineReplayBuffer):
         generations: int,
         seed: int,
         transform: Callable[[TensorDictBase], TensorDictBase] | None = None,
+        before: Callable[[int], None] | None = None,
     ) -> None:
         check_positive("interval", interval, minimum=1)
         check_positive("generations", generations, minimum=1)
@@ -97,7 +100,7 @@ class ImaginedReplayBuffer(OfflineToOnlineReplayBuffer):
             batch_size=batch_size,
             transform=transform,
         )
-        self.policy, self.rows_of = policy, rows_of
+        self.policy, self.rows_of, self.before = policy, rows_of, before
         self.interval, self.generations, self.seed = interval, generations, seed
         self.drawn = 0  # batches
         self._rng: torch.Generator | None = None
@@ -114,6 +117,8 @@ class ImaginedReplayBuffer(OfflineToOnlineReplayBuffer):
     def sample(self, batch_size: int | None = None) -> TensorDictBase:
         """Draw a batch ``[B]``; imagine a generation before, if one is due."""
         if self.drawn % self.interval == 0:
+            if self.drawn and self.before is not None:
+                self.before(self.drawn // self.interval)
             state = self.policy.state_dict()
             weights = {key: value.cpu().clone() for key, value in state.items()}
             self._policies = [*self._policies, weights][-self.generations :]

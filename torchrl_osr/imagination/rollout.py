@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict
@@ -94,12 +94,10 @@ def imagine(
     state, refused, taken = starts, 0, []
     for step in range(steps):
         action = policy(state)
-        mean, scale = model.predict(state, action)
+        mean, scale = prediction = model.predict(state, action)
         apart = model.disagreement(mean)
         uncertainty = largest_deviation(scale if units is None else scale * units)
-        drawn = torch.randint(len(model.elites), (len(state),), device=state.device)
-        chosen = model.elites[drawn], torch.arange(len(state), device=state.device)
-        sample = mean[chosen] + scale[chosen] * torch.randn_like(mean[chosen])
+        sample = model.sample(prediction)
         following, reward = state + sample[:, :-1], sample[:, -1:]
         ended = terminated(following).unsqueeze(-1)
         row = TensorDict(
@@ -126,3 +124,46 @@ def imagine(
         if not len(state):
             break
     return Imagined(torch.cat(taken), refused)
+
+
+def imagine_backwards(
+    model: DynamicsEnsemble,
+    policy: Callable[[Tensor], Tensor],
+    ends: Tensor,
+    *,
+    terminated: Termination = never,
+    **options: Any,
+) -> Imagined:
+    """Transitions that lead into given states, and on to where these came from.
+
+    "Offline Reinforcement Learning with Reverse Model-based Imagination" (ROMI),
+    https://arxiv.org/abs/2110.00188. Rows from a state in which the task has ended
+    already are refused: nobody acts there.
+
+    Args:
+        model: trained on :func:`turned` rows: it predicts from a next state and the
+            action the state before.
+        policy: maps next states ``[B, S]`` to actions ``[B, A]`` that led there.
+        ends: next states of the first rows, ``[B, S]``, in which the task goes on.
+
+    Keyword Args:
+        terminated: as in :func:`imagine`. Default: never.
+        options: all others of :func:`imagine`.
+
+    Returns:
+        The rows, in the direction of time; none is terminated.
+    """
+    rows, refused = imagine(model, policy, ends, terminated=terminated, **options)
+    acted = ~rows["next", "terminated"].squeeze(-1)
+    return Imagined(turned(rows[acted]), refused + int((~acted).sum()))
+
+
+def turned(rows: TensorDict) -> TensorDict:
+    """The same transitions with state and next state exchanged."""
+    following = rows.select(("next", "observation")).rename_key_(
+        ("next", "observation"), "observation"
+    )
+    before = rows.select("observation").rename_key_(
+        "observation", ("next", "observation")
+    )
+    return rows.copy().update(following).update(before)

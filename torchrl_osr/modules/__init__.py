@@ -5,6 +5,7 @@ from torchrl_osr.modules.actor import (
     gaussian_actor,
     tanh_gaussian_actor,
 )
+from torchrl_osr.modules.conditional_vae import ConditionalVAE
 from torchrl_osr.modules.critic import critic_ensemble, state_value
 from torchrl_osr.modules.cvae_inverse_dynamics import cvae_inverse_dynamics
 from torchrl_osr.modules.discrete import (
@@ -16,6 +17,7 @@ from torchrl_osr.modules.dynamics import DynamicsEnsemble
 from torchrl_osr.modules.inverse_dynamics import tanh_gaussian_inverse_dynamics
 
 __all__ = [
+    "ConditionalVAE",
     "DynamicsEnsemble",
     "categorical_actor",
     "categorical_inverse_dynamics",

@@ -151,6 +151,18 @@ class DynamicsEnsemble(TensorDictModuleBase):
             (log_variance.mul(0.5).exp() * self.target_scale).unflatten(1, batch),
         )
 
+    def sample(self, prediction: Prediction) -> Tensor:
+        """Draw from the Gaussian of an elite that is drawn for each row, ``[B, D]``.
+
+        Args:
+            prediction: of :meth:`predict`; there are gradients by it.
+        """
+        batch = prediction.mean.shape[1:-1]
+        drawn = torch.randint(len(self.elites), batch, device=self.elites.device)
+        chosen = self.elites[drawn].unsqueeze(-1).expand_as(prediction.mean[:1])
+        mean, scale = (each.gather(0, chosen).squeeze(0) for each in prediction)
+        return mean + scale * torch.randn_like(mean)
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"loc"`` and ``"scale"``, ``[B, E, D]``, of a batch ``[B]``."""
         found = self.predict(*(entry(tensordict, key) for key in self.in_keys))

@@ -29,6 +29,7 @@ from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
 
 from torchrl_osr._checks import check_literals, check_positive
 from torchrl_osr._entries import nested
+from torchrl_osr.modules.dynamics import DynamicsEnsemble
 from torchrl_osr.modules.initial_weights import digest_of_weights, initial_digest
 from torchrl_osr.objectives.distributions import (
     action_bounds,
@@ -103,6 +104,9 @@ class BaseLoss(LossModule):
     inverse_dynamics_network: ProbabilisticTensorDictSequential
     inverse_dynamics_network_params: TensorDictParams
     target_inverse_dynamics_network_params: TensorDictParams
+    dynamics_network: DynamicsEnsemble
+    dynamics_network_params: TensorDictParams
+    target_dynamics_network_params: TensorDictParams
 
     def __init__(
         self,
@@ -209,17 +213,21 @@ class BaseLoss(LossModule):
     def _hold_inverse_dynamics(
         self, network: ProbabilisticTensorDictSequential
     ) -> None:
-        """Hold a trained model frozen: in the state dict, moved by ``.to()``.
+        """Hold a trained model, and tell it from one that is not."""
+        self._initial_digest = initial_digest(network)
+        self._hold_frozen("inverse_dynamics_network", network)
+
+    def _hold_frozen(self, name: str, network: nn.Module) -> None:
+        """Hold a trained network frozen: in the state dict, moved by ``.to()``.
 
         Its parameters become buffers, so that no optimizer that takes
-        ``loss.parameters()`` can move them.
+        ``loss.parameters()`` can move them; they share the network's memory.
         """
-        self._initial_digest = initial_digest(network)
-        self.convert_to_functional(network, "inverse_dynamics_network")
-        frozen = self.inverse_dynamics_network_params.apply(
+        self.convert_to_functional(network, name)
+        frozen = getattr(self, f"{name}_params").apply(
             lambda tensor: tensor.data, filter_empty=False
         )
-        self.inverse_dynamics_network_params = TensorDictParams(frozen, no_convert=True)
+        setattr(self, f"{name}_params", TensorDictParams(frozen, no_convert=True))
 
     def _check_model_is_trained(self) -> None:
         """Warn, at the first call, of a model with the weights it was built with.
@@ -238,6 +246,32 @@ class BaseLoss(LossModule):
                 stacklevel=_first_frame_outside(),
             )
         self._initial_digest = None
+
+    def load_network(self, name: str, network: nn.Module) -> None:
+        """Take the weights of a trained network for one that is held frozen.
+
+        Args:
+            name: of the argument that the network was, ``"dynamics_network"`` for
+                instance.
+            network: of the same sizes.
+
+        Raises:
+            ValueError: it has other sizes.
+        """
+        held, given = getattr(self, f"{name}_params"), TensorDict.from_module(network)
+        shapes = [
+            {key: value.shape for key, value in each.items(True, True)}
+            for each in (held, given)
+        ]
+        if shapes[0] != shapes[1]:
+            raise ValueError(
+                f"the {name.replace('_', ' ')} has other sizes than this run's: give "
+                "the settings (dynamics.num_networks, dynamics.num_elites and "
+                "dynamics.num_cells) that it was trained with."
+            )
+        with torch.no_grad():
+            for key, value in held.items(True, True):
+                value.copy_(given[key])
 
     def _hold_temperature(
         self,

@@ -264,6 +264,10 @@ class OSRLoss(BaseLoss):
             tensordict: a batch ``[B]`` with the entries of ``in_keys``.
         """
         step = Step(self, tensordict, perturbed=self.reads_perturbed)
+        return self._output(tensordict, *self._terms(step))
+
+    def _terms(self, step: Step) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """The losses and the metrics, by name."""
         actor, log_prob, metrics = self.actor_loss(step)
         alpha = self.alpha_loss(step, log_prob)
         pred_value, cql, cql_metrics = self.cql_loss(step)
@@ -279,7 +283,7 @@ class OSRLoss(BaseLoss):
             **cql_metrics,
             **metrics,
         }
-        return self._output(tensordict, losses, metrics)
+        return losses, metrics
 
     def actor_loss(self, step: Step) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
         r""":math:`L_\pi`: values sought on ``actor_states``, and the recovery term.

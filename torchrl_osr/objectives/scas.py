@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
 from torch import Tensor
 
@@ -52,7 +52,7 @@ class SCASLoss(BaseLoss):
             :func:`~torchrl_osr.modules.deterministic_actor`.
         qvalue_network: one critic, copied by TorchRL, or a list of critics that keep
             their own weights. The authors have four.
-        dynamics_network: :math:`M`; trained before, or given by :meth:`load_dynamics`.
+        dynamics_network: :math:`M`; trained before, or given by :meth:`load_network`.
 
     Keyword Args:
         correction_weight: :math:`\lambda`, between 0 and 1. Default 0.25.
@@ -101,10 +101,6 @@ class SCASLoss(BaseLoss):
     default_keys = TransitionKeys
     tensor_keys: TransitionKeys
 
-    dynamics_network: DynamicsEnsemble
-    dynamics_network_params: TensorDictParams
-    target_dynamics_network_params: TensorDictParams
-
     def __init__(
         self,
         actor_network: TensorDictModuleBase,
@@ -134,39 +130,13 @@ class SCASLoss(BaseLoss):
         self._hold_actor_critic(
             actor_network, qvalue_network, delay_actor=self.delay_qvalue
         )
-        self.convert_to_functional(dynamics_network, "dynamics_network")
-        # Buffers, which no optimizer finds; they share the model's memory.
-        frozen = self.dynamics_network_params.apply(
-            lambda tensor: tensor.data, filter_empty=False
-        )
-        self.dynamics_network_params = TensorDictParams(frozen, no_convert=True)
+        self._hold_frozen("dynamics_network", dynamics_network)
         self.correction_weight = correction_weight
         self.correction_action = correction_action
         self.gain_temperature, self.largest_weight = gain_temperature, largest_weight
         self.policy_noise, self.noise_clip = policy_noise, noise_clip
         self.low, self.high = low, high
         self.make_value_estimator()
-
-    def load_dynamics(self, model: DynamicsEnsemble) -> None:
-        """Take the weights of a trained model of the same sizes.
-
-        Raises:
-            ValueError: it has other sizes.
-        """
-        given = TensorDict.from_module(model)
-        shapes = [
-            {key: value.shape for key, value in each.items(True, True)}
-            for each in (self.dynamics_network_params, given)
-        ]
-        if shapes[0] != shapes[1]:
-            raise ValueError(
-                "the dynamics model has other sizes than this run's: give the "
-                "dynamics.num_networks, dynamics.num_elites and dynamics.num_cells "
-                "that it was trained with."
-            )
-        with torch.no_grad():
-            for key, value in self.dynamics_network_params.items(True, True):
-                value.copy_(given[key])
 
     def _input_keys(self) -> list[NestedKey]:
         return actor_critic_in_keys(self, perturbed=True)
@@ -236,7 +206,7 @@ class SCASLoss(BaseLoss):
     def _next_state(self, states: TensorDictBase, action: Tensor) -> Tensor:
         """Where the elites' mean says that an action leads, ``[B, S]``."""
         model = self.dynamics_network
-        with self.dynamics_network_params.to_module(model):
+        with self.dynamics_network_params.to_module(model, preserve_module_state=False):
             state = entry(states, model.in_keys[0])
             mean, _ = model.predict(state, action)
             return state + mean[model.elites].mean(0)[..., :-1]

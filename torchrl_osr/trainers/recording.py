@@ -12,6 +12,7 @@ where it can: without Python in between they take two thirds of the time.
 from __future__ import annotations
 
 import logging
+import operator
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -19,7 +20,7 @@ from typing import Any
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torch.fx import GraphModule
+from torch.fx import GraphModule, Node, map_arg
 from torch.fx.experimental.proxy_tensor import make_fx
 from torchrl.objectives import LossModule
 
@@ -201,11 +202,41 @@ def _options(loss_module: LossModule) -> list[dict[str, Any]]:
     ]  # fmt: skip
 
 
+_VIEWS = {
+    operator.getitem,
+    *(
+        getattr(torch.ops.aten, name).default
+        for name in ("t", "unsqueeze", "expand", "permute", "view")
+    ),
+    torch.ops.aten.transpose.int,
+    torch.ops.aten.select.int,
+    torch.ops.aten.unbind.int,
+    torch.ops.aten.slice.Tensor,
+    torch.ops.aten.squeeze.dim,
+}
+
+
 def _simplified(graph: GraphModule) -> GraphModule:
-    """Leave out what has no effect without autograd, and what nobody reads."""
-    for node in graph.graph.nodes:
-        if node.target is torch.ops.aten.detach.default:
+    """Leave out what has no effect without autograd, and what nobody reads.
+
+    Views of the module's own tensors are made now, once: they show whatever an
+    optimizer writes into these.
+    """
+    own: dict[Node, Any] = {}
+    for node in list(graph.graph.nodes):
+        if node.op == "get_attr":
+            own[node] = getattr(graph, node.target)
+        elif node.target is torch.ops.aten.detach.default:
             node.replace_all_uses_with(node.args[0])
+        elif node.target in _VIEWS and set(node.all_input_nodes) <= own.keys():
+            arguments = map_arg((node.args, node.kwargs), own.__getitem__)
+            own[node] = value = node.target(*arguments[0], **arguments[1])
+            if isinstance(value, Tensor):
+                graph.register_buffer(f"{node.name}_made", value)
+                with graph.graph.inserting_before(node):
+                    made = graph.graph.get_attr(f"{node.name}_made")
+                node.replace_all_uses_with(made)
+                own[made] = value
     graph.graph.eliminate_dead_code()
     graph.recompile()
     return graph

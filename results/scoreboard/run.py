@@ -1,0 +1,180 @@
+"""Train every method for as long as the others, then disturb what it learned.
+
+    python results/scoreboard/run.py --measure             milliseconds of an update
+    python results/scoreboard/run.py outputs/scoreboard    what is missing
+    python results/scoreboard/run.py outputs/scoreboard --methods osr cql --seeds 0
+    python results/scoreboard/run.py outputs/scoreboard --pack
+
+Each run is one process with one torch thread. Stop it at any time and start it again:
+runs continue from their last checkpoint, and what is in ``runs.jsonl.gz`` beside this
+file is not done again. ``--pack`` adds what is finished to that table.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gzip
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from torchrl_osr.report import pack_runs, read_records
+
+HERE = Path(__file__).parent
+TABLE = HERE / "runs.jsonl.gz"
+CORE_SECONDS = 180
+"""Of one core, for the updates of a policy; models are trained beside it."""
+
+# In the order in which they are trained: a prefix of the list is a fair comparison.
+METHODS = {
+    "osr": [],
+    "noisy_bc": ["loss=noisy_bc"],
+    "cql_noisy_bc": ["loss=cql_noisy_bc"],
+    "cql": ["loss=cql"],
+    "iql": ["loss=iql"],
+    "td3_bc": ["loss=td3_bc"],
+    "rebrac": ["loss=rebrac"],
+    "bc": ["loss=bc"],
+    "iql+osr": ["loss=iql", "recovery=osr"],
+    "rebrac+osr": ["loss=rebrac", "recovery=osr"],
+    "osr_v": ["loss=osr_v"],
+    "osr_10": ["loss=osr_10"],
+    "sac_10": ["loss=sac_10"],
+    "edac_10": ["loss=edac_10"],
+    "rorl": ["loss=rorl"],
+    "mopo": ["loss=mopo"],
+    "rambo": ["loss=rambo"],
+    "romi": ["loss=romi"],
+    "scas": ["loss=scas"],
+    "sdc": ["loss=sdc"],
+}
+SUITES = ("oos", "push", "observation_noise")
+ENVS = ("hopper", "walker2d", "halfcheetah")
+DATA = [f"{env}-{data}" for data in ("medium-replay", "medium-expert") for env in ENVS]
+
+
+def torchrl_osr(*arguments: str, log: Path | None = None) -> None:
+    """Run a command of the package with one thread; keep what it prints."""
+    with log.open("w") if log else tempfile.TemporaryFile("w") as file:
+        subprocess.run(
+            [sys.executable, "-m", "torchrl_osr", *arguments],
+            stdout=file, stderr=subprocess.STDOUT, check=True,
+            env=os.environ | {"OMP_NUM_THREADS": "1"},
+        )  # fmt: skip
+
+
+def steps_of(method: str, env: str) -> int:
+    """Return the updates that fit in the time, in tenths that are evaluated."""
+    seconds = json.loads((HERE / "update_ms.json").read_text())[env][method] / 1000
+    return round(CORE_SECONDS / seconds / 1000) * 1000
+
+
+def measure(methods: list[str]) -> None:
+    """Write the processor's milliseconds of an update of each method and task."""
+    path = HERE / "update_ms.json"
+    found = json.loads(path.read_text()) if path.exists() else {}
+    for env in ENVS:
+        for method in methods:
+            if method in found.setdefault(env, {}):
+                continue
+            seconds = []
+            for steps in (1000, 3000):
+                with tempfile.TemporaryDirectory() as folder:
+                    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+                    torchrl_osr(
+                        "train", f"env={env}", *METHODS[method],
+                        f"trainer.steps={steps}", f"trainer.eval_interval={steps}",
+                        "trainer.eval_episodes=1", "trainer.inverse_dynamics_steps=100",
+                        "dynamics.steps=100", f"hydra.run.dir={folder}/run",
+                    )  # fmt: skip
+                    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+                seconds.append(
+                    after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+                )
+            found[env][method] = round((seconds[1] - seconds[0]) / 2, 2)
+            path.write_text(json.dumps(found, indent=2) + "\n")
+            print(env, method, found[env][method], "ms", flush=True)
+
+
+def run(folder: Path, data: str, method: str, seed: int) -> None:
+    """Train one run, then disturb its last five policies."""
+    env, quality = data.split("-", 1)
+    folder.mkdir(parents=True, exist_ok=True)
+    status = folder / "status.json"
+    if not status.exists() or json.loads(status.read_text())["status"] != "done":
+        steps = steps_of(method, env)
+        arguments = [f"resume={folder}"] if (folder / "checkpoint").exists() else []
+        torchrl_osr(
+            "train", f"env={env}", f"data={quality}", f"seed={seed}", *METHODS[method],
+            f"trainer.steps={steps}", f"trainer.eval_interval={steps // 10}",
+            f"trainer.checkpoint_interval={steps // 10}", "trainer.progress=false",
+            f"hydra.run.dir={folder}", *arguments, log=folder / "train.txt",
+        )  # fmt: skip
+    for suite in SUITES:
+        if not (folder / f"robustness-{suite}.json").exists():
+            torchrl_osr(
+                "evaluate", f"checkpoint={folder}", f"suite={suite}", "episodes=4",
+                "progress=false", log=folder / f"{suite}.txt",
+            )  # fmt: skip
+    print(folder, flush=True)
+
+
+def packed() -> list[dict[str, Any]]:
+    """Return the runs of the table."""
+    return list(read_records(TABLE)) if TABLE.exists() else []
+
+
+def pack(folder: Path) -> None:
+    """Add the finished runs below a folder to the table."""
+    with tempfile.TemporaryDirectory() as here:
+        new = Path(here) / "new.jsonl.gz"
+        last = f"robustness-{SUITES[-1]}.json"
+        finished = [path.parent for path in folder.glob(f"*/*/*/{last}")]
+        number = pack_runs(finished, new)
+        records = {each["folder"]: each for each in packed()}
+        records |= {each["folder"]: each for each in read_records(new)}
+    lines = [json.dumps(records[each]) + "\n" for each in sorted(records)]
+    TABLE.write_bytes(gzip.compress("".join(lines).encode(), mtime=0))
+    print(f"{number} finished runs in {folder}, {len(records)} in {TABLE}")
+
+
+def main() -> None:
+    """Measure, or go through the grid seed by seed."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("folder", type=Path, nargs="?")
+    parser.add_argument("--measure", action="store_true", help="run nothing else")
+    parser.add_argument("--pack", action="store_true", help="run nothing")
+    parser.add_argument("--data", nargs="+", default=DATA, choices=DATA)
+    parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=METHODS)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--jobs", type=int, default=2, help="runs at once")
+    options = parser.parse_args()
+    if options.measure:
+        measure(options.methods)
+        return
+    if options.pack:
+        pack(options.folder)
+        return
+    done = {record["folder"] for record in packed()}
+    grid = [
+        (options.folder / data / method / f"seed{seed}", data, method, seed)
+        for seed in options.seeds
+        for data in options.data
+        for method in options.methods
+        if f"{data}/{method}/seed{seed}" not in done
+    ]
+    with ThreadPoolExecutor(options.jobs) as pool:
+        for done in [pool.submit(run, *each) for each in grid]:
+            error = done.exception()
+            if error is not None:
+                print(error, file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,115 @@
+"""Print the tables of README.md and draw its figure, from the runs beside it.
+
+python results/scoreboard/tables.py
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from torchrl_osr.report import RunTables, read_runs
+from torchrl_osr.report.scores import by_run, estimate, recent
+
+HERE = Path(__file__).parent
+SUITES = {"oos": "oos", "push": "push", "observation_noise": "noise"}
+
+# On D4RL v2, which are other data, after a hundred times the updates. TD3+BC, IQL and
+# ReBRAC: Tarasov et al. 2023 (arXiv 2305.09836, tables 16 and 17), and as quoted there
+# CQL, SAC-N and EDAC (An et al. 2021) and RORL (Yang et al. 2022); MOPO: README of
+# OfflineRL-Kit; RAMBO, SDC and OSR: their papers.
+PUBLISHED = pd.DataFrame(
+    {
+        "td3_bc": (55.1, 68.0, 45.0, 87.8, 110.4, 89.1),
+        "iql": (89.6, 75.4, 42.1, 85.5, 112.1, 92.7),
+        "cql": (86.3, 76.8, 45.3, 96.9, 109.1, 95.0),
+        "sac_10": (101.8, 78.7, 63.9, 110.1, 116.7, 107.1),
+        "edac_10": (101.0, 87.1, 61.3, 110.7, 114.7, 106.3),
+        "rorl": (102.8, 90.4, 61.9, 112.7, 121.2, 107.8),
+        "rebrac": (98.1, 77.3, 51.0, 107.0, 111.6, 101.1),
+        "mopo": (92.7, 85.9, 72.1, 74.6, 108.2, 83.6),
+        "rambo": (96.6, 85.0, 68.9, 83.3, 68.3, 93.7),
+        "sdc": (48.2, 30.3, 47.3, 112.9, 105.3, 101.3),
+        "osr": (96.7, 87.9, 46.8, 113.1, 114.3, 94.7),
+    },
+    [
+        f"{env} {data}"
+        for data in ("medium-replay", "medium-expert")
+        for env in ("hopper", "walker2d", "halfcheetah")
+    ],
+)
+
+
+def scores(tables: RunTables) -> pd.DataFrame:
+    """A row for each run: its undisturbed score, and those under each suite."""
+    last, all_ = recent(tables.episodes), tables.episodes
+    keys = ["data", "method", "run", "seed"]
+    found = {"undisturbed": last.groupby(keys)["score"].mean()}
+    for suite in SUITES:
+        rows = all_[(all_["suite"] == suite) & (all_["disturbance"] != "")]
+        found[suite] = rows.groupby(keys)["score"].mean()
+    return pd.DataFrame(found).reset_index()
+
+
+def table(tables: RunTables, data: str) -> str:
+    """Markdown: the methods on one data set, best undisturbed score first."""
+    rows = []
+    for method in tables.methods:
+        mine = tables.episodes.query("data == @data and method == @method")
+        if mine.empty:
+            continue
+        cells = [str(estimate(by_run(recent(mine))))]
+        for suite in SUITES:
+            under = mine[(mine["suite"] == suite) & (mine["disturbance"] != "")]
+            cells.append(str(estimate(by_run(under))))
+        steps = tables.runs.query("data == @data and method == @method")["steps"].max()
+        quoted = str(PUBLISHED.loc[data].get(method, ""))
+        seeds = mine["seed"].nunique()
+        mean = recent(mine)["score"].mean()
+        rows.append((mean, [f"`{method}`", str(seeds), f"{steps:,}", *cells, quoted]))
+    head = ["method", "seeds", "updates", "undisturbed", *SUITES.values(), "published"]
+    lines = [head, ["---"] * len(head), *(cells for _, cells in sorted(rows)[::-1])]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def draw(rows: pd.DataFrame, path: Path) -> None:
+    """Score undisturbed against score disturbed: a point for each method."""
+    figure = Figure(figsize=(11, 7), layout="constrained")
+    FigureCanvasAgg(figure)
+    data = list(rows["data"].unique())
+    grid = figure.subplots(2, (len(data) + 1) // 2, squeeze=False).flat
+    for axes, name in zip(grid, data, strict=False):
+        mine = rows[rows["data"] == name].groupby("method")
+        mean = mine[["undisturbed", *SUITES]].mean()
+        disturbed = mean[list(SUITES)].mean(axis=1)
+        axes.scatter(mean["undisturbed"], disturbed, s=14, color="#0072B2")
+        for method, x, y in zip(
+            mean.index, mean["undisturbed"], disturbed, strict=True
+        ):
+            own = method.startswith("osr")
+            axes.annotate(
+                method, (x, y), fontsize=7, xytext=(3, 2), textcoords="offset points",
+                color="#D55E00" if own else "0.25", weight="bold" if own else "normal",
+            )  # fmt: skip
+        end = max(mean["undisturbed"].max(), 1)
+        axes.plot([0, end], [0, end], color="0.8", linewidth=0.8, zorder=0)
+        axes.set_title(name, fontsize=10, loc="left")
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.supxlabel("score undisturbed", fontsize=10)
+    figure.supylabel("score under disturbance, mean of three suites", fontsize=10)
+    figure.savefig(path, dpi=130)
+
+
+def main() -> None:
+    """Print a table for each data set, and draw."""
+    tables = read_runs([HERE / "runs.jsonl.gz"])
+    for data in tables.data:
+        print(f"\n### {data}\n\n{table(tables, data)}")
+    draw(scores(tables), HERE / "scoreboard.png")
+
+
+if __name__ == "__main__":
+    main()
