@@ -121,13 +121,7 @@ def train_policy(
 ) -> OfflineTrainer:
     """Train the policy, by the critics and frozen models; its trainer, at the end.
 
-    Args:
-        cfg: a whole configuration of ``torchrl-osr train``.
-        folder: of the run.
-        data: what it trains on.
-        learner: networks and objective.
-        imagined: draws the batches in the place of the data's buffer, if there is one.
-        new_trainer: of :func:`trainer_maker`.
+    Batches are ``imagined`` ones in part, if there are any.
     """
     actor, _, loss, objective = learner
     critics, policy = _parameters_of(learner)
@@ -137,18 +131,17 @@ def train_policy(
         targets = SoftUpdate(loss, tau=cfg.optim.tau)
     average, follow = _average_of(actor, cfg.optim.policy_average)
     limit = largest_value(data.largest_reward, cfg.optim.gamma)
-    components = new_trainer.keywords["components"] | {
-        "schedule": schedule,
-        "policy_average": average,
-    }
+    components = {"schedule": schedule, "policy_average": average}
     if imagined is not None:
         components["imagined"] = imagined
-    with closing(_episodes_of(cfg)) as episodes:
+    played = {"num_episodes": cfg.trainer.eval_episodes, "seed": EVALUATION_SEED}
+    device = cfg.trainer.device
+    with closing(EpisodeEvaluator(cfg.env.id, **played, device=device)) as episodes:
         trainer = new_trainer(
             objective,
             optimizer,
             replay_buffer=data.buffer if imagined is None else imagined,
-            components=components,
+            components=new_trainer.keywords["components"] | components,
             total_steps=cfg.trainer.steps,
             folder=folder / "checkpoint" / "policy",
             seed=cfg.seed + 1,
@@ -217,16 +210,6 @@ def _average_of(
     average = deepcopy(actor)
     weights = list(average.parameters()), list(actor.parameters())
     return average, torch.no_grad()(partial(torch._foreach_lerp_, *weights, share))
-
-
-def _episodes_of(cfg: DictConfig) -> EpisodeEvaluator:
-    """The episodes of every evaluation."""
-    return EpisodeEvaluator(
-        cfg.env.id,
-        num_episodes=cfg.trainer.eval_episodes,
-        seed=EVALUATION_SEED,
-        device=cfg.trainer.device,
-    )
 
 
 def _evaluation(
