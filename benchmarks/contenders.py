@@ -71,7 +71,7 @@ class Size:
         """Size of a name such as ``hopper-2x256``, or ``hopper-quick``: that preset."""
         task, _, layers = name.partition("-")
         if layers == "quick":
-            return cls(*DIMENSIONS[task], (128, 128), 128, 4, layer_norm=True)
+            return cls(*DIMENSIONS[task], (128, 128), 64, 4, layer_norm=True)
         depth, width = (int(number) for number in layers.split("x"))
         return cls(*DIMENSIONS[task], (width,) * depth)
 

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import statistics
 import subprocess
@@ -58,6 +57,7 @@ def train_here(overrides: Sequence[str]) -> list[dict[str, float]]:
     """Train in this process; steps, processor seconds and scores of its evaluations."""
     from torchrl_osr.commands import train
     from torchrl_osr.evaluation import EpisodeEvaluator
+    from torchrl_osr.experiment import phases
 
     began, paused = 0.0, 0.0
     seconds: list[float] = []
@@ -78,7 +78,7 @@ def train_here(overrides: Sequence[str]) -> list[dict[str, float]]:
             paused += time.process_time() - before
             return results
 
-    train.load_training_data, train.EpisodeEvaluator = load_training_data, Paused
+    train.load_training_data, phases.EpisodeEvaluator = load_training_data, Paused
     with tempfile.TemporaryDirectory() as folder:
         sys.argv = ["train", *overrides, f"hydra.run.dir={folder}/run"]
         train.main()
@@ -131,10 +131,8 @@ def last_five(run: dict[str, Any]) -> float:
 
 
 def score_at(run: dict[str, Any], seconds: float) -> float:
-    """Score of the last evaluation until then; not a number after the run's end."""
+    """Score of the last evaluation until then."""
     rows = run["evaluations"]
-    if seconds > rows[-1]["seconds"]:
-        return math.nan
     return [row["score"] for row in rows if row["seconds"] <= seconds][-1]
 
 
@@ -180,8 +178,9 @@ def draw(runs: list[dict[str, Any]], path: Path) -> None:
             group = [r for r in runs if (r["env"], r["method"]) == (env, method)]
             if not group:
                 continue
+            start = max(run["evaluations"][0]["seconds"] for run in group)
             end = min(run["evaluations"][-1]["seconds"] for run in group)
-            times = np.linspace(0, end, 200)
+            times = np.linspace(start, end, 200)
             curves = np.array([[score_at(run, t) for t in times] for run in group])
             for curve in curves:
                 axes.plot(times / 60, curve, color=color, linewidth=0.6, alpha=0.4)

@@ -21,7 +21,7 @@ import property_settings
 import pytest
 import torch
 import yaml
-from hydra import compose, initialize_config_dir
+from composed import composed
 from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
@@ -31,12 +31,10 @@ from torchrl.checkpoint import CheckpointError
 
 from torchrl_osr._files import checksummed
 from torchrl_osr.data import load_file, load_memmap, write_memmap
-from torchrl_osr.experiment import schema
 from torchrl_osr.experiment.run_config import read_run, read_yaml
 from torchrl_osr.report.runs import LeftOut, read_each
 from torchrl_osr.trainers.checkpoints import find_damage, safe_checkpoint
 
-CONF = Path(__file__).parents[1] / "conf"
 tried = property_settings.tried(20)
 
 WORDS = ["", "x", "torchrl_osr.OSRLoss", "os.system", "../x", "/etc/passwd", "${a}"]
@@ -80,9 +78,7 @@ SECRET = Path("/etc/passwd").resolve()
 
 @pytest.fixture(scope="module")
 def configuration() -> dict:
-    schema.register()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return OmegaConf.to_container(compose("train"), resolve=True)
+    return OmegaConf.to_container(composed("train"), resolve=True)
 
 
 def outcome(read: Callable[[], object]) -> tuple[object, str]:

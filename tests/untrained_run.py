@@ -6,18 +6,15 @@ from copy import deepcopy
 from pathlib import Path
 
 import torch
-from hydra import compose, initialize_config_dir
+from composed import composed
 from omegaconf import OmegaConf
 from torchrl.checkpoint import CheckpointRotation
 from torchrl.envs import ObservationNorm
 
 from torchrl_osr.evaluation import deterministic_policy
-from torchrl_osr.experiment import schema as config
 from torchrl_osr.experiment.build import make_learner
 from torchrl_osr.experiment.trained_run import CHECKPOINTS
 from torchrl_osr.trainers.checkpoints import safe_checkpoint
-
-CONF = Path(__file__).parents[1] / "conf"
 
 
 def make_run(folder: Path, *overrides: str, sizes: tuple[int, int] = (11, 3)):
@@ -25,9 +22,7 @@ def make_run(folder: Path, *overrides: str, sizes: tuple[int, int] = (11, 3)):
 
     The sizes of observation and action are hopper's unless given.
     """
-    config.register()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        cfg = compose("train", ["network.num_cells=[8]", *overrides])
+    cfg = composed("train", "network.num_cells=[8]", *overrides)
     folder.mkdir()
     OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
     actor, _, loss, objective = make_learner(cfg, *sizes)

@@ -1,8 +1,7 @@
 """Write docs/family.md from a test run: what was checked against what, how far off.
 
-    pytest tests/objectives tests/imagination -o junit_family=xunit1 \\
-        --junitxml=checks.xml
-    python results/family/table.py checks.xml
+    pytest tests/objectives tests/imagination -o junit_family=xunit1 --junitxml=c.xml
+    python results/family/table.py c.xml
 
 Tests note their largest deviation (the fixture ``check``) and the rows that critics
 score; this script adds only what a loss is called, its equation and its command line.

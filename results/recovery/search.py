@@ -173,16 +173,21 @@ class Planner:
         return np.asarray(best, dtype=np.float32), False
 
 
-def read_lines(folder: Path) -> list[dict]:
-    """All lines of the searches so far, without one that was cut off."""
+def read_jsonl(*paths: Path) -> list[dict]:
+    """All lines of the files that there are, without those that were cut off."""
     lines = []
-    for path in sorted(folder.glob("search-*.jsonl")):
-        for line in path.read_text().splitlines():
+    for path in paths:
+        for line in path.read_text().splitlines() if path.exists() else ():
             try:
                 lines.append(json.loads(line))
             except json.JSONDecodeError:
                 continue
     return lines
+
+
+def read_lines(folder: Path) -> list[dict]:
+    """All lines of the searches so far."""
+    return read_jsonl(*sorted(folder.glob("search-*.jsonl")))
 
 
 def hard_states(world: World) -> list[tuple[int, int, Rows]]:

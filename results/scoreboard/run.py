@@ -49,7 +49,10 @@ METHODS = {
     "edac_10": ["loss=edac_10"],
     "rorl": ["loss=rorl"],
     "mopo": ["loss=mopo"],
+    "rambo": ["loss=rambo"],
+    "romi": ["loss=romi"],
     "scas": ["loss=scas"],
+    "sdc": ["loss=sdc"],
 }
 SUITES = ("oos", "push", "observation_noise")
 ENVS = ("hopper", "walker2d", "halfcheetah")

@@ -6,18 +6,14 @@ import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
+from composed import composed
 from omegaconf import OmegaConf
 
 from torchrl_osr import __version__
 from torchrl_osr.__main__ import COMMANDS, main
 from torchrl_osr.commands.console import sentence
-from torchrl_osr.experiment import schema
-
-CONF = Path(__file__).parents[2] / "conf"
 
 
 def test_help_names_every_command_and_fits_a_screen(capsys):
@@ -44,12 +40,10 @@ def test_unknown_command_is_told_which_there_are():
 
 
 def composition_error(*overrides: str) -> Exception:
-    schema.register()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        try:
-            compose("train", list(overrides))
-        except Exception as error:
-            return error
+    try:
+        composed("train", *overrides)
+    except Exception as error:
+        return error
     raise AssertionError("it was accepted")
 
 

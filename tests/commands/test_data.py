@@ -8,14 +8,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from hydra import compose, initialize_config_dir
+from composed import CONF, composed
 from omegaconf import OmegaConf
 from PIL import Image
 
 from torchrl_osr.commands import data
 from torchrl_osr.data.read.table import USUAL_NAMES
-
-CONF = str(Path(__file__).parents[2] / "conf")
 
 
 @pytest.fixture
@@ -24,8 +22,7 @@ def look(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
 
     def look(*overrides):
-        with initialize_config_dir(CONF, version_base="1.3"):
-            cfg = compose("check_data", overrides=[*overrides, "progress=false"])
+        cfg = composed("check_data", *overrides, "progress=false")
         error = None
         try:
             data.main(cfg)
@@ -117,7 +114,7 @@ def test_rolled_out_data_too(look, tmp_path, monkeypatch):
 
 
 def test_help_fits_a_screen():
-    path = Path(CONF) / "check_data.yaml"
+    path = CONF / "check_data.yaml"
     text = OmegaConf.load(path).hydra.help.template.strip()
     assert len(text.splitlines()) <= 28
     assert max(map(len, text.splitlines())) <= 80

@@ -9,10 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
+from composed import composed
 from untrained_run import make_run
 
-CONF = Path(__file__).parents[2] / "conf/evaluation"
 SHORT = ["checkpoint=run", "episodes=2", "window=[20,30]", "after=8"]
 
 
@@ -27,9 +26,8 @@ def script():
     return module
 
 
-def composed(*overrides: str):
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("film", overrides=["checkpoint=run", *overrides])
+def film(*overrides: str):
+    return composed("film", "checkpoint=run", *overrides)
 
 
 def test_film_leaves_pictures_numbers_and_a_table(tmp_path, run_fresh):
@@ -97,7 +95,7 @@ def test_own_data_have_the_trained_policy_play_first(
 ):
     run = own_run(tmp_path, "halfcheetah", (17, 6), loss)
     monkeypatch.setattr(script, "Camera", FakeCamera)
-    script.main(composed(run, "episodes=2", "window=[10,12]", "after=4"))
+    script.main(film(run, "episodes=2", "window=[10,12]", "after=4"))
     printed = capsys.readouterr().out
     assert "no behaviour policy to play first: the trained policy does" in printed
     film_json = json.loads((tmp_path / "run" / "film.json").read_text())
@@ -111,28 +109,26 @@ def test_a_policy_that_falls_by_itself_is_not_pushed(script, tmp_path, monkeypat
     run = own_run(tmp_path, "hopper", (11, 3))
     monkeypatch.setattr(script, "Camera", FakeCamera)
     with pytest.raises(ValueError, match="trained policy falls.* in all 2 episodes"):
-        script.main(composed(run, "episodes=2"))
+        script.main(film(run, "episodes=2"))
 
 
 def test_filmed_is_the_first_in_which_not_all_fare_alike(script):
     up = [[True, True, False], [True, False, False]]
-    episode, why = script.choose(composed("seed=7"), [0, 2, 5], up)
+    episode, why = script.choose(film("seed=7"), [0, 2, 5], up)
     assert (episode, why) == (2, "the first with different outcomes")
     alike = [each[:1] for each in up]
-    assert script.choose(composed(), [3], alike) == (3, "the first; all end alike")
-    wanted = composed("seed=7", "film_seed=12")
+    assert script.choose(film(), [3], alike) == (3, "the first; all end alike")
+    wanted = film("seed=7", "film_seed=12")
     assert script.choose(wanted, [0, 2, 5], up) == (5, "as asked for")
     with pytest.raises(ValueError, match=r"film_seed=12 .* \[7, 9\]"):
         script.choose(wanted, [0, 2], [])
 
 
 def test_knock_takes_the_place_of_the_push(script):
-    assert script.disturbance(composed())[:2] == ("push", 5)
-    name, steps, wrap = script.disturbance(composed("knock=20"))
+    assert script.disturbance(film())[:2] == ("push", 5)
+    name, steps, wrap = script.disturbance(film("knock=20"))
     assert (name, steps, wrap.keywords["mode"]) == ("knock", 20, "torque")
-    assert script.in_words(composed("push=2"), -3.0).startswith(
-        "pushed backwards with 2 x"
-    )
+    assert script.in_words(film("push=2"), -3.0).startswith("pushed backwards with 2 x")
 
 
 @pytest.mark.parametrize(
@@ -145,4 +141,4 @@ def test_knock_takes_the_place_of_the_push(script):
 )
 def test_bad_input_is_named(script, option, named):
     with pytest.raises(ValueError, match=named):
-        script.disturbance(composed(option))
+        script.disturbance(film(option))

@@ -10,7 +10,7 @@ import gymnasium
 import minari
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
+from composed import composed
 from minari.data_collector import EpisodeBuffer
 
 from torchrl_osr.commands import evaluate
@@ -19,7 +19,6 @@ from torchrl_osr.data import load_minari, make_environment
 # Minari asks for an author's address, and more, whenever a set is made.
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:minari")
 
-ROOT = Path(__file__).parents[2]
 ANTS = "test/antmaze-v0"
 ANT_SEEDS = (0, 1, 6)  # the last of them starts at its goal
 
@@ -117,18 +116,8 @@ def test_a_point_is_trained_and_disturbed(train, tmp_path):
     folder = tmp_path / "run"
 
     def disturb(suite: str) -> None:
-        with initialize_config_dir(
-            str(ROOT / "conf" / "evaluation"), version_base="1.3"
-        ):
-            evaluate.main(
-                compose(
-                    "evaluate",
-                    [
-                        *(f"suite={suite}", f"checkpoint={folder}", "episodes=2"),
-                        *("last=1", "progress=false"),
-                    ],
-                )
-            )
+        given = f"suite={suite}", f"checkpoint={folder}", "episodes=2", "last=1"
+        evaluate.main(composed("evaluate", *given, "progress=false"))
 
     disturb("torque")
     results = json.loads((folder / "robustness-torque.json").read_text())

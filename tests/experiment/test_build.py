@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
+from composed import CONF, composed
 from hydra.utils import get_class
 from torchrl.modules import TanhDelta, TanhNormal
 from torchrl.objectives import SoftUpdate
 
 from torchrl_osr import TD3BCLoss
-from torchrl_osr.experiment import schema
 from torchrl_osr.experiment.build import make_learner
 
-CONF = Path(__file__).parents[2] / "conf"
 LOSSES = sorted(path.stem for path in (CONF / "loss").glob("*.yaml"))
 
 
 def learner_of(*overrides: str):
     """The networks and loss of a composed configuration, for make_batch's sizes."""
-    schema.register()
-    overrides = ("network.num_cells=[8]", "optim.gamma=0.5", *overrides)
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        cfg = compose("train", overrides=list(overrides))
+    cfg = composed("train", "network.num_cells=[8]", "optim.gamma=0.5", *overrides)
     return cfg, make_learner(cfg, 3, 2)
 
 

@@ -10,13 +10,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
+from composed import SMALL, composed
 from tensordict import TensorDict
 
 from torchrl_osr.commands import train
 from torchrl_osr.data.store.cache import cache_root
 from torchrl_osr.experiment import run_folder
-from torchrl_osr.experiment import schema as config
 from torchrl_osr.experiment.build import check_parts, make_learner
 from torchrl_osr.experiment.dynamics import (
     FILE,
@@ -25,19 +24,16 @@ from torchrl_osr.experiment.dynamics import (
     imagined_replay_buffer,
     load_dynamics,
 )
+from torchrl_osr.experiment.published import check_published
 from torchrl_osr.experiment.trained_run import load_trained
 from torchrl_osr.experiment.training_data import load_training_data
 from torchrl_osr.policy.tensor_file import read_tensors, write_tensors
 from torchrl_osr.trainers import OfflineTrainer
 
-ROOT = Path(__file__).parents[2]
 CPU = torch.device("cpu")
 TINY = [
+    *SMALL,
     "loss=mopo",
-    "data=random",
-    "data.num_transitions=600",
-    "data.held_out=0.1",
-    "network.num_cells=[8]",
     "dynamics.num_networks=3",
     "dynamics.num_elites=2",
     "dynamics.num_cells=[8]",
@@ -49,21 +45,16 @@ TINY = [
     "dynamics.rollout_interval=4",
     "dynamics.generations=2",
     "dynamics.real_ratio=0.25",
-    "trainer.batch_size=8",
     "trainer.steps=14",
-    "trainer.log_interval=1",
     "trainer.eval_interval=100",
-    "trainer.eval_episodes=1",
     "trainer.checkpoint_interval=7",
-    "trainer.progress=false",
 ]
 
+pytestmark = pytest.mark.usefixtures("own_cache")
 
-@pytest.fixture(scope="module", autouse=True)
-def _cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TORCHRL_OSR_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
+
+def small(*overrides: str):
+    return composed("train", *TINY, *overrides)
 
 
 def trained_model(folder: Path) -> dict[str, torch.Tensor]:
@@ -79,15 +70,9 @@ def trained_model(folder: Path) -> dict[str, torch.Tensor]:
     return model
 
 
-def composed(*overrides: str):
-    config.register()
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return compose("train", overrides=[*TINY, *overrides])
-
-
 def ran(folder: Path, *overrides: str) -> Path:
     folder.mkdir(exist_ok=True)
-    cfg = composed(*overrides)
+    cfg = small(*overrides)
     run_folder.claim(folder, cfg, {})
     with run_folder.status(folder):
         train.run(cfg, folder)
@@ -95,7 +80,7 @@ def ran(folder: Path, *overrides: str) -> Path:
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory) -> Path:
+def finished(tmp_path_factory, own_cache) -> Path:
     return ran(tmp_path_factory.mktemp("finished") / "run")
 
 
@@ -158,7 +143,7 @@ def test_rows_that_lead_into_the_data_are_imagined_backwards(tmp_path) -> None:
     given = f"dynamics.path={folder / FILE}"
     with pytest.raises(ValueError, match="direction of time: backward there, forward"):
         modelled(tmp_path / "forward", given)
-    cfg = composed("loss=romi")
+    cfg = small("loss=romi")
     data, model = load_training_data(cfg, CPU), load_dynamics(folder / FILE)
     actor = make_learner(cfg, 11, 3).actor
     buffer = imagined_replay_buffer(cfg, data, model, actor, lambda batch: batch)
@@ -182,7 +167,7 @@ def test_states_are_corrected_by_a_trained_autoencoder(tmp_path) -> None:
 def modelled(folder: Path, *overrides: str) -> list[OfflineTrainer]:
     """The phase of the model alone; returns its trainer, if one was needed."""
     folder.mkdir(exist_ok=True)
-    cfg, trainers = composed(*overrides), []
+    cfg, trainers = small(*overrides), []
 
     def new_trainer(*arguments, **options) -> OfflineTrainer:
         trainers.append(OfflineTrainer(*arguments, progress=False, **options))
@@ -270,7 +255,7 @@ def test_a_file_that_makes_no_model_is_refused(
 
 def test_from_disk_the_same_model_is_trained(finished) -> None:
     here, there = (
-        load_training_data(composed(f"data.storage={storage}"), CPU)
+        load_training_data(small(f"data.storage={storage}"), CPU)
         for storage in ("memory", "disk")
     )
     torch.testing.assert_close(here.pieces, there.pieces)
@@ -282,7 +267,7 @@ def test_from_disk_the_same_model_is_trained(finished) -> None:
     torch.testing.assert_close(*(each.sample() for each in rows))
     numbers = torch.tensor([3, 500, 7])
     torch.testing.assert_close(here.rows(numbers), there.rows(numbers))
-    facts = [facts_of(composed(), data) for data in (here, there)]
+    facts = [facts_of(small(), data) for data in (here, there)]
     assert facts[0]["rows"] == facts[1]["rows"] == 540
 
 
@@ -290,7 +275,7 @@ def test_penalty_and_units_are_those_of_the_task(finished, tmp_path) -> None:
     """Imagined rewards lose the penalty in the task's units, whatever the data's."""
     found = {}
     for penalty in (0.0, 1.5):
-        cfg = composed(f"dynamics.penalty={penalty}", "dynamics.rollout_steps=1")
+        cfg = small(f"dynamics.penalty={penalty}", "dynamics.rollout_steps=1")
         data = load_training_data(cfg, CPU)
         torch.manual_seed(0)
         actor = make_learner(cfg, 11, 3).actor
@@ -328,7 +313,7 @@ def test_penalty_and_units_are_those_of_the_task(finished, tmp_path) -> None:
 )
 def test_what_cannot_be_had_is_refused_before_the_data(overrides, message) -> None:
     with pytest.raises(ValueError, match=message):
-        check_parts(composed(*overrides), 11, 3)
+        check_parts(small(*overrides), 11, 3)
 
 
 def test_a_policy_learns_from_what_is_imagined_of_rows_on_disk(tmp_path) -> None:
@@ -344,15 +329,15 @@ def test_a_loss_has_the_trained_model_and_nothing_is_imagined(tmp_path) -> None:
     for key, value in TensorDict.from_module(model).items(True, True):
         assert torch.equal(held[key], value), key
     # No task needs a rule for its end, where nothing is imagined.
-    cfg = composed("loss=scas", "dynamics.real_ratio=1", "env=pointmaze-umaze")
+    cfg = small("loss=scas", "dynamics.real_ratio=1", "env=pointmaze-umaze")
     check_parts(cfg, 11, 3)
     with pytest.raises(ValueError, match="needs a model of the dynamics: take dyn"):
-        check_parts(composed("loss=scas", "dynamics=none"), 11, 3)
+        check_parts(small("loss=scas", "dynamics=none"), 11, 3)
 
 
 def test_a_time_limit_alone_may_end_a_task() -> None:
     check_parts(
-        composed("env=pointmaze-umaze", "data=diverse", "dynamics.terminations=never"),
+        small("env=pointmaze-umaze", "data=diverse", "dynamics.terminations=never"),
         11, 3,
     )  # fmt: skip
 
@@ -361,10 +346,10 @@ def test_roll_outs_are_as_published_for_a_data_set() -> None:
     found = {
         name: (cfg.dynamics.rollout_steps, cfg.dynamics.penalty)
         for name, cfg in {
-            "replay": composed("data=medium-replay", "env=walker2d"),
-            "by id": composed("data=medium", "env.id=HalfCheetah-v5"),
-            "another": composed("env.id=my:Arm-v0.1"),
-            "given": composed("dynamics.penalty=3", "dynamics.rollout_steps=2"),
+            "replay": small("data=medium-replay", "env=walker2d"),
+            "by id": small("data=medium", "env.id=HalfCheetah-v5"),
+            "another": small("env.id=my:Arm-v0.1"),
+            "given": small("dynamics.penalty=3", "dynamics.rollout_steps=2"),
         }.items()
     }
     assert found == {
@@ -373,16 +358,16 @@ def test_roll_outs_are_as_published_for_a_data_set() -> None:
         "another": (5, 2.5),
         "given": (2, 3.0),
     }
-    assert not composed("dynamics=none").dynamics.use
-    plain = composed("loss=rambo", "data=medium", "env=walker2d").dynamics
+    assert not small("dynamics=none").dynamics.use
+    plain = small("loss=rambo", "data=medium", "env=walker2d").dynamics
     assert (plain.rollout_steps, plain.adversarial_weight) == (5, 0.0)
-    reverse = composed("loss=romi", "env=halfcheetah").dynamics
+    reverse = small("loss=romi", "env=halfcheetah").dynamics
     assert (reverse.rollout_steps, reverse.reverse_policy) == (1, "cvae")
 
 
 def test_defaults_are_said(caplog) -> None:
     choices = {"loss": "mopo", "env": "hopper", "data": "random"}
-    train.check_published(composed(), choices)
+    check_published(small(), choices)
     assert not caplog.records
-    train.check_published(composed("env.id=Pendulum-v1"), choices)
+    check_published(small("env.id=Pendulum-v1"), choices)
     assert "rollout_steps=5 and dynamics.penalty=2.5 are taken" in caplog.text

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
-from hydra import compose, initialize_config_dir
+from composed import CONF, composed
 from omegaconf import OmegaConf
 
-from torchrl_osr.experiment import schema
 from torchrl_osr.experiment.build import check_parts
 from torchrl_osr.experiment.limits import CHOICES, RANGES, check_networks
 from torchrl_osr.experiment.run_config import check_run, flatten
 
-CONF = Path(__file__).parents[2] / "conf"
 SIZES = 11, 3
 
 # Any text will do, or what it has to be is known when the data are read.
@@ -21,10 +17,8 @@ FREE_WORDS = ("env", "data.quality", "data.path", "logger.project", "resume", "t
 
 
 @pytest.fixture(scope="module")
-def composed():
-    schema.register()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        cfg = compose("train", ["perturbation=adversarial", "network.num_cells=[8]"])
+def fresh():
+    cfg = composed("train", "perturbation=adversarial", "network.num_cells=[8]")
     plain = OmegaConf.to_container(cfg, resolve=True)
     return lambda: OmegaConf.create(plain)
 
@@ -37,8 +31,8 @@ def refused(cfg, key: str, value: object) -> str:
     return str(caught.value)
 
 
-def test_numbers_without_sense_are_refused_by_key(composed):
-    values = flatten(OmegaConf.to_container(composed()))
+def test_numbers_without_sense_are_refused_by_key(fresh):
+    values = flatten(OmegaConf.to_container(fresh()))
     numbers = [
         key
         for key, value in values.items()
@@ -47,11 +41,11 @@ def test_numbers_without_sense_are_refused_by_key(composed):
     assert len(numbers) > 35
     for key in numbers:
         wrong = 10**30 if isinstance(values[key], int) else float("nan")
-        assert f"{key} must be between" in refused(composed(), key, wrong)
+        assert f"{key} must be between" in refused(fresh(), key, wrong)
 
 
-def test_words_without_sense_are_refused_by_key(composed):
-    values = flatten(OmegaConf.to_container(composed()))
+def test_words_without_sense_are_refused_by_key(fresh):
+    values = flatten(OmegaConf.to_container(fresh()))
     words = [
         key
         for key, value in values.items()
@@ -59,7 +53,7 @@ def test_words_without_sense_are_refused_by_key(composed):
     ]
     assert len(words) > 15
     for key in words:
-        message = refused(composed(), key, "nonsense")
+        message = refused(fresh(), key, "nonsense")
         assert key.rpartition(".")[2] in message or "_target_" in key
         assert "nonsense" in message
 
@@ -81,12 +75,12 @@ def test_words_without_sense_are_refused_by_key(composed):
         ("seed", -1),
     ],
 )
-def test_values_of_the_right_type_are_refused_by_key(composed, key, value):
-    assert refused(composed(), key, value).startswith(f"{key} must be ")
+def test_values_of_the_right_type_are_refused_by_key(fresh, key, value):
+    assert refused(fresh(), key, value).startswith(f"{key} must be ")
 
 
-def test_limits_are_of_keys_that_exist(composed):
-    known = flatten(OmegaConf.to_container(composed())).keys()
+def test_limits_are_of_keys_that_exist(fresh):
+    known = flatten(OmegaConf.to_container(fresh())).keys()
     elsewhere = {"inverse_dynamics.network.latent_dim", "loss.num_samples"}
     elsewhere |= {"recovery.reduction"}
     for name in ("evaluate", "film"):
@@ -94,8 +88,8 @@ def test_limits_are_of_keys_that_exist(composed):
     assert {*RANGES, *CHOICES} <= known | elsewhere
 
 
-def test_networks_larger_than_the_memory_are_refused_before_they_are_made(composed):
-    cfg = composed()
+def test_networks_larger_than_the_memory_are_refused_before_they_are_made(fresh):
+    cfg = fresh()
     cfg.network.num_cells = [60_000] * 8
     with pytest.raises(ValueError, match=r"need 1,\d+ GB \(25,\d+,\d+,\d+ parameters"):
         check_networks(cfg, *SIZES, training=True)
@@ -103,8 +97,8 @@ def test_networks_larger_than_the_memory_are_refused_before_they_are_made(compos
     check_networks(cfg, *SIZES, training=True)
 
 
-def test_a_whole_batch_counts(composed):
-    cfg = composed()
+def test_a_whole_batch_counts(fresh):
+    cfg = fresh()
     cfg.trainer.batch_size = 10**9
     check_networks(cfg, *SIZES)
     with pytest.raises(ValueError, match=r"trainer\.batch_size=1000000000 need"):

@@ -6,9 +6,7 @@ import sys
 from types import SimpleNamespace
 
 import pytest
-from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 from torchrl_osr.evaluation import read_scalars
 from torchrl_osr.experiment import loggers
@@ -17,7 +15,7 @@ from torchrl_osr.experiment.loggers import log_outcome, make_loggers
 CONFIG = {"seed": 3, "loss": {"recovery_weight": 0.5, "kind": None}}
 ROWS = {
     "last": {"step": 7, "score": 30.0, "score_low": 20.0, "score_high": 40.0},
-    "best": {"step": 5, "score": 50.0, "score_low": 45.0, "score_high": 55.0},
+    "best": {"step": 5, "return": 50.0, "return_low": 45.0, "return_high": 55.0},
 }
 
 
@@ -37,22 +35,6 @@ def test_tensorboard_reads_the_events(tmp_path):
     events.Reload()
     (event,) = events.Scalars("policy/score")
     assert (event.step, event.value) == (7, 3.0)
-
-
-def test_tensorboard_has_hyperparameters_beside_the_scores(tmp_path):
-    made = make_loggers("tensorboard", tmp_path)
-    log_outcome(made, OmegaConf.create(CONFIG), ROWS, {})
-    events = EventAccumulator(str(tmp_path / "tensorboard"))
-    events.Reload()
-    assert events.Scalars("score/best")[0].value == 50
-    plugin = events.summary_metadata["_hparams_/session_start_info"].plugin_data
-    info = HParamsPluginData.FromString(plugin.content).session_start_info
-    found = {key: value.WhichOneof("kind") for key, value in info.hparams.items()}
-    wanted = {"loss.kind": "string_value"}
-    assert found == wanted | dict.fromkeys(
-        ["seed", "loss.recovery_weight"], "number_value"
-    )
-    assert info.hparams["loss.recovery_weight"].number_value == 0.5
 
 
 class FakeRun:
@@ -80,9 +62,7 @@ def wandb_runs(monkeypatch):
         runs.append(FakeRun(**options))
         return runs[-1]
 
-    fake = SimpleNamespace(
-        init=init, Image=lambda path: path, Table=lambda **rows: rows
-    )
+    fake = SimpleNamespace(init=init, Image=lambda path: path)
     monkeypatch.setitem(sys.modules, "wandb", fake)
     monkeypatch.setattr("torchrl.record.loggers.wandb._has_wandb", True)
     monkeypatch.setattr(loggers, "find_spec", lambda _: True)
@@ -91,21 +71,18 @@ def wandb_runs(monkeypatch):
     return runs
 
 
-def test_wandb_knows_the_run_and_keeps_its_figures_and_scores(tmp_path, wandb_runs):
+def test_wandb_knows_the_run_and_keeps_its_figure_and_results(tmp_path, wandb_runs):
     about = {"name": "hopper osr seed3", "group": "hopper osr", "tags": ["osr"],
              "config": CONFIG}  # fmt: skip
     made = make_loggers("wandb", tmp_path, project="mine", mode="offline", **about)
     made[1].log_scalar("policy/score", 3.0, step=7)
-    log_outcome(made, OmegaConf.create(CONFIG), ROWS, {"curve": tmp_path / "curve.png"})
+    log_outcome(made, ROWS, {"curve": tmp_path / "curve.png"})
     (run,) = wandb_runs
     assert about.items() <= run.options.items()
     assert (run.options["project"], run.options["mode"]) == ("mine", "offline")
     assert run.logged["policy/score"] == 3.0
     assert run.logged["curve"] == str(tmp_path / "curve.png")
-    assert run.logged["scores"]["data"] == [
-        ["last", 7, 30.0, 20.0, 40.0], ["best", 5, 50.0, 45.0, 55.0],
-    ]  # fmt: skip
-    assert run.summary == {"last_score": 30.0, "best_score": 50.0}
+    assert run.summary == {"last_score": 30.0, "best_return": 50.0}
     assert run.finished
     make_loggers("wandb", tmp_path)
     make_loggers("wandb", tmp_path / "other")

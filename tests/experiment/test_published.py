@@ -2,43 +2,29 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
+from composed import composed
 
 from torchrl_osr import ReBRACLoss, RORLLoss
-from torchrl_osr.experiment import schema
+from torchrl_osr.experiment.published import published_settings
 
-CONF = Path(__file__).parents[2] / "conf"
-FILES = sorted((CONF / "published").rglob("*.yaml"))
 LOSSES = {"rebrac": ReBRACLoss, "rorl": RORLLoss}
 ENVS = {"hopper", "walker2d", "halfcheetah"}
 DATA = {"random", "medium", "medium-replay", "medium-expert", "expert"}
 
 
-def loss_of(*overrides: str):
-    schema.register()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("train", overrides=list(overrides)).loss
-
-
 def test_there_is_one_for_each_method_robot_and_quality() -> None:
-    found = {path.relative_to(CONF / "published").as_posix() for path in FILES}
-    assert found == {
-        f"{loss}/{env}-{data}.yaml" for loss in LOSSES for env in ENVS for data in DATA
-    }
+    names = {f"{env}-{data}" for env in ENVS for data in DATA}
+    found = {loss: {*table} for loss, table in published_settings().items()}
+    assert found == dict.fromkeys(LOSSES, names)
 
 
-@pytest.mark.parametrize(
-    "path", FILES, ids=lambda path: f"{path.parent.name}-{path.stem}"
-)
-def test_they_are_options_of_the_loss_within_their_ranges(path, make_networks) -> None:
-    options = OmegaConf.to_container(OmegaConf.load(path))
+@pytest.mark.parametrize("loss", LOSSES)
+def test_they_are_options_of_the_loss_within_their_ranges(loss, make_networks) -> None:
     networks = make_networks()
-    LOSSES[path.parent.name](networks.actor, networks.critics, **options)
-    assert options
+    for options in published_settings()[loss].values():
+        assert options
+        LOSSES[loss](networks.actor, networks.critics, **options)
 
 
 # (beta_1, beta_2) of ReBRAC's table 8, and RORL's epsilon and first lambda.
@@ -69,5 +55,5 @@ def test_they_are_options_of_the_loss_within_their_ranges(path, make_networks) -
     ],
 )
 def test_they_are_taken_by_robot_and_data(overrides, wanted) -> None:
-    loss = loss_of(*overrides)
+    loss = composed("train", *overrides).loss
     assert {key: loss[key] for key in wanted} == wanted

@@ -8,11 +8,10 @@ import time
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
+from composed import composed
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from torchrl_osr.experiment import schema as config
 from torchrl_osr.experiment.run_config import (
     check_run,
     check_targets,
@@ -21,21 +20,13 @@ from torchrl_osr.experiment.run_config import (
     read_yaml,
 )
 
-CONF = Path(__file__).parents[2] / "conf"
-
-
-def composed(*overrides: str):
-    config.register()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("train", list(overrides))
-
 
 @pytest.mark.parametrize(
     "key", ["trainer.foo", "foo", "loss.recovery_wieght", "inverse_dynamics.loss.foo"]
 )
 def test_keys_that_were_added_are_refused(key):
     with pytest.raises(ValueError, match=f"there is no key {key}: docs"):
-        check_run(composed(f"+{key}=1"))
+        check_run(composed("train", f"+{key}=1"))
 
 
 @pytest.mark.parametrize(
@@ -54,7 +45,7 @@ def test_keys_that_were_added_are_refused(key):
     ],
 )
 def test_what_is_wrong_with_somebodys_run_is_named(tmp_path, key, value, reason):
-    cfg = OmegaConf.create(OmegaConf.to_container(composed(), resolve=True))
+    cfg = OmegaConf.create(OmegaConf.to_container(composed("train"), resolve=True))
     OmegaConf.update(cfg, key, value, merge=False)
     OmegaConf.save(cfg, tmp_path / "config.yaml")
     with pytest.raises(ValueError, match=rf"config\.yaml: .*{reason}"):

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import inspect
 from dataclasses import MISSING, fields, is_dataclass
-from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
+from composed import CONF, composed
 from hydra.errors import ConfigCompositionException, MissingConfigException
 from hydra.utils import get_class, instantiate
 from omegaconf import OmegaConf, ValidationError
@@ -24,7 +23,6 @@ from torchrl_osr.experiment import schema as config
 from torchrl_osr.experiment.run_config import read_run
 from torchrl_osr.experiment.schema import schema_of
 
-CONF = Path(__file__).parents[2] / "conf"
 GROUPS = ["env", "data", "inverse_dynamics", "dynamics", "loss", "recovery", "logger"]
 GROUPS += ["perturbation", "preset"]
 OBJECTIVES = sorted(set(objectives.__all__) - config.NOT_CHOSEN)
@@ -33,15 +31,8 @@ NETWORKS = {f"{part}_network" for part in PARTS}
 NO_OPTIONS = {"action_spec", "gamma"}  # an object of Python, and what is refused
 
 
-@pytest.fixture(autouse=True)
-def _hydra():
-    config.register()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        yield
-
-
-def composed(*overrides: str):
-    return compose("train", overrides=list(overrides))
+def train(*overrides: str):
+    return composed("train", *overrides)
 
 
 def options(group: str) -> list[str]:
@@ -56,7 +47,7 @@ def options(group: str) -> list[str]:
     ],
 )
 def test_every_option_composes_and_its_run_can_be_read(override, tmp_path):
-    cfg = composed(override)
+    cfg = train(override)
     assert not OmegaConf.missing_keys(cfg)
     assert isinstance(OmegaConf.to_object(cfg), config.TrainConfig)
     OmegaConf.save(cfg, tmp_path / "config.yaml", resolve=True)
@@ -67,10 +58,10 @@ def test_every_option_composes_and_its_run_can_be_read(override, tmp_path):
 @pytest.mark.parametrize("name", options("experiment"))
 def test_every_experiment_composes_and_sweeps_over_values_that_compose(name):
     raw = OmegaConf.load(CONF / "experiment" / f"{name}.yaml")
-    assert not OmegaConf.missing_keys(composed(f"+experiment={name}"))
+    assert not OmegaConf.missing_keys(train(f"+experiment={name}"))
     for key, values in raw.hydra.sweeper.params.items():
         overrides = [f"{key}={value}" for value in str(values).split(",")]
-        found = {str(composed(f"+experiment={name}", each)) for each in overrides}
+        found = {str(train(f"+experiment={name}", each)) for each in overrides}
         assert len(found) == len(overrides)
 
 
@@ -78,22 +69,22 @@ def test_groups_name_what_the_package_has():
     assert options("data") == sorted([*QUALITIES, *MAZE_QUALITIES, *RECORDED])
     assert options("env") == sorted([*load_behavior_card(), *MAZE_IDS])
     for name, env_id in MAZE_IDS.items():
-        env = composed(f"env={name}").env
+        env = train(f"env={name}").env
         assert (env.name, env.id) == (name, env_id)
     for name, entry in load_behavior_card().items():
-        env = composed(f"env={name}").env
+        env = train(f"env={name}").env
         assert (env.name, env.id) == (name, entry["env"])
 
 
 def test_an_id_alone_is_enough():
-    assert composed("env.id=Pendulum-v1").env.name == "Pendulum-v1"
-    assert composed("env.id=robots:ns/Arm-v0").env.name == "ns-Arm-v0"
-    assert composed("env.id=Walker2d-v5").env.name == "walker2d"
+    assert train("env.id=Pendulum-v1").env.name == "Pendulum-v1"
+    assert train("env.id=robots:ns/Arm-v0").env.name == "ns-Arm-v0"
+    assert train("env.id=Walker2d-v5").env.name == "walker2d"
 
 
 def test_presets_reach_the_values_and_the_command_line_wins():
-    assert composed("preset=paper").trainer.steps == 1_000_000
-    cfg = composed("preset=paper", "trainer.steps=7", "data=expert")
+    assert train("preset=paper").trainer.steps == 1_000_000
+    cfg = train("preset=paper", "trainer.steps=7", "data=expert")
     assert cfg.trainer.steps == 7
     assert cfg.trainer.batch_size == 256
     assert "expert" in cfg.data.values()
@@ -102,7 +93,7 @@ def test_presets_reach_the_values_and_the_command_line_wins():
 @pytest.mark.parametrize("group", GROUPS)
 def test_unknown_option_lists_what_exists(group):
     with pytest.raises(MissingConfigException) as error:
-        composed(f"{group}=nothing")
+        train(f"{group}=nothing")
     for name in options(group):
         assert name in str(error.value)
 
@@ -183,7 +174,7 @@ MISTYPED = [
 @pytest.mark.parametrize(("override", "named"), MISTYPED)
 def test_mistyped_key_or_type_stops_by_name(override, named):
     with pytest.raises(ConfigCompositionException) as error:
-        composed(override)
+        train(override)
     assert named in f"{error.value} {error.value.__cause__}"
 
 
@@ -241,7 +232,7 @@ def test_every_loss_configuration_is_listed():
 @pytest.mark.parametrize("name", LOSSES)
 def test_loss_is_the_class_with_these_options(name):
     target, expected = LOSSES[name]
-    loss = composed("preset=paper", f"loss={name}").loss
+    loss = train("preset=paper", f"loss={name}").loss
     loss_class = getattr(objectives, target)
     assert get_class(loss._target_) is loss_class
     # What refuses a mistyped key or value.
@@ -251,12 +242,12 @@ def test_loss_is_the_class_with_these_options(name):
 
 @pytest.mark.parametrize(("name", "number"), [("cql", 6), ("osr_10", 6), ("osr_v", 1)])
 def test_number_of_sampled_actions_is_one_for_all_losses_with_cqls_term(name, number):
-    assert composed(f"loss={name}", "num_random=6").loss.num_random == number
+    assert train(f"loss={name}", "num_random=6").loss.num_random == number
 
 
 @pytest.mark.parametrize("name", options("inverse_dynamics"))
 def test_model_config_is_the_model_loss_modules_vocabulary(name):
-    cfg = composed(f"inverse_dynamics={name}").inverse_dynamics
+    cfg = train(f"inverse_dynamics={name}").inverse_dynamics
     model = instantiate(cfg.network, 3, 2, num_cells=[4])
     loss = instantiate(cfg.loss, model)
     assert type(loss) is InverseDynamicsLoss
@@ -269,32 +260,32 @@ def test_model_config_is_the_model_loss_modules_vocabulary(name):
 
 def test_adversarial_perturbation_is_the_noise_and_the_class_default():
     adversarial, gaussian = (
-        composed(f"perturbation={name}").perturbation
+        train(f"perturbation={name}").perturbation
         for name in ("adversarial", "gaussian")
     )
     assert instantiate(adversarial.adversary) == Adversary()
     assert gaussian.adversary is None
     assert adversarial.std == gaussian.std
     options = [f"perturbation.adversary.{x}" for x in ("objective=min_Q", "epsilon=1")]
-    tried = composed("perturbation=adversarial", *options).perturbation
+    tried = train("perturbation=adversarial", *options).perturbation
     assert instantiate(tried.adversary) == Adversary("min_Q", epsilon=1.0)
     with pytest.raises(ConfigCompositionException) as error:
-        composed("perturbation=adversarial", "perturbation.adversary.epsilonn=1")
+        train("perturbation=adversarial", "perturbation.adversary.epsilonn=1")
     assert "epsilonn" in f"{error.value} {error.value.__cause__}"
 
 
 def test_official_preset_reaches_every_group_and_quick_sizes_stay_possible():
-    cfg = composed("preset=official")
-    assert cfg.loss == composed("loss=osr_official", "preset=paper").loss
-    assert cfg.inverse_dynamics == composed("inverse_dynamics=cvae").inverse_dynamics
+    cfg = train("preset=official")
+    assert cfg.loss == train("loss=osr_official", "preset=paper").loss
+    assert cfg.inverse_dynamics == train("inverse_dynamics=cvae").inverse_dynamics
     assert (cfg.data.standardize, cfg.trainer.steps) == (False, 4_000_000)
-    quick = composed("loss=osr_official", "inverse_dynamics=cvae")
+    quick = train("loss=osr_official", "inverse_dynamics=cvae")
     assert quick.loss.recovery_direction == "reverse"
-    assert quick.trainer.steps == composed().trainer.steps
+    assert quick.trainer.steps == train().trainer.steps
 
 
 def test_antmaze_preset_is_corls_cql():
-    cfg, paper = composed("preset=antmaze"), composed("preset=paper")
+    cfg, paper = train("preset=antmaze"), train("preset=paper")
     # tinkoff-ai/CORL at 140648a, configs/offline/cql/antmaze/umaze_v2.yaml
     assert (cfg.data.reward_scale, cfg.data.reward_shift) == (10, -5)
     assert (cfg.loss.with_lagrange, cfg.loss.lagrange_thresh) == (True, 0.8)

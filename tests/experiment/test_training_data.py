@@ -7,43 +7,21 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
+from composed import SMALL, composed
 
 from torchrl_osr.commands import train
 from torchrl_osr.evaluation import DataDistance
 from torchrl_osr.experiment import run_folder
-from torchrl_osr.experiment import schema as config
 from torchrl_osr.experiment.build import load_data
 from torchrl_osr.experiment.training_data import load_training_data
 
-ROOT = Path(__file__).parents[2]
 CPU = torch.device("cpu")
-TINY = [
-    "data=random",
-    "data.num_transitions=600",
-    "data.held_out=0.1",
-    "network.num_cells=[8]",
-    "trainer.batch_size=8",
-    "trainer.inverse_dynamics_steps=10",
-    "trainer.steps=10",
-    "trainer.log_interval=1",
-    "trainer.eval_interval=10",
-    "trainer.eval_episodes=1",
-    "trainer.checkpoint_interval=10",
-]
+pytestmark = pytest.mark.usefixtures("own_cache")
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TORCHRL_OSR_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
-
-
-def composed(*overrides: str):
-    config.register()
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return compose("train", overrides=[*TINY, *overrides])
+def small(*overrides: str):
+    steps = "trainer.steps=10", "trainer.eval_interval=10"
+    return composed("train", *SMALL, *steps, *overrides)
 
 
 @pytest.mark.parametrize(
@@ -52,7 +30,7 @@ def composed(*overrides: str):
 )
 def test_the_same_seed_gives_the_same_batches(more):
     here, there = (
-        load_training_data(composed(f"data.storage={storage}", *more), CPU)
+        load_training_data(small(f"data.storage={storage}", *more), CPU)
         for storage in ("memory", "disk")
     )
     torch.testing.assert_close(there.held_out, here.held_out, rtol=0, atol=1e-6)
@@ -66,13 +44,13 @@ def test_the_same_seed_gives_the_same_batches(more):
 @pytest.mark.parametrize("held_out", [0.1, 0.5])
 def test_the_next_action_is_there_for_losses_that_read_it(held_out):
     key = ("next", "action")
-    whole, _ = load_data(composed(), progress=False)
+    whole, _ = load_data(small(), progress=False)
     overrides = ["data.standardize=false", f"data.held_out={held_out}"]
     here, there = (
-        load_training_data(composed(f"data.storage={each}", *overrides), CPU, [key])
+        load_training_data(small(f"data.storage={each}", *overrides), CPU, [key])
         for each in ("memory", "disk")
     )
-    assert key not in load_training_data(composed(), CPU).buffer.sample().keys(True)
+    assert key not in load_training_data(small(), CPU).buffer.sample().keys(True)
     for _ in range(20):
         batch, other = (each.buffer.sample() for each in (here, there))
         torch.testing.assert_close(other, batch, rtol=1e-6, atol=1e-6)
@@ -82,7 +60,7 @@ def test_the_next_action_is_there_for_losses_that_read_it(held_out):
 
 
 def test_without_an_order_the_next_action_is_refused():
-    cfg = composed("data=medium", "data.random_share=0.5", "loss=rebrac")
+    cfg = small("data=medium", "data.random_share=0.5", "loss=rebrac")
     with pytest.raises(
         ValueError, match="ReBRACLoss reads .*random_share=0.5 does not"
     ):
@@ -91,9 +69,9 @@ def test_without_an_order_the_next_action_is_refused():
 
 def test_rewards_are_scaled_then_shifted():
     maze = ["env=pointmaze-umaze", "data=diverse"]
-    bare = load_training_data(composed(*maze), CPU)
+    bare = load_training_data(small(*maze), CPU)
     options = [*maze, "data.reward_scale=10.0", "data.reward_shift=-5.0"]
-    data = load_training_data(composed(*options), CPU)
+    data = load_training_data(small(*options), CPU)
     before, after = (each.buffer[:] for each in (bare, data))
     reached = before["next", "reward"] == 1
     assert (after["next", "reward"][reached] == 5).all()
@@ -115,7 +93,7 @@ def losses(folder: Path) -> dict[str, list[float]]:
 def test_the_same_seed_gives_the_same_training(tmp_path):
     results = []
     for storage in ("memory", "disk"):
-        cfg, folder = composed(f"data.storage={storage}"), tmp_path / storage
+        cfg, folder = small(f"data.storage={storage}"), tmp_path / storage
         folder.mkdir()
         with run_folder.status(folder):
             train.run(cfg, folder)
@@ -128,8 +106,8 @@ def test_the_same_seed_gives_the_same_training(tmp_path):
 
 
 def test_distances_are_those_of_memory():
-    data, _ = load_data(composed(), progress=False)
-    stored, _ = load_data(composed("data.storage=disk"), progress=False)
+    data, _ = load_data(small(), progress=False)
+    stored, _ = load_data(small("data.storage=disk"), progress=False)
     here, there = (DataDistance(each, max_reference=300) for each in (data, stored))
     assert there.threshold == pytest.approx(here.threshold, rel=1e-5)
     states = torch.randn(20, 11)
@@ -149,4 +127,4 @@ def test_distances_are_those_of_memory():
 def test_what_cannot_be_had_is_refused_before_the_data(overrides, message, monkeypatch):
     monkeypatch.setattr("torchrl_osr.data.load_dataset", None)
     with pytest.raises(ValueError, match=message):
-        load_training_data(composed(*overrides), CPU)
+        load_training_data(small(*overrides), CPU)

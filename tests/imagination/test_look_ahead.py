@@ -100,13 +100,15 @@ def test_without_a_better_way_it_is_the_policy() -> None:
     assert torch.equal(look_ahead(still), coast(still))
     fallen = torch.tensor([[5.0, 0.0], [torch.nan, 0.0]])
     assert torch.equal(look_ahead(fallen), coast(fallen))
+    look_ahead.value = lambda state: state[:, 1]
+    assert torch.equal(look_ahead(fallen), coast(fallen))
 
 
 def test_scores_are_the_steps_survived_and_the_value_of_the_last_state() -> None:
     # One network is pushed by .1 a step, one by -.1; the third is no elite.
     model = cart((0.1, -0.1, 50.0), elites=2)
     look_ahead = LookAheadPolicy(
-        coast, model, everywhere, terminated=lambda s: s[:, :, 1] > 0.45,
+        coast, model, everywhere, terminated=lambda s: s[:, 1] > 0.45,
         value=lambda s: 100 * s[:, 1], planning_horizon=5, num_offsets=2, hold=2,
         top_k=1,
     )  # fmt: skip
@@ -174,7 +176,7 @@ def test_it_is_a_policy_for_torchrl() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"planning_horizon": 19}, "planning_horizon=19 is shorter than the 5 offsets"),
+        ({"planning_horizon": 19}, "planning_horizon must be at least 20"),
         ({"top_k": 64}, "top_k must be between 1 and num_candidates - 1 = 63, got 64"),
         ({"hold": 0}, "hold must be at least 1"),
         ({"std": 0.0}, "std must be above 0"),

@@ -10,9 +10,18 @@ from torch._dynamo.exc import InternalTorchDynamoError
 
 # One loss for each path that is traced; tracing takes seconds. With ReLU critics: osr,
 # and in cql-options all of CQL that is off by default. Critics that are vmapped: with
-# CQL's term in noisy-cloning, in osrv and in edac.
+# CQL's term in noisy-cloning, in osrv and in edac. In scas a model of the dynamics.
 TRACED = (
-    *("osr", "cql-options", "noisy-cloning", "osrv", "edac", "td3bc", "discrete"),
+    *(
+        "osr",
+        "cql-options",
+        "noisy-cloning",
+        "osrv",
+        "edac",
+        "td3bc",
+        "scas",
+        "discrete",
+    ),
     *("recovery", "recovery-delta", "idm", "cvae"),
 )
 

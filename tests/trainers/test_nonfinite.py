@@ -1,4 +1,4 @@
-"""Losses and gradients that are not finite: the run stops, or the update is skipped.
+"""Losses and gradients that are not finite stop the run, and are kept.
 
 On a CPU every update is checked before its step. Tests that say ``deferred`` do on the
 CPU what is done on a GPU, where the host looks at the end of a log interval.
@@ -97,54 +97,6 @@ def test_gradient_of_a_finite_loss_is_named(tmp_path, make):
     )
     with pytest.raises(FloatingPointError, match=match):
         trainer.train()
-
-
-def test_skipping_is_as_if_the_step_had_been_left_out(tmp_path, runs, make, caplog):
-    """Compared with a run without poison, whose optimizer is held back by hand."""
-    numbers, seen = [], []
-    trainer = make(tmp_path / "run", loggers=[runs.log_of(numbers)], nonfinite="skip")
-    poison(trainer, 2, 3, 7, 11).train()
-    other = runs.make(tmp_path / "other")
-    step, forward = other.optimizer.step, other.loss_module.forward
-    other.optimizer.step = lambda: None if other.step in (2, 3, 7, 11) else step()
-    other.loss_module.forward = lambda batch: seen.append(forward(batch)) or seen[-1]
-    other.train()
-    runs.assert_same_bits(runs.state(trainer), runs.state(other))
-    counts = [value for name, _, value in numbers if name == "train/skipped_updates"]
-    assert counts == [2, 2, 3, 4]
-    # Log intervals end at 4, 6 (with an evaluation), 8, 12.
-    means = [value for name, _, value in numbers if name == "train/loss_qvalue"]
-    done = [(0, 3), (4, 5), (7,), (8, 9, 11)]
-    for mean, rows in zip(means, done, strict=True):
-        wanted = torch.stack([seen[row]["loss_qvalue"] for row in rows]).mean()
-        assert mean == pytest.approx(wanted.item(), rel=1e-5)
-    said = [each.message for each in caplog.records if "skipped" in each.message]
-    assert len(said) == 3
-    assert "2 of the 4 updates up to step 4 were skipped, 2 since" in said[0]
-    assert "1 of the 2 updates up to step 8 were skipped, 3 since" in said[1]
-    assert "1 of the 4 updates up to step 12 were skipped, 4 since" in said[2]
-
-
-def test_interval_in_which_nothing_is_learnt_stops_the_run(tmp_path, make):
-    trainer = poison(make(tmp_path, nonfinite="skip"), 5, 6)
-    with pytest.raises(FloatingPointError, match="step 5: .* All 2 updates since were"):
-        trainer.train()
-    saved = torch.load(next(tmp_path.glob("nonfinite/*")), weights_only=True)
-    assert saved["step"] == 5
-
-
-def test_count_of_skipped_updates_survives_a_resume(tmp_path, runs):
-    poison(runs.make(tmp_path, total_steps=6, nonfinite="skip"), 1, 3, 6).train()
-    resumed = runs.make(tmp_path, nonfinite="skip")
-    resumed.resume()
-    assert resumed.nonfinite_check.skipped == 3
-    poison(resumed, 8).train()
-    assert resumed.nonfinite_check.skipped == 4
-
-
-def test_unknown_mode_is_refused(tmp_path, runs):
-    with pytest.raises(ValueError, match="nonfinite must be one of"):
-        runs.make(tmp_path, nonfinite="go")
 
 
 def test_full_disk_does_not_hide_why_the_run_stops(tmp_path, runs, monkeypatch):

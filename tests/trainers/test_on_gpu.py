@@ -87,6 +87,5 @@ def test_other_optimizers_are_checked_at_every_update(tmp_path, runs):
         trainer.buffer,
         total_steps=1,
         folder=tmp_path,
-        nonfinite="skip",
     )
     assert not other.nonfinite_check.deferred

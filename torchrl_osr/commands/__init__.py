@@ -1,11 +1,5 @@
 """The commands, one a file: ``torchrl-osr train`` is ``train.py``."""
 
-from __future__ import annotations
+from torchrl_osr.experiment import CONF
 
-from pathlib import Path
-
-_PACKAGE = Path(__file__).parents[1]
-_CHECKOUT = _PACKAGE.parent
-
-CONF = str((_PACKAGE if (_PACKAGE / "conf").is_dir() else _CHECKOUT) / "conf")
-"""Folder of the configuration: in the installed package, or in the checkout."""
+__all__ = ["CONF"]

@@ -7,16 +7,12 @@ roll-outs) and ``read`` (Minari, D4RL, files of your own). ``load_dataset`` open
 Collecting needs Gymnasium, MuJoCo, tqdm and platformdirs (``torchrl-osr[train]``),
 reading HDF5, Arrow or Parquet those and Minari, h5py and pyarrow (``[minari]``); the
 names that do are loaded on first use, so that everything else works without them.
-
-Importing this registers ``osr-minari`` with ``torchrl.data.datasets.load_dataset``.
 """
 
 from __future__ import annotations
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
-
-from torchrl.data.datasets import register_dataset
 
 from torchrl_osr.data.collect.behavior import (
     BehaviorPolicy,
@@ -74,7 +70,7 @@ if TYPE_CHECKING:
     )
     from torchrl_osr.data.read.d4rl import load_d4rl
     from torchrl_osr.data.read.files import load_file
-    from torchrl_osr.data.read.minari import load_minari, minari_replay_buffer
+    from torchrl_osr.data.read.minari import load_minari
     from torchrl_osr.data.read.minari_export import export_minari
     from torchrl_osr.data.sources import RECORDED, load_dataset
     from torchrl_osr.data.store.memmap import load_memmap, write_memmap
@@ -98,7 +94,6 @@ _NEEDS_EXTRA = {
     "load_minari": "read.minari",
     "make_environment": "collect.environment",
     "measure_policy": "collect.rollout",
-    "minari_replay_buffer": "read.minari",
     "quality_policies": "collect.qualities",
     "transitions_from_episodes": "read.arrays",
     "transitions_from_rows": "read.arrays",
@@ -137,7 +132,6 @@ __all__ = [
     "make_environment",
     "make_replay_buffer",
     "measure_policy",
-    "minari_replay_buffer",
     "mix_datasets",
     "next_action",
     "normalized_score",
@@ -152,13 +146,6 @@ __all__ = [
     "update_behavior_card",
     "write_memmap",
 ]
-
-# By name, so that Minari is imported when such a set is asked for.
-register_dataset(
-    "osr-minari",
-    "torchrl_osr.data.read.minari:minari_replay_buffer",
-    replace=True,
-)
 
 
 def __getattr__(name: str) -> Any:

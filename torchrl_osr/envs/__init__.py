@@ -17,13 +17,11 @@ networks: :func:`attacked_policy` makes an attacked policy from a policy.
 Gymnasium and MuJoCo come with ``torchrl-osr[train]``.
 """
 
-try:
+from torchrl_osr._extras import needed_by
+
+with needed_by("disturbances need", "train"):
     import gymnasium  # noqa: F401
     import mujoco  # noqa: F401
-except ImportError as error:
-    raise ImportError(
-        f"disturbances need {error.name!r}: pip install torchrl-osr[train]"
-    ) from error
 
 from torchrl_osr.envs.disturbance import NotPossible
 from torchrl_osr.envs.faults import (

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from torchrl_osr._extras import needed_by
 from torchrl_osr._files import whole_file
 
 if TYPE_CHECKING:
@@ -19,13 +20,9 @@ IN_WORDS = {"score": "normalised score", "return": "return"}
 
 def new_figure(width: float, height: float, **options: Any) -> Figure:
     """Matplotlib figure, ``width`` x ``height`` inches, that draws in memory."""
-    try:
+    with needed_by("figures need", "train"):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError(
-            f"figures need {error.name!r}: pip install torchrl-osr[train]"
-        ) from error
     figure = Figure(figsize=(width, height), **options)
     FigureCanvasAgg(figure)
     return figure

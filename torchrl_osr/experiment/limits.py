@@ -96,7 +96,6 @@ CHOICES: dict[str, tuple[str | None, ...]] = {
     "recovery.reduction": _REDUCTIONS,
     "optim.actor_schedule": SCHEDULES,
     "optim.qvalue_schedule": SCHEDULES,
-    "trainer.nonfinite": ("stop", "skip"),
     "trainer.precision": ("float32", "bfloat16"),
     "trainer.matmul_precision": ("highest", "high", "medium"),
     "logger.kind": ("csv", "tensorboard", "wandb"),

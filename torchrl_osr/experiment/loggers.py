@@ -8,14 +8,12 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
 from torchrl.record.loggers import CSVLogger, Logger, get_logger
-from torchrl.record.loggers.tensorboard import TensorboardLogger
 from torchrl.record.loggers.wandb import WandbLogger
 
 from torchrl_osr._checks import check_choice
 from torchrl_osr._files import write_atomically
-from torchrl_osr.experiment.run_config import flatten
+from torchrl_osr.evaluation import measure_of
 
 
 def make_loggers(
@@ -67,46 +65,23 @@ def make_loggers(
 
 def log_outcome(
     loggers: Sequence[Logger],
-    config: DictConfig,
     rows: Mapping[str, Mapping[str, Any]],
     figures: Mapping[str, Path],
 ) -> None:
-    """Log what a run ends with, and close the loggers that need it.
-
-    TensorBoard gets hyperparameters with the scores, W&B the figures and a table.
+    """Give W&B what a run ends with, and close it; all else is in the curves.
 
     Args:
         loggers: of :func:`make_loggers`.
-        config: of the run.
         rows: evaluations by name, such as the last and the best.
         figures: PNG files by name.
     """
     for logger in loggers:
-        experiment = logger.experiment
-        if isinstance(logger, TensorboardLogger):
-            settings = flatten(OmegaConf.to_container(config, resolve=True))
-            values = {
-                key: value if isinstance(value, (bool, int, float)) else str(value)
-                for key, value in settings.items()
-            }
-            scores = {f"score/{name}": row["score"] for name, row in rows.items()}
-            # "." is the folder of the curves, not one of its own.
-            experiment.add_hparams(values, scores, run_name=".")
-            experiment.flush()
-        elif isinstance(logger, WandbLogger):
+        if isinstance(logger, WandbLogger):
             import wandb
 
-            columns = ["evaluation", "step", "score", "score_low", "score_high"]
-            table = wandb.Table(
-                columns=columns,
-                data=[
-                    [name, *(row.get(key) for key in columns[1:])]
-                    for name, row in rows.items()
-                ],
-            )
-            pictures = {name: wandb.Image(str(path)) for name, path in figures.items()}
-            experiment.log({"scores": table} | pictures)
-            experiment.summary.update(
-                {f"{name}_score": row["score"] for name, row in rows.items()}
-            )
-            experiment.finish()
+            run = logger.experiment
+            run.log({name: wandb.Image(str(path)) for name, path in figures.items()})
+            for name, row in rows.items():
+                measure = measure_of(row)
+                run.summary[f"{name}_{measure}"] = row[measure]
+            run.finish()

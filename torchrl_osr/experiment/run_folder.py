@@ -41,7 +41,6 @@ MAY_DIFFER = (
     "trainer.checkpoints_kept",
     "trainer.eval_interval",
     "trainer.log_interval",
-    "trainer.nonfinite",
     "trainer.num_threads",
     "trainer.progress",
     "trainer.record",

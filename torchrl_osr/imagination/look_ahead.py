@@ -25,46 +25,38 @@ class LookAheadPolicy:
         \frac1E \sum_{i=1}^{E} \Big( \sum_{t=1}^{H} \text{alive}^i_t
         + \text{alive}^i_H \, V(s^i_H) \Big)
 
-    where each elite :math:`i` is rolled out by itself with its mean prediction,
-    :math:`s^i_{t+1} = f_i(s^i_t, \pi(s^i_t) + \delta_{\lfloor t / h \rfloor})`, actions
-    are clipped to their bounds, and after :math:`K h` steps the policy goes on alone:
-    it is the tail of every plan. The score is the number of steps survived, and the
-    value of the last state in the same unit. The cross-entropy method searches the
-    offsets. The policy itself (no offsets) is the first candidate, and is kept unless
-    another one scores more. Without a value, nothing is searched where the policy
-    survives until the horizon in every elite: nothing scores more.
+    the steps survived, and the value of the last state. Each elite :math:`i` is rolled
+    out by itself with its mean prediction, :math:`s^i_{t+1} = f_i(s^i_t, \pi(s^i_t) +
+    \delta_{\lfloor t / h \rfloor})`; after :math:`K h` steps the policy goes on alone.
+    The cross-entropy method searches the offsets. No offsets are the first candidate,
+    kept unless another one scores more; without a value nothing is searched where the
+    policy survives in every elite.
 
     Such H-step look-ahead is known from "Model-Based Offline Planning" (MBOP,
     https://arxiv.org/abs/2008.05556) and "Learning Off-Policy with Online Planning"
-    (LOOP, https://arxiv.org/abs/2008.10066); to plan only where the state is far from
-    the data is ours.
+    (LOOP, https://arxiv.org/abs/2008.10066); to plan only far from the data is ours.
 
-    It plans anew at every call, so that it is a function of the state: the candidates'
-    noise is drawn once, and neither earlier calls nor the other rows of a batch matter
-    (but for torch's rounding).
+    It plans anew at every call, and the candidates' noise is drawn once: it is a
+    function of the state, whatever came before and whatever else is in the batch.
 
     Args:
         policy: maps observations ``[B, S]`` to actions ``[B, A]`` in [-1, 1], without
             randomness of its own; :class:`~torchrl_osr.Policy` for instance.
-        model: of the dynamics, such as
-            :func:`~torchrl_osr.experiment.dynamics.load_dynamics` loads.
+        model: see :func:`~torchrl_osr.experiment.dynamics.load_dynamics`.
         far: which of the observations ``[B, S]`` it plans for, bool ``[B]``:
             ``lambda state: distance(state) > distance.threshold`` with a
             :class:`~torchrl_osr.evaluation.DataDistance`.
 
     Keyword Args:
-        terminated: of next observations; what has ended there does not survive. Default
-            :func:`~torchrl_osr.imagination.never`; see
-            :func:`~torchrl_osr.imagination.termination` for the rules of tasks.
-        value: of observations ``[n, S]``, in steps, ``[n]``. Default: 0, survival until
-            the horizon alone.
+        terminated: of next observations, see
+            :func:`~torchrl_osr.imagination.termination`. Default: never.
+        value: of observations ``[n, S]``, in steps, ``[n]``. Default: 0.
         observation_norm: how the model's data were standardised
             (``standard_normal=True``). Default: not at all.
         planning_horizon: ``H``, steps. Default 40.
-        num_offsets: ``K``. Default 5.
-        hold: ``h``, steps for which an offset is added. Default 4.
-        num_candidates: ``C``. Default 64.
-        top_k: candidates from which the next ones are drawn. Default 8.
+        num_offsets, hold: ``K``, and for how many steps each is added. Default 5 and 4.
+        num_candidates, top_k: ``C``, and how many of them the next ones are drawn
+            around. Default 64 and 8.
         optim_steps: how often candidates are drawn. Default 3.
         std: of the first offsets. Default 0.5.
         generator: draws the candidates' noise. Default: one with seed 0.
@@ -76,10 +68,9 @@ class LookAheadPolicy:
         >>> import torch
         >>> from torchrl_osr.imagination import LookAheadPolicy, termination
         >>> from torchrl_osr.modules import DynamicsEnsemble
-        >>> def policy(state):
-        ...     return torch.zeros(len(state), 3)
         >>> look_ahead = LookAheadPolicy(
-        ...     policy, DynamicsEnsemble(11, 3), far=lambda state: state[:, 1] > 0.1,
+        ...     lambda state: torch.zeros(len(state), 3), DynamicsEnsemble(11, 3),
+        ...     far=lambda state: state[:, 1] > 0.1,
         ...     terminated=termination("Hopper-v5"), planning_horizon=20)
         >>> state = torch.zeros(2, 11)
         >>> state[:, 0], state[1, 1] = 1.2, 0.15
@@ -106,35 +97,30 @@ class LookAheadPolicy:
         std: float = 0.5,
         generator: torch.Generator | None = None,
     ) -> None:
-        for name, number in (
-            ("num_offsets", num_offsets), ("hold", hold), ("optim_steps", optim_steps),
-        ):  # fmt: skip
-            check_positive(name, number, minimum=1)
+        check_positive("num_offsets", num_offsets, minimum=1)
+        check_positive("hold", hold, minimum=1)
+        check_positive("optim_steps", optim_steps, minimum=1)
         check_positive("std", std)
-        if planning_horizon < num_offsets * hold:
-            raise ValueError(
-                f"planning_horizon={planning_horizon} is shorter than the "
-                f"{num_offsets} offsets of {hold} steps each; expected at least "
-                f"{num_offsets * hold}."
-            )
+        check_positive("planning_horizon", planning_horizon, minimum=num_offsets * hold)
         if not 1 <= top_k < num_candidates:
             raise ValueError(
                 f"top_k must be between 1 and num_candidates - 1 = "
                 f"{num_candidates - 1}, got {top_k}."
             )
         self.policy, self.far, self.terminated = policy, far, terminated
-        self.value, self.norm = value, observation_norm
+        self.value = value
+        self.loc, self.scale = torch.tensor(0.0), torch.tensor(1.0)
+        if observation_norm is not None:
+            self.loc, self.scale = observation_norm.loc, observation_norm.scale
         self.model = model.elite_networks()
         self.planning_horizon, self.hold = planning_horizon, hold
         self.top_k, self.std = top_k, std
         generator = generator or torch.Generator().manual_seed(0)
         shape = optim_steps, num_candidates, num_offsets, model.action_dim
-        # TorchRL's CEMPlanner plans all actions from nothing: it has no policy to start
-        # from and to go on with, no value of the last state, and torch's global
-        # generator; and it returns the elite's mean, which nobody has tried.
-        self.noise = torch.randn(
-            shape, generator=generator, device=generator.device
-        ).to(model.target_loc.device)
+        # TorchRL's CEMPlanner has no policy to plan around and to go on with, no value
+        # of the last state, torch's global generator, and returns an untried mean.
+        noise = torch.randn(shape, generator=generator, device=generator.device)
+        self.noise = noise.to(model.target_loc.device)
 
     @torch.no_grad()
     def __call__(self, observation: Tensor) -> Tensor:
@@ -182,11 +168,12 @@ class LookAheadPolicy:
         """What the model expects of offsets ``[B, C, K, A]``, in steps, ``[B, C]``."""
         networks, batch = self.model.num_networks, offsets.shape[:2]
         offsets = offsets.flatten(0, 1).repeat_interleave(self.hold, 1)
-        starts = observation.repeat_interleave(batch[1], 0).expand(networks, -1, -1)
-        state, steps = starts, starts.new_zeros(starts.shape[:-1])
+        offsets = offsets.repeat(networks, 1, 1)
+        start = observation.repeat_interleave(batch[1], 0).repeat(networks, 1)
+        state, steps = start, start.new_zeros(len(start))
         alive = torch.ones_like(steps, dtype=torch.bool)
         for step in range(self.planning_horizon):
-            action = self._of_all(self.policy, state)
+            action = self.policy(state)
             if step < offsets.shape[1]:
                 action = (action + offsets[:, step]).clamp(-1, 1)
             state = self._following(state, action)
@@ -194,24 +181,17 @@ class LookAheadPolicy:
             if not alive.any():
                 break
             # What has fallen must not grow until it overflows.
-            state = torch.where(alive.unsqueeze(-1), state, starts)
+            state = torch.where(alive.unsqueeze(-1), state, start)
             steps = steps + alive
         if self.value is not None:
-            steps = steps + alive * self._of_all(self.value, state)
-        return steps.mean(0).view(batch)
-
-    def _of_all(self, function: Callable[[Tensor], Tensor], state: Tensor) -> Tensor:
-        """A function of rows, of the states ``[E, n, S]`` of all networks."""
-        value = function(state.flatten(0, 1))
-        return value.reshape(*state.shape[:2], *value.shape[1:])
+            steps = steps + self.value(state).where(alive, 0.0)
+        return steps.view(networks, *batch).mean(0)
 
     def _following(self, state: Tensor, action: Tensor) -> Tensor:
-        """Each network's mean prediction for its own states, ``[E, n, S]``."""
-        loc, scale = 0.0, 1.0
-        if self.norm is not None:
-            loc, scale = self.norm.loc, self.norm.scale
-        inputs = torch.cat([(state - loc) / scale, action], -1)
+        """Mean predictions ``[E n, S]``, of the first network for the first rows."""
+        inputs = torch.cat([(state - self.loc) / self.scale, action], -1)
+        inputs = inputs.view(self.model.num_networks, -1, inputs.shape[-1])
         mean, _ = self.model.standardized(inputs)
         change = mean * self.model.target_scale + self.model.target_loc
-        following: Tensor = state + change[..., :-1] * scale
+        following: Tensor = state + change[..., :-1].flatten(0, 1) * self.scale
         return following

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from torchrl_osr._extras import needed_by
 from torchrl_osr._files import write_atomically
 
 SUFFIXES = (".onnx", ".pt2")
@@ -54,12 +55,8 @@ def write_graph(
         torch.export.save(program, file, extra_files={RECORD: text})
         write_atomically(path, file.getvalue())
         return
-    try:
+    with needed_by("ONNX needs", "export"):
         import onnxscript  # noqa: F401
-    except ImportError as error:
-        raise ImportError(
-            f"ONNX needs {error.name!r}: pip install torchrl-osr[export]"
-        ) from error
     with _without_torchs_own_notes():
         onnx = torch.onnx.export(
             module,

@@ -21,7 +21,6 @@ IGNORED = (
     "logger.",
     "trainer.progress",
     "trainer.num_threads",
-    "trainer.nonfinite",
     "trainer.compile",
     "trainer.cudagraph",
     "trainer.log_interval",

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from torchrl_osr._extras import needed_by
 from torchrl_osr._files import write_atomically
 from torchrl_osr.evaluation import NUM_RECENT, NUM_RESAMPLES
 from torchrl_osr.report.comparisons import (
@@ -43,12 +44,8 @@ from torchrl_osr.report.scores import (
 if TYPE_CHECKING:  # plots says what to install where there is no Matplotlib
     from matplotlib.figure import Figure
 
-try:
+with needed_by("the report needs", "train"):
     from jinja2 import Environment, PackageLoader
-except ImportError as error:
-    raise ImportError(
-        f"the report needs {error.name!r}: pip install torchrl-osr[train]"
-    ) from error
 
 PAGE = "report.html"
 MARKS = {"better": "▲ ", "worse": "▼ ", "not told apart": "= "}

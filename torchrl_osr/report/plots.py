@@ -11,19 +11,16 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from torchrl_osr._extras import needed_by
 from torchrl_osr.report.comparisons import Difference
 from torchrl_osr.report.scores import Band
 
-try:
+with needed_by("figures need", "train"):
     from matplotlib.axes import Axes
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
     from PIL import Image  # Matplotlib needs it, too
-except ImportError as error:
-    raise ImportError(
-        f"figures need {error.name!r}: pip install torchrl-osr[train]"
-    ) from error
 
 # Okabe and Ito's palette, which colour-blind readers can tell apart, without its
 # yellow, too pale for a line.

@@ -6,20 +6,16 @@ this check the run is lost, and so is the batch that caused it.
 
 from __future__ import annotations
 
-import logging
 import math
-from typing import Any, Literal, NoReturn
+from typing import Any, NoReturn
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_osr._checks import check_choice
 from torchrl_osr._files import whole_file
 from torchrl_osr.trainers.checkpoints import Checkpoints
-
-log = logging.getLogger(__name__)
 
 NUM_NAMED = 5
 """Losses and gradients that are named in a message, at most."""
@@ -31,42 +27,37 @@ def leaves_steps_out(optimizer: torch.optim.Optimizer) -> bool:
 
 
 class NonfiniteCheck:
-    """Steps an optimizer, unless a loss or a gradient is not finite.
+    """Steps an optimizer until a loss or a gradient is not finite.
 
-    An update is bad if a loss, a metric or the norm of a gradient is NaN or infinite. A
-    bad one leaves the parameters and the optimizer's state as they are, to the bit.
-    Target networks take their usual step, towards parameters that have not changed.
+    An update is bad if a loss, a metric or the norm of a gradient is NaN or infinite.
+    The first bad one ends the run, and leaves the parameters and the optimizer's state
+    as they are, to the bit.
 
     Every update is checked before its step. With a fused optimizer on a GPU, where the
     host would have to wait for each update and a CUDA graph could not contain the
     check, it is ``deferred``: the verdict stays on the device, where the optimizer
     reads it (``found_inf``, by which :class:`torch.amp.GradScaler` has steps left out),
-    the first bad batch is kept there, and the host looks at the end of the log
-    interval. With ``"stop"``, all updates after the first bad one are left out too.
+    the first bad batch is kept there, all updates after it are left out too, and the
+    host looks at the end of the log interval.
 
     Args:
         loss_module: whose updates.
         optimizer: of its parameters.
-        mode: ``"stop"`` or ``"skip"``.
         checkpoints: of the run; a bad update is saved in a folder beside them.
         description: names the phase in messages.
 
     Attributes:
         deferred: whether the host looks at the end of the log interval only.
-        skipped: updates left out since the beginning of the run.
     """
 
     def __init__(
         self,
         loss_module: LossModule,
         optimizer: torch.optim.Optimizer,
-        mode: Literal["stop", "skip"],
         checkpoints: Checkpoints,
         description: str,
     ) -> None:
-        check_choice("nonfinite", mode, ("stop", "skip"))
         self.loss_module, self.optimizer = loss_module, optimizer
-        self.skips, self.skipped = mode == "skip", 0
         self.checkpoints, self.description = checkpoints, description
         device = next(loss_module.parameters()).device
         self.deferred = device.type != "cpu" and leaves_steps_out(optimizer)
@@ -79,18 +70,21 @@ class NonfiniteCheck:
         self._gradients: list[str] = []
         self._start = 0
 
-    def restart(self, step: int, skipped: int) -> None:
-        """Continue after a step of the run, with so many updates left out before."""
-        self.skipped, self._start = skipped, step
+    def restart(self, step: int) -> None:
+        """Continue after a step of the run."""
+        self._start = step
         self._bad.zero_()
         self._updates.zero_()
 
-    def step(self, batch: TensorDictBase, losses: TensorDictBase) -> TensorDictBase:
-        """Step the optimizer if everything is finite; return the losses to average.
+    def step(self, batch: TensorDictBase, losses: TensorDictBase) -> None:
+        """Step the optimizer if everything is finite.
 
         Args:
             batch: what the losses are of.
-            losses: detached; those of an update that is skipped come back as zeros.
+            losses: detached.
+
+        Raises:
+            FloatingPointError: if something is not, unless that is ``deferred``.
         """
         groups = self.optimizer.param_groups
         trained = [p for each in groups for p in each["params"] if p.grad is not None]
@@ -106,7 +100,7 @@ class NonfiniteCheck:
         self._updates.add_(1)
         if not self.deferred and all(map(math.isfinite, values.tolist())):
             self.optimizer.step()
-            return losses
+            return
         bad = values.isfinite().all().logical_not()
         self._losses = list(map(str, losses.keys()))
         self._gradients = [self._names.get(each, "unnamed") for each in trained]
@@ -114,14 +108,11 @@ class NonfiniteCheck:
         self._bad.add_(bad)
         if self.deferred:
             optimizer: Any = self.optimizer
-            optimizer.found_inf = (bad if self.skips else self._bad > 0).float()
+            optimizer.found_inf = (self._bad > 0).float()
             optimizer.step()
             del optimizer.found_inf
-        elif not self.skips:
+        else:
             self.settle()
-        if not self.skips:
-            return losses
-        return losses.apply(lambda value: value.masked_fill(bad, 0))
 
     def _keep_first(self, bad: Tensor, batch: TensorDictBase, values: Tensor) -> None:
         """Keep the batch and the values of the first bad update on the device."""
@@ -137,35 +128,18 @@ class NonfiniteCheck:
                 if isinstance(value, Tensor):
                     torch.where(first, new[key], value, out=value)
 
-    def settle(self, *, whole: bool = True) -> float:
+    def settle(self) -> None:
         """Read the verdicts since the last call; on a GPU the host waits here.
 
-        Keyword Args:
-            whole: whether a log interval is over, in which at least one update must
-                have been done.
-
-        Returns:
-            Factor that turns a mean over all updates into one over those done.
-
         Raises:
-            FloatingPointError: if an update was bad; with ``"skip"``, if all were.
+            FloatingPointError: if an update was bad.
         """
         bad, updates = torch.stack([self._bad, self._updates]).tolist()
-        start = self._start
-        self.restart(start + updates, self.skipped)
-        if not bad:
-            return 1.0
-        if not self.skips or (whole and bad == updates):
-            self._stop(start, bad, updates)
-        self.skipped += bad
-        log.warning(
-            f"{self.description}: {bad} of the {updates} updates up to step "
-            f"{self._start} were skipped, {self.skipped} since the beginning: a loss "
-            "or a gradient was not finite. Parameters and optimizer are as they were."
-        )
-        return updates / (updates - bad) if bad < updates else 1.0
+        if bad:
+            self._stop(self._start)
+        self.restart(self._start + updates)
 
-    def _stop(self, start: int, bad: int, updates: int) -> NoReturn:
+    def _stop(self, start: int) -> NoReturn:
         """Save the first bad update, and raise."""
         assert self._evidence is not None
         evidence = self._evidence.cpu()
@@ -181,15 +155,12 @@ class NonfiniteCheck:
             "gradients": gradients,
             "loss_module": self.loss_module.state_dict(),
         }
-        every = f" All {bad} updates since were skipped." if self.skips else ""
         raise FloatingPointError(
             f"{self.description}: step {step}: not finite: "
             f"{_listed(nonfinite, 'losses')}; {_listed(gradients, 'gradients')}."
-            f"{every} The batch, the losses and the parameters before "
-            f"{self._saved(step, record)}. Look at the batch, lower the learning "
-            "rates, or leave such updates out with nonfinite='skip' "
-            f"(trainer.nonfinite=skip). The last checkpoint is "
-            f"{self.checkpoints.latest()}."
+            f" The batch, the losses and the parameters before "
+            f"{self._saved(step, record)}. Look at the batch, and lower the learning "
+            f"rates. The last checkpoint is {self.checkpoints.latest()}."
         )
 
     def _saved(self, step: int, record: dict[str, Any]) -> str:

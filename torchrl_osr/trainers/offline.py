@@ -126,7 +126,9 @@ class SumOfLosses(OptimizationStepper):
     ) -> TensorDictBase:
         """Losses of a batch, their gradients, and the optimizer's step."""
         try:
-            return self.check.step(batch, (gradients or self.gradients)(batch))
+            losses = (gradients or self.gradients)(batch)
+            self.check.step(batch, losses)
+            return losses
         finally:
             # Also after an error: the next backward must not add to these gradients.
             self.check.optimizer.zero_grad(set_to_none=True)
@@ -188,9 +190,6 @@ class OfflineTrainer(Trainer):
             other random numbers then. Default ``False``.
         cudagraph: replay each update, from the batch to the optimizer's step, as one
             CUDA graph. Default ``False``.
-        nonfinite: what a loss or gradient that is not finite does: ``"stop"`` the run,
-            with the batch that caused it saved, or ``"skip"`` that update. Default
-            ``"stop"``.
         value_limits: largest plausible magnitude of a logged mean, by its name; warns
             once for each that is exceeded. Default: none.
 
@@ -198,7 +197,8 @@ class OfflineTrainer(Trainer):
         ValueError: if an option is unknown or needs another device or optimizer; while
             training, if the folder's checkpoint is beyond ``total_steps``, or the
             results of ``evaluate`` lack the metric.
-        FloatingPointError: while training, if a loss or a gradient is not finite.
+        FloatingPointError: while training, if a loss or a gradient is not finite; the
+            batch that caused it is saved beside the checkpoints.
         Interrupted: while training, after SIGTERM, SIGHUP or Ctrl-C, when a checkpoint
             is written.
         CheckpointError: if a checkpoint in ``folder`` does not fit.
@@ -231,7 +231,6 @@ class OfflineTrainer(Trainer):
         record: bool = False,
         compile: bool = False,
         cudagraph: bool = False,
-        nonfinite: Literal["stop", "skip"] = "stop",
         value_limits: Mapping[str, float] | None = None,
     ) -> None:
         device = next(loss_module.parameters()).device
@@ -255,7 +254,7 @@ class OfflineTrainer(Trainer):
         replay_buffer.set_rng(generator)
         components = components or {}
         self.history: list[dict[str, Any]] = []
-        self._saved = {"step": 0, "skipped_updates": 0}
+        self._saved = {"step": 0}
         self._model_components = ("loss_module", *components)
         self.checkpoints = Checkpoints(
             folder,
@@ -272,7 +271,7 @@ class OfflineTrainer(Trainer):
             kept=checkpoints_kept,
         )
         self.nonfinite_check = NonfiniteCheck(
-            loss_module, optimizer, nonfinite, self.checkpoints, description
+            loss_module, optimizer, self.checkpoints, description
         )
         record = record and not (compile or cudagraph)
         new_gradients = partial(
@@ -376,7 +375,7 @@ class OfflineTrainer(Trainer):
         if path and step < self.total_frames:
             log.info(f"{self.description}: goes on from {path}")
         self.collected_frames = self._optim_count = self.collector.step = step
-        self.nonfinite_check.restart(step, self._saved["skipped_updates"])
+        self.nonfinite_check.restart(step)
         return path
 
     def optim_steps(self, batch: TensorDictBase) -> None:
@@ -391,8 +390,7 @@ class OfflineTrainer(Trainer):
             self._save(step)
 
     def _save(self, step: int) -> None:
-        skipped = self.nonfinite_check.skipped
-        self._saved.update(step=step, skipped_updates=skipped)
+        self._saved["step"] = step
         self.checkpoints.save(step)
 
     def _sample(self, _: TensorDictBase) -> TensorDictBase:
@@ -414,7 +412,7 @@ class OfflineTrainer(Trainer):
         number = self._stop_request.signal
         assert number is not None
         self._optim_count = self.collected_frames = step
-        self.nonfinite_check.settle(whole=False)
+        self.nonfinite_check.settle()
         if step != self._saved["step"]:
             self._save(step)
         reason = (
@@ -426,13 +424,11 @@ class OfflineTrainer(Trainer):
 
     def _log_losses(self, _: int, losses: TensorDictBase) -> None:
         """Log the means over a log interval; one copy to the host for all of them."""
-        share = self.nonfinite_check.settle()
+        self.nonfinite_check.settle()
         names = list(losses.keys())
         values = torch.stack([losses[name].float() for name in names]).tolist()
-        means = {name: share * value for name, value in zip(names, values, strict=True)}
+        means = dict(zip(names, values, strict=True))
         self._warn_of_divergence(means)
-        if self.nonfinite_check.skips:
-            means["skipped_updates"] = self.nonfinite_check.skipped
         self._send(means)
         self._progress.update(self.collected_frames)
 

@@ -7,13 +7,11 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 
-try:
+from torchrl_osr._extras import needed_by
+
+with needed_by("the trainer needs", "train"):
     from tqdm.auto import tqdm
     from tqdm.contrib.logging import logging_redirect_tqdm
-except ImportError as error:
-    raise ImportError(
-        f"the trainer needs {error.name!r}: pip install torchrl-osr[train]"
-    ) from error
 
 log = logging.getLogger(__name__)
 

@@ -13,7 +13,6 @@ import torch
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from minari.data_collector import EpisodeBuffer
-from torchrl.data.datasets import load_dataset as load_from_torchrl
 
 from torchrl_osr.data import (
     check_dataset,
@@ -306,12 +305,3 @@ def test_an_episode_that_minari_reads_in_part_is_not_exported(tmp_path):
         export_minari(data, "mine/long-v0", data_format="arrow")
     export_minari(data, "mine/long-v0")
     assert (load_minari("mine/long-v0")[0] == data).all()
-
-
-def test_torchrl_finds_the_reader_by_its_prefix():
-    made = make("test/set-v0")
-    buffer = load_from_torchrl("osr-minari:test/set-v0", batch_size=7, seed=1)
-    assert len(buffer) == made.total_steps
-    batch = buffer.sample()
-    check_dataset(batch)
-    assert len(batch) == 7

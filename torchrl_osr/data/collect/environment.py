@@ -16,16 +16,13 @@ from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 
+from torchrl_osr._extras import needed_by
 from torchrl_osr.data.collect.behavior import load_behavior_card
 
-try:
+with needed_by("MuJoCo tasks need", "train"):
     import gymnasium
     import mujoco
     from gymnasium import spaces
-except ImportError as error:
-    raise ImportError(
-        f"MuJoCo tasks need {error.name!r}: pip install torchrl-osr[train]"
-    ) from error
 
 # v4 of the ant, although there is v5: Minari's sets are of v4, whose observations lack
 # the 78 contact forces of v5, as D4RL's do.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import closing
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 from tensordict import TensorDict
 
 from torchrl_osr import __version__
+from torchrl_osr._extras import needed_by
 from torchrl_osr._files import check_disk_space
 from torchrl_osr.data.collect.environment import (
     MAZE_IDS,
@@ -168,14 +169,9 @@ def request_of(
 ) -> dict[str, Any]:
     """Entries of the manifest that decide what the data are."""
     maze = env_name in MAZE_IDS
-    extra = "examples,mazes" if maze else "examples"
     packages = MAZE_PACKAGES if maze else DATA_PACKAGES
-    try:
+    with needed_by("collecting data needs", "mazes" if maze else "train"):
         versions = {package: version(package) for package in packages}
-    except PackageNotFoundError as error:
-        raise ImportError(
-            f"collecting data needs {error.name!r}: pip install torchrl-osr[{extra}]"
-        ) from error
     return {
         "recipe_version": RECIPE_VERSION,
         "env_name": env_name,

@@ -15,6 +15,7 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
+from torchrl_osr._extras import needed_by
 from torchrl_osr._files import whole_file
 
 Act = Callable[[NDArray[Any]], ArrayLike]
@@ -149,7 +150,7 @@ def write_log(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     """
     check_log_path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    try:
+    with needed_by(f"{path.suffix} files need", "minari"):
         if path.suffix == ".parquet":
             import pyarrow
             from pyarrow import parquet
@@ -166,7 +167,3 @@ def write_log(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
             with whole_file(path) as file, h5py.File(file, "w") as archive:
                 for name, each in columns.items():
                     archive[name] = each
-    except ImportError as error:
-        raise ImportError(
-            f"{path.suffix} files need {error.name!r}: pip install torchrl-osr[minari]"
-        ) from error

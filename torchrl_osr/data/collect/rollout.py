@@ -16,16 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from tensordict import TensorDict
 
+from torchrl_osr._extras import needed_by
 from torchrl_osr.data.collect.behavior import BehaviorPolicy
 from torchrl_osr.data.store.validation import ACTION_LIMIT, as_transitions
 
-try:
+with needed_by("collecting data needs", "train"):
     import gymnasium
     from tqdm.auto import tqdm
-except ImportError as error:
-    raise ImportError(
-        f"collecting data needs {error.name!r}: pip install torchrl-osr[train]"
-    ) from error
 
 ActionSampler = Callable[[NDArray[Any], np.random.Generator], NDArray[np.float32]]
 """Draws an action ``[A]`` for an observation ``[S]``."""

@@ -14,16 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_osr._extras import needed_by
 from torchrl_osr._files import check_unpacked_size
 from torchrl_osr.data.read.recording import ReadRows
 from torchrl_osr.data.read.table import Table
 
-try:
+with needed_by("CSV files need", "train"):
     import pandas as pd
-except ImportError as error:
-    raise ImportError(
-        f"CSV files need {error.name!r}: pip install torchrl-osr[train]"
-    ) from error
 
 ROWS_AT_A_TIME = 100_000
 BLOCK = 2**20

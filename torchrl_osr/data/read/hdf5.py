@@ -9,16 +9,13 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from torchrl_osr._extras import needed_by
 from torchrl_osr._files import check_unpacked_size, refuse_other_than_files
 from torchrl_osr.data.read.recording import ReadRows
 from torchrl_osr.data.read.table import Table
 
-try:
+with needed_by("HDF5 files need", "minari"):
     import h5py
-except ImportError as error:
-    raise ImportError(
-        f"HDF5 files need {error.name!r}: pip install torchrl-osr[minari]"
-    ) from error
 
 
 def open_hdf5(path: Path) -> Table:

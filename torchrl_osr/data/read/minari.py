@@ -16,24 +16,19 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 from tensordict import TensorDict
-from torchrl.data import ReplayBuffer
 from tqdm.auto import tqdm
 
+from torchrl_osr._extras import needed_by
 from torchrl_osr._files import read_json
 from torchrl_osr.data.read.arrays import episode_parts
 from torchrl_osr.data.read.column_checks import ActionBounds
 from torchrl_osr.data.read.recording import Columns, Recording
-from torchrl_osr.data.store.replay_buffer import make_replay_buffer
 
-try:
+with needed_by("Minari data sets need", "minari"):
     import minari
     from minari.storage import get_dataset_path, hosting
 
     from torchrl_osr.data.read.hdf5 import check_hdf5
-except ImportError as error:
-    raise ImportError(
-        f"Minari data sets need {error.name!r}: pip install torchrl-osr[minari]"
-    ) from error
 
 # What a damaged set makes Minari's storages raise.
 DAMAGE = (
@@ -144,18 +139,6 @@ def open_minari(
         [file for file in files if file.is_file()],
         int(opened.total_steps),
     )
-
-
-def minari_replay_buffer(
-    dataset: str, *, batch_size: int = 256, seed: int = 0, **options: Any
-) -> ReplayBuffer:
-    """Replay buffer of a Minari data set, see :func:`load_minari` for the options.
-
-    Importing ``torchrl_osr.data`` registers it with TorchRL, so that
-    ``torchrl.data.datasets.load_dataset("osr-minari:mujoco/hopper/medium-v0")`` works.
-    """
-    data, _ = load_minari(dataset, **options)
-    return make_replay_buffer(data, batch_size=batch_size, seed=seed)
 
 
 def _open(dataset: str, download: bool) -> minari.MinariDataset:

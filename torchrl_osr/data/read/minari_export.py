@@ -19,17 +19,14 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict
 
+from torchrl_osr._extras import needed_by
 from torchrl_osr.data.collect.environment import make_environment
 from torchrl_osr.data.store.validation import check_dataset
 
-try:
+with needed_by("Minari data sets need", "minari"):
     import minari
     from minari.data_collector import EpisodeBuffer
     from minari.storage.datasets_root_dir import get_dataset_path
-except ImportError as error:
-    raise ImportError(
-        f"Minari data sets need {error.name!r}: pip install torchrl-osr[minari]"
-    ) from error
 
 
 def export_minari(

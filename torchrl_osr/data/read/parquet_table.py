@@ -9,17 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_osr._extras import needed_by
 from torchrl_osr._files import check_unpacked_size
 from torchrl_osr.data.read.recording import ReadRows
 from torchrl_osr.data.read.table import Table
 
-try:
+with needed_by("Parquet files need", "minari"):
     import pyarrow
     from pyarrow import parquet
-except ImportError as error:
-    raise ImportError(
-        f"Parquet files need {error.name!r}: pip install torchrl-osr[minari]"
-    ) from error
 
 
 def open_parquet(path: Path) -> Table:

@@ -17,6 +17,7 @@ from filelock import FileLock
 from tensordict import TensorDict
 from torchrl import torchrl_logger
 
+from torchrl_osr._extras import needed_by
 from torchrl_osr.data.store.memmap import (
     explained_write_errors,
     load_memmap,
@@ -34,12 +35,8 @@ def cache_root(cache_dir: Path | str | None = None) -> Path:
     """Folder of all cached data sets: as given, or as the user has it."""
     root = cache_dir or os.environ.get(CACHE_VARIABLE)
     if root is None:
-        try:
+        with needed_by("the cache needs", "train"):
             import platformdirs
-        except ImportError as error:
-            raise ImportError(
-                f"the cache needs {error.name!r}: pip install torchrl-osr[train]"
-            ) from error
         root = platformdirs.user_cache_dir("torchrl-osr")
     return Path(root).expanduser()
 

@@ -1,0 +1,373 @@
+"""Step 4: does a dynamics model, at action time, bring back what its base loses?
+
+    python results/recovery/look_ahead.py --seeds 0 --arms base look-ahead shuffled
+
+The base is the clone outside the jury. Models and values of a seed are trained where
+they are not in the cache yet. One line for each arm, seed and group of states is
+appended to ``parts/<system>/look-ahead-<half>.jsonl``: a bit for each state, in the
+order of the file of states; what is there is not played again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from clones import OUTSIDE, load_clone
+from search import read_jsonl
+from states import PARTS, normal
+from torch import Tensor, nn
+from world import World
+
+from torchrl_osr import DynamicsLoss
+from torchrl_osr._files import sha256_of
+from torchrl_osr.data import load_local_dataset, make_replay_buffer, split_held_out
+from torchrl_osr.data.collect.behavior import BehaviorPolicy
+from torchrl_osr.data.collect.environment import environment_id
+from torchrl_osr.data.store.cache import cache_root
+from torchrl_osr.evaluation import DataDistance, describe_dynamics, dynamics_report
+from torchrl_osr.evaluation.recoverable import (
+    RecoverableStates,
+    load_recoverable_states,
+)
+from torchrl_osr.imagination import LookAheadPolicy, termination
+from torchrl_osr.modules import DynamicsEnsemble
+from torchrl_osr.policy.tensor_file import read_tensors, write_tensors
+
+QUALITIES = "medium-replay", "medium-expert"
+ROWS = 200_000
+"""Of each of them, from which model and value are learned."""
+
+EXPERT_ROWS = 20_000
+"""Of the base's own data, from which the gate measures the distance."""
+
+NETWORKS, CELLS = 4, [200, 200]
+UPDATES, BATCH = 10_000, 256
+VALUE_UPDATES = 5_000
+CAP = 100
+"""Steps: a value says how many of the next so many an average policy stands."""
+
+PLANS: dict[str, dict[str, Any]] = {
+    "20": {"planning_horizon": 20},
+    "80": {"planning_horizon": 80, "num_offsets": 10},
+    "20v": {"planning_horizon": 20, "value": True},
+    "40v": {"planning_horizon": 40, "num_offsets": 10, "value": True},
+}
+"""What is tried on the public half: horizons, with the value of the last state or not.
+
+All with 48 candidates, three times, and a new plan every four steps, for which an
+offset is held anyway: a quarter of the time of a plan in every step.
+"""
+
+SEARCH = {"num_candidates": 48, "top_k": 6, "optim_steps": 3}
+ARMS = ("base", "look-ahead", "shuffled", "random", "always", "nearest", "simulator")
+
+
+class Counted:
+    """A gate that counts the states that it was asked about, and those it was open for.
+
+    Args:
+        gate: which rows are far, bool ``[B]``.
+    """
+
+    def __init__(self, gate: Callable[[Tensor], Tensor]) -> None:
+        self.gate, self.asked, self.open = gate, 0, 0
+
+    def __call__(self, observation: Tensor) -> Tensor:
+        far = self.gate(observation)
+        self.asked, self.open = self.asked + len(far), self.open + int(far.sum())
+        return far
+
+
+class Shuffled(LookAheadPolicy):
+    """Each candidate gets the prediction of another one."""
+
+    chance = torch.Generator().manual_seed(0)
+
+    def scores(self, observation: Tensor, offsets: Tensor) -> Tensor:
+        scores = super().scores(observation, offsets)
+        order = torch.rand(scores.shape, generator=self.chance).argsort(1)
+        return scores.gather(1, order)
+
+
+class Random(LookAheadPolicy):
+    """Scores drawn at random, but for the policy alone: the others plan there, too."""
+
+    chance = torch.Generator().manual_seed(0)
+
+    def scores(self, observation: Tensor, offsets: Tensor) -> Tensor:
+        if offsets.shape[1] == 1:
+            return super().scores(observation, offsets)
+        return torch.rand(offsets.shape[:2], generator=self.chance)
+
+
+class Simulated(LookAheadPolicy):
+    """The simulator itself in the model's place; ``world`` and ``base`` are set."""
+
+    world: World
+    base: BehaviorPolicy
+
+    def scores(self, observation: Tensor, offsets: Tensor) -> Tensor:
+        batch, world = offsets.shape[:2], self.world
+        state = observation.repeat_interleave(batch[1], 0).double().numpy()
+        rows = np.hstack([np.zeros((len(state), 2)), state])  # time and x: nobody sees
+        given = offsets.flatten(0, 1).repeat_interleave(self.hold, 1).numpy()
+        steps = self.planning_horizon
+        played = world.play(rows, self.base.deterministic, steps, given)
+        score = torch.from_numpy(played.alive).float()
+        if self.value is not None:
+            end = torch.from_numpy(world.observe(played.rows)).float()
+            score += torch.from_numpy(played.success) * self.value(end)
+        return score.view(batch)
+
+
+def trained(system: str, name: str, make: Callable[[], nn.Module], train: Any) -> Any:
+    """A module from the cache, or trained and put there."""
+    path = cache_root() / "recovery" / f"{system}-{name}.safetensors"
+    module = make()
+    if not path.exists():
+        start = time.process_time()
+        print(json.dumps(train(module) | {"module": str(path.stem)}), flush=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        seconds = {"seconds": time.process_time() - start}
+        write_tensors(path, module.state_dict(), seconds)
+    module.load_state_dict(read_tensors(path)[0])
+    return module.requires_grad_(False)
+
+
+def rows_of(system: str) -> list[Any]:
+    """The data, a table for each quality."""
+    return [
+        load_local_dataset(system, each, num_transitions=ROWS, progress=False)[0]
+        for each in QUALITIES
+    ]
+
+
+def ensemble(system: str, seed: int) -> DynamicsEnsemble:
+    """The package's model of the data, trained by its loss."""
+    sizes = {"halfcheetah": (17, 6), "hopper": (11, 3), "walker2d": (17, 6)}[system]
+
+    def make() -> nn.Module:
+        torch.manual_seed(seed)
+        options = {"num_networks": NETWORKS, "num_elites": NETWORKS}
+        return DynamicsEnsemble(*sizes, num_cells=CELLS, **options)
+
+    def train(model: DynamicsEnsemble) -> dict[str, Any]:
+        rows, held_out = split_held_out(torch.cat(rows_of(system)), 0.02, seed=seed)
+        model.standardize_(rows)
+        loss = DynamicsLoss(model)
+        buffer = make_replay_buffer(rows, batch_size=NETWORKS * BATCH, seed=seed)
+        optimizer = torch.optim.Adam(list(model.parameter_groups()), lr=1e-3)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, UPDATES)
+        for _ in range(UPDATES):
+            sum(loss(buffer.sample()).values()).backward()
+            optimizer.step()
+            optimizer.zero_grad()
+            schedule.step()
+        model.calibrate_(held_out)
+        return {"report": describe_dynamics(dynamics_report(model, held_out))}
+
+    return trained(system, f"dynamics-{seed}", make, train)
+
+
+class SurvivalValue(nn.Module):
+    """How many of the next 100 steps the policies of the data stand, ``[n]``."""
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.net = nn.Sequential(
+            nn.Linear(size, 128), nn.ReLU(), nn.Linear(128, 128), nn.ReLU(),
+            nn.Linear(128, 1), nn.Sigmoid(),
+        )  # fmt: skip
+        self.register_buffer("loc", torch.zeros(size))
+        self.register_buffer("scale", torch.ones(size))
+
+    def forward(self, observation: Tensor) -> Tensor:
+        return CAP * self.net((observation - self.loc) / self.scale).squeeze(-1)
+
+
+def steps_left(data: Any) -> Tensor:
+    """Steps until the fall, at most 100; NaN where the recording ends before."""
+    ended = data["next", "done"].flatten().numpy()
+    fell = data["next", "terminated"].flatten().numpy()
+    left, count = np.empty(len(data), np.float32), np.nan
+    for row in range(len(data) - 1, -1, -1):
+        if ended[row] or row == len(data) - 1:
+            count, sure = 0.0, fell[row]
+        count += 1
+        left[row] = min(count, CAP) if sure or count >= CAP else np.nan
+    return torch.from_numpy(left)
+
+
+def survival(system: str, seed: int) -> SurvivalValue:
+    """Fitted to what became of the rows of the data."""
+    tables = rows_of(system)
+    size = tables[0]["observation"].shape[-1]
+
+    def make() -> nn.Module:
+        torch.manual_seed(seed)
+        return SurvivalValue(size)
+
+    def train(value: SurvivalValue) -> dict[str, Any]:
+        state = torch.cat([each["observation"] for each in tables])
+        left = torch.cat([steps_left(each) for each in tables])
+        known = left.isfinite()
+        state, left = state[known], left[known]
+        value.loc.copy_(state.mean(0))
+        value.scale.copy_(state.std(0))
+        optimizer = torch.optim.Adam(value.parameters(), 1e-3)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, VALUE_UPDATES)
+        for _ in range(VALUE_UPDATES):
+            rows = torch.randint(len(state), (BATCH,))
+            loss = ((value(state[rows]) - left[rows]) / CAP).square().mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            schedule.step()
+        with torch.no_grad():
+            rows = torch.randint(len(state), (20_000,))
+            error = (value(state[rows]) - left[rows]).square().mean()
+        return {"explained": float(1 - error / left.var()), "rows": len(state)}
+
+    return trained(system, f"survival-{seed}", make, train)
+
+
+def in_torch(policy: BehaviorPolicy) -> nn.Module:
+    """The same network in torch: it acts for thousands of rows at once."""
+    layers = []
+    for each in (policy.hidden0, policy.hidden1, policy.mean):
+        layer = nn.Linear(*each.weight.shape[::-1])
+        layer.weight.data, layer.bias.data = map(torch.from_numpy, each)
+        layers.append(layer)
+    first, second, last = layers
+    net = nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), last, nn.Tanh())
+    return net.requires_grad_(False)
+
+
+def policy_of(
+    arm: str, plan: str, seed: int, world: World
+) -> tuple[Callable[[Tensor], Tensor], Counted]:
+    """An arm's policy, and its gate."""
+    clone = load_clone(world.system, OUTSIDE)
+    base = in_torch(clone)
+    own, _ = load_local_dataset(
+        world.system, "expert", num_transitions=EXPERT_ROWS, progress=False
+    )
+    distance = DataDistance(own)
+    gate = Counted(lambda state: distance(state) > distance.threshold)
+    if arm == "base":
+        return base, gate
+    if arm == "always":
+        gate = Counted(lambda state: torch.ones(len(state), dtype=torch.bool))
+    if arm == "nearest":
+        state, scale = own["observation"], own["observation"].std(0)
+
+        def nearest(observation: Tensor) -> Tensor:
+            action, far = base(observation), gate(observation)
+            found = torch.cdist(observation[far] / scale, state / scale).argmin(1)
+            action[far] = own["action"][found]
+            return action
+
+        return nearest, gate
+    options = PLANS[plan] | SEARCH
+    if options.pop("value", False):
+        options["value"] = survival(world.system, seed)
+    kinds = {"shuffled": Shuffled, "random": Random, "simulator": Simulated}
+    policy = kinds.get(arm, LookAheadPolicy)(
+        base,
+        ensemble(world.system, seed),
+        gate,
+        terminated=termination(environment_id(world.system)),
+        generator=torch.Generator().manual_seed(seed),
+        **options,
+    )
+    if isinstance(policy, Simulated):
+        policy.world, policy.base = world, clone
+    return policy, gate
+
+
+def play(
+    states: RecoverableStates, chosen: np.ndarray, world: World, policy: Any
+) -> dict[str, Any]:
+    """Which of the chosen states it comes back from, and how long it stands."""
+    count = len(chosen)
+    rows = np.hstack([np.zeros((count, 1)), states.qpos[chosen], states.qvel[chosen]])
+    plans = isinstance(policy, LookAheadPolicy)
+    base, hold = (policy.policy, policy.hold) if plans else (policy, states.steps)
+    active, alive = np.arange(count), np.full(count, states.steps)
+
+    def act(observation: np.ndarray) -> np.ndarray:
+        return base(torch.from_numpy(observation).float()).numpy()
+
+    for step in range(0, states.steps, hold):
+        offsets = None
+        if plans:
+            observation = torch.from_numpy(world.observe(rows[active])).float()
+            far = policy.far(observation)
+            offset = torch.zeros(len(active), world.nu)
+            if far.any():
+                offset[far] = policy.plan(observation[far])[:, 0]
+            offsets = offset.unsqueeze(1).expand(-1, hold, -1).numpy()
+        length = min(hold, states.steps - step)
+        played = world.play(rows[active], act, length, offsets)
+        rows[active] = played.rows
+        alive[active[~played.success]] = step + played.alive[~played.success]
+        active = active[played.success]
+        if not len(active):
+            break
+    saved = np.isin(np.arange(count), active)
+    return {"saved": "".join(map(str, saved.astype(int))), "alive": alive.tolist()}
+
+
+def main() -> None:
+    """Play what was not yet."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--system", default="walker2d", choices=("hopper", "walker2d"))
+    parser.add_argument("--half", default="public", choices=("public", "held-out"))
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=ARMS)
+    parser.add_argument("--plans", nargs="+", default=["20"], choices=list(PLANS))
+    parser.add_argument("--groups", nargs="+", default=["recoverable"])
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    folder = Path(__file__).parent / "states"
+    path = folder / f"{given.system}-{given.half}.npz"
+    states, digest = load_recoverable_states(path), sha256_of(path)
+    world = World(given.system)
+    normal(world)
+    log = PARTS / given.system / f"look-ahead-{given.half}.jsonl"
+    names = ("arm", "plan", "seed", "group", "states")
+    there = {tuple(line[name] for name in names) for line in read_jsonl(log)}
+    for seed in given.seeds:
+        for group in given.groups:
+            chosen = np.flatnonzero(states.group == group)
+            for plan in given.plans:
+                for arm in given.arms:
+                    unplanned = arm in ("base", "nearest")
+                    key = arm, "" if unplanned else plan, seed, group, digest
+                    if key in there:
+                        continue
+                    there.add(key)
+                    policy, gate = policy_of(arm, plan, seed, world)
+                    start = time.process_time()
+                    line = dict(zip(names, key, strict=True))
+                    line |= play(states, chosen, world, policy)
+                    line["planned"] = gate.open
+                    line["seconds"] = round(time.process_time() - start, 1)
+                    with log.open("a") as file:
+                        file.write(json.dumps(line, separators=(",", ":")) + "\n")
+                    alive = round(float(np.mean(line["alive"])), 1)
+                    shown = {name: line[name] for name in names[:4]}
+                    shown |= {"saved": line["saved"].count("1"), "of": len(chosen)}
+                    shown |= {"alive": alive, "seconds": line["seconds"]}
+                    print(json.dumps(shown | {"planned": gate.open}), flush=True)
+
+
+if __name__ == "__main__":
+    main()
