@@ -11,6 +11,7 @@ import atexit
 import json
 import os
 import re
+import runpy
 import signal
 import subprocess
 import sys
@@ -73,7 +74,7 @@ def start(
     """Start a command in a process of its own and return the process's id.
 
     Args:
-        command: name of the command.
+        command: name of the command, or the path of a script.
         *arguments: of its command line.
 
     Keyword Args:
@@ -101,7 +102,11 @@ def start(
             os.environ.update(environment)
         if watched is not None:
             _watch(watched, seen)
-        import_module("torchrl_osr.__main__").main([command, *arguments])
+        if command.endswith(".py"):
+            sys.argv, sys.path[0] = [command, *arguments], str(Path(command).parent)
+            runpy.run_path(command, run_name="__main__")
+        else:
+            import_module("torchrl_osr.__main__").main([command, *arguments])
         code = 0
     except SystemExit as ended:
         code = ended.code if isinstance(ended.code, int) else 1

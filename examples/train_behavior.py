@@ -17,8 +17,10 @@ from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import gymnasium
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl import torchrl_logger
@@ -32,8 +34,8 @@ from tqdm.auto import tqdm
 from torchrl_osr.data import (
     REFERENCE_RETURNS,
     BehaviorPolicy,
+    collect_transitions,
     make_environment,
-    measure_policy,
     normalized_score,
     save_behavior_policy,
     update_behavior_card,
@@ -150,11 +152,34 @@ def train(args: argparse.Namespace, eval_env: Any) -> list[Snapshot]:
             bar.update(FRAMES)
             if step >= min(args.steps, args.eval_every * (len(snapshots) + 1)):
                 actor = network.as_arrays()
-                entry = measure_policy(eval_env, actor, args.eval_steps, seed=args.seed)
+                entry = measure(eval_env, actor, args.eval_steps, args.seed)
                 snapshots.append(Snapshot(step, actor, entry["stochastic_return"][0]))
                 bar.set_postfix(mean_return=f"{snapshots[-1].mean_return:.0f}")
     collector.shutdown()
     return snapshots
+
+
+def measure(
+    env: gymnasium.Env[Any, Any], policy: BehaviorPolicy, steps: int, seed: int
+) -> dict[str, Any]:
+    """Mean and deviation of a policy's returns, as its card has them."""
+
+    def mean_action(observation: NDArray[Any], _: object) -> NDArray[np.float32]:
+        return policy.deterministic(observation)
+
+    entry: dict[str, Any] = {}
+    for name, sampler in (
+        ("deterministic", mean_action),
+        ("stochastic", policy.sample),
+    ):
+        played = collect_transitions(env, [sampler], steps, seed=seed, progress=False)
+        returns = played.episode_returns
+        if not len(returns):
+            raise SystemExit(f"no {name} episode ended in {steps} steps: take more.")
+        entry[f"{name}_return"] = [float(returns.mean()), float(returns.std())]
+    entry["episode_length"] = float(played.episode_lengths.mean())
+    entry["episodes"] = len(returns)
+    return entry
 
 
 def choose(snapshots: list[Snapshot], medium_share: float) -> dict[str, Snapshot]:
@@ -186,7 +211,7 @@ def main(arguments: list[str] | None = None) -> None:
         file = args.out / args.name / f"{name}.npz"
         save_behavior_policy(file, kept.actor, half=half)
         # Fresh episodes: those that a snapshot was chosen by flatter it.
-        entry = measure_policy(env, kept.actor, args.card_steps, seed=args.seed + 1)
+        entry = measure(env, kept.actor, args.card_steps, args.seed + 1)
         if args.name in REFERENCE_RETURNS:
             score = normalized_score(args.name, entry["stochastic_return"][0])
             entry["normalized"] = score

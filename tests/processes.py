@@ -89,14 +89,14 @@ def server() -> Iterator[Server | None]:
 
 @pytest.fixture(scope="session")
 def run(tmp_path_factory, server, run_fresh) -> Callable[..., tuple[int, str]]:
-    """Return the same function for commands in processes forked after the imports."""
+    """Return the same function for processes forked after the imports."""
     if server is None:
         return run_fresh
     outputs = tmp_path_factory.mktemp("outputs")
 
     def run(cwd: Path, script: str, *arguments: str) -> tuple[int, str]:
         if script.endswith(".py"):
-            return run_fresh(cwd, script, *arguments)
+            script = str(EXAMPLES / script)
         output = outputs / f"{len(list(outputs.iterdir()))}.txt"
         given = {"folder": str(cwd), "environment": dict(os.environ)}
         server.start(script, *arguments, output=output, **given)

@@ -62,7 +62,6 @@ if TYPE_CHECKING:
     from torchrl_osr.data.collect.rollout import (
         Collection,
         collect_transitions,
-        measure_policy,
     )
     from torchrl_osr.data.read.arrays import (
         transitions_from_episodes,
@@ -93,7 +92,6 @@ _NEEDS_EXTRA = {
     "load_memmap": "store.memmap",
     "load_minari": "read.minari",
     "make_environment": "collect.environment",
-    "measure_policy": "collect.rollout",
     "quality_policies": "collect.qualities",
     "transitions_from_episodes": "read.arrays",
     "transitions_from_rows": "read.arrays",
@@ -131,7 +129,6 @@ __all__ = [
     "load_minari",
     "make_environment",
     "make_replay_buffer",
-    "measure_policy",
     "mix_datasets",
     "next_action",
     "normalized_score",

@@ -91,13 +91,7 @@ def _names(part: str, size: int, columns: Sequence[str]) -> Sequence[str]:
 def findings(
     data: TensorDict, manifest: Mapping[str, Any], entries: Sequence[Entry]
 ) -> Iterator[str]:
-    """Yield what looks wrong with a data set that can be trained on, and the cure.
-
-    Args:
-        data: transitions ``[N]``.
-        manifest: of the readers.
-        entries: as :func:`describe_entries` found them.
-    """
+    """Yield what looks wrong with a data set that can be trained on, and the cure."""
     yield from manifest.get("warnings", [])
     # Where episodes end by themselves, to last long is worth something.
     falls = bool(data["next", "terminated"].any())
@@ -211,12 +205,7 @@ def _about_next_states(data: TensorDict, manifest: Mapping[str, Any]) -> Iterato
 def out_of_space(
     entries: Sequence[Entry], low: Sequence[float], high: Sequence[float]
 ) -> Iterator[str]:
-    """Yield which observations leave the range that their task's space has.
-
-    Args:
-        entries: as :func:`describe_entries` found them.
-        low, high: bounds of the space, ``[S]``.
-    """
+    """Yield which observations leave the range that their task's space has."""
     observed = [entry for entry in entries if entry.part == "observation"]
     for entry, least, most in zip(observed, low, high, strict=True):
         slack = 1e-3 * max(1.0, abs(entry.low), abs(entry.high))

@@ -35,14 +35,6 @@ def robustness_figure(
 
     Without scores it draws returns: over the strength, where each kind has several;
     otherwise each disturbance has a line of its own.
-
-    Args:
-        summary: see :func:`~torchrl_osr.evaluation.summarize_disturbances`.
-        evaluations: the raw results that it summarises.
-        path: the PNG to write.
-
-    Keyword Args:
-        title: what was evaluated.
     """
     curves = distance_curves(evaluations)
     figure = new_figure(11 if curves else 6.5, 4.6, layout="constrained")
@@ -71,9 +63,6 @@ def distance_curves(
     evaluations: Sequence[Mapping[str, Any]],
 ) -> dict[str, tuple[list[int], list[float]]]:
     """Mean distance to the data around the end of each disturbance.
-
-    Args:
-        evaluations: raw results of all checkpoints.
 
     Returns:
         Offsets and distances in units of the threshold, by name of the disturbance;

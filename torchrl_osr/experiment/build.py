@@ -188,11 +188,6 @@ def make_learner(
     ``qvalue_network``, ``value_network``, ``inverse_dynamics_network``,
     ``dynamics_network``, ``transition_network``.
 
-    Args:
-        cfg: a whole configuration of ``torchrl-osr train``.
-        observation_size, action_size: of the data.
-        device: where they shall be. Default CPU.
-
     Raises:
         ValueError: if an option of a loss is out of its range, the loss has a recovery
             term already, or the networks do not fit into the memory.
@@ -293,10 +288,6 @@ def check_parts(
     cfg: DictConfig, observation_size: int, action_size: int
 ) -> list[NestedKey]:
     """Build once what a run will need, so that a wrong option stops before its data.
-
-    Args:
-        cfg: a whole configuration of ``torchrl-osr train``.
-        observation_size, action_size: of the data.
 
     Returns:
         The entries that the policy's loss reads.

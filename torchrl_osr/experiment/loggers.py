@@ -68,13 +68,7 @@ def log_outcome(
     rows: Mapping[str, Mapping[str, Any]],
     figures: Mapping[str, Path],
 ) -> None:
-    """Give W&B what a run ends with, and close it; all else is in the curves.
-
-    Args:
-        loggers: of :func:`make_loggers`.
-        rows: evaluations by name, such as the last and the best.
-        figures: PNG files by name.
-    """
+    """Give W&B what a run ends with, and close it; all else is in the curves."""
     for logger in loggers:
         if isinstance(logger, WandbLogger):
             import wandb

@@ -135,9 +135,13 @@ def train_dynamics(
     """Train a run's models of the dynamics, and give them to its loss.
 
     Args:
-        cfg, folder, data, learner, new_trainer: as in :func:`train_policy`.
+        cfg: a whole configuration of ``torchrl-osr train``.
+        folder: of the run.
+        data: what it trains on.
+        learner: networks and objective.
         perturbation: what batches of the data get.
         sizes: of an observation and an action.
+        new_trainer: of :func:`trainer_maker`.
 
     Returns:
         What draws batches that are in part imagined, and what trains the model on
@@ -179,14 +183,8 @@ def train_policy(
 ) -> OfflineTrainer:
     """Train the policy, by the critics and frozen models; its trainer, at the end.
 
-    Args:
-        cfg: a whole configuration of ``torchrl-osr train``.
-        folder: of the run.
-        data: what it trains on.
-        learner: networks and objective.
-        imagined: draws the batches in the place of the data's buffer, if there is one.
-        adversary: trains the model of the dynamics on, if there is one.
-        new_trainer: of :func:`trainer_maker`.
+    Batches are ``imagined`` ones in part, if there are any; the ``adversary`` trains the
+    model of the dynamics on.
     """
     actor, _, loss, objective = learner
     critics, policy = _parameters_of(learner)
@@ -197,20 +195,19 @@ def train_policy(
     # What is played, now and by all other commands.
     average = WeightAverage(actor, cfg.optim.policy_average)
     limit = largest_value(data.largest_reward, cfg.optim.gamma)
-    components = new_trainer.keywords["components"] | {
-        "schedule": schedule,
-        "policy_average": average.network,
-    }
+    components = {"schedule": schedule, "policy_average": average.network}
     if adversary is not None:  # before the roll-outs, which are of a copy of it
         components["adversary"] = adversary
     if imagined is not None:
         components["imagined"] = imagined
-    with closing(_episodes_of(cfg)) as episodes:
+    played = {"num_episodes": cfg.trainer.eval_episodes, "seed": EVALUATION_SEED}
+    device = cfg.trainer.device
+    with closing(EpisodeEvaluator(cfg.env.id, **played, device=device)) as episodes:
         trainer = new_trainer(
             objective,
             optimizer,
             replay_buffer=data.buffer if imagined is None else imagined,
-            components=components,
+            components=new_trainer.keywords["components"] | components,
             total_steps=cfg.trainer.steps,
             folder=folder / "checkpoint" / "policy",
             seed=cfg.seed + 1,
@@ -268,16 +265,6 @@ def _optimizer_of(
     optimizer = adam_of(cfg)(groups)
     kinds = [kind for *_, kind in trained]
     return optimizer, learning_rates(optimizer, kinds, cfg.trainer.steps)
-
-
-def _episodes_of(cfg: DictConfig) -> EpisodeEvaluator:
-    """The episodes of every evaluation."""
-    return EpisodeEvaluator(
-        cfg.env.id,
-        num_episodes=cfg.trainer.eval_episodes,
-        seed=EVALUATION_SEED,
-        device=cfg.trainer.device,
-    )
 
 
 def _evaluation(

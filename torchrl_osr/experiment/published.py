@@ -42,10 +42,6 @@ def register_published() -> None:
 def check_published(cfg: DictConfig, choices: Mapping[str, str]) -> None:
     """Warn if a method's authors have told settings for other data than a run's.
 
-    Args:
-        cfg: a whole configuration of ``torchrl-osr train``.
-        choices: of Hydra's groups.
-
     Raises:
         ValueError: if those of another task would be taken.
     """

@@ -37,10 +37,6 @@ imports a module. A loss may be named as ``torchrl_osr``'s, too."""
 def read_run(path: Path, trust: Sequence[str] = ()) -> DictConfig:
     """Read the configuration of a run from which its policy shall be built.
 
-    Args:
-        path: of the YAML file.
-        trust: see :func:`check_targets`.
-
     Raises:
         OSError: if it cannot be read.
         ValueError: naming the file, if :func:`read_config` or :func:`check_run` refuses
@@ -57,10 +53,6 @@ def read_run(path: Path, trust: Sequence[str] = ()) -> DictConfig:
 
 def check_run(config: DictConfig, trust: Sequence[str] = ()) -> DictConfig:
     """Check all of a run's configuration, of whatever origin.
-
-    Args:
-        config: whole, as ``torchrl-osr train`` composes or writes it.
-        trust: see :func:`check_targets`.
 
     Returns:
         The configuration with the types of its schema.
@@ -132,9 +124,6 @@ def _schema(config: DictConfig) -> DictConfig:
 def read_config(path: Path) -> DictConfig:
     """Read a run's configuration; nothing is built.
 
-    Args:
-        path: of the YAML file.
-
     Raises:
         OSError: if it cannot be read.
         ValueError: if it is no mapping, has interpolations, which no run writes and
@@ -151,9 +140,6 @@ def read_config(path: Path) -> DictConfig:
 
 def read_yaml(path: Path) -> Any:
     """Read a YAML file of a run's folder into plain containers.
-
-    Args:
-        path: of the file.
 
     Raises:
         OSError: if it cannot be read.

@@ -538,9 +538,6 @@ def job_folder(number: int, overrides: str) -> str:
 def named_by_what_differs(arguments: Sequence[str]) -> list[str]:
     """Override that leaves out of :func:`job_folder` what all jobs of a sweep share.
 
-    Args:
-        arguments: the command line.
-
     Returns:
         Nothing where there is no sweep.
 

@@ -72,9 +72,6 @@ def checkpoints_of(folder: Path | str) -> list[Path]:
 
     Without ``best.torchrl``, which was saved besides them.
 
-    Args:
-        folder: of the run.
-
     Raises:
         FileNotFoundError: if there is no run, or it has no checkpoint yet.
     """
@@ -161,9 +158,6 @@ def _learner(
 
 def saved_sizes(path: Path) -> tuple[int, int]:
     """Sizes of observation and action that a checkpoint's networks were trained for.
-
-    Args:
-        path: of the checkpoint's file.
 
     Raises:
         CheckpointError: it is damaged, holds no actor, or tells no size of actions.

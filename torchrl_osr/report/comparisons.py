@@ -109,12 +109,6 @@ def compare(
 ) -> list[Difference]:
     """Compare a method with the reference on each data set, and on all together.
 
-    Args:
-        tables: all of the report.
-        method: its name.
-        reference: the other's name.
-        quantity: in what.
-
     Returns:
         Data set by data set, then :data:`ALL_DATA` if there are several. Data sets
         where one of the two has no such numbers are left out.
@@ -200,10 +194,6 @@ def mean_difference(data_sets: Sequence[Sequence[Array]]) -> Estimate:
 
 def verdict(differences: Sequence[Difference], reference: str) -> list[str]:
     """Which method is better than the reference in what, in plain sentences.
-
-    Args:
-        differences: of all methods.
-        reference: the method that they are compared with.
 
     Returns:
         What is told, what is not told apart and what cannot be told; over all data

@@ -182,12 +182,7 @@ def comparable(settings: pd.DataFrame) -> pd.DataFrame:
 
 
 def tell_apart(names: pd.Series, facts: pd.DataFrame) -> pd.Series:
-    """Names with, behind each, in what it differs from others of the same name.
-
-    Args:
-        names: of the rows.
-        facts: texts, with the same index.
-    """
+    """Names with, behind each, in what it differs from others of the same name."""
     found = names.copy()
     for name, group in facts.groupby(names, sort=False):
         differing = group.loc[:, group.nunique() > 1]

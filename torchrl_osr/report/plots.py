@@ -58,17 +58,7 @@ def draw_panels(
     ylabel: str,
     sharey: bool = False,
 ) -> Figure:
-    """Draw methods against each other, in small multiples if they are many.
-
-    Args:
-        panels: one for each data set or disturbance.
-        methods: in the order of their colours.
-
-    Keyword Args:
-        xlabel: of all panels.
-        ylabel: of all panels.
-        sharey: whether all have one range of values. Default: no.
-    """
+    """Draw methods against each other, in small multiples if they are many."""
     if len(methods) > MOST:
         figure = _small_multiples(panels, methods, sharey)
     else:
@@ -97,10 +87,6 @@ def draw_differences(differences: Sequence[Difference], reference: str) -> Figur
     """Draw differences with their intervals, a panel for each quantity and data set.
 
     Coloured: better or worse. Hollow: not told apart. Grey: there is no verdict.
-
-    Args:
-        differences: that are paired.
-        reference: the method that the others are compared with.
     """
     quantities = {each.quantity.name: each.quantity.sign for each in differences}
     methods: dict[str, list[str]] = {}

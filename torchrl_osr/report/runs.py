@@ -327,12 +327,7 @@ def _training_episodes(
 
 
 def _suite_episodes(content: Any, values: str) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Episodes of a robustness file, and the distance curves of its disturbances.
-
-    Args:
-        content: of the file.
-        values: which entry counts: scores or returns.
-    """
+    """Episodes of a robustness file, and the distance curves of its disturbances."""
     if not isinstance(content, dict):
         raise ValueError(str(content))  # why it could not be read
     if content["format"] != ROBUSTNESS_FORMAT:

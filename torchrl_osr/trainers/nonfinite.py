@@ -79,10 +79,6 @@ class NonfiniteCheck:
     def step(self, batch: TensorDictBase, losses: TensorDictBase) -> None:
         """Step the optimizer if everything is finite.
 
-        Args:
-            batch: what the losses are of.
-            losses: detached.
-
         Raises:
             FloatingPointError: if something is not, unless that is ``deferred``.
         """

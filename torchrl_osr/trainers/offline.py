@@ -50,10 +50,6 @@ class StepClock:
 
     A batch ends wherever something is due: a log entry, an evaluation, a checkpoint.
 
-    Args:
-        total: steps of the whole run.
-        intervals: steps between the things that may be due.
-
     Raises:
         ValueError: if one of them is not at least 1.
     """

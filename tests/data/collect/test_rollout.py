@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from contextlib import closing
-
 import gymnasium
 import numpy as np
 import pytest
@@ -14,9 +12,6 @@ from torchrl_osr.data import (
     collect_quality,
     collect_transitions,
     load_behavior_card,
-    load_behavior_policy,
-    make_environment,
-    measure_policy,
 )
 
 
@@ -140,23 +135,3 @@ def test_returns_are_near_the_card(
     assert np.median(result.episode_returns) == pytest.approx(
         card["stochastic_return"][0], rel=0.2
     )
-
-
-def test_measured_policy_matches_its_card() -> None:
-    policy = load_behavior_policy("hopper", "replay_1")
-    with closing(make_environment("Hopper-v5")) as env:
-        entry = measure_policy(env, policy, 1500)
-    card = load_behavior_card()["hopper"]["policies"]["replay_1"]
-    assert entry["episodes"] >= 10
-    for key in ("stochastic_return", "deterministic_return"):
-        assert entry[key][0] == pytest.approx(card[key][0], rel=0.2)
-    assert entry["episode_length"] == pytest.approx(card["episode_length"], rel=0.2)
-
-
-def test_measuring_too_few_steps_is_refused() -> None:
-    policy = load_behavior_policy("hopper", "expert")
-    with (
-        closing(make_environment("Hopper-v5")) as env,
-        pytest.raises(ValueError, match="no stochastic episode ended within 20 steps"),
-    ):
-        measure_policy(env, policy, 20)

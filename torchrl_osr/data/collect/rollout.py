@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 
 from torchrl_osr._extras import needed_by
-from torchrl_osr.data.collect.behavior import BehaviorPolicy
 from torchrl_osr.data.store.validation import ACTION_LIMIT, as_transitions
 
 with needed_by("collecting data needs", "train"):
@@ -154,49 +153,3 @@ def _play_episode(
         observation = next_observation
     rows["truncated"][capacity - 1] = True
     return capacity, None
-
-
-def measure_policy(
-    env: gymnasium.Env[Any, Any],
-    policy: BehaviorPolicy,
-    num_transitions: int,
-    *,
-    seed: int = 0,
-) -> dict[str, Any]:
-    """Returns of a policy, as a behaviour card states them.
-
-    Args:
-        env: task, see :func:`collect_transitions`.
-        policy: played twice: sampling its actions, and with its mean action.
-        num_transitions: steps of each; the complete episodes among them count.
-
-    Keyword Args:
-        seed: non-negative seed. Default: 0.
-
-    Returns:
-        ``stochastic_return`` and ``deterministic_return``, each a mean and a standard
-        deviation; mean ``episode_length`` and number of ``episodes`` of the former.
-
-    Raises:
-        ValueError: no episode is complete.
-    """
-
-    def mean_action(observation: NDArray[Any], _: object) -> NDArray[np.float32]:
-        return policy.deterministic(observation)
-
-    stochastic, deterministic = (
-        collect_transitions(env, [sampler], num_transitions, seed=seed, progress=False)
-        for sampler in (policy.sample, mean_action)
-    )
-    entry: dict[str, Any] = {}
-    for name, played in (("stochastic", stochastic), ("deterministic", deterministic)):
-        returns = played.episode_returns
-        if not len(returns):
-            raise ValueError(
-                f"no {name} episode ended within {num_transitions} steps; "
-                "expected at least one: measure more steps."
-            )
-        entry[f"{name}_return"] = [float(returns.mean()), float(returns.std())]
-    entry["episode_length"] = float(stochastic.episode_lengths.mean())
-    entry["episodes"] = len(stochastic.episode_lengths)
-    return entry

@@ -52,12 +52,6 @@ def checked_columns(
 ) -> Checked:
     """Check and cast the columns of some steps.
 
-    Args:
-        rows: the columns, see :func:`~torchrl_osr.data.transitions_from_rows`.
-        action_bounds: as there.
-        clip_actions: as there.
-        num_actions: see :func:`~torchrl_osr.data.load_file`.
-
     Raises:
         ValueError: a column is missing, unknown, of the wrong shape, length or type,
             or holds a value that it cannot hold.
