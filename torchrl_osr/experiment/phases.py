@@ -183,8 +183,8 @@ def train_policy(
 ) -> OfflineTrainer:
     """Train the policy, by the critics and frozen models; its trainer, at the end.
 
-    Batches are ``imagined`` ones in part, if there are any; the ``adversary`` trains the
-    model of the dynamics on.
+    Batches are ``imagined`` ones in part, if there are any; the ``adversary`` trains
+    the model of the dynamics on.
     """
     actor, _, loss, objective = learner
     critics, policy = _parameters_of(learner)
