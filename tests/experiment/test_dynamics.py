@@ -27,6 +27,7 @@ from torchrl_osr.experiment.dynamics import (
 from torchrl_osr.experiment.published import check_published
 from torchrl_osr.experiment.trained_run import load_trained
 from torchrl_osr.experiment.training_data import load_training_data
+from torchrl_osr.imagination import turned
 from torchrl_osr.policy.tensor_file import read_tensors, write_tensors
 from torchrl_osr.trainers import OfflineTrainer
 
@@ -261,10 +262,22 @@ def test_from_disk_the_same_model_is_trained(finished) -> None:
     torch.testing.assert_close(here.pieces, there.pieces)
     for data in (here, there):
         data.buffer.sample()  # which has a generator of its own
-    rows = [data.alone(8) for data in (here, there)]
-    for each in rows:
-        each.set_rng(torch.Generator().manual_seed(0))
-    torch.testing.assert_close(*(each.sample() for each in rows))
+    around = here.reverse(), there.reverse()
+    samples = []
+    for data in (here, there, *around):
+        rows = data.alone(8)
+        rows.set_rng(
+            torch.Generator().manual_seed(0)
+        )  # of the storage, which is shared
+        samples.append(rows.sample())
+    first, second, *turned_rows = samples
+    torch.testing.assert_close(first, second)
+    for each in turned_rows:
+        torch.testing.assert_close(turned(each), first)
+    # A piece of a trajectory, from its last state on.
+    for key in (("next", "observation"), "observation"):
+        step, other = around[0].pieces[0, 0], here.pieces[0, -1]
+        torch.testing.assert_close(turned(step)[key], other[key])
     numbers = torch.tensor([3, 500, 7])
     torch.testing.assert_close(here.rows(numbers), there.rows(numbers))
     facts = [facts_of(small(), data) for data in (here, there)]

@@ -53,7 +53,7 @@ class ModelAdversary:
         model: trained already; trained further here.
         loss: holds the critics.
         actor: the policy.
-        real: the data; a batch has a multiple of the model's networks as its rows.
+        real: the data. Rows are drawn with its generator, if it has one.
         optimizer: of the model's parameters.
 
     Keyword Args:
@@ -99,7 +99,7 @@ class ModelAdversary:
         self.metrics: dict[str, float] = {}
 
     def __call__(self, number: int) -> None:
-        """Train the model; equal numbers draw equally, torch's generator stays."""
+        """Train the model, with draws of this number; torch's generator stays."""
         device = self.model.elites.device
         totals = torch.zeros(2, device=device)
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
