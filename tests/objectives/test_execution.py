@@ -10,7 +10,7 @@ from torch._dynamo.exc import InternalTorchDynamoError
 
 # One loss for each path that is traced; tracing takes seconds. With ReLU critics: osr,
 # and in cql-options all of CQL that is off by default. Critics that are vmapped: with
-# CQL's term in noisy-cloning, in osrv and in edac. In scas a model of the dynamics.
+# CQL's term in noisy-cloning, in osrv and in edac.
 TRACED = (
     *(
         "osr",
