@@ -12,18 +12,9 @@ from torch._dynamo.exc import InternalTorchDynamoError
 # and in cql-options all of CQL that is off by default. Critics that are vmapped: with
 # CQL's term in noisy-cloning, in osrv and in edac.
 TRACED = (
-    *(
-        "osr",
-        "cql-options",
-        "noisy-cloning",
-        "osrv",
-        "edac",
-        "td3bc",
-        "scas",
-        "discrete",
-    ),
-    *("recovery", "recovery-delta", "idm", "cvae"),
-)
+    "osr", "cql-options", "noisy-cloning", "osrv", "edac", "td3bc", "discrete",
+    "recovery", "recovery-delta", "idm", "cvae",
+)  # fmt: skip
 
 
 @pytest.mark.losses(having="critics")
