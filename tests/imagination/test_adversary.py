@@ -11,9 +11,10 @@ import math
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.objectives import SoftUpdate
+from uneven_dynamics import uneven_dynamics
 
 from torchrl_osr import OSRLoss
 from torchrl_osr.imagination import ModelAdversary
@@ -37,23 +38,12 @@ OPTIONS = {
 }
 
 
-def make_model() -> DynamicsEnsemble:
-    torch.manual_seed(4)
-    model = DynamicsEnsemble(3, 2, num_networks=3, num_elites=2, num_cells=[6])
-    for each in model.parameters():
-        nn.init.normal_(each, std=0.5)
-    model.elites.copy_(torch.tensor([0, 2]))
-    model.target_scale.uniform_(0.5, 2)
-    model.input_loc.normal_()
-    return model.double()
-
-
 def make_adversary(networks, make_batch, **options) -> ModelAdversary:
     loss = OSRLoss(networks.actor, networks.critics, **SAC).double()
     SoftUpdate(loss, tau=0.1)
     real = ReplayBuffer(storage=LazyTensorStorage(50))
     real.extend(make_batch(50, twin=False))
-    model = make_model()
+    model = uneven_dynamics()
     optimizer = torch.optim.Adam(model.parameters(), lr=1e-2)
     return ModelAdversary(
         model, loss, networks.actor, real, optimizer, **(OPTIONS | options)
@@ -115,7 +105,7 @@ def test_objective_and_gradients_equal_the_restatement(
     make_networks, make_batch, check
 ) -> None:
     networks = make_networks(num_critics=3)
-    plain, model = copy.deepcopy(networks), make_model()
+    plain, model = copy.deepcopy(networks), uneven_dynamics()
     adversary = make_adversary(networks, make_batch)
     states = make_batch(12, twin=False)["observation"]
     torch.manual_seed(6)

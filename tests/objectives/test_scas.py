@@ -10,8 +10,9 @@ import copy
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.objectives import SoftUpdate
+from uneven_dynamics import uneven_dynamics
 
 from torchrl_osr import SCASLoss
 from torchrl_osr.modules import DynamicsEnsemble
@@ -23,17 +24,6 @@ VERSIONS = {
     "printed": ("perturbed", 2.0),
     "without weights": ("clean", 0.0),
 }
-
-
-def make_model() -> DynamicsEnsemble:
-    torch.manual_seed(4)
-    model = DynamicsEnsemble(3, 2, num_networks=3, num_elites=2, num_cells=[6])
-    for each in model.parameters():
-        nn.init.normal_(each, std=0.5)
-    model.elites.copy_(torch.tensor([0, 2]))
-    model.target_scale.uniform_(0.5, 2)
-    model.input_loc.normal_()
-    return model.double()
 
 
 @pytest.fixture
@@ -51,7 +41,7 @@ def make_loss(networks, version: str, **options) -> SCASLoss:
     loss = SCASLoss(
         networks.actor,
         networks.critics,
-        make_model(),
+        uneven_dynamics(),
         correction_action=action,
         gain_temperature=temperature,
         **(numbers | options),
@@ -79,7 +69,7 @@ def next_state(model: DynamicsEnsemble, state: Tensor, action: Tensor) -> Tensor
 def restated(networks, batch, version: str) -> dict[str, Tensor]:
     """The losses, one critic and one row at a time; no loss of torchrl_osr."""
     correction, temperature = VERSIONS[version]
-    critics, actor, model = networks.critics, networks.actor.module, make_model()
+    critics, actor, model = networks.critics, networks.actor.module, uneven_dynamics()
     critics = [each.module for each in critics]
     old_critics, old_actor = copy.deepcopy((critics, actor))
     for network in (*old_critics, old_actor):
@@ -170,12 +160,12 @@ def test_the_model_is_frozen_and_can_be_given_later(networks, make_batch) -> Non
     frozen = loss.dynamics_network_params.values(True, True)
     assert not held & {each.data_ptr() for each in frozen}
     before = loss(batch)["correction_error"]
-    other = make_model()
+    other = uneven_dynamics()
     with torch.no_grad():
         other.layers[-1].bias += 1
     loss.load_network("dynamics_network", other)
     assert loss(batch)["correction_error"] != before
-    loss.load_network("dynamics_network", make_model())
+    loss.load_network("dynamics_network", uneven_dynamics())
     assert loss(batch)["correction_error"] == before
     with pytest.raises(ValueError, match="other sizes"):
         loss.load_network(
@@ -205,4 +195,4 @@ def test_next_states_after_an_end_are_not_read(networks, make_batch) -> None:
 )
 def test_options_are_checked(networks, options, message) -> None:
     with pytest.raises(ValueError, match=message):
-        SCASLoss(networks.actor, networks.critics, make_model(), **options)
+        SCASLoss(networks.actor, networks.critics, uneven_dynamics(), **options)

@@ -12,6 +12,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
+from uneven_dynamics import uneven_dynamics
 
 from torchrl_osr import OSRLoss, SDCLoss
 from torchrl_osr.functional import maximum_mean_discrepancy
@@ -22,17 +23,14 @@ CQL = {"recovery_weight": 0.0, "actor_states": "clean", "num_random": 3}
 
 
 def make_models() -> tuple[DynamicsEnsemble, ConditionalVAE]:
-    torch.manual_seed(4)
-    dynamics = DynamicsEnsemble(3, 2, num_networks=3, num_elites=2, num_cells=[6])
+    dynamics = uneven_dynamics()
     keys = {"condition_key": "observation", "target_key": ("next", "observation")}
     vae = ConditionalVAE(3, 3, change=True, num_cells=[5], latent_dim=2, **keys)
-    for each in (*dynamics.parameters(), *vae.parameters()):
+    for each in vae.parameters():
         nn.init.normal_(each, std=0.5)
-    dynamics.elites.copy_(torch.tensor([0, 2]))
-    dynamics.target_scale.uniform_(0.5, 2)
     vae.target_scale.uniform_(0.5, 2)
     vae.target_loc.normal_()
-    return dynamics.double(), vae.double()
+    return dynamics, vae.double()
 
 
 def make_loss(networks, **options) -> SDCLoss:
@@ -70,7 +68,7 @@ def restated(actor: nn.Module, dynamics, vae, batch) -> Tensor:
             action = torch.tanh(loc + scale * action_noise[i, row])
             number = (0, 2)[drawn[i, row]]
             first, last = dynamics.layers
-            hidden = torch.cat([perturbed, action])
+            hidden = torch.cat([perturbed, action]) - dynamics.input_loc
             hidden = first.weight[number].T @ hidden + first.bias[number, 0]
             hidden = hidden * torch.sigmoid(hidden)
             out = last.weight[number].T @ hidden + last.bias[number, 0]

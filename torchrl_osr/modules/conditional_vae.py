@@ -17,7 +17,7 @@ from torchrl.modules import MLP
 
 from torchrl_osr._entries import entry
 from torchrl_osr.modules.cvae_inverse_dynamics import LATENT_LOG_SCALE_BOUNDS
-from torchrl_osr.modules.dynamics import has_next_state
+from torchrl_osr.modules.dynamics import has_next_state, loc_and_scale
 
 
 class ConditionalVAE(TensorDictModuleBase):
@@ -135,6 +135,6 @@ class ConditionalVAE(TensorDictModuleBase):
         condition, target = (
             entry(rows, key) for key in (*self.in_keys, *self.out_keys)
         )
-        scale, loc = torch.std_mean((target - condition).double(), 0, correction=0)
+        loc, scale = loc_and_scale(target - condition)
         self.target_loc.copy_(loc)
-        self.target_scale.copy_(torch.where(scale > 1e-8, scale, 1.0))
+        self.target_scale.copy_(scale)

@@ -210,8 +210,7 @@ class DynamicsEnsemble(TensorDictModuleBase):
         rows = data[has_next_state(data, self.in_keys[0])]
         names = ("input", "target")
         for name, values in zip(names, self.inputs_and_targets(rows), strict=True):
-            scale, loc = torch.std_mean(values.double(), 0, correction=0)
-            scale = torch.where(scale > 1e-8, scale, torch.ones_like(scale))
+            loc, scale = loc_and_scale(values)
             getattr(self, f"{name}_loc").copy_(loc)
             getattr(self, f"{name}_scale").copy_(scale)
 
@@ -274,6 +273,15 @@ class _StackedLinear(nn.Module):
 
     def forward(self, value: Tensor) -> Tensor:
         return torch.baddbmm(self.bias, value, self.weight)
+
+
+def loc_and_scale(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation of each entry of ``[N, D]``, float64.
+
+    An entry that does not vary has a standard deviation of 1: it is divided by.
+    """
+    scale, loc = torch.std_mean(values.double(), 0, correction=0)
+    return loc, torch.where(scale > 1e-8, scale, torch.ones_like(scale))
 
 
 def has_next_state(data: TensorDictBase, key: NestedKey = "observation") -> Tensor:

@@ -23,9 +23,6 @@ from torchrl_osr.objectives.mixed_states import States
 from torchrl_osr.objectives.osr import OSRLoss
 from torchrl_osr.objectives.step import Step
 
-HELD = {"preserve_module_state": False}
-"""Of to_module: frozen tensors stay tensors, in the network and afterwards here."""
-
 
 class SDCLoss(OSRLoss):
     r"""State Deviation Correction (SDC) on CQL(H), in our reading.
@@ -155,9 +152,10 @@ class SDCLoss(OSRLoss):
         batch = *number, *step.tensordict.batch_size, -1
         clean = entry(step.states[0], aims.in_keys[0]).expand(batch)
         perturbed = entry(step.states[2], model.in_keys[0]).expand(batch)
-        with self.dynamics_network_params.to_module(model, **HELD):
+        with self.dynamics_network_params.to_module(model, preserve_module_state=False):
             change = model.sample(model.predict(perturbed, action))[..., :-1]
-        with torch.no_grad(), self.transition_network_params.to_module(aims, **HELD):
+        held = self.transition_network_params
+        with torch.no_grad(), held.to_module(aims, preserve_module_state=False):
             aim = aims.sample(clean)
         return functional.maximum_mean_discrepancy(
             perturbed + change, aim, self.kernel_width
