@@ -54,9 +54,11 @@ def test_the_next_action_is_there_for_losses_that_read_it(held_out):
     for _ in range(20):
         batch, other = (each.buffer.sample() for each in (here, there))
         torch.testing.assert_close(other, batch, rtol=1e-6, atol=1e-6)
-        for row in batch[~batch["next", "done"].squeeze(-1)]:
-            following = (whole["observation"] == row["next", "observation"]).all(-1)
-            assert torch.equal(whole["action"][following].squeeze(0), row[key])
+        for row in batch:
+            for after in (row["next"], row["multi_step"]):
+                if not after["done"]:
+                    at = (whole["observation"] == after["observation"]).all(-1)
+                    assert torch.equal(whole["action"][at].squeeze(0), after["action"])
 
 
 def test_without_an_order_the_next_action_is_refused():
@@ -70,15 +72,24 @@ def test_without_an_order_the_next_action_is_refused():
 def test_rewards_are_scaled_then_shifted():
     maze = ["env=pointmaze-umaze", "data=diverse"]
     bare = load_training_data(small(*maze), CPU)
-    options = [*maze, "data.reward_scale=10.0", "data.reward_shift=-5.0"]
-    data = load_training_data(small(*options), CPU)
+    options = [
+        *maze,
+        "optim.gamma=0.5",
+        "data.reward_scale=10.0",
+        "data.reward_shift=-5.0",
+    ]
+    data = load_training_data(small(*maze, *options), CPU)
     before, after = (each.buffer[:] for each in (bare, data))
     reached = before["next", "reward"] == 1
     assert (after["next", "reward"][reached] == 5).all()
     assert (after["next", "reward"][~reached] == -5).all()
     assert (bare.largest_reward, data.largest_reward) == (1, 5)
     assert data.mean == bare.mean, "the data's own score stays"
-    after["next", "reward"] = before["next", "reward"]
+    never = before["multi_step", "reward"] == 0
+    discounts = 2 * (1 - 0.5 ** after["multi_step", "steps"][never])
+    torch.testing.assert_close(after["multi_step", "reward"][never], -5 * discounts)
+    for name in ("next", "multi_step"):
+        after[name, "reward"] = before[name, "reward"]
     assert (after == before).all(), "nothing else is touched"
 
 

@@ -154,6 +154,35 @@ def test_several_steps_are_refused_where_a_model_is_asked_for_one(
         family(name)(batch)
 
 
+@pytest.mark.losses(having="model")
+def test_with_its_first_step_kept_a_model_sees_that_one(
+    family, family_batch, name
+) -> None:
+    """The recovery term is that of the single steps, the target that of several."""
+    single = family_batch(name, 30)
+    several = single.clone().set("next", single["next"].roll(1, 0))
+    batch = several.clone().set("one_step", single["next"])
+    batch["steps_to_next_obs"] = torch.full((30, 1), 2)
+    found = {}
+    for kind, rows, gamma in (
+        ("both", batch, 0.5),
+        ("single", single, 0.5),
+        ("several", several, 0.25),
+    ):
+        loss = family(name)
+        if "loss_qvalue" in loss.out_keys:
+            loss.make_value_estimator(gamma=gamma)
+        torch.manual_seed(0)
+        found[kind] = loss(rows)
+    recovery = [key for key in map(str, found["both"].keys()) if "recovery" in key]
+    for key in recovery:
+        torch.testing.assert_close(found["both"][key], found["single"][key])
+        assert (found["both"][key] - found["several"][key]).abs() > 1e-6
+    if "target_value" in found["both"]:
+        both, several = (found[kind]["target_value"] for kind in ("both", "several"))
+        torch.testing.assert_close(both, several)
+
+
 @pytest.mark.losses(having="critics")
 def test_multi_step_of_one_step_changes_nothing(
     family, family_batch, record, assert_same, name

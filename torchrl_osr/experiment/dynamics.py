@@ -29,6 +29,7 @@ from torch import Tensor, nn
 from torchrl_osr import __version__
 from torchrl_osr._files import write_json
 from torchrl_osr.data.store.cache import cache_root
+from torchrl_osr.data.store.multi_step import take_multi_step
 from torchrl_osr.data.store.validation import DATASET_KEYS
 from torchrl_osr.evaluation import describe_dynamics, dynamics_report
 from torchrl_osr.experiment.build import make_dynamics, termination_of
@@ -320,7 +321,15 @@ def imagined_replay_buffer(
             units=units,
         )
         rows["next", "reward"] -= options.penalty * scale * rows["uncertainty"]
-        return Imagined(rows.select(*DATASET_KEYS), refused)
+        rows = rows.select(*DATASET_KEYS)
+        if cfg.optim.n_steps > 1:  # of the data's rows; these are single steps
+            ones = torch.ones_like(rows["next", "done"], dtype=torch.long)
+            rows["multi_step"] = rows["next"].copy().set("steps", ones)
+        return Imagined(rows, refused)
+
+    def finished(batch: TensorDictBase) -> TensorDictBase:
+        batch = transform(batch)
+        return take_multi_step(batch) if cfg.optim.n_steps > 1 else batch
 
     return ImaginedReplayBuffer(
         real,
@@ -331,7 +340,7 @@ def imagined_replay_buffer(
         interval=options.rollout_interval,
         generations=options.generations,
         seed=cfg.seed,
-        transform=transform,
+        transform=finished,
         before=adversary,
     )
 

@@ -63,6 +63,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "optim.qvalue_lr": (0, LARGEST),
     "optim.inverse_dynamics_lr": (0, LARGEST),
     "optim.gamma": (0, 1),
+    "optim.n_steps": (1, 1000),
     "optim.tau": (0, 1),
     "optim.policy_delay": (1, 1000),
     "optim.policy_average": (0, 1),

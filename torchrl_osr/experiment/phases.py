@@ -21,6 +21,7 @@ from torchrl.trainers import LRSchedulerHook
 
 from torchrl_osr import StatePerturbation
 from torchrl_osr._files import write_json
+from torchrl_osr.data.store.multi_step import take_multi_step
 from torchrl_osr.evaluation import (
     EpisodeEvaluator,
     describe_inverse_dynamics,
@@ -200,6 +201,8 @@ def train_policy(
         components["adversary"] = adversary
     if imagined is not None:
         components["imagined"] = imagined
+    if imagined is None and cfg.optim.n_steps > 1:
+        data.buffer.append_transform(take_multi_step)
     played = {"num_episodes": cfg.trainer.eval_episodes, "seed": EVALUATION_SEED}
     device = cfg.trainer.device
     with closing(EpisodeEvaluator(cfg.env.id, **played, device=device)) as episodes:

@@ -253,6 +253,8 @@ class OptimConfig:
         qvalue_lr: learning rate of the critics.
         inverse_dynamics_lr: learning rate of the inverse dynamics model.
         gamma: discount factor.
+        n_steps: rewards that the TD target sums before it goes on with the critics'
+            value, as many of them as the data have in a row: n-step returns.
         tau: step of the target networks towards the critics, at each update.
         policy_delay: updates of the critics for each of the policy, the entropy
             temperature and the target networks.
@@ -269,6 +271,7 @@ class OptimConfig:
     qvalue_lr: float = MISSING
     inverse_dynamics_lr: float = MISSING
     gamma: float = MISSING
+    n_steps: int = 1
     tau: float = MISSING
     policy_delay: int = 1
     actor_schedule: str = "constant"

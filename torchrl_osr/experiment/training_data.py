@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import torch
 from omegaconf import DictConfig
-from tensordict import NestedKey, TensorDict
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, ReplayBuffer
 from torchrl.envs import Compose, ObservationNorm, RewardScaling
@@ -27,6 +27,7 @@ from torchrl_osr.data import (
     observation_statistics,
     split_held_out,
 )
+from torchrl_osr.data.store.multi_step import multi_step
 from torchrl_osr.experiment.build import check_storage, load_data, references_of
 from torchrl_osr.imagination import turned
 
@@ -51,7 +52,6 @@ class TrainingData(NamedTuple):
         mean: score of the behaviour, or return where there are no scores, if known.
         pieces: of trajectories, each from a held-out row on, ``[n, 20]``; the rows that
             follow may be trained on. ``None`` if there is no dynamics model.
-        prepare: what is done to rows from disk; ``None`` if those in memory are ready.
         backwards: whether :meth:`alone`, held-out rows and pieces are turned around.
     """
 
@@ -61,13 +61,12 @@ class TrainingData(NamedTuple):
     largest_reward: float
     mean: float | None
     pieces: TensorDict | None
-    prepare: Compose | None
     backwards: bool = False
 
     def rows(self, numbers: Tensor) -> TensorDict:
         """Rows of :attr:`buffer` by their numbers ``[n]``, without its transforms."""
         rows: TensorDict = self.buffer.storage.get(numbers)
-        return rows if self.prepare is None else self.prepare(rows)
+        return rows
 
     def alone(self, batch_size: int | None = None) -> ReplayBuffer:
         """The buffer's rows without what is appended to :attr:`buffer` later on."""
@@ -75,7 +74,6 @@ class TrainingData(NamedTuple):
             storage=self.buffer.storage,
             writer=ImmutableDatasetWriter(),
             collate_fn=lambda batch: batch,
-            transform=None if self.prepare is None else self.prepare.clone(),
             batch_size=batch_size,
         )
         if self.backwards:
@@ -126,46 +124,49 @@ def load_training_data(
     extremes = torch.stack(data["next", "reward"].aminmax())
     largest = (factor * extremes + addend).abs().max().item()
 
-    def norm() -> ObservationNorm:  # one transform belongs to one buffer
-        keys = ["observation", ("next", "observation")]
-        return ObservationNorm(loc, scale, in_keys=keys, standard_normal=True)
+    def norm(*keys: NestedKey) -> ObservationNorm:  # one belongs to one buffer
+        return ObservationNorm(loc, scale, in_keys=list(keys), standard_normal=True)
 
-    prepare = Compose(norm())
+    states = "observation", ("next", "observation")
+    prepare = Compose(norm(*states))
     if (factor, addend) != (1.0, 0.0):
         prepare.append(RewardScaling(addend, factor, in_keys=[("next", "reward")]))
+    prepare_steps = norm("observation")
+
+    def read(data: TensorDictBase, rows: Tensor | None = None) -> TensorDictBase:
+        batch = data.copy() if rows is None else data[rows]
+        if with_next_action:
+            batch["next", "action"] = next_action(data, rows)
+        batch = prepare(batch)
+        if cfg.optim.n_steps > 1:
+            steps = multi_step(
+                data,
+                rows,
+                n_steps=cfg.optim.n_steps,
+                gamma=cfg.optim.gamma,
+                reward_scale=factor,
+                reward_shift=addend,
+                with_next_action=with_next_action,
+            )
+            batch["multi_step"] = prepare_steps(steps)
+        return batch
+
     options = {"batch_size": cfg.trainer.batch_size, "seed": 0, "device": device}
     share, seed = cfg.data.held_out, cfg.data.seed
     chosen = held_out_rows(len(data), share, seed=seed)
     pieces = None
+    if cfg.dynamics.use:
+        pieces = prepare(consecutive_rows(data, chosen[:NUM_PIECES], PIECE)).to(device)
     if on_disk:
-        if cfg.dynamics.use:
-            pieces = prepare(consecutive_rows(data, chosen[:NUM_PIECES], PIECE))
-        held_out = prepare(data[chosen[:MAX_HELD_OUT].sort().values])
-        left_out, prepare = chosen.sort().values, prepare.to(device)
-        buffer = make_replay_buffer(
-            data,
-            left_out=left_out,
-            transform=prepare,
-            with_next_action=with_next_action,
-            **options,
-        )
-    else:
-        if with_next_action:  # of the rows before some of them are held out
-            data["next", "action"] = next_action(data)
-        data = prepare(data)
-        if cfg.dynamics.use:
-            pieces = consecutive_rows(data, chosen[:NUM_PIECES], PIECE)
-        rows, held_out = split_held_out(data, share, seed=seed)
+        held_out = read(data, chosen[:MAX_HELD_OUT].sort().values)
+        left_out = chosen.sort().values
+        buffer = make_replay_buffer(data, left_out=left_out, read=read, **options)
+    else:  # what follows a row, before some are held out
+        rows, held_out = split_held_out(read(data), share, seed=seed)
         buffer = make_replay_buffer(rows, **options)
     mean = manifest["normalized_score"]
     if references_of(cfg) is None:
         mean = (manifest.get("return") or {}).get("mean")
     return TrainingData(
-        buffer,
-        held_out.to(device),
-        norm().to(device),
-        largest,
-        mean,
-        None if pieces is None else pieces.to(device),
-        prepare.clone() if on_disk else None,  # the buffer's own may grow
+        buffer, held_out.to(device), norm(*states).to(device), largest, mean, pieces
     )

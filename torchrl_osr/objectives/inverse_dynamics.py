@@ -29,7 +29,7 @@ from torchrl_osr.objectives.distributions import (
     check_action,
     is_categorical,
 )
-from torchrl_osr.objectives.mixed_states import transitions
+from torchrl_osr.objectives.mixed_states import first_step, transitions
 from torchrl_osr.objectives.step import distribution_params
 
 LATENT_KEYS = ("latent_loc", "latent_scale")
@@ -170,6 +170,7 @@ class InverseDynamicsLoss(BaseLoss):
             tensordict: a batch ``[B]`` with the entries of :attr:`in_keys`.
         """
         self._check_not_empty(tensordict)
+        tensordict = first_step(tensordict)
         done = column(tensordict, nested("next", self.tensor_keys.done)).bool()
         batch = transitions(
             tensordict,

@@ -81,6 +81,16 @@ def next_state(tensordict: TensorDictBase, key: NestedKey, absent: Tensor) -> Te
     return torch.where(absent, state, after)
 
 
+def first_step(tensordict: TensorDictBase) -> TensorDictBase:
+    """A batch whose ``"next"`` is that of single steps.
+
+    Of multi-step transitions it is their entry ``"one_step"``, where they keep it.
+    """
+    if "one_step" not in tensordict:
+        return tensordict
+    return tensordict.exclude("steps_to_next_obs").set("next", tensordict["one_step"])
+
+
 def transitions(
     tensordict: TensorDictBase,
     in_keys: Sequence[NestedKey],
@@ -92,7 +102,8 @@ def transitions(
     """What an inverse dynamics model reads, on D_tot or a half of it.
 
     Args:
-        tensordict: a batch ``[B]``.
+        tensordict: a batch ``[B]`` or of multi-step transitions that keep their
+            first step, see :func:`first_step`.
         in_keys: the model's inputs, some of them below ``"next"``.
         done: bool ``[B]``; such rows get their own state as the next one.
         perturbed: where the perturbed states are.
@@ -105,6 +116,7 @@ def transitions(
     Raises:
         ValueError: if the next states are several steps ahead.
     """
+    tensordict = first_step(tensordict)
     steps = tensordict.get("steps_to_next_obs", None)
     # Tracing cannot branch on a number; the first, eager call has looked.
     if steps is not None and not torch.compiler.is_compiling() and (steps > 1).any():

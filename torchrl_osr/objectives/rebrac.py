@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchrl_osr import functional
 from torchrl_osr._checks import check_literals, check_weight
-from torchrl_osr._entries import entry
+from torchrl_osr._entries import column, entry
 from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
 from torchrl_osr.objectives.distributions import check_action
 from torchrl_osr.objectives.step import Step, actor_critic_in_keys
@@ -174,10 +174,11 @@ class ReBRACLoss(BaseLoss):
         """The TD target, ``[B]``: smoothed, and less the penalty."""
         action, next_value = smoothed_action_and_value(self, step)
         if self.has_penalty:
-            (key,) = self._next_keys("action")
+            key, done = self._next_keys("action", "done")
             data_action = entry(step.tensordict, key)
             check_action(data_action, action.shape[-1], key)
             penalty = functional.action_distance(action, data_action)
-            penalty = penalty.masked_fill(step.done, 0.0)
+            ended = column(step.tensordict, done).bool()
+            penalty = penalty.masked_fill(ended, 0.0)
             next_value = next_value - self.critic_bc_coef * penalty
         return step.td_target(next_value)

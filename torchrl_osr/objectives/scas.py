@@ -20,6 +20,7 @@ from torchrl_osr._entries import entry, nested
 from torchrl_osr.modules.dynamics import DynamicsEnsemble
 from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
 from torchrl_osr.objectives.distributions import check_action
+from torchrl_osr.objectives.mixed_states import first_step
 from torchrl_osr.objectives.step import Step, actor_critic_in_keys
 from torchrl_osr.objectives.td3_bc import check_smoothing, smoothed_action_and_value
 
@@ -213,7 +214,7 @@ class SCASLoss(BaseLoss):
 
     def _data_next_state(self, step: Step) -> Tensor:
         key = nested("next", self.dynamics_network.in_keys[0])
-        found = entry(step.tensordict, key)
+        found = entry(first_step(step.tensordict), key)
         # What follows an end may be anything, and 0 * nan is nan in the backward pass.
         return torch.where(step.done.unsqueeze(-1), torch.zeros_like(found), found)
 

@@ -36,7 +36,7 @@ from torchrl_osr.objectives.distributions import (
     check_same_size,
     head_of,
 )
-from torchrl_osr.objectives.mixed_states import States, transitions
+from torchrl_osr.objectives.mixed_states import States, first_step, transitions
 from torchrl_osr.objectives.step import frozen_distribution
 
 
@@ -239,6 +239,7 @@ class StateRecoveryLoss(BaseLoss):
             tensordict: a batch ``[B]`` with the entries of :attr:`in_keys`.
         """
         self._check_not_empty(tensordict)
+        tensordict = first_step(tensordict)
         done = column(tensordict, nested("next", self.tensor_keys.done)).bool()
         states = self.recovery_states
         mixed = transitions(

@@ -25,6 +25,7 @@ from torchrl_osr.objectives import critic_kernel
 from torchrl_osr.objectives.base import BaseLoss
 from torchrl_osr.objectives.mixed_states import (
     States,
+    first_step,
     next_state,
     perturbed_state,
     transitions,
@@ -170,7 +171,9 @@ class Step:
 
     Attributes:
         tensordict: the batch.
-        done: ends of trajectories, whose next state may not be one, bool ``[B]``.
+        done: ends of trajectories, whose next state may not be one, bool ``[B]``; of
+            multi-step transitions that keep their first step, whether that is one.
+        terminated: whether the TD target ends with the rewards, bool ``[B]``.
         states: ``[s, s']`` or ``[s, s', s^]``, ``[2 or 3, B]``. A next state after a
             termination is not one: there ``s`` stands in its place.
 
@@ -183,10 +186,9 @@ class Step:
     ) -> None:
         loss._check_not_empty(tensordict)
         self.loss, self.tensordict = loss, tensordict
-        self.done, self.terminated = (
-            column(tensordict, key).bool()
-            for key in loss._next_keys("done", "terminated")
-        )
+        done, terminated = loss._next_keys("done", "terminated")
+        self.done = column(first_step(tensordict), done).bool()
+        self.terminated = column(tensordict, terminated).bool()
         keys = observation_keys(loss)
         clean = select(tensordict, keys)
         after = clean.copy()

@@ -53,9 +53,14 @@ def test_drawn_from_disk_it_is_the_same(tmp_path_factory, lengths, random) -> No
     chosen = random.sample(range(len(data)), k=random.randrange(len(data)))
     left_out = torch.tensor(sorted(chosen), dtype=torch.long)
     stored, _ = write_memmap([data], tmp_path_factory.mktemp("set") / "data")
-    buffer = make_replay_buffer(
-        stored, batch_size=64, seed=0, left_out=left_out, with_next_action=True
-    )
+
+    def read(data, rows):
+        batch = data[rows]
+        batch["next", "action"] = next_action(data, rows)
+        return batch
+
+    options = {"batch_size": 64, "seed": 0, "read": read}
+    buffer = make_replay_buffer(stored, left_out=left_out, **options)
     data["next", "action"] = next_action(data)
     batch = buffer.sample()
     rows = (batch["observation"] == data["observation"].squeeze(-1)).int().argmax(-1)
@@ -73,6 +78,6 @@ def test_rows_in_no_order_are_refused_by_number() -> None:
     check_order(data[4:])
 
 
-def test_in_memory_it_is_set_before_rows_are_held_out() -> None:
-    with pytest.raises(ValueError, match="before any rows are left out"):
-        make_replay_buffer(episodes([3]), batch_size=1, seed=0, with_next_action=True)
+def test_rows_in_memory_are_not_read_anew() -> None:
+    with pytest.raises(ValueError, match="give the rows as they are"):
+        make_replay_buffer(episodes([3]), batch_size=1, seed=0, read=next_action)

@@ -30,10 +30,28 @@ def next_action(data: TensorDictBase, rows: Tensor | None = None) -> Tensor:
     return following.masked_fill(data["next", "done"][rows], 0.0)
 
 
+def is_followed(data: TensorDictBase, rows: Tensor | None = None) -> Tensor:
+    """Whether the row after each is the one that came next in time, bool ``[B]``.
+
+    Then the row ends no episode, and its next state is the state of the row after.
+
+    Args:
+        data: all transitions ``[N]``.
+        rows: numbers of the rows that are asked about, ``[B]``. Default: all.
+    """
+    rows = torch.arange(len(data)) if rows is None else rows
+    after = (rows + 1).clamp(max=len(data) - 1)
+    there = data["next", "observation"][rows]
+    state = data["observation"][after]
+    slack = SAME_STATE * state.abs().clamp_min(1)
+    apart = ((there - state).abs() > slack).any(-1)
+    ends = data["next", "done"][rows].squeeze(-1) | (rows + 1 == len(data))
+    followed: Tensor = ~(apart | ends)
+    return followed
+
+
 def check_order(data: TensorDictBase) -> None:
     """Raise unless every row that does not end an episode is followed by its next.
-
-    Then the next state of the one is the state of the other.
 
     Args:
         data: transitions ``[N]``; read in chunks.
@@ -44,17 +62,12 @@ def check_order(data: TensorDictBase) -> None:
     wrong = 0
     first = len(data)
     for start in range(0, len(data), ROWS_AT_A_TIME):
-        # One row more, to which the chunk's last one leads.
-        state = data["observation"][start : start + ROWS_AT_A_TIME + 1]
-        rows = data["next"][start : start + ROWS_AT_A_TIME]
-        apart = torch.ones(len(rows), dtype=torch.bool)  # the last row of all leads on
-        before, after = rows["observation"][: len(state) - 1], state[1:]
-        slack = SAME_STATE * after.abs().clamp_min(1)
-        apart[: len(before)] = ((before - after).abs() > slack).any(-1)
-        jumps = (apart & ~rows["done"].squeeze(-1)).nonzero()[:, 0]
+        rows = torch.arange(start, min(start + ROWS_AT_A_TIME, len(data)))
+        done = data["next", "done"][rows].squeeze(-1)
+        jumps = rows[~(done | is_followed(data, rows))]
         if len(jumps):
             wrong += len(jumps)
-            first = min(first, start + int(jumps[0]))
+            first = min(first, int(jumps[0]))
     if wrong:
         raise ValueError(
             f"{wrong:,} of the {len(data):,} rows, row {first} the first, end no "

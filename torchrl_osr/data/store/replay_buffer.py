@@ -5,6 +5,8 @@ Shapes: ``N`` rows of the data set, ``B`` batch.
 
 from __future__ import annotations
 
+import operator
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -14,7 +16,7 @@ from torchrl.data import ImmutableDatasetWriter, LazyTensorStorage, ReplayBuffer
 from torchrl.data.replay_buffers.storages import Storage
 from torchrl.envs.transforms import Transform
 
-from torchrl_osr.data.store.next_action import next_action
+Reader = Callable[[TensorDictBase, Tensor], TensorDictBase]
 
 
 class MemmapStorage(Storage):
@@ -27,8 +29,7 @@ class MemmapStorage(Storage):
         left_out: sorted numbers of rows that are not drawn. Default: none.
         device: where the batches are. The draws are made there too, so that they are
             those of a buffer that holds the rows on that device. Default: CPU.
-        with_next_action: rows have the entry ``("next", "action")``, see
-            :func:`~torchrl_osr.data.next_action`. Default ``False``.
+        read: returns rows of ``data`` by their numbers. Default: as they are.
     """
 
     def __init__(
@@ -37,12 +38,11 @@ class MemmapStorage(Storage):
         *,
         left_out: Tensor | None = None,
         device: torch.device | str = "cpu",
-        with_next_action: bool = False,
+        read: Reader = operator.getitem,
     ) -> None:
         left_out = torch.empty(0, dtype=torch.long) if left_out is None else left_out
         super().__init__(len(data) - len(left_out))
-        self.data, self.device = data, torch.device(device)
-        self.with_next_action = with_next_action
+        self.data, self.device, self.read = data, torch.device(device), read
         # Before row i of the rest lie as many of the left-out ones as have no more than
         # i rows of the rest before them.
         self._shifts = left_out - torch.arange(len(left_out))
@@ -55,9 +55,7 @@ class MemmapStorage(Storage):
         """Rows ``[B]``."""
         index = index.cpu()
         rows = index + torch.searchsorted(self._shifts, index, right=True)
-        batch = self.data[rows]
-        if self.with_next_action:
-            batch["next", "action"] = next_action(self.data, rows)
+        batch = self.read(self.data, rows)
         return batch if self.device.type == "cpu" else batch.to(self.device)
 
     def state_dict(self) -> dict[str, Any]:
@@ -76,7 +74,7 @@ def make_replay_buffer(
     left_out: Tensor | None = None,
     transform: Transform | None = None,
     device: torch.device | str | None = None,
-    with_next_action: bool = False,
+    read: Reader | None = None,
 ) -> ReplayBuffer:
     """Replay buffer that samples a data set uniformly, with replacement.
 
@@ -95,8 +93,7 @@ def make_replay_buffer(
         transform: applied to each sampled batch. Default: none.
         device: where the rows are stored and sampled, or, of a memory-mapped set, where
             the batches are. Default: the device of ``data``, or CPU if it has none.
-        with_next_action: read also the next action of memory-mapped rows, see
-            :func:`next_action`. Default ``False``.
+        read: returns rows of memory-mapped data by their numbers. Default: as they are.
 
     Raises:
         ValueError: ``data`` is not flat or has no rows, or an option is for
@@ -129,7 +126,7 @@ def make_replay_buffer(
                 data,
                 left_out=left_out,
                 device=device,
-                with_next_action=with_next_action,
+                read=operator.getitem if read is None else read,
             ),
             writer=ImmutableDatasetWriter(),
             collate_fn=lambda batch: batch,
@@ -137,11 +134,8 @@ def make_replay_buffer(
         )
     if left_out is not None:
         raise ValueError("left_out is for memory-mapped data: take split_held_out.")
-    if with_next_action:
-        raise ValueError(
-            "with_next_action is for memory-mapped data: set the entry ('next', "
-            "'action') to next_action(data) before any rows are left out."
-        )
+    if read is not None:
+        raise ValueError("read is for memory-mapped data: give the rows as they are.")
     check_memory(data, device)
     buffer = ReplayBuffer(
         storage=LazyTensorStorage(data.shape[0], device=device), **options
