@@ -130,12 +130,6 @@ def last_five(run: dict[str, Any]) -> float:
     return statistics.fmean(row["score"] for row in run["evaluations"][-5:])
 
 
-def score_at(run: dict[str, Any], seconds: float) -> float:
-    """Score of the last evaluation until then."""
-    rows = run["evaluations"]
-    return [row["score"] for row in rows if row["seconds"] <= seconds][-1]
-
-
 def table(runs: list[dict[str, Any]]) -> str:
     """Markdown: last five evaluations over seeds, and the minutes that they took."""
     rows = defaultdict(list)
@@ -178,14 +172,16 @@ def draw(runs: list[dict[str, Any]], path: Path) -> None:
             group = [r for r in runs if (r["env"], r["method"]) == (env, method)]
             if not group:
                 continue
-            start = max(run["evaluations"][0]["seconds"] for run in group)
-            end = min(run["evaluations"][-1]["seconds"] for run in group)
-            times = np.linspace(start, end, 200)
-            curves = np.array([[score_at(run, t) for t in times] for run in group])
-            for curve in curves:
-                axes.plot(times / 60, curve, color=color, linewidth=0.6, alpha=0.4)
+            rows = np.array(
+                [
+                    [(row["seconds"] / 60, row["score"]) for row in run["evaluations"]]
+                    for run in group
+                ]
+            )
+            for run in rows:
+                axes.plot(*run.T, color=color, linewidth=0.6, alpha=0.4)
             label = f"{method} ({len(group)} seeds)"
-            axes.plot(times / 60, curves.mean(0), color=color, label=label)
+            axes.plot(*rows.mean(0).T, color=color, marker="o", ms=3, label=label)
         axes.set_title(f"{env} medium-replay", fontsize=10, loc="left")
         axes.spines[["top", "right"]].set_visible(False)
         axes.set_xlabel("minutes of one core")
