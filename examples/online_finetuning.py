@@ -66,6 +66,7 @@ def make_collector(run: TrainedRun, frames: int, seed: int) -> Collector:
 def make_trainer(run: TrainedRun, frames: int, seed: int) -> OfflineToOnlineTrainer:
     """TorchRL's trainer with the run's data, loss and optimizer: one update a frame."""
     cfg, loss = run.config, run.loss
+    cfg.optim.n_steps = 1  # as the rows that the environment will add
     buffer = OfflineToOnlineReplayBuffer(
         load_training_data(cfg, torch.device("cpu")).buffer,
         online_capacity=frames,
