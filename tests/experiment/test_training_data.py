@@ -72,12 +72,7 @@ def test_without_an_order_the_next_action_is_refused():
 def test_rewards_are_scaled_then_shifted():
     maze = ["env=pointmaze-umaze", "data=diverse"]
     bare = load_training_data(small(*maze), CPU)
-    options = [
-        *maze,
-        "optim.gamma=0.5",
-        "data.reward_scale=10.0",
-        "data.reward_shift=-5.0",
-    ]
+    options = ["optim.gamma=0.5", "data.reward_scale=10.0", "data.reward_shift=-5.0"]
     data = load_training_data(small(*maze, *options), CPU)
     before, after = (each.buffer[:] for each in (bare, data))
     reached = before["next", "reward"] == 1

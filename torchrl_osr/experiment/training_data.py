@@ -124,7 +124,7 @@ def load_training_data(
     extremes = torch.stack(data["next", "reward"].aminmax())
     largest = (factor * extremes + addend).abs().max().item()
 
-    def norm(*keys: NestedKey) -> ObservationNorm:  # one belongs to one buffer
+    def norm(*keys: NestedKey) -> ObservationNorm:  # one belongs to one Compose
         return ObservationNorm(loc, scale, in_keys=list(keys), standard_normal=True)
 
     states = "observation", ("next", "observation")

@@ -102,8 +102,7 @@ def transitions(
     """What an inverse dynamics model reads, on D_tot or a half of it.
 
     Args:
-        tensordict: a batch ``[B]`` or of multi-step transitions that keep their
-            first step, see :func:`first_step`.
+        tensordict: a batch ``[B]`` of single steps, see :func:`first_step`.
         in_keys: the model's inputs, some of them below ``"next"``.
         done: bool ``[B]``; such rows get their own state as the next one.
         perturbed: where the perturbed states are.
@@ -116,7 +115,6 @@ def transitions(
     Raises:
         ValueError: if the next states are several steps ahead.
     """
-    tensordict = first_step(tensordict)
     steps = tensordict.get("steps_to_next_obs", None)
     # Tracing cannot branch on a number; the first, eager call has looked.
     if steps is not None and not torch.compiler.is_compiling() and (steps > 1).any():

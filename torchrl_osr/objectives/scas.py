@@ -20,7 +20,6 @@ from torchrl_osr._entries import entry, nested
 from torchrl_osr.modules.dynamics import DynamicsEnsemble
 from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
 from torchrl_osr.objectives.distributions import check_action
-from torchrl_osr.objectives.mixed_states import first_step
 from torchrl_osr.objectives.step import Step, actor_critic_in_keys
 from torchrl_osr.objectives.td3_bc import check_smoothing, smoothed_action_and_value
 
@@ -214,7 +213,7 @@ class SCASLoss(BaseLoss):
 
     def _data_next_state(self, step: Step) -> Tensor:
         key = nested("next", self.dynamics_network.in_keys[0])
-        found = entry(first_step(step.tensordict), key)
+        found = entry(step.first, key)
         # What follows an end may be anything, and 0 * nan is nan in the backward pass.
         return torch.where(step.done.unsqueeze(-1), torch.zeros_like(found), found)
 

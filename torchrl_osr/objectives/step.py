@@ -79,7 +79,7 @@ def frozen_distribution(
 
     Args:
         loss: holds the model.
-        tensordict: a batch ``[B]``.
+        tensordict: a batch ``[B]`` of single steps.
         done: rows whose next state is not to be learnt from, bool ``[B]``.
         states: ``"both"``, ``"clean"`` or ``"perturbed"``.
     """
@@ -171,8 +171,10 @@ class Step:
 
     Attributes:
         tensordict: the batch.
+        first: the batch of single steps, see
+            :func:`~torchrl_osr.objectives.mixed_states.first_step`.
         done: ends of trajectories, whose next state may not be one, bool ``[B]``; of
-            multi-step transitions that keep their first step, whether that is one.
+            the single steps.
         terminated: whether the TD target ends with the rewards, bool ``[B]``.
         states: ``[s, s']`` or ``[s, s', s^]``, ``[2 or 3, B]``. A next state after a
             termination is not one: there ``s`` stands in its place.
@@ -186,8 +188,9 @@ class Step:
     ) -> None:
         loss._check_not_empty(tensordict)
         self.loss, self.tensordict = loss, tensordict
+        self.first = first_step(tensordict)
         done, terminated = loss._next_keys("done", "terminated")
-        self.done = column(first_step(tensordict), done).bool()
+        self.done = column(self.first, done).bool()
         self.terminated = column(tensordict, terminated).bool()
         keys = observation_keys(loss)
         clean = select(tensordict, keys)
@@ -244,9 +247,7 @@ class Step:
 
     def inverse_dynamics(self, states: States) -> Any:
         """The frozen model ``I(a | s~, s')`` at these states, ``[D, B]``."""
-        return frozen_distribution(
-            self.loss, self.tensordict, done=self.done, states=states
-        )
+        return frozen_distribution(self.loss, self.first, done=self.done, states=states)
 
     def qvalue(
         self, states: TensorDictBase, action: Tensor, params: TensorDictParams

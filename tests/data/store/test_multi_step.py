@@ -5,25 +5,10 @@ from __future__ import annotations
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from numbered_episodes import LENGTHS, episodes
 from property_settings import tried
-from tensordict import TensorDict
 
 from torchrl_osr.data.store.multi_step import multi_step, take_multi_step
-
-LENGTHS = st.lists(st.integers(1, 6), min_size=1, max_size=5)
-
-
-def episodes(lengths) -> TensorDict:
-    """Episodes that terminate or are cut off in turns, with random numbers."""
-    rows = []
-    for episode, length in enumerate(lengths):
-        state = torch.randn(length + 1, 2)
-        done = torch.arange(length).unsqueeze(-1) == length - 1
-        after = {"observation": state[1:], "reward": torch.randn(length, 1)}
-        after |= {"done": done, "terminated": done & (episode % 2 == 0)}
-        columns = {"observation": state[:-1], "action": torch.randn(length, 1)}
-        rows.append(TensorDict(columns | {"next": after}, [length]))
-    return torch.cat(rows)
 
 
 @tried(30)

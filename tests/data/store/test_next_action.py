@@ -6,36 +6,14 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from numbered_episodes import LENGTHS, episodes
 from property_settings import tried
-from tensordict import TensorDict
 
 from torchrl_osr.data import check_order, make_replay_buffer, next_action, write_memmap
 
-ENDS = st.lists(st.integers(1, 6), min_size=1, max_size=6)
-"""Lengths of episodes."""
-
-
-def episodes(lengths) -> TensorDict:
-    """Episodes whose states are numbered from 1 on, and actions after them."""
-    rows, at = [], 0
-    for episode, length in enumerate(lengths):
-        state = torch.arange(at, at + length + 1.0).unsqueeze(-1) + 1
-        done = torch.arange(length).unsqueeze(-1) == length - 1
-        terminated = done & (episode % 2 == 0)
-        after = {"observation": state[1:], "reward": torch.ones(length, 1)}
-        after |= {
-            "done": done,
-            "terminated": terminated,
-            "truncated": done ^ terminated,
-        }
-        columns = {"observation": state[:-1], "action": 0.001 * state[:-1]}
-        rows.append(TensorDict(columns | {"next": after}, [length]))
-        at += length + 1
-    return torch.cat(rows)
-
 
 @tried(20)
-@given(ENDS)
+@given(LENGTHS)
 def test_it_is_what_the_episode_did_next(lengths) -> None:
     data = episodes(lengths)
     check_order(data)
@@ -47,7 +25,7 @@ def test_it_is_what_the_episode_did_next(lengths) -> None:
 
 
 @tried(20)
-@given(ENDS, st.randoms(use_true_random=False))
+@given(LENGTHS, st.randoms(use_true_random=False))
 def test_drawn_from_disk_it_is_the_same(tmp_path_factory, lengths, random) -> None:
     data = episodes([*lengths, 3])
     chosen = random.sample(range(len(data)), k=random.randrange(len(data)))

@@ -58,15 +58,18 @@ def multi_step(
         >>> multi_step(data, n_steps=2, gamma=0.5)["reward"].flatten()
         tensor([1.5000, 1.5000, 1.0000])
     """
-    last = torch.arange(len(data)) if rows is None else rows.clone()
+
+    def reward_of(rows: Tensor) -> Tensor:
+        reward: Tensor = data["next", "reward"][rows]
+        return reward_scale * reward + reward_shift
+
+    last = torch.arange(len(data)) if rows is None else rows
     whole = is_followed(data) if rows is None else None
-    steps = torch.ones_like(last)
-    reward = data["next", "reward"][last] * reward_scale + reward_shift
+    steps, reward = torch.ones_like(last), reward_of(last)
     for step in range(1, n_steps):
         goes_on = is_followed(data, last) if whole is None else whole[last]
         last = last + goes_on
-        following = data["next", "reward"][last] * reward_scale + reward_shift
-        reward += goes_on.unsqueeze(-1) * gamma**step * following
+        reward += goes_on.unsqueeze(-1) * gamma**step * reward_of(last)
         steps += goes_on
     found: TensorDict = data["next"].exclude("action")[last].set("reward", reward)
     if with_next_action:
