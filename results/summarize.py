@@ -1,6 +1,6 @@
 """Print the scores of an experiment's runs, one by one and over seeds.
 
-    python results/summarize.py results/first_run/runs.jsonl.gz
+    python results/summarize.py results/precision/runs.jsonl.gz
 
 An interval of a run is over its episodes (of successes: Wilson's), one of a method over
 its seeds.
