@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+
 import pytest
 import torch
 from torchrl.objectives import SoftUpdate
@@ -100,6 +102,7 @@ def test_a_recording_has_the_bits_of_what_was_recorded(name, make_batch):
     loss = make(name)
     eager, recorded = LossGradients(loss), LossGradients(loss, record=True, warm_up=0)
     recorded(make_batch(6, twin=True))
+    gc.collect()  # the recording owns what it needs
     loss.zero_grad()
     assert isinstance(recorded._recording.run, torch.jit.ScriptModule)
     calls = []

@@ -15,6 +15,7 @@ import logging
 import operator
 import warnings
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
 import torch
@@ -263,6 +264,12 @@ def of_input(
 PyTorch's operation takes, nor the gaps in what it gives back."""
 
 
+@cache
+def _layer_norm_gradients() -> torch.jit.CompilationUnit:
+    # Never freed: a trace points at the functions that it calls and does not own them.
+    return torch.jit.CompilationUnit(_LAYER_NORM_GRADIENTS)
+
+
 def _without_python(graph: GraphModule, tensors: list[Tensor]) -> Run:
     """The graph as TorchScript, or as it is where that cannot be had.
 
@@ -270,7 +277,7 @@ def _without_python(graph: GraphModule, tensors: list[Tensor]) -> Run:
     from C++ without a compiler.
     """
     try:
-        gradients = torch.jit.CompilationUnit(_LAYER_NORM_GRADIENTS)
+        gradients = _layer_norm_gradients()
 
         def of_all(*arguments: Any) -> Any:
             return gradients.of_all(*arguments)
