@@ -9,8 +9,6 @@ after eight changes that the search has not seen: it tried many ways on its own 
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from clones import SYSTEMS
 from search import CHANGES
@@ -18,11 +16,10 @@ from states import generator, normal
 from world import SPEED_STEPS, Rows, World
 
 from torchrl_osr.evaluation.recoverable import (
+    STATES,
     RecoverableStates,
-    load_recoverable_states,
+    read_recoverable_states,
 )
-
-STATES = Path(__file__).parent / "states"
 
 
 def put(world: World, row: np.ndarray) -> np.ndarray:
@@ -109,7 +106,7 @@ def main() -> None:
         normal(world)
         compare(world)
         for path in sorted(STATES.glob(f"{system}-*.npz")):
-            states = load_recoverable_states(path)
+            states = read_recoverable_states(path)
             numbers = np.flatnonzero(states.group == "recoverable")
             if not len(numbers):
                 continue

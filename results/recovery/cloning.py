@@ -19,7 +19,6 @@ import time
 from collections.abc import Callable
 from functools import cached_property
 from itertools import pairwise
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -35,12 +34,12 @@ from torchrl_osr.data.collect.environment import environment_id
 from torchrl_osr.data.collect.mazes import waypoint_sampler
 from torchrl_osr.evaluation import EpisodeEvaluator
 from torchrl_osr.evaluation.recoverable import (
+    STATES,
     RecoverableStates,
-    load_recoverable_states,
+    read_recoverable_states,
 )
 
 WIDTH, BATCH, RATE = 256, 256, 1e-3
-STATES = Path(__file__).parent / "states"
 TABLE = 50_000
 """Displaced states, at least one for each row."""
 
@@ -270,7 +269,7 @@ class Demonstrations:
     def witnesses(self) -> Displaced:
         """What the planner did from the recoverable states of the public half."""
         path = STATES / f"{self.world.system}-public.npz"
-        states, std = load_recoverable_states(path), normal(self.world)["std"]
+        states, std = read_recoverable_states(path), normal(self.world)["std"]
         chosen = np.flatnonzero(states.group == "recoverable")
         chosen, rng = chosen.repeat(CHANGES), generator(self.world.system, 5)
         rows, expert = rows_of(states, chosen), self.world.policy("expert")
@@ -353,7 +352,7 @@ def main() -> None:
     world = World(given.system)
     normal(world)
     path = STATES / f"{given.system}-{given.half}.npz"
-    states, digest = load_recoverable_states(path), sha256_of(path)
+    states, digest = read_recoverable_states(path), sha256_of(path)
     rows = rows_of(states, slice(None))
     log = PARTS / given.system / f"cloning-{given.half}.jsonl"
     names = ("arm", "width", "steps", "episodes", "seed", "updates", "states")

@@ -14,7 +14,6 @@ import argparse
 import json
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,8 +32,9 @@ from torchrl_osr.data.collect.environment import environment_id
 from torchrl_osr.data.store.cache import cache_root
 from torchrl_osr.evaluation import DataDistance, describe_dynamics, dynamics_report
 from torchrl_osr.evaluation.recoverable import (
+    STATES,
     RecoverableStates,
-    load_recoverable_states,
+    read_recoverable_states,
 )
 from torchrl_osr.imagination import LookAheadPolicy, termination
 from torchrl_osr.modules import DynamicsEnsemble
@@ -336,9 +336,8 @@ def main() -> None:
     parser.add_argument("--groups", nargs="+", default=["recoverable"])
     given = parser.parse_args()
     torch.set_num_threads(1)
-    folder = Path(__file__).parent / "states"
-    path = folder / f"{given.system}-{given.half}.npz"
-    states, digest = load_recoverable_states(path), sha256_of(path)
+    path = STATES / f"{given.system}-{given.half}.npz"
+    states, digest = read_recoverable_states(path), sha256_of(path)
     world = World(given.system)
     normal(world)
     log = PARTS / given.system / f"look-ahead-{given.half}.jsonl"

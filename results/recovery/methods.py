@@ -14,14 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 from search import read_jsonl
 from states import PARTS
-from tables import HALVES, table
+from tables import table
 
 from torchrl_osr._files import sha256_of, write_atomically
 from torchrl_osr.evaluation import percentile_interval
 from torchrl_osr.evaluation.recoverable import (
     GROUPS,
+    HALVES,
+    STATES,
     RecoverableStates,
-    load_recoverable_states,
+    read_recoverable_states,
 )
 
 FOLDER = Path(__file__).parent
@@ -126,8 +128,8 @@ def rows_of(lines: list[dict], states: RecoverableStates, reference: str) -> lis
 def main() -> None:
     """Write everything."""
     pages = [TITLE]
-    for path in sorted((FOLDER / "states").glob("*.npz")):
-        states, digest = load_recoverable_states(path), sha256_of(path)
+    for path in sorted(STATES.glob("*.npz")):
+        states, digest = read_recoverable_states(path), sha256_of(path)
         half = next(each for each in HALVES if path.stem.endswith(each))
         for study, reference in STUDIES.items():
             lines = read_jsonl(PARTS / states.env_name / f"{study}-{half}.jsonl")

@@ -10,8 +10,6 @@ data's steps, root of the mean square over entries.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import torch
 from cloning import rows_of
@@ -19,7 +17,11 @@ from look_ahead import LookAheadPolicy, policy_of, survival
 from states import normal
 from world import World
 
-from torchrl_osr.evaluation.recoverable import GROUPS, load_recoverable_states
+from torchrl_osr.evaluation.recoverable import (
+    GROUPS,
+    STATES,
+    read_recoverable_states,
+)
 
 STEPS = 100
 
@@ -29,8 +31,8 @@ def main() -> None:
     torch.set_num_threads(1)
     world = World("walker2d")
     normal(world)
-    path = Path(__file__).parent / "states" / "walker2d-public.npz"
-    states = load_recoverable_states(path)
+    path = STATES / "walker2d-public.npz"
+    states = read_recoverable_states(path)
     rows = rows_of(states, slice(None))
     observation = torch.from_numpy(world.observe(rows)).float()
     policy, _ = policy_of("look-ahead", "80", 0, world)

@@ -2,8 +2,8 @@
 
     python results/recovery/tables.py
 
-Writes ``states/<system>-<half>.npz``, their SHA-256 in ``states/checksums.json``, and
-``tables.md``.
+Writes ``torchrl_osr/evaluation/states/<system>-<half>.npz``, their SHA-256 beside them,
+and ``tables.md``.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from torchrl_osr._files import (
 )
 from torchrl_osr.data import collect_quality
 from torchrl_osr.evaluation import DataDistance
+from torchrl_osr.evaluation.recoverable import HALVES, STATES
 
 FOLDER = Path(__file__).parent
-HALVES = ("public", "held-out")
 GROUPS = ("easy", "contested", "recoverable", "not saved")
 CONTROLS = 100
 """Easy and contested states of each half that are kept."""
@@ -178,7 +178,7 @@ def pack(world: World, found: dict[str, np.ndarray]) -> list[dict]:
             "steps": np.array(world.steps),
             "least_speed": np.array(world.least_speed or -np.inf),
         }
-        path = FOLDER / "states" / f"{world.system}-{half}.npz"
+        path = STATES / f"{world.system}-{half}.npz"
         path.parent.mkdir(exist_ok=True)
         with whole_file(path) as file:
             np.savez_compressed(file, **arrays)
@@ -219,9 +219,9 @@ def main() -> None:
             table(curve(world) or [{"rollouts": 0}]),
             table(by_disturbance(world, found)),
         ]
-    files = sorted((FOLDER / "states").glob("*.npz"))
+    files = sorted(STATES.glob("*.npz"))
     sums = {path.name: sha256_of(path) for path in files}
-    write_json(FOLDER / "states" / "checksums.json", sums)
+    write_json(STATES / "checksums.json", sums)
     write_atomically(FOLDER / "tables.md", "\n\n".join(pages) + "\n")
 
 

@@ -54,7 +54,14 @@ METHODS = {
     "scas": ["loss=scas"],
     "sdc": ["loss=sdc"],
 }
-SUITES = ("oos", "push", "observation_noise")
+SUITES = {
+    "oos": "robustness-oos.json",
+    "push": "robustness-push.json",
+    "observation_noise": "robustness-observation_noise.json",
+    "recoverable": "recoverable-public.json",
+}
+"""And the file that each leaves."""
+
 ENVS = ("hopper", "walker2d", "halfcheetah")
 DATA = [f"{env}-{data}" for data in ("medium-replay", "medium-expert") for env in ENVS]
 
@@ -121,8 +128,8 @@ def run(folder: Path, data: str, method: str, seed: int) -> None:
             "trainer.progress=false",
             f"hydra.run.dir={folder}", *arguments, log=folder / "train.txt",
         )  # fmt: skip
-    for suite in SUITES:
-        if not (folder / f"robustness-{suite}.json").exists():
+    for suite, file in SUITES.items():
+        if not (folder / file).exists():
             torchrl_osr(
                 "evaluate", f"checkpoint={folder}", f"suite={suite}", "episodes=4",
                 "last=1", "progress=false", log=folder / f"{suite}.txt",
@@ -139,7 +146,7 @@ def pack(folder: Path) -> None:
     """Add the finished runs below a folder to the table."""
     with tempfile.TemporaryDirectory() as here:
         new = Path(here) / "new.jsonl.gz"
-        last = f"robustness-{SUITES[-1]}.json"
+        *_, last = SUITES.values()
         finished = [path.parent for path in folder.glob(f"*/*/*/{last}")]
         number = pack_runs(finished, new)
         records = {each["folder"]: each for each in packed()}

@@ -12,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from torchrl_osr.report import RunTables, read_runs
+from torchrl_osr.report.saved import saved_states
 from torchrl_osr.report.scores import by_run, estimate, recent
 
 HERE = Path(__file__).parent
@@ -57,6 +58,11 @@ def scores(tables: RunTables) -> pd.DataFrame:
 def table(tables: RunTables, data: str) -> str:
     """Markdown: the methods on one data set, best undisturbed score first."""
     rows = []
+    saved = {
+        each.method: str(each.shares["recoverable"])
+        for each in saved_states(tables, tables.methods[0])
+        if each.data == data
+    }
     for method in tables.methods:
         mine = tables.episodes.query("data == @data and method == @method")
         if mine.empty:
@@ -65,12 +71,14 @@ def table(tables: RunTables, data: str) -> str:
         for suite in SUITES:
             under = mine[(mine["suite"] == suite) & (mine["disturbance"] != "")]
             cells.append(str(estimate(by_run(under))))
+        cells.append(saved.get(method, ""))
         steps = tables.runs.query("data == @data and method == @method")["steps"].max()
         quoted = str(PUBLISHED.loc[data].get(method, ""))
         seeds = mine["seed"].nunique()
         mean = recent(mine)["score"].mean()
         rows.append((mean, [f"`{method}`", str(seeds), f"{steps:,}", *cells, quoted]))
-    head = ["method", "seeds", "updates", "undisturbed", *SUITES.values(), "published"]
+    suites = *SUITES.values(), "recoverable %"
+    head = ["method", "seeds", "updates", "undisturbed", *suites, "published"]
     lines = [head, ["---"] * len(head), *(cells for _, cells in sorted(rows)[::-1])]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 

@@ -19,14 +19,17 @@ from torchrl.modules import ProbabilisticActor, TanhDelta
 
 from torchrl_osr.commands import evaluate as example
 from torchrl_osr.data import make_environment
-from torchrl_osr.evaluation import check_disturbances
+from torchrl_osr.evaluation import check_disturbances, deterministic_policy
+from torchrl_osr.evaluation.recoverable import load_recoverable_states, recovers
+from torchrl_osr.experiment.recoverable import states_for
 from torchrl_osr.experiment.suite import make_disturbances
-from torchrl_osr.experiment.trained_run import load_trained
+from torchrl_osr.experiment.trained_run import checkpoints_of, load_trained
 from torchrl_osr.report import read_runs
 
 ROOT = Path(__file__).parents[2]
 CONF = ROOT / "conf/evaluation"
 SUITES = sorted(path.stem for path in (CONF / "suite").glob("*.yaml"))
+DISTURBING = sorted(set(SUITES) - {"recoverable"})
 
 
 @pytest.fixture(scope="module")
@@ -151,7 +154,7 @@ def test_every_suite_is_possible_for_another_environment(folder):
     environment = make_environment(env_id)
     scale = np.full(environment.observation_space.shape, 0.5)
     environment.close()
-    for name in SUITES:
+    for name in DISTURBING:
         suite = quiet(f"suite={name}", "checkpoint=none").suite
         assert suite.name == name
         made = make_disturbances(suite.disturbances, trained, scale)
@@ -233,6 +236,38 @@ def test_sweep_evaluates_every_finished_run(tmp_path, folder, run):
     assert re.search(r"of 2: sweep/1_damaged: failed: checkpoint .* is damaged", output)
     assert re.search(r"(?m)^  sweep/0_good +-?\d+\.\d +-?\d+\.\d$", output)
     assert (tmp_path / "sweep" / "0_good" / "robustness-start.json").exists()
+
+
+def test_recoverable_states_are_played_from(folder, capsys):
+    same = ["suite=recoverable", "last=2"]
+    example.main(quiet(f"checkpoint={folder}", *same))
+    results = json.loads((folder / "recoverable-public.json").read_text())
+    states = load_recoverable_states("hopper", "public")
+    assert [each["step"] for each in results["evaluations"]] == [20, 30]
+    trained = load_trained(checkpoints_of(folder)[-1])
+    policy = deterministic_policy(trained.actor, trained.observation_norm)
+    back = recovers(states, policy)
+    assert results["evaluations"][-1]["back"] == back.astype(int).tolist()
+    easy = states.group == "easy"
+    mean = np.mean([each["back"] for each in results["evaluations"]], axis=0)
+    line = rf"(?m)^  easy +{easy.sum()} +{100 * mean[easy].mean():.0f} +\["
+    assert re.search(line, capsys.readouterr().out)
+    example.main(quiet(f"sweep={folder}", *same))
+    rows = rf"{folder} +(\d+ *){{3}}\n"
+    assert re.search(rows, capsys.readouterr().out)
+    assert read_runs([folder]).saved["back"].tolist() == mean.tolist()
+    # Fallen at once, as anything is that has learned nothing.
+    assert not back[states.group == "recoverable"].any()
+
+
+def test_a_task_without_recoverable_states_is_named(folder):
+    config = OmegaConf.load(folder / "config.yaml")
+    config.env.id = "Hopper-v4"
+    with pytest.raises(ValueError, match=r"of Hopper-v5, and the run is of Hopper-v4"):
+        states_for(config, "public")
+    config.env.name = "cart"
+    with pytest.raises(ValueError, match=r"'cart'; there are of: halfcheetah, hopper"):
+        states_for(config, "public")
 
 
 def test_every_key_and_suite_is_documented():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -9,13 +10,19 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchrl_osr._files import sha256_of
 from torchrl_osr.data import load_behavior_policy, make_environment
 from torchrl_osr.data.collect.environment import environment_id
 from torchrl_osr.evaluation.recoverable import (
+    GROUPS,
+    HALVES,
+    STATES,
     RecoverableStates,
     load_recoverable_states,
+    read_recoverable_states,
     recovered_share,
     recovers,
+    saved_share,
 )
 
 
@@ -47,7 +54,7 @@ def load(tmp_path: Path):
 
     def load(arrays: dict[str, np.ndarray]) -> RecoverableStates:
         np.savez(tmp_path / "states.npz", **arrays)
-        return load_recoverable_states(tmp_path / "states.npz")
+        return read_recoverable_states(tmp_path / "states.npz")
 
     return load
 
@@ -126,14 +133,35 @@ def test_in_a_maze_the_goal_of_each_state_counts(load) -> None:
     np.testing.assert_allclose(seen[0][:, 4:6], np.stack([here] * 3), atol=1e-6)
 
 
+@pytest.mark.parametrize("half", HALVES)
+def test_the_states_that_ship_are_whole(half) -> None:
+    sums = json.loads((STATES / "checksums.json").read_text())
+    names = [path.name for path in STATES.glob(f"*-{half}.npz")]
+    assert len(names) == 4
+    for name in names:
+        assert sha256_of(STATES / name) == sums[name]
+        states = load_recoverable_states(name.removesuffix(f"-{half}.npz"), half)
+        assert {*states.group} <= {*GROUPS}
+        hard = states.group == "recoverable"
+        assert hard.any()
+        assert not states.offsets[~hard].any()
+
+
+def test_states_that_do_not_ship_are_named() -> None:
+    with pytest.raises(ValueError, match=r"'ant'; there are of: halfcheetah, hopper,"):
+        load_recoverable_states("ant")
+    with pytest.raises(ValueError, match="half must be one of"):
+        load_recoverable_states("hopper", "all")
+
+
 def test_a_file_of_something_else_is_refused_by_name(tmp_path: Path) -> None:
     path = tmp_path / "rows.npz"
     np.savez(path, qpos=np.zeros((2, 9)), extra=np.zeros(1))
     with pytest.raises(ValueError, match=r"rows\.npz holds no recoverable.*extra"):
-        load_recoverable_states(path)
+        read_recoverable_states(path)
     path.write_bytes(b"PK broken")
     with pytest.raises(ValueError, match="damaged"):
-        load_recoverable_states(path)
+        read_recoverable_states(path)
 
 
 def test_no_states_are_no_answers(load) -> None:
@@ -158,6 +186,17 @@ def test_the_recovered_share_of_known_tables() -> None:
     two = [0, 0, 0, 0, 1, 1, 1, 1]
     single = recovered_share(method[:1], np.zeros((1, 8)), oracle, two)
     assert single == pytest.approx((1 / 4, 0, 1 / 2))
+
+
+def test_the_saved_share_of_known_tables() -> None:
+    back, walk = [[1, 1, 0, 0], [1, 0, 0, 0]], [0, 0, 1, 1]
+    # All walks alike: with one of them the seeds alone vary, from 1 / 4 to 2 / 4.
+    assert saved_share(back, [7] * 4) == pytest.approx((3 / 8, 1 / 4, 1 / 2))
+    # With one seed the walks alone vary, from none of a walk to all.
+    assert saved_share(back[:1], walk) == pytest.approx((1 / 2, 0, 1))
+    assert saved_share(np.ones((3, 4)), walk) == (1, 1, 1)
+    # A walk with more states counts for more.
+    assert saved_share([[1, 1, 1, 0]], [0, 0, 0, 1])[0] == 3 / 4
 
 
 def test_the_interval_of_the_recovered_share_covers_the_truth() -> None:

@@ -2,13 +2,16 @@
 
     torchrl-osr evaluate checkpoint=outputs/hopper-medium-replay/osr-seed0-...
     torchrl-osr evaluate checkpoint=<run's folder> suite=torque episodes=20
+    torchrl-osr evaluate checkpoint=<run's folder> suite=recoverable
     torchrl-osr evaluate checkpoint=<run's folder>/checkpoint/policy/best.torchrl
     torchrl-osr evaluate sweep=multirun/20260101-120000 jobs=4
 
 Each of the run's last checkpoints plays pairs of episodes, one of each pair disturbed.
 The run's folder gets ``robustness-<suite>.json`` with all raw results, and a figure of
-the same name. A killed evaluation continues after its last finished checkpoint.
-``sweep=`` does this for every run below a folder. See ``docs/robustness.md``.
+the same name. A killed evaluation continues after its last finished checkpoint. With
+``suite=recoverable`` they play from states that others fail from, and the folder gets
+``recoverable-<half>.json``. ``sweep=`` does this for every run below a folder. See
+``docs/robustness.md``.
 """
 
 from __future__ import annotations
@@ -17,7 +20,6 @@ import functools
 import json
 import multiprocessing
 import signal
-from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from itertools import count
 from pathlib import Path
@@ -52,10 +54,12 @@ from torchrl_osr.evaluation import (
     robustness_table,
     summarize_disturbances,
 )
+from torchrl_osr.evaluation.recoverable import GROUPS
 from torchrl_osr.evaluation.robustness import aligned_columns
 from torchrl_osr.experiment import run_folder
 from torchrl_osr.experiment.build import load_data, references_of
 from torchrl_osr.experiment.limits import check_values
+from torchrl_osr.experiment.recoverable import play_states, recoverable_table, shares
 from torchrl_osr.experiment.run_config import flatten
 from torchrl_osr.experiment.suite import (
     impossible_attacks,
@@ -96,8 +100,10 @@ def main(cfg: DictConfig) -> None:
         evaluate_sweep(cfg)
         return
     path, results = evaluate_run(cfg)
-    print("\n" + robustness_table(title(results), results["summary"]))
-    print(f"  files  {path}\n         {path.with_suffix('.png')}")
+    print("\n" + table(cfg, results))
+    print(f"  files  {path}")
+    if cfg.suite.half is None:
+        print(f"         {path.with_suffix('.png')}")
 
 
 def evaluate_run(cfg: DictConfig) -> tuple[Path, dict[str, Any]]:
@@ -105,7 +111,9 @@ def evaluate_run(cfg: DictConfig) -> tuple[Path, dict[str, Any]]:
     torchrl_logger.setLevel("WARNING")
     torch.set_num_threads(cfg.num_threads)
     folder = run_folder_of(cfg.checkpoint)
-    files, name = [Path(cfg.checkpoint)], f"robustness-{cfg.suite.name}"
+    half = cfg.suite.half
+    name = f"robustness-{cfg.suite.name}" if half is None else f"recoverable-{half}"
+    files = [Path(cfg.checkpoint)]
     if files[0].is_dir():
         files = checkpoints_of(folder)[-cfg.last :]
     else:
@@ -116,11 +124,14 @@ def evaluate_run(cfg: DictConfig) -> tuple[Path, dict[str, Any]]:
     # Hidden: a part is no result.
     partial = path.with_name(f".{name}.partial.json")
     if cfg.force or results is None:
-        results = request | evaluate(cfg, files, partial, request)
+        play = evaluate if half is None else evaluate_states
+        results = request | play(cfg, files, partial, request)
         write_json(path, results)
     else:
         print(f"{path} is there already; force=true repeats it.")
     partial.unlink(missing_ok=True)
+    if half is not None:
+        return path, results
     for name, reason in results.get("left_out", {}).items():
         print(f"left out: {name}: {reason}")
     robustness_figure(
@@ -138,6 +149,13 @@ def title(results: dict[str, Any]) -> str:
         f"{results['env']} {results['data']}, suite {results['suite']}: "
         f"{len(results['evaluations'])} x {results['episodes']} pairs of episodes"
     )
+
+
+def table(cfg: DictConfig, results: dict[str, Any]) -> str:
+    """Text table of the results."""
+    if cfg.suite.half is None:
+        return robustness_table(title(results), results["summary"])
+    return recoverable_table(results)
 
 
 def evaluate_sweep(cfg: DictConfig) -> None:
@@ -160,7 +178,7 @@ def evaluate_sweep(cfg: DictConfig) -> None:
             print(f"left out: {folder}: not finished, its status is {status}")
     if not runs:
         raise ValueError(f"there is no finished run in or below {top}.")
-    rows: dict[Path, Sequence[str]] = {}
+    rows: dict[Path, dict[str, str]] = {}
     failed = []
     # Spawned, for torch's threads do not survive a fork. Ctrl-C ends them in silence.
     workers = ProcessPoolExecutor(
@@ -178,30 +196,37 @@ def evaluate_sweep(cfg: DictConfig) -> None:
                 failed.append(folder)
                 outcome = f"failed: {sentence(error)}"
             else:
-                outcome = "undisturbed {}, disturbed {}".format(*rows[folder])
+                outcome = ", ".join(map(" ".join, rows[folder].items()))
             print(f"{number} of {len(runs)}: {folder}: {outcome}", flush=True)
     finally:
         workers.shutdown(cancel_futures=True)
-    header = ("run", "undisturbed", "disturbed")
-    done = [(str(run), *rows[run]) for run in runs if run in rows]
-    print(f"\nsuite {cfg.suite.name}: score, or return, mean over its disturbances")
-    print("\n".join(aligned_columns([header, *done])))
+    done = [(str(run), *rows[run].values()) for run in runs if run in rows]
+    if done:
+        header = ("run", *next(iter(rows.values())))
+        what = "score, or return, mean over its disturbances"
+        if cfg.suite.half is not None:
+            what = f"percent of the {cfg.suite.half} states that it comes back from"
+        print(f"\nsuite {cfg.suite.name}: {what}")
+        print("\n".join(aligned_columns([header, *done])))
     if failed:
         names = ", ".join(map(str, failed))
         raise ValueError(f"{len(failed)} of {len(runs)} runs failed: {names}.")
     print(f"  next   torchrl-osr report {top}")
 
 
-def evaluate_one_of_many(cfg: DictConfig, folder: Path) -> Sequence[str]:
-    """Evaluate one run of a sweep: its mean score or return, and the disturbed one."""
+def evaluate_one_of_many(cfg: DictConfig, folder: Path) -> dict[str, str]:
+    """Evaluate one run of a sweep: its row of the table."""
     one = cfg.copy()
     one.checkpoint, one.progress = str(folder), False
     _, results = evaluate_run(one)
+    if cfg.suite.half is not None:
+        found = shares(results)
+        return {name: f"{100 * found[name][1]:.0f}" for name in GROUPS if name in found}
     rows = results["summary"]
     measure = measure_of(rows[0])
-    keys = f"clean_{measure}", measure
-    means = [sum(row[key] for row in rows) / len(rows) for key in keys]
-    return [f"{mean:.1f}" for mean in means]
+    keys = {"undisturbed": f"clean_{measure}", "disturbed": measure}
+    means = {name: sum(row[key] for row in rows) for name, key in keys.items()}
+    return {name: f"{total / len(rows):.1f}" for name, total in means.items()}
 
 
 def requested(cfg: DictConfig, files: list[Path]) -> dict[str, Any]:
@@ -282,6 +307,22 @@ def evaluate(
         "evaluations": evaluations,
         "summary": summarize_disturbances(evaluations),
     }
+
+
+def evaluate_states(
+    cfg: DictConfig, files: list[Path], partial: Path, request: dict[str, Any]
+) -> dict[str, Any]:
+    """Play all checkpoints of one run from the recoverable states; takes seconds."""
+    del partial, request
+    progress = Progress(cfg.suite.name, len(files), bar=cfg.progress, unit="play")
+    played = count(1)
+    with progress.shown(0):
+        return play_states(
+            files,
+            cfg.suite.half,
+            trust=cfg.trust,
+            advance=lambda: progress.update(next(played)),
+        )
 
 
 def impossible(

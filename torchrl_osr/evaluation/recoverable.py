@@ -8,7 +8,7 @@ Shapes: ``M`` states, ``Q`` positions, ``V`` velocities, ``K`` offsets, ``A`` ac
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ import numpy as np
 from gymnasium.wrappers import TimeLimit
 from numpy.typing import ArrayLike, NDArray
 
+from torchrl_osr._checks import check_choice
 from torchrl_osr._files import read_arrays
 from torchrl_osr.data.collect.environment import MAZE_IDS, environment_id
 from torchrl_osr.evaluation.episodes import EpisodeEvaluator, Policy
@@ -32,6 +33,12 @@ SPEED_STEPS = 50
 NUM_SHARE_RESAMPLES = 10_000
 
 AT_ONCE = 16
+
+STATES = Path(__file__).parent / "states"
+"""Those that ship: a file for each task and half."""
+
+HALVES = ("public", "held-out")
+"""To choose by; and for one look at what is finished."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,11 +85,40 @@ class RecoverableStates:
         return len(self.qpos)
 
 
-def load_recoverable_states(path: Path | str) -> RecoverableStates:
-    """Read the states of one task and half.
+def load_recoverable_states(env_name: str, half: str = "public") -> RecoverableStates:
+    """Load the states of one task that ship with the package.
 
     Args:
-        path: such as ``results/recovery/states/walker2d-public.npz`` of a checkout.
+        env_name: ``"hopper"``, ``"walker2d"``, ``"halfcheetah"`` or
+            ``"pointmaze-medium"``.
+        half: ``"public"``, to choose by, or ``"held-out"``, for one look at what is
+            finished. Default ``"public"``.
+
+    Raises:
+        ValueError: there are none.
+
+    Examples:
+        >>> from torchrl_osr.evaluation.recoverable import load_recoverable_states
+        >>> states = load_recoverable_states("walker2d")
+        >>> states.qpos.shape[1], sorted(set(states.group))
+        (9, ['contested', 'easy', 'recoverable'])
+    """
+    check_choice("half", half, HALVES)
+    path = STATES / f"{env_name}-{half}.npz"
+    if not path.exists():
+        there = sorted(each.stem for each in STATES.glob(f"*-{half}.npz"))
+        names = ", ".join(each.removesuffix(f"-{half}") for each in there)
+        raise ValueError(
+            f"there are no recoverable states of {env_name!r}; there are of: {names}."
+        )
+    return read_recoverable_states(path)
+
+
+def read_recoverable_states(path: Path | str) -> RecoverableStates:
+    """Read the states of one task and half from a file.
+
+    Args:
+        path: an ``.npz`` with the arrays of :class:`RecoverableStates`.
 
     Raises:
         OSError: it cannot be read.
@@ -94,7 +130,7 @@ def load_recoverable_states(path: Path | str) -> RecoverableStates:
         wrong = ", ".join(sorted(set(arrays) ^ names))
         raise ValueError(
             f"{path} holds no recoverable states: missing or unknown are the arrays "
-            f"{wrong}; expected a file of results/recovery/states."
+            f"{wrong}."
         )
     kinds = {"env_name": str, "hold": int, "steps": int, "least_speed": float}
     arrays |= {name: kind(arrays[name]) for name, kind in kinds.items()}
@@ -116,12 +152,10 @@ def recovers(states: RecoverableStates, policy: Policy) -> NDArray[np.bool_]:
         >>> import torch
         >>> from torchrl_osr.evaluation.recoverable import (
         ...     load_recoverable_states, recovers)
-        >>> path = "results/recovery/states/walker2d-public.npz"
-        >>> states = load_recoverable_states(path)  # doctest: +SKIP
-        >>> back = recovers(  # doctest: +SKIP
-        ...     states, lambda observation: torch.zeros(len(observation), 6))
-        >>> back[states.group == "recoverable"].mean()  # doctest: +SKIP
-        np.float64(0.0)
+        >>> states = load_recoverable_states("walker2d")
+        >>> back = recovers(states, lambda state: torch.zeros(len(state), 6))
+        >>> bool(back.any())
+        False
     """
     back = np.zeros(len(states), dtype=np.bool_)
     if not len(states):
@@ -202,12 +236,10 @@ def recovered_share(
         )
     member = np.eye(len(walks))[number]
     method_sum, baseline_sum, oracle_sum = (table @ member for table in each)
-    rng = np.random.default_rng(0)
-    seeds, count = shape[0], len(walks)
 
     def shares(seed_weight: Any, walk_weight: Any) -> NDArray[np.float64]:
         ours, theirs = (
-            ((seed_weight @ table) * walk_weight).sum(-1) / seeds
+            ((seed_weight @ table) * walk_weight).sum(-1) / len(baseline_sum)
             for table in (method_sum, baseline_sum)
         )
         left: NDArray[np.float64] = walk_weight @ oracle_sum - theirs
@@ -219,11 +251,48 @@ def recovered_share(
         share: NDArray[np.float64] = (ours - theirs) / left
         return share
 
-    value = shares(np.ones((1, seeds)), np.ones((1, count)))
+    return _with_interval(shares, len(baseline_sum), len(walks))
+
+
+def saved_share(back: ArrayLike, walk: ArrayLike) -> tuple[float, float, float]:
+    """Share of the states that a method saves.
+
+    Its 95 % percentile-bootstrap interval resamples seeds, and walks with all of their
+    states.
+
+    Args:
+        back: whether it came back, for each seed and state, ``[N, M]``; or how often.
+        walk: of each state, ``[M]``.
+
+    Returns:
+        The share, lower and upper end.
+
+    Examples:
+        >>> saved_share([[1, 0, 1, 0]], walk=[0, 0, 1, 1])
+        (0.5, 0.5, 0.5)
+    """
+    walks, number = np.unique(np.asarray(walk), return_inverse=True)
+    member = np.eye(len(walks))[number]
+    table, sizes = np.asarray(back, dtype=np.float64) @ member, member.sum(0)
+
+    def shares(seed_weight: Any, walk_weight: Any) -> NDArray[np.float64]:
+        saved = ((seed_weight @ table) * walk_weight).sum(-1) / len(table)
+        share: NDArray[np.float64] = saved / (walk_weight @ sizes)
+        return share
+
+    return _with_interval(shares, len(table), len(walks))
+
+
+def _with_interval(
+    shares: Callable[[Any, Any], NDArray[np.float64]], seeds: int, walks: int
+) -> tuple[float, float, float]:
+    """A share that depends on how often each seed and walk counts, ``[R, seeds]``."""
+    value = shares(np.ones((1, seeds)), np.ones((1, walks)))
+    rng = np.random.default_rng(0)
     weights = (
         # In floating point: products of integers are not NumPy's strength.
         rng.multinomial(size, np.full(size, 1 / size), NUM_SHARE_RESAMPLES) * 1.0
-        for size in (seeds, count)
+        for size in (seeds, walks)
     )
     low, high = percentile_interval(shares(*weights))
     return float(value[0]), float(low), float(high)

@@ -101,6 +101,7 @@ CHOICES: dict[str, tuple[str | None, ...]] = {
     "trainer.matmul_precision": ("highest", "high", "medium"),
     "logger.kind": ("csv", "tensorboard", "wandb"),
     "logger.mode": ("offline", "online", "disabled"),
+    "suite.half": (None, "public", "held-out"),
 }
 """Words that a key may have as its value."""
 

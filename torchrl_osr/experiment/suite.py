@@ -48,15 +48,17 @@ class DisturbanceConfig:
 
 @dataclass
 class SuiteConfig:
-    """A list of disturbances.
+    """A list of disturbances, or states that others fail from.
 
     Attributes:
         name: part of the names of the result files.
         disturbances: by name.
+        half: of the recoverable states, in place of disturbances.
     """
 
     name: str = MISSING
     disturbances: dict[str, DisturbanceConfig] = MISSING
+    half: str | None = None
 
 
 @dataclass

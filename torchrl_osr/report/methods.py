@@ -69,6 +69,10 @@ class RunTables:
             disturbed or did not recover.
         distances: a row for each ``offset`` from such a disturbance, with the ``mean``
             distance to the data of the ``count`` episodes that still last.
+        saved: a row for each run and recoverable state, in the order of the states:
+            ``run``, ``data``, ``method``, ``seed``; ``states``, the half and a mark
+            that other states do not have; ``group``, ``walk``; and ``back``, the share
+            of the checkpoints that came back from it.
         left_out: what could not be used.
     """
 
@@ -76,6 +80,7 @@ class RunTables:
     settings: pd.DataFrame
     episodes: pd.DataFrame
     distances: pd.DataFrame
+    saved: pd.DataFrame
     left_out: Sequence[LeftOut]
 
     @property
@@ -161,15 +166,19 @@ def read_runs(paths: Sequence[Path]) -> RunTables:
     def joined(parts: Sequence[pd.DataFrame]) -> pd.DataFrame:
         rows = pd.concat(dict(enumerate(parts)), names=["run", None]).reset_index("run")
         rows = rows.join(runs[["data", "method", "seed"]], on="run", how="inner")
+        return rows.reset_index(drop=True)
+
+    def named(rows: pd.DataFrame) -> pd.DataFrame:
         rows = rows.join(suites, on=["run", "suite"])
         rows["suite"] = rows.pop("named").fillna("")
-        return rows.reset_index(drop=True)
+        return rows
 
     return RunTables(
         runs,
         settings.loc[runs.index],
-        joined([run.episodes for run in found]),
-        joined([run.distances for run in found]),
+        named(joined([run.episodes for run in found])),
+        named(joined([run.distances for run in found])),
+        joined([run.saved for run in found]),
         left_out,
     )
 

@@ -25,6 +25,7 @@ from torchrl_osr.report.comparisons import (
 )
 from torchrl_osr.report.methods import RunTables, comparison_notes
 from torchrl_osr.report.plots import Panel, draw_differences, draw_panels, png
+from torchrl_osr.report.saved import saved_states
 from torchrl_osr.report.scores import (
     Estimate,
     WayBack,
@@ -118,6 +119,7 @@ def write_report(
         "scores": _score_table(tables),
         "means": _mean_table(tables),
         "suites": suites,
+        "saved": _saved_table(tables, reference),
         "every_run": runs.assign(versions=runs["versions"].map(", ".join)).astype(str),
     }
     environment = Environment(
@@ -305,6 +307,18 @@ def _way_row(each: WayBack) -> dict[str, Any]:
         "median steps": f"{each.median:g}" if each.median < np.inf else "most never",
         "score lost": _cell(each.decrease, " %"),
     }
+
+
+def _saved_table(tables: RunTables, reference: str) -> pd.DataFrame | None:
+    """What each method saves of the recoverable states; nothing if none was played."""
+    rows = {}
+    for each in saved_states(tables, reference):
+        cells = {name: _cell(share, " %") for name, share in each.shares.items()}
+        if each.recovered is not None:
+            cells[f"R against {reference}"] = _cell(each.recovered, " %")
+        title = f"{each.data}, states {each.states}"
+        rows[title, each.method] = {"seeds": str(len(each.seeds))} | cells
+    return _frame(rows) if rows else None
 
 
 def _difference_table(found: Sequence[Difference]) -> pd.DataFrame | None:

@@ -8,6 +8,7 @@ in a record, it can only make its own run unreadable.
 from __future__ import annotations
 
 import gzip
+import hashlib
 import json
 import os
 import zlib
@@ -16,10 +17,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import pandas as pd
 
 from torchrl_osr._files import MAX_JSON_BYTES, parse_json, read_json, write_atomically
 from torchrl_osr.data import ReferenceReturns, reference_returns
+from torchrl_osr.evaluation.recoverable import GROUPS
 from torchrl_osr.experiment.run_config import flatten, read_yaml
 from torchrl_osr.experiment.run_folder import CONFIG, read_status
 from torchrl_osr.experiment.schema import method_name
@@ -33,6 +36,9 @@ MAX_TABLE_BYTES = 4 * MAX_JSON_BYTES
 
 MAX_REASON = 300
 """Characters of the reason why a run is left out."""
+
+MAX_STATES = 10_000
+"""Of a task, from which a run was played."""
 
 MAX_OFFSETS = 10_000
 """Entries of a distance curve; 2,000 resamples of so many have 160 MB."""
@@ -54,7 +60,8 @@ EPISODE = (
     *RECOVERY.values(),
 )
 CURVE = ("suite", "disturbance", "step", "offset", "mean", "count")
-"""Columns of the tables of episodes and of distance curves."""
+SAVED = ("states", "group", "walk", "back")
+"""Columns of the tables of episodes, of distance curves and of recoverable states."""
 
 
 class LeftOut(NamedTuple):
@@ -79,7 +86,8 @@ class Run(NamedTuple):
         protocols: how each suite was played; only like ones are compared.
         episodes: a row for each episode, see :class:`~torchrl_osr.report.RunTables`.
         distances: a row for each step of a distance curve, see there.
-        unusable: robustness files that could not be used.
+        saved: a row for each recoverable state, see there.
+        unusable: files of disturbances or states that could not be used.
     """
 
     facts: dict[str, Any]
@@ -87,6 +95,7 @@ class Run(NamedTuple):
     protocols: list[dict[str, str]]
     episodes: pd.DataFrame
     distances: pd.DataFrame
+    saved: pd.DataFrame
     unusable: list[LeftOut]
 
 
@@ -167,9 +176,9 @@ def read_record(folder: Path) -> dict[str, Any]:
 
     Returns:
         ``folder``, ``method``, ``overrides``, and the contents of ``config``,
-        ``status``, ``returns``, ``inverse_dynamics`` (``None`` without a model) and
-        ``robustness``, the last by name of the file; a damaged one is a text that says
-        why.
+        ``status``, ``returns``, ``inverse_dynamics`` (``None`` without a model),
+        ``robustness`` and ``recoverable``, the last two by name of the file; a damaged
+        one is a text that says why.
 
     Raises:
         OSError: if a file cannot be read.
@@ -186,12 +195,13 @@ def read_record(folder: Path) -> dict[str, Any]:
     above, name = folder.resolve().parts[-2:]
     in_layout = name == f"seed{config['seed']}"
     model = folder / "inverse_dynamics.json"
-    robustness: dict[str, Any] = {}
-    for path in sorted(folder.glob("robustness-*.json")):
-        try:
-            robustness[path.name] = read_json(path)
-        except (OSError, ValueError) as error:
-            robustness[path.name] = _reason(error)
+    played: dict[str, dict[str, Any]] = {"robustness": {}, "recoverable": {}}
+    for kind, files in played.items():
+        for path in sorted(folder.glob(f"{kind}-*.json")):
+            try:
+                files[path.name] = read_json(path)
+            except (OSError, ValueError) as error:
+                files[path.name] = _reason(error)
     return {
         "folder": str(folder),
         "config": config,
@@ -199,8 +209,8 @@ def read_record(folder: Path) -> dict[str, Any]:
         "status": status,
         "returns": read_json(folder / "returns.json"),
         "inverse_dynamics": read_json(model) if model.exists() else None,
-        "robustness": robustness,
         "method": above if in_layout else method_name(hydra["runtime"]["choices"]),
+        **played,
     }
 
 
@@ -240,6 +250,15 @@ def parse_run(record: Mapping[str, Any]) -> Run:
             distances.append(curves)
             protocols.append(suite)
             versions.append(content["versions"])
+    saved = [pd.DataFrame(columns=SAVED)]
+    # Tables of runs that were written before there were such states have none.
+    for name, content in record.get("recoverable", {}).items():
+        try:
+            saved.append(_saved_states(content))
+        except Exception as error:
+            unusable.append(LeftOut(f"{record['folder']}/{name}", _reason(error)))
+        else:
+            versions.append(content["versions"])
     facts = {
         "folder": str(record["folder"]),
         "method": str(record["method"]),
@@ -260,6 +279,7 @@ def parse_run(record: Mapping[str, Any]) -> Run:
         protocols,
         pd.concat(episodes, ignore_index=True),
         pd.concat(distances, ignore_index=True),
+        pd.concat(saved, ignore_index=True),
         unusable,
     )
 
@@ -357,6 +377,28 @@ def _suite_episodes(content: Any, values: str) -> tuple[pd.DataFrame, pd.DataFra
                 curves.append(where | curve)
             episodes.append(where | numbers)
     return _table(episodes, EPISODE), _table(curves, CURVE)
+
+
+def _saved_states(content: Any) -> pd.DataFrame:
+    """The states of a file, and the share of its checkpoints that each was saved by."""
+    if not isinstance(content, dict):
+        raise ValueError(str(content))  # why it could not be read
+    if content["format"] != ROBUSTNESS_FORMAT:
+        raise ValueError(
+            f"its format is {content['format']!r}, known is {ROBUSTNESS_FORMAT}"
+        )
+    half, group, walk = str(content["half"]), content["group"], content["walk"]
+    back = np.array([each["back"] for each in content["evaluations"]])
+    if not 0 < len(group) <= MAX_STATES or back.shape[1:] != (len(group),):
+        raise ValueError(
+            f"it has {len(group)} states, and answers of the shape {back.shape}"
+        )
+    if not np.isin(back, (0, 1)).all() or not {*group} <= {*GROUPS}:
+        raise ValueError(f"answers are not 0 or 1, or groups are none of {GROUPS}")
+    # The same number of the same groups may be other states.
+    digest = hashlib.sha256(json.dumps([group, walk]).encode()).hexdigest()
+    columns = {"states": f"{half} {digest[:6]}", "group": group, "back": back.mean(0)}
+    return pd.DataFrame(columns | {"walk": np.array(walk, dtype=np.int64)})
 
 
 def _protocol(content: Mapping[str, Any], steps: int) -> dict[str, str]:
