@@ -76,41 +76,39 @@ def torchrl_osr(*arguments: str, log: Path | None = None) -> None:
         )  # fmt: skip
 
 
-def steps_of(method: str, env: str) -> int:
+def steps_of(method: str) -> int:
     """Return the updates that fit in the time, in tenths that are evaluated."""
-    sizes = "hopper" if env == "hopper" else "walker2d"
-    ms = json.loads((HERE / "update_ms.json").read_text())[sizes][method]
+    ms = json.loads((HERE / "update_ms.json").read_text())[method]
     return round(CORE_SECONDS / ms) * 1000
 
 
 def measure(methods: list[str]) -> None:
-    """Write the processor's milliseconds of an update of each method.
+    """Write the processor's milliseconds of an update of each method, on Hopper.
 
-    HalfCheetah's states and actions are as many as Walker2d's.
+    Those of the others are within some percent: their inputs alone are wider.
     """
     path = HERE / "update_ms.json"
     found = json.loads(path.read_text()) if path.exists() else {}
-    for env in ("hopper", "walker2d"):
-        for method in methods:
-            if method in found.setdefault(env, {}):
-                continue
-            seconds = []
-            for steps in (500, 1500):
-                with tempfile.TemporaryDirectory() as folder:
-                    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-                    torchrl_osr(
-                        "train", f"env={env}", *METHODS[method],
-                        f"trainer.steps={steps}", f"trainer.eval_interval={steps}",
-                        "trainer.eval_episodes=1", "trainer.inverse_dynamics_steps=100",
-                        "dynamics.steps=100", f"hydra.run.dir={folder}/run",
-                    )  # fmt: skip
-                    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-                seconds.append(
-                    after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-                )
-            found[env][method] = round(seconds[1] - seconds[0], 2)
-            path.write_text(json.dumps(found, indent=2) + "\n")
-            print(env, method, found[env][method], "ms", flush=True)
+    for method in methods:
+        if method in found:
+            continue
+        seconds = []
+        for steps in (500, 1500):
+            with tempfile.TemporaryDirectory() as folder:
+                before = resource.getrusage(resource.RUSAGE_CHILDREN)
+                torchrl_osr(
+                    "train", "env=hopper", *METHODS[method],
+                    f"trainer.steps={steps}", f"trainer.eval_interval={steps}",
+                    "trainer.eval_episodes=1", "trainer.inverse_dynamics_steps=100",
+                    "dynamics.steps=100", f"hydra.run.dir={folder}/run",
+                )  # fmt: skip
+                after = resource.getrusage(resource.RUSAGE_CHILDREN)
+            seconds.append(
+                after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+            )
+        found[method] = round(seconds[1] - seconds[0], 2)
+        path.write_text(json.dumps(found, indent=2) + "\n")
+        print(method, found[method], "ms", flush=True)
 
 
 def run(folder: Path, data: str, method: str, seed: int) -> None:
@@ -119,7 +117,7 @@ def run(folder: Path, data: str, method: str, seed: int) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     status = folder / "status.json"
     if not status.exists() or json.loads(status.read_text())["status"] != "done":
-        steps = steps_of(method, env)
+        steps = steps_of(method)
         arguments = [f"resume={folder}"] if (folder / "checkpoint").exists() else []
         torchrl_osr(
             "train", f"env={env}", f"data={quality}", f"seed={seed}", *METHODS[method],
