@@ -135,6 +135,25 @@ def test_recovery_is_added_to_mopo(tmp_path) -> None:
     assert {"loss_recovery", "recovery_kl", "imagined_reward"} <= found.keys()
 
 
+@pytest.mark.parametrize("steps", [0, 3])
+def test_rollouts_begin_in_states_of_the_data_or_beside_them(finished, steps) -> None:
+    cfg = small(f"dynamics.disturbed_steps={steps}", "dynamics.refuse=true")
+    data, model = load_training_data(cfg, CPU), load_dynamics(finished / FILE)
+    actor = make_learner(cfg, 11, 3).actor
+    buffer = imagined_replay_buffer(cfg, data, model, actor, lambda batch: batch)
+    buffer.sample()
+    starts = buffer.online_buffer[:]["observation"][:15]
+    known = data.rows(torch.arange(540))["observation"]
+    there = (starts.unsqueeze(1) == known).all(-1).any(1)
+    assert not there.any() if steps else there.all()
+
+
+def test_disturbed_steps_are_forward() -> None:
+    cfg = small("loss=romi", "dynamics.disturbed_steps=3")
+    with pytest.raises(ValueError, match="disturbed_steps=3 are steps forward"):
+        check_parts(cfg, 11, 3)
+
+
 def test_rows_that_lead_into_the_data_are_imagined_backwards(tmp_path) -> None:
     romi = ["loss=romi", "dynamics.reverse_policy=cvae", "trainer.steps=2"]
     folder = ran(tmp_path, *romi)

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from torchrl_osr.imagination import imagine
+from torchrl_osr.imagination import disturbed, imagine
 from torchrl_osr.modules import DynamicsEnsemble
 
 ALMOST_NOTHING = -40.0
@@ -114,3 +114,21 @@ def test_bad_arguments_are_named() -> None:
         imagine(linear_world(), one, torch.zeros(4, 1), steps=0)
     with pytest.raises(ValueError, match="no state to start from"):
         imagine(linear_world(), one, torch.zeros(0, 1), steps=1)
+
+
+def test_disturbed_states_are_where_random_actions_lead() -> None:
+    torch.manual_seed(0)
+    states = disturbed(linear_world(), torch.zeros(60_000, 1), steps=3)
+    assert states.shape == (60_000, 1)
+    assert states.abs().max() <= 3
+    # One, two or three draws from [-1, 1], whose variance is 1 / 3.
+    assert states.mean().item() == pytest.approx(0, abs=0.02)
+    assert states.var().item() == pytest.approx(2 / 3, rel=0.03)
+
+
+def test_no_disturbed_state_is_one_in_which_the_task_has_ended() -> None:
+    world, starts = linear_world(), torch.zeros(100, 1)
+    states = disturbed(world, starts, steps=5, terminated=lambda s: s[:, 0] < 0)
+    assert (states >= 0).all()
+    with pytest.raises(ValueError, match="no state is left"):
+        disturbed(world, starts, steps=5, terminated=lambda s: s[:, 0] < 2)

@@ -333,6 +333,12 @@ def check_parts(
     if cfg.dynamics.use and cfg.dynamics.real_ratio < 1:
         termination_of(cfg)
         check_real_ratio(cfg.dynamics.real_ratio, cfg.trainer.batch_size)
+        if cfg.dynamics.disturbed_steps and cfg.dynamics.reverse_policy:
+            raise ValueError(
+                f"dynamics.disturbed_steps={cfg.dynamics.disturbed_steps} are steps "
+                "forward, and the model goes backward: take dynamics=ensemble, or set "
+                "it to 0."
+            )
         if ("next", "action") in in_keys:
             raise ValueError(
                 f"{cfg.loss._target_} reads the data's next action, which no imagined "

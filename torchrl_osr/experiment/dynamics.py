@@ -39,6 +39,8 @@ from torchrl_osr.imagination import (
     ImaginedReplayBuffer,
     ModelAdversary,
     Termination,
+    any_action,
+    disturbed,
     imagine,
     imagine_backwards,
 )
@@ -293,6 +295,10 @@ def imagined_replay_buffer(
     sizes = norm.scale.expand(model.observation_dim)
     units = torch.cat([sizes, sizes.new_tensor([1 / scale])])
     largest = float(model.largest_disagreement) if options.refuse else math.inf
+    bounds: dict[str, Any] = {
+        "terminated": _in_units_of(data, ends),
+        "max_disagreement": largest,
+    }
     backwards = options.reverse_policy is not None
 
     def rows_of(copied: nn.Module) -> Imagined:
@@ -301,8 +307,7 @@ def imagined_replay_buffer(
 
         def act(state: Tensor) -> Tensor:
             if options.reverse_policy == "uniform":
-                size = len(state), model.action_dim
-                return 2 * torch.rand(size, device=state.device) - 1
+                return any_action(model)(state)
             if isinstance(policy, ConditionalVAE):
                 return policy.sample(state)
             batch = TensorDict({"observation": state}, state.shape[:-1])
@@ -310,15 +315,13 @@ def imagined_replay_buffer(
                 action: Tensor = policy(batch)["action"]
             return action
 
-        starts = data.rows(torch.randint(len(real), [options.rollout_starts]))
+        inside = cast(DynamicsEnsemble, inside)
+        rows = data.rows(torch.randint(len(real), [options.rollout_starts]))
+        starts: Tensor = rows["observation"]
+        if steps := options.disturbed_steps:
+            starts = disturbed(inside, starts, steps=steps, **bounds)
         rows, refused = (imagine_backwards if backwards else imagine)(
-            cast(DynamicsEnsemble, inside),
-            act,
-            starts["observation"],
-            steps=options.rollout_steps,
-            terminated=_in_units_of(data, ends),
-            max_disagreement=largest,
-            units=units,
+            inside, act, starts, steps=options.rollout_steps, units=units, **bounds
         )
         rows["next", "reward"] -= options.penalty * scale * rows["uncertainty"]
         rows = rows.select(*DATASET_KEYS)

@@ -208,6 +208,8 @@ class DynamicsConfig:
         adversarial_lr: learning rate of that training.
         rollout_steps: steps of a roll-out.
         rollout_starts: states of the data that roll-outs start from, each time.
+        disturbed_steps: steps with random actions in the model, at most, that lead from
+            those to where roll-outs begin; 0 for none.
         rollout_interval: gradient steps of the policy between roll-outs.
         generations: number of newest roll-outs that are trained on.
         real_ratio: share of real rows in a batch of the policy's; with 1 nothing is
@@ -236,6 +238,7 @@ class DynamicsConfig:
     adversarial_lr: float = MISSING
     rollout_steps: int = MISSING
     rollout_starts: int = MISSING
+    disturbed_steps: int = MISSING
     rollout_interval: int = MISSING
     generations: int = MISSING
     real_ratio: float = MISSING

@@ -2,6 +2,7 @@
 
 * :func:`imagine` rolls a policy out in a
   :class:`~torchrl_osr.modules.DynamicsEnsemble`.
+* :func:`disturbed` gives the states that random actions lead to.
 * :func:`imagine_backwards` rolls one out into given states, in a model of turned
   rows (:func:`turned`).
 * :class:`ModelAdversary` trains a model against the policy.
@@ -15,6 +16,8 @@ from torchrl_osr.imagination.look_ahead import LookAheadPolicy
 from torchrl_osr.imagination.replay_buffer import ImaginedReplayBuffer
 from torchrl_osr.imagination.rollout import (
     Imagined,
+    any_action,
+    disturbed,
     imagine,
     imagine_backwards,
     turned,
@@ -27,6 +30,8 @@ __all__ = [
     "LookAheadPolicy",
     "ModelAdversary",
     "Termination",
+    "any_action",
+    "disturbed",
     "imagine",
     "imagine_backwards",
     "never",

@@ -126,6 +126,44 @@ def imagine(
     return Imagined(torch.cat(taken), refused)
 
 
+def any_action(model: DynamicsEnsemble) -> Callable[[Tensor], Tensor]:
+    """A policy whose actions are uniform in [-1, 1]."""
+
+    def policy(state: Tensor) -> Tensor:
+        size = len(state), model.action_dim
+        return 2 * torch.rand(size, device=state.device) - 1
+
+    return policy
+
+
+def disturbed(
+    model: DynamicsEnsemble, starts: Tensor, *, steps: int, **options: Any
+) -> Tensor:
+    """States that random actions lead to in a model, beside the data but in reach.
+
+    Args:
+        model: of the dynamics.
+        starts: states ``[B, S]`` from which each motor is at random in [-1, 1].
+
+    Keyword Args:
+        steps: of it, at most.
+        options: ``terminated`` and ``max_disagreement`` of :func:`imagine`.
+
+    Returns:
+        ``[B, S]``, drawn with replacement from all states in which the task goes on
+        after 1 to ``steps`` such steps.
+
+    Raises:
+        ValueError: there is none.
+    """
+    rows, _ = imagine(model, any_action(model), starts, steps=steps, **options)
+    following = rows["next", "observation"][~rows["next", "done"].squeeze(-1)]
+    if not len(following):
+        raise ValueError("no state is left after a random action: train the model.")
+    found: Tensor = following[torch.randint(len(following), [len(starts)])]
+    return found
+
+
 def imagine_backwards(
     model: DynamicsEnsemble,
     policy: Callable[[Tensor], Tensor],
