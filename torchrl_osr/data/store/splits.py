@@ -9,6 +9,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from torchrl_osr.data.store.next_action import is_followed
+
 
 def held_out_rows(rows: int, held_out: int | float, *, seed: int) -> Tensor:
     """Numbers of randomly chosen rows, in random order.
@@ -73,13 +75,11 @@ def consecutive_rows(data: TensorDictBase, starts: Tensor, length: int) -> Tenso
                 [2., 3.]])
     """
     starts = starts[starts + length <= len(data)]
-    numbers = starts.unsqueeze(-1) + torch.arange(length, device=starts.device)
-    rows = data[numbers.flatten()].reshape(len(starts), length)
-    before, after = rows[:, :-1], rows[:, 1:]
-    follows = before["next", "observation"] == after["observation"]
-    follows &= ~before["next", "done"]
-    whole: TensorDict = rows[follows.flatten(1).all(1)]
-    return whole
+    rows = starts.unsqueeze(-1) + torch.arange(length, device=starts.device)
+    followed = is_followed(data, rows[:, :-1].flatten())
+    rows = rows[followed.view(len(starts), length - 1).all(1)]
+    pieces: TensorDict = data[rows.flatten()].view(len(rows), length)
+    return pieces
 
 
 def mix_datasets(
