@@ -1,0 +1,111 @@
+"""Step 5: does it help to imagine what follows a disturbance?
+
+    python results/recovery/imagination.py outputs/imagination --seeds 0 1
+    python results/recovery/imagination.py outputs/imagination --pack
+
+Each run is ``torchrl-osr train`` in a process with one torch thread, then its last
+checkpoints play from the recoverable states. What is there is not done again; what is
+finished is packed into ``imagination.jsonl.gz``, from which the table is printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from torchrl_osr.evaluation.recoverable import GROUPS
+from torchrl_osr.report import pack_runs, read_runs
+from torchrl_osr.report.saved import saved_states
+from torchrl_osr.report.scores import by_run, estimate, recent
+
+HERE = Path(__file__).parent
+TABLE = HERE / "imagination.jsonl.gz"
+MODEL = ["dynamics=ensemble", "dynamics.real_ratio=0.5"]
+BASE = "base"
+ARMS = {
+    BASE: ["loss=cql"],
+    "disturbed starts": ["loss=cql", *MODEL, "dynamics.disturbed_steps=10"],
+    "undisturbed starts": ["loss=cql", *MODEL],
+    "noisy cloning": ["loss=cql_noisy_bc"],
+    "twice the updates": ["loss=cql", "trainer.steps=60_000"],
+}
+"""And what each adds to the base: CQL(H) of the preset quick."""
+
+
+def torchrl_osr(*arguments: str, log: Path) -> None:
+    """Run a command of the package with one thread; keep what it prints."""
+    with log.open("w") as file:
+        subprocess.run(
+            [sys.executable, "-m", "torchrl_osr", *arguments],
+            stdout=file, stderr=subprocess.STDOUT, check=True,
+            env=os.environ | {"OMP_NUM_THREADS": "1"},
+        )  # fmt: skip
+
+
+def run(folder: Path, arm: str, data: str, seed: int, half: str) -> None:
+    """Train one run, and play its last checkpoints from the states."""
+    env, quality = data.split("-", 1)
+    folder.mkdir(parents=True, exist_ok=True)
+    status = folder / "status.json"
+    if not status.exists() or json.loads(status.read_text())["status"] != "done":
+        resume = [f"resume={folder}"] if (folder / "checkpoint").exists() else []
+        torchrl_osr(
+            "train", f"env={env}", f"data={quality}", f"seed={seed}", *ARMS[arm],
+            "trainer.progress=false", f"hydra.run.dir={folder}", *resume,
+            log=folder / "train.txt",
+        )  # fmt: skip
+    torchrl_osr(
+        "evaluate", f"checkpoint={folder}", "suite=recoverable", f"suite.half={half}",
+        "progress=false", log=folder / "recoverable.txt",
+    )  # fmt: skip
+    print(folder, flush=True)
+
+
+def table() -> str:
+    """Markdown: undisturbed score and shares of the states, by data and arm."""
+    tables = read_runs([TABLE])
+    groups = GROUPS[::-1]
+    columns = "arm", "seeds", "score", *(f"{name} %" for name in groups), "R %"
+    lines = [columns, ("---",) * len(columns)]
+    for each in saved_states(tables, BASE):
+        mine = (tables.episodes["data"] == each.data) & (
+            tables.episodes["method"] == each.method
+        )
+        score = estimate(by_run(recent(tables.episodes[mine])))
+        shares = [
+            str(each.shares[name]) for name in ("recoverable", "contested", "easy")
+        ]
+        name, seeds = f"{each.method}, {each.data}", str(len(each.seeds))
+        recovered = str(each.recovered or "")
+        lines.append((name, seeds, str(score), *shares, recovered))
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def main() -> None:
+    """Train and play what was not yet, or pack and print."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--data", nargs="+", default=["walker2d-medium-expert"])
+    parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=ARMS)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--half", default="public", choices=("public", "held-out"))
+    parser.add_argument("--pack", action="store_true", help="run nothing")
+    given = parser.parse_args()
+    if given.pack:
+        last = "recoverable-*.json"
+        pack_runs({path.parent for path in given.folder.glob(f"*/*/*/{last}")}, TABLE)
+        print(table())
+        return
+    for seed in given.seeds:
+        for data in given.data:
+            for arm in given.arms:
+                folder = given.folder / data / arm / f"seed{seed}"
+                run(folder, arm, data, seed, given.half)
+
+
+if __name__ == "__main__":
+    main()
