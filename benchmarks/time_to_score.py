@@ -132,16 +132,19 @@ def last_five(run: dict[str, Any]) -> float:
 
 def table(runs: list[dict[str, Any]]) -> str:
     """Markdown: last five evaluations over seeds, and the minutes that they took."""
+    from torchrl_osr.evaluation import mean_interval
+
     rows = defaultdict(list)
     for run in runs:
         rows[run["env"], run["method"]].append(run)
     lines = [
-        "| task | method | seeds | last five, median | mean | standard deviation "
-        "| processor minutes | ms an update |",
+        "| task | method | seeds | last five, median | mean [95 %] "
+        "| standard deviation | processor minutes | ms an update |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for (env, method), group in sorted(rows.items(), key=lambda row: row[0][0]):
         scores = [last_five(run) for run in group]
+        mean, low, high = mean_interval(scores)
         spread = f"{statistics.stdev(scores):.1f}" if len(scores) > 1 else ""
         ends = [run["evaluations"][-1] for run in group]
         minutes = statistics.fmean(end["seconds"] for end in ends) / 60
@@ -153,7 +156,7 @@ def table(runs: list[dict[str, Any]]) -> str:
         seeds = ", ".join(str(run["seed"]) for run in group)
         lines.append(
             f"| {env} | {method} | {seeds} | {statistics.median(scores):.1f} "
-            f"| {statistics.fmean(scores):.1f} | {spread} | {minutes:.1f} "
+            f"| {mean:.1f} [{low:.1f}, {high:.1f}] | {spread} | {minutes:.1f} "
             f"| {1000 * update:.1f} |"
         )
     return "\n".join(lines)
