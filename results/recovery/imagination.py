@@ -27,13 +27,13 @@ TABLE = HERE / "imagination.jsonl.gz"
 MODEL = ["dynamics=ensemble", "dynamics.real_ratio=0.5"]
 BASE = "base"
 ARMS = {
-    BASE: ["loss=cql"],
-    "disturbed starts": ["loss=cql", *MODEL, "dynamics.disturbed_steps=10"],
-    "undisturbed starts": ["loss=cql", *MODEL],
-    "noisy cloning": ["loss=cql_noisy_bc"],
-    "twice the updates": ["loss=cql", "trainer.steps=60_000"],
+    BASE: ["loss=td3_bc"],
+    "disturbed starts": ["loss=td3_bc", *MODEL, "dynamics.disturbed_steps=10"],
+    "undisturbed starts": ["loss=td3_bc", *MODEL],
+    "noisy cloning": ["loss=td3_bc", "recovery=noisy_bc"],
+    "twice the updates": ["loss=td3_bc", "trainer.steps=60_000"],
 }
-"""And what each adds to the base: CQL(H) of the preset quick."""
+"""The base is TD3+BC with the preset quick; the others add to it."""
 
 
 def torchrl_osr(*arguments: str, log: Path) -> None:
