@@ -6,8 +6,8 @@
     python results/scoreboard/run.py outputs/scoreboard --pack
 
 Each run is one process with one torch thread. Stop it at any time and start it again:
-runs continue from their last checkpoint, and what is in ``runs.jsonl.gz`` beside this
-file is not done again. ``--pack`` adds what is finished to that table.
+runs continue from their last checkpoint, and what is in the tables beside this file,
+``<data>.jsonl.gz``, is not done again. ``--pack`` adds to them what is finished.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ from typing import Any
 from torchrl_osr.report import pack_runs, read_records
 
 HERE = Path(__file__).parent
-TABLE = HERE / "runs.jsonl.gz"
 CORE_SECONDS = 120
 """Of one core, for the updates of a policy; models are trained beside it."""
 
@@ -135,23 +134,31 @@ def run(folder: Path, data: str, method: str, seed: int) -> None:
     print(folder, flush=True)
 
 
-def packed() -> list[dict[str, Any]]:
-    """Return the runs of the table."""
-    return list(read_records(TABLE)) if TABLE.exists() else []
+def packed(data: str) -> dict[str, dict[str, Any]]:
+    """Return the runs in the table of a data set, by their folders."""
+    table = HERE / f"{data}.jsonl.gz"
+    found = read_records(table) if table.exists() else []
+    return {record["folder"]: record for record in found}
 
 
 def pack(folder: Path) -> None:
-    """Add the finished runs below a folder to the table."""
-    with tempfile.TemporaryDirectory() as here:
-        new = Path(here) / "new.jsonl.gz"
-        *_, last = SUITES.values()
-        finished = [path.parent for path in folder.glob(f"*/*/*/{last}")]
-        number = pack_runs(finished, new)
-        records = {each["folder"]: each for each in packed()}
-        records |= {each["folder"]: each for each in read_records(new)}
-    lines = [json.dumps(records[each]) + "\n" for each in sorted(records)]
-    TABLE.write_bytes(gzip.compress("".join(lines).encode(), mtime=0))
-    print(f"{number} finished runs in {folder}, {len(records)} in {TABLE}")
+    """Add the finished runs below a folder to the tables, one for each data set."""
+    *_, last = SUITES.values()
+    for data in DATA:
+        finished = [path.parent for path in folder.glob(f"{data}/*/*/{last}")]
+        if not finished:
+            continue
+        records = packed(data)
+        with tempfile.TemporaryDirectory() as here:
+            new = Path(here) / "new.jsonl.gz"
+            pack_runs(finished, new)
+            for record in read_records(new):
+                run = f"{data}/{record['method']}/seed{record['config']['seed']}"
+                records[run] = record | {"folder": run}
+        lines = [json.dumps(records[each]) + "\n" for each in sorted(records)]
+        content = gzip.compress("".join(lines).encode(), mtime=0)
+        (HERE / f"{data}.jsonl.gz").write_bytes(content)
+        print(f"{data}: {len(finished)} runs here, {len(records)} in the table")
 
 
 def main() -> None:
@@ -171,7 +178,7 @@ def main() -> None:
     if options.pack:
         pack(options.folder)
         return
-    done = {record["folder"] for record in packed()}
+    done = set().union(*map(packed, options.data))
     grid = [
         (options.folder / data / method / f"seed{seed}", data, method, seed)
         for seed in options.seeds

@@ -85,11 +85,13 @@ def table(tables: RunTables, data: str) -> str:
 
 def draw(rows: pd.DataFrame, path: Path) -> None:
     """Score undisturbed against score disturbed: a point for each method."""
-    figure = Figure(figsize=(11, 7), layout="constrained")
-    FigureCanvasAgg(figure)
     data = list(rows["data"].unique())
-    grid = figure.subplots(2, (len(data) + 1) // 2, squeeze=False).flat
-    for axes, name in zip(grid, data, strict=False):
+    wide = min(3, len(data))
+    high = -(-len(data) // wide)  # rounded up
+    figure = Figure(figsize=(1 + 4.5 * wide, 3.8 * high), layout="constrained")
+    FigureCanvasAgg(figure)
+    for number, name in enumerate(data, start=1):
+        axes = figure.add_subplot(high, wide, number)
         mine = rows[rows["data"] == name].groupby("method")
         mean = mine[["undisturbed", *SUITES]].mean()
         disturbed = mean[list(SUITES)].mean(axis=1)
@@ -113,7 +115,7 @@ def draw(rows: pd.DataFrame, path: Path) -> None:
 
 def main() -> None:
     """Print a table for each data set, and draw."""
-    tables = read_runs([HERE / "runs.jsonl.gz"])
+    tables = read_runs(sorted(HERE.glob("*.jsonl.gz")))
     for data in tables.data:
         print(f"\n### {data}\n\n{table(tables, data)}")
     draw(scores(tables), HERE / "scoreboard.png")
