@@ -82,7 +82,7 @@ def test_values_of_the_right_type_are_refused_by_key(fresh, key, value):
 def test_limits_are_of_keys_that_exist(fresh):
     known = flatten(OmegaConf.to_container(fresh())).keys()
     elsewhere = {"inverse_dynamics.network.latent_dim", "loss.num_samples"}
-    elsewhere |= {"recovery.reduction"}
+    elsewhere |= {"recovery.reduction", "suite.half"}
     for name in ("evaluate", "film"):
         elsewhere |= OmegaConf.load(CONF / "evaluation" / f"{name}.yaml").keys()
     assert {*RANGES, *CHOICES} <= known | elsewhere

@@ -100,7 +100,7 @@ def load_recoverable_states(env_name: str, half: str = "public") -> RecoverableS
     Examples:
         >>> from torchrl_osr.evaluation.recoverable import load_recoverable_states
         >>> states = load_recoverable_states("walker2d")
-        >>> states.qpos.shape[1], sorted(set(states.group))
+        >>> states.qpos.shape[1], sorted(set(states.group.tolist()))
         (9, ['contested', 'easy', 'recoverable'])
     """
     check_choice("half", half, HALVES)

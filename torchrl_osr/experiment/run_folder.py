@@ -23,7 +23,11 @@ from omegaconf import Container, DictConfig, OmegaConf
 from torchrl_osr._files import read_json, write_atomically, write_json
 from torchrl_osr.experiment.run_config import flatten, read_config
 from torchrl_osr.trainers import Interrupted
-from torchrl_osr.trainers.interruption import signals_noted, signals_raised
+from torchrl_osr.trainers.interruption import (
+    interrupts_kept,
+    signals_noted,
+    signals_raised,
+)
 
 log = logging.getLogger(__name__)
 
@@ -263,7 +267,8 @@ def status(folder: Path) -> Iterator[None]:
         _say_if_killed(folder)
         write_json(folder / STATUS, _running())
         try:
-            yield
+            with interrupts_kept():
+                yield
             check_ours(folder)
             with signals_noted():
                 write_json(folder / STATUS, {"status": "done"})

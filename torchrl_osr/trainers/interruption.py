@@ -105,6 +105,22 @@ def signals_raised() -> Iterator[None]:
 
 
 @contextmanager
+def interrupts_kept() -> Iterator[None]:
+    """Raise the interrupt that tensordict has replaced by an error of its own.
+
+    ``with tensordict.view(...)``, ``params.to_module(...)`` and their like answer what
+    is no :class:`Exception` with "Converting a tensordict to boolean value is not
+    permitted" (tensordict 0.14.3).
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        if isinstance(error.__context__, (Interrupted, KeyboardInterrupt)):
+            raise error.__context__ from None
+        raise
+
+
+@contextmanager
 def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
     """Handle the signals of :data:`EXIT_CODES`, unless somebody else's handler does."""
     before: dict[signal.Signals, Any] = {}
