@@ -52,11 +52,9 @@ def run(folder: Path, arm: str, data: str, seed: int, half: str) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     status = folder / "status.json"
     if not status.exists() or json.loads(status.read_text())["status"] != "done":
-        resume = [f"resume={folder}"] if (folder / "checkpoint").exists() else []
         torchrl_osr(
             "train", f"env={env}", f"data={quality}", f"seed={seed}", *ARMS[arm],
-            "trainer.progress=false", f"hydra.run.dir={folder}", *resume,
-            log=folder / "train.txt",
+            "trainer.progress=false", f"hydra.run.dir={folder}", log=folder / "train.txt",
         )  # fmt: skip
     torchrl_osr(
         "evaluate", f"checkpoint={folder}", "suite=recoverable", f"suite.half={half}",

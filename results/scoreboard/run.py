@@ -117,13 +117,12 @@ def run(folder: Path, data: str, method: str, seed: int) -> None:
     status = folder / "status.json"
     if not status.exists() or json.loads(status.read_text())["status"] != "done":
         steps = steps_of(method)
-        arguments = [f"resume={folder}"] if (folder / "checkpoint").exists() else []
         torchrl_osr(
             "train", f"env={env}", f"data={quality}", f"seed={seed}", *METHODS[method],
             f"trainer.steps={steps}", f"trainer.eval_interval={steps // 10}",
             f"trainer.checkpoint_interval={steps // 10}", "trainer.eval_episodes=5",
             "trainer.progress=false",
-            f"hydra.run.dir={folder}", *arguments, log=folder / "train.txt",
+            f"hydra.run.dir={folder}", log=folder / "train.txt",
         )  # fmt: skip
     for suite, file in SUITES.items():
         if not (folder / file).exists():

@@ -138,7 +138,7 @@ def test_recovery_is_added_to_another_loss_from_training_to_the_page(
 
     chosen = ["loss=rebrac", "recovery=osr", "trainer.steps=20"]
     read(SCRIPT, *sizes, *chosen, "hydra.run.dir=run")
-    read(SCRIPT, "resume=run", "trainer.steps=40")
+    read(SCRIPT, "resume=run", "env=hopper", "trainer.steps=40")  # said once more
     scalars = tmp_path / "run" / "csv" / "scalars" / "policy"
     for name in ("loss_recovery", "recovery_kl", "loss_qvalue"):
         assert (scalars / f"{name}.csv").read_text()

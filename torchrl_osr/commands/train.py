@@ -80,8 +80,8 @@ def train(cfg: DictConfig) -> float:
         cfg = run_folder.resumed(folder, cfg, job.overrides.task)
     with run_folder.refusal_noted(folder):
         check_run(cfg, trust)
+        read_environment(cfg)
         if fresh:
-            read_environment(cfg)
             check_published(cfg, job.runtime.choices)
     with run_folder.lock(folder):
         run_folder.claim(folder, cfg, job)
