@@ -81,6 +81,22 @@ def test_proposition_2_at_the_data_the_model_is_the_behaviour_policy() -> None:
     torch.testing.assert_close(gap, plain, rtol=0, atol=1e-12)
 
 
+def test_an_exact_model_makes_osr_v_prefer_the_datas_own_actions() -> None:
+    # Clean and noisy states p(s, s~), a ~ p(a | s), s' ~ p(s' | s, a) whatever s~ is. The
+    # model sees s~ and s' alone.
+    noise = simplex(PROBLEMS, STATES * STATES).view(PROBLEMS, STATES, STATES)
+    behaviour = simplex(PROBLEMS, STATES, ACTIONS)
+    dynamics = simplex(PROBLEMS, STATES, ACTIONS, STATES)
+    joint = torch.einsum("nij,nia,niak->njak", noise, behaviour, dynamics)
+    model = joint / joint.sum(2, keepdim=True)
+    target = torch.einsum("njk,njak->nja", joint.sum(2), model)
+    data = torch.einsum("nij,nia->nja", noise, behaviour)
+    qvalue, policy = torch.randn_like(data), simplex(*data.shape)
+    weighted = policy * noise.sum(1).unsqueeze(-1)
+    ours, twin = (constraint(qvalue, weighted, each).sum(-1) for each in (target, data))
+    torch.testing.assert_close(ours, twin, rtol=0, atol=1e-12)
+
+
 def test_theorem_1_is_one_step_towards_the_minimiser_and_not_the_minimiser() -> None:
     """Left side: argmin is the model's mean. Right side: fit of the next states.
 

@@ -52,6 +52,7 @@ METHODS = {
     "romi": ["loss=romi"],
     "scas": ["loss=scas"],
     "sdc": ["loss=sdc"],
+    "osr_v_data": ["loss=osr_v_data"],
 }
 SUITES = {
     "oos": "robustness-oos.json",

@@ -213,6 +213,7 @@ LOSSES = {
     "sdc": ("SDCLoss", {}),
     "edac_10": ("EDACLoss", {"num_qvalue_nets": 10}),
     "osr_v": ("OSRVLoss", {}),
+    "osr_v_data": ("OSRVLoss", DATA),
     "td3_bc": ("TD3BCLoss", {}),
     # For the default data, Hopper's medium-replay, its authors' settings.
     "rebrac": ("ReBRACLoss", {"actor_bc_coef": 0.05, "critic_bc_coef": 0.5}),

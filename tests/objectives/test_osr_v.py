@@ -67,16 +67,21 @@ class Restatement:
         log_prob = log_prob - torch.log(self.half * (1 - squashed**2))
         return self.low + self.half * (1 + squashed), log_prob.sum(-1)
 
-    def gap(self, critic, states, next_state, number, draws, log_sum_exp) -> Tensor:
-        """Equation (8), for a critic: mean over both state sets, ``[B]``."""
+    def gap(self, critic, states, batch, s_next, number, draws, log_sum_exp) -> Tensor:
+        """Equation (8), for a critic: mean over both state sets, ``[B]``.
+
+        Without draws of the model the data's action stands in its place.
+        """
         total = 0.0
         for i, state in enumerate(states):
             logits, plain, target = [], 0.0, 0.0
             for k in range(number):
                 with torch.no_grad():
                     ours = self.act(self.policy_net, [state], draws["policy"][k, i])
-                    inputs = [state, next_state]
-                    theirs, _ = self.act(self.idm_net, inputs, draws["model"][k, i])
+                    theirs = batch["action"]
+                    if "model" in draws:
+                        inputs, noise = [state, s_next], draws["model"][k, i]
+                        theirs, _ = self.act(self.idm_net, inputs, noise)
                 value = critic(state, ours[0]).squeeze(-1)
                 plain = plain + value / number
                 target = target + critic(state, theirs).squeeze(-1) / number
@@ -93,7 +98,7 @@ class Restatement:
         return total
 
     def losses(
-        self, batch, seed: int, number: int, log_sum_exp: bool
+        self, batch, seed: int, number: int, log_sum_exp: bool, recovery_target: str
     ) -> dict[str, Tensor]:
         s, a = batch["observation"], batch["action"]
         states = torch.stack([s, batch["perturbed", "observation"]])
@@ -103,7 +108,9 @@ class Restatement:
         torch.manual_seed(seed)
         shape, like = (number, 2, *a.shape), {"dtype": torch.float64}
         noise_actor = torch.randn(2, *a.shape, **like)
-        draws = {name: torch.randn(shape, **like) for name in ("policy", "model")}
+        draws = {"policy": torch.randn(shape, **like)}
+        if recovery_target == "inverse_dynamics":
+            draws["model"] = torch.randn(shape, **like)
         if log_sum_exp:
             draws["uniform"] = torch.rand(shape, **like)
         noise_target = torch.randn(*a.shape, **like)
@@ -119,7 +126,7 @@ class Restatement:
         td, gap = 0.0, 0.0
         for critic in self.critics:
             td = td + (critic(s, a) - target).square().mean()
-            rows = self.gap(critic, states, s_next, number, draws, log_sum_exp)
+            rows = self.gap(critic, states, batch, s_next, number, draws, log_sum_exp)
             gap = gap + rows[valid].mean()
         entropy_gap = log_prob.detach() + TARGET_ENTROPY
         return {
@@ -129,6 +136,7 @@ class Restatement:
         }
 
 
+@pytest.mark.parametrize("recovery_target", ["inverse_dynamics", "data"])
 @pytest.mark.parametrize("policy_values", ["mean", "logsumexp"])
 @pytest.mark.parametrize("number", [1, 3])
 @pytest.mark.parametrize(
@@ -137,18 +145,22 @@ class Restatement:
 # Critics with ReLUs are plain MLPs, which have a path of their own.
 @pytest.mark.parametrize("activation", [nn.Tanh, nn.ReLU])
 def test_losses_and_gradients_equal_the_restatement(
-    make_networks, make_batch, check, policy_values, number, low, high, activation
-) -> None:
+    make_networks, make_batch, check, policy_values, recovery_target, number, low, high,
+    activation,
+) -> None:  # fmt: skip
     bounds = {"low": torch.tensor(low).double(), "high": torch.tensor(high).double()}
     networks = make_networks(**bounds, critic_activation=activation)
     batch = make_batch(10)
     restated = Restatement(networks, **bounds)
-    loss = make_osr_v(networks, num_random=number, policy_values=policy_values)
+    options = {"policy_values": policy_values, "recovery_target": recovery_target}
+    loss = make_osr_v(networks, num_random=number, **options)
     out = seeded(loss, batch)
     losses = {key: value for key, value in out.items() if key.startswith("loss_")}
-    expected = restated.losses(batch, 5, number, policy_values == "logsumexp")
+    weighed = policy_values == "logsumexp"
+    expected = restated.losses(batch, 5, number, weighed, recovery_target)
     assert list(losses) == list(expected)
-    check("OSR-v", losses.values(), expected.values(), tolerance=1e-12)
+    label = "OSR-v" + " on the data's actions" * (recovery_target == "data")
+    check(label, losses.values(), expected.values(), tolerance=1e-12)
 
     # The sum of ours is correct training; the plain one needs each group by itself.
     actor = list(restated.policy_net.parameters())
@@ -164,7 +176,7 @@ def test_losses_and_gradients_equal_the_restatement(
     ours = [p.grad for p in loss.actor_network_params.values(True, True)]
     ours += [p.grad for p in loss.qvalue_network_params.values(True, True)]
     ours.append(loss.log_alpha.grad)
-    check("OSR-v", ours, wanted, tolerance=1e-12)
+    check(label, ours, wanted, tolerance=1e-12)
 
 
 def test_metrics_say_what_they_are_called(make_networks, make_batch) -> None:

@@ -67,10 +67,15 @@ class OSRVLoss(BaseLoss):
             their own weights (:func:`~torchrl_osr.modules.critic_ensemble`).
         inverse_dynamics_network: a *trained* model of ``I(a | s, s')`` with the
             actor's bounds (see :class:`~torchrl_osr.InverseDynamicsLoss`); frozen here.
+            Needed unless ``recovery_target="data"``, which leaves it out.
 
     Keyword Args:
         recovery_weight: :math:`\alpha`, weight of the constraint. Default 5.0. May be
             assigned later.
+        recovery_target: whose actions the policy's are compared with:
+            ``"inverse_dynamics"`` (default), the model's, or ``"data"``, the data's
+            own, at clean and at perturbed states. The latter is OSR-v without its
+            model: with a model at its optimum both have the same expectation.
         policy_values: how the first expectation is taken: ``"mean"`` (default, the
             paper's) over ``K`` actions of the policy, or ``"logsumexp"`` over ``K`` of
             the policy and ``K`` uniform ones, weighted by their densities.
@@ -127,9 +132,10 @@ class OSRVLoss(BaseLoss):
         self,
         actor_network: ProbabilisticTensorDictSequential,
         qvalue_network: TensorDictModule | Sequence[TensorDictModule],
-        inverse_dynamics_network: ProbabilisticTensorDictSequential,
+        inverse_dynamics_network: ProbabilisticTensorDictSequential | None = None,
         *,
         recovery_weight: float = 5.0,
+        recovery_target: Literal["inverse_dynamics", "data"] = "inverse_dynamics",
         policy_values: Literal["mean", "logsumexp"] = "mean",
         num_random: int = 1,
         temperature: float = 1.0,
@@ -146,23 +152,29 @@ class OSRVLoss(BaseLoss):
         for name, advice in CQL_ARGUMENTS.items():
             if name in options:
                 raise TypeError(f"OSRVLoss takes no {name}: {advice}.")
-        if inverse_dynamics_network is None:
-            raise ValueError("OSRVLoss needs an inverse_dynamics_network.")
+        needs_model = recovery_target == "inverse_dynamics"
+        if needs_model and inverse_dynamics_network is None:
+            raise ValueError(
+                "OSRVLoss needs an inverse_dynamics_network; pass one, or "
+                "recovery_target='data' for the data's own actions."
+            )
         check_weight("recovery_weight", recovery_weight)
         check_positive("num_random", num_random, minimum=1)
         check_positive("temperature", temperature)
         super().__init__(**options)
-        self._hold_action_bounds(actor_network, inverse_dynamics_network, action_spec)
+        model = inverse_dynamics_network if needs_model else None
+        self._hold_action_bounds(actor_network, model, action_spec)
         self._hold_actor_critic(
             actor_network,
             qvalue_network,
-            inverse_dynamics_network=inverse_dynamics_network,
+            inverse_dynamics_network=model,
             delay_actor=delay_actor,
         )
         self._hold_temperature(
             alpha_init, fixed_alpha, target_entropy, min_alpha, max_alpha
         )
         self.register_coeff_buffer("recovery_weight", float(recovery_weight))
+        self.recovery_target = recovery_target
         self.policy_values = policy_values
         self.num_random = num_random
         self.temperature = temperature
@@ -218,25 +230,30 @@ class OSRVLoss(BaseLoss):
         return step.temperature_loss(log_prob, auto=-step.data_action.shape[-1])
 
     @torch.no_grad()
-    def _candidates(self, step: Step) -> tuple[Tensor, Tensor | None]:
+    def _candidates(self, step: Step) -> tuple[Tensor, Tensor, Tensor | None]:
         """The actions whose values are compared, all on D_tot.
 
         Returns:
-            Actions ``[M, 2, B, A]``, the last ``K`` of them the model's, and the
-            log-densities of the others, ``[M - K, 2, B]``, where they are needed.
+            Those to recover with, ``[K, 2, B, A]`` (the data's: ``K = 1``); the
+            others, ``[M, 2, B, A]``, and their log-densities ``[M, 2, B]`` where they
+            are needed.
         """
         number, pi = (self.num_random,), step.policy("both")
         action, log_prob = rsample_and_log_prob(pi, number)
-        model = step.inverse_dynamics("both")
-        sizes = model.loc.shape[-1], pi.loc.shape[-1]
-        check_num_actions("inverse_dynamics_network", *sizes)
-        target, _ = rsample_and_log_prob(model, number)
+        if self.recovery_target == "data":
+            target = step.data_action.expand_as(pi.loc).unsqueeze(0)
+        else:
+            model = step.inverse_dynamics("both")
+            sizes = model.loc.shape[-1], pi.loc.shape[-1]
+            check_num_actions("inverse_dynamics_network", *sizes)
+            target, _ = rsample_and_log_prob(model, number)
         if self.policy_values == "mean":
-            return torch.cat([action, target]), None
+            return target, action, None
         bounds = self.action_low, self.action_high
         uniform, log_density = uniform_actions(self.num_random, pi.loc, *bounds)
         return (
-            torch.cat([uniform, action, target]),
+            target,
+            torch.cat([uniform, action]),
             torch.cat([log_density, log_prob]),
         )
 
@@ -246,7 +263,8 @@ class OSRVLoss(BaseLoss):
         The gap is the mean over both halves of D_tot, summed over critics, as the TD
         error is.
         """
-        candidates, log_prob = self._candidates(step)
+        target, action, log_prob = self._candidates(step)
+        candidates = torch.cat([action, target])
         mixed = step.at("both").expand(candidates.shape[:-1])
         # One pass of the critics for the data's action and all candidates.
         qvalue = step.qvalue(
@@ -256,8 +274,8 @@ class OSRVLoss(BaseLoss):
         )
         compared = qvalue[:, 1:].reshape(-1, *candidates.shape[:-1]).movedim(1, -1)
         gap = functional.value_constraint(
-            compared[..., : -self.num_random],
-            compared[..., -self.num_random :],
+            compared[..., : len(action)],
+            compared[..., len(action) :],
             log_prob=None if log_prob is None else log_prob.movedim(0, -1),
             temperature=self.temperature,
         )

@@ -1,7 +1,7 @@
-"""Write docs/family.md from a test run: what was checked against what, how far off.
+"""Write ``family.md`` from a test run: what was checked against what, how far off.
 
     pytest tests/objectives tests/imagination -o junit_family=xunit1 --junitxml=c.xml
-    python results/family/table.py c.xml
+    python docs/family.py c.xml
 
 Tests note their largest deviation (the fixture ``check``) and the rows that critics
 score; this script adds only what a loss is called, its equation and its command line.
@@ -15,7 +15,7 @@ from collections import defaultdict
 from pathlib import Path
 from xml.etree import ElementTree
 
-PAGE = Path(__file__).parents[2] / "docs" / "family.md"
+PAGE = Path(__file__).parent / "family.md"
 REST = "critic by critic and action by action, torch.distributions"
 # Label of the checks: class and equation, configuration, what it is compared with.
 FAMILY = {
@@ -32,6 +32,9 @@ FAMILY = {
         "`OSRLoss`, released code", "`loss=osr_official`", REST,
     ),
     "OSR-v": ("`OSRVLoss`, (8), 4.4", "`loss=osr_v`", REST),
+    "OSR-v on the data's actions": (
+        "`OSRVLoss`, (8) without the model", "`loss=osr_v_data`", REST,
+    ),
     "OSR-10": ("`OSRLoss`, appendix D.4", "`loss=osr_10`", "`kl_divergence` of torch"),
     "CQL(H)": ("`OSRLoss`, CQL appendix F", "`loss=cql`", REST),
     "OSR, clean states": (
@@ -117,12 +120,11 @@ TAIL = """
 This page is written by a test run:
 
 ```bash
-pytest tests/objectives tests/imagination -o junit_family=xunit1 --junitxml=checks.xml
-python results/family/table.py checks.xml
+pytest tests/objectives tests/imagination -o junit_family=xunit1 --junitxml=c.xml
+python docs/family.py c.xml
 ```
 
-One training run of each on Hopper, and the discrete loss on CartPole, are in
-`results/family/`.
+What a training run of each method gives is in `results/scoreboard/`.
 """
 
 
