@@ -82,8 +82,8 @@ def test_proposition_2_at_the_data_the_model_is_the_behaviour_policy() -> None:
 
 
 def test_an_exact_model_makes_osr_v_prefer_the_datas_own_actions() -> None:
-    # Clean and noisy states p(s, s~), a ~ p(a | s), s' ~ p(s' | s, a) whatever s~ is. The
-    # model sees s~ and s' alone.
+    # Clean and noisy states p(s, s~), a ~ p(a | s), s' ~ p(s' | s, a) whatever s~ is.
+    # The model sees s~ and s' alone.
     noise = simplex(PROBLEMS, STATES * STATES).view(PROBLEMS, STATES, STATES)
     behaviour = simplex(PROBLEMS, STATES, ACTIONS)
     dynamics = simplex(PROBLEMS, STATES, ACTIONS, STATES)

@@ -54,7 +54,8 @@ def run(folder: Path, arm: str, data: str, seed: int, half: str) -> None:
     if not status.exists() or json.loads(status.read_text())["status"] != "done":
         torchrl_osr(
             "train", f"env={env}", f"data={quality}", f"seed={seed}", *ARMS[arm],
-            "trainer.progress=false", f"hydra.run.dir={folder}", log=folder / "train.txt",
+            "trainer.progress=false", f"hydra.run.dir={folder}",
+            log=folder / "train.txt",
         )  # fmt: skip
     torchrl_osr(
         "evaluate", f"checkpoint={folder}", "suite=recoverable", f"suite.half={half}",
