@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -96,16 +97,21 @@ def draw(rows: pd.DataFrame, path: Path) -> None:
         mean = mine[["undisturbed", *SUITES]].mean()
         disturbed = mean[list(SUITES)].mean(axis=1)
         axes.scatter(mean["undisturbed"], disturbed, s=14, color="#0072B2")
-        for method, x, y in zip(
-            mean.index, mean["undisturbed"], disturbed, strict=True
-        ):
-            own = method.startswith("osr")
-            axes.annotate(
-                method, (x, y), fontsize=7, xytext=(3, 2), textcoords="offset points",
-                color="#D55E00" if own else "0.25", weight="bold" if own else "normal",
-            )  # fmt: skip
-        end = max(mean["undisturbed"].max(), 1)
+        end, top = max(mean["undisturbed"].max(), 1), max(disturbed.max(), 1)
         axes.plot([0, end], [0, end], color="0.8", linewidth=0.8, zorder=0)
+        axes.set_ylim(-0.05 * top, 1.15 * top)
+        # Names in a column, each tied to its point: beside the points they overlap.
+        order = disturbed.sort_values().index
+        heights = np.linspace(0, 1.1 * top, len(order))
+        for method, height in zip(order, heights, strict=True):
+            own = "osr" in method
+            colour = "#D55E00" if own else "0.25"
+            axes.annotate(
+                method, (mean["undisturbed"][method], disturbed[method]),
+                xytext=(1.12 * end, height), fontsize=7, va="center", color=colour,
+                weight="bold" if own else "normal", annotation_clip=False,
+                arrowprops={"arrowstyle": "-", "color": colour, "lw": 0.3},
+            )  # fmt: skip
         axes.set_title(name, fontsize=10, loc="left")
         axes.spines[["top", "right"]].set_visible(False)
     figure.supxlabel("score undisturbed", fontsize=10)
