@@ -1,9 +1,9 @@
-"""Clones of the experts: a jury of four for each system, and one that stays outside.
+"""Clones of the experts: a jury for each system, and one that stays outside.
 
     python results/recovery/clones.py walker2d
 
 Each has rows, network and order of its own seed. They are stored as behaviour policies
-are, in ``clones/<system>/<number>.npz``; 0 to 3 are the jury. ``scores.json`` beside
+are, in ``clones/<system>/<number>.npz``; the last is outside. ``scores.json`` beside
 them has the undisturbed D4RL scores of ten episodes each; of the maze, successes.
 """
 
@@ -25,16 +25,18 @@ from torchrl_osr.data.collect.environment import environment_id
 from torchrl_osr.evaluation import EpisodeEvaluator
 
 FOLDER = Path(__file__).parent / "clones"
-JURY, OUTSIDE = (0, 1, 2, 3), 4
-SYSTEMS = ("hopper", "walker2d", "halfcheetah", "pointmaze-medium")
+JURORS = {"hopper": 4, "walker2d": 4, "halfcheetah": 4, "pointmaze-medium": 8}
+"""The maze's clones differ more, and are its whole jury."""
+
+SYSTEMS = tuple(JURORS)
 ROWS, UPDATES, WIDTH = 50_000, 8_000, 256
-MAZE_EPISODES = 20
+MAZE_EPISODES = 100
 
 
 def rows_of(system: str, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Observations and actions of the expert; of the maze, 20 episodes."""
+    """Observations and actions of the expert; of the maze, 100 episodes."""
     if system.startswith("pointmaze"):
-        rows = collect_quality(system, "play", 20_000, seed=seed, progress=False).data
+        rows = collect_quality(system, "play", 60_000, seed=seed, progress=False).data
         ends = (rows["next", "done"]).flatten().nonzero().flatten()
         rows = rows[: int(ends[MAZE_EPISODES - 1]) + 1]
     else:
@@ -100,7 +102,7 @@ def main() -> None:
     """Train and play what is not there yet."""
     torch.set_num_threads(1)
     for system in sys.argv[1:] or SYSTEMS:
-        for number in (*JURY, OUTSIDE):
+        for number in range(JURORS[system] + 1):
             path = FOLDER / system / f"{number}.npz"
             if path.exists():
                 continue
@@ -110,7 +112,8 @@ def main() -> None:
             print(json.dumps({"clone": f"{system}/{number}", "seed": seed}), flush=True)
         path = FOLDER / system / "scores.json"
         if not path.exists():
-            write_json(path, {each: score(system, each) for each in (*JURY, OUTSIDE)})
+            everyone = range(JURORS[system] + 1)
+            write_json(path, {each: score(system, each) for each in everyone})
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from clones import OUTSIDE, load_clone
+from clones import JURORS, load_clone
 from search import read_jsonl
 from states import PARTS, normal
 from torch import Tensor, nn
@@ -254,7 +254,7 @@ def policy_of(
     arm: str, plan: str, seed: int, world: World
 ) -> tuple[Callable[[Tensor], Tensor], Counted]:
     """An arm's policy, and its gate."""
-    clone = load_clone(world.system, OUTSIDE)
+    clone = load_clone(world.system, JURORS[world.system])
     base = in_torch(clone)
     own, _ = load_local_dataset(
         world.system, "expert", num_transitions=EXPERT_ROWS, progress=False

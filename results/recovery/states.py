@@ -14,7 +14,7 @@ import zlib
 from pathlib import Path
 
 import numpy as np
-from clones import JURY, load_clone
+from clones import JURORS, load_clone
 from world import SPEED_STEPS, Policy, Rows, World
 
 from torchrl_osr._files import read_json, whole_file, write_json
@@ -197,7 +197,8 @@ def judge(world: World, walks: range, std: Rows) -> dict[str, np.ndarray]:
     are not hard whatever the others do.
     """
     players = PLAYERS[world.system]
-    clones = [load_clone(world.system, number).deterministic for number in JURY]
+    jurors = range(JURORS[world.system])
+    clones = [load_clone(world.system, number).deterministic for number in jurors]
     expert = world.policy("expert")
     columns: dict[str, list] = {
         name: [] for name in ("walk", "moment", "kind", "strength", "state", "jury")

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from clones import OUTSIDE, SYSTEMS, load_clone
+from clones import JURORS, SYSTEMS, load_clone
 from search import HOLD, STAGES, read_lines
 from states import DISTURBANCES, PARTS, generator, hard, normal
 from tensordict import TensorDict
@@ -149,7 +149,7 @@ def pack(world: World, found: dict[str, np.ndarray]) -> list[dict]:
     """Write both halves; return what is in them."""
     rng = generator(world.system, 3)
     kinds = np.array(list(DISTURBANCES[world.system]))
-    clone = load_clone(world.system, OUTSIDE).deterministic
+    clone = load_clone(world.system, JURORS[world.system]).deterministic
     contents = []
     for number, half in enumerate(HALVES):
         inside = found["walk"] % 2 == number

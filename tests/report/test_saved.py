@@ -13,6 +13,7 @@ from torchrl_osr.report.saved import saved_states
 
 fakes = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("fakes.py"))))
 GROUP = ["easy", "contested", *["recoverable"] * 4]
+DISTURBANCE = ["push 1", "push 1", "kick 2", "kick 10", "kick 2", "kick 10"]
 WALK = [0, 0, 1, 1, 2, 2]
 
 
@@ -23,6 +24,7 @@ def states(*back: list[int], **entries) -> dict:
         "versions": fakes.VERSIONS,
         "half": "public",
         "group": GROUP,
+        "disturbance": DISTURBANCE,
         "walk": WALK,
         "evaluations": [{"step": 1000, "back": each} for each in back],
     }
@@ -53,6 +55,10 @@ def test_shares_and_what_is_recovered(top) -> None:
     assert cql.shares["recoverable"].mean == 0
     # 3 of 8 and 4 of 8, over two checkpoints each.
     assert osr.shares["recoverable"].mean == pytest.approx(43.75)
+    # "kick 2" is the third and the fifth state: one of two, in all checkpoints.
+    assert list(osr.by_disturbance) == ["kick 2", "kick 10"]
+    assert osr.by_disturbance["kick 2"].mean == pytest.approx(50)
+    assert osr.by_disturbance["kick 10"].mean == pytest.approx(37.5)
     assert cql.recovered is None, "it is the reference itself"
     assert osr.recovered.mean == pytest.approx(43.75), "the reference saves nothing"
     assert osr.recovered.over == "seeds"
@@ -80,6 +86,9 @@ def test_the_page_has_the_table(top, tmp_path) -> None:
     assert "<h3>Recoverable states</h3>" in page
     assert "43.8 %" in page
     assert "R against cql" in page
+    by_disturbance = page.partition("Recoverable states by disturbance")[2]
+    assert by_disturbance.index("kick 2") < by_disturbance.index("kick 10")
+    assert "37.5 %" in by_disturbance
 
 
 @pytest.mark.parametrize(
@@ -88,6 +97,7 @@ def test_the_page_has_the_table(top, tmp_path) -> None:
         ({"format": 2}, "its format is 2, known is 1"),
         ({"group": GROUP[:-1]}, "5 states, and answers of the shape (1, 6)"),
         ({"walk": WALK[:-1]}, "same length"),
+        ({"disturbance": ["push"] * 6}, "not enough values to unpack"),
         ({"evaluations": []}, "answers of the shape (0,)"),
         ({"evaluations": [{"back": [2] * 6}]}, "not 0 or 1"),
         ({"group": ["lost"] * 6}, "groups are none of"),

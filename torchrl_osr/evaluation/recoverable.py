@@ -8,7 +8,7 @@ Shapes: ``M`` states, ``Q`` positions, ``V`` velocities, ``K`` offsets, ``A`` ac
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -83,6 +83,22 @@ class RecoverableStates:
 
     def __len__(self) -> int:
         return len(self.qpos)
+
+    @property
+    def disturbance(self) -> list[str]:
+        """Kind and strength of each, ``"torque 10"`` for instance."""
+        of_each = zip(self.kind, self.strength, strict=True)
+        return [f"{kind} {strength:g}" for kind, strength in of_each]
+
+
+def disturbances_of(names: Iterable[str]) -> list[str]:
+    """The disturbances among some, each once, by kind and strength."""
+
+    def order(name: str) -> tuple[str, float]:
+        kind, strength = name.rsplit(" ", 1)
+        return kind, float(strength)
+
+    return sorted({*names}, key=order)
 
 
 def load_recoverable_states(env_name: str, half: str = "public") -> RecoverableStates:

@@ -18,6 +18,7 @@ from torchrl_osr.evaluation import deterministic_policy
 from torchrl_osr.evaluation.recoverable import (
     GROUPS,
     RecoverableStates,
+    disturbances_of,
     load_recoverable_states,
     recovers,
     saved_share,
@@ -63,9 +64,9 @@ def play_states(
         advance: called after each checkpoint.
 
     Returns:
-        JSON-compatible: ``env``, ``data``, ``half``; of each state ``group``, ``kind``
-        and ``walk``; and ``evaluations``, with ``step`` and, for each state, 1 if it
-        came ``back`` and 0 if not.
+        JSON-compatible: ``env``, ``data``, ``half``; of each state ``group``,
+        ``disturbance`` (kind and strength) and ``walk``; and ``evaluations``, with
+        ``step`` and, for each state, 1 if it came ``back`` and 0 if not.
     """
     evaluations = []
     for file in files:
@@ -81,7 +82,7 @@ def play_states(
         "data": run.data.quality,
         "half": half,
         "group": states.group.tolist(),
-        "kind": states.kind.tolist(),
+        "disturbance": states.disturbance,
         "walk": states.walk.tolist(),
         "evaluations": evaluations,
     }
@@ -94,13 +95,15 @@ def shares(results: Mapping[str, Any]) -> dict[str, tuple[int, float, float, flo
         results: of :func:`play_states`.
 
     Returns:
-        By group; and for the recoverable ones also by kind of disturbance.
+        By group; and for the recoverable ones also by disturbance.
     """
-    group, kind, walk = (np.array(results[key]) for key in ("group", "kind", "walk"))
+    of_each = "group", "disturbance", "walk"
+    group, disturbance, walk = (np.array(results[key]) for key in of_each)
     back = np.mean([each["back"] for each in results["evaluations"]], axis=0)[None]
     rows = {name: group == name for name in GROUPS}
     hard = rows[GROUPS[-1]]
-    rows |= {f"  {name}": hard & (kind == name) for name in np.unique(kind[hard])}
+    for name in disturbances_of(disturbance[hard]):
+        rows[f"  {name}"] = hard & (disturbance == name)
     return {
         name: (int(chosen.sum()), *saved_share(back[:, chosen], walk[chosen]))
         for name, chosen in rows.items()

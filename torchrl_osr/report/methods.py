@@ -71,8 +71,8 @@ class RunTables:
             distance to the data of the ``count`` episodes that still last.
         saved: a row for each run and recoverable state, in the order of the states:
             ``run``, ``data``, ``method``, ``seed``; ``states``, the half and a mark
-            that other states do not have; ``group``, ``walk``; and ``back``, the share
-            of the checkpoints that came back from it.
+            that other states do not have; ``group``, ``disturbance``, ``walk``; and
+            ``back``, the share of the checkpoints that came back from it.
         left_out: what could not be used.
     """
 

@@ -120,6 +120,7 @@ def write_report(
         "means": _mean_table(tables),
         "suites": suites,
         "saved": _saved_table(tables, reference),
+        "saved_by_disturbance": _saved_by_disturbance(tables, reference),
         "every_run": runs.assign(versions=runs["versions"].map(", ".join)).astype(str),
     }
     environment = Environment(
@@ -318,6 +319,16 @@ def _saved_table(tables: RunTables, reference: str) -> pd.DataFrame | None:
             cells[f"R against {reference}"] = _cell(each.recovered, " %")
         title = f"{each.data}, states {each.states}"
         rows[title, each.method] = {"seeds": str(len(each.seeds))} | cells
+    return _frame(rows) if rows else None
+
+
+def _saved_by_disturbance(tables: RunTables, reference: str) -> pd.DataFrame | None:
+    """The same of the recoverable states, a row for each disturbance."""
+    rows: dict[tuple[str, str], dict[str, Cell]] = {}
+    for each in saved_states(tables, reference):
+        title = f"{each.data}, states {each.states}"
+        for name, share in each.by_disturbance.items():
+            rows.setdefault((title, name), {})[each.method] = _cell(share, " %")
     return _frame(rows) if rows else None
 
 

@@ -22,7 +22,7 @@ import pandas as pd
 
 from torchrl_osr._files import MAX_JSON_BYTES, parse_json, read_json, write_atomically
 from torchrl_osr.data import ReferenceReturns, reference_returns
-from torchrl_osr.evaluation.recoverable import GROUPS
+from torchrl_osr.evaluation.recoverable import GROUPS, disturbances_of
 from torchrl_osr.experiment.run_config import flatten, read_yaml
 from torchrl_osr.experiment.run_folder import CONFIG, read_status
 from torchrl_osr.experiment.schema import method_name
@@ -60,7 +60,7 @@ EPISODE = (
     *RECOVERY.values(),
 )
 CURVE = ("suite", "disturbance", "step", "offset", "mean", "count")
-SAVED = ("states", "group", "walk", "back")
+SAVED = ("states", "group", "disturbance", "walk", "back")
 """Columns of the tables of episodes, of distance curves and of recoverable states."""
 
 
@@ -395,10 +395,14 @@ def _saved_states(content: Any) -> pd.DataFrame:
         )
     if not np.isin(back, (0, 1)).all() or not {*group} <= {*GROUPS}:
         raise ValueError(f"answers are not 0 or 1, or groups are none of {GROUPS}")
+    disturbance = content["disturbance"]
+    disturbances_of(disturbance)
     # The same number of the same groups may be other states.
-    digest = hashlib.sha256(json.dumps([group, walk]).encode()).hexdigest()
+    of_each = json.dumps([group, disturbance, walk])
+    digest = hashlib.sha256(of_each.encode()).hexdigest()
     columns = {"states": f"{half} {digest[:6]}", "group": group, "back": back.mean(0)}
-    return pd.DataFrame(columns | {"walk": np.array(walk, dtype=np.int64)})
+    columns |= {"disturbance": disturbance, "walk": np.array(walk, dtype=np.int64)}
+    return pd.DataFrame(columns)
 
 
 def _protocol(content: Mapping[str, Any], steps: int) -> dict[str, str]:

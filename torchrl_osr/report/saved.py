@@ -5,13 +5,18 @@ Shapes: ``N`` seeds, ``M`` states.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from torchrl_osr.evaluation.recoverable import GROUPS, recovered_share, saved_share
+from torchrl_osr.evaluation.recoverable import (
+    GROUPS,
+    disturbances_of,
+    recovered_share,
+    saved_share,
+)
 from torchrl_osr.report.methods import RunTables
 from torchrl_osr.report.scores import Estimate
 
@@ -25,6 +30,7 @@ class Saved(NamedTuple):
         method: its name.
         seeds: of its runs.
         shares: percent saved, by group.
+        by_disturbance: of the recoverable ones, by kind and strength.
         recovered: percent that it saves of the recoverable states that the reference
             does not save, over the seeds of both; ``None`` if there are none, or the
             reference saves all.
@@ -35,6 +41,7 @@ class Saved(NamedTuple):
     method: str
     seeds: list[int]
     shares: dict[str, Estimate]
+    by_disturbance: dict[str, Estimate]
     recovered: Estimate | None
 
 
@@ -47,7 +54,8 @@ def saved_states(tables: RunTables, reference: str) -> Iterator[Saved]:
     """
     for (data, states), rows in tables.saved.groupby(["data", "states"], sort=False):
         one = rows[rows["run"] == rows["run"].iloc[0]]
-        group, walk = one["group"].to_numpy(), one["walk"].to_numpy()
+        of_each = "group", "disturbance", "walk"
+        group, disturbance, walk = (one[name].to_numpy() for name in of_each)
         back = {
             method: pd.DataFrame(
                 {seed: each["back"].to_numpy() for seed, each in of.groupby("seed")}
@@ -56,21 +64,28 @@ def saved_states(tables: RunTables, reference: str) -> Iterator[Saved]:
         }
         hard = group == GROUPS[-1]
         for method, table in back.items():
-            found = {
-                each: _estimate(table.loc[:, group == each], walk[group == each])
-                for each in GROUPS
-                if each in group
-            }
+            chosen = {each: group == each for each in GROUPS if each in group}
+            found = _estimates(table, walk, chosen)
+            names = disturbances_of(disturbance[hard])
+            chosen = {each: hard & (disturbance == each) for each in names}
+            by_disturbance = _estimates(table, walk, chosen)
             recovered = None
             if method != reference and reference in back and hard.any():
                 both = table.index.intersection(back[reference].index)
                 ours, theirs = (of.loc[both, hard] for of in (table, back[reference]))
                 recovered = _recovered(ours, theirs, walk[hard])
-            yield Saved(data, states, method, [*table.index], found, recovered)
+            seeds = [*table.index]
+            yield Saved(data, states, method, seeds, found, by_disturbance, recovered)
 
 
-def _estimate(back: pd.DataFrame, walk: np.ndarray) -> Estimate:
-    return _percent(saved_share(back, walk), len(back))
+def _estimates(
+    back: pd.DataFrame, walk: np.ndarray, chosen: Mapping[str, np.ndarray]
+) -> dict[str, Estimate]:
+    """Shares of the states of each name."""
+    return {
+        name: _percent(saved_share(back.loc[:, rows], walk[rows]), len(back))
+        for name, rows in chosen.items()
+    }
 
 
 def _recovered(
