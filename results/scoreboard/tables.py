@@ -5,10 +5,13 @@ python results/scoreboard/tables.py
 
 from __future__ import annotations
 
+import inspect
+import json
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from hydra.utils import get_class
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -84,6 +87,23 @@ def table(tables: RunTables, data: str) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
+def lines(tables: RunTables) -> str:
+    """Markdown: what was typed for each method, its class, and what an update takes."""
+    head = ["method", "typed", "class", "lines of its file, but for its docstring", "ms an update"]
+    rows = [head, ["---"] * len(head)]
+    measured = json.loads((HERE / "update_ms.json").read_text())
+    for _, run in tables.runs.drop_duplicates("method").iterrows():
+        typed = run["overrides"].split()
+        chosen = [each for each in typed if each.startswith(("loss=", "recovery="))]
+        loss = get_class(tables.settings.at[run.name, "loss._target_"])
+        file = Path(inspect.getfile(loss)).read_text()
+        code = len(file.splitlines()) - len(inspect.getdoc(loss).splitlines())
+        command = " ".join(chosen) or "loss=osr"
+        row = [f"`{run['method']}`", f"`{command}`", f"`{loss.__name__}`"]
+        rows.append([*row, str(code), f"{measured[run['method']]:.1f}"])
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
 def draw(rows: pd.DataFrame, path: Path) -> None:
     """Score undisturbed against score disturbed: a point for each method."""
     data = list(rows["data"].unique())
@@ -124,6 +144,7 @@ def main() -> None:
     tables = read_runs(sorted(HERE.glob("*.jsonl.gz")))
     for data in tables.data:
         print(f"\n### {data}\n\n{table(tables, data)}")
+    print(f"\n### Lines\n\n{lines(tables)}")
     draw(scores(tables), HERE / "scoreboard.png")
 
 

@@ -148,6 +148,19 @@ def test_rollouts_begin_in_states_of_the_data_or_beside_them(finished, steps) ->
     assert not there.any() if steps else there.all()
 
 
+@pytest.mark.parametrize("noise", [0, 0.3])
+def test_the_policys_own_actions_are_marked_and_may_have_noise(finished, noise) -> None:
+    cfg = small("loss=td3_bc", "dynamics.use=true", f"dynamics.action_noise={noise}")
+    data, model = load_training_data(cfg, CPU), load_dynamics(finished / FILE)
+    actor = make_learner(cfg, 11, 3).actor
+    buffer = imagined_replay_buffer(cfg, data, model, actor, lambda batch: batch)
+    batch = buffer.sample()
+    rows = batch[batch["imagined"].squeeze(-1)]
+    assert len(rows) == round((1 - cfg.dynamics.real_ratio) * len(batch))
+    apart = (rows["action"] - actor(rows.select("observation"))["action"]).abs()
+    assert (0.01 < apart.max() < 2) if noise else (apart.max() < 1e-6)
+
+
 def test_disturbed_steps_are_forward() -> None:
     cfg = small("loss=romi", "dynamics.disturbed_steps=3")
     with pytest.raises(ValueError, match="disturbed_steps=3 are steps forward"):

@@ -313,6 +313,9 @@ def imagined_replay_buffer(
             batch = TensorDict({"observation": state}, state.shape[:-1])
             with set_interaction_type(InteractionType.RANDOM):
                 action: Tensor = policy(batch)["action"]
+            if noise := options.action_noise:
+                scale = noise * torch.rand(len(action), 1, device=action.device)
+                action = (action + scale * torch.randn_like(action)).clamp(-1, 1)
             return action
 
         inside = cast(DynamicsEnsemble, inside)
@@ -332,6 +335,9 @@ def imagined_replay_buffer(
 
     def finished(batch: TensorDictBase) -> TensorDictBase:
         batch = transform(batch)
+        if not backwards:  # the policy's own actions, which teach it nothing as labels
+            number = torch.arange(len(batch), device=batch.device).unsqueeze(-1)
+            batch["imagined"] = number >= round(options.real_ratio * len(batch))
         return take_multi_step(batch) if cfg.optim.n_steps > 1 else batch
 
     return ImaginedReplayBuffer(

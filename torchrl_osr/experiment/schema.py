@@ -210,6 +210,9 @@ class DynamicsConfig:
         rollout_starts: states of the data that roll-outs start from, each time.
         disturbed_steps: steps with random actions in the model, at most, that lead from
             those to where roll-outs begin; 0 for none.
+        action_noise: largest standard deviation of the noise on the policy's actions in
+            roll-outs, each row's is uniform below it; for policies that are
+            deterministic.
         rollout_interval: gradient steps of the policy between roll-outs.
         generations: number of newest roll-outs that are trained on.
         real_ratio: share of real rows in a batch of the policy's; with 1 nothing is
@@ -239,6 +242,7 @@ class DynamicsConfig:
     rollout_steps: int = MISSING
     rollout_starts: int = MISSING
     disturbed_steps: int = MISSING
+    action_noise: float = MISSING
     rollout_interval: int = MISSING
     generations: int = MISSING
     real_ratio: float = MISSING

@@ -14,7 +14,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
-from torchrl_osr._entries import entry, is_next, nested, select, state_keys
+from torchrl_osr._entries import column, entry, is_next, nested, select, state_keys
 
 States = Literal["both", "clean", "perturbed"]
 """The states of D_tot on which a term is taken."""
@@ -89,6 +89,17 @@ def first_step(tensordict: TensorDictBase) -> TensorDictBase:
     if "one_step" not in tensordict:
         return tensordict
     return tensordict.exclude("steps_to_next_obs").set("next", tensordict["one_step"])
+
+
+def of_data(tensordict: TensorDictBase) -> Tensor | None:
+    """Which rows have an action of the data, bool ``[B]``; ``None`` if all have.
+
+    The others are marked by an entry ``"imagined"``: there the policy itself has acted,
+    so that there is nothing to clone.
+    """
+    if tensordict.get("imagined", None) is None:
+        return None
+    return ~column(tensordict, "imagined").bool()
 
 
 def transitions(

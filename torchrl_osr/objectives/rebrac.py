@@ -162,7 +162,7 @@ class ReBRACLoss(BaseLoss):
         # Detached: the policy's objective shall not train the critics.
         params = self.qvalue_network_params.detach()
         qvalue = step.qvalue(step.states[0], action, params).min(0).values
-        distance = functional.action_distance(action, step.data_action)
+        distance = step.cloned(functional.action_distance(action, step.data_action))
         magnitude = step.magnitude(qvalue)
         objective = functional.rebrac_objective(
             qvalue, distance, magnitude, self.actor_bc_coef

@@ -36,7 +36,12 @@ from torchrl_osr.objectives.distributions import (
     check_same_size,
     head_of,
 )
-from torchrl_osr.objectives.mixed_states import States, first_step, transitions
+from torchrl_osr.objectives.mixed_states import (
+    States,
+    first_step,
+    of_data,
+    transitions,
+)
 from torchrl_osr.objectives.step import frozen_distribution
 
 
@@ -260,8 +265,11 @@ class StateRecoveryLoss(BaseLoss):
                 self, tensordict, done=done, states=states
             )
             divergence = self._divergence(mixed, model).mean(0)
-        loss = self.recovery_weight * self._reduce(divergence, tensordict, ~done)
-        mean = self._mean(divergence, tensordict, ~done)
+        valid, data = ~done, of_data(tensordict)
+        if data is not None:
+            valid = valid & data
+        loss = self.recovery_weight * self._reduce(divergence, tensordict, valid)
+        mean = self._mean(divergence, tensordict, valid)
         return self._output(tensordict, {"loss_recovery": loss}, {self._metric: mean})
 
     def _divergence(self, states: TensorDictBase, model: TanhNormal) -> Tensor:

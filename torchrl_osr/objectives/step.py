@@ -27,6 +27,7 @@ from torchrl_osr.objectives.mixed_states import (
     States,
     first_step,
     next_state,
+    of_data,
     perturbed_state,
     transitions,
 )
@@ -175,6 +176,7 @@ class Step:
             :func:`~torchrl_osr.objectives.mixed_states.first_step`.
         done: ends of trajectories, whose next state may not be one, bool ``[B]``; of
             the single steps.
+        of_data: rows with an action of the data, bool ``[B]``; ``None`` if all have.
         terminated: whether the TD target ends with the rewards, bool ``[B]``.
         states: ``[s, s']`` or ``[s, s', s^]``, ``[2 or 3, B]``. A next state after a
             termination is not one: there ``s`` stands in its place.
@@ -191,6 +193,7 @@ class Step:
         self.first = first_step(tensordict)
         done, terminated = loss._next_keys("done", "terminated")
         self.done = column(self.first, done).bool()
+        self.of_data = of_data(tensordict)
         self.terminated = column(tensordict, terminated).bool()
         keys = observation_keys(loss)
         clean = select(tensordict, keys)
@@ -307,9 +310,20 @@ class Step:
         self.tensordict.set(self.loss.tensor_keys.priority, td_error)
 
     def reduce(self, value: Tensor, *, transitions: bool = False) -> Tensor:
-        """``[B]`` reduced as asked; with ``transitions``, over rows not done."""
-        valid = ~self.done if transitions else None
+        """``[B]`` reduced as asked; with ``transitions``, over those of the data."""
+        valid = self.transitions if transitions else None
         return self.loss._reduce(value, self.tensordict, valid)
+
+    @property
+    def transitions(self) -> Tensor:
+        """Rows of the data that are not done, bool ``[B]``."""
+        return ~self.done if self.of_data is None else ~self.done & self.of_data
+
+    def cloned(self, distance: Tensor) -> Tensor:
+        """Distances to the data's action, ``[B]``; 0 where it is not the data's."""
+        if self.of_data is None:
+            return distance
+        return torch.where(self.of_data, distance, torch.zeros_like(distance))
 
     def magnitude(self, value: Tensor) -> Tensor:
         """The mean magnitude of values ``[B]``, detached; 1 where it is 0.
@@ -321,7 +335,7 @@ class Step:
 
     def mean(self, value: Tensor, *, transitions: bool = False) -> Tensor:
         """The mean of a metric ``[..., B]``, detached."""
-        valid = ~self.done if transitions else None
+        valid = self.transitions if transitions else None
         return self.loss._mean(value, self.tensordict, valid)
 
 

@@ -146,6 +146,7 @@ class TD3BCLoss(BaseLoss):
         params = self.qvalue_network_params.detach()
         qvalue = step.qvalue(step.states[0], action, params)[0]
         cloning_error = functional.cloning_error(action, step.data_action)
+        cloning_error = step.cloned(cloning_error)
         magnitude = step.magnitude(qvalue)
         objective = functional.td3_bc_objective(
             qvalue, cloning_error, magnitude, self.alpha
