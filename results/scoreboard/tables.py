@@ -89,7 +89,13 @@ def table(tables: RunTables, data: str) -> str:
 
 def lines(tables: RunTables) -> str:
     """Markdown: what was typed for each method, its class, and what an update takes."""
-    head = ["method", "typed", "class", "lines of its file, but for its docstring", "ms an update"]
+    head = [
+        "method",
+        "typed",
+        "class",
+        "lines of its file, but for its docstring",
+        "ms an update",
+    ]
     rows = [head, ["---"] * len(head)]
     measured = json.loads((HERE / "update_ms.json").read_text())
     for _, run in tables.runs.drop_duplicates("method").iterrows():
