@@ -1,4 +1,4 @@
-"""Where the policy itself has acted in a model, there is nothing of the data to clone."""
+"""Where the policy itself has acted in a model, nothing of the data is cloned."""
 
 from __future__ import annotations
 
