@@ -24,23 +24,29 @@ from torchrl_osr.report.scores import by_run, estimate, recent
 
 HERE = Path(__file__).parent
 TABLE = HERE / "imagination.jsonl.gz"
-MODEL = ["dynamics=ensemble", "dynamics.real_ratio=0.5"]
-BASE = "base"
+STEPS = 60_000
+MODEL = [
+    *("dynamics=ensemble", "dynamics.real_ratio=0.5", "dynamics.generations=20"),
+    "dynamics.action_noise=0.2",
+]
+DISTURBED = "dynamics.disturbed_steps=10"
+REFERENCE = "noisy cloning"
 ARMS = {
-    BASE: ["loss=td3_bc"],
-    "disturbed starts": ["loss=td3_bc", *MODEL, "dynamics.disturbed_steps=10"],
-    "undisturbed starts": ["loss=td3_bc", *MODEL],
-    "noisy cloning": ["loss=td3_bc", "recovery=noisy_bc"],
-    "twice the updates": ["loss=td3_bc", "trainer.steps=60_000"],
+    REFERENCE: ["recovery=noisy_bc"],
+    "base": [],
+    "disturbed starts": [*MODEL, DISTURBED],
+    "undisturbed starts": MODEL,
+    "simulator, disturbed starts": [*MODEL, DISTURBED],
+    "simulator, undisturbed starts": MODEL,
 }
-"""The base is TD3+BC with the preset quick; the others add to it."""
+"""The base is TD3+BC with the preset quick and twice its updates; others add to it."""
 
 
-def torchrl_osr(*arguments: str, log: Path) -> None:
-    """Run a command of the package with one thread; keep what it prints."""
+def python(*arguments: str, log: Path) -> None:
+    """Run Python with one thread; keep what it prints."""
     with log.open("w") as file:
         subprocess.run(
-            [sys.executable, "-m", "torchrl_osr", *arguments],
+            [sys.executable, *arguments],
             stdout=file, stderr=subprocess.STDOUT, check=True,
             env=os.environ | {"OMP_NUM_THREADS": "1"},
         )  # fmt: skip
@@ -52,14 +58,18 @@ def run(folder: Path, arm: str, data: str, seed: int, half: str) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     status = folder / "status.json"
     if not status.exists() or json.loads(status.read_text())["status"] != "done":
-        torchrl_osr(
-            "train", f"env={env}", f"data={quality}", f"seed={seed}", *ARMS[arm],
-            "trainer.progress=false", f"hydra.run.dir={folder}",
+        train = ["-m", "torchrl_osr", "train"]
+        if arm.startswith("simulator"):
+            train = [str(HERE / "simulated.py")]
+        python(
+            *train, f"env={env}", f"data={quality}", f"seed={seed}", "loss=td3_bc",
+            *ARMS[arm], f"trainer.steps={STEPS}", f"trainer.eval_interval={STEPS // 20}",
+            "trainer.progress=false", f"hydra.run.dir='{folder}'",
             log=folder / "train.txt",
         )  # fmt: skip
-    torchrl_osr(
-        "evaluate", f"checkpoint={folder}", "suite=recoverable", f"suite.half={half}",
-        "progress=false", log=folder / "recoverable.txt",
+    python(
+        "-m", "torchrl_osr", "evaluate", f"checkpoint='{folder}'", "suite=recoverable",
+        f"suite.half={half}", "progress=false", log=folder / "recoverable.txt",
     )  # fmt: skip
     print(folder, flush=True)
 
@@ -70,7 +80,7 @@ def table() -> str:
     groups = GROUPS[::-1]
     columns = "arm", "seeds", "score", *(f"{name} %" for name in groups), "R %"
     lines = [columns, ("---",) * len(columns)]
-    for each in saved_states(tables, BASE):
+    for each in saved_states(tables, REFERENCE):
         mine = (tables.episodes["data"] == each.data) & (
             tables.episodes["method"] == each.method
         )
