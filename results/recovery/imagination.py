@@ -11,6 +11,7 @@ finished is packed into ``imagination.jsonl.gz``, from which the table is printe
 from __future__ import annotations
 
 import argparse
+import gzip
 import json
 import os
 import subprocess
@@ -18,7 +19,8 @@ import sys
 from pathlib import Path
 
 from torchrl_osr.evaluation.recoverable import GROUPS
-from torchrl_osr.report import pack_runs, read_runs
+from torchrl_osr.report import read_records, read_runs
+from torchrl_osr.report.runs import read_record
 from torchrl_osr.report.saved import saved_states
 from torchrl_osr.report.scores import by_run, estimate, recent
 
@@ -63,8 +65,9 @@ def run(folder: Path, arm: str, data: str, seed: int, half: str) -> None:
             train = [str(HERE / "simulated.py")]
         python(
             *train, f"env={env}", f"data={quality}", f"seed={seed}", "loss=td3_bc",
-            *ARMS[arm], f"trainer.steps={STEPS}", f"trainer.eval_interval={STEPS // 20}",
-            "trainer.progress=false", f"hydra.run.dir='{folder}'",
+            *ARMS[arm], f"trainer.steps={STEPS}",
+            f"trainer.eval_interval={STEPS // 20}", "trainer.progress=false",
+            f"hydra.run.dir='{folder}'",
             log=folder / "train.txt",
         )  # fmt: skip
     python(
@@ -72,6 +75,18 @@ def run(folder: Path, arm: str, data: str, seed: int, half: str) -> None:
         f"suite.half={half}", "progress=false", log=folder / "recoverable.txt",
     )  # fmt: skip
     print(folder, flush=True)
+
+
+def pack(folder: Path) -> None:
+    """Add the finished runs below a folder to the table, called by their arms."""
+    records = {}
+    if TABLE.exists():
+        records = {each["folder"]: each for each in read_records(TABLE)}
+    for run in {path.parent for path in folder.glob("*/*/*/recoverable-*.json")}:
+        name = run.relative_to(folder).as_posix()
+        records[name] = read_record(run) | {"folder": name, "method": run.parent.name}
+    lines = [json.dumps(records[each]) + "\n" for each in sorted(records)]
+    TABLE.write_bytes(gzip.compress("".join(lines).encode(), mtime=0))
 
 
 def table() -> str:
@@ -105,8 +120,7 @@ def main() -> None:
     parser.add_argument("--pack", action="store_true", help="run nothing")
     given = parser.parse_args()
     if given.pack:
-        last = "recoverable-*.json"
-        pack_runs({path.parent for path in given.folder.glob(f"*/*/*/{last}")}, TABLE)
+        pack(given.folder)
         print(table())
         return
     for seed in given.seeds:
