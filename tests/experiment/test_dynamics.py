@@ -142,7 +142,7 @@ def test_rollouts_begin_in_states_of_the_data_or_beside_them(finished, steps) ->
     actor = make_learner(cfg, 11, 3).actor
     buffer = imagined_replay_buffer(cfg, data, model, actor, lambda batch: batch)
     buffer.sample()
-    starts = buffer.online_buffer[:]["observation"][:15]
+    starts = buffer.imagined["observation"][:15]
     known = data.rows(torch.arange(540))["observation"]
     there = (starts.unsqueeze(1) == known).all(-1).any(1)
     assert not there.any() if steps else there.all()
@@ -181,7 +181,7 @@ def test_rows_that_lead_into_the_data_are_imagined_backwards(tmp_path) -> None:
     actor = make_learner(cfg, 11, 3).actor
     buffer = imagined_replay_buffer(cfg, data, model, actor, lambda batch: batch)
     buffer.sample()
-    rows = buffer.online_buffer[:]
+    rows = buffer.imagined
     # The first generation's first rows, with any action, end in states of the data.
     ends, known = rows["next", "observation"][:20], data.rows(torch.arange(540))
     same = (ends.unsqueeze(1) == known["observation"]).all(-1)
@@ -328,7 +328,7 @@ def test_penalty_and_units_are_those_of_the_task(finished, tmp_path) -> None:
         buffer = imagined_replay_buffer(cfg, data, model, actor, lambda batch: batch)
         buffer.set_rng(torch.Generator().manual_seed(0))
         buffer.sample()
-        found[penalty] = buffer.online_buffer[:]
+        found[penalty] = buffer.imagined
     free, lowered = found.values()
     assert torch.equal(free["next", "observation"], lowered["next", "observation"])
     _, scale = model.predict(free["observation"], free["action"])

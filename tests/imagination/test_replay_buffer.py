@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -117,3 +120,16 @@ def test_a_generation_without_rows_is_an_error() -> None:
     buffer.rows_of = lambda policy: Imagined(rows_of(policy).rows[:0], 9)
     with pytest.raises(ValueError, match="no imagined row was taken"):
         buffer.sample()
+
+
+def test_a_generation_that_is_no_longer_drawn_from_is_freed() -> None:
+    buffer, held = make_buffer(policy_of()), []
+    gc.disable()
+    try:
+        for number in range(18):
+            buffer.sample()
+            if number % 3 == 0:
+                held.append(weakref.ref(buffer.imagined))
+    finally:
+        gc.enable()
+    assert [each() is not None for each in held] == [False] * 5 + [True]

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from copy import deepcopy
+from itertools import accumulate, pairwise
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import nn
-from torchrl.data import LazyTensorStorage, OfflineToOnlineReplayBuffer, ReplayBuffer
+from torchrl.data import OfflineToOnlineReplayBuffer, ReplayBuffer
 
 from torchrl_osr._checks import check_positive
 from torchrl_osr.imagination.rollout import Imagined
@@ -26,6 +27,29 @@ def check_real_ratio(real_ratio: float, batch_size: int) -> None:
             f"real_ratio={real_ratio} of {batch_size} rows are {real}; expected real "
             "and imagined rows in each batch."
         )
+
+
+class _Rows:
+    """Rows to draw from, with replacement.
+
+    No ReplayBuffer: TorchRL 0.14.1's and its storage hold each other, so that every
+    generation would stay in memory until the garbage collector happens to come by.
+    """
+
+    def __init__(self, rows: TensorDictBase, rng: torch.Generator | None) -> None:
+        self.rows, self.rng = rows, rng
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def set_rng(self, generator: torch.Generator) -> None:
+        self.rng = generator
+
+    def sample(self, batch_size: int) -> TensorDictBase:
+        device = None if self.rng is None else self.rng.device
+        size = (batch_size,)
+        index = torch.randint(len(self), size, generator=self.rng, device=device)
+        return self.rows[index]
 
 
 class ImaginedReplayBuffer(OfflineToOnlineReplayBuffer):
@@ -153,13 +177,18 @@ class ImaginedReplayBuffer(OfflineToOnlineReplayBuffer):
 
     def _hold(self, generations: list[Imagined]) -> None:
         """Draw from these rows, in their order."""
-        self._imagined = generations
         rows = torch.cat([each.rows for each in generations])
-        storage = LazyTensorStorage(len(rows), device=rows.device or "cpu")
-        self._online_buffer = ReplayBuffer(storage=storage)
-        if self._rng is not None:
-            self._online_buffer.set_rng(self._rng)
-        self._online_buffer.extend(rows)
+        ends = [0, *accumulate(len(each.rows) for each in generations)]
+        self._imagined = [  # of slices, so that rows are held once
+            Imagined(rows[start:end], each.refused)
+            for (start, end), each in zip(pairwise(ends), generations, strict=True)
+        ]
+        self._online_buffer = _Rows(rows, self._rng)
+
+    @property
+    def imagined(self) -> TensorDictBase:
+        """All rows of the generations that are drawn from, oldest first, ``[n]``."""
+        return self._online_buffer.rows
 
     def state_dict(self) -> dict[str, Any]:
         """Return the number of batches so far, and the policies of the generations."""
