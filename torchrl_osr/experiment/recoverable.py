@@ -68,11 +68,10 @@ def play_states(
         ``disturbance`` (kind and strength) and ``walk``; and ``evaluations``, with
         ``step`` and, for each state, 1 if it came ``back`` and 0 if not.
     """
-    evaluations = []
+    run = load_trained(files[0], trust=trust).config
+    states, evaluations = states_for(run, half), []
     for file in files:
         trained = load_trained(file, trust=trust)
-        run = trained.config
-        states = states_for(run, half)
         policy = deterministic_policy(trained.actor, trained.observation_norm)
         back = recovers(states, policy)
         evaluations.append({"step": trained.step, "back": back.astype(int).tolist()})
