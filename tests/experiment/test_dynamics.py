@@ -161,6 +161,12 @@ def test_the_policys_own_actions_are_marked_and_may_have_noise(finished, noise) 
     assert (0.01 < apart.max() < 2) if noise else (apart.max() < 1e-6)
 
 
+def test_recovery_by_imagination_is_one_line(tmp_path) -> None:
+    rim = ["loss=rim", "dynamics.real_ratio=0.5", "trainer.steps=2"]
+    found = scalars(ran(tmp_path, *rim))
+    assert {"cloning_error", "imagined_reward", "imagined_refused"} <= found.keys()
+
+
 def test_disturbed_steps_are_forward() -> None:
     cfg = small("loss=romi", "dynamics.disturbed_steps=3")
     with pytest.raises(ValueError, match="disturbed_steps=3 are steps forward"):

@@ -215,6 +215,7 @@ LOSSES = {
     "osr_v": ("OSRVLoss", {}),
     "osr_v_data": ("OSRVLoss", DATA),
     "td3_bc": ("TD3BCLoss", {}),
+    "rim": ("TD3BCLoss", {}),
     # For the default data, Hopper's medium-replay, its authors' settings.
     "rebrac": ("ReBRACLoss", {"actor_bc_coef": 0.05, "critic_bc_coef": 0.5}),
     "rorl": ("RORLLoss", {"num_qvalue_nets": 10}),
