@@ -16,7 +16,7 @@ from torchrl_osr.report import pack_runs, read_records, read_runs
 
 HERE = Path(__file__)
 fakes = SimpleNamespace(**runpy.run_path(str(HERE.with_name("fakes.py"))))
-ARCHIVE = HERE.parents[2] / "results" / "family" / "runs.jsonl.gz"
+ARCHIVE = HERE.parents[2] / "results" / "osr_v" / "runs.jsonl.gz"
 CURVE = {1000: [10.0, 20.0], 2000: [30.0, 50.0]}
 
 
@@ -212,4 +212,4 @@ def test_a_table_that_unpacks_to_too_much_is_left_out(tmp_path, monkeypatch):
 
 def test_the_archive_is_read():
     tables = fakes.read_all(ARCHIVE)
-    assert len(tables.runs) == len(tables.methods) == 8
+    assert (len(tables.runs), len(tables.methods)) == (7, 6)
