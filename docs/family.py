@@ -52,7 +52,7 @@ FAMILY = {
     ),
     "SAC-N": ("`OSRLoss`, SAC-N", "`loss=sac_10`", REST),
     "EDAC": ("`EDACLoss`, EDAC", "`loss=edac_10`", "all pairs of gradients"),
-    "TD3+BC": ("`TD3BCLoss`, TD3+BC (3) to (5)", "`loss=td3_bc`", REST),
+    "TD3+BC": ("`TD3BCLoss`, TD3+BC (3) to (5)", "`loss=td3_bc`, `loss=rim`", REST),
     "ReBRAC": (
         "`ReBRACLoss`, released code", "`loss=rebrac`",
         "row by row and critic by critic",
