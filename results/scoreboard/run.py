@@ -5,7 +5,7 @@
     python results/scoreboard/run.py outputs/scoreboard --methods osr cql --seeds 0
     python results/scoreboard/run.py outputs/scoreboard --pack
 
-Each run is one process with one torch thread. Stop it at any time and start it again:
+Each run has one torch thread. Stop it at any time and start it again:
 runs continue from their last checkpoint, and what is in the tables beside this file,
 ``<data>.jsonl.gz``, is not done again. ``--pack`` adds to them what is finished.
 """
@@ -15,15 +15,20 @@ from __future__ import annotations
 import argparse
 import gzip
 import json
+import multiprocessing
 import os
 import resource
-import subprocess
 import sys
 import tempfile
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
+# All commands are forks of this process: each takes seconds to import.
+import torchrl_osr.commands.evaluate
+import torchrl_osr.commands.train
+from torchrl_osr.__main__ import main as start
 from torchrl_osr.report import pack_runs, read_records
 
 HERE = Path(__file__).parent
@@ -53,6 +58,7 @@ METHODS = {
     "scas": ["loss=scas"],
     "sdc": ["loss=sdc"],
     "osr_v_data": ["loss=osr_v_data"],
+    "rim": ["loss=rim"],
 }
 SUITES = {
     "oos": "robustness-oos.json",
@@ -67,13 +73,22 @@ DATA = [f"{env}-{data}" for data in ("medium-replay", "medium-expert") for env i
 
 
 def torchrl_osr(*arguments: str, log: Path | None = None) -> None:
-    """Run a command of the package with one thread; keep what it prints."""
-    with log.open("w") if log else tempfile.TemporaryFile("w") as file:
-        subprocess.run(
-            [sys.executable, "-m", "torchrl_osr", *arguments],
-            stdout=file, stderr=subprocess.STDOUT, check=True,
-            env=os.environ | {"OMP_NUM_THREADS": "1"},
-        )  # fmt: skip
+    """Run a command of the package in a fork of this process; keep what it prints."""
+    child = multiprocessing.get_context("fork").Process(
+        target=command, args=(arguments, log)
+    )
+    child.start()
+    child.join()
+    if child.exitcode:
+        raise RuntimeError(f"torchrl-osr {' '.join(arguments)} failed, see {log}")
+
+
+def command(arguments: Sequence[str], log: Path | None) -> None:
+    """Run it in this process."""
+    with (log or Path(os.devnull)).open("w") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    start(arguments)
 
 
 def steps_of(method: str) -> int:
@@ -186,7 +201,8 @@ def main() -> None:
         for method in options.methods
         if f"{data}/{method}/seed{seed}" not in done
     ]
-    with ThreadPoolExecutor(options.jobs) as pool:
+    fork = multiprocessing.get_context("fork")
+    with ProcessPoolExecutor(options.jobs, fork) as pool:
         for done in [pool.submit(run, *each) for each in grid]:
             error = done.exception()
             if error is not None:
