@@ -58,6 +58,7 @@ METHODS = {
     "scas": ["loss=scas"],
     "sdc": ["loss=sdc"],
     "osr_v_data": ["loss=osr_v_data"],
+    "cql_both": ["loss=cql", "loss.actor_states=both"],
     "rim": ["loss=rim"],
 }
 SUITES = {
