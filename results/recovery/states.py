@@ -47,16 +47,24 @@ LEGGED: dict[str, tuple[float, ...]] = {
     "start": (0.1, 0.15),
 }
 DISTURBANCES: dict[str, dict[str, tuple[float, ...]]] = {
-    "hopper": LEGGED,
+    "hopper": {
+        "torque": (5,),
+        "rest": (),
+        "push": (0.5, 1, 1.5),
+        "kick": (0.25, 0.5, 0.75, 1),
+        "kick-root": (0.5, 1, 1.5),
+        "kick-joints": (0.5, 1, 1.5, 2),
+        "start": (0.12, 0.15, 0.15, 0.18),
+    },
     "walker2d": LEGGED,
     "halfcheetah": {
-        "torque": (10, 20, 40),
-        "rest": (20,),
-        "push": (2, 4, 8),
-        "kick": (1, 2, 4),
-        "kick-root": (2, 4, 8),
-        "kick-joints": (2, 4),
-        "start": (0.5, 1.0, 1.5),
+        "torque": (20,),
+        "rest": (),
+        "push": (2, 3, 4, 6),
+        "kick": (1.5, 2, 3),
+        "kick-root": (2, 3, 4, 6),
+        "kick-joints": (2, 3, 4),
+        "start": (),
     },
     "pointmaze-medium": {
         "torque": (100, 200),
