@@ -42,7 +42,6 @@ class Simulator(nn.Module):
         super().__init__()
         self.world, self.norm = World(system), norm
         self.observation_dim, self.action_dim = model.observation_dim, model.action_dim
-        self.largest_disagreement = torch.tensor(torch.inf)
 
     def predict(self, observation: Tensor, action: Tensor) -> Prediction:
         """Change of the state and reward, ``[1, B, S + 1]``, without a doubt."""

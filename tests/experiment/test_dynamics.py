@@ -8,6 +8,7 @@ import json
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from composed import SMALL, composed
@@ -16,7 +17,7 @@ from tensordict import TensorDict
 from torchrl_osr.commands import train
 from torchrl_osr.data.store.cache import cache_root
 from torchrl_osr.experiment import run_folder
-from torchrl_osr.experiment.build import check_parts, make_learner
+from torchrl_osr.experiment.build import check_parts, make_dynamics, make_learner
 from torchrl_osr.experiment.dynamics import (
     FILE,
     dynamics_model,
@@ -99,9 +100,6 @@ def test_run_leaves_model_report_and_numbers(finished) -> None:
     model = load_dynamics(finished / "dynamics.safetensors")
     assert (model.observation_dim, model.action_dim, model.num_networks) == (11, 3, 3)
     assert len(model.elites) == 2
-    assert model.largest_disagreement.item() == pytest.approx(
-        report["largest_disagreement"]
-    )
     assert {"imagined_refused", "imagined_reward"} <= scalars(finished).keys()
     assert not (finished / "inverse_dynamics.json").exists()
     # What evaluates a run needs no model.
@@ -137,7 +135,7 @@ def test_recovery_is_added_to_mopo(tmp_path) -> None:
 
 @pytest.mark.parametrize("steps", [0, 3])
 def test_rollouts_begin_in_states_of_the_data_or_beside_them(finished, steps) -> None:
-    cfg = small(f"dynamics.disturbed_steps={steps}", "dynamics.refuse=true")
+    cfg = small(f"dynamics.disturbed_steps={steps}", "dynamics.unknown=refuse")
     data, model = load_training_data(cfg, CPU), load_dynamics(finished / FILE)
     actor = make_learner(cfg, 11, 3).actor
     buffer = imagined_replay_buffer(cfg, data, model, actor, lambda batch: batch)
@@ -165,6 +163,33 @@ def test_recovery_by_imagination_is_one_line(tmp_path) -> None:
     rim = ["loss=rim", "dynamics.real_ratio=0.5", "trainer.steps=2"]
     found = scalars(ran(tmp_path, *rim))
     assert {"cloning_error", "imagined_reward", "imagined_refused"} <= found.keys()
+
+
+@pytest.mark.parametrize("shift", [0, -100])
+def test_the_task_ends_where_the_model_knows_less_than_it_should(shift) -> None:
+    # A freshly drawn model, and a share that leaves about half of the first rows.
+    cfg = small(
+        *("dynamics.unknown=halt", "dynamics.known_share=0.5"),
+        *("dynamics.rollout_starts=400", f"data.reward_shift={shift}"),
+        *("dynamics.penalty=0", "dynamics.terminations=never"),
+    )
+    data = load_training_data(cfg, CPU)
+    torch.manual_seed(0)
+    model, actor = make_dynamics(cfg, 11, 3), make_learner(cfg, 11, 3).actor
+    buffer = imagined_replay_buffer(cfg, data, model, actor, lambda batch: batch)
+    buffer.sample()
+    first = buffer.imagined[: cfg.dynamics.rollout_starts]["next"]
+    ended = first["terminated"].squeeze(-1)
+    assert 0.3 < ended.float().mean() < 0.7
+    worst = min(np.quantile(data.held_out["next", "reward"], 0.01), 0)
+    assert (worst < -90) == (shift < 0)
+    wanted = torch.full([int(ended.sum()), 1], worst / (1 - cfg.optim.gamma))
+    torch.testing.assert_close(first["reward"][ended], wanted.float())
+
+
+def test_the_task_ends_forward_alone() -> None:
+    with pytest.raises(ValueError, match="unknown=halt ends the task"):
+        check_parts(small("loss=romi", "dynamics.unknown=halt"), 11, 3)
 
 
 def test_disturbed_steps_are_forward() -> None:

@@ -73,6 +73,23 @@ def test_rows_on_which_the_elites_disagree_are_refused_and_counted() -> None:
     torch.testing.assert_close(rows["disagreement"], torch.full([15, 1], 0.5))
 
 
+def test_the_task_may_end_where_the_elites_disagree() -> None:
+    starts, world = torch.tensor([[2.0], [math.inf]]), linear_world(spread=0.5)
+    options = {"steps": 3, "max_disagreement": 0.4, "halt_reward": -7.0}
+    rows, refused = imagine(world, one, starts, **options)
+    assert (len(rows), refused) == (1, 1)
+    assert rows["next", "observation"].item() == 2
+    assert rows["next", "reward"].item() == -7
+    assert torch.equal(rows["next", "terminated"], torch.tensor([[True]]))
+    assert torch.equal(rows["next", "done"], torch.tensor([[True]]))
+    assert rows["disagreement"].item() == pytest.approx(0.5)
+    options["max_disagreement"] = 0.6
+    rows, _ = imagine(world, one, starts, **options)
+    assert not rows["next", "terminated"].any()
+    with pytest.raises(ValueError, match="no state is left"):
+        disturbed(world, starts, **(options | {"max_disagreement": 0.4}))
+
+
 def test_rows_that_are_not_finite_are_refused() -> None:
     starts = torch.tensor([[0.0], [math.inf]])
     rows, refused = imagine(linear_world(), one, starts, steps=2)

@@ -339,6 +339,11 @@ def check_parts(
                 "forward, and the model goes backward: take dynamics=ensemble, or set "
                 "it to 0."
             )
+        if cfg.dynamics.unknown == "halt" and cfg.dynamics.reverse_policy:
+            raise ValueError(
+                "dynamics.unknown=halt ends the task where nobody knows what follows, "
+                "and the model goes backward: take refuse or take."
+            )
         if ("next", "action") in in_keys:
             raise ValueError(
                 f"{cfg.loss._target_} reads the data's next action, which no imagined "

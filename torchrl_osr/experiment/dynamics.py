@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import math
 from collections.abc import Callable, Mapping
 from itertools import pairwise
 from pathlib import Path
@@ -294,10 +293,9 @@ def imagined_replay_buffer(
     real, scale = data.alone(), cfg.data.reward_scale
     sizes = norm.scale.expand(model.observation_dim)
     units = torch.cat([sizes, sizes.new_tensor([1 / scale])])
-    largest = float(model.largest_disagreement) if options.refuse else math.inf
     bounds: dict[str, Any] = {
         "terminated": _in_units_of(data, ends),
-        "max_disagreement": largest,
+        **_unknown(cfg, data, model),
     }
     backwards = options.reverse_policy is not None
 
@@ -387,6 +385,24 @@ def model_adversary(
         terminated=_in_units_of(data, termination_of(cfg)),
         seed=cfg.seed,
     )
+
+
+@torch.no_grad()
+def _unknown(
+    cfg: DictConfig, data: TrainingData, model: DynamicsEnsemble
+) -> dict[str, float]:
+    """What :func:`imagine` does with rows on which the networks disagree."""
+    options, held_out = cfg.dynamics, data.held_out
+    if options.unknown == "take":
+        return {}
+    mean, _ = model.predict(held_out["observation"], held_out["action"])
+    known = model.disagreement(mean).quantile(options.known_share)
+    bounds = {"max_disagreement": known.item()}
+    if options.unknown == "halt":
+        # An end must not be better than what the data's worst rewards add up to.
+        worst = held_out["next", "reward"].quantile(0.01).clamp(max=0)
+        bounds["halt_reward"] = worst.item() / (1 - cfg.optim.gamma)
+    return bounds
 
 
 def _in_units_of(data: TrainingData, ends: Termination) -> Termination:

@@ -54,6 +54,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "dynamics.generations": (1, 1000),
     "dynamics.real_ratio": (0, 1),
     "dynamics.penalty": (0, LARGEST),
+    "dynamics.known_share": (0, 1),
     "perturbation.std": (0, LARGEST),
     "perturbation.adversary.num_samples": (1, 10_000),
     "perturbation.adversary.num_steps": (1, 10_000),
@@ -92,6 +93,7 @@ _REDUCTIONS = (None, "mean", "sum")  # a trainer goes backward from one number
 CHOICES: dict[str, tuple[str | None, ...]] = {
     "data.storage": ("memory", "disk"),
     "dynamics.terminations": ("auto", "never"),
+    "dynamics.unknown": ("refuse", "halt", "take"),
     "dynamics.reverse_policy": (None, "cvae", "uniform"),
     "perturbation.noise": ("gaussian", "uniform"),
     "inverse_dynamics.loss.reduction": _REDUCTIONS,

@@ -219,8 +219,9 @@ class DynamicsConfig:
             imagined.
         penalty: factor of the model's uncertainty, in the task's own units, that
             imagined rewards lose.
-        refuse: leave out rows on which the elites disagree more than on any held-out
-            row.
+        unknown: what becomes of rows on which the elites disagree more than on held-out
+            ones: refuse leaves them out, halt ends the task there, take does nothing.
+        known_share: share of the held-out rows that count as known in that.
         published: settings by data set or task, where a method has them.
     """
 
@@ -247,7 +248,8 @@ class DynamicsConfig:
     generations: int = MISSING
     real_ratio: float = MISSING
     penalty: float = MISSING
-    refuse: bool = MISSING
+    unknown: str = MISSING
+    known_share: float = MISSING
     published: dict[str, Any] = field(default_factory=dict)
 
 

@@ -171,7 +171,7 @@ class ImaginedReplayBuffer(OfflineToOnlineReplayBuffer):
             raise ValueError(
                 "no imagined row was taken: the model knows none of the policy's "
                 "actions. Train it longer (dynamics.steps), or take its rows all the "
-                "same (dynamics.refuse=false)."
+                "same (dynamics.unknown=take)."
             )
         return found
 

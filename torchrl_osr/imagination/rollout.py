@@ -42,6 +42,7 @@ def imagine(
     steps: int,
     terminated: Termination = never,
     max_disagreement: float = math.inf,
+    halt_reward: float | None = None,
     units: Tensor | None = None,
 ) -> Imagined:
     r"""Transitions of a policy in a model, from given states on.
@@ -64,6 +65,9 @@ def imagine(
             :meth:`~torchrl_osr.modules.DynamicsEnsemble.disagreement` is above that are
             refused: nobody knows what follows. Rows that are not finite are refused,
             too. Default: infinity.
+        halt_reward: takes these rows instead, as ends of the task with this reward,
+            like the HALT of MOReL (https://arxiv.org/abs/2005.05951, definition 1); the
+            next state is then the state itself. Default: they are refused.
         units: factors ``[D]`` that bring predictions to the units in which
             ``"uncertainty"`` is measured. Default: 1, those of the model's data.
 
@@ -99,7 +103,14 @@ def imagine(
         uncertainty = largest_deviation(scale if units is None else scale * units)
         sample = model.sample(prediction)
         following, reward = state + sample[:, :-1], sample[:, -1:]
+        finite = sample.isfinite().all(-1)
+        known = finite & (apart <= max_disagreement)
         ended = terminated(following).unsqueeze(-1)
+        if halt_reward is not None:
+            unknown = ~known.unsqueeze(-1)
+            following = torch.where(unknown, state, following)
+            reward = torch.where(unknown, halt_reward, reward)
+            ended, known = ended | unknown, finite
         row = TensorDict(
             {
                 "observation": state,
@@ -117,7 +128,6 @@ def imagine(
             },
             [len(state)],
         )
-        known = (apart <= max_disagreement) & sample.isfinite().all(-1)
         refused += int((~known).sum())
         taken.append(row[known])
         state = following[known & ~ended.squeeze(-1)]
@@ -147,7 +157,8 @@ def disturbed(
 
     Keyword Args:
         steps: of it, at most.
-        options: ``terminated`` and ``max_disagreement`` of :func:`imagine`.
+        options: ``terminated``, ``max_disagreement`` and ``halt_reward`` of
+            :func:`imagine`.
 
     Returns:
         ``[B, S]``, drawn with replacement from all states in which the task goes on

@@ -82,7 +82,6 @@ class DynamicsEnsemble(TensorDictModuleBase):
     """
 
     elites: Tensor
-    largest_disagreement: Tensor
 
     def __init__(
         self,
@@ -120,7 +119,6 @@ class DynamicsEnsemble(TensorDictModuleBase):
             self.register_buffer(f"{name}_loc", torch.zeros(size))
             self.register_buffer(f"{name}_scale", torch.ones(size))
         self.register_buffer("elites", torch.arange(num_elites))
-        self.register_buffer("largest_disagreement", torch.tensor(torch.inf))
 
     # -- predictions ------------------------------------------------------------
 
@@ -216,10 +214,9 @@ class DynamicsEnsemble(TensorDictModuleBase):
 
     @torch.no_grad()
     def calibrate_(self, held_out: TensorDictBase) -> None:
-        """Choose the elites, and note how far they disagree at most.
+        """Choose the elites: those of the smallest error on held-out rows.
 
-        Elites are the networks with the smallest mean squared error (of standardised
-        targets) on the held-out rows.
+        It is the mean squared error of standardised targets.
 
         Args:
             held_out: transitions ``[N]``.
@@ -230,7 +227,6 @@ class DynamicsEnsemble(TensorDictModuleBase):
         wanted = (targets - self.target_loc) / self.target_scale
         error = (mean - wanted).square().mean((-2, -1))
         self.elites.copy_(error.argsort()[: len(self.elites)].sort().values)
-        self.largest_disagreement.copy_(disagreement(mean[self.elites]).max())
 
     def elite_networks(self) -> DynamicsEnsemble:
         """Frozen copy with the elites alone, to roll each network out by itself."""
