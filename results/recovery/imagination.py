@@ -28,20 +28,28 @@ HERE = Path(__file__).parent
 TABLE = HERE / "imagination.jsonl.gz"
 STEPS = 60_000
 MODEL = [
-    *("dynamics=ensemble", "dynamics.real_ratio=0.5", "dynamics.generations=20"),
+    *("dynamics=ensemble", "dynamics.real_ratio=0.5", "dynamics.rollout_steps=30"),
+    *("dynamics.num_cells=[200,200,200]", "dynamics.steps=40_000"),
     "dynamics.action_noise=0.2",
+    "dynamics.rollout_interval=5000",
+    "dynamics.generations=4",
 ]
+HALT = ["dynamics.unknown=halt", "dynamics.known_share=0.99"]
 DISTURBED = "dynamics.disturbed_steps=10"
 REFERENCE = "noisy cloning"
 ARMS = {
     REFERENCE: ["recovery=noisy_bc"],
     "base": [],
-    "disturbed starts": [*MODEL, DISTURBED],
-    "undisturbed starts": MODEL,
+    "disturbed starts": [*MODEL, *HALT, DISTURBED],
+    "undisturbed starts": [*MODEL, *HALT],
+    "disturbed starts, no halt": [*MODEL, DISTURBED],
     "simulator, disturbed starts": [*MODEL, DISTURBED],
     "simulator, undisturbed starts": MODEL,
 }
-"""The base is TD3+BC with the preset quick and twice its updates; others add to it."""
+"""The base is TD3+BC with the preset quick and twice its updates; others add to it.
+
+With disturbed starts and the halt it is ``loss=rim`` with a longer trained model.
+"""
 
 
 def python(*arguments: str, log: Path) -> None:
