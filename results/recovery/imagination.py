@@ -30,9 +30,7 @@ STEPS = 60_000
 MODEL = [
     *("dynamics=ensemble", "dynamics.real_ratio=0.5", "dynamics.rollout_steps=30"),
     *("dynamics.num_cells=[200,200,200]", "dynamics.steps=40_000"),
-    "dynamics.action_noise=0.2",
-    "dynamics.rollout_interval=5000",
-    "dynamics.generations=4",
+    *("dynamics.action_noise=0.2", "dynamics.generations=20"),
 ]
 HALT = ["dynamics.unknown=halt", "dynamics.known_share=0.99"]
 DISTURBED = "dynamics.disturbed_steps=10"

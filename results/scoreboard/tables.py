@@ -100,7 +100,7 @@ def lines(tables: RunTables) -> str:
     measured = json.loads((HERE / "update_ms.json").read_text())
     for _, run in tables.runs.drop_duplicates("method").iterrows():
         typed = run["overrides"].split()
-        chosen = [each for each in typed if each.startswith(("loss=", "recovery="))]
+        chosen = [each for each in typed if each.startswith(("loss", "recovery"))]
         loss = get_class(tables.settings.at[run.name, "loss._target_"])
         file = Path(inspect.getfile(loss)).read_text()
         code = len(file.splitlines()) - len(inspect.getdoc(loss).splitlines())
