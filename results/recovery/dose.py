@@ -27,6 +27,7 @@ SOURCES = (
 )
 LINES = {
     "disturbed starts": ("recovery by imagination", "#D55E00"),
+    "base": ("the same without", "#E69F00"),
     "osr": ("OSR", "#0072B2"),
     "noisy_bc": ("noisy cloning", "0.45"),
 }
