@@ -25,6 +25,7 @@ SOURCES = (
     HERE / "imagination.jsonl.gz",
     HERE.parent / "scoreboard" / "walker2d-medium-expert.jsonl.gz",
 )
+FIGURE = HERE.parents[1] / "docs" / "figures" / "dose.png"
 LINES = {
     "disturbed starts": ("recovery by imagination", "#D55E00"),
     "base": ("the same without", "#E69F00"),
@@ -94,7 +95,7 @@ def main() -> None:
         for method, of in saved.groupby("method")
         if method in LINES
     }
-    draw(counts, shares, HERE / "dose.png")
+    draw(counts, shares, FIGURE)
     oracle = 1 - counts["not saved"] / counts.sum(axis=1)
     means = {name: of.mean(axis=1) for name, of in shares.items()}
     print(pd.DataFrame({"planner": oracle} | means).round(2).to_string())
