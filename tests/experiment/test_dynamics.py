@@ -187,9 +187,11 @@ def test_the_task_ends_where_the_model_knows_less_than_it_should(shift) -> None:
     torch.testing.assert_close(first["reward"][ended], wanted.float())
 
 
-def test_the_task_ends_forward_alone() -> None:
+def test_the_task_ends_forward_alone_and_with_a_discount() -> None:
     with pytest.raises(ValueError, match="unknown=halt ends the task"):
         check_parts(small("loss=romi", "dynamics.unknown=halt"), 11, 3)
+    with pytest.raises(ValueError, match="no answer for optim.gamma=1"):
+        check_parts(small("dynamics.unknown=halt", "optim.gamma=1"), 11, 3)
 
 
 def test_disturbed_steps_are_forward() -> None:

@@ -344,6 +344,11 @@ def check_parts(
                 "dynamics.unknown=halt ends the task where nobody knows what follows, "
                 "and the model goes backward: take refuse or take."
             )
+        if cfg.dynamics.unknown == "halt" and cfg.optim.gamma == 1:
+            raise ValueError(
+                "dynamics.unknown=halt asks what a reward for ever is worth, which has "
+                "no answer for optim.gamma=1: take a smaller one."
+            )
         if ("next", "action") in in_keys:
             raise ValueError(
                 f"{cfg.loss._target_} reads the data's next action, which no imagined "
