@@ -100,6 +100,11 @@ def test_run_leaves_model_report_and_numbers(finished) -> None:
     model = load_dynamics(finished / "dynamics.safetensors")
     assert (model.observation_dim, model.action_dim, model.num_networks) == (11, 3, 3)
     assert len(model.elites) == 2
+    rows = load_training_data(small(), CPU).held_out
+    mean, _ = model.predict(rows["observation"], rows["action"])
+    assert model.disagreement(mean).max().item() == pytest.approx(
+        report["largest_disagreement"]
+    )
     assert {"imagined_refused", "imagined_reward"} <= scalars(finished).keys()
     assert not (finished / "inverse_dynamics.json").exists()
     # What evaluates a run needs no model.

@@ -115,6 +115,9 @@ def test_elites_are_the_best_on_held_out_rows() -> None:
     ones, zeros = torch.ones(3, 1), torch.zeros(3, 1)
     model.calibrate_(rows_of(zeros, zeros, ones, zeros))
     assert model.elites.tolist() == [1, 3]
+    # Their mean is .95, and both are .15 from it.
+    apart = model.disagreement(model.predict(zeros, zeros).mean)
+    assert apart.max().item() == pytest.approx(0.15)
 
 
 def test_elites_alone_predict_as_they_did() -> None:

@@ -214,9 +214,10 @@ class DynamicsEnsemble(TensorDictModuleBase):
 
     @torch.no_grad()
     def calibrate_(self, held_out: TensorDictBase) -> None:
-        """Choose the elites: those of the smallest error on held-out rows.
+        """Choose the elites by their error on held-out rows.
 
-        It is the mean squared error of standardised targets.
+        They are the networks with the smallest mean squared error of standardised
+        targets.
 
         Args:
             held_out: transitions ``[N]``.
