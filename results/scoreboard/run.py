@@ -1,6 +1,7 @@
 """Train every method for as long as the others, then disturb what it learned.
 
-    python results/scoreboard/run.py --measure             milliseconds of an update
+    python results/scoreboard/run.py --measure quick       milliseconds of an update
+    python results/scoreboard/run.py --measure paper       at the paper's sizes
     python results/scoreboard/run.py outputs/scoreboard    what is missing
     python results/scoreboard/run.py outputs/scoreboard --methods osr cql --seeds 0
     python results/scoreboard/run.py outputs/scoreboard --pack
@@ -94,37 +95,40 @@ def command(arguments: Sequence[str], log: Path | None) -> None:
 
 def steps_of(method: str) -> int:
     """Return the updates that fit in the time, in tenths that are evaluated."""
-    ms = json.loads((HERE / "update_ms.json").read_text())[method]
+    ms = json.loads((HERE / "update_ms.json").read_text())["quick"][method]
     return round(CORE_SECONDS / ms) * 1000
 
 
-def measure(methods: list[str]) -> None:
+def measure(methods: list[str], preset: str) -> None:
     """Write the processor's milliseconds of an update of each method, on Hopper.
 
     Those of the others are within some percent: their inputs alone are wider.
     """
     path = HERE / "update_ms.json"
     found = json.loads(path.read_text()) if path.exists() else {}
+    here = found.setdefault(preset, {})
     for method in methods:
-        if method in found:
+        if method in here:
             continue
         seconds = []
-        for steps in (500, 500, 1500):  # the first one fills the caches
+        # The first one fills the caches. A generation of roll-outs is in between.
+        for steps in (100, 100, 1100):
             with tempfile.TemporaryDirectory() as folder:
                 before = resource.getrusage(resource.RUSAGE_CHILDREN)
                 torchrl_osr(
-                    "train", "env=hopper", *METHODS[method],
-                    f"trainer.steps={steps}", f"trainer.eval_interval={steps}",
-                    "trainer.eval_episodes=1", "trainer.inverse_dynamics_steps=100",
-                    "dynamics.steps=100", f"hydra.run.dir={folder}/run",
+                    "train", "env=hopper", *METHODS[method], f"preset={preset}",
+                    "data.num_transitions=200_000", f"trainer.steps={steps}",
+                    f"trainer.eval_interval={steps}", "trainer.eval_episodes=1",
+                    "trainer.inverse_dynamics_steps=100", "dynamics.steps=100",
+                    "dynamics.vae_steps=100", f"hydra.run.dir={folder}/run",
                 )  # fmt: skip
                 after = resource.getrusage(resource.RUSAGE_CHILDREN)
             seconds.append(
                 after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
             )
-        found[method] = round(seconds[2] - seconds[1], 2)
+        here[method] = round(seconds[2] - seconds[1], 2)
         path.write_text(json.dumps(found, indent=2) + "\n")
-        print(method, found[method], "ms", flush=True)
+        print(method, here[method], "ms", flush=True)
 
 
 def run(folder: Path, data: str, method: str, seed: int) -> None:
@@ -181,7 +185,9 @@ def main() -> None:
     """Measure, or go through the grid seed by seed."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("folder", type=Path, nargs="?")
-    parser.add_argument("--measure", action="store_true", help="run nothing else")
+    parser.add_argument(
+        "--measure", metavar="PRESET", help="run nothing else; of quick or paper"
+    )
     parser.add_argument("--pack", action="store_true", help="run nothing")
     parser.add_argument("--data", nargs="+", default=DATA, choices=DATA)
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=METHODS)
@@ -189,7 +195,7 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2, help="runs at once")
     options = parser.parse_args()
     if options.measure:
-        measure(options.methods)
+        measure(options.methods, options.measure)
         return
     if options.pack:
         pack(options.folder)

@@ -90,6 +90,19 @@ def test_presets_reach_the_values_and_the_command_line_wins():
     assert "expert" in cfg.data.values()
 
 
+@pytest.mark.parametrize(("env", "weight"), [("walker2d", 20), ("halfcheetah", 100)])
+def test_quick_preset_knows_data_of_an_expert(env, weight):
+    cfg = train(f"env={env}", "data=medium-expert")
+    assert (cfg.loss.min_q_weight, cfg.optim.actor_lr) == (weight, 3e-4)
+    here = ["data=medium-expert", "optim.actor_lr=1e-3", "min_q_weight=7"]
+    chosen = train(f"env={env}", *here)
+    assert (chosen.loss.min_q_weight, chosen.optim.actor_lr) == (7, 1e-3)
+    for other in (["data=medium-replay"], ["data=medium-expert", "preset=paper"]):
+        assert train(f"env={env}", *other).loss.min_q_weight == 5
+    # Losses without the term have no use for it.
+    assert train(f"env={env}", "data=medium-expert", "loss=mopo").loss.min_q_weight == 0
+
+
 @pytest.mark.parametrize("group", GROUPS)
 def test_unknown_option_lists_what_exists(group):
     with pytest.raises(MissingConfigException) as error:

@@ -352,6 +352,7 @@ class TrainConfig:
     Attributes:
         seed: random seed of networks, sampling and noise.
         num_random: value of ``loss.num_random`` for the losses with CQL's term.
+        min_q_weight: value of ``loss.min_q_weight`` for them.
         recovery: options of ``StateRecoveryLoss``, whose term is added to a loss that
             has none of its own; null for none.
         resume: folder of a run to continue, or to extend with more ``trainer.steps``.
@@ -374,6 +375,7 @@ class TrainConfig:
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     seed: int = MISSING
     num_random: int = MISSING
+    min_q_weight: float = MISSING
     recovery: Any = None  # derived like loss
     resume: str | None = None
     force: bool = False
