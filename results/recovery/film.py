@@ -31,8 +31,9 @@ from torchrl_osr.experiment.trained_run import load_trained
 from torchrl_osr.film import Camera, Take, film_gif, film_strip
 
 FIGURES = Path(__file__).parents[2] / "docs" / "figures"
-STEPS = 150
-COLUMNS = (0, 5, 10, 20, 30, 45, 60, 80, 110, 150)
+COLUMNS = (0, 10, 20, 40, 60, 80, 110, 150, 220, 300)
+MOVING = 200
+"""Steps of the moving film."""
 
 
 def came_back(run: Path) -> np.ndarray:
@@ -69,7 +70,7 @@ def take(world: World, states: RecoverableStates, number: int, name: str, policy
     row = [[0.0], states.qpos[number], states.qvel[number], states.goal[number]]
     observation = put(world, np.concatenate(row))
     seen, poses, fell = [observation], [states.qpos[number]], False
-    for step in range(STEPS):
+    for step in range(states.steps):
         action = np.clip(policy(observation, step), -1, 1)
         observation, _, fell, _, _ = world.env.step(action)
         seen.append(observation)
@@ -91,21 +92,28 @@ def main() -> None:
     takes = [
         take(world, states, number, "noisy cloning", policy_of(clone)),
         take(world, states, number, "recovery by imagination", policy_of(ours)),
-        take(world, states, number, "planner, simulator", planner(world, states, number)),
+        take(
+            world, states, number, "planner, simulator", planner(world, states, number)
+        ),
     ]
     shares = [100 * each[:, recoverable].mean() for each in (theirs, mine)]
     title = f"After a push ({states.strength[number]:g} body weights): who comes back?"
-    note = (
-        f"State {number} of {system}'s public half, chosen because it tells them "
-        f"apart.\nOf all {recoverable.sum()} recoverable ones noisy cloning comes back "
-        f"from {shares[0]:.0f} %, recovery by imagination from {shares[1]:.0f} %, the "
+    share = (
+        f"Of all {recoverable.sum()} recoverable states noisy cloning comes back from "
+        f"{shares[0]:.0f} %, recovery by imagination from {shares[1]:.0f} %, the "
         "planner from all."
     )
+    chosen = f"State {number} of {system}'s public half, which tells them apart."
     camera = Camera(make_environment(load_trained(ours).config.env.id), 224)
-    options = {"title": title, "note": note, "event": "push"}
-    film_strip(takes, camera, FIGURES / "recovery.png", offsets=COLUMNS, **options)
-    frames = range(STEPS + 1)
-    film_gif(takes, camera, FIGURES / "recovery.gif", offsets=frames, **options)
+    options = {"title": title, "event": "push"}
+    film_strip(
+        takes, camera, FIGURES / "recovery.png",
+        offsets=COLUMNS, note=f"{chosen}\n{share}", **options,
+    )  # fmt: skip
+    film_gif(
+        takes, camera, FIGURES / "recovery.gif",
+        offsets=range(MOVING + 1), note=chosen, **options,
+    )  # fmt: skip
     camera.close()
     print(number, [each.last for each in takes], shares)
 
