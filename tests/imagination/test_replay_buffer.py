@@ -23,14 +23,20 @@ def policy_of(weight: float = 0.0) -> nn.Linear:
 def rows_of(policy: nn.Linear) -> Imagined:
     """Nine rows that say which policy has imagined them, with noise below 1."""
     state = policy.weight.detach() + torch.rand(9, 1)
-    reward = {"reward": torch.ones(9, 1)}
-    return Imagined(TensorDict({"state": state, "next": reward}, [9]), 3)
+    following = {
+        "reward": torch.ones(9, 1),
+        "terminated": torch.arange(9).unsqueeze(-1) == 0,
+    }
+    return Imagined(TensorDict({"state": state, "next": following}, [9]), 3)
 
 
 def make_buffer(policy: nn.Linear, *, seed: int = 0, **options) -> ImaginedReplayBuffer:
     real = ReplayBuffer(storage=LazyTensorStorage(50))
-    reward = {"reward": torch.zeros(50, 1)}
-    real.extend(TensorDict({"state": -torch.ones(50, 1), "next": reward}, [50]))
+    following = {
+        "reward": torch.zeros(50, 1),
+        "terminated": torch.zeros(50, 1, dtype=torch.bool),
+    }
+    real.extend(TensorDict({"state": -torch.ones(50, 1), "next": following}, [50]))
     options = {"real_ratio": 0.25, "batch_size": 40} | options
     buffer = ImaginedReplayBuffer(
         real, policy, rows_of, interval=3, generations=2, seed=seed, **options
@@ -54,7 +60,11 @@ def test_batches_have_the_share_of_real_rows_and_the_newest_generations() -> Non
         found.append(origins(batch) - {-1})
     # Imagined before batches 0, 3, 6, 9; the last two are kept.
     assert found == [{0}] * 3 + [{0, 3}] * 3 + [{3, 6}] * 3 + [{6, 9}] * 3
-    assert buffer.metrics() == {"imagined_refused": 0.25, "imagined_reward": 1.0}
+    assert buffer.metrics() == {
+        "imagined_refused": 0.25,
+        "imagined_ended": pytest.approx(1 / 9),
+        "imagined_reward": 1.0,
+    }
 
 
 def test_batches_are_transformed_as_a_whole() -> None:

@@ -152,12 +152,12 @@ class ImaginedReplayBuffer(OfflineToOnlineReplayBuffer):
         return super().sample(batch_size)
 
     def metrics(self) -> dict[str, float]:
-        """What the generations are like: share of refused rows, mean reward."""
-        refused = sum(each.refused for each in self._imagined)
-        reward = torch.cat([each.rows["next", "reward"] for each in self._imagined])
+        """Share of refused rows, and of the others those that end; mean reward."""
+        refused, rows = sum(each.refused for each in self._imagined), self.imagined
         return {
-            "imagined_refused": refused / (refused + len(reward)),
-            "imagined_reward": reward.mean().item(),
+            "imagined_refused": refused / (refused + len(rows)),
+            "imagined_ended": rows["next", "terminated"].float().mean().item(),
+            "imagined_reward": rows["next", "reward"].mean().item(),
         }
 
     def _imagine(self, weights: Mapping[str, Any], number: int) -> Imagined:
