@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import subprocess
@@ -13,7 +14,7 @@ from omegaconf import OmegaConf
 
 from torchrl_osr import __version__
 from torchrl_osr.__main__ import COMMANDS, main
-from torchrl_osr.commands.console import sentence
+from torchrl_osr.commands.console import sentence, single_job
 
 
 def test_help_names_every_command_and_fits_a_screen(capsys):
@@ -89,6 +90,16 @@ def test_error_is_alone_and_debug_shows_where(tmp_path, run):
     assert code == 1
     assert output.startswith("Traceback")
     assert "FileNotFoundError: there is no run" in output
+
+
+def test_screen_is_not_for_what_matplotlib_logs(caplog):
+    def job(cfg):
+        logging.getLogger("matplotlib.font_manager").info("generated new fontManager")
+        logging.getLogger("torchrl_osr").info("step 1")
+
+    caplog.set_level(logging.INFO)
+    single_job(job)(None)
+    assert caplog.messages == ["step 1"]
 
 
 def test_example_is_the_command_by_another_name(tmp_path, run):

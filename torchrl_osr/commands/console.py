@@ -51,6 +51,8 @@ def single_job(task: Callable[..., Any]) -> Callable[..., Any]:
         from hydra.core.hydra_config import HydraConfig
         from hydra.types import RunMode
 
+        # Hydra shows what all libraries log, as that fonts have been looked for.
+        logging.getLogger("matplotlib").setLevel(logging.WARNING)
         try:
             return task(cfg)
         except Exception as error:
