@@ -44,7 +44,7 @@ ARMS = {
     "simulator, disturbed starts": [*MODEL, DISTURBED],
     "simulator, undisturbed starts": MODEL,
 }
-"""The base is TD3+BC with the preset quick and twice its updates; others add to it.
+"""The base is TD3+BC: the preset quick, larger batches and twice its updates.
 
 With disturbed starts and the halt it is ``loss=rim`` with a longer trained model.
 """
@@ -71,7 +71,8 @@ def run(folder: Path, arm: str, data: str, seed: int, half: str) -> None:
             train = [str(HERE / "simulated.py")]
         python(
             *train, f"env={env}", f"data={quality}", f"seed={seed}", "loss=td3_bc",
-            *ARMS[arm], f"trainer.steps={STEPS}",
+            *ARMS[arm], f"trainer.steps={STEPS}", "trainer.batch_size=256",
+            "optim.actor_lr=1e-3",  # the preset's, but for medium-expert
             f"trainer.eval_interval={STEPS // 20}", "trainer.progress=false",
             f"hydra.run.dir='{folder}'",
             log=folder / "train.txt",
