@@ -5,7 +5,8 @@
 
 Each run is ``torchrl-osr train`` in a process with one torch thread, then its last
 checkpoints play from the recoverable states. What is there is not done again; what is
-finished is packed into ``imagination.jsonl.gz``, from which the table is printed.
+finished is packed into ``imagination.jsonl.gz``, from which the first table is printed.
+The second one is of arms that are not made any more, ``imagination-pilots.jsonl.gz``.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from torchrl_osr.report.scores import by_run, estimate, recent
 
 HERE = Path(__file__).parent
 TABLE = HERE / "imagination.jsonl.gz"
+PILOTS = HERE / "imagination-pilots.jsonl.gz"
 STEPS = 60_000
 MODEL = [
     *("dynamics=ensemble", "dynamics.real_ratio=0.5", "dynamics.rollout_steps=30"),
@@ -96,9 +98,9 @@ def pack(folder: Path) -> None:
     TABLE.write_bytes(gzip.compress("".join(lines).encode(), mtime=0))
 
 
-def table() -> str:
+def table(path: Path) -> str:
     """Markdown: undisturbed score and shares of the states, by data and arm."""
-    tables = read_runs([TABLE])
+    tables = read_runs([path])
     groups = GROUPS[::-1]
     columns = "arm", "seeds", "score", *(f"{name} %" for name in groups), "R %"
     lines = [columns, ("---",) * len(columns)]
@@ -128,7 +130,7 @@ def main() -> None:
     given = parser.parse_args()
     if given.pack:
         pack(given.folder)
-        print(table())
+        print(table(TABLE), table(PILOTS), sep="\n\n")
         return
     for seed in given.seeds:
         for data in given.data:

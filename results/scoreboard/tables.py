@@ -107,12 +107,8 @@ def lines(tables: RunTables) -> str:
         code = len(file.splitlines()) - len(inspect.getdoc(loss).splitlines())
         command = " ".join(chosen) or "loss=osr"
         row = [f"`{run['method']}`", f"`{command}`", f"`{loss.__name__}`"]
-        took = [
-            f"{measured[preset][run['method']]:.1f}"
-            if run["method"] in measured[preset]
-            else ""
-            for preset in ("quick", "paper")
-        ]
+        found = [measured[preset].get(run["method"]) for preset in ("quick", "paper")]
+        took = ["" if each is None else f"{each:.1f}" for each in found]
         rows.append([*row, str(code), *took])
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
@@ -135,7 +131,11 @@ def draw(rows: pd.DataFrame, path: Path) -> None:
         axes.set_ylim(-0.05 * top, 1.15 * top)
         # Names in a column, each tied to its point: beside the points they overlap.
         order = disturbed.sort_values().index
-        heights = np.linspace(0, 1.1 * top, len(order))
+        apart = 1.1 * top / 20  # that 21 names fit
+        heights: list[float] = []
+        for point in disturbed[order[::-1]]:  # as near to the points as names allow
+            heights.append(min([point, *(each - apart for each in heights[-1:])]))
+        heights = np.maximum(heights[::-1], apart * np.arange(len(order)))
         for method, height in zip(order, heights, strict=True):
             own = "osr" in method
             colour = "#D55E00" if own else "0.25"

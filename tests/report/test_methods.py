@@ -36,6 +36,21 @@ def test_other_budgets_and_settings_are_never_averaged(tmp_path):
     assert "hopper medium-replay: its runs differ in trainer.steps." in notes
 
 
+def test_what_is_chosen_by_the_data_keeps_no_runs_apart_and_is_said(tmp_path):
+    for seed in (0, 1):
+        for env, rate in (("hopper", 1e-3), ("walker2d", 3e-4)):
+            changes = {"optim.actor_lr": rate, "loss.beta": seed * (env == "hopper")}
+            folder = tmp_path / f"{env}{seed}"
+            fakes.write_run(folder, CURVE, seed=seed, env=env, changes=changes)
+    tables = fakes.read_all(tmp_path)
+    assert tables.runs.groupby("method")["data"].agg(len).to_dict() == {
+        "osr (loss.beta=0)": 3,
+        "osr (loss.beta=1)": 1,
+    }
+    note = "osr (loss.beta=0) differs between data sets: optim.actor_lr."
+    assert note in comparison_notes(tables)
+
+
 def test_what_does_not_fit_into_a_name_still_keeps_runs_apart(tmp_path):
     for seed, last in enumerate((1, 2, 2)):
         changes = {f"optim.{key}": 0 if seed == 1 else seed for key in "abc"}

@@ -1,8 +1,8 @@
 """Methods: which runs may be averaged, what they are called, how fair comparisons are.
 
 Runs are averaged only if their configurations differ in nothing but the seed (and, over
-data sets, the data set). Of runs with one name that differ in more, each kind becomes a
-method of its own, with the difference in its name.
+data sets, in the data set and in what is chosen by it). Of runs with one name that
+differ in more, each kind becomes a method of its own, with the difference in its name.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ def read_runs(paths: Sequence[Path]) -> RunTables:
     found.sort(key=lambda run: names.index(run.facts["method"]))
     runs = pd.DataFrame([run.facts for run in found])
     settings = pd.DataFrame([run.settings for run in found]).fillna("none")
-    runs["method"] = tell_apart(runs["method"], comparable(settings))
+    runs["method"] = tell_apart(runs["method"], comparable(settings), runs["data"])
     cell = ["method", "data", "seed"]
     first = runs.groupby(cell)["folder"].transform("first")
     again = runs.duplicated(cell)
@@ -161,7 +161,8 @@ def read_runs(paths: Sequence[Path]) -> RunTables:
     protocols = pd.DataFrame(played_suites or [{"run": 0, "suite": ""}])
     protocols = protocols.set_index(["run", "suite"])
     played = protocols.index.get_level_values("suite").to_series(protocols.index)
-    suites = tell_apart(played, protocols).rename("named")
+    everywhere = pd.Series("", protocols.index)
+    suites = tell_apart(played, protocols, everywhere).rename("named")
 
     def joined(parts: Sequence[pd.DataFrame]) -> pd.DataFrame:
         rows = pd.concat(dict(enumerate(parts)), names=["run", None]).reset_index("run")
@@ -190,11 +191,18 @@ def comparable(settings: pd.DataFrame) -> pd.DataFrame:
     ]
 
 
-def tell_apart(names: pd.Series, facts: pd.DataFrame) -> pd.Series:
-    """Names with, behind each, in what it differs from others of the same name."""
+def tell_apart(names: pd.Series, facts: pd.DataFrame, data: pd.Series) -> pd.Series:
+    """Names with, behind each, in what it differs from others of the same name.
+
+    Args:
+        names: of the rows.
+        facts: of each, a column for each kind.
+        data: of which data set each is. What is alike in every one of them tells
+            nothing apart: it has been chosen by the data.
+    """
     found = names.copy()
     for name, group in facts.groupby(names, sort=False):
-        differing = group.loc[:, group.nunique() > 1]
+        differing = group.loc[:, group.groupby(data).nunique().max() > 1]
         if differing.empty:
             continue
         kinds = differing.groupby(list(differing), sort=False).ngroup() + 1
@@ -221,6 +229,10 @@ def comparison_notes(tables: RunTables) -> list[str]:
     if silent.any():
         notes.append(f"No versions are recorded of {counted(silent.sum(), 'run')}.")
     settings = comparable(tables.settings).assign(data_score=runs["data_score"])
+    for method, group in runs.groupby("method", sort=False):
+        chosen = comparable(tables.settings).loc[group.index].nunique()
+        if keys := list(chosen.index[chosen > 1]):
+            notes.append(f"{method} differs between data sets: {', '.join(keys)}.")
     for data, group in runs.groupby("data", sort=False):
         facts = settings.loc[group.index]
         keys = [
