@@ -28,9 +28,9 @@ SOURCES = (
 FIGURE = HERE.parents[1] / "docs" / "figures" / "dose.png"
 LINES = {
     "disturbed starts": ("recovery by imagination", "#D55E00"),
-    "base": ("the same without", "#E69F00"),
+    "undisturbed starts": ("from undisturbed starts", "#E69F00"),
     "osr": ("OSR", "#0072B2"),
-    "noisy_bc": ("noisy cloning", "0.45"),
+    "noisy cloning": ("noisy cloning", "0.45"),
 }
 KINDS = ("torque", "rest", "push", "kick", "kick-root", "kick-joints")
 LEAST = 50
