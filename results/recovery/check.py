@@ -9,6 +9,9 @@ after eight changes that the search has not seen: it tried many ways on its own 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from typing import Any
+
 import numpy as np
 from clones import SYSTEMS
 from search import CHANGES
@@ -20,6 +23,9 @@ from torchrl_osr.evaluation.recoverable import (
     RecoverableStates,
     read_recoverable_states,
 )
+
+Policy = Callable[[np.ndarray, int], np.ndarray]
+"""Action for an observation and the number of the step."""
 
 
 def put(world: World, row: np.ndarray) -> np.ndarray:
@@ -64,21 +70,45 @@ def compare(world: World) -> None:
     )
 
 
+def row_of(states: RecoverableStates, number: int) -> np.ndarray:
+    """A state as a row, at time 0."""
+    parts = states.qpos[number], states.qvel[number], states.goal[number]
+    return np.concatenate([[0.0], *parts])
+
+
+def planner(world: World, states: RecoverableStates, number: int) -> Policy:
+    """The expert, and what the search added to its actions, by state and step."""
+    expert = world.policy("expert")
+    offsets = np.repeat(states.offsets[number], states.hold, axis=0)
+
+    def policy(observation: np.ndarray, step: int) -> np.ndarray:
+        action = expert(observation[None])[0]
+        return action + offsets[step] if step < len(offsets) else action
+
+    return policy
+
+
+def played(
+    world: World, states: RecoverableStates, number: int, policy: Policy
+) -> Iterator[tuple[np.ndarray, bool, dict[str, Any]]]:
+    """Observation, end and info of each step in the environment from a state on."""
+    observation = put(world, row_of(states, number))
+    for step in range(states.steps):
+        action = np.clip(policy(observation, step), -1, 1)
+        observation, _, terminated, _, info = world.env.step(action)
+        yield observation, terminated, info
+        if terminated:
+            return
+
+
 def holds(world: World, states: RecoverableStates, number: int) -> bool:
     """Whether a witness succeeds in the environment."""
-    row = [[0.0], states.qpos[number], states.qvel[number], states.goal[number]]
-    observation = put(world, np.concatenate(row))
-    offsets = np.repeat(states.offsets[number], states.hold, axis=0)
-    expert, speeds = world.policy("expert"), []
-    for step in range(states.steps):
-        action = expert(observation[None])[0]
-        if step < len(offsets):
-            action = action + offsets[step]
-        action = np.clip(action, -1, 1)
-        observation, _, terminated, _, info = world.env.step(action)
-        speeds.append(info.get("x_velocity", 0.0))
+    speeds = []
+    way = planner(world, states, number)
+    for _, terminated, info in played(world, states, number, way):
         if terminated:
             return world.is_maze
+        speeds.append(info.get("x_velocity", 0.0))
     return not world.is_maze and np.mean(speeds[-SPEED_STEPS:]) >= states.least_speed
 
 

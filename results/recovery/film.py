@@ -18,7 +18,7 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 
 import numpy as np
 import torch
-from check import put
+from check import Policy, planner, played, row_of
 from world import World
 
 from torchrl_osr.data import make_environment
@@ -27,7 +27,7 @@ from torchrl_osr.evaluation.recoverable import (
     RecoverableStates,
     load_recoverable_states,
 )
-from torchrl_osr.experiment.trained_run import load_trained
+from torchrl_osr.experiment.trained_run import TrainedRun, load_trained
 from torchrl_osr.film import Camera, Take, film_gif, film_strip
 
 FIGURES = Path(__file__).parents[2] / "docs" / "figures"
@@ -42,9 +42,8 @@ def came_back(run: Path) -> np.ndarray:
     return np.array([each["back"] for each in found["evaluations"]])
 
 
-def policy_of(run: Path):
-    """The last checkpoint's action for an observation."""
-    trained = load_trained(run)
+def policy_of(trained: TrainedRun) -> Policy:
+    """Its checkpoint's action."""
     act = deterministic_policy(trained.actor, trained.observation_norm)
 
     def policy(observation: np.ndarray, step: int) -> np.ndarray:
@@ -53,48 +52,37 @@ def policy_of(run: Path):
     return policy
 
 
-def planner(world: World, states: RecoverableStates, number: int):
-    """The expert, and what the search added to its actions."""
-    expert = world.policy("expert")
-    offsets = np.repeat(states.offsets[number], states.hold, axis=0)
-
-    def policy(observation: np.ndarray, step: int) -> np.ndarray:
-        action = expert(observation[None])[0]
-        return action + offsets[step] if step < len(offsets) else action
-
-    return policy
-
-
-def take(world: World, states: RecoverableStates, number: int, name: str, policy):
+def take(
+    world: World, states: RecoverableStates, number: int, name: str, policy: Policy
+) -> Take:
     """What a policy does from a state."""
-    row = [[0.0], states.qpos[number], states.qvel[number], states.goal[number]]
-    observation = put(world, np.concatenate(row))
-    seen, poses, fell = [observation], [states.qpos[number]], False
-    for step in range(states.steps):
-        action = np.clip(policy(observation, step), -1, 1)
-        observation, _, fell, _, _ = world.env.step(action)
+    seen = [world.observe(row_of(states, number)[None])[0]]
+    poses, fell = [states.qpos[number]], False
+    for observation, terminated, _ in played(world, states, number, policy):
         seen.append(observation)
         poses.append(world.simulation.data.qpos.copy())
-        if fell:
-            break
+        fell = terminated
     return Take(name, np.stack(seen), np.stack(poses), -1, 0, bool(fell))
 
 
 def main() -> None:
     """Choose the state, play it three times, draw."""
     clone, ours = map(Path, sys.argv[1:])
-    system = load_trained(ours).config.env.name
-    states, world = load_recoverable_states(system), World(system)
+    policies = {
+        "noisy cloning": load_trained(clone),
+        "recovery by imagination": (trained := load_trained(ours)),
+    }
+    env = trained.config.env
+    states, world = load_recoverable_states(env.name), World(env.name)
     theirs, mine = came_back(clone), came_back(ours)
     recoverable = states.group == "recoverable"
     tells = recoverable & (states.kind == "push") & mine.all(0) & ~theirs.any(0)
     number = int(np.flatnonzero(tells)[0])
+    controllers = {name: policy_of(each) for name, each in policies.items()}
+    controllers["planner, simulator"] = planner(world, states, number)
     takes = [
-        take(world, states, number, "noisy cloning", policy_of(clone)),
-        take(world, states, number, "recovery by imagination", policy_of(ours)),
-        take(
-            world, states, number, "planner, simulator", planner(world, states, number)
-        ),
+        take(world, states, number, name, policy)
+        for name, policy in controllers.items()
     ]
     shares = [100 * each[:, recoverable].mean() for each in (theirs, mine)]
     title = f"After a push ({states.strength[number]:g} body weights): who comes back?"
@@ -103,8 +91,8 @@ def main() -> None:
         f"{shares[0]:.0f} %, recovery by imagination from {shares[1]:.0f} %, the "
         "planner from all."
     )
-    chosen = f"State {number} of {system}'s public half, which tells them apart."
-    camera = Camera(make_environment(load_trained(ours).config.env.id), 224)
+    chosen = f"State {number} of {env.name}'s public half, which tells them apart."
+    camera = Camera(make_environment(env.id), 224)
     options = {"title": title, "event": "push"}
     film_strip(
         takes, camera, FIGURES / "recovery.png",

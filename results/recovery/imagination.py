@@ -124,10 +124,10 @@ def difference(first: str, second: str) -> str:
     saved = saved[saved["group"] == "recoverable"].astype({"back": float})
     saved = saved[saved["data"] == "walker2d medium-expert"]
     saved["state"] = saved.groupby("run").cumcount()
-    mean = saved.groupby(["method", "seed", "state"])["back"].mean().unstack()
+    back = saved.pivot(index=["method", "seed"], columns="state", values="back")
     walk = saved.groupby("state")["walk"].first()
-    both = mean.loc[first] - mean.loc[second]
-    found = (f"{100 * each:.1f}" for each in saved_share(both, walk))
+    more = back.loc[first] - back.loc[second]
+    found = (f"{100 * each:.1f}" for each in saved_share(more, walk))
     return "{} less {}: {} points [{}, {}]".format(first, second, *found)
 
 
