@@ -43,6 +43,7 @@ METHOD = (
     "inverse_dynamics.",
     "dynamics.",
     "num_random",
+    "min_q_weight",
 )
 """Settings in which methods differ by intent; all others should be equal."""
 
@@ -228,11 +229,12 @@ def comparison_notes(tables: RunTables) -> list[str]:
     silent = runs["versions"].str.len() == 0
     if silent.any():
         notes.append(f"No versions are recorded of {counted(silent.sum(), 'run')}.")
-    settings = comparable(tables.settings).assign(data_score=runs["data_score"])
+    settings = comparable(tables.settings)
     for method, group in runs.groupby("method", sort=False):
-        chosen = comparable(tables.settings).loc[group.index].nunique()
-        if keys := list(chosen.index[chosen > 1]):
+        kinds = settings.loc[group.index].nunique()
+        if keys := list(kinds.index[kinds > 1]):
             notes.append(f"{method} differs between data sets: {', '.join(keys)}.")
+    settings = settings.assign(data_score=runs["data_score"])
     for data, group in runs.groupby("data", sort=False):
         facts = settings.loc[group.index]
         keys = [
