@@ -111,8 +111,9 @@ def measure(methods: list[str], preset: str) -> None:
         if method in here:
             continue
         seconds = []
-        # The first one fills the caches. A generation of roll-outs is in between.
-        for steps in (100, 100, 1100):
+        # The first one fills the caches; the others both record the update, once. A
+        # generation of roll-outs is between them.
+        for steps in (500, 500, 1500):
             with tempfile.TemporaryDirectory() as folder:
                 before = resource.getrusage(resource.RUSAGE_CHILDREN)
                 torchrl_osr(
