@@ -1,12 +1,16 @@
 """Step 5: does it help to imagine what follows a disturbance?
 
     python results/recovery/imagination.py outputs/imagination --seeds 0 1
-    python results/recovery/imagination.py outputs/imagination --pack
+    python results/recovery/imagination.py outputs/imagination --pack imagination
+    python results/recovery/imagination.py outputs/look --seeds 300 301 302 303 304
+    python results/recovery/imagination.py outputs/look --half held-out --seeds ...
+    python results/recovery/imagination.py outputs/look --pack imagination-look
 
 Each run is ``torchrl-osr train`` in a process with one torch thread, then its last
 checkpoints play from the recoverable states. What is there is not done again; what is
-finished is packed into ``imagination.jsonl.gz``, from which the first table is printed.
-The second one is of arms that are not made any more, ``imagination-pilots.jsonl.gz``.
+finished is packed into a table beside this file, and all of them are printed:
+``imagination.jsonl.gz``; ``imagination-look.jsonl.gz``, the look at the held-out half;
+and ``imagination-pilots.jsonl.gz``, of arms that are not made any more.
 """
 
 from __future__ import annotations
@@ -26,8 +30,7 @@ from torchrl_osr.report.saved import saved_states
 from torchrl_osr.report.scores import by_run, estimate, recent
 
 HERE = Path(__file__).parent
-TABLE = HERE / "imagination.jsonl.gz"
-PILOTS = HERE / "imagination-pilots.jsonl.gz"
+TABLES = "imagination", "imagination-look", "imagination-pilots"
 STEPS = 60_000
 MODEL = [
     *("dynamics=ensemble", "dynamics.real_ratio=0.5", "dynamics.rollout_steps=30"),
@@ -86,23 +89,23 @@ def run(folder: Path, arm: str, data: str, seed: int, half: str) -> None:
     print(folder, flush=True)
 
 
-def pack(folder: Path) -> None:
-    """Add the finished runs below a folder to the table, called by their arms."""
+def pack(folder: Path, table: Path) -> None:
+    """Add the finished runs below a folder to a table, called by their arms."""
     records = {}
-    if TABLE.exists():
-        records = {each["folder"]: each for each in read_records(TABLE)}
+    if table.exists():
+        records = {each["folder"]: each for each in read_records(table)}
     for run in {path.parent for path in folder.glob("*/*/*/recoverable-*.json")}:
         name = run.relative_to(folder).as_posix()
         records[name] = read_record(run) | {"folder": name, "method": run.parent.name}
     lines = [json.dumps(records[each]) + "\n" for each in sorted(records)]
-    TABLE.write_bytes(gzip.compress("".join(lines).encode(), mtime=0))
+    table.write_bytes(gzip.compress("".join(lines).encode(), mtime=0))
 
 
-def table(path: Path) -> str:
-    """Markdown: undisturbed score and shares of the states, by data and arm."""
+def described(path: Path) -> str:
+    """Markdown: undisturbed score and shares of the states, by data, half and arm."""
     tables = read_runs([path])
     groups = GROUPS[::-1]
-    columns = "arm", "seeds", "score", *(f"{name} %" for name in groups), "R %"
+    columns = "arm", "half", "seeds", "score", *(f"{name} %" for name in groups), "R %"
     lines = [columns, ("---",) * len(columns)]
     for each in saved_states(tables, REFERENCE):
         mine = (tables.episodes["data"] == each.data) & (
@@ -112,23 +115,30 @@ def table(path: Path) -> str:
         shares = [
             str(each.shares[name]) for name in ("recoverable", "contested", "easy")
         ]
-        name, seeds = f"{each.method}, {each.data}", str(len(each.seeds))
-        recovered = str(each.recovered or "")
-        lines.append((name, seeds, str(score), *shares, recovered))
+        name, half = f"{each.method}, {each.data}", each.states.split()[0]
+        recovered, seeds = str(each.recovered or ""), str(len(each.seeds))
+        lines.append((name, half, seeds, str(score), *shares, recovered))
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def difference(first: str, second: str) -> str:
-    """What the first arm saves more than the second on Walker2d's medium-expert."""
-    saved = read_runs([TABLE]).saved
+def difference(path: Path, first: str, second: str) -> str:
+    """What the first arm saves more than the second, on Walker2d's medium-expert."""
+    saved = read_runs([path]).saved
     saved = saved[saved["group"] == "recoverable"].astype({"back": float})
     saved = saved[saved["data"] == "walker2d medium-expert"]
-    saved["state"] = saved.groupby("run").cumcount()
-    back = saved.pivot(index=["method", "seed"], columns="state", values="back")
-    walk = saved.groupby("state")["walk"].first()
-    more = back.loc[first] - back.loc[second]
-    found = (f"{100 * each:.1f}" for each in saved_share(more, walk))
-    return "{} less {}: {} points [{}, {}]".format(first, second, *found)
+    lines = []
+    for states, rows in saved.groupby("states"):
+        state = rows.groupby("run").cumcount()
+        back = rows.assign(state=state).pivot(
+            index=["method", "seed"], columns="state", values="back"
+        )
+        more = (back.loc[first] - back.loc[second]).dropna()
+        walk = rows["walk"].groupby(state).first()
+        found = (f"{100 * each:.1f}" for each in saved_share(more, walk))
+        half = str(states).split()[0]
+        text = "{}: {} less {}: {} points [{}, {}]"
+        lines.append(text.format(half, first, second, *found))
+    return "\n".join(lines)
 
 
 def main() -> None:
@@ -139,12 +149,15 @@ def main() -> None:
     parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=ARMS)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--half", default="public", choices=("public", "held-out"))
-    parser.add_argument("--pack", action="store_true", help="run nothing")
+    parser.add_argument("--pack", choices=TABLES[:2], help="the table; run nothing")
     given = parser.parse_args()
     if given.pack:
-        pack(given.folder)
-        print(table(TABLE), table(PILOTS), sep="\n\n")
-        print("", difference("disturbed starts", "undisturbed starts"), sep="\n")
+        pack(given.folder, HERE / f"{given.pack}.jsonl.gz")
+        for name in TABLES:
+            path = HERE / f"{name}.jsonl.gz"
+            print(f"\n{name}\n\n{described(path)}")
+            if name in TABLES[:2]:
+                print("", difference(path, *list(ARMS)[2:4]), sep="\n")
         return
     for seed in given.seeds:
         for data in given.data:
