@@ -20,6 +20,9 @@ from torchrl_osr.report.saved import saved_states
 from torchrl_osr.report.scores import by_run, estimate, recent
 
 HERE = Path(__file__).parent
+OVERVIEW = ["hopper medium-expert", "walker2d medium-expert"]
+"""The data sets of the README's table of methods."""
+
 SUITES = {"oos": "oos", "push": "push", "observation_noise": "noise"}
 
 # On D4RL v2, which are other data, after a hundred times the updates. TD3+BC, IQL and
@@ -85,6 +88,30 @@ def table(tables: RunTables, data: str) -> str:
     head = ["method", "seeds", "updates", "undisturbed", *suites, "published"]
     lines = [head, ["---"] * len(head), *(cells for _, cells in sorted(rows)[::-1])]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def overview(tables: RunTables) -> str:
+    """Markdown: means over ``OVERVIEW`` of the methods with three seeds on each."""
+    means = scores(tables).assign(
+        disturbed=lambda rows: rows[list(SUITES)].mean(axis=1)
+    )
+    means = means[means["data"].isin(OVERVIEW)]
+    seeds = means.groupby(["method", "data"])["seed"].nunique().unstack()
+    means = means.groupby(["method", "data"])[["undisturbed", "disturbed"]].mean()
+    saved = {
+        (each.method, each.data): each.shares["recoverable"].mean
+        for each in saved_states(tables, tables.methods[0])
+    }
+    means["recoverable %"] = pd.Series(saved)
+    means = means.groupby("method").mean()[(seeds >= 3).all(axis=1)]
+    head = ["method", *means]
+    rows = [
+        [f"`{method}`", *(f"{each:.1f}" for each in row)]
+        for method, row in means.sort_values("undisturbed").iloc[::-1].iterrows()
+    ]
+    return "\n".join(
+        f"| {' | '.join(row)} |" for row in [head, ["---"] * len(head), *rows]
+    )
 
 
 def lines(tables: RunTables) -> str:
@@ -157,6 +184,7 @@ def main() -> None:
     tables = read_runs(sorted(HERE.glob("*.jsonl.gz")))
     for data in tables.data:
         print(f"\n### {data}\n\n{table(tables, data)}")
+    print(f"\n### Means over {' and '.join(OVERVIEW)}\n\n{overview(tables)}")
     print(f"\n### Lines\n\n{lines(tables)}")
     draw(scores(tables), HERE / "scoreboard.png")
 
