@@ -23,7 +23,13 @@ import subprocess
 import sys
 from pathlib import Path
 
-from torchrl_osr.evaluation.recoverable import GROUPS, saved_share
+import numpy as np
+
+from torchrl_osr.evaluation.recoverable import (
+    GROUPS,
+    recovered_share,
+    saved_share,
+)
 from torchrl_osr.report import read_records, read_runs
 from torchrl_osr.report.runs import read_record
 from torchrl_osr.report.saved import saved_states
@@ -121,24 +127,42 @@ def described(path: Path) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def difference(path: Path, first: str, second: str) -> str:
-    """What the first arm saves more than the second, on Walker2d's medium-expert."""
+def by_kind(path: Path) -> str:
+    """Markdown: disturbed starts against the two others, by kind of disturbance.
+
+    In percent: what they save; points more than undisturbed starts; and R against noisy
+    cloning, each over the seeds that both have.
+    """
+    first, second = list(ARMS)[2:4]
+    columns = "kind", "states", first, f"points more than {second}", "R %"
+    lines = [columns, ("---",) * len(columns)]
     saved = read_runs([path]).saved
     saved = saved[saved["group"] == "recoverable"].astype({"back": float})
-    saved = saved[saved["data"] == "walker2d medium-expert"]
-    lines = []
-    for states, rows in saved.groupby("states"):
-        state = rows.groupby("run").cumcount()
-        back = rows.assign(state=state).pivot(
-            index=["method", "seed"], columns="state", values="back"
-        )
-        more = (back.loc[first] - back.loc[second]).dropna()
-        walk = rows["walk"].groupby(state).first()
-        found = (f"{100 * each:.1f}" for each in saved_share(more, walk))
-        half = str(states).split()[0]
-        text = "{}: {} less {}: {} points [{}, {}]"
-        lines.append(text.format(half, first, second, *found))
-    return "\n".join(lines)
+    for (data, states), rows in saved.groupby(["data", "states"], sort=False):
+        rows = rows.assign(state=rows.groupby("run").cumcount())
+        back = rows.pivot(index=["method", "seed"], columns="state", values="back")
+        one = rows.drop_duplicates("state").set_index("state")
+        kind = one["disturbance"].str.extract(r"^(\w+)", expand=False)
+        for name in ("all", *sorted(set(kind))):
+            of = (kind == name) | (name == "all")
+            walk, ours = one["walk"][of], back.loc[first].loc[:, of]
+            cells = [percent(saved_share(ours, walk)), "", ""]
+            if second in back.index:
+                more = (ours - back.loc[second].loc[:, of]).dropna()
+                cells[1] = percent(saved_share(more, walk))
+            theirs = back.loc[REFERENCE].loc[:, of]
+            both = theirs.index.intersection(ours.index)
+            share = ours.loc[both], theirs.loc[both], np.ones(of.sum())
+            cells[2] = percent(recovered_share(*share, walk))
+            where = f"{name}, {data}, {str(states).split()[0]}"
+            lines.append((where, str(of.sum()), *cells))
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def percent(found: tuple[float, float, float]) -> str:
+    """A share and its interval."""
+    mean, low, high = (100 * each for each in found)
+    return f"{mean:.1f} [{low:.1f}, {high:.1f}]"
 
 
 def main() -> None:
@@ -157,7 +181,7 @@ def main() -> None:
             path = HERE / f"{name}.jsonl.gz"
             print(f"\n{name}\n\n{described(path)}")
             if name in TABLES[:2]:
-                print("", difference(path, *list(ARMS)[2:4]), sep="\n")
+                print("", by_kind(path), sep="\n")
         return
     for seed in given.seeds:
         for data in given.data:
