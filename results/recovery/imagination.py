@@ -21,6 +21,7 @@ import json
 import os
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -153,7 +154,8 @@ def by_kind(path: Path) -> str:
             theirs = back.loc[REFERENCE].loc[:, of]
             both = theirs.index.intersection(ours.index)
             share = ours.loc[both], theirs.loc[both], np.ones(of.sum())
-            cells[2] = percent(recovered_share(*share, walk))
+            with suppress(ValueError):  # cloning saves all, at least in a resample
+                cells[2] = percent(recovered_share(*share, walk))
             where = f"{name}, {data}, {str(states).split()[0]}"
             lines.append((where, str(of.sum()), *cells))
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
