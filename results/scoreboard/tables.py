@@ -15,6 +15,7 @@ from hydra.utils import get_class
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from torchrl_osr.evaluation.recoverable import recovered_share, saved_share
 from torchrl_osr.report import RunTables, read_runs
 from torchrl_osr.report.saved import saved_states
 from torchrl_osr.report.scores import by_run, estimate, recent
@@ -114,6 +115,31 @@ def overview(tables: RunTables) -> str:
     )
 
 
+def ablation(tables: RunTables) -> str:
+    """Markdown: what the arms of OSR's ablation save more than its twin, and R."""
+    twin = "cql_noisy_bc"
+    rows = [["data", "arm", "seeds", f"points more than `{twin}`", "R %"], ["---"] * 5]
+    saved = tables.saved[tables.saved["group"] == "recoverable"]
+    saved = saved[saved["data"].isin(OVERVIEW)].astype({"back": float})
+    for data, found in saved.groupby("data"):
+        found = found.assign(state=found.groupby("run").cumcount())
+        back = found.pivot(index=["method", "seed"], columns="state", values="back")
+        walk = found.drop_duplicates("state").set_index("state")["walk"]
+        for arm in ("osr", "cql_both", "noisy_bc", "td3_bc"):
+            seeds = back.loc[arm].index.intersection(back.loc[twin].index)
+            ours, theirs = (back.loc[each].loc[seeds] for each in (arm, twin))
+            shares = (
+                saved_share(ours - theirs, walk),
+                recovered_share(ours, theirs, np.ones(len(walk)), walk),
+            )
+            cells = [
+                "{:.1f} [{:.1f}, {:.1f}]".format(*(100 * value for value in share))
+                for share in shares
+            ]
+            rows.append([data, f"`{arm}`", str(len(seeds)), *cells])
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
 def lines(tables: RunTables) -> str:
     """Markdown: what was typed for each method, its class, and what an update takes."""
     head = [
@@ -185,6 +211,7 @@ def main() -> None:
     for data in tables.data:
         print(f"\n### {data}\n\n{table(tables, data)}")
     print(f"\n### Means over {' and '.join(OVERVIEW)}\n\n{overview(tables)}")
+    print(f"\n### Ablation\n\n{ablation(tables)}")
     print(f"\n### Lines\n\n{lines(tables)}")
     draw(scores(tables), HERE / "scoreboard.png")
 
