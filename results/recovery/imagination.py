@@ -2,9 +2,7 @@
 
     python results/recovery/imagination.py outputs/imagination --seeds 0 1
     python results/recovery/imagination.py outputs/imagination --pack imagination
-    python results/recovery/imagination.py outputs/look --seeds 300 301 302 303 304
-    python results/recovery/imagination.py outputs/look --half held-out --seeds ...
-    python results/recovery/imagination.py outputs/look --pack imagination-look
+    sh results/recovery/look.sh
 
 Each run is ``torchrl-osr train`` in a process with one torch thread, then its last
 checkpoints play from the recoverable states. What is there is not done again; what is
@@ -33,7 +31,7 @@ from torchrl_osr.evaluation.recoverable import (
 )
 from torchrl_osr.report import read_records, read_runs
 from torchrl_osr.report.runs import read_record
-from torchrl_osr.report.saved import saved_states
+from torchrl_osr.report.saved import came_back, percent, saved_states
 from torchrl_osr.report.scores import by_run, estimate, recent
 
 HERE = Path(__file__).parent
@@ -125,7 +123,7 @@ def described(path: Path) -> str:
         name, half = f"{each.method}, {each.data}", each.states.split()[0]
         recovered, seeds = str(each.recovered or ""), str(len(each.seeds))
         lines.append((name, half, seeds, str(score), *shares, recovered))
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return markdown(lines)
 
 
 def by_kind(path: Path) -> str:
@@ -137,34 +135,29 @@ def by_kind(path: Path) -> str:
     first, second = list(ARMS)[2:4]
     columns = "kind", "states", first, f"points more than {second}", "R %"
     lines = [columns, ("---",) * len(columns)]
-    saved = read_runs([path]).saved
-    saved = saved[saved["group"] == "recoverable"].astype({"back": float})
-    for (data, states), rows in saved.groupby(["data", "states"], sort=False):
-        rows = rows.assign(state=rows.groupby("run").cumcount())
-        back = rows.pivot(index=["method", "seed"], columns="state", values="back")
-        one = rows.drop_duplicates("state").set_index("state")
-        kind = one["disturbance"].str.extract(r"^(\w+)", expand=False)
-        for name in ("all", *sorted(set(kind))):
-            of = (kind == name) | (name == "all")
-            walk, ours = one["walk"][of], back.loc[first].loc[:, of]
-            cells = [percent(saved_share(ours, walk)), "", ""]
-            if second in back.index:
-                more = (ours - back.loc[second].loc[:, of]).dropna()
-                cells[1] = percent(saved_share(more, walk))
-            theirs = back.loc[REFERENCE].loc[:, of]
+    for data, states, of_each, back in came_back(read_runs([path])):
+        hard = of_each["group"] == GROUPS[-1]
+        kind = of_each["disturbance"].str.extract(r"^(\w+)", expand=False)
+        for name in ("all", *sorted(set(kind[hard]))):
+            of = hard & ((kind == name) | (name == "all"))
+            walk, table = of_each["walk"][of], back.loc[:, of]
+            ours, theirs = table.loc[first], table.loc[REFERENCE]
+            cells = [percent(saved_share(ours, walk), len(ours)), "", ""]
+            if second in table.index:
+                more = (ours - table.loc[second]).dropna()
+                cells[1] = percent(saved_share(more, walk), len(more))
             both = theirs.index.intersection(ours.index)
             share = ours.loc[both], theirs.loc[both], np.ones(of.sum())
             with suppress(ValueError):  # cloning saves all, at least in a resample
-                cells[2] = percent(recovered_share(*share, walk))
-            where = f"{name}, {data}, {str(states).split()[0]}"
-            lines.append((where, str(of.sum()), *cells))
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+                cells[2] = percent(recovered_share(*share, walk), len(both))
+            where = f"{name}, {data}, {states.split()[0]}"
+            lines.append((where, str(of.sum()), *map(str, cells)))
+    return markdown(lines)
 
 
-def percent(found: tuple[float, float, float]) -> str:
-    """A share and its interval."""
-    mean, low, high = (100 * each for each in found)
-    return f"{mean:.1f} [{low:.1f}, {high:.1f}]"
+def markdown(rows: list[tuple[str, ...]]) -> str:
+    """A table of these rows, the second of which is a line."""
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
 def main() -> None:

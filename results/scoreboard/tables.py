@@ -15,9 +15,13 @@ from hydra.utils import get_class
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from torchrl_osr.evaluation.recoverable import recovered_share, saved_share
+from torchrl_osr.evaluation.recoverable import (
+    GROUPS,
+    recovered_share,
+    saved_share,
+)
 from torchrl_osr.report import RunTables, read_runs
-from torchrl_osr.report.saved import saved_states
+from torchrl_osr.report.saved import came_back, percent, saved_states
 from torchrl_osr.report.scores import by_run, estimate, recent
 
 HERE = Path(__file__).parent
@@ -88,7 +92,7 @@ def table(tables: RunTables, data: str) -> str:
     suites = *SUITES.values(), "recoverable %"
     head = ["method", "seeds", "updates", "undisturbed", *suites, "published"]
     lines = [head, ["---"] * len(head), *(cells for _, cells in sorted(rows)[::-1])]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return markdown(lines)
 
 
 def overview(tables: RunTables) -> str:
@@ -110,33 +114,31 @@ def overview(tables: RunTables) -> str:
         [f"`{method}`", *(f"{each:.1f}" for each in row)]
         for method, row in means.sort_values("undisturbed").iloc[::-1].iterrows()
     ]
-    return "\n".join(
-        f"| {' | '.join(row)} |" for row in [head, ["---"] * len(head), *rows]
-    )
+    return markdown([head, ["---"] * len(head), *rows])
 
 
 def ablation(tables: RunTables) -> str:
     """Markdown: what the arms of OSR's ablation save more than its twin, and R."""
     twin = "cql_noisy_bc"
     rows = [["data", "arm", "seeds", f"points more than `{twin}`", "R %"], ["---"] * 5]
-    saved = tables.saved[tables.saved["group"] == "recoverable"]
-    saved = saved[saved["data"].isin(OVERVIEW)].astype({"back": float})
-    for data, found in saved.groupby("data"):
-        found = found.assign(state=found.groupby("run").cumcount())
-        back = found.pivot(index=["method", "seed"], columns="state", values="back")
-        walk = found.drop_duplicates("state").set_index("state")["walk"]
+    for data, _, of_each, back in came_back(tables):
+        if data not in OVERVIEW:
+            continue
+        hard = of_each["group"] == GROUPS[-1]
+        walk, table = of_each["walk"][hard], back.loc[:, hard]
         for arm in ("osr", "cql_both", "noisy_bc", "td3_bc"):
-            seeds = back.loc[arm].index.intersection(back.loc[twin].index)
-            ours, theirs = (back.loc[each].loc[seeds] for each in (arm, twin))
+            ours, theirs = table.loc[arm].align(table.loc[twin], "inner", axis=0)
             shares = (
                 saved_share(ours - theirs, walk),
                 recovered_share(ours, theirs, np.ones(len(walk)), walk),
             )
-            cells = [
-                "{:.1f} [{:.1f}, {:.1f}]".format(*(100 * value for value in share))
-                for share in shares
-            ]
-            rows.append([data, f"`{arm}`", str(len(seeds)), *cells])
+            cells = [str(percent(share, len(ours))) for share in shares]
+            rows.append([data, f"`{arm}`", str(len(ours)), *cells])
+    return markdown(rows)
+
+
+def markdown(rows: list[list[str]]) -> str:
+    """A table of these rows, the second of which is a line."""
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
@@ -163,7 +165,7 @@ def lines(tables: RunTables) -> str:
         found = [measured[preset].get(run["method"]) for preset in ("quick", "paper")]
         took = ["" if each is None else f"{each:.1f}" for each in found]
         rows.append([*row, str(code), *took])
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return markdown(rows)
 
 
 def draw(rows: pd.DataFrame, path: Path) -> None:

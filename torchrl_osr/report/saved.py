@@ -52,30 +52,48 @@ def saved_states(tables: RunTables, reference: str) -> Iterator[Saved]:
         tables: of :func:`~torchrl_osr.report.read_runs`.
         reference: the method that the others are compared with.
     """
-    for (data, states), rows in tables.saved.groupby(["data", "states"], sort=False):
-        one = rows[rows["run"] == rows["run"].iloc[0]]
-        of_each = "group", "disturbance", "walk"
-        group, disturbance, walk = (one[name].to_numpy() for name in of_each)
-        back = {
-            method: pd.DataFrame(
-                {seed: each["back"].to_numpy() for seed, each in of.groupby("seed")}
-            ).T
-            for method, of in rows.groupby("method", sort=False)
-        }
+    for data, states, of_each, back in came_back(tables):
+        columns = "group", "disturbance", "walk"
+        group, disturbance, walk = (of_each[name].to_numpy() for name in columns)
         hard = group == GROUPS[-1]
-        for method, table in back.items():
+        methods = back.index.unique("method")
+        for method in methods:
+            table = back.loc[method]
             chosen = {each: group == each for each in GROUPS if each in group}
             found = _estimates(table, walk, chosen)
             names = disturbances_of(disturbance[hard])
             chosen = {each: hard & (disturbance == each) for each in names}
             by_disturbance = _estimates(table, walk, chosen)
             recovered = None
-            if method != reference and reference in back and hard.any():
-                both = table.index.intersection(back[reference].index)
-                ours, theirs = (of.loc[both, hard] for of in (table, back[reference]))
+            if method != reference and reference in methods and hard.any():
+                theirs = back.loc[reference]
+                both = table.index.intersection(theirs.index)
+                ours, theirs = (of.loc[both, hard] for of in (table, theirs))
                 recovered = _recovered(ours, theirs, walk[hard])
             seeds = [*table.index]
             yield Saved(data, states, method, seeds, found, by_disturbance, recovered)
+
+
+def came_back(
+    tables: RunTables,
+) -> Iterator[tuple[str, str, pd.DataFrame, pd.DataFrame]]:
+    """Which states each run comes back from, data set by data set.
+
+    Args:
+        tables: of :func:`~torchrl_osr.report.read_runs`.
+
+    Yields:
+        The data set; half and mark of its states; ``group``, ``disturbance`` and
+        ``walk`` of each, ``M`` rows; and how often each was come back from, ``M``
+        columns and a row for each ``method`` and ``seed``, in the order of the runs.
+    """
+    for (data, states), rows in tables.saved.groupby(["data", "states"], sort=False):
+        rows = rows.assign(state=rows.groupby("run").cumcount())
+        of_each = rows.drop_duplicates("state").set_index("state")
+        keys = ["method", "seed"]
+        back = rows.pivot(index=keys, columns="state", values="back").astype(float)
+        order = pd.MultiIndex.from_frame(rows[keys].drop_duplicates())
+        yield data, states, of_each, back.loc[order]
 
 
 def _estimates(
@@ -83,7 +101,7 @@ def _estimates(
 ) -> dict[str, Estimate]:
     """Shares of the states of each name."""
     return {
-        name: _percent(saved_share(back.loc[:, rows], walk[rows]), len(back))
+        name: percent(saved_share(back.loc[:, rows], walk[rows]), len(back))
         for name, rows in chosen.items()
     }
 
@@ -97,9 +115,10 @@ def _recovered(
         found = recovered_share(ours, theirs, np.ones(len(walk)), walk)
     except ValueError:  # the reference saves all of them, at least in a resample
         return None
-    return _percent(found, len(ours))
+    return percent(found, len(ours))
 
 
-def _percent(found: tuple[float, float, float], seeds: int) -> Estimate:
+def percent(found: tuple[float, float, float], seeds: int) -> Estimate:
+    """A share and its interval, over so many seeds."""
     mean, low, high = (100 * each for each in found)
     return Estimate(mean, low, high, "seeds" if seeds > 1 else "walks")
