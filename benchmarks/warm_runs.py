@@ -117,10 +117,12 @@ def start(
     except BaseException:
         traceback.print_exc()
     finally:
-        atexit._run_exitfuncs()
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
+        try:
+            atexit._run_exitfuncs()
+            sys.stdout.flush()
+            sys.stderr.flush()
+        finally:  # also interrupted here: the child must not go on as its parent
+            os._exit(code)
 
 
 def ended(process: int, *, wait: bool = True) -> int | None:

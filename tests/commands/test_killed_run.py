@@ -133,7 +133,8 @@ def test_interrupted_at_any_moment_it_ends_in_order_and_goes_on(
         with suppress(ProcessLookupError):  # it has come to its end
             os.kill(process, number)
         code, said = runs.server.ended(), status(folder)["status"]
-        if (code, said) == (0, "done"):
+        if said == "done":  # after that, the signal meets a process without a run
+            assert code == 0 or code == 128 + number, (seed, runs.output)
             break
         ends.append((code, said))
         assert ends[-1] == (CODES[number], "preempted"), (seed, runs.output)
