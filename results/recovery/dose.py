@@ -1,6 +1,7 @@
-"""Draw which share of Walker2d's disturbed states is survived, by strength.
+"""Draw which share of a robot's disturbed states is survived, by strength.
 
-    python results/recovery/dose.py
+    python results/recovery/dose.py walker2d
+    python results/recovery/dose.py hopper
 
 A disturbance leads to easy, contested, recoverable and not saved states; ``tables.md``
 counts them. A policy survives its share of each group, of the recoverable ones by
@@ -10,6 +11,7 @@ which nobody here is given any.
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 
 import pandas as pd
@@ -21,11 +23,7 @@ from world import World
 from torchrl_osr.report import read_runs
 
 HERE = Path(__file__).parent
-SOURCES = (
-    HERE / "imagination-look.jsonl.gz",
-    HERE.parent / "scoreboard" / "walker2d-medium-expert.jsonl.gz",
-)
-FIGURE = HERE.parents[1] / "docs" / "figures" / "dose.png"
+FIGURES = HERE.parents[1] / "docs" / "figures"
 LINES = {
     "disturbed starts": ("recovery by imagination", "#D55E00"),
     "undisturbed starts": ("from undisturbed starts", "#E69F00"),
@@ -33,6 +31,7 @@ LINES = {
     "noisy cloning": ("noisy cloning", "0.45"),
 }
 KINDS = ("torque", "rest", "push", "kick", "kick-root", "kick-joints")
+COLUMNS = 3
 LEAST = 50
 """States of a strength, both halves together, below which it is left out."""
 
@@ -53,11 +52,16 @@ def survived(counts: pd.DataFrame, saved: pd.DataFrame) -> pd.DataFrame:
 
 
 def draw(counts: pd.DataFrame, shares: dict[str, pd.DataFrame], path: Path) -> None:
-    """A panel for each kind of disturbance."""
-    figure = Figure(figsize=(10, 5.6), layout="constrained")
+    """A panel for each kind of disturbance that has two strengths."""
+    of_kind = counts.index.str.split().str[0].value_counts()
+    kinds = [kind for kind in KINDS if of_kind.get(kind, 0) > 1]
+    rows = -(-len(kinds) // COLUMNS)
+    figure = Figure(figsize=(10, 2.8 * rows), layout="constrained")
     FigureCanvasAgg(figure)
-    panels = figure.subplots(2, 3, sharey=True).ravel()
-    for axes, kind in zip(panels, KINDS, strict=True):
+    panels = figure.subplots(rows, COLUMNS, sharey=True, squeeze=False).ravel()
+    for axes in panels[len(kinds) :]:
+        axes.remove()
+    for axes, kind in zip(panels, kinds, strict=False):
         names = [name for name in counts.index if name.split()[0] == kind]
         strength = [float(name.split()[1]) for name in names]
         mine = counts.loc[names]
@@ -83,12 +87,16 @@ def draw(counts: pd.DataFrame, shares: dict[str, pd.DataFrame], path: Path) -> N
 
 def main() -> None:
     """Read, draw and print."""
-    world = World("walker2d")
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("system", choices=("walker2d", "hopper"))
+    system = parser.parse_args().system
+    world = World(system)
     counts = pd.DataFrame(by_disturbance(world, gather(world)))
     counts = counts.set_index("disturbance").drop(columns="not searched yet")
     counts = counts[counts.sum(axis=1) >= LEAST]
-    tables = read_runs([each for each in SOURCES if each.exists()])
-    saved = tables.saved[tables.saved["data"] == "walker2d medium-expert"]
+    scores = HERE.parent / "scoreboard" / f"{system}-medium-expert.jsonl.gz"
+    saved = read_runs([HERE / "imagination-look.jsonl.gz", scores]).saved
+    saved = saved[saved["data"] == f"{system} medium-expert"]
     # OSR has played from this half alone.
     saved = saved[saved["states"].str.startswith("public")].astype({"back": float})
     shares = {
@@ -96,7 +104,7 @@ def main() -> None:
         for method, of in saved.groupby("method")
         if method in LINES
     }
-    draw(counts, shares, FIGURE)
+    draw(counts, shares, FIGURES / f"dose-{system}.png")
     oracle = 1 - counts["not saved"] / counts.sum(axis=1)
     means = {name: of.mean(axis=1) for name, of in shares.items()}
     print(pd.DataFrame({"planner": oracle} | means).round(2).to_string())
