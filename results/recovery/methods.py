@@ -17,19 +17,28 @@ from states import PARTS
 from tables import table
 
 from torchrl_osr._files import sha256_of, write_atomically
-from torchrl_osr.evaluation import percentile_interval
 from torchrl_osr.evaluation.recoverable import (
     GROUPS,
     HALVES,
     STATES,
     RecoverableStates,
     read_recoverable_states,
+    recovered_share,
+    saved_share,
 )
 
 FOLDER = Path(__file__).parent
-RESAMPLES = 10_000
-STUDIES = {"cloning": "noisy 0.1", "look-ahead": "base"}
-"""Files, and the arm that all others are compared with."""
+STUDIES = "cloning", "look-ahead"
+NOISY = {"pointmaze-medium": "noisy 0.3", "walker2d": "noisy 0.1"}
+"""Of whose losses R is the share: the better width of the pilot."""
+
+SAME_STATES = {
+    "osr": "noisy",
+    "osr-clean": "noisy",
+    "expert": "noisy",
+    "corrective": "corrective-row",
+    "corrective-flipped": "corrective-row",
+}
 
 
 def name_of(line: dict) -> str:
@@ -54,44 +63,25 @@ def bits_of(line: dict, states: RecoverableStates) -> NDArray[np.float64]:
 TITLE = """# Which method saves any?
 
 Written by `methods.py`: share of the states saved, mean over seeds, with 95 %
-percentile intervals over seeds and walks; with one seed, over walks alone."""
+percentile intervals over seeds and walks; with one seed, over walks alone. *less the
+row's action*: points more than the same states with the row's action as their label.
+*R*: what is saved of the losses of noisy cloning, of the better width."""
 
 
-class Draws:
-    """Resamples of seeds and, independently, of walks: the same for all arms.
-
-    Args:
-        walk: of each state, ``[M]``.
-    """
-
-    def __init__(self, walk: NDArray[np.int32]) -> None:
-        self.walks, number = np.unique(walk, return_inverse=True)
-        self.member = np.eye(len(self.walks))[number]
-
-    def shares(self, bits: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Share saved ``[RESAMPLES]`` of a table of seeds and states ``[N, M]``."""
-        rng = np.random.default_rng(0)
-        weights = [
-            rng.multinomial(size, np.full(size, 1 / size), RESAMPLES) * 1.0
-            for size in (len(self.walks), len(bits))
-        ]
-        walks, seeds = weights
-        saved = np.einsum("rn,nw,rw->r", seeds, bits @ self.member, walks)
-        return saved / (walks @ self.member.sum(0)) / len(bits)
-
-    def describe(
-        self, bits: NDArray[np.float64], less: NDArray[np.float64] | None = None
-    ) -> str:
-        """``.12 [.05, .20]`` of a share, or of the difference of two."""
-        value, draws = bits.mean(), self.shares(bits)
-        if less is not None:
-            value, draws = value - less.mean(), draws - self.shares(less)
-        low, high = percentile_interval(draws)
-        return f"{value:.2f} [{low:.2f}, {high:.2f}]"
+def told(share: tuple[float, float, float]) -> str:
+    """``0.12 [0.05, 0.20]``."""
+    value, low, high = share
+    return f"{value:.2f} [{low:.2f}, {high:.2f}]"
 
 
-def rows_of(lines: list[dict], states: RecoverableStates, reference: str) -> list[dict]:
-    """A row for each arm; differences are of the seeds that both have."""
+def same_states(name: str) -> str:
+    """The arm whose states these are, with the row's action as their label."""
+    arm, _, step = name.partition(" ")
+    return f"{SAME_STATES.get(arm, '')} {step}"
+
+
+def rows_of(lines: list[dict], states: RecoverableStates) -> list[dict]:
+    """A row for each arm; comparisons are over the seeds that both have."""
     runs: dict[str, dict[int, NDArray[np.float64]]] = {}
     extra: dict[str, list[dict]] = {}
     for line in lines:
@@ -99,21 +89,38 @@ def rows_of(lines: list[dict], states: RecoverableStates, reference: str) -> lis
         old = runs.setdefault(name, {}).get(line["seed"], bits)
         runs[name][line["seed"]] = np.where(np.isnan(bits), old, bits)
         extra.setdefault(name, []).append(line)
+    hard = states.group == GROUPS[-1]
+
+    def pair(name: str, other: str) -> NDArray[np.float64]:
+        """Recoverable states ``[2, N, M]`` of the seeds that both arms have."""
+        common = runs[name].keys() & runs.get(other, {}).keys()
+        return np.array(
+            [[runs[each][seed][hard] for seed in common] for each in (name, other)]
+        )
+
     found = []
     for name, seeds in runs.items():
         row: dict = {"arm": name, "seeds": len(seeds)}
-        common = [seed for seed in seeds if seed in runs.get(reference, {})]
         for group in reversed(GROUPS):
             inside = states.group == group
-            bits, ours, theirs = (
-                np.array([runs[each][seed][inside] for seed in some])
-                for each, some in ((name, seeds), (name, common), (reference, common))
-            )
-            draws = Draws(states.walk[inside])
-            row[group] = "" if np.isnan(bits).any() else draws.describe(bits)
-            if group == "recoverable":
-                there = name != reference and common
-                row[f"less {reference}"] = draws.describe(ours, theirs) if there else ""
+            bits = np.array([each[inside] for each in seeds.values()])
+            known = not np.isnan(bits).any()
+            row[group] = told(saved_share(bits, states.walk[inside])) if known else ""
+        for column, other in (
+            ("less the row's action", same_states(name)),
+            ("less base", "base"),
+            ("R", NOISY[states.env_name]),
+        ):
+            row[column] = ""
+            if name == other or not runs[name].keys() & runs.get(other, {}).keys():
+                continue
+            ours, theirs = pair(name, other)
+            walk = states.walk[hard]
+            if column == "R":
+                share = recovered_share(ours, theirs, np.ones(hard.sum()), walk)
+            else:
+                share = saved_share(ours - theirs, walk)
+            row[column] = told(share)
         if "undisturbed" in extra[name][0]:
             values = [line["undisturbed"] for line in extra[name]]
             row["undisturbed"] = f"{np.mean(values):.2f}"
@@ -122,7 +129,8 @@ def rows_of(lines: list[dict], states: RecoverableStates, reference: str) -> lis
             row["steps alive"] = f"{np.mean([x['alive'] for x in of]):.0f}"
         row["core seconds"] = f"{np.mean([x['seconds'] for x in extra[name]]):.0f}"
         found.append(row)
-    return found
+    used = {column for row in found for column, cell in row.items() if cell != ""}
+    return [{name: row[name] for name in row if name in used} for row in found]
 
 
 def main() -> None:
@@ -131,7 +139,7 @@ def main() -> None:
     for path in sorted(STATES.glob("*.npz")):
         states, digest = read_recoverable_states(path), sha256_of(path)
         half = next(each for each in HALVES if path.stem.endswith(each))
-        for study, reference in STUDIES.items():
+        for study in STUDIES:
             lines = read_jsonl(PARTS / states.env_name / f"{study}-{half}.jsonl")
             lines = [line for line in lines if line["states"] == digest]
             settings = sorted({(x.get("episodes"), x.get("updates")) for x in lines})
@@ -144,7 +152,7 @@ def main() -> None:
                 title = f"## {study}, {states.env_name}, {half} half"
                 if episodes:
                     title += f", {episodes} episodes, {updates} updates"
-                pages += [title, table(rows_of(chosen, states, reference))]
+                pages += [title, table(rows_of(chosen, states))]
     write_atomically(FOLDER / "methods.md", "\n\n".join(pages) + "\n")
 
 
