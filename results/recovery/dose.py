@@ -31,7 +31,6 @@ LINES = {
     "noisy cloning": ("noisy cloning", "0.45"),
 }
 KINDS = ("torque", "rest", "push", "kick", "kick-root", "kick-joints")
-COLUMNS = 3
 LEAST = 50
 """States of a strength, both halves together, below which it is left out."""
 
@@ -52,16 +51,11 @@ def survived(counts: pd.DataFrame, saved: pd.DataFrame) -> pd.DataFrame:
 
 
 def draw(counts: pd.DataFrame, shares: dict[str, pd.DataFrame], path: Path) -> None:
-    """A panel for each kind of disturbance that has two strengths."""
-    of_kind = counts.index.str.split().str[0].value_counts()
-    kinds = [kind for kind in KINDS if of_kind.get(kind, 0) > 1]
-    rows = -(-len(kinds) // COLUMNS)
-    figure = Figure(figsize=(10, 2.8 * rows), layout="constrained")
+    """A panel for each kind of disturbance."""
+    figure = Figure(figsize=(10, 5.6), layout="constrained")
     FigureCanvasAgg(figure)
-    panels = figure.subplots(rows, COLUMNS, sharey=True, squeeze=False).ravel()
-    for axes in panels[len(kinds) :]:
-        axes.remove()
-    for axes, kind in zip(panels, kinds, strict=False):
+    panels = figure.subplots(2, 3, sharey=True).ravel()
+    for axes, kind in zip(panels, KINDS, strict=True):
         names = [name for name in counts.index if name.split()[0] == kind]
         strength = [float(name.split()[1]) for name in names]
         mine = counts.loc[names]

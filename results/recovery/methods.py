@@ -91,13 +91,6 @@ def rows_of(lines: list[dict], states: RecoverableStates) -> list[dict]:
         extra.setdefault(name, []).append(line)
     hard = states.group == GROUPS[-1]
 
-    def pair(name: str, other: str) -> NDArray[np.float64]:
-        """Recoverable states ``[2, N, M]`` of the seeds that both arms have."""
-        common = runs[name].keys() & runs.get(other, {}).keys()
-        return np.array(
-            [[runs[each][seed][hard] for seed in common] for each in (name, other)]
-        )
-
     found = []
     for name, seeds in runs.items():
         row: dict = {"arm": name, "seeds": len(seeds)}
@@ -112,9 +105,13 @@ def rows_of(lines: list[dict], states: RecoverableStates) -> list[dict]:
             ("R", NOISY[states.env_name]),
         ):
             row[column] = ""
-            if name == other or not runs[name].keys() & runs.get(other, {}).keys():
+            common = runs[name].keys() & runs.get(other, {}).keys()
+            if name == other or not common:
                 continue
-            ours, theirs = pair(name, other)
+            ours, theirs = (
+                np.array([runs[each][seed][hard] for seed in common])
+                for each in (name, other)
+            )
             walk = states.walk[hard]
             if column == "R":
                 share = recovered_share(ours, theirs, np.ones(hard.sum()), walk)
