@@ -23,6 +23,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+from tables import table
 
 from torchrl_osr.evaluation.recoverable import (
     GROUPS,
@@ -94,36 +95,33 @@ def run(folder: Path, arm: str, data: str, seed: int, half: str) -> None:
     print(folder, flush=True)
 
 
-def pack(folder: Path, table: Path) -> None:
+def pack(folder: Path, path: Path) -> None:
     """Add the finished runs below a folder to a table, called by their arms."""
     records = {}
-    if table.exists():
-        records = {each["folder"]: each for each in read_records(table)}
-    for run in {path.parent for path in folder.glob("*/*/*/recoverable-*.json")}:
+    if path.exists():
+        records = {each["folder"]: each for each in read_records(path)}
+    for run in {each.parent for each in folder.glob("*/*/*/recoverable-*.json")}:
         name = run.relative_to(folder).as_posix()
         records[name] = read_record(run) | {"folder": name, "method": run.parent.name}
     lines = [json.dumps(records[each]) + "\n" for each in sorted(records)]
-    table.write_bytes(gzip.compress("".join(lines).encode(), mtime=0))
+    path.write_bytes(gzip.compress("".join(lines).encode(), mtime=0))
 
 
 def described(path: Path) -> str:
     """Markdown: undisturbed score and shares of the states, by data, half and arm."""
     tables = read_runs([path])
     groups = GROUPS[::-1]
-    columns = "arm", "half", "seeds", "score", *(f"{name} %" for name in groups), "R %"
-    lines = [columns, ("---",) * len(columns)]
+    rows = []
     for each in saved_states(tables, REFERENCE):
         mine = (tables.episodes["data"] == each.data) & (
             tables.episodes["method"] == each.method
         )
         score = estimate(by_run(recent(tables.episodes[mine])))
-        shares = [
-            str(each.shares[name]) for name in ("recoverable", "contested", "easy")
-        ]
-        name, half = f"{each.method}, {each.data}", each.states.split()[0]
-        recovered, seeds = str(each.recovered or ""), str(len(each.seeds))
-        lines.append((name, half, seeds, str(score), *shares, recovered))
-    return markdown(lines)
+        row = {"arm": f"{each.method}, {each.data}", "half": each.states.split()[0]}
+        row |= {"seeds": len(each.seeds), "score": score}
+        row |= {f"{name} %": each.shares[name] for name in groups}
+        rows.append(row | {"R %": each.recovered or ""})
+    return table(rows)
 
 
 def by_kind(path: Path) -> str:
@@ -133,31 +131,26 @@ def by_kind(path: Path) -> str:
     cloning, each over the seeds that both have.
     """
     first, second = list(ARMS)[2:4]
-    columns = "kind", "states", first, f"points more than {second}", "R %"
-    lines = [columns, ("---",) * len(columns)]
+    gained, rows = f"points more than {second}", []
     for data, states, of_each, back in came_back(read_runs([path])):
         hard = of_each["group"] == GROUPS[-1]
         kind = of_each["disturbance"].str.extract(r"^(\w+)", expand=False)
         for name in ("all", *sorted(set(kind[hard]))):
             of = hard & ((kind == name) | (name == "all"))
-            walk, table = of_each["walk"][of], back.loc[:, of]
-            ours, theirs = table.loc[first], table.loc[REFERENCE]
-            cells = [percent(saved_share(ours, walk), len(ours)), "", ""]
-            if second in table.index:
-                more = (ours - table.loc[second]).dropna()
-                cells[1] = percent(saved_share(more, walk), len(more))
+            walk, mine = of_each["walk"][of], back.loc[:, of]
+            ours, theirs = mine.loc[first], mine.loc[REFERENCE]
+            row = {"kind": f"{name}, {data}, {states.split()[0]}", "states": of.sum()}
+            row |= {first: percent(saved_share(ours, walk), len(ours))}
+            row |= {gained: "", "R %": ""}
+            if second in mine.index:
+                more = (ours - mine.loc[second]).dropna()
+                row[gained] = percent(saved_share(more, walk), len(more))
             both = theirs.index.intersection(ours.index)
             share = ours.loc[both], theirs.loc[both], np.ones(of.sum())
             with suppress(ValueError):  # cloning saves all, at least in a resample
-                cells[2] = percent(recovered_share(*share, walk), len(both))
-            where = f"{name}, {data}, {states.split()[0]}"
-            lines.append((where, str(of.sum()), *map(str, cells)))
-    return markdown(lines)
-
-
-def markdown(rows: list[tuple[str, ...]]) -> str:
-    """A table of these rows, the second of which is a line."""
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+                row["R %"] = percent(recovered_share(*share, walk), len(both))
+            rows.append(row)
+    return table(rows)
 
 
 def main() -> None:

@@ -102,7 +102,7 @@ def rows_of(lines: list[dict], states: RecoverableStates) -> list[dict]:
         for column, other in (
             ("less the row's action", same_states(name)),
             ("less base", "base"),
-            ("R", NOISY[states.env_name]),
+            ("R", NOISY.get(states.env_name, "")),
         ):
             row[column] = ""
             common = runs[name].keys() & runs.get(other, {}).keys()
