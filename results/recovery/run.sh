@@ -11,10 +11,8 @@ for walks in $(seq 16 16 640); do
     for system in "$@"; do
         [ "$(saved "$system")" -ge 320 ] && continue
         $PYTHON -W ignore $folder/states.py "$system" --walks "$walks"
-        $PYTHON -W ignore $folder/search.py "$system" --stages 1
+        $PYTHON -W ignore $folder/search.py "$system"
     done
 done
-# The budget's curve: more and more for some of what is not saved.
-for system in "$@"; do $PYTHON -W ignore $folder/search.py "$system" --stages 2 --every 8; done
-for system in "$@"; do $PYTHON -W ignore $folder/search.py "$system" --stages 3 --every 8; done
-for system in "$@"; do $PYTHON -W ignore $folder/search.py "$system" --stages 4 --every 8; done
+# The budget's curve: all stages for a sample of what is not saved.
+for system in "$@"; do $PYTHON -W ignore $folder/search.py "$system" --deeper 30; done

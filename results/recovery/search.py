@@ -1,11 +1,14 @@
 """Search ways back from the hard states, with the simulator itself as the model.
 
-    python results/recovery/search.py walker2d --stages 2
+    python results/recovery/search.py walker2d
+    python results/recovery/search.py walker2d --deeper 30
 
 Cross-entropy method over offsets on the expert's actions, held for four steps each;
-afterwards the expert acts alone. Each stage tries what the earlier ones did not save,
-with about twice the rollouts of all before. One line for each state and stage is
-appended to ``parts/<system>/search-<worker>.jsonl``: interrupted, it goes on there.
+afterwards the expert acts alone. What is saved by the first stage is recoverable; a
+line for each state is appended to ``parts/<system>/search-0.jsonl``. What more would
+save is asked of a sample of the rest, in ``parts/<system>/curve.jsonl``: each stage
+tries what the earlier ones did not save, with about three times their rollouts.
+Interrupted, both go on where they were.
 """
 
 from __future__ import annotations
@@ -57,6 +60,7 @@ STAGES = (
     Stage(96, 4, 15),  # 384
     Stage(144, 8, 15),  # 1152
     Stage(288, 12, 25),  # 3456
+    Stage(512, 20, 25),  # 10240
 )
 
 
@@ -202,34 +206,38 @@ def hard_states(world: World) -> list[tuple[int, int, Rows]]:
 
 
 def main() -> None:
-    """Search what is not saved yet."""
+    """Search what is not searched yet."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("system")
-    parser.add_argument("--stages", type=int, default=2, help="the first so many")
-    parser.add_argument("--worker", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--every", type=int, default=1, help="only each n-th state")
+    parser.add_argument(
+        "--deeper", type=int, help="all later stages, for so many of what is not saved"
+    )
     given = parser.parse_args()
     world = World(given.system)
     planner = Planner(world, normal(world)["std"])
     folder = PARTS / given.system
-    done = {(x["part"], x["index"], x["stage"]): x for x in read_lines(folder)}
-    with (folder / f"search-{given.worker}.jsonl").open("a") as file:
+    first = {(x["part"], x["index"]): x for x in read_lines(folder) if not x["stage"]}
+    states = hard_states(world)
+    if given.deeper is None:
+        path, stages = folder / "search-0.jsonl", range(1)
+    else:
+        path, stages = folder / "curve.jsonl", range(1, len(STAGES))
+        states = [x for x in states if x[:2] in first and not first[x[:2]]["saved"]]
+        order = generator(given.system, 4).permutation(len(states))
+        states = [states[number] for number in order[: given.deeper]]
+    done = {(x["part"], x["index"], x["stage"]): x for x in read_jsonl(path)}
+    done |= {(*key, 0): line for key, line in first.items()}
+    with path.open("a") as file:
         if file.tell():
             file.write("\n")  # after a line that was cut off
-        for number in range(given.stages):
-            for part, index, row in hard_states(world):
-                earlier = [done.get((part, index, before)) for before in range(number)]
-                if (part, index, number) in done or any(
-                    line is None or line["saved"] for line in earlier
-                ):
+        for part, index, row in states:
+            for number in stages:
+                earlier = done.get((part, index, number - 1))
+                if (part, index, number) in done:
                     continue
-                key = part * 1009 + index
-                if key % given.workers != given.worker:
-                    continue
-                if number and key // given.workers % given.every:
-                    continue
-                warm = np.array(earlier[-1]["offsets"]) if number else None
+                if earlier and earlier["saved"]:
+                    break
+                warm = np.array(earlier["offsets"]) if earlier else None
                 rng = generator(given.system, part, index, number, 2)
                 planner.rollouts = planner.steps = 0
                 start = time.process_time()

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from clones import JURORS, SYSTEMS, load_clone
-from search import HOLD, STAGES, read_lines
+from search import HOLD, STAGES, read_jsonl, read_lines
 from states import DISTURBANCES, PARTS, generator, hard, normal
 from tensordict import TensorDict
 from world import World
@@ -26,7 +26,7 @@ from torchrl_osr._files import (
     write_json,
 )
 from torchrl_osr.data import collect_quality
-from torchrl_osr.evaluation import DataDistance
+from torchrl_osr.evaluation import DataDistance, wilson_interval
 from torchrl_osr.evaluation.recoverable import HALVES, STATES
 
 FOLDER = Path(__file__).parent
@@ -84,30 +84,51 @@ def distances(world: World, states: np.ndarray) -> np.ndarray:
 
 
 def curve(world: World) -> list[dict]:
-    """Share of the hard states saved, by stages, of those that have all of them.
+    """Share of the hard states saved, by the rollouts of a search.
 
-    A state that was saved has no need of the later stages; of the others a fixed part
-    was tried in all.
+    All are tried with the first stage; a random sample of those it does not save with
+    the others. Wilson intervals at 95 %.
     """
-    lines = read_lines(PARTS / world.system)
-    by_state: dict[tuple, dict[int, dict]] = {}
-    for line in lines:
-        key = line["part"], line["index"]
-        by_state.setdefault(key, {})[line["stage"]] = line
-    entries, left, saved = [], 1.0, 0.0
-    for number, stage in enumerate(STAGES):
-        tried = [x[number] for x in by_state.values() if number in x]
-        if not tried:
-            break
-        share = float(np.mean([x["saved"] for x in tried]))
-        saved += left * share
-        left *= 1 - share
+    folder = PARTS / world.system
+    first = [line for line in read_lines(folder) if not line["stage"]]
+    saved = sum(line["saved"] for line in first)
+    by_state: dict[tuple, list[dict]] = {}
+    for line in read_jsonl(folder / "curve.jsonl"):
+        by_state.setdefault((line["part"], line["index"]), []).append(line)
+    # An interrupted search has a last state that did not get to its end.
+    sample = [
+        lines
+        for lines in by_state.values()
+        if lines[-1]["saved"] or lines[-1]["stage"] == len(STAGES) - 1
+    ]
+    rate = saved / max(len(first), 1)
+    entries = [
+        {
+            "rollouts": STAGES[0].candidates * STAGES[0].iterations,
+            "tried": len(first),
+            "saved": saved,
+            "of the sample, all stages so far": "",
+            "share of hard states saved so far": f"{rate:.2f}",
+            "core seconds each": f"{np.mean([x['seconds'] for x in first]):.1f}",
+        }
+    ]
+    found = 0
+    for number, stage in enumerate(STAGES[1:] if sample else (), 1):
+        tried = [x for lines in sample for x in lines if x["stage"] == number]
+        new = sum(x["saved"] for x in tried)
+        found += new
+        low, high = wilson_interval(found, len(sample))
+        share, low, high = (
+            rate + (1 - rate) * each for each in (found / len(sample), low, high)
+        )
         entries.append(
             {
                 "rollouts": stage.candidates * stage.iterations,
                 "tried": len(tried),
-                "saved": sum(x["saved"] for x in tried),
-                "share of hard states saved so far": f"{saved:.3f}",
+                "saved": new,
+                "of the sample, all stages so far": f"{found} of {len(sample)}",
+                "share of hard states saved so far": f"{share:.2f} "
+                f"[{low:.2f}, {high:.2f}]",
                 "core seconds each": f"{np.mean([x['seconds'] for x in tried]):.1f}",
             }
         )
