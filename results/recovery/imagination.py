@@ -46,14 +46,17 @@ MODEL = [
 HALT = ["dynamics.unknown=halt", "dynamics.known_share=0.99"]
 DISTURBED = "dynamics.disturbed_steps=10"
 REFERENCE = "noisy cloning"
+BASE = ["loss=td3_bc", "optim.actor_lr=1e-3"]  # the preset's, but for medium-expert
 ARMS = {
-    REFERENCE: ["recovery=noisy_bc"],
-    "base": [],
-    "disturbed starts": [*MODEL, *HALT, DISTURBED],
-    "undisturbed starts": [*MODEL, *HALT],
-    "disturbed starts, no halt": [*MODEL, DISTURBED],
-    "simulator, disturbed starts": [*MODEL, DISTURBED],
-    "simulator, undisturbed starts": MODEL,
+    REFERENCE: [*BASE, "recovery=noisy_bc"],
+    "base": BASE,
+    "disturbed starts": [*BASE, *MODEL, *HALT, DISTURBED],
+    "undisturbed starts": [*BASE, *MODEL, *HALT],
+    "disturbed starts, no halt": [*BASE, *MODEL, DISTURBED],
+    "simulator, disturbed starts": [*BASE, *MODEL, DISTURBED],
+    "simulator, undisturbed starts": [*BASE, *MODEL],
+    "CQL(H)": ["loss=cql"],
+    "CQL(H), disturbed starts": ["loss=cql", *MODEL, *HALT, DISTURBED],
 }
 """The base is TD3+BC: the preset quick, larger batches and twice its updates.
 
@@ -81,9 +84,8 @@ def run(folder: Path, arm: str, data: str, seed: int, half: str) -> None:
         if arm.startswith("simulator"):
             train = [str(HERE / "simulated.py")]
         python(
-            *train, f"env={env}", f"data={quality}", f"seed={seed}", "loss=td3_bc",
+            *train, f"env={env}", f"data={quality}", f"seed={seed}",
             *ARMS[arm], f"trainer.steps={STEPS}", "trainer.batch_size=256",
-            "optim.actor_lr=1e-3",  # the preset's, but for medium-expert
             f"trainer.eval_interval={STEPS // 20}", "trainer.progress=false",
             f"hydra.run.dir='{folder}'",
             log=folder / "train.txt",
