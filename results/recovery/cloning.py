@@ -17,13 +17,13 @@ import argparse
 import json
 import time
 from collections.abc import Callable
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from search import read_jsonl
+from search import HOLD, hard_states, read_jsonl, read_lines
 from states import PARTS, generator, normal
 from torch import Tensor, nn
 from world import NoNoise, World
@@ -266,39 +266,78 @@ class Demonstrations:
         label = np.stack([sample(row, NoNoise()) for row in rows[free]])
         return Displaced(state[free], torch.from_numpy(label).float())
 
-    def witnesses(self) -> Displaced:
-        """What the planner did from the recoverable states of the public half."""
-        path = STATES / f"{self.world.system}-public.npz"
-        states, std = read_recoverable_states(path), normal(self.world)["std"]
-        chosen = np.flatnonzero(states.group == "recoverable")
-        chosen, rng = chosen.repeat(CHANGES), generator(self.world.system, 5)
-        rows, expert = rows_of(states, chosen), self.world.policy("expert")
-        change = np.where(np.arange(len(rows)) % CHANGES, 1e-3, 0.0)[:, None]
-        rows = self.world.changed(rows, change * std, rng)
-        offsets = states.offsets[chosen].repeat(states.hold, axis=1)
-        length = 2 * self.world.steps // 5  # 120 steps: until it walks again
-        seen, done = [], []
+    def ways(self, count: int, label: str = "planner") -> Displaced:
+        """What the planner did from recoverable states, on the way and after it.
 
-        def record(observation: np.ndarray) -> np.ndarray:
-            action = expert(observation)
-            step = len(seen)
-            if step < offsets.shape[1]:
-                action = np.clip(action + offsets[standing, step], -1, 1)
-            seen.append(observation)
-            done.append(action)
-            return action
+        Args:
+            count: from so many of those for training; 0 are the public half's.
+            label: ``"planner"``, or ``"expert"``: what the expert does in these states.
+        """
+        state, action = ways_back(self.world, count)
+        if label == "expert":
+            policy = self.world.policy("expert")
+            action = torch.from_numpy(policy(state.numpy())).float()
+        return Displaced(state, action)
 
-        standing = np.arange(len(rows))
-        for _ in range(length):
-            if self.world.is_maze:
-                standing = standing[~self.world.at_goal(rows[standing])]
-            if not len(standing):
-                break
-            now = rows[standing]
-            rows[standing] = self.world.step(now, record(self.world.observe(now)))
-            standing = standing[self.world.standing(rows[standing])]
-        pair = (np.concatenate(each).astype(np.float32) for each in (seen, done))
-        return Displaced(*map(torch.from_numpy, pair))
+
+def for_training(world: World) -> tuple[np.ndarray, np.ndarray]:
+    """States with a way back from walks that are not in the benchmark, and these ways.
+
+    Rows of ``world.py``, in a random order, and offsets on the expert's actions, each
+    held for HOLD steps.
+    """
+    folder = PARTS / world.system / "ways"
+    rows = {(part, index): row for part, index, row in hard_states(world, folder)}
+    found = [line for line in read_lines(folder) if line["saved"]]
+    found.sort(key=lambda line: (line["part"], line["index"]))
+    order = generator(world.system, 6).permutation(len(found))
+    chosen = [found[number] for number in order]
+    knots = max(len(line["offsets"]) for line in chosen)
+    offsets = np.zeros((len(chosen), knots, world.nu), np.float32)
+    for each, line in zip(offsets, chosen, strict=True):
+        each[: len(line["offsets"])] = line["offsets"]
+    return np.stack([rows[line["part"], line["index"]] for line in chosen]), offsets
+
+
+@cache
+def ways_back(world: World, count: int) -> Displaced:
+    """Observations on the ways back from states, and from small changes of them.
+
+    Args:
+        world: whose.
+        count: of those for training; 0 are the public half's.
+    """
+    if count:
+        rows, knots = (each[:count] for each in for_training(world))
+        if len(rows) < count:
+            raise ValueError(f"{count} ways are wanted, there are {len(rows)}.")
+    else:
+        states = read_recoverable_states(STATES / f"{world.system}-public.npz")
+        chosen = states.group == "recoverable"
+        rows, knots = rows_of(states, chosen), states.offsets[chosen]
+    rows, rng = rows.repeat(CHANGES, axis=0), generator(world.system, 5)
+    change = np.where(np.arange(len(rows)) % CHANGES, 1e-3, 0.0)[:, None]
+    rows = world.changed(rows, change * normal(world)["std"], rng)
+    offsets = knots.repeat(CHANGES, axis=0).repeat(HOLD, axis=1)
+    length = 2 * world.steps // 5  # 120 steps: until it walks again
+    expert, seen, done = world.policy("expert"), [], []
+    standing = np.arange(len(rows))
+    for step in range(length):
+        if world.is_maze:
+            standing = standing[~world.at_goal(rows[standing])]
+        if not len(standing):
+            break
+        now = rows[standing]
+        observation = world.observe(now)
+        action = expert(observation)
+        if step < offsets.shape[1]:
+            action = np.clip(action + offsets[standing, step], -1, 1)
+        seen.append(observation)
+        done.append(action)
+        rows[standing] = world.step(now, action)
+        standing = standing[world.standing(rows[standing])]
+    pair = (np.concatenate(each).astype(np.float32) for each in (seen, done))
+    return Displaced(*map(torch.from_numpy, pair))
 
 
 ARMS: dict[str, Callable[[Demonstrations, float, int], Displaced | None]] = {
@@ -309,7 +348,9 @@ ARMS: dict[str, Callable[[Demonstrations, float, int], Displaced | None]] = {
     "corrective": lambda data, *step: data.corrective(*step, "displaced"),
     "corrective-row": lambda data, *step: data.corrective(*step, "row"),
     "corrective-flipped": lambda data, *step: data.corrective(*step, "flipped"),
-    "witnesses": lambda data, *_: data.witnesses(),
+    "witnesses": lambda data, *_: data.ways(0),
+    "ways": lambda data, _, count: data.ways(count),
+    "ways-expert": lambda data, _, count: data.ways(count, "expert"),
     "expert": lambda data, width, _: data.expert(width),
 }
 PILOT = (
@@ -318,7 +359,7 @@ PILOT = (
     "corrective:.3:20", "corrective-row:.3:20", "corrective-flipped:.3:20",
     "witnesses", "expert:.1",
 )  # fmt: skip
-"""Arm, width of its noise on states or actions, steps."""
+"""Arm, width of its noise on states or actions, steps; of ``ways``, how many."""
 
 
 def rows_of(states: RecoverableStates, chosen: np.ndarray | slice) -> np.ndarray:

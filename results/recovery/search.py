@@ -2,13 +2,15 @@
 
     python results/recovery/search.py walker2d
     python results/recovery/search.py walker2d --deeper 30
+    python results/recovery/search.py walker2d --ways 128 150
 
 Cross-entropy method over offsets on the expert's actions, held for four steps each;
 afterwards the expert acts alone. What is saved by the first stage is recoverable; a
 line for each state is appended to ``parts/<system>/search-0.jsonl``. What more would
 save is asked of a sample of the rest, in ``parts/<system>/curve.jsonl``: each stage
-tries what the earlier ones did not save, with about three times their rollouts.
-Interrupted, both go on where they were.
+tries what the earlier ones did not save, with about three times their rollouts. Ways
+for training, from files of ``states.py --ways``, are searched by the first stage, too.
+Interrupted, it goes on where it was.
 """
 
 from __future__ import annotations
@@ -194,10 +196,10 @@ def read_lines(folder: Path) -> list[dict]:
     return read_jsonl(*sorted(folder.glob("search-*.jsonl")))
 
 
-def hard_states(world: World) -> list[tuple[int, int, Rows]]:
+def hard_states(world: World, folder: Path) -> list[tuple[int, int, Rows]]:
     """Part, index and row of every hard state so far."""
     found = []
-    for path in sorted((PARTS / world.system).glob("states-*.npz")):
+    for path in sorted(folder.glob("states-*.npz")):
         arrays = read_arrays(path)
         part = int(path.stem.removeprefix("states-"))
         for index in np.flatnonzero(hard(world.is_maze, arrays["jury"])):
@@ -212,15 +214,18 @@ def main() -> None:
     parser.add_argument(
         "--deeper", type=int, help="all later stages, for so many of what is not saved"
     )
+    parser.add_argument("--ways", type=int, nargs=2, help="of these files")
     given = parser.parse_args()
     world = World(given.system)
     planner = Planner(world, normal(world)["std"])
-    folder = PARTS / given.system
+    folder = PARTS / given.system / ("ways" if given.ways else "")
     first = {(x["part"], x["index"]): x for x in read_lines(folder) if not x["stage"]}
-    states = hard_states(world)
-    if given.deeper is None:
-        path, stages = folder / "search-0.jsonl", range(1)
-    else:
+    states = hard_states(world, folder)
+    path, stages = folder / "search-0.jsonl", range(1)
+    if given.ways:
+        states = [x for x in states if x[0] in range(*given.ways)]
+        path = folder / f"search-{given.ways[0]}.jsonl"
+    if given.deeper is not None:
         path, stages = folder / "curve.jsonl", range(1, len(STAGES))
         states = [x for x in states if x[:2] in first and not first[x[:2]]["saved"]]
         order = generator(given.system, 4).permutation(len(states))

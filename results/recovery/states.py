@@ -1,9 +1,11 @@
 """Disturb walks, and let the jury play from every state: easy, contested or hard.
 
     python results/recovery/states.py walker2d --walks 64
+    python results/recovery/states.py walker2d --ways 128 150
 
 Walk after walk is appended to ``parts/<system>/``, a file for eight of them; files that
-are there are kept. Everything of a walk is decided by its number.
+are there are kept. Everything of a walk is decided by its number. Files below ``ways``
+never enter the benchmark: how to get back from their states is for training.
 """
 
 from __future__ import annotations
@@ -264,11 +266,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("system", choices=list(DISTURBANCES))
     parser.add_argument("--walks", type=int, default=64)
+    parser.add_argument("--ways", type=int, nargs=2, help="these files, for training")
     given = parser.parse_args()
     world = World(given.system)
     std = normal(world)["std"]
-    for part in range(given.walks // WALKS_A_FILE):
-        path = PARTS / given.system / f"states-{part:03d}.npz"
+    folder, parts = PARTS / given.system, range(given.walks // WALKS_A_FILE)
+    if given.ways:
+        folder, parts = folder / "ways", range(*given.ways)
+        folder.mkdir(exist_ok=True)
+    for part in parts:
+        path = folder / f"states-{part:03d}.npz"
         if path.exists():
             continue
         walks = range(part * WALKS_A_FILE, (part + 1) * WALKS_A_FILE)
