@@ -1,11 +1,12 @@
 """Step 3: few demonstrations, and what a state beside them is labelled with.
 
     python results/recovery/cloning.py walker2d --episodes 20 --seeds 0 1 2
+    python results/recovery/cloning.py walker2d --study ways --arms ways:0:100
 
 Every arm clones the same rows with the same network, half of each batch being states
 displaced from them; arms differ in these states and their labels, of which a table is
 drawn beforehand. One line for each arm and seed is appended to
-``parts/<system>/cloning-<half>.jsonl``, with a bit for each state in the order of the
+``parts/<system>/<study>-<half>.jsonl``, with a bit for each state in the order of the
 file of states; what is there is not trained again.
 
 Shapes: ``N`` rows, ``S`` observation, ``X`` state, ``A`` action.
@@ -384,6 +385,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("system", choices=("walker2d", "pointmaze-medium"))
     parser.add_argument("--half", default="public", choices=("public", "held-out"))
+    parser.add_argument("--study", default="cloning", choices=("cloning", "ways"))
     parser.add_argument("--episodes", type=int, nargs="+", default=[20])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--updates", type=int, default=8000)
@@ -395,7 +397,7 @@ def main() -> None:
     path = STATES / f"{given.system}-{given.half}.npz"
     states, digest = read_recoverable_states(path), sha256_of(path)
     rows = rows_of(states, slice(None))
-    log = PARTS / given.system / f"cloning-{given.half}.jsonl"
+    log = PARTS / given.system / f"{given.study}-{given.half}.jsonl"
     names = ("arm", "width", "steps", "episodes", "seed", "updates", "states")
     there = {tuple(line[name] for name in names) for line in read_jsonl(log)}
     for seed in given.seeds:

@@ -2,7 +2,7 @@
 
     python results/recovery/methods.py
 
-Reads ``parts/<system>/{cloning,look-ahead}-<half>.jsonl`` and writes ``methods.md``.
+Reads ``parts/<system>/{cloning,ways,look-ahead}-<half>.jsonl``, writes ``methods.md``.
 Lines of an older file of states are left out: their bits are of other states.
 """
 
@@ -28,16 +28,23 @@ from torchrl_osr.evaluation.recoverable import (
 )
 
 FOLDER = Path(__file__).parent
-STUDIES = "cloning", "look-ahead"
+STUDIES = "cloning", "ways", "look-ahead"
+EPISODES = 20
+"""Of an arm that does not name them."""
+
 NOISY = {"pointmaze-medium": "noisy 0.3", "walker2d": "noisy 0.1"}
 """Of whose losses R is the share: the better width of the pilot."""
 
-SAME_STATES = {
+MATCHED = "noisy 0.1, 100 episodes"
+"""The same for ``ways``: noisy cloning whose undisturbed score is like theirs."""
+
+TWINS = {
     "osr": "noisy",
     "osr-clean": "noisy",
     "expert": "noisy",
     "corrective": "corrective-row",
     "corrective-flipped": "corrective-row",
+    "ways": "ways-expert",
 }
 
 
@@ -48,7 +55,9 @@ def name_of(line: dict) -> str:
         chosen.append(f"{line['width']:g}")
     if line.get("steps"):
         chosen.append(f"x {line['steps']}")
-    return " ".join(filter(None, chosen))
+    name = " ".join(filter(None, chosen))
+    episodes = line.get("episodes", EPISODES)
+    return name if episodes == EPISODES else f"{name}, {episodes} episodes"
 
 
 def bits_of(line: dict, states: RecoverableStates) -> NDArray[np.float64]:
@@ -63,9 +72,11 @@ def bits_of(line: dict, states: RecoverableStates) -> NDArray[np.float64]:
 TITLE = """# Which method saves any?
 
 Written by `methods.py`: share of the states saved, mean over seeds, with 95 %
-percentile intervals over seeds and walks; with one seed, over walks alone. *less the
-row's action*: points more than the same states with the row's action as their label.
-*R*: what is saved of the losses of noisy cloning, of the better width."""
+percentile intervals over seeds and walks; with one seed, over walks alone. *less its
+twin*: points more than the same states with the row's action as their label, or, for
+the planner's ways, with the expert's. *R*: what is saved of the losses of noisy
+cloning, of the better width, or, for ways, of 100 episodes. Demonstrations are of 20
+episodes but where it says otherwise."""
 
 
 def told(share: tuple[float, float, float]) -> str:
@@ -74,10 +85,10 @@ def told(share: tuple[float, float, float]) -> str:
     return f"{value:.2f} [{low:.2f}, {high:.2f}]"
 
 
-def same_states(name: str) -> str:
-    """The arm whose states these are, with the row's action as their label."""
+def twin(name: str) -> str:
+    """The arm whose states these are, with another label."""
     arm, _, step = name.partition(" ")
-    return f"{SAME_STATES.get(arm, '')} {step}"
+    return f"{TWINS.get(arm, '')} {step}"
 
 
 def rows_of(lines: list[dict], states: RecoverableStates) -> list[dict]:
@@ -90,6 +101,7 @@ def rows_of(lines: list[dict], states: RecoverableStates) -> list[dict]:
         runs[name][line["seed"]] = np.where(np.isnan(bits), old, bits)
         extra.setdefault(name, []).append(line)
     hard = states.group == GROUPS[-1]
+    noisy = NOISY.get(states.env_name, "")
 
     found = []
     for name, seeds in runs.items():
@@ -100,9 +112,9 @@ def rows_of(lines: list[dict], states: RecoverableStates) -> list[dict]:
             known = not np.isnan(bits).any()
             row[group] = told(saved_share(bits, states.walk[inside])) if known else ""
         for column, other in (
-            ("less the row's action", same_states(name)),
+            ("less its twin", twin(name)),
             ("less base", "base"),
-            ("R", NOISY.get(states.env_name, "")),
+            ("R", MATCHED if name.startswith("ways") else noisy),
         ):
             row[column] = ""
             common = runs[name].keys() & runs.get(other, {}).keys()
@@ -139,16 +151,10 @@ def main() -> None:
         for study in STUDIES:
             lines = read_jsonl(PARTS / states.env_name / f"{study}-{half}.jsonl")
             lines = [line for line in lines if line["states"] == digest]
-            settings = sorted({(x.get("episodes"), x.get("updates")) for x in lines})
-            for episodes, updates in settings:
-                chosen = [
-                    x
-                    for x in lines
-                    if (x.get("episodes"), x.get("updates")) == (episodes, updates)
-                ]
+            for updates in sorted({line.get("updates") for line in lines}):
+                chosen = [line for line in lines if line.get("updates") == updates]
                 title = f"## {study}, {states.env_name}, {half} half"
-                if episodes:
-                    title += f", {episodes} episodes, {updates} updates"
+                title += f", {updates} updates" if updates else ""
                 pages += [title, table(rows_of(chosen, states))]
     write_atomically(FOLDER / "methods.md", "\n\n".join(pages) + "\n")
 
