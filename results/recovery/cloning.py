@@ -29,7 +29,7 @@ from states import PARTS, generator, normal
 from torch import Tensor, nn
 from world import NoNoise, World
 
-from torchrl_osr._files import sha256_of
+from torchrl_osr._files import read_arrays, sha256_of
 from torchrl_osr.data import collect_quality, load_behavior_policy, normalized_score
 from torchrl_osr.data.collect.environment import environment_id
 from torchrl_osr.data.collect.mazes import waypoint_sampler
@@ -267,55 +267,70 @@ class Demonstrations:
         label = np.stack([sample(row, NoNoise()) for row in rows[free]])
         return Displaced(state[free], torch.from_numpy(label).float())
 
-    def ways(self, count: int, label: str = "planner") -> Displaced:
-        """What the planner did from recoverable states, on the way and after it.
+    def ways(self, source: str, count: int = 0, label: str = "played") -> Displaced:
+        """What is done on ways back, and after them.
 
         Args:
-            count: from so many of those for training; 0 are the public half's.
-            label: ``"planner"``, or ``"expert"``: what the expert does in these states.
+            source, count: of :func:`ways_back`.
+            label: ``"played"``, or ``"expert"``: what the expert does in these states.
         """
-        state, action = ways_back(self.world, count)
+        state, action = ways_back(self.world, source, count)
         if label == "expert":
             policy = self.world.policy("expert")
             action = torch.from_numpy(policy(state.numpy())).float()
         return Displaced(state, action)
 
 
-def for_training(world: World) -> tuple[np.ndarray, np.ndarray]:
-    """States with a way back from walks that are not in the benchmark, and these ways.
+def benchmark(world: World) -> tuple[np.ndarray, np.ndarray]:
+    """Recoverable states of the public half ``[n, N]``, and the planner's ways.
 
-    Rows of ``world.py``, in a random order, and offsets on the expert's actions, each
-    held for HOLD steps.
+    States are rows of ``world.py``; a way is offsets ``[K, A]`` on the expert's
+    actions, each held for HOLD steps.
     """
+    states = read_recoverable_states(STATES / f"{world.system}-public.npz")
+    chosen = states.group == "recoverable"
+    return rows_of(states, chosen), states.offsets[chosen]
+
+
+def planned(world: World) -> tuple[np.ndarray, np.ndarray]:
+    """The same from the walks that are for training, in a random order."""
     folder = PARTS / world.system / "ways"
     rows = {(part, index): row for part, index, row in hard_states(world, folder)}
     found = [line for line in read_lines(folder) if line["saved"]]
     found.sort(key=lambda line: (line["part"], line["index"]))
     order = generator(world.system, 6).permutation(len(found))
     chosen = [found[number] for number in order]
-    knots = max(len(line["offsets"]) for line in chosen)
-    offsets = np.zeros((len(chosen), knots, world.nu), np.float32)
-    for each, line in zip(offsets, chosen, strict=True):
-        each[: len(line["offsets"])] = line["offsets"]
-    return np.stack([rows[line["part"], line["index"]] for line in chosen]), offsets
+    row = np.stack([rows[line["part"], line["index"]] for line in chosen])
+    return row, np.array([line["offsets"] for line in chosen], np.float32)
+
+
+def survived(world: World) -> tuple[np.ndarray, np.ndarray]:
+    """States of these walks that the expert survives by itself, but not all jurors."""
+    paths = sorted((PARTS / world.system / "ways").glob("states-*.npz"))
+    rows = []
+    for arrays in map(read_arrays, paths):
+        jury = arrays["jury"]
+        rows.append(arrays["state"][(jury[:, 1] == 1) & (jury == 0).any(1)])
+    row = generator(world.system, 7).permutation(np.concatenate(rows))
+    return row, np.zeros((len(row), 0, world.nu), np.float32)
+
+
+SOURCES = {"benchmark": benchmark, "planned": planned, "survived": survived}
 
 
 @cache
-def ways_back(world: World, count: int) -> Displaced:
-    """Observations on the ways back from states, and from small changes of them.
+def ways_back(world: World, source: str, count: int) -> Displaced:
+    """Observations and actions on ways back from states, and from changes of them.
 
     Args:
         world: whose.
-        count: of those for training; 0 are the public half's.
+        source: of SOURCES.
+        count: from the first so many states; 0 are all.
     """
-    if count:
-        rows, knots = (each[:count] for each in for_training(world))
-        if len(rows) < count:
-            raise ValueError(f"{count} ways are wanted, there are {len(rows)}.")
-    else:
-        states = read_recoverable_states(STATES / f"{world.system}-public.npz")
-        chosen = states.group == "recoverable"
-        rows, knots = rows_of(states, chosen), states.offsets[chosen]
+    rows, knots = SOURCES[source](world)
+    if len(rows) < count:
+        raise ValueError(f"{count} ways {source} are wanted, there are {len(rows)}.")
+    rows, knots = (each[: count or None] for each in (rows, knots))
     rows, rng = rows.repeat(CHANGES, axis=0), generator(world.system, 5)
     change = np.where(np.arange(len(rows)) % CHANGES, 1e-3, 0.0)[:, None]
     rows = world.changed(rows, change * normal(world)["std"], rng)
@@ -349,9 +364,10 @@ ARMS: dict[str, Callable[[Demonstrations, float, int], Displaced | None]] = {
     "corrective": lambda data, *step: data.corrective(*step, "displaced"),
     "corrective-row": lambda data, *step: data.corrective(*step, "row"),
     "corrective-flipped": lambda data, *step: data.corrective(*step, "flipped"),
-    "witnesses": lambda data, *_: data.ways(0),
-    "ways": lambda data, _, count: data.ways(count),
-    "ways-expert": lambda data, _, count: data.ways(count, "expert"),
+    "witnesses": lambda data, *_: data.ways("benchmark"),
+    "ways": lambda data, _, count: data.ways("planned", count),
+    "ways-expert": lambda data, _, count: data.ways("planned", count, "expert"),
+    "survived": lambda data, _, count: data.ways("survived", count),
     "expert": lambda data, width, _: data.expert(width),
 }
 PILOT = (
@@ -360,7 +376,7 @@ PILOT = (
     "corrective:.3:20", "corrective-row:.3:20", "corrective-flipped:.3:20",
     "witnesses", "expert:.1",
 )  # fmt: skip
-"""Arm, width of its noise on states or actions, steps; of ``ways``, how many."""
+"""Arm, width of its noise on states or actions, steps; of ways, how many."""
 
 
 def rows_of(states: RecoverableStates, chosen: np.ndarray | slice) -> np.ndarray:
