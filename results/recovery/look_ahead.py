@@ -42,13 +42,18 @@ from torchrl_osr.policy.tensor_file import read_tensors, write_tensors
 
 QUALITIES = "medium-replay", "medium-expert"
 ROWS = 200_000
-"""Of each of them, from which model and value are learned."""
+"""Of each of them, from which the value is learned, and the small model."""
 
 EXPERT_ROWS = 20_000
 """Of the base's own data, from which the gate measures the distance."""
 
-NETWORKS, CELLS = 4, [200, 200]
-UPDATES, BATCH = 10_000, 256
+NETWORKS, BATCH = 4, 256
+MODELS: dict[str, dict[str, Any]] = {
+    "small": {"rows": ROWS, "num_cells": [200, 200], "updates": 10_000},
+    "large": {"rows": 1_000_000, "num_cells": [256] * 3, "updates": 60_000},
+}
+"""Rows of each quality, sizes and training of the model."""
+
 VALUE_UPDATES = 5_000
 CAP = 100
 """Steps: a value says how many of the next so many an average policy stands."""
@@ -141,31 +146,34 @@ def trained(system: str, name: str, make: Callable[[], nn.Module], train: Any) -
     return module.requires_grad_(False)
 
 
-def rows_of(system: str) -> list[Any]:
+def rows_of(system: str, count: int = ROWS) -> list[Any]:
     """The data, a table for each quality."""
     return [
-        load_local_dataset(system, each, num_transitions=ROWS, progress=False)[0]
+        load_local_dataset(system, each, num_transitions=count, progress=False)[0]
         for each in QUALITIES
     ]
 
 
-def ensemble(system: str, seed: int) -> DynamicsEnsemble:
+def ensemble(system: str, model_size: str, seed: int) -> DynamicsEnsemble:
     """The package's model of the data, trained by its loss."""
+    settings = MODELS[model_size]
+    updates = settings["updates"]
     sizes = {"halfcheetah": (17, 6), "hopper": (11, 3), "walker2d": (17, 6)}[system]
 
     def make() -> nn.Module:
         torch.manual_seed(seed)
         options = {"num_networks": NETWORKS, "num_elites": NETWORKS}
-        return DynamicsEnsemble(*sizes, num_cells=CELLS, **options)
+        return DynamicsEnsemble(*sizes, num_cells=settings["num_cells"], **options)
 
     def train(model: DynamicsEnsemble) -> dict[str, Any]:
-        rows, held_out = split_held_out(torch.cat(rows_of(system)), 0.02, seed=seed)
+        rows = torch.cat(rows_of(system, settings["rows"]))
+        rows, held_out = split_held_out(rows, 0.02, seed=seed)
         model.standardize_(rows)
         loss = DynamicsLoss(model)
         buffer = make_replay_buffer(rows, batch_size=NETWORKS * BATCH, seed=seed)
         optimizer = torch.optim.Adam(list(model.parameter_groups()), lr=1e-3)
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, UPDATES)
-        for _ in range(UPDATES):
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, updates)
+        for _ in range(updates):
             sum(loss(buffer.sample()).values()).backward()
             optimizer.step()
             optimizer.zero_grad()
@@ -173,7 +181,8 @@ def ensemble(system: str, seed: int) -> DynamicsEnsemble:
         model.calibrate_(held_out)
         return {"report": describe_dynamics(dynamics_report(model, held_out))}
 
-    return trained(system, f"dynamics-{seed}", make, train)
+    name = "dynamics" if model_size == "small" else f"dynamics-{model_size}"
+    return trained(system, f"{name}-{seed}", make, train)
 
 
 class SurvivalValue(nn.Module):
@@ -251,7 +260,7 @@ def in_torch(policy: BehaviorPolicy) -> nn.Module:
 
 
 def policy_of(
-    arm: str, plan: str, seed: int, world: World
+    arm: str, plan: str, model: str, seed: int, world: World
 ) -> tuple[Callable[[Tensor], Tensor], Counted]:
     """An arm's policy, and its gate."""
     clone = load_clone(world.system, JURORS[world.system])
@@ -281,7 +290,7 @@ def policy_of(
     kinds = {"shuffled": Shuffled, "random": Random, "simulator": Simulated}
     policy = kinds.get(arm, LookAheadPolicy)(
         base,
-        ensemble(world.system, seed),
+        ensemble(world.system, model, seed),
         gate,
         terminated=termination(environment_id(world.system)),
         generator=torch.Generator().manual_seed(seed),
@@ -333,6 +342,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=ARMS)
     parser.add_argument("--plans", nargs="+", default=["20"], choices=list(PLANS))
+    parser.add_argument("--model", default="small", choices=list(MODELS))
     parser.add_argument("--groups", nargs="+", default=["recoverable"])
     given = parser.parse_args()
     torch.set_num_threads(1)
@@ -341,19 +351,20 @@ def main() -> None:
     world = World(given.system)
     normal(world)
     log = PARTS / given.system / f"look-ahead-{given.half}.jsonl"
-    names = ("arm", "plan", "seed", "group", "states")
-    there = {tuple(line[name] for name in names) for line in read_jsonl(log)}
+    names = ("arm", "plan", "seed", "group", "states", "model")
+    there = {tuple(line.get(name) for name in names) for line in read_jsonl(log)}
+    size = None if given.model == "small" else given.model
     for seed in given.seeds:
         for group in given.groups:
             chosen = np.flatnonzero(states.group == group)
             for plan in given.plans:
                 for arm in given.arms:
                     unplanned = arm in ("base", "nearest")
-                    key = arm, "" if unplanned else plan, seed, group, digest
+                    key = arm, "" if unplanned else plan, seed, group, digest, size
                     if key in there:
                         continue
                     there.add(key)
-                    policy, gate = policy_of(arm, plan, seed, world)
+                    policy, gate = policy_of(arm, plan, given.model, seed, world)
                     start = time.process_time()
                     line = dict(zip(names, key, strict=True))
                     line |= play(states, chosen, world, policy)

@@ -50,7 +50,7 @@ TWINS = {
 
 def name_of(line: dict) -> str:
     """Of an arm, with what was chosen for it."""
-    chosen = [line["arm"], line.get("plan", "")]
+    chosen = [line["arm"], line.get("plan", ""), line.get("model") or ""]
     if line.get("width"):
         chosen.append(f"{line['width']:g}")
     if line.get("steps"):
