@@ -1,11 +1,12 @@
 """Step 4: does a dynamics model, at action time, bring back what its base loses?
 
     python results/recovery/look_ahead.py --seeds 0 --arms base look-ahead shuffled
+    python results/recovery/look_ahead.py --run outputs/look/<data>/<arm>/seed300
 
-The base is the clone outside the jury. Models and values of a seed are trained where
-they are not in the cache yet. One line for each arm, seed and group of states is
-appended to ``parts/<system>/look-ahead-<half>.jsonl``: a bit for each state, in the
-order of the file of states; what is there is not played again.
+The base is the clone outside the jury, or a run's policy. Models and values of a seed
+are trained where they are not in the cache yet. One line for each arm, seed and group
+of states is appended to ``parts/<system>/look-ahead-<half>.jsonl``: a bit for each
+state, in the order of the file of states; what is there is not played again.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import argparse
 import json
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,8 +23,9 @@ import torch
 from clones import JURORS, load_clone
 from search import read_jsonl
 from states import PARTS, normal
+from tensordict import TensorDict
 from torch import Tensor, nn
-from world import World
+from world import Policy, World
 
 from torchrl_osr import DynamicsLoss
 from torchrl_osr._files import sha256_of
@@ -30,12 +33,18 @@ from torchrl_osr.data import load_local_dataset, make_replay_buffer, split_held_
 from torchrl_osr.data.collect.behavior import BehaviorPolicy
 from torchrl_osr.data.collect.environment import environment_id
 from torchrl_osr.data.store.cache import cache_root
-from torchrl_osr.evaluation import DataDistance, describe_dynamics, dynamics_report
+from torchrl_osr.evaluation import (
+    DataDistance,
+    describe_dynamics,
+    deterministic_policy,
+    dynamics_report,
+)
 from torchrl_osr.evaluation.recoverable import (
     STATES,
     RecoverableStates,
     read_recoverable_states,
 )
+from torchrl_osr.experiment.trained_run import load_trained
 from torchrl_osr.imagination import LookAheadPolicy, termination
 from torchrl_osr.modules import DynamicsEnsemble
 from torchrl_osr.policy.tensor_file import read_tensors, write_tensors
@@ -116,7 +125,7 @@ class Simulated(LookAheadPolicy):
     """The simulator itself in the model's place; ``world`` and ``base`` are set."""
 
     world: World
-    base: BehaviorPolicy
+    base: Policy
 
     def scores(self, observation: Tensor, offsets: Tensor) -> Tensor:
         batch, world = offsets.shape[:2], self.world
@@ -124,7 +133,7 @@ class Simulated(LookAheadPolicy):
         rows = np.hstack([np.zeros((len(state), 2)), state])  # time and x: nobody sees
         given = offsets.flatten(0, 1).repeat_interleave(self.hold, 1).numpy()
         steps = self.planning_horizon
-        played = world.play(rows, self.base.deterministic, steps, given)
+        played = world.play(rows, self.base, steps, given)
         score = torch.from_numpy(played.alive).float()
         if self.value is not None:
             end = torch.from_numpy(world.observe(played.rows)).float()
@@ -259,15 +268,32 @@ def in_torch(policy: BehaviorPolicy) -> nn.Module:
     return net.requires_grad_(False)
 
 
+def in_numpy(policy: Callable[[Tensor], Tensor]) -> Policy:
+    """The same for the simulator's rows."""
+    return lambda state: policy(torch.from_numpy(state).float()).numpy()
+
+
+def base_of(
+    system: str, run: Path | None
+) -> tuple[Callable[[Tensor], Tensor], TensorDict]:
+    """The policy that is planned around, and its data."""
+    if run is None:
+        base = in_torch(load_clone(system, JURORS[system]))
+        quality, count = "expert", EXPERT_ROWS
+    else:
+        trained_run = load_trained(run)
+        actor, norm = trained_run.actor, trained_run.observation_norm
+        base = deterministic_policy(actor, norm)
+        quality, count = run.parent.parent.name.removeprefix(f"{system}-"), ROWS
+    own, _ = load_local_dataset(system, quality, num_transitions=count, progress=False)
+    return base, own
+
+
 def policy_of(
-    arm: str, plan: str, model: str, seed: int, world: World
+    arm: str, plan: str, model: str, seed: int, world: World, run: Path | None = None
 ) -> tuple[Callable[[Tensor], Tensor], Counted]:
     """An arm's policy, and its gate."""
-    clone = load_clone(world.system, JURORS[world.system])
-    base = in_torch(clone)
-    own, _ = load_local_dataset(
-        world.system, "expert", num_transitions=EXPERT_ROWS, progress=False
-    )
+    base, own = base_of(world.system, run)
     distance = DataDistance(own)
     gate = Counted(lambda state: distance(state) > distance.threshold)
     if arm == "base":
@@ -297,7 +323,7 @@ def policy_of(
         **options,
     )
     if isinstance(policy, Simulated):
-        policy.world, policy.base = world, clone
+        policy.world, policy.base = world, in_numpy(base)
     return policy, gate
 
 
@@ -311,9 +337,7 @@ def play(
     base, hold = (policy.policy, policy.hold) if plans else (policy, states.steps)
     active, alive = np.arange(count), np.full(count, states.steps)
 
-    def act(observation: np.ndarray) -> np.ndarray:
-        return base(torch.from_numpy(observation).float()).numpy()
-
+    act = in_numpy(base)
     for step in range(0, states.steps, hold):
         offsets = None
         if plans:
@@ -339,6 +363,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--system", default="walker2d", choices=("hopper", "walker2d"))
     parser.add_argument("--half", default="public", choices=("public", "held-out"))
+    parser.add_argument("--run", type=Path, help="<data>/<arm>/seed<number>")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=ARMS)
     parser.add_argument("--plans", nargs="+", default=["20"], choices=list(PLANS))
@@ -351,7 +376,8 @@ def main() -> None:
     world = World(given.system)
     normal(world)
     log = PARTS / given.system / f"look-ahead-{given.half}.jsonl"
-    names = ("arm", "plan", "seed", "group", "states", "model")
+    names = ("arm", "plan", "seed", "group", "states", "model", "run")
+    run = None if given.run is None else "/".join(given.run.parts[-3:])
     there = {tuple(line.get(name) for name in names) for line in read_jsonl(log)}
     size = None if given.model == "small" else given.model
     for seed in given.seeds:
@@ -360,11 +386,13 @@ def main() -> None:
             for plan in given.plans:
                 for arm in given.arms:
                     unplanned = arm in ("base", "nearest")
-                    key = arm, "" if unplanned else plan, seed, group, digest, size
+                    key = arm, "" if unplanned else plan, seed, group, digest, size, run
                     if key in there:
                         continue
                     there.add(key)
-                    policy, gate = policy_of(arm, plan, given.model, seed, world)
+                    policy, gate = policy_of(
+                        arm, plan, given.model, seed, world, given.run
+                    )
                     start = time.process_time()
                     line = dict(zip(names, key, strict=True))
                     line |= play(states, chosen, world, policy)

@@ -2,9 +2,9 @@
 
     python results/recovery/model_error.py > results/recovery/model_error.txt
 
-For each group of the public half of Walker2d: steps of the next 100 that the base
-stands, in the simulator and as predicted (mean over networks); the value; and the
-error of one predicted step, mean of the networks, in standard deviations of the
+For each model and each group of the public half of Walker2d: steps of the next 100
+that the base stands, in the simulator and as predicted (mean over networks); the value;
+and the error of one predicted step, mean of the networks, in standard deviations of the
 data's steps, root of the mean square over entries.
 """
 
@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 from cloning import rows_of
-from look_ahead import LookAheadPolicy, policy_of, survival
+from look_ahead import MODELS, LookAheadPolicy, policy_of, survival
 from states import normal
 from world import World
 
@@ -26,8 +26,8 @@ from torchrl_osr.evaluation.recoverable import (
 STEPS = 100
 
 
-def main() -> None:
-    """Of seed 0."""
+def describe(model: str) -> None:
+    """Print a line for each group, of seed 0."""
     torch.set_num_threads(1)
     world = World("walker2d")
     normal(world)
@@ -35,7 +35,7 @@ def main() -> None:
     states = read_recoverable_states(path)
     rows = rows_of(states, slice(None))
     observation = torch.from_numpy(world.observe(rows)).float()
-    policy, _ = policy_of("look-ahead", "80", 0, world)
+    policy, _ = policy_of("look-ahead", "80", model, 0, world)
     assert isinstance(policy, LookAheadPolicy)
     policy.planning_horizon = STEPS
     nothing = torch.zeros(len(rows), 1, 1, world.nu)
@@ -53,14 +53,15 @@ def main() -> None:
     error = difference / policy.model.target_scale[:-1]
     for group in GROUPS:
         of = states.group == group
-        size = error[of].square().mean().sqrt().item()
+        one = error[of].square().mean().sqrt().item()
         print(
-            f"{group}: {of.sum()} states, stands {alive[of].mean():.0f} of {STEPS} "
-            f"steps, predicted {predicted[of].mean():.0f}, value "
-            f"{value[of].mean():.0f}; error of one step {size:.2f}",
+            f"{model}, {group}: {of.sum()} states, stands {alive[of].mean():.0f} of "
+            f"{STEPS} steps, predicted {predicted[of].mean():.0f}, value "
+            f"{value[of].mean():.0f}; error of one step {one:.2f}",
             flush=True,
         )
 
 
 if __name__ == "__main__":
-    main()
+    for size in MODELS:
+        describe(size)
