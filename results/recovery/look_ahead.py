@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from clones import JURORS, load_clone
 from search import read_jsonl
-from states import PARTS, normal
+from states import PARTS, PLAYERS, generator, normal, walk
 from tensordict import TensorDict
 from torch import Tensor, nn
 from world import Policy, World
@@ -60,8 +60,14 @@ NETWORKS, BATCH = 4, 256
 MODELS: dict[str, dict[str, Any]] = {
     "small": {"rows": ROWS, "num_cells": [200, 200], "updates": 10_000},
     "large": {"rows": 1_000_000, "num_cells": [256] * 3, "updates": 60_000},
+    "pushed": {"rows": ROWS, "num_cells": [256] * 3, "updates": 60_000, "pushed": 2000},
 }
-"""Rows of each quality, sizes and training of the model."""
+"""Rows of each quality, sizes and training of the model, and steps of
+:func:`pushed_rows`."""
+
+WALKERS = 256
+BURST, KICK = 0.02, 0.01
+"""Chances in each step of :func:`pushed_rows`."""
 
 VALUE_UPDATES = 5_000
 CAP = 100
@@ -163,9 +169,54 @@ def rows_of(system: str, count: int = ROWS) -> list[Any]:
     ]
 
 
-def ensemble(system: str, model_size: str, seed: int) -> DynamicsEnsemble:
+def pushed_rows(world: World, steps: int) -> TensorDict:
+    """What a robot records that is pushed all the time, ``[WALKERS * steps]`` rows.
+
+    The policies of the data walk; now and then random torques at their bounds take
+    over for 1 to 15 steps, or all velocities change by up to two standard deviations
+    of normal walking. A walk begins anew where it falls.
+    """
+    rng, std = generator(world.system, 8), normal(world)["std"]
+    names = sorted(set(PLAYERS[world.system]))
+    policies = [world.policy(name) for name in names]
+    start, seconds = walk(world, "expert", 2 * 10**6, 1)[:1], world.seconds
+    begin = np.where(np.arange(world.nq + world.nv) == 0, 0.0, 5e-3)
+    rows = world.changed(start.repeat(WALKERS, 0), begin, rng)
+    burst = np.zeros(WALKERS, int)
+    tables = []
+    for _ in range(steps):
+        kicked = rng.random(WALKERS) < KICK
+        size = np.where(kicked, rng.uniform(0, 2, WALKERS), 0)[:, None] * std
+        size[:, : world.nq] = 0
+        after = world.changed(rows, size, rng)
+        rows = np.where(world.standing(after)[:, None], after, rows)
+        state = world.observe(rows)
+        action = np.empty((WALKERS, world.nu), np.float32)
+        for number, policy in enumerate(policies):
+            action[number :: len(policies)] = policy(state[number :: len(policies)])
+        torque = rng.choice([-1.0, 1.0], action.shape)
+        action = np.where(burst[:, None] > 0, torque, action)
+        begins = rng.random(WALKERS) < BURST
+        burst = np.where(begins, rng.integers(1, 16, WALKERS), np.maximum(burst - 1, 0))
+        after = world.step(rows, action)
+        fell = ~world.standing(after)
+        speed = (after[:, 1] - rows[:, 1]) / seconds
+        reward = speed + ~fell - 1e-3 * np.square(action).sum(1)
+        columns = state, action, world.observe(after), reward
+        tables.append([torch.from_numpy(each).float() for each in columns])
+        again = world.changed(start.repeat(WALKERS, 0), begin, rng)
+        rows = np.where(fell[:, None], again, after)
+    state, action, following, reward = (
+        torch.cat(column) for column in zip(*tables, strict=True)
+    )
+    after = {"observation": following, "reward": reward.unsqueeze(1)}
+    table = {"observation": state, "action": action, "next": after}
+    return TensorDict(table, [len(state)])
+
+
+def ensemble(world: World, model_size: str, seed: int) -> DynamicsEnsemble:
     """The package's model of the data, trained by its loss."""
-    settings = MODELS[model_size]
+    system, settings = world.system, MODELS[model_size]
     updates = settings["updates"]
     sizes = {"halfcheetah": (17, 6), "hopper": (11, 3), "walker2d": (17, 6)}[system]
 
@@ -176,6 +227,9 @@ def ensemble(system: str, model_size: str, seed: int) -> DynamicsEnsemble:
 
     def train(model: DynamicsEnsemble) -> dict[str, Any]:
         rows = torch.cat(rows_of(system, settings["rows"]))
+        if "pushed" in settings:
+            more = pushed_rows(world, settings["pushed"])
+            rows = torch.cat([rows.select(*more.keys(True, True)), more])
         rows, held_out = split_held_out(rows, 0.02, seed=seed)
         model.standardize_(rows)
         loss = DynamicsLoss(model)
@@ -316,7 +370,7 @@ def policy_of(
     kinds = {"shuffled": Shuffled, "random": Random, "simulator": Simulated}
     policy = kinds.get(arm, LookAheadPolicy)(
         base,
-        ensemble(world.system, model, seed),
+        ensemble(world, model, seed),
         gate,
         terminated=termination(environment_id(world.system)),
         generator=torch.Generator().manual_seed(seed),
