@@ -86,7 +86,8 @@ offset is held anyway: a quarter of the time of a plan in every step.
 """
 
 SEARCH = {"num_candidates": 48, "top_k": 6, "optim_steps": 3}
-ARMS = ("base", "look-ahead", "shuffled", "random", "always", "nearest", "simulator")
+ARMS = ("base", "look-ahead", "shuffled", "random", "always", "nearest", "simulator",
+        "least", "margin")  # fmt: skip
 
 
 class Counted:
@@ -114,6 +115,21 @@ class Shuffled(LookAheadPolicy):
         scores = super().scores(observation, offsets)
         order = torch.rand(scores.shape, generator=self.chance).argsort(1)
         return scores.gather(1, order)
+
+
+class Least(LookAheadPolicy):
+    """What the elite expects that expects least."""
+
+    def scores(self, observation: Tensor, offsets: Tensor) -> Tensor:
+        return self.elite_scores(observation, offsets).amin(0)
+
+
+class Margin(LookAheadPolicy):
+    """The policy alone has five steps more: what is hardly better is not done."""
+
+    def scores(self, observation: Tensor, offsets: Tensor) -> Tensor:
+        scores = super().scores(observation, offsets)
+        return scores + 5 * (offsets == 0).all(-1).all(-1)
 
 
 class Random(LookAheadPolicy):
@@ -202,15 +218,15 @@ def pushed_rows(world: World, steps: int) -> TensorDict:
         fell = ~world.standing(after)
         speed = (after[:, 1] - rows[:, 1]) / seconds
         reward = speed + ~fell - 1e-3 * np.square(action).sum(1)
-        columns = state, action, world.observe(after), reward
-        tables.append([torch.from_numpy(each).float() for each in columns])
+        columns = state, action, world.observe(after), reward, fell
+        tables.append([torch.from_numpy(each) for each in columns])
         again = world.changed(start.repeat(WALKERS, 0), begin, rng)
         rows = np.where(fell[:, None], again, after)
-    state, action, following, reward = (
-        torch.cat(column) for column in zip(*tables, strict=True)
-    )
-    after = {"observation": following, "reward": reward.unsqueeze(1)}
-    table = {"observation": state, "action": action, "next": after}
+    columns = (torch.cat(column) for column in zip(*tables, strict=True))
+    state, action, following, reward, fell = columns
+    after = {"observation": following.float(), "reward": reward.float().unsqueeze(1)}
+    after["terminated"] = fell.unsqueeze(1)
+    table = {"observation": state.float(), "action": action.float(), "next": after}
     return TensorDict(table, [len(state)])
 
 
@@ -367,7 +383,10 @@ def policy_of(
     options = PLANS[plan] | SEARCH
     if options.pop("value", False):
         options["value"] = survival(world.system, seed)
-    kinds = {"shuffled": Shuffled, "random": Random, "simulator": Simulated}
+    kinds = {
+        "shuffled": Shuffled, "random": Random, "simulator": Simulated,
+        "least": Least, "margin": Margin,
+    }  # fmt: skip
     policy = kinds.get(arm, LookAheadPolicy)(
         base,
         ensemble(world, model, seed),

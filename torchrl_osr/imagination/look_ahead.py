@@ -166,6 +166,10 @@ class LookAheadPolicy:
 
     def scores(self, observation: Tensor, offsets: Tensor) -> Tensor:
         """What the model expects of offsets ``[B, C, K, A]``, in steps, ``[B, C]``."""
+        return self.elite_scores(observation, offsets).mean(0)
+
+    def elite_scores(self, observation: Tensor, offsets: Tensor) -> Tensor:
+        """What each elite expects of them, ``[E, B, C]``."""
         networks, batch = self.model.num_networks, offsets.shape[:2]
         offsets = offsets.flatten(0, 1).repeat_interleave(self.hold, 1)
         offsets = offsets.repeat(networks, 1, 1)
@@ -185,7 +189,7 @@ class LookAheadPolicy:
             steps = steps + alive
         if self.value is not None:
             steps = steps + self.value(state).where(alive, 0.0)
-        return steps.view(networks, *batch).mean(0)
+        return steps.view(networks, *batch)
 
     def _following(self, state: Tensor, action: Tensor) -> Tensor:
         """Mean predictions ``[E n, S]``, of the first network for the first rows."""
