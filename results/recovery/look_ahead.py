@@ -459,7 +459,8 @@ def main() -> None:
             for plan in given.plans:
                 for arm in given.arms:
                     unplanned = arm in ("base", "nearest")
-                    key = arm, "" if unplanned else plan, seed, group, digest, size, run
+                    used = ("", None) if unplanned else (plan, size)
+                    key = arm, used[0], seed, group, digest, used[1], run
                     if key in there:
                         continue
                     there.add(key)

@@ -50,14 +50,24 @@ TWINS = {
 
 def name_of(line: dict) -> str:
     """Of an arm, with what was chosen for it."""
-    chosen = [line["arm"], line.get("plan", ""), line.get("model") or ""]
+    chosen = [line["arm"]]
+    if line.get("plan"):
+        chosen.append(line["plan"])
+        if line["arm"] != "simulator":
+            chosen.append(line.get("model") or "small")
     if line.get("width"):
         chosen.append(f"{line['width']:g}")
     if line.get("steps"):
         chosen.append(f"x {line['steps']}")
-    name = " ".join(filter(None, chosen))
+    name = " ".join(chosen) + around(line)
     episodes = line.get("episodes", EPISODES)
     return name if episodes == EPISODES else f"{name}, {episodes} episodes"
+
+
+def around(line: dict) -> str:
+    """Whose policy it is that is planned around; nothing for the clone."""
+    run = line.get("run")
+    return f", {run.split('/')[1]}" if run else ""
 
 
 def bits_of(line: dict, states: RecoverableStates) -> NDArray[np.float64]:
@@ -97,8 +107,9 @@ def rows_of(lines: list[dict], states: RecoverableStates) -> list[dict]:
     extra: dict[str, list[dict]] = {}
     for line in lines:
         bits, name = bits_of(line, states), name_of(line)
-        old = runs.setdefault(name, {}).get(line["seed"], bits)
-        runs[name][line["seed"]] = np.where(np.isnan(bits), old, bits)
+        seed = line["seed"], line.get("run")
+        old = runs.setdefault(name, {}).get(seed, bits)
+        runs[name][seed] = np.where(np.isnan(bits), old, bits)
         extra.setdefault(name, []).append(line)
     hard = states.group == GROUPS[-1]
     noisy = NOISY.get(states.env_name, "")
@@ -113,7 +124,7 @@ def rows_of(lines: list[dict], states: RecoverableStates) -> list[dict]:
             row[group] = told(saved_share(bits, states.walk[inside])) if known else ""
         for column, other in (
             ("less its twin", twin(name)),
-            ("less base", "base"),
+            ("less base", "base" + around(extra[name][0])),
             ("R", MATCHED if name.startswith("ways") else noisy),
         ):
             row[column] = ""
