@@ -78,16 +78,17 @@ PLANS: dict[str, dict[str, Any]] = {
     "80": {"planning_horizon": 80, "num_offsets": 10},
     "20v": {"planning_horizon": 20, "value": True},
     "40v": {"planning_horizon": 40, "num_offsets": 10, "value": True},
+    "20v anew": {"planning_horizon": 20, "value": True, "every": 1},
 }
 """What is tried on the public half: horizons, with the value of the last state or not.
 
 All with 48 candidates, three times, and a new plan every four steps, for which an
-offset is held anyway: a quarter of the time of a plan in every step.
+offset is held anyway; ``anew``, in every step.
 """
 
 SEARCH = {"num_candidates": 48, "top_k": 6, "optim_steps": 3}
 ARMS = ("base", "look-ahead", "shuffled", "random", "always", "nearest", "simulator",
-        "least", "margin")  # fmt: skip
+        "least", "margin", "both")  # fmt: skip
 
 
 class Counted:
@@ -130,6 +131,16 @@ class Margin(LookAheadPolicy):
     def scores(self, observation: Tensor, offsets: Tensor) -> Tensor:
         scores = super().scores(observation, offsets)
         return scores + 5 * (offsets == 0).all(-1).all(-1)
+
+
+class Both(LookAheadPolicy):
+    """The mean of two models; ``other`` is set."""
+
+    other: LookAheadPolicy
+
+    def scores(self, observation: Tensor, offsets: Tensor) -> Tensor:
+        other = self.other.scores(observation, offsets)
+        return (super().scores(observation, offsets) + other) / 2
 
 
 class Random(LookAheadPolicy):
@@ -381,11 +392,12 @@ def policy_of(
 
         return nearest, gate
     options = PLANS[plan] | SEARCH
+    options.pop("every", None)
     if options.pop("value", False):
         options["value"] = survival(world.system, seed)
     kinds = {
         "shuffled": Shuffled, "random": Random, "simulator": Simulated,
-        "least": Least, "margin": Margin,
+        "least": Least, "margin": Margin, "both": Both,
     }  # fmt: skip
     policy = kinds.get(arm, LookAheadPolicy)(
         base,
@@ -395,23 +407,34 @@ def policy_of(
         generator=torch.Generator().manual_seed(seed),
         **options,
     )
+    if isinstance(policy, Both):  # the one that is named, and the model of pushed data
+        other, _ = policy_of("look-ahead", plan, "pushed", seed, world, run)
+        assert isinstance(other, LookAheadPolicy)
+        policy.other = other
     if isinstance(policy, Simulated):
         policy.world, policy.base = world, in_numpy(base)
     return policy, gate
 
 
 def play(
-    states: RecoverableStates, chosen: np.ndarray, world: World, policy: Any
+    states: RecoverableStates,
+    chosen: np.ndarray,
+    world: World,
+    policy: Any,
+    every: int,
 ) -> dict[str, Any]:
-    """Which of the chosen states it comes back from, and how long it stands."""
+    """Which of the chosen states it comes back from, and how long it stands.
+
+    A plan is made ``every`` so many steps.
+    """
     count = len(chosen)
     rows = np.hstack([np.zeros((count, 1)), states.qpos[chosen], states.qvel[chosen]])
     plans = isinstance(policy, LookAheadPolicy)
-    base, hold = (policy.policy, policy.hold) if plans else (policy, states.steps)
+    base, every = (policy.policy, every) if plans else (policy, states.steps)
     active, alive = np.arange(count), np.full(count, states.steps)
 
     act = in_numpy(base)
-    for step in range(0, states.steps, hold):
+    for step in range(0, states.steps, every):
         offsets = None
         if plans:
             observation = torch.from_numpy(world.observe(rows[active])).float()
@@ -419,8 +442,8 @@ def play(
             offset = torch.zeros(len(active), world.nu)
             if far.any():
                 offset[far] = policy.plan(observation[far])[:, 0]
-            offsets = offset.unsqueeze(1).expand(-1, hold, -1).numpy()
-        length = min(hold, states.steps - step)
+            offsets = offset.unsqueeze(1).expand(-1, every, -1).numpy()
+        length = min(every, states.steps - step)
         played = world.play(rows[active], act, length, offsets)
         rows[active] = played.rows
         alive[active[~played.success]] = step + played.alive[~played.success]
@@ -469,7 +492,8 @@ def main() -> None:
                     )
                     start = time.process_time()
                     line = dict(zip(names, key, strict=True))
-                    line |= play(states, chosen, world, policy)
+                    every = PLANS[plan].get("every", 4)
+                    line |= play(states, chosen, world, policy, every)
                     line["planned"] = gate.open
                     line["seconds"] = round(time.process_time() - start, 1)
                     with log.open("a") as file:
