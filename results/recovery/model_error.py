@@ -5,7 +5,7 @@
 For each model and each group of the public half of Walker2d: steps of the next 100
 that the base stands, in the simulator and as predicted (mean over networks); the value;
 and the error of one predicted step, mean of the networks, in standard deviations of the
-data's steps, root of the mean square over entries.
+data's steps (the small model's data), root of the mean square over entries.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 from cloning import rows_of
-from look_ahead import MODELS, LookAheadPolicy, policy_of, survival
+from look_ahead import MODELS, LookAheadPolicy, ensemble, policy_of, survival
 from states import normal
 from world import World
 
@@ -50,7 +50,7 @@ def describe(model: str) -> None:
     after = torch.from_numpy(world.observe(world.step(rows, action.numpy()))).float()
     mean, _ = policy.model.predict(observation, action)
     difference = observation + mean[..., :-1].mean(0) - after
-    error = difference / policy.model.target_scale[:-1]
+    error = difference / ensemble(world, "small", 0).target_scale[:-1]
     for group in GROUPS:
         of = states.group == group
         one = error[of].square().mean().sqrt().item()
