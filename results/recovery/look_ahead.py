@@ -88,7 +88,14 @@ offset is held anyway; ``anew``, in every step.
 
 SEARCH = {"num_candidates": 48, "top_k": 6, "optim_steps": 3}
 ARMS = ("base", "look-ahead", "shuffled", "random", "always", "nearest", "simulator",
-        "least", "margin", "both")  # fmt: skip
+        "least", "margin", "both", "two", "five")  # fmt: skip
+OTHERS: dict[str, list[tuple[str, int]]] = {
+    "both": [("pushed", 0)],
+    "two": [("large", 1)],
+    "five": [("large", more) for more in range(1, 5)],
+}
+"""Arms that take the mean of several models: the others' kinds, and how many more than
+the arm's own their seeds are."""
 
 
 class Counted:
@@ -133,14 +140,16 @@ class Margin(LookAheadPolicy):
         return scores + 5 * (offsets == 0).all(-1).all(-1)
 
 
-class Both(LookAheadPolicy):
-    """The mean of two models; ``other`` is set."""
+class Mean(LookAheadPolicy):
+    """The mean of several models; ``others`` are set."""
 
-    other: LookAheadPolicy
+    others: list[LookAheadPolicy]
 
     def scores(self, observation: Tensor, offsets: Tensor) -> Tensor:
-        other = self.other.scores(observation, offsets)
-        return (super().scores(observation, offsets) + other) / 2
+        total = super().scores(observation, offsets)
+        for other in self.others:
+            total = total + other.scores(observation, offsets)
+        return total / (1 + len(self.others))
 
 
 class Random(LookAheadPolicy):
@@ -397,8 +406,8 @@ def policy_of(
         options["value"] = survival(world.system, seed)
     kinds = {
         "shuffled": Shuffled, "random": Random, "simulator": Simulated,
-        "least": Least, "margin": Margin, "both": Both,
-    }  # fmt: skip
+        "least": Least, "margin": Margin,
+    } | dict.fromkeys(OTHERS, Mean)  # fmt: skip
     policy = kinds.get(arm, LookAheadPolicy)(
         base,
         ensemble(world, model, seed),
@@ -407,10 +416,12 @@ def policy_of(
         generator=torch.Generator().manual_seed(seed),
         **options,
     )
-    if isinstance(policy, Both):  # the one that is named, and the model of pushed data
-        other, _ = policy_of("look-ahead", plan, "pushed", seed, world, run)
-        assert isinstance(other, LookAheadPolicy)
-        policy.other = other
+    if isinstance(policy, Mean):
+        policy.others = []
+        for kind, more in OTHERS[arm]:
+            other, _ = policy_of("look-ahead", plan, kind, seed + more, world, run)
+            assert isinstance(other, LookAheadPolicy)
+            policy.others.append(other)
     if isinstance(policy, Simulated):
         policy.world, policy.base = world, in_numpy(base)
     return policy, gate
