@@ -6,7 +6,8 @@
 The base is the clone outside the jury, or a run's policy. Models and values of a seed
 are trained where they are not in the cache yet. One line for each arm, seed and group
 of states is appended to ``parts/<system>/look-ahead-<half>.jsonl``: a bit for each
-state, in the order of the file of states; what is there is not played again.
+state, in the order of the file of states; what is there is not played again. Beside
+easy states the undisturbed score is measured, with a plan in every step.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from typing import Any
 import numpy as np
 import torch
 from clones import JURORS, load_clone
+from cloning import undisturbed
 from search import read_jsonl
 from states import PARTS, PLAYERS, generator, normal, walk
 from tensordict import TensorDict
@@ -506,6 +508,8 @@ def main() -> None:
                     every = PLANS[plan].get("every", 4)
                     line |= play(states, chosen, world, policy, every)
                     line["planned"] = gate.open
+                    if group == "easy":
+                        line["undisturbed"] = round(undisturbed(world, policy), 2)
                     line["seconds"] = round(time.process_time() - start, 1)
                     with log.open("a") as file:
                         file.write(json.dumps(line, separators=(",", ":")) + "\n")

@@ -141,8 +141,8 @@ def rows_of(lines: list[dict], states: RecoverableStates) -> list[dict]:
             else:
                 share = saved_share(ours - theirs, walk)
             row[column] = told(share)
-        if "undisturbed" in extra[name][0]:
-            values = [line["undisturbed"] for line in extra[name]]
+        values = [x["undisturbed"] for x in extra[name] if "undisturbed" in x]
+        if values:
             row["undisturbed"] = f"{np.mean(values):.2f}"
         if "alive" in extra[name][0]:
             of = [x for x in extra[name] if x["group"] == "recoverable"]
