@@ -128,7 +128,7 @@ def rows_of(lines: list[dict], states: RecoverableStates) -> list[dict]:
             ("R", MATCHED if name.startswith("ways") else noisy),
         ):
             row[column] = ""
-            common = runs[name].keys() & runs.get(other, {}).keys()
+            common = [seed for seed in runs[name] if seed in runs.get(other, {})]
             if name == other or not common:
                 continue
             ours, theirs = (
