@@ -9,6 +9,7 @@ Lines of an older file of states are left out: their bits are of other states.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +37,7 @@ NOISY = {"pointmaze-medium": "noisy 0.3", "walker2d": "noisy 0.1"}
 """Of whose losses R is the share: the better width of the pilot."""
 
 MATCHED = "noisy 0.1, 100 episodes"
-"""The same for ``ways``: noisy cloning whose undisturbed score is like theirs."""
+"""The same for ``ways`` and look-ahead: its undisturbed score is more like theirs."""
 
 TWINS = {
     "osr": "noisy",
@@ -45,6 +46,7 @@ TWINS = {
     "corrective": "corrective-row",
     "corrective-flipped": "corrective-row",
     "ways": "ways-expert",
+    "look-ahead": "shuffled",
 }
 
 
@@ -84,9 +86,10 @@ TITLE = """# Which method saves any?
 Written by `methods.py`: share of the states saved, mean over seeds, with 95 %
 percentile intervals over seeds and walks; with one seed, over walks alone. *less its
 twin*: points more than the same states with the row's action as their label, or, for
-the planner's ways, with the expert's. *R*: what is saved of the losses of noisy
-cloning, of the better width, or, for ways, of 100 episodes. Demonstrations are of 20
-episodes but where it says otherwise."""
+the planner's ways, with the expert's, or for look-ahead with shuffled predictions.
+*R*: what is saved of the losses of noisy cloning, of the better width, or, for ways and
+look-ahead, of 100 episodes (the ways' study). Demonstrations are of 20 episodes but
+where it says otherwise."""
 
 
 def told(share: tuple[float, float, float]) -> str:
@@ -101,8 +104,16 @@ def twin(name: str) -> str:
     return f"{TWINS.get(arm, '')} {step}"
 
 
-def rows_of(lines: list[dict], states: RecoverableStates) -> list[dict]:
-    """A row for each arm; comparisons are over the seeds that both have."""
+def rows_of(
+    lines: list[dict],
+    states: RecoverableStates,
+    elsewhere: NDArray[np.float64] | None = None,
+) -> list[dict]:
+    """A row for each arm; comparisons are over the seeds that both have.
+
+    R is against ``elsewhere`` if given: how often noisy cloning comes back from each
+    state in another study, ``[M]``.
+    """
     runs: dict[str, dict[int, NDArray[np.float64]]] = {}
     extra: dict[str, list[dict]] = {}
     for line in lines:
@@ -112,7 +123,10 @@ def rows_of(lines: list[dict], states: RecoverableStates) -> list[dict]:
         runs[name][seed] = np.where(np.isnan(bits), old, bits)
         extra.setdefault(name, []).append(line)
     hard = states.group == GROUPS[-1]
-    noisy = NOISY.get(states.env_name, "")
+    noisy, others = NOISY.get(states.env_name, ""), dict(runs)
+    if elsewhere is not None:
+        noisy = MATCHED
+        others[noisy] = {seed: elsewhere for each in runs.values() for seed in each}
 
     found = []
     for name, seeds in runs.items():
@@ -128,11 +142,11 @@ def rows_of(lines: list[dict], states: RecoverableStates) -> list[dict]:
             ("R", MATCHED if name.startswith("ways") else noisy),
         ):
             row[column] = ""
-            common = [seed for seed in runs[name] if seed in runs.get(other, {})]
+            common = [seed for seed in seeds if seed in others.get(other, {})]
             if name == other or not common:
                 continue
             ours, theirs = (
-                np.array([runs[each][seed][hard] for seed in common])
+                np.array([others[each][seed][hard] for seed in common])
                 for each in (name, other)
             )
             walk = states.walk[hard]
@@ -144,13 +158,19 @@ def rows_of(lines: list[dict], states: RecoverableStates) -> list[dict]:
         values = [x["undisturbed"] for x in extra[name] if "undisturbed" in x]
         if values:
             row["undisturbed"] = f"{np.mean(values):.2f}"
-        if "alive" in extra[name][0]:
-            of = [x for x in extra[name] if x["group"] == "recoverable"]
+        of = [x for x in extra[name] if x.get("group", GROUPS[-1]) == GROUPS[-1]]
+        if "alive" in of[0]:
             row["steps alive"] = f"{np.mean([x['alive'] for x in of]):.0f}"
-        row["core seconds"] = f"{np.mean([x['seconds'] for x in extra[name]]):.0f}"
+        row["core seconds"] = f"{np.mean([x['seconds'] for x in of]):.0f}"
         found.append(row)
     used = {column for row in found for column, cell in row.items() if cell != ""}
     return [{name: row[name] for name in row if name in used} for row in found]
+
+
+def mean_bits(lines: list[dict], states: RecoverableStates, name: str) -> Any:
+    """How often an arm comes back from each state, ``[M]``; None without it."""
+    bits = [bits_of(line, states) for line in lines if name_of(line) == name]
+    return np.mean(bits, axis=0) if bits else None
 
 
 def main() -> None:
@@ -159,14 +179,19 @@ def main() -> None:
     for path in sorted(STATES.glob("*.npz")):
         states, digest = read_recoverable_states(path), sha256_of(path)
         half = next(each for each in HALVES if path.stem.endswith(each))
+        studies = {}
         for study in STUDIES:
             lines = read_jsonl(PARTS / states.env_name / f"{study}-{half}.jsonl")
-            lines = [line for line in lines if line["states"] == digest]
+            studies[study] = [line for line in lines if line["states"] == digest]
+        for study, lines in studies.items():
+            elsewhere = None
+            if study == "look-ahead":
+                elsewhere = mean_bits(studies["ways"], states, MATCHED)
             for updates in sorted({line.get("updates") for line in lines}):
                 chosen = [line for line in lines if line.get("updates") == updates]
                 title = f"## {study}, {states.env_name}, {half} half"
                 title += f", {updates} updates" if updates else ""
-                pages += [title, table(rows_of(chosen, states))]
+                pages += [title, table(rows_of(chosen, states, elsewhere))]
     write_atomically(FOLDER / "methods.md", "\n\n".join(pages) + "\n")
 
 
