@@ -90,11 +90,10 @@ offset is held anyway; ``anew``, in every step.
 
 SEARCH = {"num_candidates": 48, "top_k": 6, "optim_steps": 3}
 ARMS = ("base", "look-ahead", "shuffled", "random", "always", "nearest", "simulator",
-        "least", "margin", "both", "two", "three")  # fmt: skip
+        "least", "margin", "both", "two")  # fmt: skip
 OTHERS: dict[str, list[tuple[str, int]]] = {
     "both": [("pushed", 0)],
     "two": [("large", 1)],
-    "three": [("large", 1), ("large", 2)],
 }
 """Arms that take the mean of several models: the others' kinds, and how many more than
 the arm's own their seeds are."""

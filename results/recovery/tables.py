@@ -2,7 +2,8 @@
 
     python results/recovery/tables.py
 
-Writes ``torchrl_osr/evaluation/states/<system>-<half>.npz``, their SHA-256 beside them,
+Writes ``torchrl_osr/evaluation/states/<system>-<half>.npz`` where it is not there yet,
+their SHA-256 beside them,
 and ``tables.md``.
 """
 
@@ -13,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from clones import JURORS, SYSTEMS, load_clone
+from cloning import rows_of
 from search import HOLD, STAGES, read_jsonl, read_lines
 from states import DISTURBANCES, PARTS, generator, hard, normal
 from tensordict import TensorDict
@@ -27,7 +29,11 @@ from torchrl_osr._files import (
 )
 from torchrl_osr.data import collect_quality
 from torchrl_osr.evaluation import DataDistance, wilson_interval
-from torchrl_osr.evaluation.recoverable import HALVES, STATES
+from torchrl_osr.evaluation.recoverable import (
+    HALVES,
+    STATES,
+    read_recoverable_states,
+)
 
 FOLDER = Path(__file__).parent
 GROUPS = ("easy", "contested", "recoverable", "not saved")
@@ -166,12 +172,10 @@ def by_disturbance(world: World, found: dict[str, np.ndarray]) -> list[dict]:
     return rows
 
 
-def pack(world: World, found: dict[str, np.ndarray]) -> list[dict]:
-    """Write both halves; return what is in them."""
+def pack(world: World, found: dict[str, np.ndarray]) -> None:
+    """Write both halves; one that is there is not made again, results name its sum."""
     rng = generator(world.system, 3)
     kinds = np.array(list(DISTURBANCES[world.system]))
-    clone = load_clone(world.system, JURORS[world.system]).deterministic
-    contents = []
     for number, half in enumerate(HALVES):
         inside = found["walk"] % 2 == number
         chosen = [np.flatnonzero(inside & (found["group"] == 2))]
@@ -180,48 +184,56 @@ def pack(world: World, found: dict[str, np.ndarray]) -> list[dict]:
             count = min(CONTROLS, len(there))
             chosen.append(np.sort(rng.choice(there, count, replace=False)))
         rows = np.concatenate(chosen)
+        path = STATES / f"{world.system}-{half}.npz"
+        if path.exists():
+            continue
         states = found["state"][rows]
-        group = np.array(GROUPS)[found["group"][rows]]
-        distance = distances(world, states)
         arrays = {
             "env_name": np.array(world.system),
             "qpos": states[:, 1 : 1 + world.nq],
             "qvel": states[:, 1 + world.nq : world.size],
             "goal": states[:, world.size :],
-            "group": group,
+            "group": np.array(GROUPS)[found["group"][rows]],
             "walk": found["walk"][rows].astype(np.int32),
             "moment": found["moment"][rows].astype(np.int32),
             "kind": kinds[found["kind"][rows]],
             "strength": found["strength"][rows],
-            "distance": distance.astype(np.float32),
+            "distance": distances(world, states).astype(np.float32),
             "offsets": found["offsets"][rows],
             "hold": np.array(HOLD),
             "steps": np.array(world.steps),
             "least_speed": np.array(world.least_speed or -np.inf),
         }
-        path = STATES / f"{world.system}-{half}.npz"
         path.parent.mkdir(exist_ok=True)
         with whole_file(path) as file:
             np.savez_compressed(file, **arrays)
-        there = group == "recoverable"
+
+
+def contents(world: World) -> list[dict]:
+    """What is in the two files, and what a clone saves of the public one."""
+    clone = load_clone(world.system, JURORS[world.system]).deterministic
+    entries = []
+    for half in HALVES:
+        states = read_recoverable_states(STATES / f"{world.system}-{half}.npz")
+        there = states.group == "recoverable"
         entry: dict = {"half": half, "recoverable": int(there.sum())}
-        entry["of walks"] = len(np.unique(arrays["walk"][there]))
+        entry["of walks"] = len(np.unique(states.walk[there]))
+        far = states.distance[there]
         for low, high, name in (
             (0, 1, "in the data"), (1, 2, "up to 2"), (2, np.inf, "further"),
         ):  # fmt: skip
-            entry[name] = int(((distance > low) & (distance <= high))[there].sum())
+            entry[name] = int(((far > low) & (far <= high)).sum())
         for control in GROUPS[:2]:
-            entry[control] = int((group == control).sum())
+            entry[control] = int((states.group == control).sum())
         if half == "public":  # the other one is not looked at
-            back = world.play(states, clone, world.steps).success
-            for each in ("recoverable", "contested", "easy"):
-                of = group == each
-                entry[f"a clone saves of {each}"] = f"{back[of].sum()} of {of.sum()}"
-        else:
-            for each in ("recoverable", "contested", "easy"):
-                entry[f"a clone saves of {each}"] = ""
-        contents.append(entry)
-    return contents
+            back = world.play(rows_of(states, slice(None)), clone, world.steps).success
+        for each in ("recoverable", "contested", "easy"):
+            of = states.group == each
+            known = half == "public"
+            told = f"{back[of].sum()} of {of.sum()}" if known else ""
+            entry[f"a clone saves of {each}"] = told
+        entries.append(entry)
+    return entries
 
 
 def main() -> None:
@@ -234,9 +246,10 @@ def main() -> None:
         world = World(system)
         normal(world)  # sets the least speed
         found = gather(world)
+        pack(world, found)
         pages += [
             f"## {system}",
-            table(pack(world, found)),
+            table(contents(world)),
             table(curve(world) or [{"rollouts": 0}]),
             table(by_disturbance(world, found)),
         ]
