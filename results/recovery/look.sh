@@ -1,6 +1,31 @@
-# The looks of step 5, Walker2d's and Hopper's: all runs of one first, then all of them
-# from the held-out half, once.
+# The looks at the held-out half, as they were taken; what is there is not done again.
 set -e
+labels() {
+    for system in pointmaze-medium walker2d; do
+        wide=$([ $system = walker2d ] || echo noisy:.3)
+        python results/recovery/cloning.py $system --half held-out --episodes 20 \
+            --updates 8000 --seeds $(seq 100 119) --arms cloning noisy:.1 $wide \
+            osr:.1 osr-clean:.1 corrective:.3:1 corrective-row:.3:1 \
+            corrective-flipped:.3:1 witnesses expert:.1
+    done
+}
+ways() {
+    set -- walker2d --half held-out --study ways --updates 8000 --seeds $(seq 120 139)
+    python results/recovery/cloning.py "$@" --episodes 20 \
+        --arms noisy:.1 ways:0:565 ways-expert:0:565
+    python results/recovery/cloning.py "$@" --episodes 100 --arms noisy:.1
+}
+ahead() {
+    set -- --half held-out --plans 20v
+    python results/recovery/look_ahead.py "$@" --model large --seeds 200 201 202 \
+        --arms base look-ahead shuffled
+    python results/recovery/look_ahead.py "$@" --model large --seeds 200 \
+        --arms random always nearest simulator both
+    python results/recovery/look_ahead.py "$@" --model pushed --seeds 200 \
+        --arms look-ahead
+    python results/recovery/look_ahead.py "$@" --model large --seeds 200 \
+        --arms base look-ahead both --groups easy contested
+}
 from() {
     half=$1 data=$2
     shift 2
@@ -19,6 +44,9 @@ hopper() {
         --arms "disturbed starts" "undisturbed starts" "noisy cloning"
     from "$1" hopper-medium-expert --seeds 300 303 --arms base
 }
+labels
+ways
+ahead
 walker2d public
 walker2d held-out
 hopper public
