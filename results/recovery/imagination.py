@@ -55,6 +55,7 @@ ARMS = {
     "disturbed starts, no halt": [*BASE, *MODEL, DISTURBED],
     "simulator, disturbed starts": [*BASE, *MODEL, DISTURBED],
     "simulator, undisturbed starts": [*BASE, *MODEL],
+    "permuted, disturbed starts": [*BASE, *MODEL, *HALT, DISTURBED],
     "CQL(H)": ["loss=cql"],
     "CQL(H), disturbed starts": ["loss=cql", *MODEL, *HALT, DISTURBED],
 }
@@ -62,6 +63,13 @@ ARMS = {
 
 With disturbed starts and the halt it is ``loss=rim`` with a longer trained model.
 """
+IN_PLACE = {
+    "simulator, disturbed starts": "simulated.py",
+    "simulator, undisturbed starts": "simulated.py",
+    "permuted, disturbed starts": "permuted.py",
+}
+"""Arms that have something else in the model's place."""
+
 
 
 def python(*arguments: str, log: Path) -> None:
@@ -81,8 +89,8 @@ def run(folder: Path, arm: str, data: str, seed: int, half: str) -> None:
     status = folder / "status.json"
     if not status.exists() or json.loads(status.read_text())["status"] != "done":
         train = ["-m", "torchrl_osr", "train"]
-        if arm.startswith("simulator"):
-            train = [str(HERE / "simulated.py")]
+        if arm in IN_PLACE:
+            train = [str(HERE / IN_PLACE[arm])]
         python(
             *train, f"env={env}", f"data={quality}", f"seed={seed}",
             *ARMS[arm], f"trainer.steps={STEPS}", "trainer.batch_size=256",

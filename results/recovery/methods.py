@@ -156,11 +156,10 @@ def rows_of(
                 share = saved_share(ours - theirs, walk)
             row[column] = told(share)
         values = [x["undisturbed"] for x in extra[name] if "undisturbed" in x]
-        if values:
-            row["undisturbed"] = f"{np.mean(values):.2f}"
+        row["undisturbed"] = f"{np.mean(values):.2f}" if values else ""
         of = [x for x in extra[name] if x.get("group", GROUPS[-1]) == GROUPS[-1]]
-        if "alive" in of[0]:
-            row["steps alive"] = f"{np.mean([x['alive'] for x in of]):.0f}"
+        alive = [x["alive"] for x in of if "alive" in x]
+        row["steps alive"] = f"{np.mean(alive):.0f}" if alive else ""
         row["core seconds"] = f"{np.mean([x['seconds'] for x in of]):.0f}"
         found.append(row)
     used = {column for row in found for column, cell in row.items() if cell != ""}
