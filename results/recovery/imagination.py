@@ -71,7 +71,6 @@ IN_PLACE = {
 """Arms that have something else in the model's place."""
 
 
-
 def python(*arguments: str, log: Path) -> None:
     """Run Python with one thread; keep what it prints."""
     with log.open("w") as file:

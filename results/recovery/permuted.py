@@ -38,8 +38,10 @@ class Permuted(nn.Module):
         return self.model.predict(observation, action)
 
     def sample(self, prediction: Prediction) -> Tensor:
-        """A change that leads to another row's next state, and the reward, ``[B, S + 1]``."""
-        change, reward = self.model.sample(prediction).split([self.observation_dim, 1], -1)
+        """Changes that lead to other rows' next states, and rewards, ``[B, S + 1]``."""
+        change, reward = self.model.sample(prediction).split(
+            [self.observation_dim, 1], -1
+        )
         following = (self.state + change)[torch.randperm(len(change))]
         return torch.cat([following - self.state, reward], -1)
 
