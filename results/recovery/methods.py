@@ -87,9 +87,9 @@ Written by `methods.py`: share of the states saved, mean over seeds, with 95 %
 percentile intervals over seeds and walks; with one seed, over walks alone. *less its
 twin*: points more than the same states with the row's action as their label, or, for
 the planner's ways, with the expert's, or for look-ahead with shuffled predictions.
-*R*: what is saved of the losses of noisy cloning, of the better width, or, for ways and
-look-ahead, of 100 episodes (the ways' study). Demonstrations are of 20 episodes but
-where it says otherwise."""
+*R*: what is saved of the losses of noisy cloning of as many episodes and the better
+width, or, for ways and look-ahead, of 100 episodes (the ways' study). Demonstrations
+are of 20 episodes but where it says otherwise."""
 
 
 def told(share: tuple[float, float, float]) -> str:
@@ -104,9 +104,17 @@ def twin(name: str) -> str:
     return f"{TWINS.get(arm, '')} {step}"
 
 
+def reference(name: str, study: str, env_name: str) -> str:
+    """The arm of whose losses R is the share."""
+    if study != "cloning":
+        return MATCHED
+    return ", ".join([NOISY[env_name], *name.split(", ")[1:]])
+
+
 def rows_of(
     lines: list[dict],
     states: RecoverableStates,
+    study: str,
     elsewhere: NDArray[np.float64] | None = None,
 ) -> list[dict]:
     """A row for each arm; comparisons are over the seeds that both have.
@@ -123,10 +131,9 @@ def rows_of(
         runs[name][seed] = np.where(np.isnan(bits), old, bits)
         extra.setdefault(name, []).append(line)
     hard = states.group == GROUPS[-1]
-    noisy, others = NOISY.get(states.env_name, ""), dict(runs)
+    others = dict(runs)
     if elsewhere is not None:
-        noisy = MATCHED
-        others[noisy] = {seed: elsewhere for each in runs.values() for seed in each}
+        others[MATCHED] = {seed: elsewhere for each in runs.values() for seed in each}
 
     found = []
     for name, seeds in runs.items():
@@ -139,7 +146,7 @@ def rows_of(
         for column, other in (
             ("less its twin", twin(name)),
             ("less base", "base" + around(extra[name][0])),
-            ("R", MATCHED if name.startswith("ways") else noisy),
+            ("R", reference(name, study, states.env_name)),
         ):
             row[column] = ""
             common = [seed for seed in seeds if seed in others.get(other, {})]
@@ -190,7 +197,7 @@ def main() -> None:
                 chosen = [line for line in lines if line.get("updates") == updates]
                 title = f"## {study}, {states.env_name}, {half} half"
                 title += f", {updates} updates" if updates else ""
-                pages += [title, table(rows_of(chosen, states, elsewhere))]
+                pages += [title, table(rows_of(chosen, states, study, elsewhere))]
     write_atomically(FOLDER / "methods.md", "\n\n".join(pages) + "\n")
 
 
