@@ -1,12 +1,12 @@
 """Step 1: how near OSR's gradient is to noisy cloning's, as its model is trained.
 
-    python results/recovery/gradients.py > results/recovery/gradients.md
+    python results/recovery/gradients.py
 
 By proposition A (docs/method.md) the policy's gradients of the two terms are equal in
 expectation once the inverse dynamics model is at its optimum. Here both are taken on
 the same rows with the same noise, and compared by the cosine of their expectations:
 products of sums over different chunks of rows, so that the chance of the rows does not
-look like a difference.
+look like a difference. Writes ``gradients.md``.
 
 Shapes: ``N`` rows, ``A`` action, ``C`` chunks, ``P`` parameters of the policy.
 """
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -23,6 +24,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from torchrl_osr import InverseDynamicsLoss, StatePerturbation, StateRecoveryLoss
+from torchrl_osr._files import write_atomically
 from torchrl_osr.data import (
     load_local_dataset,
     make_replay_buffer,
@@ -32,6 +34,7 @@ from torchrl_osr.data import (
 from torchrl_osr.functional import state_recovery
 from torchrl_osr.modules import tanh_gaussian_actor, tanh_gaussian_inverse_dynamics
 
+PATH = Path(__file__).parent / "gradients.md"
 SYSTEMS = "hopper", "walker2d"
 WIDTHS = 1e-3, 0.1
 ROWS, HELD_OUT, CHUNKS = 200_000, 64_000, 64
@@ -199,14 +202,14 @@ def study(system: str, width: float) -> list[dict[str, str]]:
 
 
 def main() -> None:
-    """Print the table."""
+    """Write the table."""
     torch.set_num_threads(1)
     rows = []
     for system in SYSTEMS:
         for width in WIDTHS:
             found = study(system, width)
             rows += sorted(found, key=lambda row: len(row["policy"]))
-    print(TITLE, table(rows), sep="\n\n")
+    write_atomically(PATH, f"{TITLE}\n\n{table(rows)}\n")
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import torch
 from clones import JURORS, SYSTEMS, load_clone
 from cloning import rows_of
 from search import HOLD, STAGES, read_jsonl, read_lines
-from states import DISTURBANCES, PARTS, generator, hard, normal
+from states import DISTURBANCES, PARTS, PLAYERS, generator, hard, normal
 from tensordict import TensorDict
 from world import World
 
@@ -210,8 +210,7 @@ def pack(world: World, found: dict[str, np.ndarray]) -> None:
 
 
 def contents(world: World) -> list[dict]:
-    """What is in the two files, and what a clone saves of the public one."""
-    clone = load_clone(world.system, JURORS[world.system]).deterministic
+    """What is in the two files."""
     entries = []
     for half in HALVES:
         states = read_recoverable_states(STATES / f"{world.system}-{half}.npz")
@@ -225,13 +224,26 @@ def contents(world: World) -> list[dict]:
             entry[name] = int(((far > low) & (far <= high)).sum())
         for control in GROUPS[:2]:
             entry[control] = int((states.group == control).sum())
-        if half == "public":  # the other one is not looked at
-            back = world.play(rows_of(states, slice(None)), clone, world.steps).success
-        for each in ("recoverable", "contested", "easy"):
-            of = states.group == each
-            known = half == "public"
-            told = f"{back[of].sum()} of {of.sum()}" if known else ""
-            entry[f"a clone saves of {each}"] = told
+        entries.append(entry)
+    return entries
+
+
+def comes_back(world: World) -> list[dict]:
+    """Who comes back from the public half; the other one is not looked at.
+
+    Of who walked: a state's own walker and the expert are of its jury.
+    """
+    states = read_recoverable_states(STATES / f"{world.system}-public.npz")
+    clone = load_clone(world.system, JURORS[world.system]).deterministic
+    policies = {name: world.policy(name) for name in sorted(set(PLAYERS[world.system]))}
+    rows = rows_of(states, slice(None))
+    entries = []
+    for name, policy in (policies | {"a clone outside the jury": clone}).items():
+        back = world.play(rows, policy, world.steps).success
+        entry = {"policy": name}
+        for group in ("recoverable", "contested", "easy"):
+            of = states.group == group
+            entry[group] = f"{back[of].sum()} of {of.sum()}"
         entries.append(entry)
     return entries
 
@@ -250,6 +262,7 @@ def main() -> None:
         pages += [
             f"## {system}",
             table(contents(world)),
+            table(comes_back(world)),
             table(curve(world) or [{"rollouts": 0}]),
             table(by_disturbance(world, found)),
         ]
