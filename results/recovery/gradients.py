@@ -58,7 +58,10 @@ batches of 256. *all*: cosine between the expected gradients of the policy, with
 95 % interval of a jackknife over 64 chunks. *size*: of OSR's gradient, in units of the
 other. *NLL*: of the model on the rows compared, in nats. *policy*, *model*: their
 updates, the policy's of noisy cloning. *inside*: of rows without an action beyond 0.99.
-*mean*, *scale*: through the policy's mean alone, and through its scale."""
+*mean*, *scale*: through the policy's mean alone, and through its scale. *error /
+variance*: the model's squared error before the tanh, of the rows compared, over the
+variance that it names, 1 where it is as sure as it may be; *worst 1 %*: the share of
+the squared error that one row in a hundred has."""
 
 
 def trained(
@@ -179,6 +182,10 @@ def study(system: str, width: float) -> list[dict[str, str]]:
     for update in trained(likelihood, rows, noise, STEPS):
         with torch.no_grad():
             nll = likelihood(others)["loss_inverse_dynamics"].item()
+            label = model.get_dist(others)
+            error = (others["action"].atanh() - label.loc).square()
+            variance = label.scale.square()
+            few = error.sum(-1).topk(len(error) // 100).values.sum() / error.sum()
         for cloned, policy in policies.items():
             osr = recovery(policy, model)
             data_only = recovery(policy, recovery_target="data")
@@ -190,6 +197,8 @@ def study(system: str, width: float) -> list[dict[str, str]]:
             }
             row = {"data": system, "β": f"{width:g}", "policy": f"{cloned:,}"}
             row |= {"model": f"{update:,}", "NLL": f"{nll:.2f}"}
+            row["error / variance"] = f"{error.sum() / variance.sum():.2f}"
+            row["worst 1 %"] = f"{few:.2f}"
             for name, (first, second, each) in terms.items():
                 cosine, size = told(
                     gradients(first, policy, each), gradients(second, policy, each)
