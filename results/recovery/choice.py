@@ -2,7 +2,7 @@
 
     python results/recovery/choice.py outputs/imagination --seeds 0 1 2 3 4
 
-Every four steps the return of each run's policy is predicted, and the best one acts:
+Every few steps the return of each run's policy is predicted, and the best one acts:
 roll-outs in all runs' models, and the mean of all runs' critics at their end. All of it
 comes of the runs' own data. One line for each arm and group of states is appended to
 ``parts/<system>/choice-<half>.jsonl``: a bit for each state; what is there is not
@@ -17,7 +17,7 @@ import argparse
 import json
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -37,19 +37,43 @@ from torchrl_osr.evaluation.recoverable import (
 )
 from torchrl_osr.experiment.dynamics import FILE, load_dynamics
 from torchrl_osr.imagination import termination
-from torchrl_osr.policy import Policy, policy_from_run
+from torchrl_osr.policy import Policy, load_policy
 
 GAMMA = 0.99
 """Of the runs."""
 
-EVERY = 4
-"""Steps for which the chosen policy acts."""
 
-ARMS: dict[str, int] = {
-    "one": 0, "mean": 0, "random": 0, "critics": 0,
-    "models 20": 20, "models 60": 60, "shuffled 20": 20, "simulator 20": 20,
-}  # fmt: skip
-"""And the steps of their roll-outs."""
+class Arm(NamedTuple):
+    """How a policy is chosen.
+
+    Attributes:
+        steps: of the roll-outs.
+        least: the least hopeful network of all models, with the least hopeful of all
+            critics, and not their means.
+        alive: steps alive alone, without rewards and critics.
+        every: steps for which the chosen policy acts.
+    """
+
+    steps: int = 0
+    least: bool = False
+    alive: bool = False
+    every: int = 4
+
+
+ARMS = {
+    "one": Arm(),
+    "mean": Arm(),
+    "random": Arm(),
+    "critics": Arm(),
+    "critics, least": Arm(least=True),
+    "models 20": Arm(20),
+    "models 20, least": Arm(20, least=True),
+    "models 20, anew": Arm(20, every=1),
+    "models 60": Arm(60),
+    "models 100, alive": Arm(100, alive=True),
+    "shuffled 20": Arm(20),
+    "simulator 20": Arm(20),
+}
 
 
 class Choice:
@@ -62,20 +86,27 @@ class Choice:
     """
 
     def __init__(self, runs: list[Path], world: World, arm: str) -> None:
-        self.policies: list[Policy] = [policy_from_run(run) for run in runs]
+        self.policies: list[Policy] = [load_policy(run) for run in runs]
         self.models = [load_dynamics(run / FILE).elite_networks() for run in runs]
-        self.world, self.arm, self.steps = world, arm, ARMS[arm]
+        self.world, self.arm = world, arm
+        self.steps, self.least, self.alive, self.every = ARMS[arm]
         self.terminated = termination(environment_id(world.system))
         self.chance = torch.Generator().manual_seed(0)
 
     def value(self, state: Tensor, policy: Policy) -> Tensor:
-        """Mean of the critics of all runs, of a policy's action, ``[n]``."""
+        """What the critics of all runs say of a policy's action, ``[n]``."""
+        if self.alive:
+            return torch.zeros(len(state))
         action = policy(state)
         values = [each.smallest_value(state, action) for each in self.policies]
-        return torch.stack(values).mean(0)
+        return self.one_of(torch.stack(values))
+
+    def one_of(self, values: Tensor) -> Tensor:
+        """The mean over the first dimension, or the least."""
+        return values.amin(0) if self.least else values.mean(0)
 
     def predicted(self, state: Tensor, policy: Policy) -> Tensor:
-        """Return of a policy, mean over all networks of all models, ``[B]``."""
+        """Return of a policy in all networks of all models, ``[B]``."""
         if not self.steps:
             return self.value(state, policy)
         found = []
@@ -89,14 +120,16 @@ class Choice:
                 mean, _ = model.standardized(inputs.view(networks, len(state), -1))
                 change = (mean * model.target_scale + model.target_loc).flatten(0, 1)
                 after = now + change[:, :-1] * run.scale
-                total += GAMMA**step * alive * change[:, -1]
+                reward = change[:, -1]
                 finite = after.isfinite().all(-1)
-                alive = alive * (finite & ~self.terminated(after))
+                stands = alive * (finite & ~self.terminated(after))
+                total += stands if self.alive else GAMMA**step * alive * reward
+                alive = stands
                 # What has fallen must not grow until it overflows.
                 now = torch.where(alive.bool().unsqueeze(-1), after, now)
             total += GAMMA**self.steps * alive * self.value(now, policy)
             found.append(total.view(networks, -1))
-        return torch.cat(found).mean(0)
+        return self.one_of(torch.cat(found))
 
     def simulated(self, rows: np.ndarray, policy: Policy) -> Tensor:
         """The same by the simulator, of rows of ``world.py``."""
@@ -145,11 +178,11 @@ def play(states: RecoverableStates, chosen: np.ndarray, choice: Choice) -> np.nd
     if choice.arm == "mean":
         return world.play(rows, in_numpy(choice), states.steps).success
     active = np.arange(count)
-    for _ in range(0, states.steps, EVERY):
+    for _ in range(0, states.steps, choice.every):
         number, stands = choice.choose(rows[active]), []
         for index, policy in enumerate(choice.policies):
             mine = active[number == index]
-            played = world.play(rows[mine], in_numpy(policy), EVERY)
+            played = world.play(rows[mine], in_numpy(policy), choice.every)
             rows[mine] = played.rows
             stands.append(mine[played.success])
         active = np.sort(np.concatenate(stands))
