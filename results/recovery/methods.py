@@ -1,8 +1,9 @@
-"""What came of steps 3 and 4: shares saved, with intervals.
+"""What came of steps 3, 4 and of a choice: shares saved, with intervals.
 
     python results/recovery/methods.py
 
-Reads ``parts/<system>/{cloning,ways,look-ahead}-<half>.jsonl``, writes ``methods.md``.
+Reads ``parts/<system>/{cloning,ways,look-ahead,choice}-<half>.jsonl`` and, for noisy
+cloning beside a choice, step 5's tables; writes ``methods.md``.
 Lines of an older file of states are left out: their bits are of other states.
 """
 
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from imagination import REFERENCE
 from numpy.typing import NDArray
 from search import read_jsonl
 from states import PARTS
@@ -27,6 +29,8 @@ from torchrl_osr.evaluation.recoverable import (
     recovered_share,
     saved_share,
 )
+from torchrl_osr.report import read_runs
+from torchrl_osr.report.saved import came_back
 
 FOLDER = Path(__file__).parent
 STUDIES = "cloning", "ways", "look-ahead"
@@ -89,7 +93,8 @@ twin*: points more than the same states with the row's action as their label, or
 the planner's ways, with the expert's, or for look-ahead with shuffled predictions.
 *R*: what is saved of the losses of noisy cloning of as many episodes and the better
 width, or, for ways and look-ahead, of 100 episodes (the ways' study). Demonstrations
-are of 20 episodes but where it says otherwise."""
+are of 20 episodes but where it says otherwise. A *choice* is among the policies of
+several runs: *less one of them*, their mean; R is of step 5's noisy cloning."""
 
 
 def told(share: tuple[float, float, float]) -> str:
@@ -173,6 +178,58 @@ def rows_of(
     return [{name: row[name] for name in row if name in used} for row in found]
 
 
+def rows_of_choice(
+    lines: list[dict], states: RecoverableStates, noisy: NDArray[np.float64]
+) -> list[dict]:
+    """A row for each arm of ``choice.py``.
+
+    R is against ``noisy``: how often noisy cloning comes back from each of the
+    recoverable states, ``[m]``. Intervals are over walks.
+    """
+    found: dict[tuple[str, int], dict[str, list[dict]]] = {}
+    for line in lines:
+        groups = found.setdefault((line["arm"], len(line["seeds"])), {})
+        groups.setdefault(line["group"], []).append(line)
+    walks = {group: states.walk[states.group == group] for group in GROUPS}
+    hard = GROUPS[-1]
+
+    def bits(arm: str, count: int, group: str) -> NDArray[np.float64]:
+        played = found.get((arm, count), {}).get(group, [])
+        return np.array([[int(bit) for bit in each["saved"]] for each in played], float)
+
+    one = bits("one", 1, hard).mean(0, keepdims=True)
+    rows = []
+    for (arm, count), groups in found.items():
+        row: dict = {"arm": arm, "policies": count}
+        for group in reversed(GROUPS):
+            mine = bits(arm, count, group)
+            row[group] = told(saved_share(mine, walks[group])) if mine.size else ""
+        mine = bits(arm, count, hard).mean(0, keepdims=True)
+        everything = np.ones(len(walks[hard]))
+        less = saved_share(mine - one, walks[hard])
+        row["less one of them"] = "" if arm == "one" else told(less)
+        share = recovered_share(mine, noisy[None], everything, walks[hard])
+        row["R"] = told(share)
+        values = [x["undisturbed"] for x in groups.get("easy", [])]
+        row["undisturbed"] = f"{np.mean(values):.1f}" if values else ""
+        seconds = [x["seconds"] for x in groups[hard]]
+        rows.append(row | {"core seconds": f"{np.mean(seconds):.0f}"})
+    return rows
+
+
+def noisy_cloning(states: RecoverableStates, half: str) -> NDArray[np.float64]:
+    """How often step 5's noisy cloning comes back from the recoverable states."""
+    source = {"public": "imagination", "held-out": "imagination-look"}[half]
+    wanted = f"{states.env_name} medium-expert", half
+    for data, name, of_each, back in came_back(
+        read_runs([FOLDER / f"{source}.jsonl.gz"])
+    ):
+        if (data, name.split()[0]) == wanted:
+            hard = (of_each["group"] == GROUPS[-1]).to_numpy()
+            return back.loc[REFERENCE].to_numpy()[:, hard].mean(0)
+    raise ValueError(f"{source} has no run on the {half} half of {states.env_name}.")
+
+
 def mean_bits(lines: list[dict], states: RecoverableStates, name: str) -> Any:
     """How often an arm comes back from each state, ``[M]``; None without it."""
     bits = [bits_of(line, states) for line in lines if name_of(line) == name]
@@ -198,6 +255,10 @@ def main() -> None:
                 title = f"## {study}, {states.env_name}, {half} half"
                 title += f", {updates} updates" if updates else ""
                 pages += [title, table(rows_of(chosen, states, study, elsewhere))]
+        lines = read_jsonl(PARTS / states.env_name / f"choice-{half}.jsonl")
+        if lines := [line for line in lines if line["states"] == digest]:
+            rows = rows_of_choice(lines, states, noisy_cloning(states, half))
+            pages += [f"## choice, {states.env_name}, {half} half", table(rows)]
     write_atomically(FOLDER / "methods.md", "\n\n".join(pages) + "\n")
 
 
