@@ -36,6 +36,7 @@ from torchrl_osr.evaluation.recoverable import (
     read_recoverable_states,
 )
 from torchrl_osr.experiment.dynamics import FILE, load_dynamics
+from torchrl_osr.experiment.trained_run import checkpoints_of
 from torchrl_osr.imagination import termination
 from torchrl_osr.policy import Policy, load_policy
 
@@ -83,10 +84,14 @@ class Choice:
         runs: their folders.
         world: of the simulator's arm.
         arm: of :data:`ARMS`.
+        last: how many of each run's last checkpoints are chosen from; models and
+            critics are those of its end.
     """
 
-    def __init__(self, runs: list[Path], world: World, arm: str) -> None:
-        self.policies: list[Policy] = [load_policy(run) for run in runs]
+    def __init__(self, runs: list[Path], world: World, arm: str, last: int = 1) -> None:
+        paths = [path for run in runs for path in checkpoints_of(run)[-last:]]
+        self.policies: list[Policy] = [load_policy(path) for path in paths]
+        self.ends = self.policies[last - 1 :: last]
         self.models = [load_dynamics(run / FILE).elite_networks() for run in runs]
         self.world, self.arm = world, arm
         self.steps, self.least, self.alive, self.every = ARMS[arm]
@@ -98,7 +103,7 @@ class Choice:
         if self.alive:
             return torch.zeros(len(state))
         action = policy(state)
-        values = [each.smallest_value(state, action) for each in self.policies]
+        values = [each.smallest_value(state, action) for each in self.ends]
         return self.one_of(torch.stack(values))
 
     def one_of(self, values: Tensor) -> Tensor:
@@ -110,7 +115,7 @@ class Choice:
         if not self.steps:
             return self.value(state, policy)
         found = []
-        for run, model in zip(self.policies, self.models, strict=True):
+        for run, model in zip(self.ends, self.models, strict=True):
             networks = model.num_networks
             now = state.repeat(networks, 1)
             alive, total = torch.ones(len(now)), torch.zeros(len(now))
@@ -197,6 +202,7 @@ def main() -> None:
     parser.add_argument("--runs", default="disturbed starts")
     parser.add_argument("--half", default="public", choices=("public", "held-out"))
     parser.add_argument("--seeds", type=int, nargs="+", required=True)
+    parser.add_argument("--last", type=int, default=1, help="checkpoints of each run")
     parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=ARMS)
     parser.add_argument(
         "--groups", nargs="+", default=["recoverable", "easy", "contested"]
@@ -208,8 +214,8 @@ def main() -> None:
     path = STATES / f"{world.system}-{given.half}.npz"
     states, digest = read_recoverable_states(path), sha256_of(path)
     log = PARTS / world.system / f"choice-{given.half}.jsonl"
-    names = ("arm", "runs", "seeds", "group", "states")
-    there = [[line[name] for name in names] for line in read_jsonl(log)]
+    names = ("arm", "runs", "seeds", "group", "states", "last")
+    there = [[line.get(name, 1) for name in names] for line in read_jsonl(log)]
     folders = [given.folder / given.data / given.runs / f"seed{n}" for n in given.seeds]
     of = f"{given.data}, {given.runs}"
     for group in given.groups:
@@ -217,12 +223,13 @@ def main() -> None:
         for arm in given.arms:
             alone = [[seed] for seed in given.seeds]
             for seeds in alone if arm == "one" else [given.seeds]:
-                key = [arm, of, seeds, group, digest]
+                key = [arm, of, seeds, group, digest, given.last]
                 if key in there:
                     continue
                 start = time.process_time()
                 runs = [folders[given.seeds.index(seed)] for seed in seeds]
-                choice = Choice(runs, world, "mean" if arm == "one" else arm)
+                kind = "mean" if arm == "one" else arm
+                choice = Choice(runs, world, kind, given.last)
                 line: dict[str, Any] = dict(zip(names, key, strict=True))
                 back = play(states, chosen, choice)
                 line["saved"] = "".join(map(str, back.astype(int)))

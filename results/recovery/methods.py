@@ -188,7 +188,8 @@ def rows_of_choice(
     """
     found: dict[tuple[str, int], dict[str, list[dict]]] = {}
     for line in lines:
-        groups = found.setdefault((line["arm"], len(line["seeds"])), {})
+        count = len(line["seeds"]) * line.get("last", 1)
+        groups = found.setdefault((line["arm"], count), {})
         groups.setdefault(line["group"], []).append(line)
     walks = {group: states.walk[states.group == group] for group in GROUPS}
     hard = GROUPS[-1]
