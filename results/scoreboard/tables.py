@@ -1,4 +1,4 @@
-"""Print the tables of README.md and draw its figure, from the runs beside it.
+"""Write tables.md and draw the figure, from the runs beside this file.
 
 python results/scoreboard/tables.py
 """
@@ -15,6 +15,7 @@ from hydra.utils import get_class
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from torchrl_osr._files import write_atomically
 from torchrl_osr.evaluation.recoverable import (
     GROUPS,
     recovered_share,
@@ -207,14 +208,46 @@ def draw(rows: pd.DataFrame, path: Path) -> None:
     figure.savefig(path, dpi=130)
 
 
+TITLE = """# Scoreboard: the tables
+
+Written by `tables.py`; [README.md](README.md) says what they are of. *updates*: what
+two minutes of a core gave beside another run on the same two virtual cores
+(`update_ms.json`). Under the suites: mean score over all disturbances. *recoverable*:
+percent of the public half's states that the last policy comes back from. *published*:
+scores on D4RL v2, other data, after a hundred times the updates; `tables.py` has their
+sources. Intervals at 95 %; ᵉ: one seed, over episodes, or over walks for the
+recoverable states."""
+
+ABLATION = """What the arms of OSR's ablation save of the recoverable states more than
+`cql_noisy_bc`, whose states, noise and updates are OSR's and whose label is the row's
+action; R is the share of what that one loses. Seeds and walks are resampled."""
+
+LINES = """*ms an update*: of the preset `quick` and, where it was measured, of
+`preset=paper`, whose batches and layers of 256 are those of CORL's files (K = 10);
+processor time beside other work."""
+
+
+def seeds(tables: RunTables) -> str:
+    """Markdown: how many seeds there are of each method on each data set."""
+    runs = scores(tables).groupby(["method", "data"]).size()
+    head = ["method", *tables.data]
+    rows = [head, ["---"] * len(head)]
+    for method in tables.methods:
+        counts = [runs.get((method, data), 0) for data in tables.data]
+        rows.append([f"`{method}`", *(str(each) if each else "" for each in counts)])
+    return markdown(rows)
+
+
 def main() -> None:
-    """Print a table for each data set, and draw."""
+    """Write the tables, and draw."""
     tables = read_runs(sorted(HERE.glob("*.jsonl.gz")))
+    pages = [TITLE, "## Seeds", seeds(tables)]
     for data in tables.data:
-        print(f"\n### {data}\n\n{table(tables, data)}")
-    print(f"\n### Means over {' and '.join(OVERVIEW)}\n\n{overview(tables)}")
-    print(f"\n### Ablation\n\n{ablation(tables)}")
-    print(f"\n### Lines\n\n{lines(tables)}")
+        pages += [f"## {data}", table(tables, data)]
+    pages += [f"## Means over {' and '.join(OVERVIEW)}", overview(tables)]
+    pages += ["## Ablation", ABLATION, ablation(tables)]
+    pages += ["## Lines", LINES, lines(tables)]
+    write_atomically(HERE / "tables.md", "\n\n".join(pages) + "\n")
     draw(scores(tables), HERE / "scoreboard.png")
 
 
