@@ -8,7 +8,7 @@ comes of the runs' own data. One line for each arm and group of states is append
 ``parts/<system>/choice-<half>.jsonl``: a bit for each state; what is there is not
 played again. Beside easy states the undisturbed score is measured.
 
-Shapes: ``B`` states, ``S`` observation, ``P`` policies, ``n`` rows.
+Shapes: ``B`` states, ``n`` rows.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from cloning import undisturbed
+from cloning import rows_of, undisturbed
 from look_ahead import in_numpy
 from search import read_jsonl
 from states import PARTS, normal
@@ -178,8 +178,7 @@ class Choice:
 def play(states: RecoverableStates, chosen: np.ndarray, choice: Choice) -> np.ndarray:
     """Which of the chosen states it comes back from."""
     world = choice.world
-    count = len(chosen)
-    rows = np.hstack([np.zeros((count, 1)), states.qpos[chosen], states.qvel[chosen]])
+    rows, count = rows_of(states, chosen), len(chosen)
     if choice.arm == "mean":
         return world.play(rows, in_numpy(choice), states.steps).success
     active = np.arange(count)

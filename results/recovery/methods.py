@@ -202,10 +202,10 @@ def rows_of_choice(
     rows = []
     for (arm, count), groups in found.items():
         row: dict = {"arm": arm, "policies": count}
-        for group in reversed(GROUPS):
-            mine = bits(arm, count, group)
+        back = {group: bits(arm, count, group) for group in reversed(GROUPS)}
+        for group, mine in back.items():
             row[group] = told(saved_share(mine, walks[group])) if mine.size else ""
-        mine = bits(arm, count, hard).mean(0, keepdims=True)
+        mine = back[hard].mean(0, keepdims=True)
         everything = np.ones(len(walks[hard]))
         less = saved_share(mine - one, walks[hard])
         row["less one of them"] = "" if arm == "one" else told(less)
