@@ -44,6 +44,27 @@ hopper() {
         --arms "disturbed starts" "undisturbed starts" "noisy cloning"
     from "$1" hopper-medium-expert --seeds 300 303 --arms base
 }
+chosen() {
+    set -- outputs/look --half held-out --data "$@"
+    python results/recovery/choice.py "$@" \
+        --arms one critics "models 20" "shuffled 20"
+    python results/recovery/choice.py "$@" --groups easy \
+        --arms one critics "models 20"
+    python results/recovery/choice.py "$@" --groups contested --arms one "models 20"
+}
+choice() {
+    for first in 310 315; do
+        seeds=$(seq $first $((first + 4)))
+        from held-out walker2d-medium-expert --seeds $seeds --arms "disturbed starts"
+        chosen walker2d-medium-expert --seeds $seeds
+    done
+    seeds=$(seq 310 314)
+    from held-out hopper-medium-expert --seeds $seeds --arms "disturbed starts"
+    chosen hopper-medium-expert --seeds $seeds
+    from held-out walker2d-medium-expert --seeds $seeds --arms "noisy cloning"
+    python results/recovery/choice.py outputs/look --half held-out --seeds $seeds \
+        --policies "noisy cloning" --arms one "models 20"
+}
 labels
 ways
 ahead
@@ -52,3 +73,4 @@ walker2d held-out
 hopper public
 hopper held-out
 python results/recovery/imagination.py outputs/look --pack imagination-look
+choice

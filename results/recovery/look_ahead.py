@@ -48,7 +48,7 @@ from torchrl_osr.evaluation.recoverable import (
 )
 from torchrl_osr.experiment.trained_run import load_trained
 from torchrl_osr.imagination import LookAheadPolicy, termination
-from torchrl_osr.modules import DynamicsEnsemble
+from torchrl_osr.modules import DynamicsEnsemble, EliteNetworks
 from torchrl_osr.policy.tensor_file import read_tensors, write_tensors
 
 QUALITIES = "medium-replay", "medium-expert"
@@ -411,7 +411,7 @@ def policy_of(
     } | dict.fromkeys(OTHERS, Mean)  # fmt: skip
     policy = kinds.get(arm, LookAheadPolicy)(
         base,
-        ensemble(world, model, seed),
+        EliteNetworks(ensemble(world, model, seed)),
         gate,
         terminated=termination(environment_id(world.system)),
         generator=torch.Generator().manual_seed(seed),

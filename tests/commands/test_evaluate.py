@@ -21,9 +21,12 @@ from torchrl_osr.commands import evaluate as example
 from torchrl_osr.data import make_environment
 from torchrl_osr.evaluation import check_disturbances, deterministic_policy
 from torchrl_osr.evaluation.recoverable import load_recoverable_states, recovers
+from torchrl_osr.experiment.dynamics import FILE, write_dynamics
 from torchrl_osr.experiment.recoverable import states_for
 from torchrl_osr.experiment.suite import make_disturbances
 from torchrl_osr.experiment.trained_run import checkpoints_of, load_trained
+from torchrl_osr.modules import DynamicsEnsemble
+from torchrl_osr.policy.switching import load_switching_policy
 from torchrl_osr.report import read_runs
 
 ROOT = Path(__file__).parents[2]
@@ -258,6 +261,38 @@ def test_recoverable_states_are_played_from(folder, capsys):
     assert read_runs([folder]).saved["back"].tolist() == mean.tolist()
     # Fallen at once, as anything is that has learned nothing.
     assert not back[states.group == "recoverable"].any()
+
+
+def test_runs_of_a_sweep_are_one_policy_that_switches(folder, tmp_path, capsys):
+    runs = [tmp_path / name for name in ("a/run", "b/run")]
+    for run in runs:
+        shutil.copytree(folder, run)
+        torch.manual_seed(len(run.parts))
+        model = DynamicsEnsemble(11, 3, num_networks=2, num_elites=1, num_cells=[4])
+        write_dynamics(run / FILE, model, {})
+    for file in (runs[1] / "checkpoint" / "policy").glob("checkpoint-*30.torchrl"):
+        file.unlink()  # so that they differ: its last step is 20
+    sweep = [f"sweep={tmp_path}", "switching=true"]
+    example.main(quiet(*sweep, "suite=recoverable"))
+    results = json.loads((tmp_path / "switching-recoverable-public.json").read_text())
+    last = "checkpoint/policy/checkpoint-0000000000"
+    assert list(results["checkpoints"]) == [
+        f"a/run/{last}30.torchrl", f"b/run/{last}20.torchrl"
+    ]  # fmt: skip
+    states = load_recoverable_states("hopper", "public")
+    back = recovers(states, load_switching_policy(runs))
+    assert results["evaluations"][0]["back"] == back.astype(int).tolist()
+    assert "hopper random, public recoverable states\n" in capsys.readouterr().out
+
+    example.main(quiet(*sweep, "suite=push", "episodes=2"))
+    results = json.loads((tmp_path / "switching-robustness-push.json").read_text())
+    assert len(results["evaluations"]) == 1
+    assert results["summary"]
+    assert (tmp_path / "switching-robustness-push.png").exists()
+    with pytest.raises(ValueError, match="nobody attacks a choice"):
+        example.main(quiet(*sweep, "suite=observation_attack"))
+    with pytest.raises(ValueError, match="switching=true is for sweep="):
+        example.main(quiet(f"checkpoint={folder}", "switching=true"))
 
 
 def test_a_task_without_recoverable_states_is_named(folder):

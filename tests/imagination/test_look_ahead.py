@@ -7,16 +7,19 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.envs import ObservationNorm
 
 from torchrl_osr.imagination import LookAheadPolicy
-from torchrl_osr.modules import DynamicsEnsemble
+from torchrl_osr.modules import DynamicsEnsemble, EliteNetworks
 
 STEP = 0.1
 EDGE = 1.0
 
 
-def cart(bias: tuple[float, ...] = (0.0,), elites: int = 1) -> DynamicsEnsemble:
+def cart(*bias: float, elites: int = 1) -> EliteNetworks:
+    return EliteNetworks(ensemble(bias or (0.0,), elites))
+
+
+def ensemble(bias: tuple[float, ...] = (0.0,), elites: int = 1) -> DynamicsEnsemble:
     """Position and velocity ``[x, v]``; the action accelerates, a bias pushes."""
     model = DynamicsEnsemble(
         2, 1, num_networks=len(bias), num_elites=elites, num_cells=[]
@@ -106,7 +109,7 @@ def test_without_a_better_way_it_is_the_policy() -> None:
 
 def test_scores_are_the_steps_survived_and_the_value_of_the_last_state() -> None:
     # One network is pushed by .1 a step, one by -.1; the third is no elite.
-    model = cart((0.1, -0.1, 50.0), elites=2)
+    model = cart(0.1, -0.1, 50.0, elites=2)
     look_ahead = LookAheadPolicy(
         coast, model, everywhere, terminated=lambda s: s[:, 1] > 0.45,
         value=lambda s: 100 * s[:, 1], planning_horizon=5, num_offsets=2, hold=2,
@@ -150,18 +153,15 @@ def test_it_is_a_function_of_the_state() -> None:
 
 def test_a_standardised_model_plans_as_the_one_in_the_tasks_units() -> None:
     loc, scale = torch.tensor([0.3, -1.0]), torch.tensor([2.0, 0.25])
-    standardised = cart()
+    standardised = ensemble()
     with torch.no_grad():
         # The same world: inputs are brought back, targets divided.
         standardised.input_loc[:2] = -loc / scale
         standardised.input_scale[:2] = 1 / scale
         standardised.target_scale[:2] = 1 / scale
     options = {"terminated": over_the_edge, "planning_horizon": 20}
-    norm = ObservationNorm(loc, scale, ["observation"], standard_normal=True)
-    pair = [
-        LookAheadPolicy(coast, model, everywhere, observation_norm=given, **options)
-        for model, given in ((cart(), None), (standardised, norm))
-    ]
+    models = cart(), EliteNetworks(standardised, loc, scale)
+    pair = [LookAheadPolicy(coast, each, everywhere, **options) for each in models]
     plans = [each.plan(FAST) for each in pair]
     torch.testing.assert_close(*plans, rtol=1e-4, atol=1e-4)
 

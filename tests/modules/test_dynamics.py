@@ -120,17 +120,6 @@ def test_elites_are_the_best_on_held_out_rows() -> None:
     assert apart.max().item() == pytest.approx(0.15)
 
 
-def test_elites_alone_predict_as_they_did() -> None:
-    model = DynamicsEnsemble(3, 2, num_networks=4, num_elites=2, num_cells=[8])
-    model.elites.copy_(torch.tensor([1, 3]))
-    alone, given = model.elite_networks(), (torch.randn(5, 3), torch.randn(5, 2))
-    for ours, theirs in zip(alone.predict(*given), model.predict(*given), strict=True):
-        torch.testing.assert_close(ours, theirs[[1, 3]])
-    assert alone.num_networks == 2
-    assert len(list(model.parameters())) == len(list(alone.parameters()))
-    assert all(each.requires_grad for each in model.parameters())
-
-
 def test_a_repeated_state_is_no_next_state() -> None:
     state, no_change = torch.randn(4, 2), torch.zeros(4, 2)
     data = rows_of(state, state[:, :1], no_change, state[:, :1])

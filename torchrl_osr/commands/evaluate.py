@@ -5,12 +5,14 @@
     torchrl-osr evaluate checkpoint=<run's folder> suite=recoverable
     torchrl-osr evaluate checkpoint=<run's folder>/checkpoint/policy/best.torchrl
     torchrl-osr evaluate sweep=multirun/20260101-120000 jobs=4
+    torchrl-osr evaluate sweep=<folder above runs> switching=true suite=recoverable
 
 Each of the run's last checkpoints plays pairs of episodes, one of each pair disturbed.
 The run's folder gets ``robustness-<suite>.json`` with all raw results, and a figure of
 the same name. A killed evaluation continues after its last finished checkpoint. With
 ``suite=recoverable`` they play from states that others fail from, and the folder gets
-``recoverable-<half>.json``. ``sweep=`` does this for every run below a folder. See
+``recoverable-<half>.json``. ``sweep=`` does this for every run below a folder; with
+``switching=true`` all of them are one policy instead, of which the best run acts. See
 ``docs/robustness.md``.
 """
 
@@ -45,6 +47,7 @@ from torchrl_osr.commands.console import sentence, single_job
 from torchrl_osr.data import observation_statistics
 from torchrl_osr.evaluation import (
     DataDistance,
+    Policy,
     deterministic_policy,
     evaluate_paired,
     evaluation_json,
@@ -72,6 +75,7 @@ from torchrl_osr.experiment.trained_run import (
     load_trained,
     run_folder_of,
 )
+from torchrl_osr.policy.switching import load_switching_policy
 from torchrl_osr.report.runs import find_runs
 from torchrl_osr.trainers.progress import Progress
 
@@ -96,10 +100,12 @@ def main(cfg: DictConfig) -> None:
         raise ValueError(
             "give either checkpoint=<a run's folder> or sweep=<a folder above runs>."
         )
-    if cfg.sweep is not None:
+    if cfg.switching and cfg.sweep is None:
+        raise ValueError("switching=true is for sweep=<a folder above runs>.")
+    if cfg.sweep is not None and not cfg.switching:
         evaluate_sweep(cfg)
         return
-    path, results = evaluate_run(cfg)
+    path, results = evaluate_switching(cfg) if cfg.switching else evaluate_run(cfg)
     print("\n" + table(cfg, results))
     print(f"  files  {path}")
     if cfg.suite.half is None:
@@ -108,29 +114,51 @@ def main(cfg: DictConfig) -> None:
 
 def evaluate_run(cfg: DictConfig) -> tuple[Path, dict[str, Any]]:
     """Evaluate one run or checkpoint: the file of the results, and what is in it."""
-    torchrl_logger.setLevel("WARNING")
-    torch.set_num_threads(cfg.num_threads)
-    folder = run_folder_of(cfg.checkpoint)
-    half = cfg.suite.half
-    name = f"robustness-{cfg.suite.name}" if half is None else f"recoverable-{half}"
-    files = [Path(cfg.checkpoint)]
+    folder, name, files = run_folder_of(cfg.checkpoint), "", [Path(cfg.checkpoint)]
     if files[0].is_dir():
         files = checkpoints_of(folder)[-cfg.last :]
     else:
-        name = f"{files[0].stem}-{name}"  # beside the one of the whole run
-    path = folder / f"{name}.json"
-    request = requested(cfg, files)
+        name = f"{files[0].stem}-"  # beside the one of the whole run
+    return evaluate_files(cfg, folder / f"{name}{file_name(cfg)}", files)
+
+
+def evaluate_switching(cfg: DictConfig) -> tuple[Path, dict[str, Any]]:
+    """The same for the runs of a sweep as one policy, each with its last checkpoint."""
+    files = [checkpoints_of(run)[-1] for run in finished_runs(cfg)]
+    policy = load_switching_policy(files, trust=cfg.trust)
+    path = Path(cfg.sweep) / f"switching-{file_name(cfg)}"
+    return evaluate_files(cfg, path, files, policy)
+
+
+def file_name(cfg: DictConfig) -> str:
+    """How the names of the results' files end."""
+    if cfg.suite.half is None:
+        return f"robustness-{cfg.suite.name}.json"
+    return f"recoverable-{cfg.suite.half}.json"
+
+
+def evaluate_files(
+    cfg: DictConfig, path: Path, files: list[Path], policy: Policy | None = None
+) -> tuple[Path, dict[str, Any]]:
+    """Evaluate checkpoints, unless ``path`` has the results; return these, too.
+
+    Args:
+        policy: of all of them together. Default: each plays by itself.
+    """
+    torchrl_logger.setLevel("WARNING")
+    torch.set_num_threads(cfg.num_threads)
+    request = requested(cfg, files, path.parent)
     results = results_in(path, request)
     # Hidden: a part is no result.
-    partial = path.with_name(f".{name}.partial.json")
+    partial = path.with_name(f".{path.stem}.partial.json")
     if cfg.force or results is None:
-        play = evaluate if half is None else evaluate_states
-        results = request | play(cfg, files, partial, request)
+        play = evaluate if cfg.suite.half is None else evaluate_states
+        results = request | play(cfg, files, partial, request, policy)
         write_json(path, results)
     else:
         print(f"{path} is there already; force=true repeats it.")
     partial.unlink(missing_ok=True)
-    if half is not None:
+    if cfg.suite.half is not None:
         return path, results
     for name, reason in results.get("left_out", {}).items():
         print(f"left out: {name}: {reason}")
@@ -158,12 +186,11 @@ def table(cfg: DictConfig, results: dict[str, Any]) -> str:
     return recoverable_table(results)
 
 
-def evaluate_sweep(cfg: DictConfig) -> None:
-    """Evaluate every finished run below a folder, ``jobs`` at once; print a table.
+def finished_runs(cfg: DictConfig) -> list[Path]:
+    """Folders of a sweep's finished runs; the others are named.
 
     Raises:
-        ValueError: if there is no finished run, or, when all others are done, if some
-            could not be evaluated.
+        ValueError: there is none.
     """
     top = Path(cfg.sweep)
     runs = []
@@ -178,6 +205,17 @@ def evaluate_sweep(cfg: DictConfig) -> None:
             print(f"left out: {folder}: not finished, its status is {status}")
     if not runs:
         raise ValueError(f"there is no finished run in or below {top}.")
+    return runs
+
+
+def evaluate_sweep(cfg: DictConfig) -> None:
+    """Evaluate every finished run below a folder, ``jobs`` at once; print a table.
+
+    Raises:
+        ValueError: if there is no finished run, or, when all others are done, if some
+            could not be evaluated.
+    """
+    runs = finished_runs(cfg)
     rows: dict[Path, dict[str, str]] = {}
     failed = []
     # Spawned, for torch's threads do not survive a fork. Ctrl-C ends them in silence.
@@ -211,7 +249,7 @@ def evaluate_sweep(cfg: DictConfig) -> None:
     if failed:
         names = ", ".join(map(str, failed))
         raise ValueError(f"{len(failed)} of {len(runs)} runs failed: {names}.")
-    print(f"  next   torchrl-osr report {top}")
+    print(f"  next   torchrl-osr report {cfg.sweep}")
 
 
 def evaluate_one_of_many(cfg: DictConfig, folder: Path) -> dict[str, str]:
@@ -229,8 +267,13 @@ def evaluate_one_of_many(cfg: DictConfig, folder: Path) -> dict[str, str]:
     return {name: f"{total / len(rows):.1f}" for name, total in means.items()}
 
 
-def requested(cfg: DictConfig, files: list[Path]) -> dict[str, Any]:
-    """Everything that decides the results: settings, checkpoints' digests, versions."""
+def requested(cfg: DictConfig, files: list[Path], folder: Path) -> dict[str, Any]:
+    """Everything that decides the results: settings, checkpoints' digests, versions.
+
+    Checkpoints are named as seen from a folder.
+    """
+    folder = folder.absolute()
+    names = [each.absolute().relative_to(folder).as_posix() for each in files]
     return {
         "format": JSON_FORMAT,
         "versions": run_folder.package_versions(),
@@ -238,7 +281,7 @@ def requested(cfg: DictConfig, files: list[Path]) -> dict[str, Any]:
         "levels": OmegaConf.to_container(cfg.suite.disturbances, resolve=True),
         "episodes": cfg.episodes,
         "seed": cfg.seed,
-        "checkpoints": {file.name: sha256_of(file) for file in files},
+        "checkpoints": dict(zip(names, map(sha256_of, files), strict=True)),
     }
 
 
@@ -259,9 +302,16 @@ def results_in(path: Path, request: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def evaluate(
-    cfg: DictConfig, files: list[Path], partial: Path, request: dict[str, Any]
+    cfg: DictConfig,
+    files: list[Path],
+    partial: Path,
+    request: dict[str, Any],
+    together: Policy | None,
 ) -> dict[str, Any]:
-    """Play all checkpoints of one run, except those that ``partial`` has already."""
+    """Play all checkpoints, except those that ``partial`` has already.
+
+    Data, spread and disturbances are those of the first one's run.
+    """
     first = load_trained(files[0], trust=cfg.trust)
     run = first.config
     data, _ = load_data(run, progress=cfg.progress)
@@ -272,12 +322,14 @@ def evaluate(
     if evaluations:
         print(f"{partial} has {len(evaluations)} of {len(files)} checkpoints already.")
     references = references_of(run)
-    left_out = impossible(cfg, first, scale.numpy())
+    left_out = impossible(cfg, first, scale.numpy(), together)
     suite = {
         name: config
         for name, config in cfg.suite.disturbances.items()
         if name not in left_out
     }
+    if together is not None:
+        files = files[:1]
     plays = 1 + len(suite)  # the clean episodes first
     progress = Progress(
         cfg.suite.name, len(files) * plays, bar=cfg.progress, unit="play"
@@ -287,8 +339,9 @@ def evaluate(
         for number in range(len(evaluations), len(files)):
             trained = load_trained(files[number], trust=cfg.trust)
             seed = cfg.seed + SEED_STRIDE * number
+            alone = deterministic_policy(trained.actor, trained.observation_norm)
             paired = evaluate_paired(
-                deterministic_policy(trained.actor, trained.observation_norm),
+                together or alone,
                 run.env.id,
                 make_disturbances(suite, trained, scale.numpy(), seed=seed),
                 distance,
@@ -310,27 +363,39 @@ def evaluate(
 
 
 def evaluate_states(
-    cfg: DictConfig, files: list[Path], partial: Path, request: dict[str, Any]
+    cfg: DictConfig,
+    files: list[Path],
+    partial: Path,
+    request: dict[str, Any],
+    together: Policy | None,
 ) -> dict[str, Any]:
-    """Play all checkpoints of one run from the recoverable states; takes seconds."""
+    """Play all checkpoints from the recoverable states; takes seconds."""
     del partial, request
-    progress = Progress(cfg.suite.name, len(files), bar=cfg.progress, unit="play")
+    plays = len(files) if together is None else 1
+    progress = Progress(cfg.suite.name, plays, bar=cfg.progress, unit="play")
     played = count(1)
     with progress.shown(0):
         return play_states(
             files,
             cfg.suite.half,
+            together=together,
             trust=cfg.trust,
             advance=lambda: progress.update(next(played)),
         )
 
 
 def impossible(
-    cfg: DictConfig, trained: TrainedRun, scale: NDArray[np.floating]
+    cfg: DictConfig,
+    trained: TrainedRun,
+    scale: NDArray[np.floating],
+    together: Policy | None = None,
 ) -> dict[str, str]:
     """Say which disturbances environment or policy lack what it takes for, and why."""
     env_id, configs = trained.config.env.id, cfg.suite.disturbances
     left_out = impossible_attacks(configs, trained)
+    if together is not None:
+        attacks = (name for name, each in configs.items() if each.attack is not None)
+        left_out = dict.fromkeys(attacks, "nobody attacks a choice between policies")
     others = {name: each for name, each in configs.items() if name not in left_out}
     made = make_disturbances(others, trained, scale)
     left_out |= impossible_disturbances(env_id, made)

@@ -134,9 +134,11 @@ class EpisodeEvaluator:
         """Play one episode for each seed.
 
         Args:
-            policy: the same for all episodes.
+            policy: the same for all episodes; its ``reset`` is called before, if it
+                has one.
             watch: called at each reset and step. Default: nothing.
         """
+        getattr(policy, "reset", lambda: None)()
         episodes = len(self.environments)
         returns, lengths = np.zeros(episodes), np.zeros(episodes, dtype=np.int64)
         infos: list[dict[str, Any]] = [{} for _ in range(episodes)]

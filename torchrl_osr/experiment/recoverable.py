@@ -14,7 +14,7 @@ import numpy as np
 from omegaconf import DictConfig
 
 from torchrl_osr.data.collect.environment import environment_id
-from torchrl_osr.evaluation import deterministic_policy
+from torchrl_osr.evaluation import Policy, deterministic_policy
 from torchrl_osr.evaluation.recoverable import (
     GROUPS,
     RecoverableStates,
@@ -50,16 +50,18 @@ def play_states(
     files: Sequence[Path],
     half: str,
     *,
+    together: Policy | None = None,
     trust: Sequence[str] = (),
     advance: Callable[[], object] = lambda: None,
 ) -> dict[str, Any]:
     """Play every checkpoint from every state.
 
     Args:
-        files: checkpoints of one run.
+        files: checkpoints of one run, or of one task.
         half: of the states.
 
     Keyword Args:
+        together: one policy of all of them. Default: each plays by itself.
         trust: modules of the user's own that the run may name.
         advance: called after each checkpoint.
 
@@ -70,10 +72,10 @@ def play_states(
     """
     run = load_trained(files[0], trust=trust).config
     states, evaluations = states_for(run, half), []
-    for file in files:
+    for file in files if together is None else files[:1]:
         trained = load_trained(file, trust=trust)
-        policy = deterministic_policy(trained.actor, trained.observation_norm)
-        back = recovers(states, policy)
+        alone = deterministic_policy(trained.actor, trained.observation_norm)
+        back = recovers(states, together or alone)
         evaluations.append({"step": trained.step, "back": back.astype(int).tolist()})
         advance()
     return {
@@ -117,8 +119,8 @@ def recoverable_table(results: Mapping[str, Any]) -> str:
         (name, str(number), f"{100 * mean:.0f}", f"[{100 * low:.0f}, {100 * high:.0f}]")
         for name, (number, mean, low, high) in shares(results).items()
     ]
-    title = (
-        f"{results['env']} {results['data']}, {results['half']} recoverable states: "
-        f"mean of {len(results['evaluations'])} checkpoints"
-    )
+    number = len(results["evaluations"])
+    title = f"{results['env']} {results['data']}, {results['half']} recoverable states"
+    if number > 1:
+        title += f": mean of {number} checkpoints"
     return "\n".join([title, *aligned_columns([header, *rows])])

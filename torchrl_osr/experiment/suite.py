@@ -68,6 +68,7 @@ class EvaluateConfig:
     Attributes:
         checkpoint: a run's folder, or one checkpoint's file in it.
         sweep: in its place a folder: every finished run in or below it.
+        switching: the sweep's runs are one policy, of which the best one acts.
         jobs: runs of a sweep that are evaluated at once.
         suite: the disturbances.
         episodes: pairs of episodes for each checkpoint and disturbance, at least 2.
@@ -82,6 +83,7 @@ class EvaluateConfig:
 
     checkpoint: str | None = None
     sweep: str | None = None
+    switching: bool = MISSING
     jobs: int = MISSING
     suite: SuiteConfig = field(default_factory=SuiteConfig)
     episodes: int = MISSING

@@ -10,11 +10,11 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
-from torchrl.envs import ObservationNorm
 
 from torchrl_osr._checks import check_positive
+from torchrl_osr.imagination.rollout import expect
 from torchrl_osr.imagination.termination import Termination, never
-from torchrl_osr.modules.dynamics import DynamicsEnsemble
+from torchrl_osr.modules.elite_networks import EliteNetworks
 
 
 class LookAheadPolicy:
@@ -42,7 +42,7 @@ class LookAheadPolicy:
     Args:
         policy: maps observations ``[B, S]`` to actions ``[B, A]`` in [-1, 1], without
             randomness of its own; :class:`~torchrl_osr.Policy` for instance.
-        model: see :func:`~torchrl_osr.experiment.dynamics.load_dynamics`.
+        networks: of the dynamics, in the policy's units.
         far: which of the observations ``[B, S]`` it plans for, bool ``[B]``:
             ``lambda state: distance(state) > distance.threshold`` with a
             :class:`~torchrl_osr.evaluation.DataDistance`.
@@ -51,8 +51,6 @@ class LookAheadPolicy:
         terminated: of next observations, see
             :func:`~torchrl_osr.imagination.termination`. Default: never.
         value: of observations ``[n, S]``, in steps, ``[n]``. Default: 0.
-        observation_norm: how the model's data were standardised
-            (``standard_normal=True``). Default: not at all.
         planning_horizon: ``H``, steps. Default 40.
         num_offsets, hold: ``K``, and for how many steps each is added. Default 5 and 4.
         num_candidates, top_k: ``C``, and how many of them the next ones are drawn
@@ -67,9 +65,10 @@ class LookAheadPolicy:
     Examples:
         >>> import torch
         >>> from torchrl_osr.imagination import LookAheadPolicy, termination
-        >>> from torchrl_osr.modules import DynamicsEnsemble
+        >>> from torchrl_osr.modules import DynamicsEnsemble, EliteNetworks
         >>> look_ahead = LookAheadPolicy(
-        ...     lambda state: torch.zeros(len(state), 3), DynamicsEnsemble(11, 3),
+        ...     lambda state: torch.zeros(len(state), 3),
+        ...     EliteNetworks(DynamicsEnsemble(11, 3)),
         ...     far=lambda state: state[:, 1] > 0.1,
         ...     terminated=termination("Hopper-v5"), planning_horizon=20)
         >>> state = torch.zeros(2, 11)
@@ -82,12 +81,11 @@ class LookAheadPolicy:
     def __init__(
         self,
         policy: Callable[[Tensor], Tensor],
-        model: DynamicsEnsemble,
+        networks: EliteNetworks,
         far: Callable[[Tensor], Tensor],
         *,
         terminated: Termination = never,
         value: Callable[[Tensor], Tensor] | None = None,
-        observation_norm: ObservationNorm | None = None,
         planning_horizon: int = 40,
         num_offsets: int = 5,
         hold: int = 4,
@@ -109,18 +107,15 @@ class LookAheadPolicy:
             )
         self.policy, self.far, self.terminated = policy, far, terminated
         self.value = value
-        self.loc, self.scale = torch.tensor(0.0), torch.tensor(1.0)
-        if observation_norm is not None:
-            self.loc, self.scale = observation_norm.loc, observation_norm.scale
-        self.model = model.elite_networks()
+        self.networks = networks
         self.planning_horizon, self.hold = planning_horizon, hold
         self.top_k, self.std = top_k, std
         generator = generator or torch.Generator().manual_seed(0)
-        shape = optim_steps, num_candidates, num_offsets, model.action_dim
+        shape = optim_steps, num_candidates, num_offsets, networks.action_dim
         # TorchRL's CEMPlanner has no policy to plan around and to go on with, no value
         # of the last state, torch's global generator, and returns an untried mean.
         noise = torch.randn(shape, generator=generator, device=generator.device)
-        self.noise = noise.to(model.target_loc.device)
+        self.noise = noise.to(networks.biases[0].device)
 
     @torch.no_grad()
     def __call__(self, observation: Tensor) -> Tensor:
@@ -170,32 +165,24 @@ class LookAheadPolicy:
 
     def elite_scores(self, observation: Tensor, offsets: Tensor) -> Tensor:
         """What each elite expects of them, ``[E, B, C]``."""
-        networks, batch = self.model.num_networks, offsets.shape[:2]
+        batch = offsets.shape[:2]
         offsets = offsets.flatten(0, 1).repeat_interleave(self.hold, 1)
-        offsets = offsets.repeat(networks, 1, 1)
-        start = observation.repeat_interleave(batch[1], 0).repeat(networks, 1)
-        state, steps = start, start.new_zeros(len(start))
-        alive = torch.ones_like(steps, dtype=torch.bool)
-        for step in range(self.planning_horizon):
+        offsets = offsets.repeat(self.networks.num_networks, 1, 1)
+
+        def act(state: Tensor, step: int) -> Tensor:
             action = self.policy(state)
             if step < offsets.shape[1]:
                 action = (action + offsets[:, step]).clamp(-1, 1)
-            state = self._following(state, action)
-            alive &= state.isfinite().all(-1) & ~self.terminated(state)
-            if not alive.any():
-                break
-            # What has fallen must not grow until it overflows.
-            state = torch.where(alive.unsqueeze(-1), state, start)
-            steps = steps + alive
-        if self.value is not None:
-            steps = steps + self.value(state).where(alive, 0.0)
-        return steps.view(networks, *batch)
+            return action
 
-    def _following(self, state: Tensor, action: Tensor) -> Tensor:
-        """Mean predictions ``[E n, S]``, of the first network for the first rows."""
-        inputs = torch.cat([(state - self.loc) / self.scale, action], -1)
-        inputs = inputs.view(self.model.num_networks, -1, inputs.shape[-1])
-        mean, _ = self.model.standardized(inputs)
-        change = mean * self.model.target_scale + self.model.target_loc
-        following: Tensor = state + change[..., :-1].flatten(0, 1) * self.scale
-        return following
+        way = expect(
+            self.networks,
+            act,
+            observation.repeat_interleave(batch[1], 0),
+            steps=self.planning_horizon,
+            terminated=self.terminated,
+        )
+        steps = way.alive.sum(0).to(way.state.dtype)
+        if self.value is not None:
+            steps = steps + self.value(way.state).where(way.alive[-1], 0.0)
+        return steps.view(-1, *batch)

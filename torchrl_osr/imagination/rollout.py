@@ -18,6 +18,7 @@ from torchrl_osr._checks import check_positive
 from torchrl_osr.functional import largest_deviation
 from torchrl_osr.imagination.termination import Termination, never
 from torchrl_osr.modules.dynamics import DynamicsEnsemble
+from torchrl_osr.modules.elite_networks import EliteNetworks
 
 
 class Imagined(NamedTuple):
@@ -134,6 +135,65 @@ def imagine(
         if not len(state):
             break
     return Imagined(torch.cat(taken), refused)
+
+
+class Expected(NamedTuple):
+    """What each network expects of a policy, ``T`` steps on.
+
+    Attributes:
+        reward: of each step, 0 after the end, ``[T, E B]``, the first network's first.
+        alive: whether the task goes on after each step, bool ``[T, E B]``.
+        state: the last one, or the one before the end, ``[E B, S]``.
+    """
+
+    reward: Tensor
+    alive: Tensor
+    state: Tensor
+
+
+@torch.no_grad()
+def expect(
+    networks: EliteNetworks,
+    policy: Callable[[Tensor, int], Tensor],
+    starts: Tensor,
+    *,
+    steps: int,
+    terminated: Termination = never,
+) -> Expected:
+    """Roll each network out by itself, with its mean predictions.
+
+    Nothing is drawn: :func:`imagine` does. A prediction that is not finite ends the
+    task, too, without a reward.
+
+    Args:
+        networks: of the dynamics, ``E``.
+        policy: maps states ``[E B, S]``, the first network's first, and the number of
+            the step to actions ``[E B, A]``.
+        starts: first states ``[B, S]``.
+
+    Keyword Args:
+        steps: ``T``.
+        terminated: of next states. Default: never.
+    """
+    number = networks.num_networks
+    state = starts.repeat(number, 1)
+    going = torch.ones_like(state[:, 0], dtype=torch.bool)
+    reward = torch.zeros(steps, len(going), device=starts.device)
+    alive = torch.zeros_like(reward, dtype=torch.bool)
+    for step in range(steps):
+        action = policy(state, step)
+        rows = number, len(starts), -1
+        change = networks(state.view(rows), action.reshape(rows)).flatten(0, 1)
+        going = going & change.isfinite().all(-1)
+        reward[step] = change[:, -1].where(going, 0.0)
+        following = state + change[:, :-1]
+        going = going & ~terminated(following)
+        alive[step] = going
+        # What has fallen must not grow until it overflows.
+        state = torch.where(going.unsqueeze(-1), following, state)
+        if not going.any():
+            break
+    return Expected(reward, alive, state)
 
 
 def any_action(model: DynamicsEnsemble) -> Callable[[Tensor], Tensor]:

@@ -14,11 +14,13 @@ from torchrl_osr.modules.discrete import (
     discrete_critic_ensemble,
 )
 from torchrl_osr.modules.dynamics import DynamicsEnsemble
+from torchrl_osr.modules.elite_networks import EliteNetworks
 from torchrl_osr.modules.inverse_dynamics import tanh_gaussian_inverse_dynamics
 
 __all__ = [
     "ConditionalVAE",
     "DynamicsEnsemble",
+    "EliteNetworks",
     "categorical_actor",
     "categorical_inverse_dynamics",
     "critic_ensemble",

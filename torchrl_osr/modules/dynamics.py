@@ -7,7 +7,6 @@ networks, ``D`` predicted entries: ``S`` differences of the state, and the rewar
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from copy import deepcopy
 from itertools import pairwise
 from typing import Any, NamedTuple, cast
 
@@ -228,17 +227,6 @@ class DynamicsEnsemble(TensorDictModuleBase):
         wanted = (targets - self.target_loc) / self.target_scale
         error = (mean - wanted).square().mean((-2, -1))
         self.elites.copy_(error.argsort()[: len(self.elites)].sort().values)
-
-    def elite_networks(self) -> DynamicsEnsemble:
-        """Frozen copy with the elites alone, to roll each network out by itself."""
-        copy: DynamicsEnsemble = deepcopy(self).requires_grad_(False)
-        for layer in copy.layers:
-            for name, value in layer.named_parameters():
-                kept = nn.Parameter(value[self.elites], requires_grad=False)
-                layer.register_parameter(name, kept)
-        copy.num_networks = len(self.elites)
-        copy.elites = torch.arange(len(self.elites), device=self.elites.device)
-        return copy
 
     def parameter_groups(self) -> Iterator[dict[str, Any]]:
         """Groups for an optimizer: weights with MOPO's decay, the rest without.
