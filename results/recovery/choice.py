@@ -49,6 +49,8 @@ ARMS = {
     "critics": {"critics_only": True},
     "models 20": {"steps": 20},
     "models 20, anew": {"steps": 20, "hold": 1},
+    "models 20, ten steps": {"steps": 20, "hold": 10},
+    "models 20, one judge": {"steps": 20},
     "models 60": {"steps": 60},
     "shuffled 20": {"steps": 20},
 }
@@ -59,6 +61,8 @@ def policy_of(arm: str, runs: list[Path], judges: list[Path]) -> Callable[..., T
     """Of an arm."""
     if arm == "one":
         return load_policy(runs[0])
+    if arm.endswith("one judge"):
+        judges = judges[:1]
     policy = load_switching_policy(runs, judges=judges, **ARMS[arm])
     chance = torch.Generator().manual_seed(0)
     predicted = policy.returns
