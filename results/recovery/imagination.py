@@ -8,7 +8,8 @@ Each run is ``torchrl-osr train`` in a process with one torch thread, then its l
 checkpoints play from the recoverable states. What is there is not done again; what is
 finished is packed into a table beside this file, and all of them are printed:
 ``imagination.jsonl.gz``; ``imagination-look.jsonl.gz``, the look at the held-out half;
-and ``imagination-pilots.jsonl.gz``, of arms that are not made any more.
+``imagination-choice.jsonl.gz``, the runs of the look at a choice; and
+``imagination-pilots.jsonl.gz``, of arms that are not made any more.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ from torchrl_osr.report.saved import came_back, percent, saved_states
 from torchrl_osr.report.scores import by_run, estimate, recent
 
 HERE = Path(__file__).parent
-TABLES = "imagination", "imagination-look", "imagination-pilots"
+LOOKS = "imagination-look", "imagination-choice"
+TABLES = "imagination", *LOOKS, "imagination-pilots"
 STEPS = 60_000
 MODEL = [
     *("dynamics=ensemble", "dynamics.real_ratio=0.5", "dynamics.rollout_steps=30"),
@@ -170,14 +172,16 @@ def main() -> None:
     parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=ARMS)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--half", default="public", choices=("public", "held-out"))
-    parser.add_argument("--pack", choices=TABLES[:2], help="the table; run nothing")
+    parser.add_argument("--pack", choices=TABLES[:3], help="the table; run nothing")
     given = parser.parse_args()
     if given.pack:
         pack(given.folder, HERE / f"{given.pack}.jsonl.gz")
         for name in TABLES:
             path = HERE / f"{name}.jsonl.gz"
+            if not path.exists():
+                continue
             print(f"\n{name}\n\n{described(path)}")
-            if name in TABLES[:2]:
+            if name in TABLES[:3]:
                 print("", by_kind(path), sep="\n")
         return
     for seed in given.seeds:

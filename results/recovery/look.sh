@@ -29,7 +29,7 @@ ahead() {
 from() {
     half=$1 data=$2
     shift 2
-    python results/recovery/imagination.py outputs/look --half "$half" \
+    python results/recovery/imagination.py "$folder" --half "$half" \
         --data "$data" "$@"
 }
 walker2d() {
@@ -45,7 +45,7 @@ hopper() {
     from "$1" hopper-medium-expert --seeds 300 303 --arms base
 }
 chosen() {
-    set -- outputs/look --half held-out --data "$@"
+    set -- "$folder" --half held-out --data "$@"
     python results/recovery/choice.py "$@" \
         --arms one critics "models 20" "shuffled 20"
     python results/recovery/choice.py "$@" --groups easy \
@@ -61,10 +61,13 @@ choice() {
     seeds=$(seq 310 314)
     from held-out hopper-medium-expert --seeds $seeds --arms "disturbed starts"
     chosen hopper-medium-expert --seeds $seeds
+    python results/recovery/choice.py "$folder" --half held-out \
+        --seeds $(seq 310 319) --arms "models 20"
     from held-out walker2d-medium-expert --seeds $seeds --arms "noisy cloning"
-    python results/recovery/choice.py outputs/look --half held-out --seeds $seeds \
+    python results/recovery/choice.py "$folder" --half held-out --seeds $seeds \
         --policies "noisy cloning" --arms one "models 20"
 }
+folder=outputs/look
 labels
 ways
 ahead
@@ -73,4 +76,6 @@ walker2d held-out
 hopper public
 hopper held-out
 python results/recovery/imagination.py outputs/look --pack imagination-look
+folder=outputs/choice
 choice
+python results/recovery/imagination.py "$folder" --pack imagination-choice

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from imagination import REFERENCE
+from imagination import LOOKS, REFERENCE
 from numpy.typing import NDArray
 from search import read_jsonl
 from states import PARTS
@@ -52,6 +52,10 @@ TWINS = {
     "ways": "ways-expert",
     "look-ahead": "shuffled",
 }
+
+
+SHUFFLED = "shuffled 20"
+"""What a choice owes to chance."""
 
 
 def name_of(line: dict) -> str:
@@ -94,7 +98,9 @@ the planner's ways, with the expert's, or for look-ahead with shuffled predictio
 *R*: what is saved of the losses of noisy cloning of as many episodes and the better
 width, or, for ways and look-ahead, of 100 episodes (the ways' study). Demonstrations
 are of 20 episodes but where it says otherwise. A *choice* is among the policies of
-several runs: *less one of them*, their mean; R is of step 5's noisy cloning."""
+several runs, as many *sets* of them as were played: *less one of them*, their mean;
+*less shuffled*, as many of them chosen by shuffled predictions; intervals are over
+walks alone, but for the shares of one of them, and R is of step 5's noisy cloning."""
 
 
 def told(share: tuple[float, float, float]) -> str:
@@ -186,29 +192,42 @@ def rows_of_choice(
     R is against ``noisy``: how often noisy cloning comes back from each of the
     recoverable states, ``[m]``. Intervals are over walks.
     """
-    found: dict[tuple[str, int], dict[str, list[dict]]] = {}
+    found: dict[tuple[str, str, int], dict[str, list[dict]]] = {}
     for line in lines:
+        kind = line["runs"].partition(", ")[2]
         count = len(line["seeds"]) * line.get("last", 1)
-        groups = found.setdefault((line["arm"], count), {})
+        groups = found.setdefault((line["arm"], kind, count), {})
         groups.setdefault(line["group"], []).append(line)
     walks = {group: states.walk[states.group == group] for group in GROUPS}
     hard = GROUPS[-1]
 
-    def bits(arm: str, count: int, group: str) -> NDArray[np.float64]:
-        played = found.get((arm, count), {}).get(group, [])
-        return np.array([[int(bit) for bit in each["saved"]] for each in played], float)
+    def bits(
+        key: tuple[str, str, int], group: str, seeds: set[int]
+    ) -> NDArray[np.float64]:
+        """Which states of a group these seeds' policies save, line by line."""
+        played = found.get(key, {}).get(group, [])
+        mine = [line["saved"] for line in played if seeds.issuperset(line["seeds"])]
+        return np.array([[int(bit) for bit in saved] for saved in mine], float)
 
-    one = bits("one", 1, hard).mean(0, keepdims=True)
     rows = []
-    for (arm, count), groups in found.items():
-        row: dict = {"arm": arm, "policies": count}
-        back = {group: bits(arm, count, group) for group in reversed(GROUPS)}
-        for group, mine in back.items():
+    for key, groups in found.items():
+        arm, kind, count = key
+        row: dict = {"arm": arm, "policies": f"{count} of {kind}"}
+        row["sets"] = len(groups[hard])
+        seeds = {seed for line in groups[hard] for seed in line["seeds"]}
+        for group in reversed(GROUPS):
+            mine = bits(key, group, seeds)
+            if mine.size and arm != "one":
+                mine = mine.mean(0, keepdims=True)
             row[group] = told(saved_share(mine, walks[group])) if mine.size else ""
-        mine = back[hard].mean(0, keepdims=True)
+        mine = bits(key, hard, seeds).mean(0, keepdims=True)
+        others = {"one of them": ("one", kind, 1), "shuffled": (SHUFFLED, kind, count)}
+        for name, other in others.items():
+            theirs, row[f"less {name}"] = bits(other, hard, seeds), ""
+            if key != other and theirs.size:
+                more = mine - theirs.mean(0, keepdims=True)
+                row[f"less {name}"] = told(saved_share(more, walks[hard]))
         everything = np.ones(len(walks[hard]))
-        less = saved_share(mine - one, walks[hard])
-        row["less one of them"] = "" if arm == "one" else told(less)
         share = recovered_share(mine, noisy[None], everything, walks[hard])
         row["R"] = told(share)
         values = [x["undisturbed"] for x in groups.get("easy", [])]
@@ -220,15 +239,14 @@ def rows_of_choice(
 
 def noisy_cloning(states: RecoverableStates, half: str) -> NDArray[np.float64]:
     """How often step 5's noisy cloning comes back from the recoverable states."""
-    source = {"public": "imagination", "held-out": "imagination-look"}[half]
+    sources = ["imagination"] if half == "public" else LOOKS
+    tables = read_runs([FOLDER / f"{source}.jsonl.gz" for source in sources])
     wanted = f"{states.env_name} medium-expert", half
-    for data, name, of_each, back in came_back(
-        read_runs([FOLDER / f"{source}.jsonl.gz"])
-    ):
+    for data, name, of_each, back in came_back(tables):
         if (data, name.split()[0]) == wanted:
             hard = (of_each["group"] == GROUPS[-1]).to_numpy()
             return back.loc[REFERENCE].to_numpy()[:, hard].mean(0)
-    raise ValueError(f"{source} has no run on the {half} half of {states.env_name}.")
+    raise ValueError(f"{sources}: nothing of the {half} half of {states.env_name}.")
 
 
 def mean_bits(lines: list[dict], states: RecoverableStates, name: str) -> Any:
