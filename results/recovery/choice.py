@@ -104,6 +104,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="of imagination.py")
     parser.add_argument("--data", default="walker2d-medium-expert")
     parser.add_argument("--policies", default=JUDGES, help="the runs they are of")
+    parser.add_argument("--among", type=Path, nargs="+", help="of these runs instead")
     parser.add_argument("--half", default="public", choices=("public", "held-out"))
     parser.add_argument("--seeds", type=int, nargs="+", required=True)
     parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=ARMS)
@@ -118,13 +119,19 @@ def main() -> None:
     there = [[line[name] for name in names] for line in read_jsonl(log)]
     top = given.folder / given.data
     judges = [top / JUDGES / f"seed{seed}" for seed in given.seeds]
-    runs = [top / given.policies / f"seed{seed}" for seed in given.seeds]
+    runs, labels = (
+        [top / given.policies / f"seed{seed}" for seed in given.seeds],
+        given.seeds,
+    )
+    if given.among:
+        runs = given.among
+        labels = ["/".join(each.parts[-2:]) for each in runs]
     for group in given.groups:
         for arm in given.arms:
             for first in range(len(runs)) if arm == "one" else [None]:
                 mine = slice(None) if first is None else slice(first, first + 1)
                 of = f"{given.data}, {given.policies}"
-                key = [arm, of, given.seeds[mine], group, digest]
+                key = [arm, of, labels[mine], group, digest]
                 if key in there:
                     continue
                 start = time.process_time()
