@@ -149,7 +149,11 @@ def by_kind(path: Path) -> str:
         for name in ("all", *sorted(set(kind[hard]))):
             of = hard & ((kind == name) | (name == "all"))
             walk, mine = of_each["walk"][of], back.loc[:, of]
-            ours, theirs = mine.loc[first], mine.loc[REFERENCE]
+            ours, theirs = (
+                mine.loc[first],
+                mine[mine.index.get_level_values(0) == REFERENCE],
+            )
+            theirs = theirs.droplevel(0)
             row = {"kind": f"{name}, {data}, {states.split()[0]}", "states": of.sum()}
             row |= {first: percent(saved_share(ours, walk), len(ours))}
             row |= {gained: "", "R %": ""}
@@ -158,8 +162,9 @@ def by_kind(path: Path) -> str:
                 row[gained] = percent(saved_share(more, walk), len(more))
             both = theirs.index.intersection(ours.index)
             share = ours.loc[both], theirs.loc[both], np.ones(of.sum())
-            with suppress(ValueError):  # cloning saves all, at least in a resample
-                row["R %"] = percent(recovered_share(*share, walk), len(both))
+            if len(both):
+                with suppress(ValueError):  # cloning saves all, at least in a resample
+                    row["R %"] = percent(recovered_share(*share, walk), len(both))
             rows.append(row)
     return table(rows)
 

@@ -9,6 +9,7 @@ Lines of an older file of states are left out: their bits are of other states.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -54,8 +55,8 @@ TWINS = {
 }
 
 
-SHUFFLED = "shuffled 20"
-"""What a choice owes to chance."""
+CHOICE, SHUFFLED = "models 20", "shuffled 20"
+"""The choice that was looked at, and what it owes to chance."""
 
 
 def name_of(line: dict) -> str:
@@ -237,6 +238,46 @@ def rows_of_choice(
     return rows
 
 
+def kinds_of_choice(
+    lines: list[dict], states: RecoverableStates, noisy: NDArray[np.float64]
+) -> list[dict]:
+    """A row for each kind of disturbance: the models' choice among five.
+
+    Intervals are over walks; R has none where noisy cloning saves all in a resample.
+    """
+    hard = states.group == GROUPS[-1]
+    bits = {
+        arm: np.array(
+            [
+                [int(bit) for bit in line["saved"]]
+                for line in lines
+                if (line["arm"], line["group"], len(line["seeds"]))
+                == (arm, GROUPS[-1], count)
+                and line["runs"].endswith("disturbed starts")
+                and "last" not in line
+            ],
+            float,
+        )
+        for arm, count in (("one", 1), (CHOICE, 5))
+    }
+    rows = []
+    kinds = np.array([each.partition("-")[0] for each in states.kind[hard]])
+    for kind in sorted(set(kinds)):
+        of = kinds == kind
+        walk = states.walk[hard][of]
+        one, mine = (table[:, of].mean(0, keepdims=True) for table in bits.values())
+        row = {"kind": kind, "states": of.sum()}
+        row |= {"noisy cloning": told(saved_share(noisy[None, of], walk))}
+        row |= {"one": told(saved_share(one, walk))}
+        row |= {CHOICE: told(saved_share(mine, walk)), "R": ""}
+        with suppress(ValueError):
+            row["R"] = told(
+                recovered_share(mine, noisy[None, of], np.ones(of.sum()), walk)
+            )
+        rows.append(row)
+    return rows
+
+
 def noisy_cloning(states: RecoverableStates, half: str) -> NDArray[np.float64]:
     """How often step 5's noisy cloning comes back from the recoverable states."""
     sources = ["imagination"] if half == "public" else LOOKS
@@ -278,6 +319,8 @@ def main() -> None:
         if lines := [line for line in lines if line["states"] == digest]:
             rows = rows_of_choice(lines, states, noisy_cloning(states, half))
             pages += [f"## choice, {states.env_name}, {half} half", table(rows)]
+            rows = kinds_of_choice(lines, states, noisy_cloning(states, half))
+            pages += [f"### {CHOICE}, by kind of disturbance", table(rows)]
     write_atomically(FOLDER / "methods.md", "\n\n".join(pages) + "\n")
 
 
