@@ -51,6 +51,7 @@ ARMS = {
     "models 20, anew": {"steps": 20, "hold": 1},
     "models 20, ten steps": {"steps": 20, "hold": 10},
     "models 20, one judge": {"steps": 20},
+    "models 20, ten steps, one judge": {"steps": 20, "hold": 10},
     "models 60": {"steps": 60},
     "shuffled 20": {"steps": 20},
 }
