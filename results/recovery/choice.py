@@ -120,10 +120,8 @@ def main() -> None:
     there = [[line[name] for name in names] for line in read_jsonl(log)]
     top = given.folder / given.data
     judges = [top / JUDGES / f"seed{seed}" for seed in given.seeds]
-    runs, labels = (
-        [top / given.policies / f"seed{seed}" for seed in given.seeds],
-        given.seeds,
-    )
+    runs = [top / given.policies / f"seed{seed}" for seed in given.seeds]
+    labels: list[Any] = given.seeds
     if given.among:
         runs = given.among
         labels = ["/".join(each.parts[-2:]) for each in runs]

@@ -317,9 +317,10 @@ def main() -> None:
                 pages += [title, table(rows_of(chosen, states, study, elsewhere))]
         lines = read_jsonl(PARTS / states.env_name / f"choice-{half}.jsonl")
         if lines := [line for line in lines if line["states"] == digest]:
-            rows = rows_of_choice(lines, states, noisy_cloning(states, half))
+            noisy = noisy_cloning(states, half)
+            rows = rows_of_choice(lines, states, noisy)
             pages += [f"## choice, {states.env_name}, {half} half", table(rows)]
-            rows = kinds_of_choice(lines, states, noisy_cloning(states, half))
+            rows = kinds_of_choice(lines, states, noisy)
             pages += [f"### {CHOICE}, by kind of disturbance", table(rows)]
     write_atomically(FOLDER / "methods.md", "\n\n".join(pages) + "\n")
 

@@ -4,34 +4,20 @@ from __future__ import annotations
 
 import pytest
 import torch
+from cart_world import cart
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from torchrl_osr.imagination import LookAheadPolicy
-from torchrl_osr.modules import DynamicsEnsemble, EliteNetworks
+from torchrl_osr.modules import EliteNetworks
 
 STEP = 0.1
 EDGE = 1.0
 
 
-def cart(*bias: float, elites: int = 1) -> EliteNetworks:
-    return EliteNetworks(ensemble(bias or (0.0,), elites))
-
-
-def ensemble(bias: tuple[float, ...] = (0.0,), elites: int = 1) -> DynamicsEnsemble:
-    """Position and velocity ``[x, v]``; the action accelerates, a bias pushes."""
-    model = DynamicsEnsemble(
-        2, 1, num_networks=len(bias), num_elites=elites, num_cells=[]
-    )
-    (layer,) = model.layers
-    with torch.no_grad():
-        layer.weight.zero_()
-        layer.bias.zero_()
-        layer.weight[:, 1, 0] = STEP  # velocity to position
-        layer.weight[:, 2, 1] = STEP  # action to velocity
-        layer.bias[:, 0, 1] = torch.tensor(bias)
-    return model
+def networks(*bias: float, elites: int = 1) -> EliteNetworks:
+    return EliteNetworks(cart(*bias, elites=elites, step=STEP))
 
 
 def over_the_edge(state: Tensor) -> Tensor:
@@ -75,10 +61,10 @@ class Permuted(LookAheadPolicy):
 
 def test_a_plan_survives_where_the_policy_does_not_and_the_model_is_why() -> None:
     options = {"terminated": over_the_edge, "std": 1.0, "planning_horizon": 20}
-    look_ahead = LookAheadPolicy(coast, cart(), everywhere, **options)
+    look_ahead = LookAheadPolicy(coast, networks(), everywhere, **options)
     assert not survivors(coast, FAST, 30).any()
     assert survivors(look_ahead, FAST, 30).all()
-    permuted = Permuted(coast, cart(), everywhere, **options)
+    permuted = Permuted(coast, networks(), everywhere, **options)
     assert not survivors(permuted, FAST, 30).all()
 
 
@@ -89,9 +75,9 @@ def test_on_the_data_it_is_the_policy_bit_for_bit() -> None:
     states = torch.randn(64, 2, generator=torch.Generator().manual_seed(0))
     options = {"terminated": over_the_edge, "planning_horizon": 20, "num_candidates": 8}
     options["top_k"] = 2
-    never = LookAheadPolicy(policy, cart(), lambda s: s[:, 0] > 99, **options)
+    never = LookAheadPolicy(policy, networks(), lambda s: s[:, 0] > 99, **options)
     assert torch.equal(never(states), policy(states))
-    some = LookAheadPolicy(policy, cart(), lambda s: s[:, 0] > 0.5, **options)
+    some = LookAheadPolicy(policy, networks(), lambda s: s[:, 0] > 0.5, **options)
     far = states[:, 0] > 0.5
     assert torch.equal(some(states)[~far], policy(states)[~far])
     assert not torch.equal(some(states)[far], policy(states)[far])
@@ -99,7 +85,9 @@ def test_on_the_data_it_is_the_policy_bit_for_bit() -> None:
 
 def test_without_a_better_way_it_is_the_policy() -> None:
     still = torch.zeros(3, 2)
-    look_ahead = LookAheadPolicy(coast, cart(), everywhere, terminated=over_the_edge)
+    look_ahead = LookAheadPolicy(
+        coast, networks(), everywhere, terminated=over_the_edge
+    )
     assert torch.equal(look_ahead(still), coast(still))
     fallen = torch.tensor([[5.0, 0.0], [torch.nan, 0.0]])
     assert torch.equal(look_ahead(fallen), coast(fallen))
@@ -109,7 +97,7 @@ def test_without_a_better_way_it_is_the_policy() -> None:
 
 def test_scores_are_the_steps_survived_and_the_value_of_the_last_state() -> None:
     # One network is pushed by .1 a step, one by -.1; the third is no elite.
-    model = cart(0.1, -0.1, 50.0, elites=2)
+    model = networks(0.1, -0.1, 50.0, elites=2)
     look_ahead = LookAheadPolicy(
         coast, model, everywhere, terminated=lambda s: s[:, 1] > 0.45,
         value=lambda s: 100 * s[:, 1], planning_horizon=5, num_offsets=2, hold=2,
@@ -128,7 +116,7 @@ def test_a_value_leads_beyond_the_horizon() -> None:
         return -(state[:, 0] - 0.5).abs()
 
     states = torch.tensor([[0.0, 0.0], [1.0, 0.0]])
-    look_ahead = LookAheadPolicy(coast, cart(), everywhere, value=value)
+    look_ahead = LookAheadPolicy(coast, networks(), everywhere, value=value)
     none, best = torch.zeros(2, 5, 1), look_ahead.plan(states)
     scores = look_ahead.scores(states, torch.stack([none, best], 1))
     torch.testing.assert_close(scores[:, 0], torch.full([2], 40 - 0.5))
@@ -141,7 +129,7 @@ def test_it_is_a_function_of_the_state() -> None:
     def make(seed: int) -> LookAheadPolicy:
         generator = torch.Generator().manual_seed(seed)
         return LookAheadPolicy(
-            coast, cart(), everywhere, generator=generator, **options
+            coast, networks(), everywhere, generator=generator, **options
         )
 
     together = make(0)(FAST)
@@ -153,21 +141,21 @@ def test_it_is_a_function_of_the_state() -> None:
 
 def test_a_standardised_model_plans_as_the_one_in_the_tasks_units() -> None:
     loc, scale = torch.tensor([0.3, -1.0]), torch.tensor([2.0, 0.25])
-    standardised = ensemble()
+    standardised = cart(step=STEP)
     with torch.no_grad():
         # The same world: inputs are brought back, targets divided.
         standardised.input_loc[:2] = -loc / scale
         standardised.input_scale[:2] = 1 / scale
         standardised.target_scale[:2] = 1 / scale
     options = {"terminated": over_the_edge, "planning_horizon": 20}
-    models = cart(), EliteNetworks(standardised, loc, scale)
+    models = networks(), EliteNetworks(standardised, loc, scale)
     pair = [LookAheadPolicy(coast, each, everywhere, **options) for each in models]
     plans = [each.plan(FAST) for each in pair]
     torch.testing.assert_close(*plans, rtol=1e-4, atol=1e-4)
 
 
 def test_it_is_a_policy_for_torchrl() -> None:
-    look_ahead = LookAheadPolicy(coast, cart(), everywhere, planning_horizon=20)
+    look_ahead = LookAheadPolicy(coast, networks(), everywhere, planning_horizon=20)
     module = TensorDictModule(look_ahead, ["observation"], ["action"])
     batch = module(TensorDict({"observation": FAST}, [4]))
     assert torch.equal(batch["action"], look_ahead(FAST))
@@ -184,4 +172,4 @@ def test_it_is_a_policy_for_torchrl() -> None:
 )
 def test_bad_arguments_are_named(options, message) -> None:
     with pytest.raises(ValueError, match=message):
-        LookAheadPolicy(coast, cart(), everywhere, **options)
+        LookAheadPolicy(coast, networks(), everywhere, **options)

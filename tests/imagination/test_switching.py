@@ -4,27 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
+from cart_world import cart
 from torch import Tensor
 
 from torchrl_osr.imagination import SwitchingPolicy
-from torchrl_osr.modules import DynamicsEnsemble, EliteNetworks
-
-
-def cart(*bias: float, elites: int) -> EliteNetworks:
-    """Position and velocity ``[x, v]``; the action is added to the velocity.
-
-    A bias is added, too; the reward is the velocity before the step.
-    """
-    model = DynamicsEnsemble(
-        2, 1, num_networks=len(bias), num_elites=elites, num_cells=[]
-    )
-    (layer,) = model.layers
-    with torch.no_grad():
-        layer.weight.zero_()
-        layer.bias.zero_()
-        layer.weight[:, 1, 0] = layer.weight[:, 2, 1] = layer.weight[:, 1, 2] = 1.0
-        layer.bias[:, 0, 1] = torch.tensor(bias)
-    return EliteNetworks(model)
+from torchrl_osr.modules import EliteNetworks
 
 
 def left(state: Tensor) -> Tensor:
@@ -41,7 +25,7 @@ def nothing(state: Tensor, action: Tensor) -> Tensor:
 
 def test_returns_are_discounted_rewards_and_the_value_of_where_they_end() -> None:
     # One network is pushed by 1, one by -1; the third is no elite.
-    parts = [cart(1.0, -1.0, 50.0, elites=2), cart(0.0, elites=1)]
+    parts = [EliteNetworks(cart(1.0, -1.0, 50.0, elites=2)), EliteNetworks(cart())]
     switching = SwitchingPolicy(
         [left, right], EliteNetworks.join(parts),
         value=lambda state, action: 100 * state[:, 0] + action[:, 0],
@@ -89,9 +73,10 @@ def test_together_they_survive_where_each_alone_falls_and_predictions_are_why() 
 
     assert falls(left, states).all()
     assert falls(right, states).all()
-    switching = SwitchingPolicy([left, right], cart(0.0, elites=1), centred, **options)
+    given = [left, right], EliteNetworks(cart()), centred
+    switching = SwitchingPolicy(*given, **options)
     assert not falls(switching, states).any()
-    shuffled = Shuffled([left, right], cart(0.0, elites=1), centred, **options)
+    shuffled = Shuffled(*given, **options)
     assert falls(shuffled, states).all()
 
 
@@ -113,7 +98,7 @@ def test_a_choice_holds_until_it_is_reset_or_the_number_of_states_changes() -> N
 
 
 def test_a_model_that_breaks_down_ends_the_task() -> None:
-    model = cart(torch.inf, elites=1)
+    model = EliteNetworks(cart(torch.inf))
     switching = SwitchingPolicy([left], model, lambda state, action: state[:, 1])
     torch.testing.assert_close(switching.returns(torch.ones(1, 2)), torch.zeros(1, 1))
 

@@ -125,9 +125,8 @@ def evaluate_run(cfg: DictConfig) -> tuple[Path, dict[str, Any]]:
 def evaluate_switching(cfg: DictConfig) -> tuple[Path, dict[str, Any]]:
     """The same for the runs of a sweep as one policy, each with its last checkpoint."""
     files = [checkpoints_of(run)[-1] for run in finished_runs(cfg)]
-    policy = load_switching_policy(files, trust=cfg.trust)
     path = Path(cfg.sweep) / f"switching-{file_name(cfg)}"
-    return evaluate_files(cfg, path, files, policy)
+    return evaluate_files(cfg, path, files)
 
 
 def file_name(cfg: DictConfig) -> str:
@@ -138,13 +137,9 @@ def file_name(cfg: DictConfig) -> str:
 
 
 def evaluate_files(
-    cfg: DictConfig, path: Path, files: list[Path], policy: Policy | None = None
+    cfg: DictConfig, path: Path, files: list[Path]
 ) -> tuple[Path, dict[str, Any]]:
-    """Evaluate checkpoints, unless ``path`` has the results; return these, too.
-
-    Args:
-        policy: of all of them together. Default: each plays by itself.
-    """
+    """Evaluate checkpoints, unless ``path`` has the results; return these, too."""
     torchrl_logger.setLevel("WARNING")
     torch.set_num_threads(cfg.num_threads)
     request = requested(cfg, files, path.parent)
@@ -153,7 +148,10 @@ def evaluate_files(
     partial = path.with_name(f".{path.stem}.partial.json")
     if cfg.force or results is None:
         play = evaluate if cfg.suite.half is None else evaluate_states
-        results = request | play(cfg, files, partial, request, policy)
+        together = None
+        if cfg.switching:
+            together = load_switching_policy(files, trust=cfg.trust)
+        results = request | play(cfg, files, partial, request, together)
         write_json(path, results)
     else:
         print(f"{path} is there already; force=true repeats it.")
@@ -392,8 +390,9 @@ def impossible(
 ) -> dict[str, str]:
     """Say which disturbances environment or policy lack what it takes for, and why."""
     env_id, configs = trained.config.env.id, cfg.suite.disturbances
-    left_out = impossible_attacks(configs, trained)
-    if together is not None:
+    if together is None:
+        left_out = impossible_attacks(configs, trained)
+    else:
         attacks = (name for name, each in configs.items() if each.attack is not None)
         left_out = dict.fromkeys(attacks, "nobody attacks a choice between policies")
     others = {name: each for name, each in configs.items() if name not in left_out}

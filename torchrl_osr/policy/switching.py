@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from omegaconf import DictConfig
 from torch import Tensor
 
 from torchrl_osr.experiment.build import termination_of
@@ -73,22 +74,22 @@ def load_switching_policy(
         values = [each.smallest_value(state, action) for each in critics]
         return torch.stack(values).mean(0)
 
-    config = read_run(run_folder_of(judging[0]) / CONFIG, trust)
+    configs = [read_run(run_folder_of(each) / CONFIG, trust) for each in judging]
     networks = None
     if not critics_only:
-        parts = [_networks(each, policies[each]) for each in judging]
-        networks = EliteNetworks.join(parts)
+        parts = map(_networks, judging, configs, critics)
+        networks = EliteNetworks.join(list(parts))
     return SwitchingPolicy(
         [policies[each] for each in paths],
         networks,
         value,
-        terminated=termination_of(config),
-        gamma=config.optim.gamma,
+        terminated=termination_of(configs[0]),
+        gamma=configs[0].optim.gamma,
         **options,
     )
 
 
-def _networks(path: Path, policy: Policy) -> EliteNetworks:
+def _networks(path: Path, config: DictConfig, policy: Policy) -> EliteNetworks:
     """The model of a run, in its policy's units."""
     folder = run_folder_of(path)
     if not (folder / FILE).exists():
@@ -97,7 +98,7 @@ def _networks(path: Path, policy: Policy) -> EliteNetworks:
             "with loss=rim or dynamics=ensemble, name runs that have one as judges, or "
             "choose with critics_only=True."
         )
-    if read_run(folder / CONFIG).dynamics.reverse_policy is not None:
+    if config.dynamics.reverse_policy is not None:
         raise ValueError(f"{folder} has a model that runs backwards in time.")
     units = policy.loc, policy.scale, policy.low, policy.high
     return EliteNetworks(load_dynamics(folder / FILE), *units)
