@@ -58,6 +58,9 @@ TWINS = {
 CHOICE, SHUFFLED = "models 20", "shuffled 20"
 """The choice that was looked at, and what it owes to chance."""
 
+DISTURBED = "disturbed starts"
+"""Whose policies the looks chose between."""
+
 
 def name_of(line: dict) -> str:
     """Of an arm, with what was chosen for it."""
@@ -241,7 +244,7 @@ def rows_of_choice(
 def kinds_of_choice(
     lines: list[dict], states: RecoverableStates, noisy: NDArray[np.float64]
 ) -> list[dict]:
-    """A row for each kind of disturbance: the models' choice among five.
+    """A row for each kind of disturbance: the models' choice among five, and one.
 
     Intervals are over walks; R has none where noisy cloning saves all in a resample.
     """
@@ -253,7 +256,6 @@ def kinds_of_choice(
                 for line in lines
                 if (line["arm"], line["group"], len(line["seeds"]))
                 == (arm, GROUPS[-1], count)
-                and line["runs"].endswith("disturbed starts")
                 and "last" not in line
             ],
             float,
@@ -320,8 +322,10 @@ def main() -> None:
             noisy = noisy_cloning(states, half)
             rows = rows_of_choice(lines, states, noisy)
             pages += [f"## choice, {states.env_name}, {half} half", table(rows)]
-            rows = kinds_of_choice(lines, states, noisy)
-            pages += [f"### {CHOICE}, by kind of disturbance", table(rows)]
+            of_starts = [x for x in lines if x["runs"].endswith(DISTURBED)]
+            if of_starts:
+                rows = kinds_of_choice(of_starts, states, noisy)
+                pages += [f"### {CHOICE}, by kind of disturbance", table(rows)]
     write_atomically(FOLDER / "methods.md", "\n\n".join(pages) + "\n")
 
 
