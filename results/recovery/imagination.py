@@ -86,6 +86,7 @@ def python(*arguments: str, log: Path) -> None:
 def run(folder: Path, arm: str, data: str, seed: int, half: str) -> None:
     """Train one run, and play its last checkpoints from the states."""
     env, quality = data.split("-", 1)
+    quality, _, random = quality.partition("+random")  # expert+random0.5: half of it
     folder.mkdir(parents=True, exist_ok=True)
     status = folder / "status.json"
     if not status.exists() or json.loads(status.read_text())["status"] != "done":
@@ -94,7 +95,7 @@ def run(folder: Path, arm: str, data: str, seed: int, half: str) -> None:
             train = [str(HERE / IN_PLACE[arm])]
         python(
             *train, f"env={env}", f"data={quality}", f"seed={seed}",
-            *ARMS[arm], f"trainer.steps={STEPS}", "trainer.batch_size=256",
+            f"data.random_share={random or 0}", *ARMS[arm], f"trainer.steps={STEPS}", "trainer.batch_size=256",
             f"trainer.eval_interval={STEPS // 20}", "trainer.progress=false",
             f"hydra.run.dir='{folder}'",
             log=folder / "train.txt",
