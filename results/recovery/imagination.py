@@ -95,7 +95,8 @@ def run(folder: Path, arm: str, data: str, seed: int, half: str) -> None:
             train = [str(HERE / IN_PLACE[arm])]
         python(
             *train, f"env={env}", f"data={quality}", f"seed={seed}",
-            f"data.random_share={random or 0}", *ARMS[arm], f"trainer.steps={STEPS}", "trainer.batch_size=256",
+            f"data.random_share={random or 0}",
+            *ARMS[arm], f"trainer.steps={STEPS}", "trainer.batch_size=256",
             f"trainer.eval_interval={STEPS // 20}", "trainer.progress=false",
             f"hydra.run.dir='{folder}'",
             log=folder / "train.txt",
