@@ -59,6 +59,7 @@ ARMS = {
     "simulator, undisturbed starts": [*BASE, *MODEL],
     "permuted, disturbed starts": [*BASE, *MODEL, *HALT, DISTURBED],
     "CQL(H)": ["loss=cql"],
+    "OSR": ["loss=osr"],
     "CQL(H), disturbed starts": ["loss=cql", *MODEL, *HALT, DISTURBED],
 }
 """The base is TD3+BC: the preset quick, larger batches and twice its updates.
