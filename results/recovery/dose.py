@@ -1,69 +1,130 @@
-"""Draw which share of a robot's disturbed states is survived, by strength.
+"""Play from all disturbed states of a robot, and draw the share survived by strength.
 
-    python results/recovery/dose.py walker2d
-    python results/recovery/dose.py hopper
+    python results/recovery/dose.py outputs/imagination
+    python results/recovery/dose.py outputs/imagination --arms "noisy cloning"
 
-A disturbance leads to easy, contested, recoverable and not saved states; ``tables.md``
-counts them. A policy survives its share of each group, of the recoverable ones by
-disturbance, public half; the planner survives all but those that it did not save, of
-which nobody here is given any.
+Not the recoverable states alone: those that every policy survives and those that the
+planner did not save, too; public walks. What each policy survives is appended to
+``parts/<system>/dose.jsonl``, a bit for each state in the order of ``tables.gather``;
+what is there is not played again. ``dose.md`` has the numbers of the figure.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import time
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
+import torch
+from choice import policy_of
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from tables import by_disturbance, gather
+from search import read_jsonl
+from states import DISTURBANCES, PARTS
+from tables import GROUPS, gather, table
 from world import World
 
-from torchrl_osr.report import read_runs
+from torchrl_osr._files import write_atomically
+from torchrl_osr.evaluation.recoverable import RecoverableStates, recovers
 
 HERE = Path(__file__).parent
 FIGURES = HERE.parents[1] / "docs" / "figures"
+IMAGINATION, CHOICE = "disturbed starts", "choice"
 LINES = {
-    "disturbed starts": ("recovery by imagination", "#D55E00"),
-    "undisturbed starts": ("from undisturbed starts", "#E69F00"),
-    "osr": ("OSR", "#0072B2"),
+    CHOICE: ("five by imagination, the best one acts", "#009E73"),
+    IMAGINATION: ("recovery by imagination", "#D55E00"),
+    "OSR": ("OSR", "#0072B2"),
     "noisy cloning": ("noisy cloning", "0.45"),
 }
 KINDS = ("torque", "rest", "push", "kick", "kick-root", "kick-joints")
-LEAST = 50
-"""States of a strength, both halves together, below which it is left out."""
+LEAST = 20
+"""States of a strength below which it is left out of the figure."""
 
 
-def survived(counts: pd.DataFrame, saved: pd.DataFrame) -> pd.DataFrame:
-    """Share survived ``[disturbance, seed]`` of one method."""
-    controls = saved[saved["group"] != "recoverable"]
-    share = controls.groupby(["seed", "group"])["back"].mean().unstack()
-    hard = saved[saved["group"] == "recoverable"]
-    back = hard.groupby(["seed", "disturbance"])["back"].mean().unstack()
-    back = back.reindex(columns=counts.index).fillna(0)
-    found = {
-        name: sum(counts.at[name, each] * share[each] for each in ("easy", "contested"))
-        + counts.at[name, "recoverable"] * back[name]
-        for name in counts.index
-    }
-    return pd.DataFrame(found).T.div(counts.sum(axis=1), axis=0)
+def public(world: World) -> dict[str, np.ndarray]:
+    """All judged states of the public walks, ``[M]`` each."""
+    found = gather(world)
+    inside = found["walk"] % 2 == 0
+    return {name: value[inside] for name, value in found.items()}
 
 
-def draw(counts: pd.DataFrame, shares: dict[str, pd.DataFrame], path: Path) -> None:
+def played_from(world: World, found: dict[str, np.ndarray]) -> RecoverableStates:
+    """The same as a policy can be played from."""
+    states, nothing = found["state"], np.zeros(len(found["walk"]))
+    return RecoverableStates(
+        env_name=world.system,
+        qpos=states[:, 1 : 1 + world.nq],
+        qvel=states[:, 1 + world.nq : world.size],
+        goal=states[:, world.size :],
+        group=np.array(GROUPS)[found["group"]],
+        walk=found["walk"],
+        moment=found["moment"],
+        kind=np.array(list(DISTURBANCES[world.system]))[found["kind"]],
+        strength=found["strength"],
+        distance=nothing,
+        offsets=found["offsets"],
+        hold=0,
+        steps=300,
+        least_speed=-np.inf,
+    )
+
+
+def play(
+    states: RecoverableStates, log: Path, folder: Path, arms: list[str], seeds: list
+) -> None:
+    """Play what was not yet."""
+    there = {(line["arm"], *line["seeds"]) for line in read_jsonl(log)}
+    for arm in arms:
+        for mine in [seeds] if arm == CHOICE else [[seed] for seed in seeds]:
+            if (arm, *mine) in there:
+                continue
+            name = IMAGINATION if arm == CHOICE else arm
+            runs = [folder / name / f"seed{seed}" for seed in mine]
+            start = time.process_time()
+            policy = policy_of("models 20" if arm == CHOICE else "one", runs, runs)
+            back = recovers(states, policy)
+            line = {"arm": arm, "seeds": mine}
+            line |= {"saved": "".join(map(str, back.astype(int)))}
+            line |= {"seconds": round(time.process_time() - start, 1)}
+            with log.open("a") as file:
+                file.write(json.dumps(line, separators=(",", ":")) + "\n")
+            print(arm, mine, f"{back.sum()} of {len(back)}", flush=True)
+
+
+def survived(
+    states: RecoverableStates, weight: np.ndarray, log: Path
+) -> dict[str, pd.DataFrame]:
+    """Share survived ``[disturbance, run]`` of each method, and of the planner.
+
+    A state that the expert survives stands for four, see ``states.py``.
+    """
+    bits = {"planner": [states.group != GROUPS[-1]]}
+    for line in read_jsonl(log):
+        bits.setdefault(line["arm"], []).append([bit == "1" for bit in line["saved"]])
+    shares = {}
+    for name, of in bits.items():
+        rows = pd.DataFrame(np.array(of, float).T * weight[:, None])
+        sums = rows.assign(weight=weight).groupby(states.disturbance).sum()
+        shares[name] = sums.drop(columns="weight").div(sums["weight"], axis=0)
+    return shares
+
+
+def draw(shares: dict[str, pd.DataFrame], path: Path) -> None:
     """A panel for each kind of disturbance."""
     figure = Figure(figsize=(10, 5.6), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(2, 3, sharey=True).ravel()
     for axes, kind in zip(panels, KINDS, strict=True):
-        names = [name for name in counts.index if name.split()[0] == kind]
+        there = shares["planner"].index
+        names = [name for name in there if name.rsplit(" ", 1)[0] == kind]
+        names.sort(key=lambda name: float(name.split()[1]))
         strength = [float(name.split()[1]) for name in names]
-        mine = counts.loc[names]
-        oracle = 1 - mine["not saved"] / mine.sum(axis=1)
-        axes.plot(strength, oracle, color="black", linestyle=":", label="planner")
+        planner = shares["planner"].loc[names].mean(axis=1)
+        axes.plot(strength, planner, color="black", linestyle=":", label="planner")
         for method, (label, colour) in LINES.items():
-            if method not in shares:
-                continue
             of = shares[method].loc[names]
             axes.plot(strength, of.mean(axis=1), "o-", ms=3, color=colour, label=label)
             if of.shape[1] > 1:
@@ -79,29 +140,61 @@ def draw(counts: pd.DataFrame, shares: dict[str, pd.DataFrame], path: Path) -> N
     figure.savefig(path, dpi=130)
 
 
+def by_group(states: RecoverableStates, log: Path) -> list[dict]:
+    """Share survived of each group of states, all strengths together."""
+    rows: dict[str, list[np.ndarray]] = {}
+    for line in read_jsonl(log):
+        bits = np.array([int(bit) for bit in line["saved"]])
+        rows.setdefault(line["arm"], []).append(bits)
+    return [
+        {"method": name, "runs": len(bits)}
+        | {
+            f"{group} ({(states.group == group).sum()})": f"{share:.3f}"
+            for group in GROUPS
+            for share in [np.mean(bits, 0)[states.group == group].mean()]
+        }
+        for name, bits in rows.items()
+    ]
+
+
 def main() -> None:
-    """Read, draw and print."""
+    """Play, draw and write."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("system", choices=("walker2d", "hopper"))
-    system = parser.parse_args().system
-    world = World(system)
-    counts = pd.DataFrame(by_disturbance(world, gather(world)))
-    counts = counts.set_index("disturbance").drop(columns="not searched yet")
-    counts = counts[counts.sum(axis=1) >= LEAST]
-    scores = HERE.parent / "scoreboard" / f"{system}-medium-expert.jsonl.gz"
-    saved = read_runs([HERE / "imagination-look.jsonl.gz", scores]).saved
-    saved = saved[saved["data"] == f"{system} medium-expert"]
-    # OSR has played from this half alone.
-    saved = saved[saved["states"].str.startswith("public")].astype({"back": float})
-    shares = {
-        method: survived(counts, of)
-        for method, of in saved.groupby("method")
-        if method in LINES
-    }
-    draw(counts, shares, FIGURES / f"dose-{system}.png")
-    oracle = 1 - counts["not saved"] / counts.sum(axis=1)
-    means = {name: of.mean(axis=1) for name, of in shares.items()}
-    print(pd.DataFrame({"planner": oracle} | means).round(2).to_string())
+    parser.add_argument("folder", type=Path, help="of imagination.py")
+    parser.add_argument("--system", default="walker2d", choices=("walker2d", "hopper"))
+    parser.add_argument("--arms", nargs="*", default=[], choices=LINES)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    world = World(given.system)
+    found = public(world)
+    states = played_from(world, found)
+    log = PARTS / given.system / "dose.jsonl"
+    top = given.folder / f"{given.system}-medium-expert"
+    play(states, log, top, given.arms, given.seeds)
+    weight = np.where(found["jury"][:, 1] == 1, 4, 1)
+    shares = survived(states, weight, log)
+    count = pd.Series(states.disturbance).value_counts()
+    kept = count.index[count >= LEAST]
+    shares = {name: of.loc[of.index.isin(kept)] for name, of in shares.items()}
+    if set(LINES) <= set(shares):
+        draw(shares, FIGURES / f"dose-{given.system}.png")
+    means = pd.DataFrame({name: of.mean(axis=1) for name, of in shares.items()})
+    rows = [
+        {"disturbance": name, "states": count[name]}
+        | {method: f"{share:.2f}" for method, share in row.items()}
+        for name, row in means.iterrows()
+    ]
+    pages = [
+        f"# Share of {given.system}'s disturbed states survived",
+        "Written by `dose.py`: public walks, all judged states. A state that the "
+        "expert survives stands for four in the first table, since one of four was "
+        "kept.",
+        table(rows),
+        "By group, each state once:",
+        table(by_group(states, log)),
+    ]
+    write_atomically(HERE / f"dose-{given.system}.md", "\n\n".join(pages) + "\n")
 
 
 if __name__ == "__main__":

@@ -131,7 +131,7 @@ def ablation(tables: RunTables) -> str:
             ours, theirs = table.loc[arm].align(table.loc[twin], "inner", axis=0)
             shares = (
                 saved_share(ours - theirs, walk),
-                recovered_share(ours, theirs, np.ones(len(walk)), walk),
+                recovered_share(ours, theirs, walk),
             )
             cells = [str(percent(share, len(ours))) for share in shares]
             rows.append([data, f"`{arm}`", str(len(ours)), *cells])

@@ -151,7 +151,7 @@ def test_clean_table_has_each_method_once_with_its_seeds(report):
     assert found[: len(head)] == head
     start = found.index("cql")
     assert found[start : start + 3] == ["cql", "2 (0, 1)", "8,000"]
-    assert re.fullmatch(r"\d+\.\d \[\d+\.\d, \d+\.\d\]", found[start + 3])
+    assert re.fullmatch(r"\d+\.\d \[\d+\.\d, \d+\.\d\] ²", found[start + 3])
     start = found.index("osr (trainer.steps=9000)")
     assert found[start + 1 : start + 4] == ["1 (2)", "9,000", "1.5 [1.0, 2.0] ᵉ"]
     assert found.count("osr (trainer.steps=8000)") == 2
@@ -167,7 +167,7 @@ def test_disturbed_table_has_scores_and_decreases(report):
 def test_differences_are_in_a_table_and_refusals_in_words(report):
     markup = section(report, "differences")
     table, by_disturbance = markup.split("Disturbance by disturbance")
-    numbers = r"[+\u2212]\d+\.\d \[[+\u2212]\d+\.\d, [+\u2212]\d+\.\d\]"
+    numbers = r"[+\u2212]\d+\.\d \[[+\u2212]\d+\.\d, [+\u2212]\d+\.\d\] ²"
     # Three methods on two data sets in three quantities. Of the other two one has a
     # seed of its own, and one other episodes.
     found = [each for each in cells(table) if re.fullmatch(numbers, each)]

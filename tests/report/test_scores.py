@@ -48,7 +48,8 @@ def test_scores_are_means_of_the_last_evaluations(tmp_path):
     assert estimate(by_run(recent(found))).mean == pytest.approx(5 * (15 + 30) / 2)
     # Two seeds: resamples are both, or one of them twice with chance 1/4 each.
     assert last[1:3] == pytest.approx((7 * 15, 7 * 30))
-    assert last.over == "seeds"
+    assert last.over == "two seeds"
+    assert str(last).endswith("²")
     band = score_curve(found)
     np.testing.assert_allclose(band.mean, 22.5 * np.arange(1, 8))
     assert (band.low < band.mean).all()
@@ -61,6 +62,7 @@ def test_one_seed_gives_an_interval_over_episodes_that_says_so():
     assert (found.mean, found.low) == (2, 1)
     assert found.high in (3, 4)
     assert str(found).endswith("ᵉ")
+    assert str(estimate([np.array([value]) for value in (1.0, 2, 3)])).endswith("]")
     assert str(Estimate(-1.25, -2.0, 3.0)) == "-1.2 [-2.0, 3.0]".replace("-", MINUS)
 
 
@@ -72,7 +74,7 @@ def test_profile_and_interquartile_mean_pool_data_sets(tmp_path):
         write(tmp_path / f"{env}{seed}", curve, env=env, seed=seed)
     found = episodes(tmp_path)
     mean = iqm(found)
-    assert (mean.mean, mean.over) == (pytest.approx((20 + 40) / 2), "seeds")
+    assert (mean.mean, mean.over) == (pytest.approx((20 + 40) / 2), "two seeds")
     # Stratified: the middle two are at least 10 and 40, at most 20 and 90.
     assert (10 + 40) / 2 <= mean.low < 30 < mean.high <= (20 + 90) / 2
     alone = iqm(found[(found["seed"] == 0) | (found["data"] == "hopper medium-replay")])

@@ -8,7 +8,7 @@ Shapes: ``M`` states, ``Q`` positions, ``V`` velocities, ``K`` offsets, ``A`` ac
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from torchrl_osr._checks import check_choice
 from torchrl_osr._files import read_arrays
 from torchrl_osr.data.collect.environment import MAZE_IDS, environment_id
 from torchrl_osr.evaluation.episodes import EpisodeEvaluator, Policy
-from torchrl_osr.evaluation.statistics import percentile_interval
+from torchrl_osr.evaluation.statistics import percentile_interval, wilson_interval
 
 GROUPS = ("easy", "contested", "recoverable")
 """No policy of the jury failed; some did; all did, and a planner did not."""
@@ -209,109 +209,135 @@ def recovers(states: RecoverableStates, policy: Policy) -> NDArray[np.bool_]:
 
 
 def recovered_share(
-    method: ArrayLike, baseline: ArrayLike, oracle: ArrayLike, walk: ArrayLike
+    method: ArrayLike, baseline: ArrayLike, walk: ArrayLike, *, paired: bool = True
 ) -> tuple[float, float, float]:
-    r"""Share of what the oracle saves and the baseline loses that a method saves.
+    r"""Share of the states that the baseline loses that a method saves.
 
     .. math::
-        R = \frac{p_{method} - p_{baseline}}{p_{oracle} - p_{baseline}}
+        R = \frac{p_{method} - p_{baseline}}{1 - p_{baseline}}
 
-    with :math:`p` the share of states that :func:`recovers` is true of. Its 95 %
-    percentile-bootstrap interval resamples seeds, the same ones for method and
-    baseline, and walks, each with all of its states.
+    with :math:`p` the share of states that :func:`recovers` is true of. There is a way
+    back from each of them, so that 1 is what can be reached. Its 95 %
+    percentile-bootstrap interval resamples seeds, and walks with all of their states.
 
     Args:
         method: whether it came back, for each seed and state, ``[N, M]``.
-        baseline: the same of the baseline with the same seeds, ``[N, M]``.
-        oracle: the same of the oracle, ``[M]``.
+        baseline: the same of the baseline, ``[N, M]``.
         walk: of each state, ``[M]``.
+
+    Keyword Args:
+        paired: row by row method and baseline have the same seed, and are resampled
+            together. Otherwise they may have different numbers of seeds. Default
+            ``True``.
 
     Returns:
         The share, lower and upper end.
 
     Raises:
-        ValueError: if the shapes do not fit, or the oracle saves no more states than
-            the baseline, in the data or in a resample: then there is nothing to share.
+        ValueError: if the shapes do not fit, if there are no seeds or states, or
+            numbers that are not finite, or if the baseline saves all states, in the
+            data or in a resample: then there is nothing to share.
 
     Examples:
-        >>> recovered_share(
-        ...     [[1, 1, 1, 0]], [[1, 0, 0, 0]], oracle=[1, 1, 1, 1], walk=[5, 5, 5, 5]
-        ... )[0]
+        >>> from torchrl_osr.evaluation.recoverable import recovered_share
+        >>> recovered_share([[1, 1, 1, 0]], [[1, 0, 0, 0]], walk=[5, 5, 5, 5])[0]
         0.6666666666666666
     """
-    each = [np.asarray(table, dtype=np.float64) for table in (method, baseline, oracle)]
-    walks, number = np.unique(np.asarray(walk), return_inverse=True)
-    shape = each[0].shape
-    if len(shape) != 2 or each[1].shape != shape or {*shape[1:]} != {
-        *each[2].shape, *number.shape
-    }:  # fmt: skip
-        shapes = [table.shape for table in each]
+    ours, sizes = _by_walk(method, walk)
+    theirs, _ = _by_walk(baseline, walk)
+    if paired and len(ours) != len(theirs):
         raise ValueError(
-            "recovered_share needs a method and a baseline [N, M], an oracle [M] and "
-            f"walks [M]; got {shapes} and {number.shape}."
+            "paired rows of method and baseline have the same seeds; got "
+            f"{len(ours)} and {len(theirs)} of them (paired=False is for others)."
         )
-    member = np.eye(len(walks))[number]
-    method_sum, baseline_sum, oracle_sum = (table @ member for table in each)
-
-    def shares(seed_weight: Any, walk_weight: Any) -> NDArray[np.float64]:
-        ours, theirs = (
-            ((seed_weight @ table) * walk_weight).sum(-1) / len(baseline_sum)
-            for table in (method_sum, baseline_sum)
+    seeds, walks, others = _weights(len(ours), len(sizes), len(theirs))
+    baseline_seeds = seeds if paired else others
+    total = walks @ sizes
+    saved, before = (
+        ((weight @ table) * walks).sum(-1) / len(table)
+        for weight, table in ((seeds, ours), (baseline_seeds, theirs))
+    )
+    if (total - before <= 0).any():
+        raise ValueError(
+            "the baseline saves all states, so that there is no share to speak of; use "
+            "more states, or another baseline."
         )
-        left: NDArray[np.float64] = walk_weight @ oracle_sum - theirs
-        if (left <= 0).any():
-            raise ValueError(
-                "the oracle saves no more states than the baseline, so that there is "
-                "no share to speak of; use more states, or another baseline."
-            )
-        share: NDArray[np.float64] = (ours - theirs) / left
-        return share
-
-    return _with_interval(shares, len(baseline_sum), len(walks))
+    return _with_interval((saved - before) / (total - before))
 
 
 def saved_share(back: ArrayLike, walk: ArrayLike) -> tuple[float, float, float]:
     """Share of the states that a method saves.
 
     Its 95 % percentile-bootstrap interval resamples seeds, and walks with all of their
-    states.
+    states. Where all are saved, or none, no resample differs, and the interval is
+    Wilson's of as many trials as there are walks.
 
     Args:
-        back: whether it came back, for each seed and state, ``[N, M]``; or how often.
+        back: whether it came back, for each seed and state, ``[N, M]``; or how often;
+            or by how much more often than another method.
         walk: of each state, ``[M]``.
 
     Returns:
         The share, lower and upper end.
 
+    Raises:
+        ValueError: if the shapes do not fit, if there are no seeds or states, or
+            numbers that are not finite.
+
     Examples:
+        >>> from torchrl_osr.evaluation.recoverable import saved_share
         >>> saved_share([[1, 0, 1, 0]], walk=[0, 0, 1, 1])
         (0.5, 0.5, 0.5)
+        >>> share, low, high = saved_share([[0, 0, 0, 0]], walk=[0, 1, 2, 3])
+        >>> share, low, round(high, 2)
+        (0.0, 0.0, 0.49)
     """
-    walks, number = np.unique(np.asarray(walk), return_inverse=True)
+    table, sizes = _by_walk(back, walk)
+    for share, whole in ((0.0, 0.0 * sizes), (1.0, sizes)):
+        if (table == whole).all():
+            count = round(share * len(sizes))
+            return (share, *wilson_interval(count, len(sizes)))
+    seeds, walks = _weights(len(table), len(sizes))
+    saved = ((seeds @ table) * walks).sum(-1) / len(table)
+    return _with_interval(saved / (walks @ sizes))
+
+
+def _by_walk(
+    table: ArrayLike, walk: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Sums over the states of each walk, ``[N, W]``, and their numbers, ``[W]``."""
+    rows, of_each = np.asarray(table, dtype=np.float64), np.asarray(walk)
+    if rows.ndim != 2 or not rows.size or of_each.shape != rows.shape[1:]:
+        raise ValueError(
+            "shares of states need a number for each seed and state [N, M] and a walk "
+            f"for each state [M]; got {rows.shape} and {of_each.shape}."
+        )
+    if not np.isfinite(rows).all():
+        raise ValueError("shares of states need finite numbers; some are not.")
+    walks, number = np.unique(of_each, return_inverse=True)
     member = np.eye(len(walks))[number]
-    table, sizes = np.asarray(back, dtype=np.float64) @ member, member.sum(0)
-
-    def shares(seed_weight: Any, walk_weight: Any) -> NDArray[np.float64]:
-        saved = ((seed_weight @ table) * walk_weight).sum(-1) / len(table)
-        share: NDArray[np.float64] = saved / (walk_weight @ sizes)
-        return share
-
-    return _with_interval(shares, len(table), len(walks))
+    return rows @ member, member.sum(0)
 
 
-def _with_interval(
-    shares: Callable[[Any, Any], NDArray[np.float64]], seeds: int, walks: int
-) -> tuple[float, float, float]:
-    """A share that depends on how often each seed and walk counts, ``[R, seeds]``."""
-    value = shares(np.ones((1, seeds)), np.ones((1, walks)))
+def _weights(*sizes: int) -> list[NDArray[np.float64]]:
+    """How often each of them counts: once, then in each resample, ``[1 + R, size]``."""
     rng = np.random.default_rng(0)
-    weights = (
-        # In floating point: products of integers are not NumPy's strength.
-        rng.multinomial(size, np.full(size, 1 / size), NUM_SHARE_RESAMPLES) * 1.0
-        for size in (seeds, walks)
-    )
-    low, high = percentile_interval(shares(*weights))
-    return float(value[0]), float(low), float(high)
+    return [
+        np.concatenate(
+            [
+                np.ones((1, size)),
+                # In floating point: products of integers are not NumPy's strength.
+                rng.multinomial(size, np.full(size, 1 / size), NUM_SHARE_RESAMPLES),
+            ]
+        )
+        for size in sizes
+    ]
+
+
+def _with_interval(shares: NDArray[np.float64]) -> tuple[float, float, float]:
+    """The first one, and the interval of the resamples behind it."""
+    low, high = percentile_interval(shares[1:])
+    return float(shares[0]), float(low), float(high)
 
 
 class _Start(gymnasium.Wrapper[Any, Any, Any, Any]):

@@ -97,7 +97,7 @@ def nested_resamples(
         Means, every run with equal weight, ``[R, K]``.
 
     Raises:
-        ValueError: if there are no runs, or one has no episodes.
+        ValueError: if there are no runs, one has no episodes, or ``K`` differs.
 
     Examples:
         >>> resamples = nested_resamples([[[1.0, 5.0]] * 3, [[1.0, 5.0]] * 4])
@@ -105,8 +105,12 @@ def nested_resamples(
         ((2000, 2), [1.0, 5.0])
     """
     tables = [np.asarray(run, dtype=np.float64) for run in runs]
-    if not tables or any(table.ndim != 2 or not len(table) for table in tables):
-        shapes = [table.shape for table in tables]
+    shapes = [table.shape for table in tables]
+    if (
+        not tables
+        or any(table.ndim != 2 or not len(table) for table in tables)
+        or len({each[1] for each in shapes}) > 1
+    ):
         raise ValueError(f"nested_resamples needs episodes [E, K], got {shapes}.")
     rng = np.random.default_rng(seed)
     drawn = rng.integers(len(tables), size=(NUM_RESAMPLES, len(tables)))

@@ -25,7 +25,7 @@ from torchrl_osr.report.comparisons import (
 )
 from torchrl_osr.report.methods import RunTables, comparison_notes
 from torchrl_osr.report.plots import Panel, draw_differences, draw_panels, png
-from torchrl_osr.report.saved import saved_states
+from torchrl_osr.report.saved import Saved, saved_states
 from torchrl_osr.report.scores import (
     Estimate,
     WayBack,
@@ -103,6 +103,7 @@ def write_report(
         figures |= suite["figures"]
     pictures = {name: png(figure) for name, figure in figures.items() if figure}
     runs = tables.runs.drop(columns="data_score").set_index("folder")
+    saved = list(saved_states(tables, reference))
     content = {
         "tables": tables,
         "reference": reference,
@@ -119,8 +120,8 @@ def write_report(
         "scores": _score_table(tables),
         "means": _mean_table(tables),
         "suites": suites,
-        "saved": _saved_table(tables, reference),
-        "saved_by_disturbance": _saved_by_disturbance(tables, reference),
+        "saved": _saved_table(saved, reference),
+        "saved_by_disturbance": _saved_by_disturbance(saved),
         "every_run": runs.assign(versions=runs["versions"].map(", ".join)).astype(str),
     }
     environment = Environment(
@@ -310,10 +311,10 @@ def _way_row(each: WayBack) -> dict[str, Any]:
     }
 
 
-def _saved_table(tables: RunTables, reference: str) -> pd.DataFrame | None:
+def _saved_table(saved: Sequence[Saved], reference: str) -> pd.DataFrame | None:
     """What each method saves of the recoverable states; nothing if none was played."""
     rows = {}
-    for each in saved_states(tables, reference):
+    for each in saved:
         cells = {name: _cell(share, " %") for name, share in each.shares.items()}
         if each.recovered is not None:
             cells[f"R against {reference}"] = _cell(each.recovered, " %")
@@ -322,10 +323,10 @@ def _saved_table(tables: RunTables, reference: str) -> pd.DataFrame | None:
     return _frame(rows) if rows else None
 
 
-def _saved_by_disturbance(tables: RunTables, reference: str) -> pd.DataFrame | None:
+def _saved_by_disturbance(saved: Sequence[Saved]) -> pd.DataFrame | None:
     """The same of the recoverable states, a row for each disturbance."""
     rows: dict[tuple[str, str], dict[str, Cell]] = {}
-    for each in saved_states(tables, reference):
+    for each in saved:
         title = f"{each.data}, states {each.states}"
         for name, share in each.by_disturbance.items():
             rows.setdefault((title, name), {})[each.method] = _cell(share, " %")

@@ -112,7 +112,7 @@ def _recovered(
     if not len(ours):
         return None
     try:
-        found = recovered_share(ours, theirs, np.ones(len(walk)), walk)
+        found = recovered_share(ours, theirs, walk)
     except ValueError:  # the reference saves all of them, at least in a resample
         return None
     return percent(found, len(ours))
@@ -121,4 +121,5 @@ def _recovered(
 def percent(found: tuple[float, float, float], seeds: int) -> Estimate:
     """A share and its interval, over so many seeds."""
     mean, low, high = (100 * each for each in found)
-    return Estimate(mean, low, high, "seeds" if seeds > 1 else "walks")
+    over = {1: "walks", 2: "two seeds"}.get(seeds, "seeds")
+    return Estimate(mean, low, high, over)

@@ -33,7 +33,8 @@ class Estimate(NamedTuple):
         mean: of the runs.
         low: lower end.
         high: upper end.
-        over: what was resampled: "seeds", or "episodes" where a data set has one seed.
+        over: what was resampled: "seeds"; "two seeds", whose interval is hardly more
+            than the two of them; "episodes" or "walks" where a data set has one seed.
     """
 
     mean: float
@@ -47,7 +48,7 @@ class Estimate(NamedTuple):
 
     def interval(self, sign: str = "") -> str:
         """The interval in brackets, with a mark if it is not over seeds."""
-        mark = "" if self.over == "seeds" else " ᵉ"
+        mark = {"seeds": "", "two seeds": " ²"}.get(self.over, " ᵉ")
         return f"[{decimal(self.low, sign)}, {decimal(self.high, sign)}]{mark}"
 
 
@@ -106,8 +107,9 @@ def counted(number: int, noun: str) -> str:
 
 
 def over_what(groups: Sequence[Sequence[object]]) -> str:
-    """What an interval is over: seeds, if the group of each data set has several."""
-    return "seeds" if min(map(len, groups)) > 1 else "episodes"
+    """What an interval is over, given the runs of each data set."""
+    fewest = min(map(len, groups))
+    return {1: "episodes", 2: "two seeds"}.get(fewest, "seeds")
 
 
 def undisturbed(episodes: pd.DataFrame) -> pd.DataFrame:
@@ -140,9 +142,10 @@ def estimate(runs: Sequence[Array]) -> Estimate:
     Returns:
         Interval over the runs' means; with one run, over its episodes.
     """
-    if len(runs) == 1:
-        return Estimate(*mean_interval(runs[0]), over="episodes")
-    return Estimate(*mean_interval([run.mean() for run in runs]))
+    over = over_what([runs])
+    if over == "episodes":
+        return Estimate(*mean_interval(runs[0]), over)
+    return Estimate(*mean_interval([run.mean() for run in runs]), over)
 
 
 def score_curve(episodes: pd.DataFrame) -> Band:
@@ -163,7 +166,7 @@ def iqm(episodes: pd.DataFrame) -> Estimate:
     groups = _strata(episodes)
     scores = [[run.mean() for run in group] for group in groups]
     over = over_what(groups)
-    if over == "seeds":
+    if over != "episodes":
         resamples = stratified_resamples(scores)
     else:
         runs = [run for group in groups for run in group]
@@ -180,7 +183,7 @@ def profile(episodes: pd.DataFrame, thresholds: Array) -> Band:
     scores = [[run.mean() for run in group] for group in _strata(episodes)]
     mean = performance_profile(np.concatenate(scores), thresholds)
     resamples = performance_profile(stratified_resamples(scores), thresholds)
-    if over_what(scores) != "seeds":
+    if over_what(scores) == "episodes":
         resamples[:] = np.nan
     return Band(thresholds, mean, *percentile_interval(resamples))
 
@@ -266,7 +269,8 @@ def way_back(
     steps = np.sort(curves["offset"][curves["offset"] >= 0].unique()).astype(float)
     within = [run["recovery_steps"].to_numpy()[:, None] <= steps for run in runs]
     recovered = np.mean([each.mean(0) for each in within], axis=0)
-    shares = there[["stood", "alive_after", "undisturbed_alive"]].mean()
+    columns = ["stood", "alive_after", "undisturbed_alive"]
+    shares = there.groupby("run")[columns].mean().mean()  # as all else: a run, a vote
     return WayBack(
         num_episodes=len(rows),
         reached=len(there) / len(rows),
