@@ -111,7 +111,7 @@ FAMILY = {
 }  # fmt: skip
 HEAD = """# The family of losses
 
-Every loss is compared with a restatement of its published formula that shares no code with the package: losses and gradients, in float64, on random networks and batches with the same random draws. The last column is the largest deviation over all those numbers, relative to the larger of 1 and the number itself. Critic rows are the state-action pairs (for discrete actions: states) that all critics together score for one row of a batch, with two critics and K = 10 where there is a K, and ten critics for the ensembles; the policy's own action and the target's are counted.
+Every loss is compared with a restatement of its published formula that shares no code with the package: losses and gradients, in float64, on random networks and batches with the same random draws. The last column is the largest deviation over all those numbers, relative to the larger of 1 and the number itself. Critic rows are the state-action pairs (for discrete actions: states) that all critics together score for one row of a batch, with two critics and K = 10 where there is a K, ten critics for the ensembles and four for SCAS; the policy's own action and the target's are counted.
 
 | loss | class, equation | configuration | critic rows | compared with | checks | largest deviation |
 |---|---|---|---|---|---|---|

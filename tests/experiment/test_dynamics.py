@@ -133,6 +133,12 @@ def test_a_model_in_training_is_continued_with_the_same_bits(tmp_path) -> None:
         assert not torch.is_tensor(value) or torch.equal(value, there[key]), key
 
 
+def test_a_weight_of_0_is_no_adversary(tmp_path) -> None:
+    folder = ran(tmp_path, *RAMBO, "dynamics.adversarial_weight=0", "trainer.steps=2")
+    assert "imagined_reward" in scalars(folder)
+    assert "adversary_objective" not in scalars(folder)
+
+
 def test_recovery_is_added_to_mopo(tmp_path) -> None:
     found = scalars(ran(tmp_path, *RECOVERY, "trainer.steps=2"))
     assert {"loss_recovery", "recovery_kl", "imagined_reward"} <= found.keys()

@@ -188,7 +188,7 @@ def test_a_restored_adversary_goes_on_as_before(make_networks, make_batch) -> No
         ({"steps": 0}, "steps must be at least 1"),
         ({"weight": -1.0}, "weight must be at least 0"),
         ({"rollout_steps": 0}, "rollout_steps must be at least 1"),
-        ({"batch_size": 0}, "batch_size must be at least 1"),
+        ({"batch_size": 1}, "batch_size must be at least 2"),
     ],
 )
 def test_options_are_checked(make_networks, make_batch, options, message) -> None:

@@ -498,3 +498,24 @@ def test_autocast_changes_the_numbers_as_it_does_those_of_modules(
         torch.testing.assert_close(out[-1], exact, rtol=0.02, atol=0.05)
     torch.testing.assert_close(*out, rtol=0.02, atol=0.05)
     assert out[0].dtype == torch.float32
+
+
+class Scaled(ValueOperator):
+    """A critic that does something of its own with its network's output."""
+
+    def forward(self, tensordict):
+        out = super().forward(tensordict)
+        return out.set("state_action_value", 10 * out["state_action_value"])
+
+
+def test_a_critic_with_a_forward_of_its_own_is_not_plain() -> None:
+    keys = {"in_keys": ["observation", "action"]}
+    assert plain_mlp(
+        ValueOperator(MLP(5, 1, num_cells=[4], activation_class=nn.ReLU), **keys), *KEYS
+    )
+    assert (
+        plain_mlp(
+            Scaled(MLP(5, 1, num_cells=[4], activation_class=nn.ReLU), **keys), *KEYS
+        )
+        is None
+    )

@@ -110,3 +110,14 @@ def test_the_users_network_is_the_one_that_learns(make_batch) -> None:
     model = make_model()
     sum(DynamicsLoss(model)(make_batch(10, twin=False)).values()).backward()
     assert all(each.grad.count_nonzero() > 0 for each in model.parameters())
+
+
+def test_a_model_learns_single_steps(make_batch) -> None:
+    single = make_batch(10, twin=False)
+    several = single.clone().set("next", single["next"].roll(1, 0))
+    several["steps_to_next_obs"] = torch.full((10, 1), 5)
+    loss = DynamicsLoss(make_model())
+    with pytest.raises(ValueError, match="up to 5.*the model of the dynamics reads"):
+        loss(several)
+    kept = several.set("one_step", single["next"])
+    assert torch.equal(loss(kept)["loss_dynamics"], loss(single)["loss_dynamics"])

@@ -5,6 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
+from torchrl_osr import BCLoss
+
 # What is to be learned from the data's actions, or where they led.
 TERMS = {
     "osr": "loss_actor",
@@ -42,3 +44,17 @@ def test_cloning_is_left_out_row_by_row(family, family_batch, seeded, name) -> N
     ours = seeded(loss, batch)["loss_actor"]
     assert torch.equal(ours[:6], everywhere[:6])
     assert (ours[6:] < everywhere[6:]).all(), "a squared distance less"
+
+
+def test_a_constraint_and_cloning_alone_leave_them_out(
+    family, family_batch, seeded, make_networks, make_batch
+) -> None:
+    sdc = family("sdc", reduction="none"), family_batch("sdc", 10), "loss_deviation"
+    bc = BCLoss(make_networks().actor, reduction="none").double(), make_batch(10)
+    for loss, batch, key in (sdc, (*bc, "loss_actor")):
+        everywhere = seeded(loss, batch)[key]
+        batch["imagined"] = torch.arange(10).unsqueeze(-1) >= 6
+        ours = seeded(loss, batch)[key]
+        assert torch.equal(ours[:6], everywhere[:6])
+        assert (everywhere[6:] != 0).all()
+        assert (ours[6:] == 0).all()

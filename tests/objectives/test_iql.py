@@ -171,3 +171,24 @@ def test_the_mean_of_the_actor_is_within_the_bounds_and_its_scale_is_learnt() ->
     assert loc.abs().max() <= 1
     assert (scale == 1).all()
     assert len(list(actor.parameters())) == len(list(fixed.parameters())) + 1
+
+
+def test_what_follows_an_end_is_never_read(make_batch) -> None:
+    batch = make_batch(10, twin=False)
+    wanted = make_loss(networks())(batch)["loss_qvalue"]
+    ended = batch["next", "terminated"].squeeze(-1)
+    assert ended.any()
+    batch["next", "observation"][ended] = torch.nan
+    assert torch.equal(make_loss(networks())(batch)["loss_qvalue"], wanted)
+
+
+def test_imagined_rows_are_refused(make_batch) -> None:
+    batch = make_batch(4, twin=False)
+    batch["imagined"] = torch.zeros(4, 1, dtype=torch.bool)
+    with pytest.raises(ValueError, match="learns from the data's actions alone"):
+        make_loss(networks())(batch)
+
+
+def test_a_policy_without_spread_is_refused() -> None:
+    with pytest.raises(ValueError, match="scale must be above 0"):
+        gaussian_actor(3, 2, scale=0.0)

@@ -453,3 +453,14 @@ def test_model_is_called_once_where_the_policy_is_pulled_to_it(
     )
     make_osr(networks, **options)(make_batch(10))
     assert len(counted) == calls
+
+
+def test_cloning_in_the_models_place_is_reduced_as_its_divergence(
+    family, family_batch, seeded
+) -> None:
+    found = [
+        seeded(family("noisy-cloning", action_reduction=each), batch)["recovery_nll"]
+        for batch in [family_batch("noisy-cloning", 10)]
+        for each in ("sum", "mean")
+    ]
+    torch.testing.assert_close(found[1], found[0] / 2)

@@ -196,3 +196,17 @@ def test_next_states_after_an_end_are_not_read(networks, make_batch) -> None:
 def test_options_are_checked(networks, options, message) -> None:
     with pytest.raises(ValueError, match=message):
         SCASLoss(networks.actor, networks.critics, uneven_dynamics(), **options)
+
+
+def test_the_correction_and_its_weight_are_of_single_steps(
+    networks, make_batch
+) -> None:
+    single = make_batch(10)
+    several = single.clone().set("next", single["next"].roll(1, 0))
+    several["steps_to_next_obs"] = torch.full((10, 1), 5)
+    loss = make_loss(networks, "released", largest_weight=9.0)
+    with pytest.raises(ValueError, match="up to 5.*the model of the dynamics reads"):
+        loss(several)
+    kept = several.set("one_step", single["next"])
+    assert torch.equal(loss(kept)["loss_actor"], loss(single)["loss_actor"])
+    assert not torch.equal(loss(kept)["loss_qvalue"], loss(single)["loss_qvalue"])

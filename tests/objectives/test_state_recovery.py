@@ -351,10 +351,11 @@ def test_the_datas_action_may_be_the_target(
     if kind == "tanh":
         z = action.atanh()
         density = Normal(*plain.module[0](restated.states)[1:])
-        expected = -(density.log_prob(z) - (1 - action**2).log()).sum(-1).mean()
+        log_prob = density.log_prob(z) - (1 - action**2).log()
+        expected = -getattr(log_prob, reduction)(-1).mean()
     elif kind == "gaussian":
         density = Normal(*plain.module[0].module(restated.states))
-        expected = -density.log_prob(action).sum(-1).mean()
+        expected = -getattr(density.log_prob(action), reduction)(-1).mean()
     else:
         mlp = plain.module[0].module if kind == "delta" else plain.module[0]
         error = (torch.tanh(mlp(restated.states)) - action) ** 2

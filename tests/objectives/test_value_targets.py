@@ -190,3 +190,14 @@ def test_multi_step_of_one_step_changes_nothing(
     loss, batch = family(name), family_batch(name, 2, 5)
     shifted = MultiStep(GAMMA, 1)(batch.clone())
     assert_same(record(loss, shifted), record(loss, batch))
+
+
+@pytest.mark.parametrize("kind", ["td1", ValueEstimators.TDLambda])
+def test_rows_are_no_trajectory(family, family_batch, kind) -> None:
+    loss = family("td3bc")
+    loss.make_value_estimator(kind)
+    with pytest.raises(
+        ValueError, match=r"a batch \[B, T\] of trajectories, got \[10\]"
+    ):
+        loss(family_batch("td3bc", 10))
+    assert loss(family_batch("td3bc", 2, 5))["loss_qvalue"].isfinite()

@@ -16,6 +16,7 @@ from omegaconf import OmegaConf
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
+from torchrl.envs import ObservationNorm
 from torchrl.modules import MLP, NormalParamExtractor, ValueOperator
 from untrained_run import make_run
 
@@ -149,6 +150,12 @@ def test_actions_are_within_their_bounds(observation, low, width, seed):
     assert np.float32(low) <= action.min()
     assert action.max() <= np.float32(low + width)
     policy.value(observation, action)  # an action of its own is never refused
+
+
+def test_a_transform_that_standardises_the_other_way_round_is_refused(make_loss):
+    norm = ObservationNorm(loc=1.0, scale=4.0, in_keys=["observation"])
+    with pytest.raises(ValueError, match="standard_normal=True"):
+        policy_from_loss(make_loss("osr"), observation_norm=norm)
 
 
 def test_drawn_actions_have_the_distribution_of_the_actor(make_loss, norm):

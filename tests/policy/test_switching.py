@@ -72,6 +72,14 @@ def test_others_may_judge_and_critics_may_judge_alone(folders, tmp_path) -> None
         torch.testing.assert_close(column, sum(values) / 2)
 
 
+def test_judges_of_another_unit_of_reward_are_refused(folders, tmp_path) -> None:
+    bounds = "env.action_low=[-1,-2,0]", "env.action_high=[1,2,4]"
+    make_run(tmp_path / "other", LOSS, *bounds, "data.reward_scale=100")
+    with pytest.raises(ValueError, match=r"\(1.0, 0.0\), \(100.0, 0.0\)"):
+        load_switching_policy([*folders, tmp_path / "other"], critics_only=True)
+    load_switching_policy([*folders, tmp_path / "other"], judges=folders)
+
+
 def test_what_cannot_be_switched_is_named(folders, tmp_path) -> None:
     def refused(message: str, *runs: Path, kind: type[Exception] = ValueError) -> None:
         with pytest.raises(kind, match=message):

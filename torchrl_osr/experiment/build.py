@@ -19,7 +19,7 @@ from torchrl_osr.experiment.limits import check_networks
 from torchrl_osr.imagination import Termination, never, termination
 from torchrl_osr.imagination.replay_buffer import check_real_ratio
 from torchrl_osr.modules import ConditionalVAE, DynamicsEnsemble, state_value
-from torchrl_osr.objectives import BaseLoss
+from torchrl_osr.objectives import BaseLoss, IQLLoss
 from torchrl_osr.objectives.distributions import head_of, is_categorical
 from torchrl_osr.objectives.with_recovery import WithRecovery
 
@@ -348,6 +348,11 @@ def check_parts(
             raise ValueError(
                 "dynamics.unknown=halt asks what a reward for ever is worth, which has "
                 "no answer for optim.gamma=1: take a smaller one."
+            )
+        if isinstance(learner.loss, IQLLoss):
+            raise ValueError(
+                f"{cfg.loss._target_} learns from the data's actions alone, and "
+                "imagined rows have the policy's: take dynamics=none, or another loss."
             )
         if ("next", "action") in in_keys:
             raise ValueError(

@@ -165,7 +165,7 @@ def train_dynamics(
         imagining = make_reverse_vae(cfg, *sizes)
         train_vae(imagining, cfg, data, folder, new_trainer, adam)
     adversary = None
-    if cfg.dynamics.adversarial_steps:
+    if cfg.dynamics.adversarial_steps and cfg.dynamics.adversarial_weight:
         adversary = model_adversary(cfg, data, model, actor, loss, adam)
     imagined = imagined_replay_buffer(
         cfg, data, model, imagining, perturbation, adversary

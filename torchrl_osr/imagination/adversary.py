@@ -60,7 +60,7 @@ class ModelAdversary:
         steps: gradient steps of a call.
         weight: :math:`\lambda`; with 0 the model is trained on the data alone.
         rollout_steps: steps of a roll-out, one for each gradient step.
-        batch_size: ``B``.
+        batch_size: ``B``, at least 2.
         gamma: discount factor.
         terminated: of next states, see :func:`~torchrl_osr.imagination.imagine`.
             Default: never.
@@ -89,7 +89,7 @@ class ModelAdversary:
         check_positive("steps", steps, minimum=1)
         check_weight("weight", weight)
         check_positive("rollout_steps", rollout_steps, minimum=1)
-        check_positive("batch_size", batch_size, minimum=1)
+        check_positive("batch_size", batch_size, minimum=2)  # advantages deviate
         self.model = model.requires_grad_(True)
         self.loss, self.actor, self.real, self.optimizer = loss, actor, real, optimizer
         self.likelihood = DynamicsLoss(model)

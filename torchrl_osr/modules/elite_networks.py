@@ -18,9 +18,10 @@ from torchrl_osr.modules.dynamics import DynamicsEnsemble
 class EliteNetworks:
     """Mean changes of the state and mean rewards, ``[E, n, D]``, of frozen networks.
 
-    The elites of a :class:`DynamicsEnsemble` without their variances, in an
-    environment's units. All standardisation is folded into the first and the last
-    layer: what is left to compute is one batched product a layer.
+    The elites of a :class:`DynamicsEnsemble` without their variances: states and
+    actions in an environment's units, rewards in those that the model has learned. All
+    standardisation is folded into the first and the last layer: what is left to compute
+    is one batched product a layer.
 
     Args:
         model: is copied.

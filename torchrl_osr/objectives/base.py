@@ -36,7 +36,6 @@ from torchrl_osr.objectives.distributions import (
     check_action_spec,
     check_apart,
     check_same_bounds,
-    check_same_size,
 )
 
 
@@ -208,7 +207,6 @@ class BaseLoss(LossModule):
                 inverse_dynamics_network, "inverse_dynamics_network"
             )
             check_same_bounds(bounds, model_bounds)
-            check_same_size(network, inverse_dynamics_network)
 
     def _hold_inverse_dynamics(
         self, network: ProbabilisticTensorDictSequential
@@ -318,7 +316,7 @@ class BaseLoss(LossModule):
             )
 
     def reset_parameters_recursive(self) -> None:
-        """Reset what the loss trains; a frozen inverse dynamics model stays."""
+        """Reset actor, critics and inverse dynamics model, unless they are frozen."""
         for name in ("actor_network", "qvalue_network", "inverse_dynamics_network"):
             if name not in self.__dict__:
                 continue

@@ -16,7 +16,7 @@ from torchrl_osr._checks import check_literals
 from torchrl_osr._entries import entry, nested, select, state_keys
 from torchrl_osr.objectives.base import BaseLoss
 from torchrl_osr.objectives.cloning import cloning_distance, policy_at
-from torchrl_osr.objectives.mixed_states import States, perturbed_state
+from torchrl_osr.objectives.mixed_states import States, of_data, perturbed_state
 
 
 class BCLoss(BaseLoss):
@@ -28,7 +28,8 @@ class BCLoss(BaseLoss):
     and :math:`\mathbb E \|\pi(\tilde s) - a\|^2` of a deterministic actor. There are no
     critics. With ``states="both"`` it is noisy behaviour cloning, on D_tot; so is
     :class:`~torchrl_osr.StateRecoveryLoss` with ``recovery_target="data"``, which goes
-    with other losses and leaves out the ends of trajectories. Here all rows count.
+    with other losses and leaves out the ends of trajectories. Here all rows
+    of the data count; imagined ones do not.
 
     Args:
         actor_network: any with a density, or a deterministic one.
@@ -115,5 +116,5 @@ class BCLoss(BaseLoss):
         key, states = self.tensor_keys.action, torch.stack(stack)
         pi = policy_at(self.actor_network, self.actor_network_params, states, key)
         distance = cloning_distance(pi, entry(tensordict, key), key).mean(0)
-        loss = self._reduce(distance, tensordict)
+        loss = self._reduce(distance, tensordict, of_data(tensordict))
         return self._output(tensordict, {"loss_actor": loss}, {})

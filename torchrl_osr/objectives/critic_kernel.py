@@ -20,10 +20,10 @@ from typing import Any, NamedTuple
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torch.nn.functional import layer_norm
-from torchrl.modules import MLP
+from torchrl.modules import MLP, ValueOperator
 
 
 class Layer(NamedTuple):
@@ -91,12 +91,14 @@ def plain_mlp(
 
     Plain is a :class:`~torchrl.modules.MLP` with one output that reads observations and
     then the action, of linear layers and ReLUs in between; before the ReLUs there may
-    be layer normalisations. All of them have a weight and a bias, and nobody has put a
-    hook on them.
+    be layer normalisations. All of them have a weight and a bias, nobody has put a hook
+    on them, and what they are wrapped in does nothing of its own.
 
     It takes microseconds and is not kept: hooks and layers may come and go.
     """
-    module: Any = getattr(network, "module", None)
+    if type(network) not in (TensorDictModule, ValueOperator):
+        return None
+    module: Any = network.module
     if type(module) is not MLP or network.in_keys[-1] != action_key:
         return None
     if value_key not in network.out_keys:

@@ -29,7 +29,6 @@ from torchrl_osr.objectives.distributions import (
     action_index,
     check_categorical,
     check_num_actions,
-    check_same_size,
 )
 from torchrl_osr.objectives.mixed_states import States
 from torchrl_osr.objectives.step import (
@@ -175,7 +174,6 @@ class DiscreteOSRLoss(BaseLoss):
         model = inverse_dynamics_network if recovery_weight else None
         if model is not None:
             check_categorical(model, "inverse_dynamics_network")
-            check_same_size(actor_network, model)
         self._hold_actor_critic(
             actor_network,
             qvalue_network,

@@ -18,7 +18,6 @@ from torch.distributions import OneHotCategorical as TorchOneHotCategorical
 from torchrl.data import Bounded, Composite, TensorSpec
 from torchrl.modules import (
     MaskedOneHotCategorical,
-    NormalParamExtractor,
     OneHotCategorical,
     TanhNormal,
 )
@@ -112,33 +111,6 @@ def check_action(action: Tensor, action_dim: int, key: NestedKey) -> None:
             f"{key!r} has shape {tuple(action.shape)}, but the network's actions have "
             f"{action_dim} dimensions."
         )
-
-
-def _action_size(network: TensorDictModuleBase) -> int | None:
-    """Return the size of a network's actions, where its last layers tell."""
-    kinds = (nn.Linear, NormalParamExtractor)
-    layers = [layer for layer in network.modules() if isinstance(layer, kinds)]
-    if layers and isinstance(layers[-1], nn.Linear):
-        categorical = is_categorical(network)
-        return int(layers[-1].out_features) if categorical else None
-    if len(layers) > 1 and isinstance(layers[-2], nn.Linear):
-        return int(layers[-2].out_features) // 2
-    return None
-
-
-def check_same_size(
-    actor_network: TensorDictModuleBase, inverse_dynamics_network: TensorDictModuleBase
-) -> None:
-    """Raise unless policy and inverse dynamics model have actions of one size.
-
-    Where the networks do not tell, the losses compare what they compute.
-
-    Raises:
-        ValueError: naming both sizes.
-    """
-    policy, model = _action_size(actor_network), _action_size(inverse_dynamics_network)
-    if policy is not None and model is not None:
-        check_num_actions("inverse_dynamics_network", model, policy)
 
 
 def check_num_actions(name: str, number: int, policy: int) -> None:

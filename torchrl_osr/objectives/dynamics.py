@@ -16,6 +16,7 @@ from torchrl_osr._entries import nested
 from torchrl_osr.functional import gaussian_error
 from torchrl_osr.modules.dynamics import DynamicsEnsemble, has_next_state
 from torchrl_osr.objectives.base import BaseLoss
+from torchrl_osr.objectives.mixed_states import check_single_steps, first_step
 
 
 class DynamicsLoss(BaseLoss):
@@ -103,6 +104,8 @@ class DynamicsLoss(BaseLoss):
             tensordict: a batch ``[B]`` with the entries of :attr:`in_keys`.
         """
         self._check_not_empty(tensordict)
+        tensordict = first_step(tensordict)
+        check_single_steps(tensordict, "the model of the dynamics")
         model, rows = self.dynamics_network, tensordict.batch_size.numel()
         if rows % model.num_networks:
             raise ValueError(

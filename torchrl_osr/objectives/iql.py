@@ -13,7 +13,8 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, d
 from torchrl import objectives
 
 from torchrl_osr._checks import check_literals, check_positive, check_weight
-from torchrl_osr._entries import nested, state_keys
+from torchrl_osr._entries import column, nested, state_keys
+from torchrl_osr.objectives.mixed_states import next_state
 
 
 class IQLLoss(objectives.IQLLoss):
@@ -121,10 +122,18 @@ class IQLLoss(objectives.IQLLoss):
         Args:
             tensordict: a batch ``[B]`` with the entries of ``in_keys``.
         """
-        own = tensordict.copy()
+        if "imagined" in tensordict:
+            raise ValueError(
+                "the batch has imagined rows, and IQL learns from the data's actions "
+                "alone: leave out the roll-outs of a model."
+            )
+        own, keys = tensordict.copy(), self.tensor_keys
+        # TorchRL 0.14.1 multiplies the value there by 0, which leaves a NaN one.
+        terminated = column(own, nested("next", keys.terminated)).bool()
+        for key in state_keys(self.value_network.in_keys):
+            own.set(nested("next", key), next_state(own, key, terminated))
         losses: TensorDictBase = super().forward(own)
-        key = self.tensor_keys.priority
-        tensordict.set(key, own.get(key))
+        tensordict.set(keys.priority, own.get(keys.priority))
         if "entropy" in losses:
             # TorchRL's name for minus the log-density of the data's action.
             losses.rename_key_("entropy", "nll")

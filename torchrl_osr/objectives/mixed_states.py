@@ -19,8 +19,6 @@ from torchrl_osr._entries import column, entry, is_next, nested, select, state_k
 States = Literal["both", "clean", "perturbed"]
 """The states of D_tot on which a term is taken."""
 
-STATES = ("both", "clean", "perturbed")
-
 
 def perturbed_state(
     tensordict: TensorDictBase, keys: Sequence[NestedKey], perturbed: NestedKey
@@ -91,6 +89,27 @@ def first_step(tensordict: TensorDictBase) -> TensorDictBase:
     return tensordict.exclude("steps_to_next_obs").set("next", tensordict["one_step"])
 
 
+def check_single_steps(tensordict: TensorDictBase, reader: str) -> None:
+    """Raise where a next state is not the one that an action has led to.
+
+    Args:
+        tensordict: a batch ``[B]``, see :func:`first_step`.
+        reader: what reads it.
+
+    Raises:
+        ValueError: if some next states are several steps ahead.
+    """
+    steps = tensordict.get("steps_to_next_obs", None)
+    # Tracing cannot branch on a number; the first, eager call has looked.
+    if steps is not None and not torch.compiler.is_compiling() and (steps > 1).any():
+        raise ValueError(
+            f"The batch holds multi-step transitions (steps_to_next_obs up to "
+            f"{int(steps.max())}), but {reader} reads the state one step ahead: leave "
+            "MultiStep out of the buffer, or that term out of the loss "
+            "(recovery_weight=0, correction_weight=0)."
+        )
+
+
 def of_data(tensordict: TensorDictBase) -> Tensor | None:
     """Which rows have an action of the data, bool ``[B]``; ``None`` if all have.
 
@@ -126,15 +145,7 @@ def transitions(
     Raises:
         ValueError: if the next states are several steps ahead.
     """
-    steps = tensordict.get("steps_to_next_obs", None)
-    # Tracing cannot branch on a number; the first, eager call has looked.
-    if steps is not None and not torch.compiler.is_compiling() and (steps > 1).any():
-        raise ValueError(
-            f"The batch holds multi-step transitions (steps_to_next_obs up to "
-            f"{int(steps.max())}), but the inverse dynamics model tells which action "
-            "leads to the *next* state: leave MultiStep out of the buffer, or train "
-            "without the recovery term (recovery_weight=0)."
-        )
+    check_single_steps(tensordict, "the inverse dynamics model")
     keys = state_keys(in_keys)
     stack = []
     if states != "perturbed":

@@ -78,8 +78,8 @@ class OSRLoss(BaseLoss):
             behaviour cloning, noisy on D_tot: OSR without its model.
         recovery_states: where the recovery term is taken: ``"both"`` (default) for
             D_tot, ``"perturbed"`` or ``"clean"`` states alone.
-        action_reduction: of the divergence over action dimensions: ``"sum"`` (default,
-            the paper's) or ``"mean"`` (the released code's).
+        action_reduction: of the recovery term over action dimensions: ``"sum"``
+            (default, the paper's) or ``"mean"`` (the released code's).
         actor_states: where the policy seeks values, whatever the recovery term does:
             ``"both"`` (default) for D_tot, ``"clean"`` or ``"perturbed"`` states alone.
         min_q_weight: :math:`\alpha`, weight of the conservative term. Default 5.0. May
@@ -312,7 +312,8 @@ class OSRLoss(BaseLoss):
         pi = step.policy(self.recovery_states)
         if self.recovery_target == "data":
             log_prob: Tensor = pi.log_prob(step.data_action.expand_as(pi.loc))
-            return -log_prob
+            terms = pi.loc.shape[-1] if self.action_reduction == "mean" else 1
+            return -log_prob / terms
         model = step.inverse_dynamics(self.recovery_states)
         sizes = model.loc.shape[-1], pi.loc.shape[-1]
         check_num_actions("inverse_dynamics_network", *sizes)

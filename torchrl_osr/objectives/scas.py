@@ -16,11 +16,12 @@ from torch import Tensor
 
 from torchrl_osr import functional
 from torchrl_osr._checks import check_literals, check_positive, check_weight
-from torchrl_osr._entries import entry, nested
+from torchrl_osr._entries import entry, nested, select
 from torchrl_osr.modules.dynamics import DynamicsEnsemble
 from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
 from torchrl_osr.objectives.distributions import check_action
-from torchrl_osr.objectives.step import Step, actor_critic_in_keys
+from torchrl_osr.objectives.mixed_states import check_single_steps, next_state
+from torchrl_osr.objectives.step import Step, actor_critic_in_keys, observation_keys
 from torchrl_osr.objectives.td3_bc import check_smoothing, smoothed_action_and_value
 
 
@@ -72,7 +73,7 @@ class SCASLoss(BaseLoss):
 
     Raises:
         ValueError: if an option is out of its range; in the call, if the batch is
-            empty.
+            empty, or holds multi-step transitions without their single steps.
         KeyError: in the call, if the batch has no perturbed states.
 
     Examples:
@@ -193,7 +194,11 @@ class SCASLoss(BaseLoss):
     @torch.no_grad()
     def _weight(self, step: Step, value: Tensor) -> Tensor:
         """Weight of each row's correction, ``[B]``, from the value of its state."""
-        after = step.states[1]
+        # Of single steps, as the correction: not step.states[1].
+        keys = observation_keys(self)
+        after = select(step.first, keys)
+        for key in keys:
+            after.set(key, next_state(step.first, key, step.done))
         action = step.action(after, self.actor_network_params)
         next_value = step.qvalue(after, action, self.qvalue_network_params).mean(0)
         return functional.value_gain_weight(
@@ -212,6 +217,7 @@ class SCASLoss(BaseLoss):
             return state + mean[model.elites].mean(0)[..., :-1]
 
     def _data_next_state(self, step: Step) -> Tensor:
+        check_single_steps(step.first, "the model of the dynamics")
         key = nested("next", self.dynamics_network.in_keys[0])
         found = entry(step.first, key)
         # What follows an end may be anything, and 0 * nan is nan in the backward pass.

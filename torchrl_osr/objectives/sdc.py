@@ -138,8 +138,8 @@ class SDCLoss(OSRLoss):
             deviation, self.log_multiplier, self.threshold
         )
         for name, term in zip(("deviation", "multiplier"), terms, strict=True):
-            losses[f"loss_{name}"] = step.reduce(term)
-        metrics["deviation"] = step.mean(deviation)
+            losses[f"loss_{name}"] = self._reduce(term, step.tensordict, step.of_data)
+        metrics["deviation"] = self._mean(deviation, step.tensordict, step.of_data)
         metrics["multiplier"] = self.log_multiplier.detach().exp()
         return losses, metrics
 

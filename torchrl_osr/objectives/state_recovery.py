@@ -33,7 +33,6 @@ from torchrl_osr.objectives.distributions import (
     action_bounds,
     check_num_actions,
     check_same_bounds,
-    check_same_size,
     head_of,
 )
 from torchrl_osr.objectives.mixed_states import (
@@ -206,7 +205,6 @@ class StateRecoveryLoss(BaseLoss):
         self.register_buffer("action_high", high, persistent=False)
         if not (self.is_deterministic or self.is_normal):
             check_same_bounds(action_bounds(network, "actor_network"), bounds)
-            check_same_size(network, model)
         elif self.has_distribution and not self.is_normal:
             kwargs = {"low": -1.0, "high": 1.0} | head_of(network)[1]
             low, high = (torch.as_tensor(kwargs[key]) for key in ("low", "high"))
@@ -258,7 +256,7 @@ class StateRecoveryLoss(BaseLoss):
             action = entry(tensordict, self.tensor_keys.action)
             pi = self._policy(mixed)
             divergence = cloning_distance(pi, action, self.tensor_keys.action).mean(0)
-            if self.is_deterministic and self.action_reduction == "mean":
+            if self.action_reduction == "mean":
                 divergence = divergence / action.shape[-1]
         else:
             model: TanhNormal = frozen_distribution(

@@ -18,6 +18,7 @@ from tensordict.nn import (
 )
 from torch import Tensor
 from torchrl.objectives import distance_loss
+from torchrl.objectives.value import TD0Estimator
 
 from torchrl_osr import functional
 from torchrl_osr._entries import column, entry, nested, select, state_keys
@@ -275,13 +276,21 @@ class Step:
         r"""The TD target :math:`r + \gamma (1 - \text{terminated}) V(s')`, ``[B]``.
 
         Computed by the value estimator that ``make_value_estimator`` chose; this is
-        TD(0), the default. ``terminated``, not ``done``: a time-out cuts the recording,
-        not the task.
+        TD(0), the default. The others need trajectories, ``[B, T]``. ``terminated``,
+        not ``done``: a time-out cuts the recording, not the task.
 
         Args:
             next_value: :math:`V(s')`, ``[B]``.
         """
         loss = self.loss
+        if self.tensordict.ndim < 2 and not isinstance(
+            loss.value_estimator, TD0Estimator
+        ):
+            raise ValueError(
+                f"{type(loss.value_estimator).__name__} reads the rows of a batch as "
+                "one trajectory: expected a batch [B, T] of trajectories, got "
+                f"{[*self.tensordict.batch_size]}; use the default, TD(0)."
+            )
         column(self.tensordict, nested("next", loss.tensor_keys.reward))
         batch = self.tensordict.copy()
         key = nested("next", loss.value_estimator.tensor_keys.value)

@@ -64,6 +64,11 @@ def policy_from_loss(
             f"the actor of a policy ends in one of {DISTRIBUTIONS}, as those of "
             "torchrl_osr.modules; this one has no distribution."
         )
+    if observation_norm is not None and not observation_norm.standard_normal:
+        raise ValueError(
+            "a policy standardises as ObservationNorm(standard_normal=True) does, "
+            "(observation - loc) / scale; this transform is the other way round."
+        )
     actor, prefix = _mlp(loss.actor_network)
     distribution = loss.actor_network[-1].distribution_class.__name__
     # A policy acts by the mean of a Gaussian actor, which ends in a tanh.

@@ -48,8 +48,8 @@ def load_switching_policy(
     Raises:
         FileNotFoundError: there is no such run, or a judge has no model.
         ValueError: there is no run, they are of different tasks or discounts, their
-            actions are discrete, a judge has no critics or a model that runs backwards,
-            or the models' layers differ.
+            actions are discrete, the judges' rewards are in different units, a judge
+            has no critics or a model that runs backwards, or the models' layers differ.
     """
     paths = [Path(each) for each in runs]
     judging = paths if judges is None else [Path(each) for each in judges]
@@ -75,6 +75,12 @@ def load_switching_policy(
         return torch.stack(values).mean(0)
 
     configs = [read_run(run_folder_of(each) / CONFIG, trust) for each in judging]
+    units = {(each.data.reward_scale, each.data.reward_shift) for each in configs}
+    if len(units) > 1:
+        raise ValueError(
+            "the judges predict and value rewards in different units: their "
+            f"data.reward_scale and data.reward_shift are {sorted(units)}."
+        )
     networks = None
     if not critics_only:
         parts = map(_networks, judging, configs, critics)
