@@ -23,7 +23,6 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-import numpy as np
 from tables import table
 
 from torchrl_osr.evaluation.recoverable import (
@@ -164,7 +163,7 @@ def by_kind(path: Path) -> str:
                 more = (ours - mine.loc[second]).dropna()
                 row[gained] = percent(saved_share(more, walk), len(more))
             both = theirs.index.intersection(ours.index)
-            share = ours.loc[both], theirs.loc[both], np.ones(of.sum())
+            share = ours.loc[both], theirs.loc[both]
             if len(both):
                 with suppress(ValueError):  # cloning saves all, at least in a resample
                     row["R %"] = percent(recovered_share(*share, walk), len(both))

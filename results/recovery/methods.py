@@ -102,9 +102,11 @@ the planner's ways, with the expert's, or for look-ahead with shuffled predictio
 *R*: what is saved of the losses of noisy cloning of as many episodes and the better
 width, or, for ways and look-ahead, of 100 episodes (the ways' study). Demonstrations
 are of 20 episodes but where it says otherwise. A *choice* is among the policies of
-several runs, as many *sets* of them as were played: *less one of them*, their mean;
-*less shuffled*, as many of them chosen by shuffled predictions; intervals are over
-walks alone, but for the shares of one of them, and R is of step 5's noisy cloning."""
+several runs, as many *sets* of them as were played: *less one of them*, the mean of
+the set; *less shuffled*, the same chosen between by shuffled predictions; intervals
+resample sets (of *one*, the policies) and walks, with one set walks alone, so that
+another set may differ by more. R is against step 5's noisy cloning, whose seeds are
+resampled, too."""
 
 
 def told(share: tuple[float, float, float]) -> str:
@@ -173,7 +175,7 @@ def rows_of(
             )
             walk = states.walk[hard]
             if column == "R":
-                share = recovered_share(ours, theirs, np.ones(hard.sum()), walk)
+                share = recovered_share(ours, theirs, walk)
             else:
                 share = saved_share(ours - theirs, walk)
             row[column] = told(share)
@@ -193,8 +195,8 @@ def rows_of_choice(
 ) -> list[dict]:
     """A row for each arm of ``choice.py``.
 
-    R is against ``noisy``: how often noisy cloning comes back from each of the
-    recoverable states, ``[m]``. Intervals are over walks.
+    R is against ``noisy``: how often each seed of noisy cloning comes back from each of
+    the recoverable states, ``[N, m]``.
     """
     found: dict[tuple[str, str, int], dict[str, list[dict]]] = {}
     for line in lines:
@@ -206,33 +208,34 @@ def rows_of_choice(
     hard = GROUPS[-1]
 
     def bits(
-        key: tuple[str, str, int], group: str, seeds: set[int]
+        key: tuple[str, str, int], group: str, sets: list[list]
     ) -> NDArray[np.float64]:
-        """Which states of a group these seeds' policies save, line by line."""
+        """How often each set's policies save each state of a group, ``[sets, m]``."""
         played = found.get(key, {}).get(group, [])
-        mine = [line["saved"] for line in played if seeds.issuperset(line["seeds"])]
-        return np.array([[int(bit) for bit in saved] for saved in mine], float)
+        mine = [
+            [line["saved"] for line in played if {*each}.issuperset(line["seeds"])]
+            for each in sets
+        ]
+        return np.array(
+            [np.mean([[*map(int, bits)] for bits in each], 0) for each in mine if each]
+        )
 
     rows = []
     for key, groups in found.items():
         arm, kind, count = key
         row: dict = {"arm": arm, "policies": f"{count} of {kind}"}
         row["sets"] = len(groups[hard])
-        seeds = {seed for line in groups[hard] for seed in line["seeds"]}
+        sets = [line["seeds"] for line in groups[hard]]
         for group in reversed(GROUPS):
-            mine = bits(key, group, seeds)
-            if mine.size and arm != "one":
-                mine = mine.mean(0, keepdims=True)
+            mine = bits(key, group, sets)
             row[group] = told(saved_share(mine, walks[group])) if mine.size else ""
-        mine = bits(key, hard, seeds).mean(0, keepdims=True)
+        mine = bits(key, hard, sets)
         others = {"one of them": ("one", kind, 1), "shuffled": (SHUFFLED, kind, count)}
         for name, other in others.items():
-            theirs, row[f"less {name}"] = bits(other, hard, seeds), ""
-            if key != other and theirs.size:
-                more = mine - theirs.mean(0, keepdims=True)
-                row[f"less {name}"] = told(saved_share(more, walks[hard]))
-        everything = np.ones(len(walks[hard]))
-        share = recovered_share(mine, noisy[None], everything, walks[hard])
+            theirs, row[f"less {name}"] = bits(other, hard, sets), ""
+            if key != other and len(theirs) == len(mine):
+                row[f"less {name}"] = told(saved_share(mine - theirs, walks[hard]))
+        share = recovered_share(mine, noisy, walks[hard], paired=False)
         row["R"] = told(share)
         values = [x["undisturbed"] for x in groups.get("easy", [])]
         row["undisturbed"] = f"{np.mean(values):.1f}" if values else ""
@@ -246,7 +249,7 @@ def kinds_of_choice(
 ) -> list[dict]:
     """A row for each kind of disturbance: the models' choice among five, and one.
 
-    Intervals are over walks; R has none where noisy cloning saves all in a resample.
+    R has no interval where noisy cloning saves all in a resample.
     """
     hard = states.group == GROUPS[-1]
     bits = {
@@ -267,28 +270,26 @@ def kinds_of_choice(
     for kind in sorted(set(kinds)):
         of = kinds == kind
         walk = states.walk[hard][of]
-        one, mine = (table[:, of].mean(0, keepdims=True) for table in bits.values())
+        one, mine = (table[:, of] for table in bits.values())
         row = {"kind": kind, "states": of.sum()}
-        row |= {"noisy cloning": told(saved_share(noisy[None, of], walk))}
+        row |= {"noisy cloning": told(saved_share(noisy[:, of], walk))}
         row |= {"one": told(saved_share(one, walk))}
         row |= {CHOICE: told(saved_share(mine, walk)), "R": ""}
         with suppress(ValueError):
-            row["R"] = told(
-                recovered_share(mine, noisy[None, of], np.ones(of.sum()), walk)
-            )
+            row["R"] = told(recovered_share(mine, noisy[:, of], walk, paired=False))
         rows.append(row)
     return rows
 
 
 def noisy_cloning(states: RecoverableStates, half: str) -> NDArray[np.float64]:
-    """How often step 5's noisy cloning comes back from the recoverable states."""
+    """How often each seed of step 5's noisy cloning comes back, ``[N, m]``."""
     sources = ["imagination"] if half == "public" else LOOKS
     tables = read_runs([FOLDER / f"{source}.jsonl.gz" for source in sources])
     wanted = f"{states.env_name} medium-expert", half
     for data, name, of_each, back in came_back(tables):
         if (data, name.split()[0]) == wanted:
             hard = (of_each["group"] == GROUPS[-1]).to_numpy()
-            return back.loc[REFERENCE].to_numpy()[:, hard].mean(0)
+            return back.loc[REFERENCE].to_numpy()[:, hard]
     raise ValueError(f"{sources}: nothing of the {half} half of {states.env_name}.")
 
 
