@@ -39,9 +39,13 @@ def test_coverage_of_a_normal_sample():
 
 
 @pytest.mark.parametrize("values", [[], [1.0, np.nan], [np.inf]])
-def test_no_or_non_finite_values_are_an_error(values):
+@pytest.mark.parametrize(
+    "statistic",
+    [mean_interval, interquartile_mean, lambda sample: performance_profile(sample, [0])],
+)
+def test_no_or_non_finite_values_are_an_error(statistic, values):
     with pytest.raises(ValueError, match="finite"):
-        mean_interval(values)
+        statistic(values)
 
 
 def test_interquartile_mean_is_that_of_the_sorted_middle():

@@ -39,9 +39,7 @@ def mean_interval(values: ArrayLike) -> tuple[float, float, float]:
         >>> mean, low <= mean <= high
         (2.5, True)
     """
-    sample = np.asarray(values, dtype=np.float64).ravel()
-    if not sample.size or not np.isfinite(sample).all():
-        raise ValueError(f"mean_interval needs finite values, got {sample}.")
+    sample = _finite(values, "mean_interval").ravel()
     low, high = percentile_interval(stratified_resamples([sample]).mean(1))
     return float(sample.mean()), float(low), float(high)
 
@@ -154,11 +152,14 @@ def interquartile_mean(values: ArrayLike) -> NDArray[np.float64]:
     As rliable has it (Agarwal et al., 2021, https://arxiv.org/abs/2108.13264): of ``N``
     values ``N // 4`` are left out at each end.
 
+    Raises:
+        ValueError: if there are no values, or some are not finite.
+
     Examples:
         >>> float(interquartile_mean([0.0, 3.0, 5.0, 1000.0]))
         4.0
     """
-    ordered = np.sort(np.asarray(values, dtype=np.float64), axis=-1)
+    ordered = np.sort(_finite(values, "interquartile_mean"), axis=-1)
     cut = ordered.shape[-1] // 4
     mean: NDArray[np.float64] = ordered[..., cut : ordered.shape[-1] - cut].mean(-1)
     return mean
@@ -176,11 +177,21 @@ def performance_profile(
     Returns:
         Shares between 0 and 1, ``[..., T]``.
 
+    Raises:
+        ValueError: if there are no values, or some are not finite.
+
     Examples:
         >>> performance_profile([10.0, 20.0, 30.0, 40.0], [0.0, 20.0, 50.0]).tolist()
         [1.0, 0.5, 0.0]
     """
-    table = np.asarray(values, dtype=np.float64)
+    table = _finite(values, "performance_profile")
     # One threshold after the other: all at once would fill the memory.
     shares = [(table > each).mean(-1) for each in np.asarray(thresholds)]
     return np.stack(shares, axis=-1)
+
+
+def _finite(values: ArrayLike, name: str) -> NDArray[np.float64]:
+    table = np.asarray(values, dtype=np.float64)
+    if not table.size or not np.isfinite(table).all():
+        raise ValueError(f"{name} needs finite values, got {table}.")
+    return table
