@@ -41,7 +41,7 @@ def test_coverage_of_a_normal_sample():
 @pytest.mark.parametrize("values", [[], [1.0, np.nan], [np.inf]])
 @pytest.mark.parametrize(
     "statistic",
-    [mean_interval, interquartile_mean, lambda sample: performance_profile(sample, [0])],
+    [mean_interval, interquartile_mean, lambda each: performance_profile(each, [0])],
 )
 def test_no_or_non_finite_values_are_an_error(statistic, values):
     with pytest.raises(ValueError, match="finite"):
