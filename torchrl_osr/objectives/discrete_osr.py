@@ -224,7 +224,7 @@ class DiscreteOSRLoss(BaseLoss):
         losses = {
             "loss_actor": actor,
             "loss_alpha": self.alpha_loss(step, pi),
-            "loss_qvalue": self.qvalue_loss(step, pred_value, target_value),
+            "loss_qvalue": step.reduce(step.td_distance(pred_value, target_value)),
         }
         if self.has_cql:
             losses["loss_cql"] = self.cql_loss(step, qvalue, pred_value)
@@ -307,10 +307,3 @@ class DiscreteOSRLoss(BaseLoss):
         qvalue = self._action_values(step.at("next"), params, pi)
         next_value = -functional.discrete_policy_value(pi.logits, qvalue, 0.0)
         return step.td_target(next_value.squeeze(0))
-
-    def qvalue_loss(
-        self, step: Step, pred_value: Tensor, target_value: Tensor
-    ) -> Tensor:
-        """Sum over critics of the TD distance, equation (2)."""
-        distance = step.td_distance(pred_value, target_value)
-        return step.reduce(distance)

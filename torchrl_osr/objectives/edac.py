@@ -17,13 +17,11 @@ from tensordict.nn import (
     dispatch,
 )
 from torch import Tensor
-from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives.utils import _vmap_func
 
 from torchrl_osr import functional
 from torchrl_osr._checks import check_literals, check_weight
 from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
-from torchrl_osr.objectives.distributions import check_action
 from torchrl_osr.objectives.step import Step, actor_critic_in_keys, critic_inputs
 
 
@@ -141,13 +139,14 @@ class EDACLoss(BaseLoss):
             tensordict: a batch ``[B]`` with the entries of ``in_keys``.
         """
         step = Step(self, tensordict, perturbed=False)
-        actor, log_prob = self.actor_loss(step)
-        alpha = self.alpha_loss(step, log_prob)
+        objective, log_prob = step.soft_objective("clean")
+        actor, alpha = step.reduce(objective), step.temperature_loss(log_prob)
         params = self.qvalue_network_params
         pred_value = step.qvalue(step.states[0], step.data_action, params)
         diversity = functional.gradient_diversity(self._action_gradients(step))
-        target_value = self._target_value(step)
-        qvalue = self.qvalue_loss(step, pred_value, target_value, diversity)
+        target_value = step.soft_target()
+        distance = step.td_distance(pred_value, target_value)
+        qvalue = step.reduce(distance + self.diversity_weight * diversity)
         step.write_priority(pred_value, target_value)
         losses = {"loss_actor": actor, "loss_alpha": alpha, "loss_qvalue": qvalue}
         metrics = {
@@ -158,20 +157,6 @@ class EDACLoss(BaseLoss):
             "diversity": step.mean(diversity),
         }
         return self._output(tensordict, losses, metrics)
-
-    def actor_loss(self, step: Step) -> tuple[Tensor, Tensor]:
-        r""":math:`L_\pi`, and the log-density of the policy's own actions."""
-        action, log_prob = rsample_and_log_prob(step.policy("clean"))
-        check_action(step.data_action, action.shape[-1], self.tensor_keys.action)
-        params = self.qvalue_network_params.detach()
-        qvalue = step.qvalue(step.at("clean"), action, params)
-        alpha = self._alpha
-        objective = functional.soft_policy_value(log_prob, qvalue, alpha)
-        return step.reduce(objective.mean(0)), log_prob
-
-    def alpha_loss(self, step: Step, log_prob: Tensor) -> Tensor:
-        """SAC's objective of the entropy temperature."""
-        return step.temperature_loss(log_prob, auto=-step.data_action.shape[-1])
 
     def _action_gradients(self, step: Step) -> Tensor:
         """Gradient of each critic by the data's action, ``[N, B, A]``."""
@@ -190,20 +175,3 @@ class EDACLoss(BaseLoss):
         # differentiated once more.
         gradient: Tensor = torch.func.grad(total)(action.expand(number, *action.shape))
         return gradient
-
-    @torch.no_grad()
-    def _target_value(self, step: Step) -> Tensor:
-        """The TD target with SAC's entropy, ``[B]``."""
-        action, log_prob = rsample_and_log_prob(step.policy("next"))
-        params = self.target_qvalue_network_params
-        qvalue = step.qvalue(step.at("next"), action, params)
-        alpha = self._alpha
-        next_value = functional.bootstrap_value(qvalue, log_prob, alpha)
-        return step.td_target(next_value.squeeze(0))
-
-    def qvalue_loss(
-        self, step: Step, pred_value: Tensor, target_value: Tensor, diversity: Tensor
-    ) -> Tensor:
-        """:math:`L_Q`: the TD distance and the similarity of the gradients."""
-        distance = step.td_distance(pred_value, target_value)
-        return step.reduce(distance + self.diversity_weight * diversity)

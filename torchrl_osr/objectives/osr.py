@@ -26,7 +26,7 @@ from torchrl_osr import functional
 from torchrl_osr._checks import check_literals, check_positive, check_weight
 from torchrl_osr.objectives import critic_kernel
 from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
-from torchrl_osr.objectives.distributions import check_action, check_num_actions
+from torchrl_osr.objectives.distributions import check_num_actions
 from torchrl_osr.objectives.mixed_states import States
 from torchrl_osr.objectives.step import (
     Step,
@@ -269,10 +269,10 @@ class OSRLoss(BaseLoss):
     def _terms(self, step: Step) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """The losses and the metrics, by name."""
         actor, log_prob, metrics = self.actor_loss(step)
-        alpha = self.alpha_loss(step, log_prob)
+        alpha = step.temperature_loss(log_prob)
         pred_value, cql, cql_metrics = self.cql_loss(step)
         target_value = self._target_value(step)
-        qvalue = self.qvalue_loss(step, pred_value, target_value)
+        qvalue = step.reduce(step.td_distance(pred_value, target_value))
         step.write_priority(pred_value, target_value)
         losses = {"loss_actor": actor, "loss_alpha": alpha, "loss_qvalue": qvalue} | cql
         metrics = {
@@ -291,15 +291,8 @@ class OSRLoss(BaseLoss):
         Returns:
             The loss, the log-density of the policy's own actions ``[D, B]``, metrics.
         """
-        pi = step.policy(self.actor_states)
-        action, log_prob = rsample_and_log_prob(pi)
-        check_action(step.data_action, action.shape[-1], self.tensor_keys.action)
-        # Detached: the policy's objective shall not train the critics.
-        params = self.qvalue_network_params.detach()
-        qvalue = step.qvalue(step.at(self.actor_states), action, params)
-        alpha = self._alpha
-        objective = functional.soft_policy_value(log_prob, qvalue, alpha)
-        loss, metrics = step.reduce(objective.mean(0)), {}
+        objective, log_prob = step.soft_objective(self.actor_states)
+        loss, metrics = step.reduce(objective), {}
         if self.has_recovery:
             recovery = self._recovery_divergence(step).mean(0)
             term = step.reduce(recovery, transitions=True)
@@ -325,10 +318,6 @@ class OSRLoss(BaseLoss):
             direction=self.recovery_direction,
             action_reduction=self.action_reduction,
         )
-
-    def alpha_loss(self, step: Step, log_prob: Tensor) -> Tensor:
-        """SAC's objective of the entropy temperature."""
-        return step.temperature_loss(log_prob, auto=-step.data_action.shape[-1])
 
     def cql_loss(
         self, step: Step
@@ -422,10 +411,3 @@ class OSRLoss(BaseLoss):
             alpha = self._alpha
             next_value = functional.bootstrap_value(qvalue, log_prob, alpha)
         return step.td_target(next_value.squeeze(0))
-
-    def qvalue_loss(
-        self, step: Step, pred_value: Tensor, target_value: Tensor
-    ) -> Tensor:
-        """Sum over critics of the TD distance, equation (2)."""
-        distance = step.td_distance(pred_value, target_value)
-        return step.reduce(distance)

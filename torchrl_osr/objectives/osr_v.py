@@ -23,7 +23,7 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl_osr import functional
 from torchrl_osr._checks import check_literals, check_positive, check_weight
 from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
-from torchrl_osr.objectives.distributions import check_action, check_num_actions
+from torchrl_osr.objectives.distributions import check_num_actions
 from torchrl_osr.objectives.step import Step, actor_critic_in_keys, uniform_actions
 
 _NO_CQL = "the constraint of weight recovery_weight stands in the place of CQL's term"
@@ -198,11 +198,14 @@ class OSRVLoss(BaseLoss):
             tensordict: a batch ``[B]`` with the entries of ``in_keys``.
         """
         step = Step(self, tensordict, perturbed=True)
-        actor, log_prob = self.actor_loss(step)
-        alpha = self.alpha_loss(step, log_prob)
+        objective, log_prob = step.soft_objective("both")
+        actor, alpha = step.reduce(objective), step.temperature_loss(log_prob)
         pred_value, gap = self._data_qvalue_and_gap(step)
         target_value = self._target_value(step)
-        qvalue = self.qvalue_loss(step, pred_value, target_value, gap)
+        # The paper prints OSR-v's TD error without the square; (2) has it.
+        distance = step.reduce(step.td_distance(pred_value, target_value))
+        constraint = step.reduce(gap, transitions=True)
+        qvalue = distance + self.recovery_weight * constraint
         step.write_priority(pred_value, target_value)
         losses = {"loss_actor": actor, "loss_alpha": alpha, "loss_qvalue": qvalue}
         metrics = {
@@ -213,21 +216,6 @@ class OSRVLoss(BaseLoss):
             "recovery_gap": step.mean(gap, transitions=True),
         }
         return self._output(tensordict, losses, metrics)
-
-    def actor_loss(self, step: Step) -> tuple[Tensor, Tensor]:
-        r""":math:`L_\pi` on D_tot, and the log-density of the policy's own actions."""
-        action, log_prob = rsample_and_log_prob(step.policy("both"))
-        check_action(step.data_action, action.shape[-1], self.tensor_keys.action)
-        # Detached: the policy's objective shall not train the critics.
-        params = self.qvalue_network_params.detach()
-        qvalue = step.qvalue(step.at("both"), action, params)
-        alpha = self._alpha
-        objective = functional.soft_policy_value(log_prob, qvalue, alpha)
-        return step.reduce(objective.mean(0)), log_prob
-
-    def alpha_loss(self, step: Step, log_prob: Tensor) -> Tensor:
-        """SAC's objective of the entropy temperature."""
-        return step.temperature_loss(log_prob, auto=-step.data_action.shape[-1])
 
     @torch.no_grad()
     def _candidates(self, step: Step) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -288,15 +276,3 @@ class OSRVLoss(BaseLoss):
         params = self.target_qvalue_network_params
         qvalue = step.qvalue(step.at("next"), action, params)
         return step.td_target(functional.bootstrap_value(qvalue).squeeze(0))
-
-    def qvalue_loss(
-        self, step: Step, pred_value: Tensor, target_value: Tensor, gap: Tensor
-    ) -> Tensor:
-        """:math:`L_Q`: the TD distance, equation (2), and the constraint (8).
-
-        The paper prints OSR-v's TD error without the square; (2) has it.
-        """
-        distance = step.td_distance(pred_value, target_value)
-        constraint = step.reduce(gap, transitions=True)
-        loss: Tensor = step.reduce(distance) + self.recovery_weight * constraint
-        return loss

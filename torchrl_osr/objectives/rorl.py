@@ -18,7 +18,6 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl_osr import functional
 from torchrl_osr._checks import check_literals, check_positive, check_weight
 from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
-from torchrl_osr.objectives.distributions import check_action
 from torchrl_osr.objectives.step import (
     Step,
     actor_critic_in_keys,
@@ -191,10 +190,10 @@ class RORLLoss(BaseLoss):
         """
         step = Step(self, tensordict, perturbed=False)
         actor, log_prob, smooth = self.actor_loss(step)
-        alpha = step.temperature_loss(log_prob, auto=-step.data_action.shape[-1])
+        alpha = step.temperature_loss(log_prob)
         params = self.qvalue_network_params
         pred_value = step.qvalue(step.states[0], step.data_action, params)
-        target_value = self._target_value(step)
+        target_value = step.soft_target()
         distance = step.td_distance(pred_value, target_value)
         terms = self._value_terms(step, pred_value)
         weights = {
@@ -220,15 +219,10 @@ class RORLLoss(BaseLoss):
 
     def actor_loss(self, step: Step) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
         r""":math:`L_\pi`, the log-density of the policy's actions, its smoothness."""
-        pi = step.policy("clean")
-        action, log_prob = rsample_and_log_prob(pi)
-        check_action(step.data_action, action.shape[-1], self.tensor_keys.action)
-        # Detached: the policy's objective shall not train the critics.
-        params = self.qvalue_network_params.detach()
-        qvalue = step.qvalue(step.at("clean"), action, params)
-        objective = functional.soft_policy_value(log_prob, qvalue, self._alpha).mean(0)
+        objective, log_prob = step.soft_objective("clean")
         if not self.policy_smooth_reg:
             return step.reduce(objective), log_prob, {}
+        pi = step.policy("clean")
         around = self._policy(self._around(step.states[0], self.policy_smooth_eps))
         divergence = functional.jeffreys_divergence(
             pi.loc, pi.scale, around.loc, around.scale
@@ -236,15 +230,6 @@ class RORLLoss(BaseLoss):
         smoothness = divergence.amax(0)
         objective = objective + self.policy_smooth_reg * smoothness
         return step.reduce(objective), log_prob, {"policy_smoothness": smoothness}
-
-    @torch.no_grad()
-    def _target_value(self, step: Step) -> Tensor:
-        """The TD target with SAC's entropy, ``[B]``."""
-        action, log_prob = rsample_and_log_prob(step.policy("next"))
-        params = self.target_qvalue_network_params
-        qvalue = step.qvalue(step.at("next"), action, params)
-        next_value = functional.bootstrap_value(qvalue, log_prob, self._alpha)
-        return step.td_target(next_value.squeeze(0))
 
     def _value_terms(self, step: Step, pred_value: Tensor) -> dict[str, Tensor]:
         """What is added to the TD distance, unweighted, ``[B]`` each."""

@@ -17,6 +17,7 @@ from tensordict.nn import (
     set_interaction_type,
 )
 from torch import Tensor
+from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import distance_loss
 from torchrl.objectives.value import TD0Estimator
 
@@ -24,6 +25,7 @@ from torchrl_osr import functional
 from torchrl_osr._entries import column, entry, nested, select, state_keys
 from torchrl_osr.objectives import critic_kernel
 from torchrl_osr.objectives.base import BaseLoss
+from torchrl_osr.objectives.distributions import check_action
 from torchrl_osr.objectives.mixed_states import (
     States,
     first_step,
@@ -259,18 +261,47 @@ class Step:
         """The values of all critics, see :func:`qvalue`."""
         return qvalue(self.loss, states, action, params)
 
-    def temperature_loss(self, log_prob: Tensor, *, auto: float) -> Tensor:
+    def soft_objective(self, states: States) -> tuple[Tensor, Tensor]:
+        """SAC's objective of the policy, to be minimised, on a set of states.
+
+        Returns:
+            The objective, ``[B]``, and the log-density of the policy's own actions,
+            ``[D, B]``.
+        """
+        loss = self.loss
+        action, log_prob = rsample_and_log_prob(self.policy(states))
+        check_action(self.data_action, action.shape[-1], loss.tensor_keys.action)
+        # Detached: the policy's objective shall not train the critics.
+        params = loss.qvalue_network_params.detach()
+        qvalue = self.qvalue(self.at(states), action, params)
+        objective = functional.soft_policy_value(log_prob, qvalue, loss._alpha)
+        return objective.mean(0), log_prob
+
+    def temperature_loss(self, log_prob: Tensor, auto: float | None = None) -> Tensor:
         """SAC's objective of the entropy temperature, reduced.
 
         Args:
             log_prob: log-density of the policy's own actions, ``[D, B]``.
-            auto: target that ``target_entropy="auto"`` stands for, in nats.
+            auto: target that ``target_entropy="auto"`` stands for, in nats. Default:
+                minus the number of an action's dimensions.
         """
         wanted = self.loss.target_entropy
+        if wanted == "auto":
+            wanted = -self.data_action.shape[-1] if auto is None else auto
         objective = functional.temperature_objective(
-            self.loss.log_alpha, log_prob, auto if wanted == "auto" else wanted
+            self.loss.log_alpha, log_prob, wanted
         )
         return self.reduce(objective.mean(0))
+
+    def soft_target(self) -> Tensor:
+        """The TD target with SAC's entropy, ``[B]``."""
+        loss = self.loss
+        with torch.no_grad():  # as a decorator here, torch.compile cannot trace it
+            action, log_prob = rsample_and_log_prob(self.target_policy())
+            params = loss.target_qvalue_network_params
+            qvalue = self.qvalue(self.at("next"), action, params)
+            next_value = functional.bootstrap_value(qvalue, log_prob, loss._alpha)
+            return self.td_target(next_value.squeeze(0))
 
     def td_target(self, next_value: Tensor) -> Tensor:
         r"""The TD target :math:`r + \gamma (1 - \text{terminated}) V(s')`, ``[B]``.

@@ -128,7 +128,7 @@ class TD3BCLoss(BaseLoss):
         params = self.qvalue_network_params
         pred_value = step.qvalue(step.states[0], step.data_action, params)
         target_value = self._target_value(step)
-        qvalue = self.qvalue_loss(step, pred_value, target_value)
+        qvalue = step.reduce(step.td_distance(pred_value, target_value))
         step.write_priority(pred_value, target_value)
         metrics = {
             "cloning_error": step.mean(cloning_error),
@@ -158,13 +158,6 @@ class TD3BCLoss(BaseLoss):
         """The TD target, ``[B]``, with target policy smoothing."""
         _, next_value = smoothed_action_and_value(self, step)
         return step.td_target(next_value)
-
-    def qvalue_loss(
-        self, step: Step, pred_value: Tensor, target_value: Tensor
-    ) -> Tensor:
-        """Sum over critics of the TD distance."""
-        distance = step.td_distance(pred_value, target_value)
-        return step.reduce(distance)
 
 
 def check_smoothing(
