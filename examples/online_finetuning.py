@@ -1,7 +1,7 @@
 """A policy that OSR has learnt from data goes on learning in its environment.
 
     torchrl-osr train env=hopper
-    python examples/online_finetuning.py outputs/hopper-medium-replay/seed0-... out/
+    python examples/online_finetuning.py outputs/hopper-medium-replay/osr-seed0-... out/
 
 TorchRL's OfflineToOnlineTrainer collects and mixes: half of every batch is the run's
 data at first, none at the end. The loss is the run's own, with the inverse dynamics

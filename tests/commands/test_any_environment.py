@@ -35,8 +35,8 @@ def trained(folder: Path, *overrides: str) -> Path:
     read_environment(cfg)
     folder.mkdir()
     job = {"overrides": {"task": []}, "runtime": {"choices": {"loss": "osr"}}}
-    run_folder.claim(folder, cfg, OmegaConf.create(job))
-    with run_folder.status(folder):
+    claimed = run_folder.claimed(folder, cfg, OmegaConf.create(job))
+    with claimed, run_folder.status(folder):
         train.run(cfg, folder)
     return folder
 
@@ -135,6 +135,9 @@ def test_what_does_not_fit_is_refused_before_anything(overrides, message):
         (["env=hopper", "path=a.npz", "policy=good"], ValueError, "neither random"),
         (["env=hopper", "path=a.npz", "policy=no:act"], ValueError, "cannot be imp"),
         (["env=hopper", "path=a.npz", "policy=own:no"], ValueError, "cannot be imp"),
+        (["env=hopper", "path=a.npz", "policy=own:act"], ValueError, r"shape \(1,\)"),
+        (["env=hopper", "path=a.npz", "noise=0.1"], ValueError, "random has none"),
+        (["env=hopper", "path=a.npz", "seed=-1"], ValueError, "seed"),
     ],
 )
 def test_collect_refuses_in_a_sentence(

@@ -107,6 +107,8 @@ def test_what_cannot_be_trained_on_is_one_sentence(look, changes, overrides, mes
 
 def test_rolled_out_data_too(look, tmp_path, monkeypatch):
     monkeypatch.setenv("TORCHRL_OSR_CACHE", str(tmp_path / "cache"))
+    mixed = ["data.num_transitions=300", "data.random_share=0.5"]
+    assert look("data=medium", "env=hopper", *mixed)[1] is None
     output, error = look("data=medium", "env=hopper", "data.num_transitions=300")
     assert error is None
     assert "300 rows" in output

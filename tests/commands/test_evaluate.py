@@ -95,7 +95,10 @@ def test_finished_evaluation_is_not_done_again(folder, evaluated, capsys):
     example.main(quiet(*same, "force=true"))
     assert path.stat().st_mtime_ns > before
     assert json.loads(path.read_text()) == content, "the same numbers again"
-    example.main(quiet(*same, "seed=5"))
+    with pytest.raises(ValueError, match=r"other settings \(seed\): force=true"):
+        example.main(quiet(*same, "seed=5"))
+    assert json.loads(path.read_text()) == content
+    example.main(quiet(*same, "seed=5", "force=true"))
     assert json.loads(path.read_text())["evaluations"] != content["evaluations"]
 
 

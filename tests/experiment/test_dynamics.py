@@ -75,8 +75,7 @@ def trained_model(folder: Path) -> dict[str, torch.Tensor]:
 def ran(folder: Path, *overrides: str) -> Path:
     folder.mkdir(exist_ok=True)
     cfg = small(*overrides)
-    run_folder.claim(folder, cfg, {})
-    with run_folder.status(folder):
+    with run_folder.claimed(folder, cfg, {}), run_folder.status(folder):
         train.run(cfg, folder)
     return folder
 
@@ -455,8 +454,17 @@ def test_roll_outs_are_as_published_for_a_data_set() -> None:
 
 
 def test_defaults_are_said(caplog) -> None:
-    choices = {"loss": "mopo", "env": "hopper", "data": "random"}
+    choices = {"loss": "mopo", "env": "hopper", "data": "random", "preset": "quick"}
     check_published(small(), choices)
     assert not caplog.records
     check_published(small("env.id=Pendulum-v1"), choices)
     assert "rollout_steps=5 and dynamics.penalty=2.5 are taken" in caplog.text
+
+
+def test_settings_of_other_data_or_of_another_task_are_refused() -> None:
+    choices = {"loss": "osr", "env": "hopper", "data": "random", "preset": "quick"}
+    with pytest.raises(ValueError, match="data.quality=expert .* give data=expert"):
+        check_published(small("data.quality=expert"), choices)
+    choices["preset/for_data"] = "quick-hopper-random"
+    with pytest.raises(ValueError, match="quick .* for hopper random.*env=halfcheetah"):
+        check_published(small("env.id=HalfCheetah-v5"), choices)

@@ -11,6 +11,7 @@ import sys
 
 import pytest
 from omegaconf import OmegaConf
+from torchrl.checkpoint import CheckpointError
 
 from torchrl_osr.experiment import run_folder
 from torchrl_osr.trainers import Interrupted
@@ -32,7 +33,8 @@ def configured(**changes):
 
 def claim(folder, **changes):
     folder.mkdir(parents=True, exist_ok=True)
-    run_folder.claim(folder, configured(**changes), JOB)
+    with run_folder.claimed(folder, configured(**changes), JOB):
+        pass
 
 
 def resumed(folder, *overrides):
@@ -63,7 +65,6 @@ def test_what_changes_no_update_may_differ(tmp_path, changes):
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"trainer": {"steps": 4}}, r"\(trainer\.steps: 5 there, 4 now\)"),
         ({"seed": 1}, r"\(seed: 0 there, 1 now\)"),
         ({"optim": {"tau": 0.1}}, r"\(optim\.tau: 'nothing' there, 0\.1 now\)"),
     ],
@@ -79,6 +80,27 @@ def test_other_settings_are_refused_by_key_unless_forced(
     claim(tmp_path, **changes, force=True)
     assert "by force=true" in caplog.text
     assert OmegaConf.load(tmp_path / "config.yaml") == configured(**changes)
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_a_run_never_goes_back(tmp_path, force):
+    claim(tmp_path)
+    with pytest.raises(ValueError, match="with trainer.steps=5, and 4 are fewer"):
+        claim(tmp_path, trainer={"steps": 4}, force=force)
+    assert OmegaConf.load(tmp_path / "config.yaml") == CONFIG
+
+
+def test_a_run_whose_checkpoints_do_not_fit_is_what_it_was(tmp_path):
+    claim(tmp_path)
+    (tmp_path / "status.json").write_text('{"status": "done"}')
+    with (
+        pytest.raises(CheckpointError),
+        run_folder.claimed(tmp_path, configured(seed=1, force=True), JOB),
+        run_folder.status(tmp_path),
+    ):
+        raise CheckpointError("5 tensors differ")
+    assert OmegaConf.load(tmp_path / "config.yaml") == CONFIG
+    assert run_folder.read_status(tmp_path) == {"status": "done"}
 
 
 def test_overrides_replace_settings_of_the_run(tmp_path):

@@ -7,15 +7,8 @@ import pytest
 from PIL import Image
 
 from torchrl_osr.data import make_environment
-from torchrl_osr.film import (
-    GIF_STRIDE,
-    Camera,
-    Take,
-    film_gif,
-    film_strip,
-    principal_plane,
-    visited_states,
-)
+from torchrl_osr.film import Camera, Take, film_gif, film_strip, visited_states
+from torchrl_osr.film.pictures import GIF_STRIDE, principal_plane
 
 
 class FakeCamera:

@@ -9,15 +9,8 @@ import torch
 
 from torchrl_osr.envs import ExternalPush
 from torchrl_osr.evaluation import Trajectory
-from torchrl_osr.film import (
-    BEHAVIOR,
-    NEVER,
-    Survival,
-    hand_over,
-    play_takeovers,
-    steps_alive,
-    survival_table,
-)
+from torchrl_osr.film import BEHAVIOR, Survival, play_takeovers, survival_table
+from torchrl_osr.film.takeover import NEVER, hand_over, steps_alive
 
 
 def trajectory(entries: int, *, terminated: bool) -> Trajectory:

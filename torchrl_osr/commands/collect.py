@@ -30,6 +30,7 @@ from torchrl_osr.data.collect.record import (
     write_log,
 )
 from torchrl_osr.experiment import schema
+from torchrl_osr.experiment.limits import check_values
 from torchrl_osr.experiment.run_config import (
     chosen_environment,
     import_from_here,
@@ -44,17 +45,24 @@ schema.register()
 @single_job
 def main(cfg: DictConfig) -> None:
     """Play the episodes, write the log, and say what is in it."""
+    check_values({name: cfg[name] for name in ("episodes", "seed")})
     torch.set_num_threads(1)
     path = Path(cfg.path).expanduser()
     check_log_path(path)
     env_id = chosen_environment(cfg)
     act: Act | None = None
-    if Path(cfg.policy).exists():
+    if cfg.policy == "random":
+        if cfg.noise:
+            raise ValueError(
+                f"noise={cfg.noise} is added to a policy's actions, and policy=random "
+                "has none of its own: leave it out."
+            )
+    elif Path(cfg.policy).exists():
         policy = load_policy(cfg.policy, trust=cfg.trust)
         env_id, act = env_id or environment_of(policy), policy.act
     elif ":" in cfg.policy:
         act = imported(cfg.policy)
-    elif cfg.policy != "random":
+    else:
         raise ValueError(
             f"policy={cfg.policy} is neither random, nor the folder of a run, nor a "
             "function as in policy=my_package:act."

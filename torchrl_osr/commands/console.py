@@ -14,6 +14,13 @@ OURS = (ValueError, OSError, RuntimeError, ImportError, ArithmeticError, MemoryE
 """What this package raises, with a whole sentence; anything else is a defect."""
 
 
+EXTRAS = (
+    *("filelock", "gymnasium", "hydra", "jinja2", "matplotlib", "mujoco"),
+    *("omegaconf", "pandas", "platformdirs", "safetensors", "tqdm"),
+)
+"""Modules that the commands need, and the package without extras does not."""
+
+
 @contextmanager
 def errors_as_sentences() -> Iterator[None]:
     """End the process with a sentence instead of a traceback, and with code 1.
@@ -71,7 +78,7 @@ def sentence(error: Exception) -> str:
     """What went wrong, in words; of a defect also its type and how to see more."""
     if type(error).__module__.startswith(("hydra.", "omegaconf.")):
         return _configuration_error(error)
-    if isinstance(error, ModuleNotFoundError):
+    if isinstance(error, ModuleNotFoundError) and error.name in EXTRAS:
         return f"{error.name!r} is missing: pip install 'torchrl-osr[train]'"
     if isinstance(error, OURS) and str(error):
         return str(error)

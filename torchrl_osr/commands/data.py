@@ -10,7 +10,6 @@ what that refuses is refused here. See docs/your_data.md.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -87,14 +86,14 @@ def main(cfg: DictConfig) -> None:
     except (OSError, ValueError) as error:
         if entries:
             print(entries_table(entries) + "\n")
-        sys.exit(f"{title} cannot be trained on: {error}")
+        raise SystemExit(f"{title} cannot be trained on: {error}") from error
     entries = entries or describe_entries(own_columns(data), {})
     wrong = [*findings(data, manifest, entries)]
     if env_id is not None:
         with closing(make_environment(env_id)) as env:
             space: Any = env.observation_space
         wrong += out_of_space(entries, space.low.tolist(), space.high.tolist())
-    name = title.split(".")[0].replace(" ", "-")
+    name = (title.removesuffix(".gz").rpartition(".")[0] or title).replace(" ", "-")
     picture = Path(cfg.picture or f"{name}-data.png")
     by_part = {part: [e.name for e in entries if e.part == part] for part in PARTS}
     data_figure(data, manifest, by_part, picture, title=title)
@@ -131,7 +130,7 @@ def overview(
         kinds = ("terminated", "truncated", "unmarked")
         numbers = [f"{manifest[f'{kind}_ends']:,} {kind}" for kind in kinds]
         lines.append(f"  ends      {', '.join(numbers)}")
-    known = "complete" if manifest["episode_returns"] else "incomplete"
+    known = "complete" if manifest.get("episode_returns") else "incomplete"
     kept = "episode" if known == "complete" else known
     for label, key in (("length", f"{kept}_lengths"), ("return", f"{kept}_returns")):
         if values := manifest.get(key):

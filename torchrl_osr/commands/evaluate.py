@@ -146,6 +146,8 @@ def evaluate_files(
     results = results_in(path, request)
     # Hidden: a part is no result.
     partial = path.with_name(f".{path.stem}.partial.json")
+    if not cfg.force:
+        check_replaced(path, request)
     if cfg.force or results is None:
         play = evaluate if cfg.suite.half is None else evaluate_states
         together = None
@@ -194,7 +196,7 @@ def finished_runs(cfg: DictConfig) -> list[Path]:
     runs = []
     for folder in find_runs([top]):
         try:
-            status = read_json(folder / run_folder.STATUS)["status"]
+            status = run_folder.read_status(folder)["status"]
         except (OSError, ValueError, KeyError):
             status = "unknown"
         if status == "done":
@@ -272,15 +274,38 @@ def requested(cfg: DictConfig, files: list[Path], folder: Path) -> dict[str, Any
     """
     folder = folder.absolute()
     names = [each.absolute().relative_to(folder).as_posix() for each in files]
-    return {
+    request = {
         "format": JSON_FORMAT,
         "versions": run_folder.package_versions(),
         "suite": cfg.suite.name,
-        "levels": OmegaConf.to_container(cfg.suite.disturbances, resolve=True),
-        "episodes": cfg.episodes,
-        "seed": cfg.seed,
         "checkpoints": dict(zip(names, map(sha256_of, files), strict=True)),
     }
+    if cfg.suite.half is not None:  # each state is played once
+        return request
+    disturbances = OmegaConf.to_container(cfg.suite.disturbances, resolve=True)
+    return request | {
+        "levels": disturbances,
+        "episodes": cfg.episodes,
+        "seed": cfg.seed,
+    }
+
+
+def check_replaced(path: Path, request: dict[str, Any]) -> None:
+    """Raise a ValueError if a file has results of other settings, naming these.
+
+    Those of other checkpoints or versions are out of date, and may be replaced.
+    """
+    old = results_in(path, {}) or {}
+    wanted = json.loads(json.dumps(request))
+    other = [
+        name for name in ("levels", "episodes", "seed")
+        if name in old and name in wanted and old[name] != wanted[name]
+    ]  # fmt: skip
+    if other:
+        raise ValueError(
+            f"{path} has results of other settings ({', '.join(other)}): force=true "
+            "replaces them; or rename the file."
+        )
 
 
 def results_in(path: Path, request: dict[str, Any]) -> dict[str, Any] | None:

@@ -63,15 +63,12 @@ def main() -> None:
     options = parser.parse_args()
     if options.path.suffix not in (SUFFIX, *SUFFIXES):
         parser.error(f"the path must end in {SUFFIX}, {' or '.join(SUFFIXES)}.")
-    try:
-        policy = load_policy(options.source, trust=options.trust)
-        if options.path.suffix == SUFFIX:
-            policy.save(options.path)
-        else:
-            policy.export(options.path, options.output)
-        deviation = check(policy, options.path, options.output)
-    except (ImportError, OSError, RuntimeError, ValueError) as error:
-        parser.exit(1, f"{error}\n")
+    policy = load_policy(options.source, trust=options.trust)
+    if options.path.suffix == SUFFIX:
+        policy.save(options.path)
+    else:
+        policy.export(options.path, options.output)
+    deviation = check(policy, options.path, options.output)
     origin = {"env_id": "?", "step": "?"} | policy.record["source"]
     print(
         f"{options.path}: {options.path.stat().st_size:,} bytes, "

@@ -100,6 +100,8 @@ def main(cfg: DictConfig) -> None:
     check_values(flatten(OmegaConf.to_container(cfg, resolve=True)))
     torchrl_logger.setLevel("WARNING")
     torch.set_num_threads(cfg.num_threads)
+    if cfg.knock is None and cfg.push <= 0:
+        raise ValueError(f"push must be above 0 body weights, got {cfg.push}.")
     event, duration, wrap = disturbance(cfg)
     trained = load_trained(cfg.checkpoint, trust=cfg.trust)
     run = trained.config

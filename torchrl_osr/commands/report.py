@@ -48,6 +48,8 @@ def main() -> None:
 
     command = " ".join([sys.argv[0], shlex.join(sys.argv[1:])])
     if options.pack:
+        if not options.pack.name.endswith(".jsonl.gz"):
+            parser.error(f"--pack {options.pack}: a table's name ends in .jsonl.gz.")
         number = pack_runs(options.runs, options.pack)
         print(f"{counted(number, 'run')} in {options.pack}")
         return

@@ -76,6 +76,8 @@ def train(cfg: DictConfig) -> float:
     fresh = cfg.resume is None
     if fresh:
         trust += module_of(cfg.env.id)
+        if cfg.data.path and Path(cfg.data.path).exists():  # seen from any folder
+            cfg.data.path = str(Path(cfg.data.path).absolute())
     else:
         cfg = run_folder.resumed(folder, cfg, job.overrides.task)
     with run_folder.refusal_noted(folder):
@@ -83,10 +85,12 @@ def train(cfg: DictConfig) -> float:
         read_environment(cfg)
         if fresh:
             check_published(cfg, job.runtime.choices)
-    with run_folder.lock(folder):
-        run_folder.claim(folder, cfg, job)
-        with run_folder.status(folder):
-            return run(cfg, folder)
+    with (
+        run_folder.lock(folder),
+        run_folder.claimed(folder, cfg, job),
+        run_folder.status(folder),
+    ):
+        return run(cfg, folder)
 
 
 def run(cfg: DictConfig, folder: Path) -> float:

@@ -83,7 +83,13 @@ def load_dataset(
         ValueError: an option is missing or has no use, a task of which there are no
             data to roll out, or data that do not fit it.
     """
-    given = {"columns": _named(columns), "action_bounds": action_bounds, "path": path}
+    given: dict[str, Any] = {
+        "columns": _named(columns),
+        "action_bounds": action_bounds,
+        "path": path,
+        "clip_actions": clip_actions,
+        "download": download,
+    }
     if quality not in RECORDED:
         if env_id is not None:
             _check_rolled_out(env_name, env_id, quality)

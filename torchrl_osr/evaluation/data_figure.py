@@ -46,8 +46,10 @@ def data_figure(
     actions: NDArray[Any] = low + (data["action"].numpy() + 1) / 2 * (high - low)
     if manifest.get("num_actions") is not None:
         actions = data["action"].numpy().argmax(1)[:, None]
-    returns = [*manifest["episode_returns"], *manifest.get("incomplete_returns", [])]
-    lengths = [*manifest["episode_lengths"], *manifest.get("incomplete_lengths", [])]
+    returns, lengths = (
+        [*manifest.get(f"episode_{each}", []), *manifest.get(f"incomplete_{each}", [])]
+        for each in ("returns", "lengths")
+    )
     panels: list[tuple[str, NDArray[Any], str]] = [
         ("return of an episode", np.array(returns), GREEN),
         ("steps of an episode", np.array(lengths), GREEN),

@@ -133,7 +133,8 @@ def settings_of(cfg: DictConfig) -> dict[str, Any]:
     """What decides a model beside the data, JSON-compatible."""
     options: Any = OmegaConf.to_container(cfg.dynamics)
     chosen = {name: options[name] for name in FITTED}
-    where = {name: cfg.trainer[name] for name in ("device", "precision")}
+    arithmetic = "device", "precision", "matmul_precision", "compile"
+    where = {name: cfg.trainer[name] for name in arithmetic}
     return {"version": __version__, "seed": cfg.seed} | chosen | where
 
 

@@ -43,8 +43,19 @@ def check_published(cfg: DictConfig, choices: Mapping[str, str]) -> None:
     """Warn if a method's authors have told settings for other data than a run's.
 
     Raises:
-        ValueError: if those of another task would be taken.
+        ValueError: if settings of another task or of other data would be taken.
     """
+    if cfg.data.quality != choices["data"]:
+        raise ValueError(
+            f"settings go by the group data={choices['data']}, and data.quality="
+            f"{cfg.data.quality} is another: give data={cfg.data.quality}."
+        )
+    if choices.get("preset/for_data") and cfg.env.name != choices["env"]:
+        raise ValueError(
+            f"preset={choices['preset']} would take its settings for {choices['env']} "
+            f"{cfg.data.quality}, but env.id={cfg.env.id} is {cfg.env.name}: give "
+            f"env={cfg.env.name}."
+        )
     loss, name = choices["loss"], f"{cfg.env.name}-{cfg.data.quality}"
     table = published_settings().get(loss)
     if table and f"{choices['env']}-{choices['data']}" not in table:

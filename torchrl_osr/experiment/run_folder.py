@@ -19,6 +19,7 @@ from filelock import FileLock, Timeout
 from hydra.conf import HydraConf
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import Container, DictConfig, OmegaConf
+from torchrl.checkpoint import CheckpointError
 
 from torchrl_osr._files import read_json, write_atomically, write_json
 from torchrl_osr.experiment.run_config import flatten, read_config
@@ -41,7 +42,6 @@ MAY_DIFFER = (
     "logger.kind",
     "logger.mode",
     "logger.project",
-    "trainer.checkpoint_interval",
     "trainer.checkpoints_kept",
     "trainer.eval_interval",
     "trainer.log_interval",
@@ -78,13 +78,17 @@ class Settings:
         What differs is named key by key, :data:`MAY_DIFFER` aside.
         """
         there, now = state_dict["settings"], self.values
-        fewer_steps = now.get("trainer.steps", 0) < there.get("trainer.steps", 0)
+        before, wanted = (each.get("trainer.steps", 0) for each in (there, now))
+        if wanted < before:
+            raise ValueError(
+                f"it was made with trainer.steps={before}, and {wanted} are fewer: a "
+                "run goes on, never back. Give more, or choose another folder."
+            )
         refused = "; ".join(
             f"{key}: {there.get(key, 'nothing')!r} there, "
             f"{now.get(key, 'nothing')!r} now"
             for key in sorted(now.keys() | there.keys())
-            if now.get(key, ...) != there.get(key, ...)
-            and (key not in MAY_DIFFER or (key == "trainer.steps" and fewer_steps))
+            if now.get(key, ...) != there.get(key, ...) and key not in MAY_DIFFER
         )
         if refused and not self.force:
             raise ValueError(
@@ -106,7 +110,7 @@ def resumed(folder: Path, composed: DictConfig, overrides: Sequence[str]) -> Dic
         folder: of the run.
         composed: what Hydra has made of the command line.
         overrides: of the command line. They replace settings of the run;
-            :func:`claim` says which of them may differ.
+            :func:`claimed` says which of them may differ.
 
     Raises:
         FileNotFoundError: if there is no run in ``folder``.
@@ -132,8 +136,12 @@ def resumed(folder: Path, composed: DictConfig, overrides: Sequence[str]) -> Dic
     return there
 
 
-def claim(folder: Path, config: DictConfig, job: HydraConf) -> None:
+@contextmanager
+def claimed(folder: Path, config: DictConfig, job: HydraConf) -> Iterator[None]:
     """Write a run's configuration into its folder, which is to be locked.
+
+    If its checkpoints then turn out not to fit, configuration and status are put back:
+    the run is what it was.
 
     Args:
         folder: of the run.
@@ -145,6 +153,8 @@ def claim(folder: Path, config: DictConfig, job: HydraConf) -> None:
         ValueError: if the folder holds a run of other settings, naming them.
     """
     path, hydra = folder / CONFIG, folder / ".hydra" / "hydra.yaml"
+    files = (path, folder / STATUS) if path.exists() else ()
+    old = {each: each.read_text() for each in files if each.exists()}
     if path.exists():
         try:
             Settings(config).load_state_dict(Settings(read_config(path)).state_dict())
@@ -156,6 +166,12 @@ def claim(folder: Path, config: DictConfig, job: HydraConf) -> None:
     # Last: this file makes the folder that of a run.
     saved = OmegaConf.merge(config, {"resume": None, "force": False, "trust": []})
     write_atomically(path, OmegaConf.to_yaml(saved, resolve=True))
+    try:
+        yield
+    except CheckpointError:
+        for each, content in old.items():
+            write_atomically(each, content)
+        raise
 
 
 @contextmanager

@@ -9,44 +9,30 @@
 
 from torchrl_osr.film.control import InverseDynamicsController
 from torchrl_osr.film.pictures import (
-    GIF_STRIDE,
     Camera,
     Take,
     film_gif,
     film_strip,
-    principal_plane,
     visited_states,
 )
 from torchrl_osr.film.takeover import (
     BEHAVIOR,
-    NEVER,
     Controller,
-    PoseRecorder,
     Survival,
-    Takeover,
-    hand_over,
     play_takeovers,
-    steps_alive,
     survival_table,
 )
 
 __all__ = [
     "BEHAVIOR",
-    "GIF_STRIDE",
-    "NEVER",
     "Camera",
     "Controller",
     "InverseDynamicsController",
-    "PoseRecorder",
     "Survival",
     "Take",
-    "Takeover",
     "film_gif",
     "film_strip",
-    "hand_over",
     "play_takeovers",
-    "principal_plane",
-    "steps_alive",
     "survival_table",
     "visited_states",
 ]

@@ -137,6 +137,11 @@ def test_a_task_that_never_ends(write):
             "holds nan in row 0|has no value in row 0",
         ),
         ({"fell": [None] + [True] * 119}, WANTED, "'fell' has no value in row 0"),
+        (
+            {"walk": ["a"] * 60 + [None] * 2 + ["b"] * 58},
+            WANTED | {"episode": "walk"},
+            "'walk' has no value in (2 rows, the first of them|row) 60",
+        ),
         ({"fell": 0.5}, WANTED, "'terminated' holds 0.5 in row 0"),
         (
             {"w": 7.0},
@@ -170,7 +175,7 @@ def test_what_is_wrong_with_a_log_is_one_sentence(write, changes, columns, messa
     frame = robot()
     for name, value in changes.items():
         text = isinstance(value, list) and any(isinstance(each, str) for each in value)
-        frame[name] = [str(each) for each in value] if text else value
+        frame[name] = [each and str(each) for each in value] if text else value
     with pytest.raises(ValueError, match=message):
         load_file(write(frame), columns=columns)
 
@@ -220,6 +225,7 @@ def test_entries_without_a_common_numbering_stay_in_the_files_order():
         (b"", "is no CSV file, or damaged"),
         (b"\xff\xfe\x00", "is no CSV file, or damaged"),
         (b"a;b;c\n1;2;3\n", "expected the names of at least two columns, separated by"),
+        (b",obs_0,action\n0,1,2\n", "column 1 has no name. pandas writes one"),
         (b"0.1,0.2,0.3\n1,2,3\n", "the first line holds numbers, 0.1, 0.2, 0.3"),
         (b"obs_0,action,reward,reward\n1,2,3,4\n", "two columns are called 'reward'"),
         (b"obs_0,action,reward,terminated,episode\n", "the data hold no rows"),
@@ -307,6 +313,8 @@ def test_options_without_a_use_are_refused(tmp_path):
     named = {"observation": ["x"]}
     with pytest.raises(ValueError, match=r"data\.columns=.* has no use with data=med"):
         load_dataset("hopper", "medium", columns=named)
+    with pytest.raises(ValueError, match=r"data\.clip_actions=True has no use"):
+        load_dataset("hopper", "medium", clip_actions=True)
     with pytest.raises(ValueError, match=r"data\.columns has no use with data=d4rl"):
         load_dataset("hopper", "d4rl", path="x.hdf5", columns=named)
     with pytest.raises(

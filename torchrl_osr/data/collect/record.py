@@ -113,9 +113,11 @@ def _action(
             action = np.clip(noisy, space.low, space.high)
         action = action.astype(space.dtype)
     if not space.contains(action):
+        shape = np.shape(action)
         raise ValueError(
-            f"the policy's action {np.asarray(action).tolist()} is not in the "
-            f"environment's {space}: expected one in the environment's own units."
+            f"the policy's action {np.asarray(action).tolist()} of shape {shape} is "
+            f"not in the environment's {space}: expected the shape {space.shape}, and "
+            "the environment's own units."
         )
     return action
 

@@ -55,10 +55,16 @@ def _names(path: Path) -> list[str]:
             f"{path} is no CSV file, or damaged: {error}. Take a whole copy of it."
         ) from error
     names = [name.strip() for name in names]
-    if len(names) < 2 or not all(names):
+    if len(names) < 2:
         raise ValueError(
             f"{path} is no CSV file, or damaged: its first line holds {names}; "
             "expected the names of at least two columns, separated by commas."
+        )
+    if not all(names):
+        raise ValueError(
+            f"{path}: column {names.index('') + 1} has no name. pandas writes one "
+            "unless index=False, and a comma at the end of the first line makes one: "
+            "name it or remove it."
         )
     if any(name.replace(".", "").lstrip("-").isdigit() for name in names):
         raise ValueError(

@@ -125,6 +125,7 @@ def assemble(
     for part, names in layout.columns.items():
         parts = [arrays[name] for name in names]
         if part == "episode" and parts[0].dtype.kind in "OU":
+            _refuse_nameless(names[0], parts[0])
             numbers = [
                 episodes.setdefault(str(each), len(episodes)) for each in parts[0]
             ]
@@ -142,6 +143,17 @@ def assemble(
     if "terminated" not in columns:
         columns["terminated"] = np.zeros(len(columns["reward"]), np.bool_)
     return columns
+
+
+def _refuse_nameless(name: str, episodes: NDArray[Any]) -> None:
+    """Raise where an episode has no name: it would be joined to others of that kind."""
+    # None, NaN and "": of these alone, NaN is not itself.
+    nameless = [each is None or each != each or each == "" for each in episodes]
+    if any(nameless):
+        raise ValueError(
+            f"{name!r} has no value in {sum(nameless)} rows, the first of them "
+            f"{nameless.index(True)} of those just read: give each row its episode."
+        )
 
 
 def _named(
