@@ -191,3 +191,14 @@ def test_an_actor_that_writes_another_entry_is_named(
     networks.actor = make_deterministic_actor("module", action="torque")
     with pytest.raises(KeyError, match=r"actor writes no 'action'.*set_keys\(action="):
         family("td3bc", networks)(family_batch("td3bc", 10))
+
+
+def test_an_action_that_would_be_read_as_a_state_is_named(family, family_batch) -> None:
+    """As with nested keys of which ``set_keys`` was told nothing."""
+    loss = family("td3bc")
+    loss.set_keys(action="torque")
+    batch = family_batch("td3bc", 4)
+    batch["torque"] = batch["action"]
+    batch["next", "action"] = batch["action"]
+    with pytest.raises(KeyError, match="'action' is what the actor writes"):
+        loss(batch)

@@ -248,7 +248,7 @@ def test_networks_that_a_policy_would_not_copy_whole():
         ((actor(mapping="exp"), critics), "compute something else"),
         ((actor(low=-2.0, high=2.0), critics), "compute something else"),
         ((actor(), swapped), "compute something else"),
-        ((actor(MLP(3, 3)), critics), "one MLP.* has 2"),
+        ((actor(MLP(3, 3)), critics), "one torchrl.modules.MLP.* has 2"),
     ]:
         loss = OSRLoss(*networks, recovery_weight=0)
         with pytest.raises(ValueError, match=message):
@@ -292,3 +292,11 @@ def test_packages_that_are_missing_are_named(tmp_path, make_policy, monkeypatch)
         monkeypatch.delitem(sys.modules, "torchrl_osr.policy.from_run", raising=False)
         with pytest.raises(ImportError, match=rf"install torchrl-osr\[{extra}\]"):
             load_policy(file)
+
+
+def test_observations_of_mujoco_are_taken_as_a_module_too(make_policy):
+    policy = make_policy("osr")
+    module = TensorDictModule(policy, ["observation"], ["action"])
+    rows = torch.randn(4, 3, dtype=torch.float64)
+    action = module(TensorDict({"observation": rows}, [4]))["action"]
+    assert torch.equal(action, policy.act(rows.float()))

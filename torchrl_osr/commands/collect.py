@@ -9,6 +9,7 @@ The log is what ``torchrl-osr train data=file`` reads. See docs/any_environment.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import closing
 from importlib import import_module
 from pathlib import Path
@@ -59,7 +60,7 @@ def main(cfg: DictConfig) -> None:
             )
     elif Path(cfg.policy).exists():
         policy = load_policy(cfg.policy, trust=cfg.trust)
-        env_id, act = env_id or environment_of(policy), policy.act
+        env_id, act = env_id or environment_of(policy, cfg.trust), policy.act
     elif ":" in cfg.policy:
         act = imported(cfg.policy)
     else:
@@ -84,17 +85,18 @@ def main(cfg: DictConfig) -> None:
     print(f"  torchrl-osr train env.id={env_id} {loss}data=file data.path={path}")
 
 
-def environment_of(policy: Policy) -> str | None:
+def environment_of(policy: Policy, trust: Sequence[str]) -> str | None:
     """Id of the environment that a policy was trained in, if it is known.
 
     Raises:
-        ValueError: if it imports a package, which the policy may come with.
+        ValueError: if it imports a package that is not trusted: the policy may come
+            with it.
     """
     env_id: str | None = policy.record["source"].get("env_id")
-    if env_id is not None and module_of(env_id):
+    if env_id is not None and not {*module_of(env_id)} <= {*trust}:
         raise ValueError(
             f"the policy is of env.id={env_id}, which imports a package: if you know "
-            "it, give env.id yourself."
+            "it, give env.id yourself, or trust=[...]."
         )
     return env_id
 

@@ -241,7 +241,7 @@ def evaluate_sweep(cfg: DictConfig) -> None:
     done = [(str(run), *rows[run].values()) for run in runs if run in rows]
     if done:
         header = ("run", *next(iter(rows.values())))
-        what = "score, or return, mean over its disturbances"
+        what = "score, or return, mean over its disturbances that were met"
         if cfg.suite.half is not None:
             what = f"percent of the {cfg.suite.half} states that it comes back from"
         print(f"\nsuite {cfg.suite.name}: {what}")
@@ -262,9 +262,11 @@ def evaluate_one_of_many(cfg: DictConfig, folder: Path) -> dict[str, str]:
         return {name: f"{100 * found[name][1]:.0f}" for name in GROUPS if name in found}
     rows = results["summary"]
     measure = measure_of(rows[0])
-    keys = {"undisturbed": f"clean_{measure}", "disturbed": measure}
-    means = {name: sum(row[key] for row in rows) for name, key in keys.items()}
-    return {name: f"{total / len(rows):.1f}" for name, total in means.items()}
+    # A disturbance that came in no episode says nothing.
+    met = [row[measure] for row in rows if row["disturbed_share"]]
+    disturbed = f"{np.mean(met):.1f}" if met else "never met"
+    clean = np.mean([row[f"clean_{measure}"] for row in rows])
+    return {"undisturbed": f"{clean:.1f}", "disturbed": disturbed}
 
 
 def requested(cfg: DictConfig, files: list[Path], folder: Path) -> dict[str, Any]:

@@ -405,7 +405,13 @@ def robustness_table(title: str, summary: Sequence[Mapping[str, Any]]) -> str:
         for row in summary
     ]
     header = ("disturbance", "clean", measure, *COLUMNS)
-    return "\n".join([title, *aligned_columns([header, *rows])])
+    lines = [title, *aligned_columns([header, *rows])]
+    if unmet := [row["name"] for row in summary if not row["disturbed_share"]]:
+        lines.append(
+            f"  {', '.join(unmet)}: no episode lasted until it came, so that nothing "
+            "is known of it; windows are steps of an episode."
+        )
+    return "\n".join(lines)
 
 
 def aligned_columns(rows: Sequence[Sequence[str]]) -> list[str]:

@@ -50,7 +50,9 @@ def check_published(cfg: DictConfig, choices: Mapping[str, str]) -> None:
             f"settings go by the group data={choices['data']}, and data.quality="
             f"{cfg.data.quality} is another: give data={cfg.data.quality}."
         )
-    if choices.get("preset/for_data") and cfg.env.name != choices["env"]:
+    task = f"{choices['env']}-{choices['data']}"
+    own = Path(CONF) / "preset" / "for_data" / f"{choices['preset']}-{task}.yaml"
+    if own.exists() and cfg.env.name != choices["env"]:
         raise ValueError(
             f"preset={choices['preset']} would take its settings for {choices['env']} "
             f"{cfg.data.quality}, but env.id={cfg.env.id} is {cfg.env.name}: give "
@@ -58,7 +60,7 @@ def check_published(cfg: DictConfig, choices: Mapping[str, str]) -> None:
         )
     loss, name = choices["loss"], f"{cfg.env.name}-{cfg.data.quality}"
     table = published_settings().get(loss)
-    if table and f"{choices['env']}-{choices['data']}" not in table:
+    if table and task not in table:
         log.warning(
             f"There are no published settings of loss={loss} for {cfg.env.name} "
             f"{cfg.data.quality}: its defaults are taken. {FOLDER / loss}.yaml has "

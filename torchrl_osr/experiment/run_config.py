@@ -45,10 +45,7 @@ def read_run(path: Path, trust: Sequence[str] = ()) -> DictConfig:
     try:
         return check_run(read_config(path), trust)
     except ValueError as error:
-        raise ValueError(
-            f"{path}: {str(error).removesuffix('.')}. Take the file that torchrl-osr "
-            "train has written."
-        ) from error
+        raise ValueError(f"{path}: {error}") from error
 
 
 def check_run(config: DictConfig, trust: Sequence[str] = ()) -> DictConfig:
@@ -190,7 +187,8 @@ def check_targets(config: DictConfig, trust: Sequence[str] = ()) -> None:
         if module not in trusted:
             raise ValueError(
                 f"env.id={env_id} imports a module, and a run may come from somebody "
-                f"else. If you know {module}, allow it with trust=[{module}]."
+                f"else. If you know {module}, allow it with trust=[{module}]; "
+                f"torchrl-osr export takes --trust {module}."
             )
     ours = [import_module(name) for name in TARGET_PACKAGES]
     known = {f"torchrl_osr.{name}" for name in objectives.__all__}

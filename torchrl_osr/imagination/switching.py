@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import torch
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from torchrl_osr._checks import check_positive
@@ -104,6 +106,17 @@ class SwitchingPolicy:
         """Choose anew at the next call."""
         self.chosen: Tensor | None = None
         self._calls = 0
+
+    def act(self, observation: ArrayLike) -> NDArray[np.float32]:
+        """Actions for observations as an environment gives them, ``[S]`` or ``[B, S]``.
+
+        Returns:
+            ``[A]`` or ``[B, A]``.
+        """
+        rows = torch.as_tensor(np.asarray(observation, np.float32))
+        action = self(rows.view(-1, rows.shape[-1]))
+        found: NDArray[np.float32] = action.view(*rows.shape[:-1], -1).numpy()
+        return found
 
     @torch.no_grad()
     def __call__(self, observation: Tensor) -> Tensor:

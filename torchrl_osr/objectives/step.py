@@ -199,6 +199,12 @@ class Step:
         self.of_data = of_data(tensordict)
         self.terminated = column(tensordict, terminated).bool()
         keys = observation_keys(loss)
+        for key in keys:
+            if key in loss.actor_network.out_keys:
+                raise KeyError(
+                    f"{key!r} is what the actor writes, and would be read as a state: "
+                    f"call set_keys(action={key!r})."
+                )
         clean = select(tensordict, keys)
         after = clean.copy()
         for key in keys:

@@ -110,8 +110,8 @@ def _mlp(network: torch.nn.Module) -> tuple[MLP, str]:
     ]
     if len(found) != 1:
         raise ValueError(
-            f"a network of a policy has one MLP, as those of torchrl_osr.modules; this "
-            f"one has {len(found)}."
+            "a network of a policy has one torchrl.modules.MLP, as those of "
+            f"torchrl_osr.modules; this one has {len(found)}."
         )
     return found[0]
 

@@ -253,7 +253,8 @@ class Policy(nn.Module):
         return self._in_units((loc + scale * noise.to(raw.device)).tanh())
 
     def _standardized(self, observation: Tensor) -> Tensor:
-        return (observation - self.loc) / self.scale
+        # Gymnasium's MuJoCo tasks have float64.
+        return (observation.to(self.loc.dtype) - self.loc) / self.scale
 
     def mode(self, raw: Tensor) -> Tensor:
         """Deterministic action: an index, or within the network's bounds -1 and 1."""

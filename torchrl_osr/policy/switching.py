@@ -101,8 +101,8 @@ def _networks(path: Path, config: DictConfig, policy: Policy) -> EliteNetworks:
     if not (folder / FILE).exists():
         raise FileNotFoundError(
             f"{folder} has no model of the dynamics to roll policies out in: train "
-            "with loss=rim or dynamics=ensemble, name runs that have one as judges, or "
-            "choose with critics_only=True."
+            "with loss=rim or dynamics=ensemble; or in Python, name runs that have one "
+            "as judges, or choose with critics_only=True."
         )
     if config.dynamics.reverse_policy is not None:
         raise ValueError(f"{folder} has a model that runs backwards in time.")

@@ -219,9 +219,16 @@ def _profiles(tables: RunTables) -> Figure | None:
         for method, rows in tables.episodes.groupby("method", sort=False)
         if rows["data"].nunique() == len(tables.data)
     }
+    if not bands:
+        return None
     panel = Panel("Runs, by the mean of their last evaluations", bands)
-    x, share = f"{tables.measure} τ", "share of runs above τ"
-    return draw_panels([panel], list(bands), xlabel=x, ylabel=share) if bands else None
+    return draw_panels(
+        [panel],
+        list(bands),
+        xlabel=f"{tables.measure} τ",
+        ylabel="share of runs above τ",
+        order=tables.methods,
+    )
 
 
 def _mean_table(tables: RunTables) -> pd.DataFrame:
@@ -266,7 +273,7 @@ def _suite(tables: RunTables, suite: str, reference: str) -> dict[str, Any]:
         }
         if ways:
             recovery[title] = _frame({key: _way_row(way) for key, way in ways.items()})
-            for kind, figure in _recovery_figures(ways).items():
+            for kind, figure in _recovery_figures(ways, tables.methods).items():
                 figures[f"{kind}-{slug(title)}"] = figure
     compared = compare_all(tables, reference, suite_quantities(tables, suite))
     return {
@@ -278,7 +285,9 @@ def _suite(tables: RunTables, suite: str, reference: str) -> dict[str, Any]:
     }
 
 
-def _recovery_figures(ways: Mapping[tuple[str, str], WayBack]) -> dict[str, Figure]:
+def _recovery_figures(
+    ways: Mapping[tuple[str, str], WayBack], order: Sequence[str]
+) -> dict[str, Figure]:
     """Draw distance and recovered share along the steps after each disturbance."""
     methods = list(dict.fromkeys(method for _, method in ways))
     distance: dict[str, Panel] = {}
@@ -286,13 +295,17 @@ def _recovery_figures(ways: Mapping[tuple[str, str], WayBack]) -> dict[str, Figu
     for (name, method), way in ways.items():
         distance.setdefault(name, Panel(name, {}, [1.0])).bands[method] = way.distance
         recovered.setdefault(name, Panel(name, {})).bands[method] = way.recovered
-    x, share = "steps after the disturbance", "share recovered"
+    options: dict[str, Any] = {"xlabel": "steps after the disturbance", "order": order}
     return {
         "distance": draw_panels(
-            list(distance.values()), methods, xlabel=x, ylabel="distance to the data"
+            list(distance.values()), methods, ylabel="distance to the data", **options
         ),
         "recovered": draw_panels(
-            list(recovered.values()), methods, xlabel=x, ylabel=share, sharey=True
+            list(recovered.values()),
+            methods,
+            ylabel="share recovered",
+            sharey=True,
+            **options,
         ),
     }
 

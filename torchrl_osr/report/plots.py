@@ -57,8 +57,14 @@ def draw_panels(
     xlabel: str,
     ylabel: str,
     sharey: bool = False,
+    order: Sequence[str] = (),
 ) -> Figure:
-    """Draw methods against each other, in small multiples if they are many."""
+    """Draw methods against each other, in small multiples if they are many.
+
+    Those among the first of ``order`` have the same colour in all figures.
+    """
+    first = order[: len(COLORS)]
+    colors = dict(zip(first if {*methods} <= {*first} else methods, COLORS))
     if len(methods) > MOST:
         figure = _small_multiples(panels, methods, sharey)
     else:
@@ -66,13 +72,13 @@ def draw_panels(
         rows = -(-len(panels) // columns)
         figure, grid = _figure(rows, columns, 2.8 * rows + 0.6, sharey=sharey)
         for axes, panel in zip(grid.flat, panels, strict=False):
-            _draw(axes, panel, dict(zip(methods, COLORS, strict=False)))
+            _draw(axes, panel, {each: colors[each] for each in methods})
             axes.set_title(plain(panel.title), fontsize=10)
         for axes in grid.flat[len(panels) :]:
             axes.set_visible(False)
         handles = [
-            Line2D([], [], color=color, label=plain(method))
-            for method, color in zip(methods, COLORS, strict=False)
+            Line2D([], [], color=colors[method], label=plain(method))
+            for method in methods
         ]
         in_row = max(1, min(len(methods), 110 // (max(map(len, methods)) + 8)))
         figure.legend(

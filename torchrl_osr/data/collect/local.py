@@ -6,6 +6,7 @@ manifest or checksums do not fit is collected anew, never trusted.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import closing
 from importlib.metadata import version
@@ -33,6 +34,8 @@ from torchrl_osr.data.store.cache import (
 )
 from torchrl_osr.data.store.splits import mix_datasets
 from torchrl_osr.data.store.statistics import describe_episodes
+
+log = logging.getLogger(__name__)
 
 # Raise it whenever the recipe changes: older sets are then made anew.
 RECIPE_VERSION = 1
@@ -118,6 +121,10 @@ def _rolled_out(
 
     def collect() -> Iterator[TensorDict]:
         _check_room(folder, request)
+        log.info(
+            f"rolls out {request['num_transitions']:,} transitions of {env_name} "
+            f"{request['quality']}, once: they stay in {folder}"
+        )
         data, returns, lengths = collect_quality(
             env_name,
             request["quality"],
