@@ -215,8 +215,8 @@ two minutes of a core gave beside another run on the same two virtual cores
 (`update_ms.json`). Under the suites: mean score over all disturbances. *recoverable*:
 percent of the public half's states that the last policy comes back from. *published*:
 scores on D4RL v2, other data, after a hundred times the updates; `tables.py` has their
-sources. Intervals at 95 %; ᵉ: one seed, over episodes, or over walks for the
-recoverable states."""
+sources. Intervals at 95 %; ²: two seeds, whose interval holds the mean every other
+time; ᵉ: one seed, over episodes, or over walks for the recoverable states."""
 
 ABLATION = """What the arms of OSR's ablation save of the recoverable states more than
 `cql_noisy_bc`, whose states, noise and updates are OSR's and whose label is the row's
