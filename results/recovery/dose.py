@@ -134,7 +134,10 @@ def draw(shares: dict[str, pd.DataFrame], path: Path) -> None:
         axes.set_xticks(strength)
         axes.spines[["top", "right"]].set_visible(False)
         axes.set_ylim(0, 1)
-    panels[0].legend(frameon=False, fontsize=8)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside upper center", ncols=5, frameon=False, fontsize=9
+    )
     figure.supxlabel("strength", fontsize=10)
     figure.supylabel("share survived", fontsize=10)
     figure.savefig(path, dpi=130)
