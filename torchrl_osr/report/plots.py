@@ -64,7 +64,8 @@ def draw_panels(
     Those among the first of ``order`` have the same colour in all figures.
     """
     first = order[: len(COLORS)]
-    colors = dict(zip(first if {*methods} <= {*first} else methods, COLORS))
+    named = first if {*methods} <= {*first} else methods
+    colors = dict(zip(named, COLORS, strict=False))
     if len(methods) > MOST:
         figure = _small_multiples(panels, methods, sharey)
     else:
