@@ -19,6 +19,7 @@ from torchrl_osr.film.takeover import (
     BEHAVIOR,
     Controller,
     Survival,
+    Takeover,
     play_takeovers,
     survival_table,
 )
@@ -30,6 +31,7 @@ __all__ = [
     "InverseDynamicsController",
     "Survival",
     "Take",
+    "Takeover",
     "film_gif",
     "film_strip",
     "play_takeovers",
