@@ -18,6 +18,7 @@ from torchrl_osr.film.pictures import (
 from torchrl_osr.film.takeover import (
     BEHAVIOR,
     Controller,
+    PoseRecorder,
     Survival,
     Takeover,
     play_takeovers,
@@ -29,6 +30,7 @@ __all__ = [
     "Camera",
     "Controller",
     "InverseDynamicsController",
+    "PoseRecorder",
     "Survival",
     "Take",
     "Takeover",
