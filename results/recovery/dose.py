@@ -6,7 +6,7 @@
 Not the recoverable states alone: those that every policy survives and those that the
 planner did not save, too; public walks. What each policy survives is appended to
 ``parts/<system>/dose.jsonl``, a bit for each state in the order of ``tables.gather``;
-what is there is not played again. ``dose.md`` has the numbers of the figure.
+what is there is not played again. ``dose-<system>.md`` has the figure's numbers.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import torch
-from choice import policy_of
+from choice import JUDGES, policy_of
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from search import read_jsonl
@@ -32,10 +32,10 @@ from torchrl_osr.evaluation.recoverable import RecoverableStates, recovers
 
 HERE = Path(__file__).parent
 FIGURES = HERE.parents[1] / "docs" / "figures"
-IMAGINATION, CHOICE = "disturbed starts", "choice"
+CHOICE = "choice"
 LINES = {
     CHOICE: ("five by imagination, the best one acts", "#009E73"),
-    IMAGINATION: ("recovery by imagination", "#D55E00"),
+    JUDGES: ("recovery by imagination", "#D55E00"),
     "OSR": ("OSR", "#0072B2"),
     "noisy cloning": ("noisy cloning", "0.45"),
 }
@@ -81,7 +81,7 @@ def play(
         for mine in [seeds] if arm == CHOICE else [[seed] for seed in seeds]:
             if (arm, *mine) in there:
                 continue
-            name = IMAGINATION if arm == CHOICE else arm
+            name = JUDGES if arm == CHOICE else arm
             runs = [folder / name / f"seed{seed}" for seed in mine]
             start = time.process_time()
             policy = policy_of("models 20" if arm == CHOICE else "one", runs, runs)
@@ -94,19 +94,25 @@ def play(
             print(arm, mine, f"{back.sum()} of {len(back)}", flush=True)
 
 
+def played(log: Path) -> dict[str, np.ndarray]:
+    """Whether each run of each method survived each state, ``[run, M]``."""
+    bits: dict[str, list[list[int]]] = {}
+    for line in read_jsonl(log):
+        bits.setdefault(line["arm"], []).append([*map(int, line["saved"])])
+    return {name: np.array(of, float) for name, of in bits.items()}
+
+
 def survived(
-    states: RecoverableStates, weight: np.ndarray, log: Path
+    states: RecoverableStates, weight: np.ndarray, bits: dict[str, np.ndarray]
 ) -> dict[str, pd.DataFrame]:
     """Share survived ``[disturbance, run]`` of each method, and of the planner.
 
     A state that the expert survives stands for four, see ``states.py``.
     """
-    bits = {"planner": [states.group != GROUPS[-1]]}
-    for line in read_jsonl(log):
-        bits.setdefault(line["arm"], []).append([bit == "1" for bit in line["saved"]])
+    planner = (states.group != GROUPS[-1]).astype(float)[None]
     shares = {}
-    for name, of in bits.items():
-        rows = pd.DataFrame(np.array(of, float).T * weight[:, None])
+    for name, of in ({"planner": planner} | bits).items():
+        rows = pd.DataFrame(of.T * weight[:, None])
         sums = rows.assign(weight=weight).groupby(states.disturbance).sum()
         shares[name] = sums.drop(columns="weight").div(sums["weight"], axis=0)
     return shares
@@ -143,20 +149,16 @@ def draw(shares: dict[str, pd.DataFrame], path: Path) -> None:
     figure.savefig(path, dpi=130)
 
 
-def by_group(states: RecoverableStates, log: Path) -> list[dict]:
+def by_group(states: RecoverableStates, bits: dict[str, np.ndarray]) -> list[dict]:
     """Share survived of each group of states, all strengths together."""
-    rows: dict[str, list[np.ndarray]] = {}
-    for line in read_jsonl(log):
-        bits = np.array([int(bit) for bit in line["saved"]])
-        rows.setdefault(line["arm"], []).append(bits)
+    inside = {group: states.group == group for group in GROUPS}
     return [
-        {"method": name, "runs": len(bits)}
+        {"method": name, "runs": len(of)}
         | {
-            f"{group} ({(states.group == group).sum()})": f"{share:.3f}"
-            for group in GROUPS
-            for share in [np.mean(bits, 0)[states.group == group].mean()]
+            f"{group} ({rows.sum()})": f"{of[:, rows].mean():.3f}"
+            for group, rows in inside.items()
         }
-        for name, bits in rows.items()
+        for name, of in bits.items()
     ]
 
 
@@ -176,7 +178,8 @@ def main() -> None:
     top = given.folder / f"{given.system}-medium-expert"
     play(states, log, top, given.arms, given.seeds)
     weight = np.where(found["jury"][:, 1] == 1, 4, 1)
-    shares = survived(states, weight, log)
+    bits = played(log)
+    shares = survived(states, weight, bits)
     count = pd.Series(states.disturbance).value_counts()
     kept = count.index[count >= LEAST]
     shares = {name: of.loc[of.index.isin(kept)] for name, of in shares.items()}
@@ -195,7 +198,7 @@ def main() -> None:
         "kept.",
         table(rows),
         "By group, each state once:",
-        table(by_group(states, log)),
+        table(by_group(states, bits)),
     ]
     write_atomically(HERE / f"dose-{given.system}.md", "\n\n".join(pages) + "\n")
 

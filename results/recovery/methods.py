@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from choice import JUDGES
 from imagination import LOOKS, REFERENCE
 from numpy.typing import NDArray
 from search import read_jsonl
@@ -57,9 +58,6 @@ TWINS = {
 
 CHOICE, SHUFFLED = "models 20", "shuffled 20"
 """The choice that was looked at, and what it owes to chance."""
-
-DISTURBED = "disturbed starts"
-"""Whose policies the looks chose between."""
 
 
 def name_of(line: dict) -> str:
@@ -323,7 +321,7 @@ def main() -> None:
             noisy = noisy_cloning(states, half)
             rows = rows_of_choice(lines, states, noisy)
             pages += [f"## choice, {states.env_name}, {half} half", table(rows)]
-            of_starts = [x for x in lines if x["runs"].endswith(DISTURBED)]
+            of_starts = [x for x in lines if x["runs"].endswith(JUDGES)]
             if of_starts:
                 rows = kinds_of_choice(of_starts, states, noisy)
                 pages += [f"### {CHOICE}, by kind of disturbance", table(rows)]

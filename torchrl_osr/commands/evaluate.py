@@ -25,7 +25,7 @@ import signal
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import hydra
 import numpy as np
@@ -143,12 +143,12 @@ def evaluate_files(
     torchrl_logger.setLevel("WARNING")
     torch.set_num_threads(cfg.num_threads)
     request = requested(cfg, files, path.parent)
-    results = results_in(path, request)
+    results = results_in(path)
     # Hidden: a part is no result.
     partial = path.with_name(f".{path.stem}.partial.json")
-    if not cfg.force:
-        check_replaced(path, request)
-    if cfg.force or results is None:
+    if cfg.force or not answers(results, request):
+        if not cfg.force:
+            check_replaced(path, results, request)
         play = evaluate if cfg.suite.half is None else evaluate_states
         together = None
         if cfg.switching:
@@ -292,17 +292,17 @@ def requested(cfg: DictConfig, files: list[Path], folder: Path) -> dict[str, Any
     }
 
 
-def check_replaced(path: Path, request: dict[str, Any]) -> None:
+def check_replaced(
+    path: Path, old: dict[str, Any] | None, request: dict[str, Any]
+) -> None:
     """Raise a ValueError if a file has results of other settings, naming these.
 
     Those of other checkpoints or versions are out of date, and may be replaced.
     """
-    old = results_in(path, {}) or {}
-    wanted = json.loads(json.dumps(request))
+    settings = {"levels", "episodes", "seed"} & request.keys() & (old or {}).keys()
     other = [
-        name for name in ("levels", "episodes", "seed")
-        if name in old and name in wanted and old[name] != wanted[name]
-    ]  # fmt: skip
+        each for each in sorted(settings) if not answers(old, {each: request[each]})
+    ]
     if other:
         raise ValueError(
             f"{path} has results of other settings ({', '.join(other)}): force=true "
@@ -310,20 +310,29 @@ def check_replaced(path: Path, request: dict[str, Any]) -> None:
         )
 
 
-def results_in(path: Path, request: dict[str, Any]) -> dict[str, Any] | None:
-    """Results of an earlier evaluation with the same request, if there are any."""
+def results_in(path: Path) -> dict[str, Any] | None:
+    """Results of an earlier evaluation, if there are any and they are whole."""
     if not path.exists():
         return None
     try:
-        results = read_json(path)
+        results: dict[str, Any] = read_json(path)
         if CHECKSUM in results:
             check_checksum(results, path.name)
     except ValueError as error:
         print(f"{path} is ignored: {error}.")
         return None
+    return results
+
+
+def answers(
+    results: dict[str, Any] | None, request: dict[str, Any]
+) -> TypeGuard[dict[str, Any]]:
+    """Whether results are there, and of this request."""
+    if results is None:
+        return False
     # Through JSON, like the file: it has no tuples.
-    same = json.loads(json.dumps(request)).items() <= results.items()
-    return results if same else None
+    wanted: dict[str, Any] = json.loads(json.dumps(request))
+    return wanted.items() <= results.items()
 
 
 def evaluate(
@@ -342,8 +351,8 @@ def evaluate(
     data, _ = load_data(run, progress=cfg.progress)
     distance = DataDistance(data, seed=run.data.seed)
     _, scale = observation_statistics(data)
-    begun = results_in(partial, request) or {"evaluations": []}
-    evaluations = begun["evaluations"]
+    begun = results_in(partial)
+    evaluations = begun["evaluations"] if answers(begun, request) else []
     if evaluations:
         print(f"{partial} has {len(evaluations)} of {len(files)} checkpoints already.")
     references = references_of(run)
@@ -375,8 +384,7 @@ def evaluate(
                 advance=lambda: progress.update(next(played)),
             )
             evaluations.append(evaluation_json(trained.step, paired, references))
-            begun = checksummed(request | {"evaluations": evaluations})
-            write_json(partial, begun)
+            write_json(partial, checksummed(request | {"evaluations": evaluations}))
     return {
         "env": run.env.name,
         "data": run.data.quality,

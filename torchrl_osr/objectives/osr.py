@@ -398,16 +398,14 @@ class OSRLoss(BaseLoss):
     @torch.no_grad()
     def _target_value(self, step: Step) -> Tensor:
         """The TD target, ``[B]``, from an action of the policy at ``s'``."""
+        if not (self.max_q_backup or self.deterministic_backup):
+            return step.soft_target()
         state, pi = step.at("next"), step.target_policy()
         number = (self.num_random,) if self.max_q_backup else ()
-        action, log_prob = rsample_and_log_prob(pi, number)
+        action, _ = rsample_and_log_prob(pi, number)
         params = self.target_qvalue_network_params
         qvalue = step.qvalue(state.expand(action.shape[:-1]), action, params)
+        next_value = functional.bootstrap_value(qvalue)
         if self.max_q_backup:
-            next_value = functional.bootstrap_value(qvalue).max(0).values
-        elif self.deterministic_backup:
-            next_value = functional.bootstrap_value(qvalue)
-        else:
-            alpha = self._alpha
-            next_value = functional.bootstrap_value(qvalue, log_prob, alpha)
+            next_value = next_value.max(0).values
         return step.td_target(next_value.squeeze(0))

@@ -18,7 +18,7 @@ from torchrl_osr.evaluation.recoverable import (
     saved_share,
 )
 from torchrl_osr.report.methods import RunTables
-from torchrl_osr.report.scores import Estimate
+from torchrl_osr.report.scores import Estimate, over_what
 
 
 class Saved(NamedTuple):
@@ -121,5 +121,4 @@ def _recovered(
 def percent(found: tuple[float, float, float], seeds: int) -> Estimate:
     """A share and its interval, over so many seeds."""
     mean, low, high = (100 * each for each in found)
-    over = {1: "walks", 2: "two seeds"}.get(seeds, "seeds")
-    return Estimate(mean, low, high, over)
+    return Estimate(mean, low, high, over_what([range(seeds)], alone="walks"))

@@ -106,10 +106,10 @@ def counted(number: int, noun: str) -> str:
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
-def over_what(groups: Sequence[Sequence[object]]) -> str:
-    """What an interval is over, given the runs of each data set."""
+def over_what(groups: Sequence[Sequence[object]], alone: str = "episodes") -> str:
+    """What an interval is over, given the runs of each data set; ``alone`` with one."""
     fewest = min(map(len, groups))
-    return {1: "episodes", 2: "two seeds"}.get(fewest, "seeds")
+    return {1: alone, 2: "two seeds"}.get(fewest, "seeds")
 
 
 def undisturbed(episodes: pd.DataFrame) -> pd.DataFrame:
