@@ -63,6 +63,7 @@ def test_words_without_sense_are_refused_by_key(fresh):
     [
         ("data.num_transitions", 0),
         ("data.random_share", 1.5),
+        ("data.reward_scale", 0.0),
         ("network.num_cells", [8, 0]),
         ("network.num_cells", [10_000_000]),
         ("optim.actor_lr", -1e-3),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import shlex
 import signal
 import subprocess
 import sys
@@ -251,6 +252,17 @@ def test_interrupted_run_is_preempted_and_says_how_to_continue(tmp_path, caplog)
     assert read_status(folder) == {"status": "preempted", "reason": "saved at step 3"}
     # Quoted for Hydra, and then for the shell.
     assert f"""resume='"'"'{folder}'"'"''""" in caplog.text
+
+
+def test_run_of_modules_of_ones_own_has_to_be_trusted_again(tmp_path, caplog):
+    trust = ["my_losses", "my_robots.arms"]
+    with pytest.raises(Interrupted), run_folder.status(tmp_path, trust):
+        raise Interrupted("saved at step 3", 75)
+    *_, line = caplog.text.strip().splitlines()
+    _, command = line.split("Continue with: ")
+    assert shlex.split(command) == [
+        "torchrl-osr", "train", f"resume={tmp_path}", "trust=[my_losses,my_robots.arms]",
+    ]  # fmt: skip
 
 
 def test_failed_write_keeps_the_old_file_and_names_it(tmp_path, monkeypatch):

@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import nn
+from torchrl.modules import TanhNormal
 
-from torchrl_osr import InverseDynamicsLoss, OSRLoss
+from torchrl_osr import BCLoss, InverseDynamicsLoss, OSRLoss
 from torchrl_osr.modules import (
     critic_ensemble,
     cvae_inverse_dynamics,
@@ -76,3 +77,14 @@ def test_likelihood_is_that_of_float32_parameters(make_batch, build) -> None:
     key = "loss_inverse_dynamics"
     assert out[key].dtype == torch.float32
     torch.testing.assert_close(found[key], wanted[key], rtol=RELATIVE, atol=RELATIVE)
+
+
+def test_density_of_a_cloned_policy_is_that_of_float32_parameters(make_batch) -> None:
+    actor, batch = tanh_gaussian_actor(3, 2, num_cells=[32]), single(make_batch(64))
+    with torch.autocast("cpu", torch.bfloat16):
+        # As accurate as its parameters: the density itself is not rounded.
+        found = BCLoss(actor, reduction="none")(batch.copy())["loss_actor"]
+        params = actor.get_dist_params(batch.copy())
+    loc, scale = (params[name].float() for name in ("loc", "scale"))
+    policy = TanhNormal(loc, scale)
+    torch.testing.assert_close(found, -policy.log_prob(batch["action"]))

@@ -36,6 +36,13 @@ def test_other_budgets_and_settings_are_never_averaged(tmp_path):
     assert "hopper medium-replay: its runs differ in trainer.steps." in notes
 
 
+def test_settings_that_change_no_number_keep_no_runs_apart(tmp_path):
+    for seed, recorded in enumerate((True, False)):
+        changes = {"trainer.record": recorded, "data.storage": ("memory", "disk")[seed]}
+        fakes.write_run(tmp_path / str(seed), CURVE, seed=seed, changes=changes)
+    assert fakes.read_all(tmp_path).methods == ["osr"]
+
+
 def test_what_is_chosen_by_the_data_keeps_no_runs_apart_and_is_said(tmp_path):
     for seed in (0, 1):
         for env, rate in (("hopper", 1e-3), ("walker2d", 3e-4)):

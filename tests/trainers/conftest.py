@@ -13,7 +13,7 @@ from torch.utils._pytree import tree_leaves
 from torchrl.objectives import SoftUpdate
 
 from torchrl_osr import (
-    Adversary,
+    EDACLoss,
     InverseDynamicsLoss,
     OSRLoss,
     OSRVLoss,
@@ -33,13 +33,7 @@ LOSSES = {
     "OSR-v": {},
     "CQL": {"recovery_weight": 0, "with_lagrange": True, "chunk_size": None},
     "OSR-10": {"min_q_weight": 0, "deterministic_backup": False},
-    "EDAC": {"min_q_weight": 0, "recovery_weight": 0, "diversity_weight": 1.0},
-    "adversarial": {
-        "adversary": Adversary("min_Q", "gradient", num_samples=3, num_steps=2),
-        "max_q_backup": True,
-        "num_random": 2,
-        "chunk_size": None,
-    },
+    "EDAC": {},
 }
 CRITICS = {"OSR-10": 10, "EDAC": 3}
 
@@ -78,8 +72,10 @@ def build_loss(name: str, *, layer_norm=False, cells=8, device="cpu", **options)
     options = LOSSES[name] | options
     if options.get("recovery_weight") == 0:
         inverse_dynamics = None
-    kind = OSRVLoss if name == "OSR-v" else OSRLoss
     critics = [each.to(device) for each in critics]
+    if name == "EDAC":
+        return EDACLoss(actor, critics, **options)
+    kind = OSRVLoss if name == "OSR-v" else OSRLoss
     return kind(actor, critics, inverse_dynamics, **options)
 
 

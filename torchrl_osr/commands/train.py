@@ -88,7 +88,7 @@ def train(cfg: DictConfig) -> float:
     with (
         run_folder.lock(folder),
         run_folder.claimed(folder, cfg, job),
-        run_folder.status(folder),
+        run_folder.status(folder, trust),
     ):
         return run(cfg, folder)
 

@@ -33,6 +33,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "data.num_transitions": _COUNT,
     "data.random_share": (0, 1),
     "data.held_out": (0, 1),
+    "data.reward_scale": (1e-9, LARGEST),
     "network.num_cells": _WIDTH,
     "inverse_dynamics.network.latent_dim": _WIDTH,
     "dynamics.num_networks": (1, 1000),

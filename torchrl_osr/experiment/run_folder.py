@@ -273,11 +273,12 @@ def _is_ours(folder: Path) -> bool:
 
 
 @contextmanager
-def status(folder: Path) -> Iterator[None]:
+def status(folder: Path, trust: Sequence[str] = ()) -> Iterator[None]:
     """Keep ``status.json`` true: running, then done, preempted, or failed and why.
 
     A run that a signal has stopped is ``preempted``; the command that continues it is
-    logged. The folder is to be locked, see :func:`lock`.
+    logged, with the modules that it has to ``trust``. The folder is to be locked, see
+    :func:`lock`.
     """
     with signals_raised():
         _say_if_killed(folder)
@@ -290,7 +291,7 @@ def status(folder: Path) -> Iterator[None]:
                 write_json(folder / STATUS, {"status": "done"})
         except Interrupted as error:
             _write_end(folder, {"status": "preempted", "reason": error.reason})
-            log.warning(_how_to_continue(folder))
+            log.warning(_how_to_continue(folder, trust))
             raise
         except BaseException as error:
             reason = f"{type(error).__name__}: {error}"
@@ -321,12 +322,14 @@ def _write_end(folder: Path, end: dict[str, Any]) -> None:
         log.warning(f"{error}: the file still says that the run is running.")
 
 
-def _how_to_continue(folder: Path) -> str:
+def _how_to_continue(folder: Path, trust: Sequence[str]) -> str:
     """Say which command continues a run, quoted for Hydra and for the shell."""
     override = f"resume={folder}"
     if not re.fullmatch(r"[\w./+-]+", str(folder)):
         quoted = str(folder).replace("\\", "\\\\").replace("'", "\\'")
         override = shlex.quote(f"resume='{quoted}'")
+    if trust:  # which no run's folder may say
+        override += " " + shlex.quote(f"trust=[{','.join(trust)}]")
     return f"Continue with: torchrl-osr train {override}"
 
 

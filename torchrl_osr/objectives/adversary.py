@@ -11,7 +11,6 @@ candidate perturbations of one state.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -21,7 +20,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.modules import TanhNormal
 
-from torchrl_osr._checks import check_choice, check_positive
+from torchrl_osr._checks import check_choice, check_positive, check_weight
 from torchrl_osr._entries import entry, nested, select
 from torchrl_osr.functional import jeffreys_divergence
 from torchrl_osr.objectives.base import BaseLoss
@@ -105,8 +104,7 @@ class Adversary:
     def __post_init__(self) -> None:
         check_choice("objective", self.objective, ("action_diff", "min_Q"))
         check_choice("method", self.method, ("sample", "gradient"))
-        if not 0 <= self.epsilon < math.inf:
-            raise ValueError(f"epsilon must be at least 0, got {self.epsilon}.")
+        check_weight("epsilon", self.epsilon)
         check_positive("num_samples", self.num_samples, minimum=1)
         check_positive("num_steps", self.num_steps, minimum=1)
         check_positive("step_size", self.step_size)

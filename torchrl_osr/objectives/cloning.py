@@ -14,6 +14,7 @@ from torchrl.modules import TanhDelta
 
 from torchrl_osr import functional
 from torchrl_osr.objectives.distributions import check_action, head_of
+from torchrl_osr.objectives.step import distribution_params, written_action
 
 
 def is_deterministic(network: TensorDictModuleBase) -> bool:
@@ -38,13 +39,10 @@ def policy_at(
     Raises:
         KeyError: if it writes no such action.
     """
-    with params.to_module(network, preserve_module_state=False):
-        if head_of(network)[0] is not None:
-            return network.get_dist(states)
-        action = network(states).get(key, None)
-    if action is None:
-        raise KeyError(f"The actor writes no {key!r}: call set_keys(action=...).")
-    return action
+    if head_of(network)[0] is not None:
+        found = distribution_params(network, params, states)
+        return network.build_dist_from_params(found)
+    return written_action(network, params, states, key)
 
 
 def cloning_distance(policy: Any, data_action: Tensor, key: NestedKey) -> Tensor:

@@ -93,10 +93,7 @@ class DiscreteOSRLoss(BaseLoss):
             the entropy of the uniform policy, ``log(n)``.
         target_entropy_weight: Default 0.98, TorchRL's in ``DiscreteSACLoss``: a policy
             that is nearly uniform.
-        options: of every loss: ``num_qvalue_nets``, ``loss_function``,
-            ``delay_qvalue``, ``deactivate_vmap``, ``reduction``,
-            ``use_prioritized_weights`` and ``scalar_output_mode``, see
-            :class:`~torchrl_osr.objectives.BaseLoss`.
+        options: of every loss, see :class:`~torchrl_osr.objectives.BaseLoss`.
 
     Raises:
         TypeError: if a distribution is not categorical.

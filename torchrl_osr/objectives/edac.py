@@ -52,10 +52,7 @@ class EDACLoss(BaseLoss):
         alpha_init: initial entropy temperature :math:`\alpha_e`. Default 1.0.
         fixed_alpha: keep the temperature. Default ``False``.
         target_entropy: in nats; ``"auto"`` (default) is minus the action's size.
-        options: of every loss: ``num_qvalue_nets``, ``loss_function``,
-            ``delay_qvalue``, ``deactivate_vmap``, ``reduction``,
-            ``use_prioritized_weights`` and ``scalar_output_mode``, see
-            :class:`~torchrl_osr.objectives.BaseLoss`.
+        options: of every loss, see :class:`~torchrl_osr.objectives.BaseLoss`.
 
     Raises:
         TypeError: if the actor's distribution is not a ``TanhNormal``.

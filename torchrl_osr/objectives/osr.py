@@ -111,10 +111,7 @@ class OSRLoss(BaseLoss):
         chunk_size: on a CPU, how many states go through the critics at a time, with
             all their sampled actions, if the critics are plain MLPs; ``None`` for all
             at once, as other networks go. Default 64. The mathematics is the same.
-        options: of every loss: ``num_qvalue_nets``, ``loss_function``,
-            ``delay_qvalue``, ``deactivate_vmap``, ``reduction``,
-            ``use_prioritized_weights`` and ``scalar_output_mode``, see
-            :class:`~torchrl_osr.objectives.BaseLoss`.
+        options: of every loss, see :class:`~torchrl_osr.objectives.BaseLoss`.
 
     Raises:
         TypeError: if a distribution is not a ``TanhNormal``, or ``gamma`` is given.

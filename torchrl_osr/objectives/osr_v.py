@@ -90,10 +90,7 @@ class OSRVLoss(BaseLoss):
         delay_actor: the action in the TD target is that of a target actor, which
             :class:`~torchrl.objectives.SoftUpdate` moves with the target critics.
             Default ``False``.
-        options: of every loss: ``num_qvalue_nets``, ``loss_function``,
-            ``delay_qvalue``, ``deactivate_vmap``, ``reduction``,
-            ``use_prioritized_weights`` and ``scalar_output_mode``, see
-            :class:`~torchrl_osr.objectives.BaseLoss`.
+        options: of every loss, see :class:`~torchrl_osr.objectives.BaseLoss`.
 
     Raises:
         TypeError: if a distribution is not a ``TanhNormal``, or an argument belongs to

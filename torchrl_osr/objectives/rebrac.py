@@ -60,10 +60,7 @@ class ReBRACLoss(BaseLoss):
         noise_clip: largest magnitude of :math:`\epsilon`. Default 0.5.
         low, high: action bounds, between which the target's action is kept. Default
             -1 and 1.
-        options: of every loss: ``num_qvalue_nets``, ``loss_function``,
-            ``delay_qvalue``, ``deactivate_vmap``, ``reduction``,
-            ``use_prioritized_weights`` and ``scalar_output_mode``, see
-            :class:`~torchrl_osr.objectives.BaseLoss`.
+        options: of every loss, see :class:`~torchrl_osr.objectives.BaseLoss`.
 
     Raises:
         ValueError: if an option is out of its range; in the call, if the batch is

@@ -68,6 +68,25 @@ def distribution_params(
         return full_precision(network.get_dist_params(states.copy()))
 
 
+def written_action(
+    network: TensorDictModuleBase,
+    params: TensorDictParams,
+    states: TensorDictBase,
+    key: NestedKey,
+) -> Tensor:
+    """The action that a deterministic network writes at ``states``, ``[..., A]``.
+
+    Raises:
+        KeyError: if it writes no such action.
+    """
+    with params.to_module(network, preserve_module_state=False):
+        output = full_precision(network(states.copy()))
+    action: Tensor | None = output.get(key, None)
+    if action is None:
+        raise KeyError(f"The actor writes no {key!r}: call set_keys(action=...).")
+    return action
+
+
 def frozen_distribution(
     loss: BaseLoss,
     tensordict: TensorDictBase,
@@ -249,13 +268,8 @@ class Step:
 
     def action(self, states: TensorDictBase, params: TensorDictParams) -> Tensor:
         """The action that a deterministic policy writes, ``[..., A]``."""
-        network, key = self.loss.actor_network, self.loss.tensor_keys.action
-        with params.to_module(network, preserve_module_state=False):
-            output = full_precision(network(states.copy()))
-        action: Tensor | None = output.get(key, None)
-        if action is None:
-            raise KeyError(f"The actor writes no {key!r}: call set_keys(action=...).")
-        return action
+        key = self.loss.tensor_keys.action
+        return written_action(self.loss.actor_network, params, states, key)
 
     def inverse_dynamics(self, states: States) -> Any:
         """The frozen model ``I(a | s~, s')`` at these states, ``[D, B]``."""

@@ -13,19 +13,18 @@ from pathlib import Path
 
 import pandas as pd
 
+from torchrl_osr.experiment.run_folder import MAY_DIFFER
 from torchrl_osr.report.runs import QUALITY, LeftOut, read_each
 from torchrl_osr.report.scores import counted
 
 IGNORED = (
+    *sorted({*MAY_DIFFER} - {"trainer.steps", "trainer.eval_interval"}),
     "resume",
+    "data.storage",
     "logger.",
-    "trainer.progress",
-    "trainer.num_threads",
     "trainer.compile",
     "trainer.cudagraph",
-    "trainer.log_interval",
     "trainer.checkpoint_interval",
-    "trainer.checkpoints_kept",
     "loss.chunk_size",
     "loss.deactivate_vmap",
 )

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
+from torchrl_osr._checks import check_choice, check_weight
 from torchrl_osr._entries import nested
 
 
@@ -24,20 +25,18 @@ class StatePerturbation(Transform):
     it. In an environment it adds the same entry to observations and specs.
 
     Args:
-        std: :math:`\beta`, the noise's standard deviation per dimension; in units of
-            the observation, or of ``relative_to`` where that is given.
+        std: :math:`\beta`, the noise's standard deviation per dimension, in units of
+            the observation.
 
     Keyword Args:
         in_keys: the states to perturb. Default ``["observation"]``.
-        relative_to: the data's standard deviation, one tensor ``[S]`` for each key (a
-            single tensor for a single key). Default: none, ``std`` is absolute.
         noise: ``"gaussian"`` (default), or ``"uniform"`` with the same standard
             deviation (half-width :math:`\sqrt 3\,\beta`).
         perturbed: where to write the perturbed states. Default ``"perturbed"``.
         seed: of the generator. Default: torch's initial seed.
 
     Raises:
-        ValueError: if ``std`` is negative or ``noise`` unknown.
+        ValueError: if ``std`` is negative or infinite, or ``noise`` unknown.
         KeyError: in the call, if a state is missing.
         TypeError: in the call, if a state is not floating point.
 
@@ -60,15 +59,12 @@ class StatePerturbation(Transform):
         std: float,
         *,
         in_keys: Sequence[NestedKey] = ("observation",),
-        relative_to: Tensor | Sequence[Tensor] | None = None,
         noise: Literal["gaussian", "uniform"] = "gaussian",
         perturbed: NestedKey = "perturbed",
         seed: int | None = None,
     ) -> None:
-        if not std >= 0:
-            raise ValueError(f"std must be at least 0, got {std}.")
-        if noise not in ("gaussian", "uniform"):
-            raise ValueError(f"noise must be 'gaussian' or 'uniform', got {noise!r}.")
+        check_weight("std", std)
+        check_choice("noise", noise, ("gaussian", "uniform"))
         in_keys = [in_keys] if isinstance(in_keys, str) else list(in_keys)
         super().__init__(
             in_keys=in_keys, out_keys=[nested(perturbed, key) for key in in_keys]
@@ -76,16 +72,6 @@ class StatePerturbation(Transform):
         self.register_buffer("std", torch.tensor(std, dtype=torch.float64))
         self.noise = noise
         self.seed = torch.initial_seed() if seed is None else seed
-        if isinstance(relative_to, Tensor):
-            relative_to = [relative_to]
-        if relative_to is not None and len(relative_to) != len(in_keys):
-            raise ValueError(
-                f"relative_to needs one tensor for each of {in_keys}, got "
-                f"{len(relative_to)}."
-            )
-        for i in range(len(in_keys)):
-            unit = 1.0 if relative_to is None else relative_to[i]
-            self.register_buffer(f"_unit_{i}", torch.as_tensor(unit))
         self._generator: torch.Generator | None = None
         self._loaded: Tensor | None = None
 
@@ -104,7 +90,7 @@ class StatePerturbation(Transform):
             generator.set_state(loaded)
             self._loaded = None
 
-    def _perturb(self, state: Tensor, key: NestedKey, scale: Tensor) -> Tensor:
+    def _perturb(self, state: Tensor, key: NestedKey) -> Tensor:
         if not state.is_floating_point():
             raise TypeError(
                 f"{key!r} must be floating point to be perturbed, got {state.dtype}; "
@@ -120,13 +106,11 @@ class StatePerturbation(Transform):
                 state.shape, generator=generator, dtype=state.dtype, device=state.device
             )
             noise = (2 * noise - 1) * 3**0.5
-        return torch.addcmul(state, noise, scale.to(state))
+        return torch.addcmul(state, noise, self.std.to(state))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Add the perturbed states to a batch of any shape."""
-        for i, (key, out_key) in enumerate(
-            zip(self.in_keys, self.out_keys, strict=True)
-        ):
+        for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
             state = tensordict.get(key, None)
             if state is None:
                 raise KeyError(
@@ -137,8 +121,7 @@ class StatePerturbation(Transform):
                 # Once: a copy from the host at each draw keeps a GPU waiting, and
                 # cannot be captured in a CUDA graph.
                 self.to(state.device)
-            unit: Tensor = getattr(self, f"_unit_{i}")
-            tensordict.set(out_key, self._perturb(state, key, self.std * unit))
+            tensordict.set(out_key, self._perturb(state, key))
         return tensordict
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:

@@ -157,3 +157,10 @@ def test_a_mixture_says_what_it_is_made_of(tmp_path, on_disk):
     }
     expected = 0.1 * scores["medium"] + 0.9 * scores["random"]
     assert manifest["normalized_score"] == pytest.approx(expected)
+
+
+def test_random_data_are_not_mixed_with_random_data(tmp_path):
+    request = {"num_transitions": 100, "cache_dir": tmp_path, "random_share": 0.5}
+    with pytest.raises(ValueError, match="quality is random already"):
+        load_local_dataset("hopper", "random", **request)
+    assert not [*tmp_path.iterdir()]

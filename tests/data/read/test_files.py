@@ -121,6 +121,23 @@ def test_what_only_parquet_can_hold_is_named(tmp_path, name, column, message):
         load_file(path)
 
 
+def test_columns_that_are_not_read_do_not_count(tmp_path, monkeypatch):
+    rows = make_columns(60)
+    pictures = {"observation_image": np.zeros((60, 5000), np.float32)}
+    path = save(tmp_path / "log.parquet", rows | pictures)
+    monkeypatch.setattr("torchrl_osr._files.MAX_UNPACKED_BYTES", 10_000)
+    names = {name: name for name in rows}
+    assert len(load_file(path, columns=names)[0])
+
+
+def test_one_value_is_no_column(tmp_path):
+    path = tmp_path / "log.npz"
+    for name, value in {"reward": 1.0, "episode": "first"}.items():
+        np.savez(path, **(make_columns(60) | {name: np.array(value)}))
+        with pytest.raises(ValueError, match=f"'{name}' is one value"):
+            load_file(path)
+
+
 def test_lists_of_a_fixed_size_are_read(tmp_path):
     columns = {k: v for k, v in make_columns(60).items() if v.ndim == 1}
     for name in ("observation", "action"):

@@ -88,10 +88,16 @@ def load_local_dataset(
         mean over the rows.
 
     Raises:
-        ValueError: unknown environment or quality.
+        ValueError: unknown environment or quality, or a mixture of random data with
+            random data.
         OSError: the cache folder cannot be written.
     """
     root = cache_root(cache_dir)
+    if random_share and quality == "random":
+        raise ValueError(
+            f"random_share={random_share} mixes random rows into data of another "
+            "quality; quality is random already."
+        )
     request = request_of(env_name, quality, num_transitions, seed)
     data, manifest = _rolled_out(root, request, progress)
     if not random_share:

@@ -68,8 +68,12 @@ def open_parquet(path: Path) -> Table:
 def _number_of_values(group: Any, names: list[str]) -> int:
     """Numbers in some columns of a row group; of lists, their entries count."""
     parts = [group.column(i) for i in range(group.num_columns)]
-    start = tuple(names)
-    return sum(int(p.num_values) for p in parts if p.path_in_schema.startswith(start))
+    inner = tuple(f"{name}." for name in names)  # entries of a list
+    return sum(
+        int(part.num_values)
+        for part in parts
+        if part.path_in_schema in names or part.path_in_schema.startswith(inner)
+    )
 
 
 def _as_numpy(name: str, column: Any) -> NDArray[Any]:

@@ -119,11 +119,15 @@ def assemble(
         episodes: number of each episode that is called by a text; new ones are added.
 
     Raises:
-        ValueError: a column holds text, or is longer or shorter than another.
+        ValueError: a column holds text or a single value, or is longer or shorter than
+            another.
     """
     columns: dict[str, NDArray[Any]] = {}
     for part, names in layout.columns.items():
         parts = [arrays[name] for name in names]
+        for name, array in zip(names, parts, strict=True):
+            if not array.ndim:
+                raise ValueError(f"{name!r} is one value; expected one for each row.")
         if part == "episode" and parts[0].dtype.kind in "OU":
             _refuse_nameless(names[0], parts[0])
             numbers = [
