@@ -187,7 +187,7 @@ def draw(rows: pd.DataFrame, path: Path) -> None:
         axes.set_ylim(min(disturbed.min(), 0) - 0.05 * top, 1.15 * top)
         # Names in a column, each tied to its point: beside the points they overlap.
         order = disturbed.sort_values().index
-        apart = 1.1 * top / 20  # that 21 names fit
+        apart = 1.1 * top / 22  # that 23 names fit
         heights: list[float] = []
         for point in disturbed[order[::-1]]:  # as near to the points as names allow
             heights.append(min([point, *(each - apart for each in heights[-1:])]))
@@ -197,7 +197,7 @@ def draw(rows: pd.DataFrame, path: Path) -> None:
             colour = "#D55E00" if own else "0.25"
             axes.annotate(
                 method, (mean["undisturbed"][method], disturbed[method]),
-                xytext=(1.12 * end, height), fontsize=7, va="center", color=colour,
+                xytext=(1.2 * end, height), fontsize=7, va="center", color=colour,
                 weight="bold" if own else "normal", annotation_clip=False,
                 arrowprops={"arrowstyle": "-", "color": colour, "lw": 0.3},
             )  # fmt: skip

@@ -13,6 +13,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import (
     InteractionType,
     ProbabilisticTensorDictSequential,
+    TensorDictModuleBase,
     TensorDictParams,
     set_interaction_type,
 )
