@@ -4,7 +4,7 @@
     python results/oos/run.py outputs/oos --data hopper-medium-replay --methods osr cql
 
 Each run is one process with one torch thread. Stop it at any time and start it again:
-runs continue from their last checkpoint. ``collect.py`` gathers what came out.
+runs continue from their last checkpoint.
 """
 
 from __future__ import annotations
