@@ -24,7 +24,7 @@ from torchrl_osr._checks import check_choice, check_positive, check_weight
 from torchrl_osr._entries import entry, nested, select
 from torchrl_osr.functional import jeffreys_divergence
 from torchrl_osr.objectives.base import BaseLoss
-from torchrl_osr.objectives.step import distribution_params, observation_keys, qvalue
+from torchrl_osr.objectives.step import distribution, observation_keys, qvalue
 
 TanhNormalPolicy = Callable[[TensorDictBase], TanhNormal]
 """Maps states ``[M, B]`` (or ``[B]``) to the policy's distribution there."""
@@ -125,9 +125,7 @@ class Adversary:
         critics = loss.qvalue_network_params.detach()
 
         def policy(states: TensorDictBase) -> TanhNormal:
-            network, params = loss.actor_network, loss.actor_network_params
-            found = distribution_params(network, params, states)
-            return network.build_dist_from_params(found)
+            return distribution(loss.actor_network, loss.actor_network_params, states)
 
         worst = self.perturb(
             select(tensordict, keys),

@@ -14,7 +14,7 @@ from torchrl.modules import TanhDelta
 
 from torchrl_osr import functional
 from torchrl_osr.objectives.distributions import check_action, head_of
-from torchrl_osr.objectives.step import distribution_params, written_action
+from torchrl_osr.objectives.step import distribution, written_action
 
 
 def is_deterministic(network: TensorDictModuleBase) -> bool:
@@ -40,8 +40,7 @@ def policy_at(
         KeyError: if it writes no such action.
     """
     if head_of(network)[0] is not None:
-        found = distribution_params(network, params, states)
-        return network.build_dist_from_params(found)
+        return distribution(network, params, states)
     return written_action(network, params, states, key)
 
 

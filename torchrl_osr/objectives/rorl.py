@@ -21,7 +21,7 @@ from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
 from torchrl_osr.objectives.step import (
     Step,
     actor_critic_in_keys,
-    distribution_params,
+    distribution,
     observation_keys,
 )
 
@@ -259,6 +259,4 @@ class RORLLoss(BaseLoss):
         return around
 
     def _policy(self, states: TensorDictBase) -> Any:
-        network, params = self.actor_network, self.actor_network_params
-        found = distribution_params(network, params, states)
-        return network.build_dist_from_params(found)
+        return distribution(self.actor_network, self.actor_network_params, states)

@@ -69,6 +69,16 @@ def distribution_params(
         return full_precision(network.get_dist_params(states.copy()))
 
 
+def distribution(
+    network: ProbabilisticTensorDictSequential,
+    params: TensorDictParams,
+    states: TensorDictBase,
+) -> Any:
+    """A network's distribution at ``states``."""
+    found = distribution_params(network, params, states)
+    return network.build_dist_from_params(found)
+
+
 def written_action(
     network: TensorDictModuleBase,
     params: TensorDictParams,
@@ -117,10 +127,7 @@ def frozen_distribution(
         states=states,
     )
     with torch.no_grad(), set_interaction_type(InteractionType.DETERMINISTIC):
-        params = loss.inverse_dynamics_network_params
-        return network.build_dist_from_params(
-            distribution_params(network, params, batch)
-        )
+        return distribution(network, loss.inverse_dynamics_network_params, batch)
 
 
 def qvalue(
@@ -263,9 +270,8 @@ class Step:
         loss = self.loss
         if not loss.delay_actor:
             return self.policy("next")
-        network, params = loss.actor_network, loss.target_actor_network_params
-        found = distribution_params(network, params, self.at("next"))
-        return network.build_dist_from_params(found)
+        params = loss.target_actor_network_params
+        return distribution(loss.actor_network, params, self.at("next"))
 
     def action(self, states: TensorDictBase, params: TensorDictParams) -> Tensor:
         """The action that a deterministic policy writes, ``[..., A]``."""
