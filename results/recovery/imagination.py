@@ -28,6 +28,7 @@ from tables import table
 from torchrl_osr.evaluation.recoverable import (
     GROUPS,
     recovered_share,
+    saved_difference,
     saved_share,
 )
 from torchrl_osr.report import read_records, read_runs
@@ -160,8 +161,8 @@ def by_kind(path: Path) -> str:
             row |= {first: percent(saved_share(ours, walk), len(ours))}
             row |= {gained: "", "R %": ""}
             if second in mine.index:
-                more = (ours - mine.loc[second]).dropna()
-                row[gained] = percent(saved_share(more, walk), len(more))
+                pair = ours.align(mine.loc[second], "inner", axis=0)
+                row[gained] = percent(saved_difference(*pair, walk), len(pair[0]))
             both = theirs.index.intersection(ours.index)
             share = ours.loc[both], theirs.loc[both]
             if len(both):

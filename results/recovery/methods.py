@@ -29,6 +29,7 @@ from torchrl_osr.evaluation.recoverable import (
     RecoverableStates,
     read_recoverable_states,
     recovered_share,
+    saved_difference,
     saved_share,
 )
 from torchrl_osr.report import read_runs
@@ -175,7 +176,7 @@ def rows_of(
             if column == "R":
                 share = recovered_share(ours, theirs, walk)
             else:
-                share = saved_share(ours - theirs, walk)
+                share = saved_difference(ours, theirs, walk)
             row[column] = told(share)
         values = [x["undisturbed"] for x in extra[name] if "undisturbed" in x]
         row["undisturbed"] = f"{np.mean(values):.2f}" if values else ""
@@ -232,7 +233,7 @@ def rows_of_choice(
         for name, other in others.items():
             theirs, row[f"less {name}"] = bits(other, hard, sets), ""
             if key != other and len(theirs) == len(mine):
-                row[f"less {name}"] = told(saved_share(mine - theirs, walks[hard]))
+                row[f"less {name}"] = told(saved_difference(mine, theirs, walks[hard]))
         share = recovered_share(mine, noisy, walks[hard], paired=False)
         row["R"] = told(share)
         values = [x["undisturbed"] for x in groups.get("easy", [])]

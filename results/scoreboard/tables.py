@@ -19,7 +19,7 @@ from torchrl_osr._files import write_atomically
 from torchrl_osr.evaluation.recoverable import (
     GROUPS,
     recovered_share,
-    saved_share,
+    saved_difference,
 )
 from torchrl_osr.report import RunTables, read_runs
 from torchrl_osr.report.saved import came_back, percent, saved_states
@@ -130,7 +130,7 @@ def ablation(tables: RunTables) -> str:
         for arm in ("osr", "cql_both", "noisy_bc", "td3_bc"):
             ours, theirs = table.loc[arm].align(table.loc[twin], "inner", axis=0)
             shares = (
-                saved_share(ours - theirs, walk),
+                saved_difference(ours, theirs, walk),
                 recovered_share(ours, theirs, walk),
             )
             cells = [str(percent(share, len(ours))) for share in shares]

@@ -22,6 +22,7 @@ from torchrl_osr.evaluation.recoverable import (
     read_recoverable_states,
     recovered_share,
     recovers,
+    saved_difference,
     saved_share,
 )
 
@@ -203,6 +204,16 @@ def test_the_saved_share_of_known_tables() -> None:
     assert saved_share([[1, 1, 1, 0]], [0, 0, 0, 1])[0] == 3 / 4
 
 
+def test_the_saved_difference_of_known_tables() -> None:
+    method, baseline, walk = [[1, 1, 1, 0]], [[1, 0, 0, 0]], [0, 0, 1, 1]
+    assert saved_difference(method, baseline, walk) == (1 / 2, 1 / 2, 1 / 2)
+    # One more of four states with one seed, one fewer with the other.
+    both = [[1, 1, 0, 0], [1, 0, 0, 0]], [[1, 0, 0, 0], [1, 1, 0, 0]]
+    assert saved_difference(*both, [7] * 4) == (0, -1 / 4, 1 / 4)
+    # A tie is no share of none: it says nothing about what either saves.
+    assert saved_difference(method, method, walk) == (0, 0, 0)
+
+
 def test_the_interval_of_the_recovered_share_covers_the_truth() -> None:
     """Seeds and walks differ; of 30 intervals of 95 % at least 25 hold the truth."""
     rng, held = np.random.default_rng(0), 0
@@ -227,6 +238,8 @@ def test_shares_without_a_difference_or_with_other_shapes_are_refused() -> None:
         recovered_share([[1, 0]], [[1, 0], [0, 0]], [0, 1])
     with pytest.raises(ValueError, match="finite"):
         saved_share([[1, np.nan]], [0, 1])
+    with pytest.raises(ValueError, match="have the same seeds; got 1 and 2"):
+        saved_difference([[1, 0]], [[1, 0], [0, 0]], [0, 1])
     with pytest.raises(ValueError, match=r"got \(0, 2\) and"):
         saved_share(np.zeros((0, 2)), [0, 1])
 
