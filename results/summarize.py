@@ -14,7 +14,7 @@ from typing import Any
 
 import pandas as pd
 
-from torchrl_osr.evaluation import mean_interval, wilson_interval
+from torchrl_osr.evaluation import mean_interval, measure_of, wilson_interval
 from torchrl_osr.report import read_records, read_runs
 from torchrl_osr.report.scores import by_run, estimate, recent, undisturbed
 
@@ -31,7 +31,7 @@ def row(episodes: pd.DataFrame, record: dict[str, Any]) -> dict[str, Any]:
         )
     model = record["inverse_dynamics"] or {}
     return {
-        "data's own": record["returns"]["data_score"],
+        "data's own": record["returns"][f"data_{measure_of(last)}"],
         "last": f"{means.iloc[-1]:.1f} [{low:.1f}, {high:.1f}]",
         "mean of the last five": means.iloc[-5:].mean(),
         "best (step)": f"{means.max():.1f} ({means.idxmax():,})",

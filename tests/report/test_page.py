@@ -199,6 +199,15 @@ def test_the_same_runs_give_the_same_page(tmp_path):
         write_report(tables, tmp_path, reference="iql")
 
 
+def test_runs_whose_disturbances_all_last_have_no_recovery(tmp_path):
+    scores = [1.0, 2.0]
+    lasting = fakes.hand_suite((4, [0, 1], scores, [fakes.hand_level("mass", scores)]))
+    fakes.write_hand(tmp_path / "runs" / "a", {4: scores}, suite=lasting)
+    markup = write_report(read_runs([tmp_path / "runs"]), tmp_path).read_text()
+    assert "No run was disturbed by anything that ends" in markup
+    assert "No run has been disturbed" not in markup
+
+
 def test_five_seeds_have_a_verdict_and_many_methods_small_panels(tmp_path):
     for shift in range(MOST + 1):
         for seed in range(5):
