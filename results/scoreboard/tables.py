@@ -23,7 +23,7 @@ from torchrl_osr.evaluation.recoverable import (
 )
 from torchrl_osr.report import RunTables, read_runs
 from torchrl_osr.report.saved import came_back, percent, saved_states
-from torchrl_osr.report.scores import by_run, estimate, recent
+from torchrl_osr.report.scores import Estimate, by_run, estimate, recent
 
 HERE = Path(__file__).parent
 OVERVIEW = [f"{env} medium-expert" for env in ("hopper", "walker2d", "halfcheetah")]
@@ -68,14 +68,9 @@ def scores(tables: RunTables) -> pd.DataFrame:
     return pd.DataFrame(found).reset_index()
 
 
-def table(tables: RunTables, data: str) -> str:
+def table(tables: RunTables, data: str, saved: dict[tuple[str, str], Estimate]) -> str:
     """Markdown: the methods on one data set, best undisturbed score first."""
     rows = []
-    saved = {
-        each.method: str(each.shares["recoverable"])
-        for each in saved_states(tables, tables.methods[0])
-        if each.data == data
-    }
     for method in tables.methods:
         mine = tables.episodes.query("data == @data and method == @method")
         if mine.empty:
@@ -84,7 +79,7 @@ def table(tables: RunTables, data: str) -> str:
         for suite in SUITES:
             under = mine[(mine["suite"] == suite) & (mine["disturbance"] != "")]
             cells.append(str(estimate(by_run(under))))
-        cells.append(saved.get(method, ""))
+        cells.append(str(saved.get((method, data), "")))
         steps = tables.runs.query("data == @data and method == @method")["steps"].max()
         quoted = str(PUBLISHED.loc[data].get(method, ""))
         seeds = mine["seed"].nunique()
@@ -96,7 +91,7 @@ def table(tables: RunTables, data: str) -> str:
     return markdown(lines)
 
 
-def overview(tables: RunTables) -> str:
+def overview(tables: RunTables, saved: dict[tuple[str, str], Estimate]) -> str:
     """Markdown: means over ``OVERVIEW`` of the methods with three seeds on each."""
     means = scores(tables).assign(
         disturbed=lambda rows: rows[list(SUITES)].mean(axis=1)
@@ -104,11 +99,7 @@ def overview(tables: RunTables) -> str:
     means = means[means["data"].isin(OVERVIEW)]
     seeds = means.groupby(["method", "data"])["seed"].nunique().unstack()
     means = means.groupby(["method", "data"])[["undisturbed", "disturbed"]].mean()
-    saved = {
-        (each.method, each.data): each.shares["recoverable"].mean
-        for each in saved_states(tables, tables.methods[0])
-    }
-    means["recoverable %"] = pd.Series(saved)
+    means["recoverable %"] = pd.Series({key: each.mean for key, each in saved.items()})
     means = means.groupby("method").mean()[(seeds >= 3).all(axis=1)]
     head = ["method", *means]
     rows = [
@@ -241,10 +232,14 @@ def seeds(tables: RunTables) -> str:
 def main() -> None:
     """Write the tables, and draw."""
     tables = read_runs(sorted(HERE.glob("*.jsonl.gz")))
+    saved = {
+        (each.method, each.data): each.shares["recoverable"]
+        for each in saved_states(tables, tables.methods[0])
+    }
     pages = [TITLE, "## Seeds", seeds(tables)]
     for data in tables.data:
-        pages += [f"## {data}", table(tables, data)]
-    pages += [f"## Means over {', '.join(OVERVIEW)}", overview(tables)]
+        pages += [f"## {data}", table(tables, data, saved)]
+    pages += [f"## Means over {', '.join(OVERVIEW)}", overview(tables, saved)]
     pages += ["## Ablation", ABLATION, ablation(tables)]
     pages += ["## Lines", LINES, lines(tables)]
     write_atomically(HERE / "tables.md", "\n\n".join(pages) + "\n")
