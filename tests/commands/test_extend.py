@@ -48,6 +48,8 @@ def test_your_algorithm_in_your_environment(tmp_path, run, tiny):
     folder = tmp_path / "runs" / "awac"
     scalars = folder / "csv" / "scalars" / "policy"
     assert {path.stem for path in scalars.iterdir()} >= {"loss_actor", "pred_value"}
+    evaluations = json.loads((folder / "returns.json").read_text())["evaluations"]
+    assert evaluations[0]["returns"] != evaluations[-1]["returns"], "it learns"
     read("torchrl-osr evaluate", "suite=observation_noise", "episodes=2", "last=1")
     results = json.loads((folder / "robustness-observation_noise.json").read_text())
     assert results["env"] == "PointMass-v0"

@@ -130,6 +130,23 @@ def test_a_buffers_batches_are_a_collectors_frames() -> None:
     assert not torch.equal(batches(20, seed=3), batches(20, seed=4))
 
 
+def test_a_collector_goes_on_with_the_draws_that_come_next() -> None:
+    data = TensorDict({"row": torch.arange(50.0)}, [50])
+
+    def make() -> ReplayBufferCollector:
+        buffer = make_replay_buffer(data, batch_size=5, seed=0)
+        collector = ReplayBufferCollector(buffer, total_frames=20)
+        collector.set_seed(7)
+        return collector
+
+    whole = torch.stack([batch["row"] for batch in make()])
+    first, second = make(), make()
+    draws = iter(first)
+    assert torch.equal(torch.stack([next(draws)["row"] for _ in range(2)]), whole[:2])
+    second.load_state_dict(first.state_dict())
+    assert torch.equal(torch.stack([batch["row"] for batch in second]), whole[2:])
+
+
 def test_the_example_trains_on_real_data(tmp_path, run) -> None:
     code, printed = run(
         tmp_path,

@@ -49,6 +49,10 @@ def test_they_are_options_of_the_loss_within_their_ranges(loss, make_networks) -
             {"policy_smooth_eps": 0.005, "q_ood_uncertainty_reg": 5.0},
         ),
         (
+            ["loss=rorl", "env=walker2d", "data=medium"],
+            {"q_ood_uncertainty_reg": 1.0, "q_ood_uncertainty_decay": 5e-7},
+        ),
+        (
             ["loss=rorl", "env=halfcheetah", "data=medium"],
             {"num_samples": 10, "q_ood_reg": 0.0},
         ),

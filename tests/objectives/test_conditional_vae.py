@@ -102,6 +102,30 @@ def test_it_learns_which_actions_lead_to_a_state() -> None:
     assert close.float().mean() > 0.8
 
 
+def test_the_network_names_what_is_read_and_of_single_steps(make_batch) -> None:
+    batch = make_batch(10, twin=False)
+    nested = batch.exclude("observation", "action", ("next", "observation"))
+    nested["agent", "obs"], nested["agent", "action"] = (
+        batch["observation"], batch["action"],
+    )  # fmt: skip
+    nested["next", "agent", "obs"] = batch["next", "observation"]
+    keys = {
+        "condition_key": ("next", "agent", "obs"),
+        "target_key": ("agent", "action"),
+    }
+    losses = []
+    for given, rows in (({}, batch), (keys, nested)):
+        torch.manual_seed(0)
+        defaults = {"condition_key": ("next", "observation"), "target_key": "action"}
+        model = ConditionalVAE(3, 2, num_cells=[6], **(defaults | given)).double()
+        loss = ConditionalVAELoss(model)
+        losses.append(loss(rows.select(*loss.in_keys))["loss_vae"])
+    assert losses[0] == losses[1]
+    nested["steps_to_next_obs"] = torch.full((10, 1), 5)
+    with pytest.raises(ValueError, match="up to 5.*the autoencoder reads"):
+        loss(nested)
+
+
 def test_a_change_needs_a_condition_of_its_size() -> None:
     with pytest.raises(ValueError, match="condition of the target's size, 3, got 2"):
         ConditionalVAE(2, 3, **KINDS["change"][1])

@@ -44,6 +44,10 @@ def test_cloning_is_left_out_row_by_row(family, family_batch, seeded, name) -> N
     ours = seeded(loss, batch)["loss_actor"]
     assert torch.equal(ours[:6], everywhere[:6])
     assert (ours[6:] < everywhere[6:]).all(), "a squared distance less"
+    # What is logged is that of the rows that are cloned.
+    whole, rows = family(name), family_batch(name, 10)[:6]
+    error = seeded(whole, batch)["cloning_error"]
+    torch.testing.assert_close(error, seeded(whole, rows)["cloning_error"])
 
 
 def test_a_constraint_and_cloning_alone_leave_them_out(

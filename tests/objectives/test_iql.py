@@ -182,6 +182,14 @@ def test_what_follows_an_end_is_never_read(make_batch) -> None:
     assert torch.equal(make_loss(networks())(batch)["loss_qvalue"], wanted)
 
 
+def test_a_list_of_critics_has_its_own_length(make_batch) -> None:
+    nets, critics = networks(), critic_ensemble(3, 2, num_qvalue_nets=4)
+    loss = IQLLoss(nets.actor, critics, nets.value)
+    SoftUpdate(loss, tau=0.1)
+    assert loss.num_qvalue_nets == 4
+    assert loss(make_batch(4, twin=False))["loss_qvalue"].isfinite()
+
+
 def test_imagined_rows_are_refused(make_batch) -> None:
     batch = make_batch(4, twin=False)
     batch["imagined"] = torch.zeros(4, 1, dtype=torch.bool)

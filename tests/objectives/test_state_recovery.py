@@ -367,6 +367,8 @@ def test_the_datas_action_may_be_the_target(
     got = [*value_and_gradients(loss, batch), loss(batch)[metric]]
     check("Noisy cloning alone", got, wanted, tolerance=1e-10)
     assert not [key for key in loss.in_keys if "next" in key and "done" not in key]
+    batch["steps_to_next_obs"] = torch.full((10, 1), 5)
+    torch.testing.assert_close(value_and_gradients(loss, batch), got[:-1])
 
 
 def test_a_model_is_needed_unless_the_data_are_the_target(make_networks) -> None:

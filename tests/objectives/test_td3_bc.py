@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 
 from torchrl_osr import TD3BCLoss
+from torchrl_osr.modules import critic_ensemble, deterministic_actor
 
 GAMMA, ALPHA, NOISE, CLIP, TARGET_SCALE = 0.875, 1.7, 0.6, 0.5, 0.8
 LOW, HIGH = -0.8, 0.7
@@ -146,6 +147,12 @@ def test_metrics_say_what_they_are_called(make_networks, make_batch) -> None:
     errors = torch.stack(values) - batch["next", "reward"]
     wanted = errors.abs().amax(0).squeeze(-1).detach()
     torch.testing.assert_close(batch["td_error"], wanted)
+
+
+def test_bounds_are_those_of_the_actor(make_networks) -> None:
+    actor, critics = deterministic_actor(3, 2, high=[1.0, 3.0]), critic_ensemble(3, 2)
+    with pytest.raises(ValueError, match=r"high=1.0, but its actor high=\[1.0, 3.0\]"):
+        TD3BCLoss(actor, critics)
 
 
 @pytest.mark.parametrize("option", ["alpha", "policy_noise"])

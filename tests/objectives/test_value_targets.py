@@ -29,6 +29,19 @@ def test_td_target_is_the_reward_and_the_discounted_value(family, make_batch) ->
     assert target.tolist() == [6, 2, 18, 24, 30]
 
 
+def test_a_policy_that_is_first_asked_without_gradient_has_one(
+    family, make_batch
+) -> None:
+    loss = family("cql")
+    step = Step(loss, make_batch(5), perturbed=False)
+    with torch.no_grad():
+        step.policy("clean").sample()
+    log_prob = step.policy("clean").log_prob(step.data_action.unsqueeze(0))
+    log_prob.sum().backward()
+    actor = loss.actor_network_params.parameters()
+    assert all(each.grad is not None for each in actor)
+
+
 @pytest.mark.losses(having="critics")
 def test_the_kinds_of_target_agree_where_they_must(
     family, family_batch, seeded, name

@@ -15,7 +15,10 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.checkpoint import CheckpointError
+from torchrl.data import SamplerWithoutReplacement
 
+from torchrl_osr import StatePerturbation
+from torchrl_osr.data import make_replay_buffer
 from torchrl_osr.trainers import OfflineTrainer, largest_value
 
 STEPS = 20
@@ -85,6 +88,30 @@ def test_killed_and_resumed_run_ends_with_the_same_bits(
     runs.assert_same_bits(runs.state(resumed), wanted)
     steps = [row["step"] for row in resumed.history]
     assert steps == [row["step"] for row in undisturbed.history]
+
+
+def test_a_sampler_without_replacement_goes_on_in_its_epoch(tmp_path, runs):
+    def make_run(folder):
+        loss = runs.make_loss("inverse dynamics", states="clean")
+        buffer = make_replay_buffer(runs.make_data("cpu"), batch_size=8, seed=0)
+        buffer.set_sampler(SamplerWithoutReplacement())
+        return OfflineTrainer(
+            loss, torch.optim.Adam(loss.parameters()), buffer, STEPS, folder,
+            eval_interval=5, progress=False, components={"order": buffer.sampler},
+        )  # fmt: skip
+
+    whole = make_run(tmp_path / "whole")
+    whole.train()
+    stop_at(make_run(tmp_path / "run"), 7)
+    resumed = make_run(tmp_path / "run")
+    resumed.train()
+    runs.assert_same_bits(runs.state(resumed), runs.state(whole))
+
+
+def test_components_cannot_take_the_place_of_the_trainers_own(tmp_path, make):
+    match = r"components have names of the trainer's own: \['sampler'\]"
+    with pytest.raises(ValueError, match=match):
+        make(tmp_path, components={"sampler": StatePerturbation(0.1)})
 
 
 def test_finished_run_returns_at_once(make, undisturbed):

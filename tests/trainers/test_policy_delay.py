@@ -102,6 +102,11 @@ def test_there_must_be_something_to_train_in_between(tmp_path, runs) -> None:
         )
 
 
+def test_what_is_delayed_must_be_said(tmp_path, runs) -> None:
+    with pytest.raises(ValueError, match="policy_delay=2 needs the parameters"):
+        runs.make(tmp_path, policy_delay=2, policy_params=())
+
+
 def test_a_delay_below_one_is_refused(tmp_path, make) -> None:
     with pytest.raises(ValueError, match="policy_delay must be at least 1, got 0"):
         make(tmp_path, 0)

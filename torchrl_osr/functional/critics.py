@@ -108,11 +108,10 @@ def value_constraint(
 
     Minimised over Q, it lowers actions with unknown consequences and raises those that
     lead to ``s'``. With ``log_prob`` the first expectation is a log-sum-exp over
-    importance-weighted actions instead (:func:`soft_maximum`): an addition, not in the
-    paper, which puts the weight on the actions that Q overrates. The printed
-    difference is linear in Q and has no minimum;
-    :math:`\log\int e^{Q} da - \mathbb E_I Q`, of which this is an estimate but for
-    :math:`\log M`, is bounded below by the model's entropy.
+    importance-weighted actions instead (:func:`soft_maximum`): our addition, which
+    puts the weight on the actions that Q overrates. The paper's difference is linear
+    in Q, so that it has no minimum. Ours estimates, up to the constant :math:`\log M`,
+    :math:`\log\int e^{Q} da - \mathbb E_I Q`, which is never below the model's entropy.
 
     Args:
         policy_qvalue: values of the sampled actions at ``s~``, ``[B, M]``.
@@ -187,9 +186,8 @@ def uncertainty_penalty(qvalue: Tensor, weight: Tensor | float) -> Tensor:
     .. math::
         \frac1N \sum_i \big( Q_i - [Q_i - \lambda\, \text{std}_i Q_i] \big)^2
 
-    where what is in brackets is a target without gradient: each critic is pulled down,
-    by the more the larger the deviation of all is. Source: see
-    :func:`value_smoothness`.
+    The bracket is a target without gradient: the more the critics disagree, the further
+    each is pulled down. Source: see :func:`value_smoothness`.
 
     Args:
         qvalue: ``[N, B]``, ``N >= 2``.

@@ -167,8 +167,8 @@ def deterministic_recovery(
 
     with :math:`x` the policy's action before the tanh. An addition, not in the paper,
     whose divergence needs two densities: towards a point :math:`KL(I \,\|\, \pi)` is
-    infinite. This is what of the reverse :math:`KL(\pi \,\|\, I)` depends on where a
-    Gaussian policy of constant width lies.
+    infinite. This is the part of the reverse :math:`KL(\pi \,\|\, I)` that depends on
+    the mean of a Gaussian policy of fixed width.
 
     Args:
         policy_loc: pre-tanh action at ``s~``, ``[B, A]``.

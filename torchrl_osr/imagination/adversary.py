@@ -21,6 +21,7 @@ from torchrl.data import ReplayBuffer
 
 from torchrl_osr import functional
 from torchrl_osr._checks import check_positive, check_weight
+from torchrl_osr._entries import entry
 from torchrl_osr.imagination.termination import Termination, never
 from torchrl_osr.modules.dynamics import DynamicsEnsemble
 from torchrl_osr.objectives import BaseLoss, DynamicsLoss
@@ -105,7 +106,7 @@ class ModelAdversary:
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
             torch.manual_seed(SEED + self.seed + number)
             for begun in range(0, self.steps, self.rollout_steps):
-                state = self.real.sample(self.batch_size)["observation"]
+                state = entry(self.real.sample(self.batch_size), self.model.in_keys[0])
                 for _ in range(min(self.rollout_steps, self.steps - begun)):
                     likelihood, objective, state = self._update(state)
                     totals += torch.stack([likelihood, objective])

@@ -59,8 +59,8 @@ class ImaginedReplayBuffer(OfflineToOnlineReplayBuffer):
     policy imagines a generation of rows; the last ``generations`` of them are drawn
     from. Each has a seed of its own and leaves torch's global generator alone.
 
-    The rows are not part of its state: that is the policies that have imagined them,
-    which are small. Loading it imagines the same rows again, bit for bit on the same
+    Its state holds not the rows but the policies that have imagined them, which are
+    small. Loading it imagines the same rows again, bit for bit on the same
     machine.
 
     Args:

@@ -66,9 +66,9 @@ def imagine(
             :meth:`~torchrl_osr.modules.DynamicsEnsemble.disagreement` is above that are
             refused: nobody knows what follows. Rows that are not finite are refused,
             too. Default: infinity.
-        halt_reward: takes these rows instead, as ends of the task with this reward,
-            like the HALT of MOReL (https://arxiv.org/abs/2005.05951, definition 1); the
-            next state is then the state itself. Default: they are refused.
+        halt_reward: keep these rows instead, each as an end of the task with this
+            reward, like the HALT of MOReL (https://arxiv.org/abs/2005.05951, definition
+            1); the next state is then the state itself. Default: they are refused.
         units: factors ``[D]`` that bring predictions to the units in which
             ``"uncertainty"`` is measured. Default: 1, those of the model's data.
 

@@ -131,7 +131,7 @@ class ConditionalVAE(TensorDictModuleBase):
         Rows without a next state are left out. An entry that does not vary keeps a
         standard deviation of 1.
         """
-        rows = data[has_next_state(data)]
+        rows = data[has_next_state(data, self.in_keys[0])]
         condition, target = (
             entry(rows, key) for key in (*self.in_keys, *self.out_keys)
         )

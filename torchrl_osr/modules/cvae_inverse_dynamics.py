@@ -72,8 +72,8 @@ def cvae_inverse_dynamics(
         observation_dim: size of the observation, ``S``.
         action_dim: size of the action, ``A``.
         latent_dim: size of the latent, ``Z``. Default 32, the authors'.
-        num_cells: width of each hidden layer of the decoder. The encoder has its last
-            one twice; by default both are then as deep and wide as the authors'.
+        num_cells: width of each hidden layer of the decoder. The encoder has one more,
+            as wide as the last. By default both then match the authors'.
         activation_class: activation between the layers.
         low, high: action bounds, a number or ``[A]``.
         observation_key: the state it reads, and the next state below ``"next"``.

@@ -51,7 +51,7 @@ class DynamicsEnsemble(TensorDictModuleBase):
     (https://arxiv.org/abs/2005.13239). All networks are stacked: each layer is one
     batched product. Log-variances are bounded smoothly, by bounds that are learned.
 
-    Other than there, not the inputs alone are standardised but the targets, too (see
+    Unlike there, the targets are standardised as well as the inputs (see
     :meth:`standardize_`), so that no entry outweighs the others because of its unit.
 
     Args:

@@ -50,8 +50,7 @@ class Adversary:
     The methods, with the names of the RORL attacks:
 
     * ``"sample"`` (RORL's zero order): the best of ``num_samples`` uniform draws, for
-      ``"min_Q"`` also of no perturbation at all. No perturbation is what
-      ``"action_diff"`` likes least, it need not be tried;
+      ``"min_Q"`` also of no perturbation at all, where ``"action_diff"`` is smallest;
     * ``"gradient"``: ``num_steps`` steps along the sign of the gradient, from each of
       ``num_samples`` uniform draws and back into the box after each step; then the
       best of the ends. One start is RORL's first order, 20 are its mixed order. Its

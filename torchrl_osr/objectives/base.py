@@ -21,6 +21,7 @@ from tensordict.nn import (
     TensorDictModule,
     TensorDictModuleBase,
     TensorDictParams,
+    dispatch,
 )
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
@@ -37,6 +38,9 @@ from torchrl_osr.objectives.distributions import (
     check_apart,
     check_same_bounds,
 )
+
+Terms = tuple[dict[str, Tensor], dict[str, Tensor]]
+"""The losses and the metrics of a batch, by name."""
 
 
 @dataclass
@@ -69,10 +73,9 @@ class TransitionKeys:
 class BaseLoss(LossModule):
     """Abstract base: keys in a stable order, networks, value estimator, reduction.
 
-    A loss lists its keys, computes its terms in ``forward`` and hands them to
-    :meth:`_output`. TorchRL 0.14.1 builds ``in_keys`` from sets, so that their order,
-    and with it the meaning of positional arguments, changes from one process to the
-    next; here the order is that of :meth:`_input_keys`.
+    A loss lists its keys and computes its terms. TorchRL 0.14.1 builds ``in_keys`` from
+    sets, so that their order, and with it the meaning of positional arguments, changes
+    from one process to the next; here the order is that of :meth:`_input_keys`.
 
     Keyword Args:
         num_qvalue_nets: number of critics ``N`` where a loss is given a single one,
@@ -389,16 +392,32 @@ class BaseLoss(LossModule):
     def out_keys(self, values: list[NestedKey]) -> None:
         self._out_keys = values
 
-    def _check_not_empty(self, tensordict: TensorDictBase) -> None:
-        """Raise a ValueError unless the batch has a row."""
+    # -- the call -------------------------------------------------------------------
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return the losses and metrics of a batch, see :attr:`out_keys`.
+
+        A loss with critics writes the largest absolute TD error of them under the
+        ``priority`` key, ``[B]``; nothing else is written into ``tensordict``.
+
+        Args:
+            tensordict: a batch ``[B]`` with the entries of :attr:`in_keys`.
+
+        Raises:
+            ValueError: if the batch is empty.
+        """
         # Not tensordict.numel(), which is at least 1.
         if not tensordict.batch_size.numel():
             raise ValueError(
                 f"The batch is empty (batch_size {tuple(tensordict.batch_size)}): the "
                 f"mean of {type(self).__name__} needs at least one transition."
             )
+        return self._output(tensordict, *self._terms(tensordict))
 
-    # -- reduction and output -----------------------------------------------------
+    @abstractmethod
+    def _terms(self, tensordict: TensorDictBase) -> Terms:
+        """The losses and the metrics of a batch that has rows."""
 
     def _weights(self, tensordict: TensorDictBase) -> Tensor | None:
         """The rows' importance weights ``[B]``, if they are there and to be used."""

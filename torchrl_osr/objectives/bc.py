@@ -10,11 +10,11 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.nn import TensorDictModuleBase
 
 from torchrl_osr._checks import check_literals
 from torchrl_osr._entries import entry, nested, select, state_keys
-from torchrl_osr.objectives.base import BaseLoss
+from torchrl_osr.objectives.base import BaseLoss, Terms
 from torchrl_osr.objectives.cloning import cloning_distance, policy_at
 from torchrl_osr.objectives.mixed_states import States, of_data, perturbed_state
 
@@ -99,14 +99,7 @@ class BCLoss(BaseLoss):
     def _output_keys(self) -> tuple[list[NestedKey], list[NestedKey]]:
         return ["loss_actor"], []
 
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return ``"loss_actor"``.
-
-        Args:
-            tensordict: a batch ``[B]`` with the entries of :attr:`in_keys`.
-        """
-        self._check_not_empty(tensordict)
+    def _terms(self, tensordict: TensorDictBase) -> Terms:
         keys, stack = state_keys(self.actor_network.in_keys), []
         if self.states != "perturbed":
             stack.append(select(tensordict, keys))
@@ -117,4 +110,4 @@ class BCLoss(BaseLoss):
         pi = policy_at(self.actor_network, self.actor_network_params, states, key)
         distance = cloning_distance(pi, entry(tensordict, key), key).mean(0)
         loss = self._reduce(distance, tensordict, of_data(tensordict))
-        return self._output(tensordict, {"loss_actor": loss}, {})
+        return {"loss_actor": loss}, {}

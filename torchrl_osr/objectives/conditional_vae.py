@@ -9,15 +9,15 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase, TensorDictParams
-from tensordict.nn import dispatch
+from tensordict import NestedKey, TensorDictBase, TensorDictParams, unravel_key
 
 from torchrl_osr._checks import check_weight
-from torchrl_osr._entries import entry
+from torchrl_osr._entries import entry, is_next, nested
 from torchrl_osr.functional import gaussian_kl
 from torchrl_osr.modules.conditional_vae import ConditionalVAE
 from torchrl_osr.modules.dynamics import has_next_state
-from torchrl_osr.objectives.base import BaseLoss
+from torchrl_osr.objectives.base import BaseLoss, Terms
+from torchrl_osr.objectives.mixed_states import check_single_steps, first_step
 
 
 class ConditionalVAELoss(BaseLoss):
@@ -84,22 +84,24 @@ class ConditionalVAELoss(BaseLoss):
         self.convert_to_functional(vae_network, "vae_network")
         self.latent_weight = latent_weight
 
+    @property
+    def _state(self) -> NestedKey:
+        """The entry whose next one is read or written, or else the condition."""
+        keys = [*self.vae_network.in_keys, *self.vae_network.out_keys]
+        after = (unravel_key(key[1:]) for key in keys if is_next(key))
+        return next(after, keys[0])
+
     def _input_keys(self) -> list[NestedKey]:
-        model = self.vae_network
-        rows = ["observation", ("next", "observation"), ("next", "terminated")]
+        model, state = self.vae_network, self._state
+        rows = [state, nested("next", state), ("next", "terminated")]
         return [*model.in_keys, *model.out_keys, *rows]
 
     def _output_keys(self) -> tuple[list[NestedKey], list[NestedKey]]:
         return ["loss_vae"], []
 
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return ``"loss_vae"``.
-
-        Args:
-            tensordict: a batch ``[B]`` with the entries of :attr:`in_keys`.
-        """
-        self._check_not_empty(tensordict)
+    def _terms(self, tensordict: TensorDictBase) -> Terms:
+        tensordict = first_step(tensordict)
+        check_single_steps(tensordict, "the autoencoder")
         model = self.vae_network
         condition, target = (
             entry(tensordict, key) for key in (*model.in_keys, *model.out_keys)
@@ -111,5 +113,5 @@ class ConditionalVAELoss(BaseLoss):
         prior = torch.zeros_like(loc), torch.ones_like(scale)
         divergence = gaussian_kl(loc, scale, *prior).mean(-1)
         value = (output - target).square().mean(-1) + self.latent_weight * divergence
-        loss = self._reduce(value, tensordict, has_next_state(tensordict))
-        return self._output(tensordict, {"loss_vae": loss}, {})
+        loss = self._reduce(value, tensordict, has_next_state(tensordict, self._state))
+        return {"loss_vae": loss}, {}

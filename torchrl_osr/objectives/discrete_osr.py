@@ -18,13 +18,12 @@ from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModule,
     TensorDictParams,
-    dispatch,
 )
 from torch import Tensor
 
 from torchrl_osr import functional
 from torchrl_osr._checks import check_literals, check_positive, check_weight
-from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
+from torchrl_osr.objectives.base import BaseLoss, Terms, TransitionKeys
 from torchrl_osr.objectives.distributions import (
     action_index,
     check_categorical,
@@ -202,16 +201,7 @@ class DiscreteOSRLoss(BaseLoss):
         metrics: list[NestedKey] = ["alpha", "entropy", "pred_value", "target_value"]
         return losses, metrics + ["recovery_kl"] * self.has_recovery
 
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the losses and metrics of a batch, see ``out_keys``.
-
-        Writes the largest absolute TD error of the critics under the ``priority`` key,
-        ``[B]``, and nothing else, into ``tensordict``.
-
-        Args:
-            tensordict: a batch ``[B]`` with the entries of ``in_keys``.
-        """
+    def _terms(self, tensordict: TensorDictBase) -> Terms:
         step = Step(self, tensordict, perturbed=self.reads_perturbed)
         pi = step.policy(self.actor_states)
         qvalue, pred_value = self._data_qvalue(step, pi)
@@ -232,7 +222,7 @@ class DiscreteOSRLoss(BaseLoss):
             "target_value": step.mean(target_value),
             **metrics,
         }
-        return self._output(tensordict, losses, metrics)
+        return losses, metrics
 
     def _action_values(
         self, states: TensorDictBase, params: TensorDictParams, pi: Any

@@ -9,13 +9,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import dispatch
 
 from torchrl_osr._checks import check_weight
 from torchrl_osr._entries import nested
 from torchrl_osr.functional import gaussian_error
 from torchrl_osr.modules.dynamics import DynamicsEnsemble, has_next_state
-from torchrl_osr.objectives.base import BaseLoss
+from torchrl_osr.objectives.base import BaseLoss, Terms
 from torchrl_osr.objectives.mixed_states import check_single_steps, first_step
 
 
@@ -96,14 +95,7 @@ class DynamicsLoss(BaseLoss):
     def _output_keys(self) -> tuple[list[NestedKey], list[NestedKey]]:
         return ["loss_dynamics", "loss_bounds"], []
 
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return ``"loss_dynamics"`` and ``"loss_bounds"``.
-
-        Args:
-            tensordict: a batch ``[B]`` with the entries of :attr:`in_keys`.
-        """
-        self._check_not_empty(tensordict)
+    def _terms(self, tensordict: TensorDictBase) -> Terms:
         tensordict = first_step(tensordict)
         check_single_steps(tensordict, "the model of the dynamics")
         model, rows = self.dynamics_network, tensordict.batch_size.numel()
@@ -132,4 +124,4 @@ class DynamicsLoss(BaseLoss):
         if self.reduction == "none":
             bounds = bounds.expand(tensordict.batch_size) / rows
         losses = {"loss_dynamics": loss, "loss_bounds": bounds}
-        return self._output(tensordict, losses, {})
+        return losses, {}

@@ -14,14 +14,13 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModule,
-    dispatch,
 )
 from torch import Tensor
 from torchrl.objectives.utils import _vmap_func
 
 from torchrl_osr import functional
 from torchrl_osr._checks import check_literals, check_weight
-from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
+from torchrl_osr.objectives.base import BaseLoss, Terms, TransitionKeys
 from torchrl_osr.objectives.step import Step, actor_critic_in_keys, critic_inputs
 
 
@@ -125,16 +124,7 @@ class EDACLoss(BaseLoss):
         metrics = ["alpha", "entropy", "pred_value", "target_value", "diversity"]
         return ["loss_actor", "loss_alpha", "loss_qvalue"], metrics
 
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the losses and metrics of a batch, see ``out_keys``.
-
-        Writes the largest absolute TD error of the critics under the ``priority`` key,
-        ``[B]``, and nothing else, into ``tensordict``.
-
-        Args:
-            tensordict: a batch ``[B]`` with the entries of ``in_keys``.
-        """
+    def _terms(self, tensordict: TensorDictBase) -> Terms:
         step = Step(self, tensordict, perturbed=False)
         objective, log_prob = step.soft_objective("clean")
         actor, alpha = step.reduce(objective), step.temperature_loss(log_prob)
@@ -153,7 +143,7 @@ class EDACLoss(BaseLoss):
             "target_value": step.mean(target_value),
             "diversity": step.mean(diversity),
         }
-        return self._output(tensordict, losses, metrics)
+        return losses, metrics
 
     def _action_gradients(self, step: Step) -> Tensor:
         """Gradient of each critic by the data's action, ``[N, B, A]``."""

@@ -14,7 +14,6 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import (
     InteractionType,
     ProbabilisticTensorDictSequential,
-    dispatch,
     set_interaction_type,
 )
 from torch import Tensor
@@ -22,7 +21,7 @@ from torch import Tensor
 from torchrl_osr._checks import check_literals, check_weight
 from torchrl_osr._entries import column, entry, nested, state_keys
 from torchrl_osr.functional import gaussian_kl
-from torchrl_osr.objectives.base import BaseLoss
+from torchrl_osr.objectives.base import BaseLoss, Terms
 from torchrl_osr.objectives.distributions import (
     action_bounds,
     action_index,
@@ -162,14 +161,7 @@ class InverseDynamicsLoss(BaseLoss):
     def _output_keys(self) -> tuple[list[NestedKey], list[NestedKey]]:
         return ["loss_inverse_dynamics"], []
 
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return ``"loss_inverse_dynamics"``.
-
-        Args:
-            tensordict: a batch ``[B]`` with the entries of :attr:`in_keys`.
-        """
-        self._check_not_empty(tensordict)
+    def _terms(self, tensordict: TensorDictBase) -> Terms:
         tensordict = first_step(tensordict)
         done = column(tensordict, nested("next", self.tensor_keys.done)).bool()
         batch = transitions(
@@ -189,7 +181,7 @@ class InverseDynamicsLoss(BaseLoss):
         if self.has_latent:
             value = value + self.latent_weight * self._latent_kl(output)
         loss = self._reduce(value.mean(0), tensordict, ~done)
-        return self._output(tensordict, {"loss_inverse_dynamics": loss}, {})
+        return {"loss_inverse_dynamics": loss}, {}
 
     def _action_error(
         self, output: TensorDictBase, tensordict: TensorDictBase

@@ -44,7 +44,8 @@ class IQLLoss(objectives.IQLLoss):
             3.0, the authors' for the robots; 10.0 for the mazes.
         expectile: :math:`\tau`, between 0 and 1. Default 0.7; 0.9 for the mazes.
         loss_function: distance of the TD error. Default ``"l2"``.
-        num_qvalue_nets: number of critics ``N``. Default 2.
+        num_qvalue_nets: number of critics ``N`` where a single one is given; a list
+            has its own length. Default 2.
         deactivate_vmap: run the critics one by one. Default ``False``.
         reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
 
@@ -89,6 +90,8 @@ class IQLLoss(objectives.IQLLoss):
         if not 0 < expectile < 1:
             raise ValueError(f"expectile must be between 0 and 1, got {expectile}.")
         check_positive("num_qvalue_nets", num_qvalue_nets, minimum=1)
+        if isinstance(qvalue_network, Sequence):
+            num_qvalue_nets = len(qvalue_network)
         super().__init__(
             actor_network,
             qvalue_network,

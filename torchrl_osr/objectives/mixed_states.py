@@ -143,9 +143,10 @@ def transitions(
         perturbed: it is where the agent shall return to.
 
     Raises:
-        ValueError: if the next states are several steps ahead.
+        ValueError: if next states are read, and are several steps ahead.
     """
-    check_single_steps(tensordict, "the inverse dynamics model")
+    if any(map(is_next, in_keys)):
+        check_single_steps(tensordict, "the inverse dynamics model")
     keys = state_keys(in_keys)
     stack = []
     if states != "perturbed":

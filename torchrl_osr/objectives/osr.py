@@ -16,7 +16,6 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModule,
-    dispatch,
 )
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
@@ -25,7 +24,7 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl_osr import functional
 from torchrl_osr._checks import check_literals, check_positive, check_weight
 from torchrl_osr.objectives import critic_kernel
-from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
+from torchrl_osr.objectives.base import BaseLoss, Terms, TransitionKeys
 from torchrl_osr.objectives.distributions import check_num_actions
 from torchrl_osr.objectives.mixed_states import States
 from torchrl_osr.objectives.step import (
@@ -55,8 +54,8 @@ class OSRLoss(BaseLoss):
 
     The entries are those of :class:`~torchrl.objectives.CQLLoss`: ``loss_actor`` (both
     terms of :math:`L_\pi`), ``loss_qvalue``, ``loss_cql`` and ``loss_alpha``. Each is
-    weighted already and sends gradient into its own group of parameters only, so their
-    sum, one backward and one optimizer step is right, and so are separate optimizers.
+    weighted already and sends gradient to its own parameters only: add them up for one
+    backward and one optimizer step, or use separate optimizers.
 
     Args:
         actor_network: ends in a :class:`~torchrl.modules.TanhNormal`.
@@ -73,8 +72,8 @@ class OSRLoss(BaseLoss):
         recovery_direction: ``"forward"`` (default, the paper's ``KL(I || pi)``) or
             ``"reverse"`` (``KL(pi || I)``, the released code's).
         recovery_target: what the policy is pulled to: ``"inverse_dynamics"``
-            (default), the model, or ``"data"``, the data's action,
-            ``-log pi(a | s~)`` in the place of the divergence. The latter is CQL with
+            (default), the model, or ``"data"``, the data's action: then
+            ``-log pi(a | s~)`` replaces the divergence, and the loss is CQL with
             behaviour cloning, noisy on D_tot: OSR without its model.
         recovery_states: where the recovery term is taken: ``"both"`` (default) for
             D_tot, ``"perturbed"`` or ``"clean"`` states alone.
@@ -250,21 +249,11 @@ class OSRLoss(BaseLoss):
     def _recovery_metric(self) -> str:
         return "recovery_nll" if self.recovery_target == "data" else "recovery_kl"
 
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the losses and metrics of a batch, see ``out_keys``.
-
-        Writes the largest absolute TD error of the critics under the ``priority`` key,
-        ``[B]``, and nothing else, into ``tensordict``.
-
-        Args:
-            tensordict: a batch ``[B]`` with the entries of ``in_keys``.
-        """
+    def _terms(self, tensordict: TensorDictBase) -> Terms:
         step = Step(self, tensordict, perturbed=self.reads_perturbed)
-        return self._output(tensordict, *self._terms(step))
+        return self._terms_of(step)
 
-    def _terms(self, step: Step) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """The losses and the metrics, by name."""
+    def _terms_of(self, step: Step) -> Terms:
         actor, log_prob, metrics = self.actor_loss(step)
         alpha = step.temperature_loss(log_prob)
         pred_value, cql, cql_metrics = self.cql_loss(step)

@@ -14,7 +14,6 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModule,
-    dispatch,
 )
 from torch import Tensor
 from torchrl.data import TensorSpec
@@ -22,7 +21,7 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 
 from torchrl_osr import functional
 from torchrl_osr._checks import check_literals, check_positive, check_weight
-from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
+from torchrl_osr.objectives.base import BaseLoss, Terms, TransitionKeys
 from torchrl_osr.objectives.distributions import check_num_actions
 from torchrl_osr.objectives.step import Step, actor_critic_in_keys, uniform_actions
 
@@ -184,16 +183,7 @@ class OSRVLoss(BaseLoss):
         metrics = ["alpha", "entropy", "pred_value", "target_value", "recovery_gap"]
         return ["loss_actor", "loss_alpha", "loss_qvalue"], metrics
 
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the losses and metrics of a batch, see ``out_keys``.
-
-        Writes the largest absolute TD error of the critics under the ``priority`` key,
-        ``[B]``, and nothing else, into ``tensordict``.
-
-        Args:
-            tensordict: a batch ``[B]`` with the entries of ``in_keys``.
-        """
+    def _terms(self, tensordict: TensorDictBase) -> Terms:
         step = Step(self, tensordict, perturbed=True)
         objective, log_prob = step.soft_objective("both")
         actor, alpha = step.reduce(objective), step.temperature_loss(log_prob)
@@ -212,7 +202,7 @@ class OSRVLoss(BaseLoss):
             "target_value": step.mean(target_value),
             "recovery_gap": step.mean(gap, transitions=True),
         }
-        return self._output(tensordict, losses, metrics)
+        return losses, metrics
 
     @torch.no_grad()
     def _candidates(self, step: Step) -> tuple[Tensor, Tensor, Tensor | None]:

@@ -11,13 +11,13 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_osr import functional
 from torchrl_osr._checks import check_literals, check_weight
 from torchrl_osr._entries import column, entry
-from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
+from torchrl_osr.objectives.base import BaseLoss, Terms, TransitionKeys
 from torchrl_osr.objectives.distributions import check_action
 from torchrl_osr.objectives.step import Step, actor_critic_in_keys
 from torchrl_osr.objectives.td3_bc import check_smoothing, smoothed_action_and_value
@@ -58,7 +58,8 @@ class ReBRACLoss(BaseLoss):
         policy_noise: standard deviation of :math:`\epsilon`, in units of the action.
             Default 0.2.
         noise_clip: largest magnitude of :math:`\epsilon`. Default 0.5.
-        low, high: action bounds, between which the target's action is kept. Default
+        low, high: action bounds, between which the target's action is kept; those of
+            the actor's :class:`~torchrl.modules.TanhDelta`, if it ends in one. Default
             -1 and 1.
         options: of every loss, see :class:`~torchrl_osr.objectives.BaseLoss`.
 
@@ -106,7 +107,7 @@ class ReBRACLoss(BaseLoss):
         check_literals(ReBRACLoss.__init__, locals())
         check_weight("actor_bc_coef", actor_bc_coef)
         check_weight("critic_bc_coef", critic_bc_coef)
-        check_smoothing(policy_noise, noise_clip, low, high)
+        check_smoothing(policy_noise, noise_clip, low, high, actor_network)
         super().__init__(**options)
         self._hold_actor_critic(
             actor_network,
@@ -127,16 +128,7 @@ class ReBRACLoss(BaseLoss):
         metrics = ["cloning_error", "pred_value", "target_value"]
         return ["loss_actor", "loss_qvalue"], metrics
 
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the losses and metrics of a batch, see ``out_keys``.
-
-        Writes the largest absolute TD error of the critics under the ``priority`` key,
-        ``[B]``, and nothing else, into ``tensordict``.
-
-        Args:
-            tensordict: a batch ``[B]`` with the entries of ``in_keys``.
-        """
+    def _terms(self, tensordict: TensorDictBase) -> Terms:
         step = Step(self, tensordict, perturbed=False)
         actor, cloning_error = self.actor_loss(step)
         params = self.qvalue_network_params
@@ -145,12 +137,12 @@ class ReBRACLoss(BaseLoss):
         distance = step.td_distance(pred_value, target_value)
         step.write_priority(pred_value, target_value)
         metrics = {
-            "cloning_error": step.mean(cloning_error),
+            "cloning_error": self._mean(cloning_error, tensordict, step.of_data),
             "pred_value": step.mean(pred_value),
             "target_value": step.mean(target_value),
         }
         losses = {"loss_actor": actor, "loss_qvalue": step.reduce(distance)}
-        return self._output(tensordict, losses, metrics)
+        return losses, metrics
 
     def actor_loss(self, step: Step) -> tuple[Tensor, Tensor]:
         r""":math:`L_\pi`, and the squared distance to the data's action, ``[B]``."""

@@ -11,13 +11,13 @@ from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 
 from torchrl_osr import functional
 from torchrl_osr._checks import check_literals, check_positive, check_weight
-from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
+from torchrl_osr.objectives.base import BaseLoss, Terms, TransitionKeys
 from torchrl_osr.objectives.step import (
     Step,
     actor_critic_in_keys,
@@ -175,16 +175,7 @@ class RORLLoss(BaseLoss):
         metrics += ["uncertainty_penalty"] * (self.q_ood_reg > 0)
         return ["loss_actor", "loss_alpha", "loss_qvalue"], metrics
 
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the losses and metrics of a batch, see ``out_keys``.
-
-        Writes the largest absolute TD error of the critics under the ``priority`` key,
-        ``[B]``, and nothing else, into ``tensordict``.
-
-        Args:
-            tensordict: a batch ``[B]`` with the entries of ``in_keys``.
-        """
+    def _terms(self, tensordict: TensorDictBase) -> Terms:
         step = Step(self, tensordict, perturbed=False)
         actor, log_prob, smooth = self.actor_loss(step)
         alpha = step.temperature_loss(log_prob)
@@ -212,7 +203,7 @@ class RORLLoss(BaseLoss):
             "target_value": step.mean(target_value),
             **{name: step.mean(term) for name, term in (smooth | terms).items()},
         }
-        return self._output(tensordict, losses, metrics)
+        return losses, metrics
 
     def actor_loss(self, step: Step) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
         r""":math:`L_\pi`, the log-density of the policy's actions, its smoothness."""

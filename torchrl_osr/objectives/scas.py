@@ -11,14 +11,14 @@ from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_osr import functional
 from torchrl_osr._checks import check_literals, check_positive, check_weight
 from torchrl_osr._entries import entry, nested, select
 from torchrl_osr.modules.dynamics import DynamicsEnsemble
-from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
+from torchrl_osr.objectives.base import BaseLoss, Terms, TransitionKeys
 from torchrl_osr.objectives.distributions import check_action
 from torchrl_osr.objectives.mixed_states import check_single_steps, next_state
 from torchrl_osr.objectives.step import Step, actor_critic_in_keys, observation_keys
@@ -46,7 +46,9 @@ class SCASLoss(BaseLoss):
 
     Differences from that code: :math:`M` is the mean of an ensemble's elites, which
     predicts the state's change by likelihood (there one network, the next state by its
-    squared error); rows that are ``done`` have no correction.
+    squared error); rows that are ``done`` have no correction; the actor's rate stays as
+    it is (there it falls by a cosine); the target is the critics' minimum in mazes, too
+    (there their mean).
 
     Args:
         actor_network: writes the action; see
@@ -64,7 +66,8 @@ class SCASLoss(BaseLoss):
         policy_noise: standard deviation of the target action's noise, in units of the
             action. Default 0.2.
         noise_clip: its largest magnitude. Default 0.5.
-        low, high: action bounds, between which the target's action is kept. Default
+        low, high: action bounds, between which the target's action is kept; those of
+            the actor's :class:`~torchrl.modules.TanhDelta`, if it ends in one. Default
             -1 and 1.
         options: of every loss, see :class:`~torchrl_osr.objectives.BaseLoss`.
 
@@ -123,7 +126,7 @@ class SCASLoss(BaseLoss):
             )
         check_weight("gain_temperature", gain_temperature)
         check_positive("largest_weight", largest_weight)
-        check_smoothing(policy_noise, noise_clip, low, high)
+        check_smoothing(policy_noise, noise_clip, low, high, actor_network)
         super().__init__(**options)
         self._hold_actor_critic(
             actor_network, qvalue_network, delay_actor=self.delay_qvalue
@@ -143,16 +146,7 @@ class SCASLoss(BaseLoss):
         metrics = ["correction_error", "pred_value", "target_value"]
         return ["loss_actor", "loss_qvalue"], metrics
 
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the losses and metrics of a batch, see ``out_keys``.
-
-        Writes the largest absolute TD error of the critics under the ``priority`` key,
-        ``[B]``, and nothing else, into ``tensordict``.
-
-        Args:
-            tensordict: a batch ``[B]`` with the entries of ``in_keys``.
-        """
+    def _terms(self, tensordict: TensorDictBase) -> Terms:
         step = Step(self, tensordict, perturbed=True)
         actor, error = self.actor_loss(step)
         params = self.qvalue_network_params
@@ -166,7 +160,7 @@ class SCASLoss(BaseLoss):
             "target_value": step.mean(target_value),
         }
         losses = {"loss_actor": actor, "loss_qvalue": step.reduce(distance)}
-        return self._output(tensordict, losses, metrics)
+        return losses, metrics
 
     def actor_loss(self, step: Step) -> tuple[Tensor, Tensor]:
         r""":math:`L_\pi`, and the weighted error of the correction, ``[B]``."""

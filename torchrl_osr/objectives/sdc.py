@@ -19,6 +19,7 @@ from torchrl_osr._checks import check_positive, check_weight
 from torchrl_osr._entries import entry
 from torchrl_osr.modules.conditional_vae import ConditionalVAE
 from torchrl_osr.modules.dynamics import DynamicsEnsemble
+from torchrl_osr.objectives.base import Terms
 from torchrl_osr.objectives.mixed_states import States
 from torchrl_osr.objectives.osr import OSRLoss
 from torchrl_osr.objectives.step import Step
@@ -131,8 +132,8 @@ class SDCLoss(OSRLoss):
             [*metrics, "deviation", "multiplier"],
         )
 
-    def _terms(self, step: Step) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        losses, metrics = super()._terms(step)
+    def _terms_of(self, step: Step) -> Terms:
+        losses, metrics = super()._terms_of(step)
         deviation = self.deviation(step)
         terms = functional.lagrange_terms(
             deviation, self.log_multiplier, self.threshold

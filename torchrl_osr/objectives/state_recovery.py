@@ -14,7 +14,6 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModuleBase,
-    dispatch,
 )
 from torch import Tensor
 from torchrl.modules import IndependentNormal, TanhNormal
@@ -23,7 +22,7 @@ from torchrl.modules.distributions.utils import safeatanh_noeps
 from torchrl_osr import functional
 from torchrl_osr._checks import check_literals, check_weight
 from torchrl_osr._entries import column, entry, nested, state_keys
-from torchrl_osr.objectives.base import BaseLoss
+from torchrl_osr.objectives.base import BaseLoss, Terms
 from torchrl_osr.objectives.cloning import (
     cloning_distance,
     is_deterministic,
@@ -231,17 +230,7 @@ class StateRecoveryLoss(BaseLoss):
             return "recovery_kl"
         return "recovery_error" if self.is_deterministic else "recovery_nll"
 
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return ``"loss_recovery"`` and its unweighted mean.
-
-        The latter is ``"recovery_kl"``; with ``recovery_target="data"``
-        ``"recovery_nll"``, or ``"recovery_error"`` of a deterministic actor.
-
-        Args:
-            tensordict: a batch ``[B]`` with the entries of :attr:`in_keys`.
-        """
-        self._check_not_empty(tensordict)
+    def _terms(self, tensordict: TensorDictBase) -> Terms:
         tensordict = first_step(tensordict)
         done = column(tensordict, nested("next", self.tensor_keys.done)).bool()
         states = self.recovery_states
@@ -268,7 +257,7 @@ class StateRecoveryLoss(BaseLoss):
             valid = valid & data
         loss = self.recovery_weight * self._reduce(divergence, tensordict, valid)
         mean = self._mean(divergence, tensordict, valid)
-        return self._output(tensordict, {"loss_recovery": loss}, {self._metric: mean})
+        return {"loss_recovery": loss}, {self._metric: mean}
 
     def _divergence(self, states: TensorDictBase, model: TanhNormal) -> Tensor:
         """The recovery term (11) at ``states``, ``[D, B]``."""

@@ -210,15 +210,11 @@ class Step:
         terminated: whether the TD target ends with the rewards, bool ``[B]``.
         states: ``[s, s']`` or ``[s, s', s^]``, ``[2 or 3, B]``. A next state after a
             termination is not one: there ``s`` stands in its place.
-
-    Raises:
-        ValueError: if the batch is empty.
     """
 
     def __init__(
         self, loss: BaseLoss, tensordict: TensorDictBase, *, perturbed: bool
     ) -> None:
-        loss._check_not_empty(tensordict)
         self.loss, self.tensordict = loss, tensordict
         self.first = first_step(tensordict)
         done, terminated = loss._next_keys("done", "terminated")
@@ -240,6 +236,7 @@ class Step:
         if perturbed:
             stack.append(perturbed_state(tensordict, keys, loss.tensor_keys.perturbed))
         self.states = torch.stack(stack)
+        self._with_grad = torch.is_grad_enabled()
         self._policy_params: TensorDictBase | None = None
         self._policies: dict[str, Any] = {}
 
@@ -254,15 +251,17 @@ class Step:
 
     def policy(self, states: str) -> Any:
         """The policy's distribution at a set of states in :data:`ROWS`, ``[D, B]``."""
-        if self._policy_params is None:
-            loss = self.loss
-            self._policy_params = distribution_params(
-                loss.actor_network, loss.actor_network_params, self.states
-            )
-        if states not in self._policies:
-            params = self._policy_params[ROWS[states]]
-            pi = self.loss.actor_network.build_dist_from_params(params)
-            self._policies[states] = pi
+        # Kept for those who ask next, so with a gradient even where none is wanted now.
+        with torch.set_grad_enabled(self._with_grad):
+            if self._policy_params is None:
+                loss = self.loss
+                self._policy_params = distribution_params(
+                    loss.actor_network, loss.actor_network_params, self.states
+                )
+            if states not in self._policies:
+                params = self._policy_params[ROWS[states]]
+                pi = self.loss.actor_network.build_dist_from_params(params)
+                self._policies[states] = pi
         return self._policies[states]
 
     def target_policy(self) -> Any:

@@ -11,13 +11,14 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
+from torchrl.modules import TanhDelta
 
 from torchrl_osr import functional
 from torchrl_osr._checks import check_literals, check_positive, check_weight
-from torchrl_osr.objectives.base import BaseLoss, TransitionKeys
-from torchrl_osr.objectives.distributions import check_action
+from torchrl_osr.objectives.base import BaseLoss, Terms, TransitionKeys
+from torchrl_osr.objectives.distributions import check_action, head_of
 from torchrl_osr.objectives.step import Step, actor_critic_in_keys
 
 
@@ -48,7 +49,8 @@ class TD3BCLoss(BaseLoss):
         policy_noise: standard deviation of :math:`\epsilon`, in units of the action.
             Default 0.2.
         noise_clip: largest magnitude of :math:`\epsilon`. Default 0.5.
-        low, high: action bounds, between which the target's action is kept. Default
+        low, high: action bounds, between which the target's action is kept; those of
+            the actor's :class:`~torchrl.modules.TanhDelta`, if it ends in one. Default
             -1 and 1.
         options: of every loss, see :class:`~torchrl_osr.objectives.BaseLoss`.
 
@@ -91,7 +93,7 @@ class TD3BCLoss(BaseLoss):
     ) -> None:
         check_literals(TD3BCLoss.__init__, locals())
         check_weight("alpha", alpha)
-        check_smoothing(policy_noise, noise_clip, low, high)
+        check_smoothing(policy_noise, noise_clip, low, high, actor_network)
         super().__init__(**options)
         self._hold_actor_critic(
             actor_network,
@@ -110,16 +112,7 @@ class TD3BCLoss(BaseLoss):
         metrics = ["cloning_error", "pred_value", "target_value"]
         return ["loss_actor", "loss_qvalue"], metrics
 
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the losses and metrics of a batch, see ``out_keys``.
-
-        Writes the largest absolute TD error of the critics under the ``priority`` key,
-        ``[B]``, and nothing else, into ``tensordict``.
-
-        Args:
-            tensordict: a batch ``[B]`` with the entries of ``in_keys``.
-        """
+    def _terms(self, tensordict: TensorDictBase) -> Terms:
         step = Step(self, tensordict, perturbed=False)
         actor, cloning_error = self.actor_loss(step)
         params = self.qvalue_network_params
@@ -128,12 +121,12 @@ class TD3BCLoss(BaseLoss):
         qvalue = step.reduce(step.td_distance(pred_value, target_value))
         step.write_priority(pred_value, target_value)
         metrics = {
-            "cloning_error": step.mean(cloning_error),
+            "cloning_error": self._mean(cloning_error, tensordict, step.of_data),
             "pred_value": step.mean(pred_value),
             "target_value": step.mean(target_value),
         }
         losses = {"loss_actor": actor, "loss_qvalue": qvalue}
-        return self._output(tensordict, losses, metrics)
+        return losses, metrics
 
     def actor_loss(self, step: Step) -> tuple[Tensor, Tensor]:
         r""":math:`L_\pi`, and the squared distance to the data's action, ``[B]``."""
@@ -158,13 +151,27 @@ class TD3BCLoss(BaseLoss):
 
 
 def check_smoothing(
-    policy_noise: float, noise_clip: float, low: float, high: float
+    policy_noise: float,
+    noise_clip: float,
+    low: float,
+    high: float,
+    actor_network: TensorDictModuleBase,
 ) -> None:
     """Raise a ValueError unless target policy smoothing can have these options."""
     check_weight("policy_noise", policy_noise)
     check_positive("noise_clip", noise_clip, minimum=0)
     if not low < high:
         raise ValueError(f"high must be above low={low}, got {high}.")
+    distribution, options = head_of(actor_network)
+    if distribution is not TanhDelta:
+        return
+    for name, ours in (("low", low), ("high", high)):
+        theirs = torch.as_tensor(options.get(name, ours))
+        if not bool((theirs == ours).all()):
+            raise ValueError(
+                f"the loss has {name}={ours}, but its actor {name}={theirs.tolist()}: "
+                "give both the same."
+            )
 
 
 def smoothed_action_and_value(loss: Any, step: Step) -> tuple[Tensor, Tensor]:

@@ -227,8 +227,8 @@ class Checkpoints:
     def _remove_outdated(self) -> None:
         """Keep the newest regular ones, and the newest of all.
 
-        That of an interrupted run lies between two regular ones and stays until the
-        next: a continued run ends up with the files of an undisturbed one.
+        An interrupted run's checkpoint lies between two regular ones and stays until
+        the next: a continued run ends up with the files of an undisturbed one.
         """
         found = self._found()
         regular = [

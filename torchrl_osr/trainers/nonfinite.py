@@ -33,12 +33,12 @@ class NonfiniteCheck:
     The first bad one ends the run, and leaves the parameters and the optimizer's state
     as they are, to the bit.
 
-    Every update is checked before its step. With a fused optimizer on a GPU, where the
-    host would have to wait for each update and a CUDA graph could not contain the
-    check, it is ``deferred``: the verdict stays on the device, where the optimizer
-    reads it (``found_inf``, by which :class:`torch.amp.GradScaler` has steps left out),
-    the first bad batch is kept there, all updates after it are left out too, and the
-    host looks at the end of the log interval.
+    Every update is checked before its step. With a fused optimizer on a GPU the check
+    is ``deferred``, because to read each verdict would stall the host and cannot be
+    part of a CUDA graph. The verdict stays on the device. The optimizer reads it there,
+    as ``found_inf`` of :class:`torch.amp.GradScaler`, and leaves out the bad update and
+    all later ones. The first bad batch is kept, and the host looks at the end of the
+    log interval.
 
     Args:
         loss_module: whose updates.

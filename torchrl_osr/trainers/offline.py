@@ -156,17 +156,17 @@ class OfflineTrainer(Trainer):
     Keyword Args:
         seed: of the sampling. Default 0.
         target_net_updater: stepped after each update. Default: none.
-        policy_delay: every how many updates ``policy_params`` and the target networks
-            move, the first time at the update of that number, as in TD3; in between
-            neither they nor their optimizer's state do. Default 1.
-        policy_params: see there. Default: none.
+        policy_delay: ``policy_params`` and the target networks move only at every
+            ``policy_delay``-th update, as in TD3. At the other updates they and their
+            optimizer's state stay as they are. Default 1.
+        policy_params: see there; needed with a ``policy_delay`` above 1.
         evaluate: returns JSON-compatible results, of which numbers are logged and all
             are kept in ``history``, with their ``"step"``. Called before the first step
             of a new run, every ``eval_interval`` steps and at the end. Default: none.
         metric: which result decides the best checkpoint, and whether ``"max"`` or
             ``"min"`` is best. Default ``("score", "max")``.
         components: more state to checkpoint, by name: a transform with a generator,
-            observation statistics.
+            observation statistics, a sampler without replacement.
         loggers: TorchRL loggers; all get every number. Default: none.
         log_interval: steps between log entries, which are means over them. Default 200.
         eval_interval: steps between evaluations. Default 5000.
@@ -252,17 +252,19 @@ class OfflineTrainer(Trainer):
         self.history: list[dict[str, Any]] = []
         self._saved = {"step": 0}
         self._model_components = ("loss_module", *components)
+        own = {
+            "loss_module": loss_module,
+            "optimizer": optimizer,
+            "sampler": GeneratorState(generator),
+            "global_rng": GlobalRNGState(),
+            "history": self.history,
+            "progress": self._saved,
+        }
+        if taken := sorted(own.keys() & components):
+            raise ValueError(f"components have names of the trainer's own: {taken}.")
         self.checkpoints = Checkpoints(
             folder,
-            {
-                "loss_module": loss_module,
-                "optimizer": optimizer,
-                "sampler": GeneratorState(generator),
-                "global_rng": GlobalRNGState(),
-                "history": self.history,
-                "progress": self._saved,
-                **components,
-            },
+            own | dict(components),
             interval=checkpoint_interval,
             kept=checkpoints_kept,
         )
@@ -277,6 +279,11 @@ class OfflineTrainer(Trainer):
         if policy_delay > 1:
             delayed = set(policy_params)
             rest = [each for each in loss_module.parameters() if each not in delayed]
+            if not delayed:
+                raise ValueError(
+                    f"policy_delay={policy_delay} needs the parameters that it delays: "
+                    "give policy_params."
+                )
             if not rest:
                 raise ValueError(
                     f"policy_delay={policy_delay} leaves nothing to train in between, "

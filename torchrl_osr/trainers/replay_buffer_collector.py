@@ -42,6 +42,7 @@ class ReplayBufferCollector(BaseCollector):
         self.replay_buffer = replay_buffer
         self.total_frames = total_frames
         self._frames = 0
+        self._generator: torch.Generator | None = None
 
     def iterator(self) -> Iterator[TensorDictBase]:
         """Yield batches ``[B]`` until ``total_frames`` rows were drawn."""
@@ -53,7 +54,8 @@ class ReplayBufferCollector(BaseCollector):
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Seed the draws; return the seed."""
         device = self.replay_buffer.storage.device  # where the draws are made
-        self.replay_buffer.set_rng(torch.Generator(device).manual_seed(seed))
+        self._generator = torch.Generator(device).manual_seed(seed)
+        self.replay_buffer.set_rng(self._generator)
         return seed
 
     def update_policy_weights_(self, *_: Any, **__: Any) -> None:
@@ -63,9 +65,14 @@ class ReplayBufferCollector(BaseCollector):
         """Do nothing: no environment runs."""
 
     def state_dict(self) -> OrderedDict[str, Any]:
-        """Return the number of rows that were drawn."""
-        return OrderedDict(frames=self._frames)
+        """Return the number of rows that were drawn and, once seeded, the draws."""
+        state: OrderedDict[str, Any] = OrderedDict(frames=self._frames)
+        if self._generator is not None:
+            state["generator"] = self._generator.get_state()
+        return state
 
     def load_state_dict(self, state_dict: OrderedDict[str, Any]) -> None:
-        """Go on after so many rows."""
+        """Go on after so many rows; of a seeded one, call :meth:`set_seed` first."""
         self._frames = int(state_dict["frames"])
+        if self._generator is not None and "generator" in state_dict:
+            self._generator.set_state(state_dict["generator"])
