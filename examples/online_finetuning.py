@@ -33,7 +33,13 @@ from torchrl.trainers.algorithms import OfflineToOnlineTrainer
 from torchrl_osr import StatePerturbation
 from torchrl_osr._files import write_json
 from torchrl_osr.data import make_environment
-from torchrl_osr.evaluation import EpisodeEvaluator, deterministic_policy, summarize
+from torchrl_osr.evaluation import (
+    EpisodeEvaluator,
+    deterministic_policy,
+    measure_of,
+    summarize,
+)
+from torchrl_osr.evaluation.drawing import IN_WORDS
 from torchrl_osr.experiment.build import references_of
 from torchrl_osr.experiment.trained_run import TrainedRun, load_trained
 from torchrl_osr.experiment.training_data import load_training_data
@@ -104,11 +110,14 @@ def draw(record: dict, path: Path) -> None:
     curve = record["curve"]
     frames = [point["frames"] for point in curve]
     figure, axes = pyplot.subplots(figsize=(6, 3.5), layout="constrained")
-    low, high = ([point[key] for point in curve] for key in ("score_low", "score_high"))
+    measure = measure_of(curve[0])
+    low, high = (
+        [point[f"{measure}_{end}"] for point in curve] for end in ("low", "high")
+    )
     axes.fill_between(frames, low, high, alpha=0.2)
-    axes.plot(frames, [point["score"] for point in curve], marker="o")
+    axes.plot(frames, [point[measure] for point in curve], marker="o")
     axes.set(xlabel="environment frames after training from data")
-    axes.set(ylabel="normalised score", title=f"{record['env']}, {record['loss']}")
+    axes.set(ylabel=IN_WORDS[measure], title=f"{record['env']}, {record['loss']}")
     figure.savefig(path, dpi=120)
     pyplot.close(figure)
 
@@ -155,7 +164,8 @@ def main(arguments: Sequence[str]) -> None:
         record["curve"].append(point)
         write_json(options.output / "online.json", record)
         draw(record, options.output / "online.png")
-        print(f"{frames} frames: score {point['score']:.1f}", flush=True)
+        measure = measure_of(point)
+        print(f"{frames} frames: {measure} {point[measure]:.1f}", flush=True)
 
     evaluate()
     trainer.register_op("post_steps", evaluate)

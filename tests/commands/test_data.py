@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,8 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from torchrl_osr.commands import data
+from torchrl_osr.data import load_file, make_environment, write_memmap
+from torchrl_osr.data.collect.record import record_episodes
 from torchrl_osr.data.read.table import USUAL_NAMES
 
 
@@ -49,6 +52,23 @@ NAMED = [
     "data.columns.action=torque",
     "data.columns.terminated=false",
 ]
+
+
+def test_a_picture_that_cannot_be_written_loses_no_table(look, capsys):
+    write_log("log.csv")
+    with pytest.raises(OSError, match="cannot write the file"):
+        look(*NAMED, "env.id=Pendulum-v1", "picture=/proc/x.png")
+    assert "looks wrong" in capsys.readouterr().out
+
+
+def test_discrete_actions_of_a_converted_set_are_drawn(look, tmp_path):
+    with closing(make_environment("CartPole-v1")) as env:
+        np.savez("log.npz", **record_episodes(env, None, 3, progress=False))
+    data, manifest = load_file("log.npz", num_actions=2)
+    write_memmap([data], "set", describe=lambda: manifest, progress=False)
+    output, error = look("data.path=set", "env.id=CartPole-v1")
+    assert error is None, error
+    assert "Picture: " in output
 
 
 def test_a_log_is_described_and_drawn(look, tmp_path):

@@ -97,6 +97,8 @@ def test_finished_evaluation_is_not_done_again(folder, evaluated, capsys):
     assert json.loads(path.read_text()) == content, "the same numbers again"
     with pytest.raises(ValueError, match=r"other settings \(seed\): force=true"):
         example.main(quiet(*same, "seed=5"))
+    with pytest.raises(ValueError, match="results of 2 checkpoints, these 1 among"):
+        example.main(quiet(*same, "last=1"))
     assert json.loads(path.read_text()) == content
     example.main(quiet(*same, "seed=5", "force=true"))
     assert json.loads(path.read_text())["evaluations"] != content["evaluations"]

@@ -108,7 +108,7 @@ def test_own_data_have_the_trained_policy_play_first(
 def test_a_policy_that_falls_by_itself_is_not_pushed(script, tmp_path, monkeypatch):
     run = own_run(tmp_path, "hopper", (11, 3))
     monkeypatch.setattr(script, "Camera", FakeCamera)
-    with pytest.raises(ValueError, match="trained policy falls.* in all 2 episodes"):
+    with pytest.raises(ValueError, match="In all 2 episodes the trained policy falls"):
         script.main(film(run, "episodes=2"))
 
 
@@ -142,3 +142,8 @@ def test_knock_takes_the_place_of_the_push(script):
 def test_bad_input_is_named(script, option, named):
     with pytest.raises(ValueError, match=named):
         script.disturbance(film(option))
+
+
+def test_an_episode_that_is_not_played_is_refused_before_any_is(script):
+    with pytest.raises(ValueError, match="film_seed=3 is none of the 20 episodes"):
+        script.main(film("film_seed=3"))

@@ -83,6 +83,16 @@ def test_bad_input_is_named(finished, run, arguments, named):
         (["loss.chunk_size=0"], "chunk_size must be at least 1, got 0"),
         (["loss=rebrac", "env.id=Walker2d-v5"], "is walker2d: give env=walker2d."),
         (["trainer.cudagraph=true"], "cudagraph=True needs a CUDA device"),
+        (["dynamics=ensemble", "dynamics.path=typo"], "typo"),
+        (["data.held_out=0"], "data.held_out=0.0 must be above 0"),
+        (
+            ["loss=bc", "recovery=osr", "optim.policy_delay=2"],
+            "BCLoss has none: take optim.policy_delay=1",
+        ),
+        (
+            ["env=pointmaze-umaze", "data=diverse", "data.random_share=0.5"],
+            "unknown quality 'random'",
+        ),
     ],
 )
 def test_bad_input_is_named_before_data_are_made(

@@ -188,7 +188,7 @@ def test_process_of_another_machine_is_not_guessed_about(tmp_path):
     assert found["status"] == "running"
     here = platform.node()
     assert found["reason"] == (
-        f"process {os.getpid()} on elsewhere, of which {here} cannot see more"
+        f"process {os.getpid()} on elsewhere; {here} cannot see whether it still runs"
     )
     assert [path.name for path in tmp_path.iterdir()] == ["status.json"]
 

@@ -126,7 +126,7 @@ def test_distances_are_those_of_memory():
         (["data.storage=tape"], "data.storage must be one of"),
         (
             ["data.storage=disk", "trainer.cudagraph=true"],
-            "trainer.cudagraph=true cannot be had with data.storage=disk",
+            "trainer.cudagraph=true cannot be combined with data.storage=disk",
         ),
     ],
 )

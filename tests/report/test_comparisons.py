@@ -85,7 +85,7 @@ def test_a_known_shift_is_found_without_the_spread_of_seeds(
     sentences = verdict(compare_all(tables, "cql", [score]), "cql")
     first = "osr is {} than cql in undisturbed score on hopper medium-replay: {}"
     if told in ("better", "worse"):
-        number = f"{shift:+.1f} points [".replace("-", "\N{MINUS SIGN}")
+        number = f"{shift:+.1f} [".replace("-", "\N{MINUS SIGN}")
         assert sentences[0].startswith(first.format(told, number))
     else:
         assert sentences[0] == f"osr against cql in undisturbed score: {told}."

@@ -244,5 +244,8 @@ def test_the_command_packs_runs_reports_on_them_and_says_what_is_missing(
     output = run(table, "--output", page)
     assert "note: Every method has one seed" in output
     assert (page / "report.html").exists()
+    with pytest.raises(SystemExit):
+        run(tmp_path / "runs", table, "--pack", tmp_path / "all.jsonl.gz")
+    assert f"--pack takes folders of runs, got {table}." in capsys.readouterr().err
     with pytest.raises(FileNotFoundError, match="nowhere does not exist"):
         run(tmp_path / "nowhere")

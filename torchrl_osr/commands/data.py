@@ -96,12 +96,12 @@ def main(cfg: DictConfig) -> None:
     name = (title.removesuffix(".gz").rpartition(".")[0] or title).replace(" ", "-")
     picture = Path(cfg.picture or f"{name}-data.png")
     by_part = {part: [e.name for e in entries if e.part == part] for part in PARTS}
-    data_figure(data, manifest, by_part, picture, title=title)
     print(f"{title}: {overview(data, manifest, by_part['action'])}\n")
     print(entries_table(entries) + "\n")
     print("What looks wrong:" if wrong else "Nothing looks wrong.")
     for number, sentence in enumerate(wrong, 1):
         print(f"  {number}. {sentence}")
+    data_figure(data, manifest, by_part, picture, title=title)
     print(f"\nPicture: {picture.absolute()}")
 
 

@@ -297,7 +297,8 @@ def check_replaced(
 ) -> None:
     """Raise a ValueError if a file has results of other settings, naming these.
 
-    Those of other checkpoints or versions are out of date, and may be replaced.
+    So it does if it has more checkpoints. Results of other checkpoints or versions are
+    out of date, and may be replaced.
     """
     settings = {"levels", "episodes", "seed"} & request.keys() & (old or {}).keys()
     other = [
@@ -307,6 +308,13 @@ def check_replaced(
         raise ValueError(
             f"{path} has results of other settings ({', '.join(other)}): force=true "
             "replaces them; or rename the file."
+        )
+    kept = (old or {}).get("checkpoints", {})
+    if request["checkpoints"].items() < kept.items():
+        raise ValueError(
+            f"{path} has results of {len(kept)} checkpoints, these "
+            f"{len(request['checkpoints'])} among them: force=true replaces them; or "
+            "give the same last=, or rename the file."
         )
 
 

@@ -102,6 +102,11 @@ def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.num_threads)
     if cfg.knock is None and cfg.push <= 0:
         raise ValueError(f"push must be above 0 body weights, got {cfg.push}.")
+    if cfg.film_seed is not None and not 0 <= cfg.film_seed - cfg.seed < cfg.episodes:
+        raise ValueError(
+            f"film_seed={cfg.film_seed} is none of the {cfg.episodes} episodes from "
+            f"seed={cfg.seed} on."
+        )
     event, duration, wrap = disturbance(cfg)
     trained = load_trained(cfg.checkpoint, trust=cfg.trust)
     run = trained.config
@@ -117,9 +122,9 @@ def main(cfg: DictConfig) -> None:
     kept = played[first].up_clean(ends, cfg.after)
     if not kept:
         raise ValueError(
-            f"the {first} falls, or the episode ends, in all {cfg.episodes} episodes "
-            f"before {cfg.after} steps after the {event} are over, without the {event} "
-            "too: choose an earlier window or a smaller after."
+            f"In all {cfg.episodes} episodes the {first} falls, or the episode ends, "
+            f"within {cfg.after} steps of the {event}, even without it: choose an "
+            "earlier window or a smaller after."
         )
     measure = (kept, ends, DataDistance(data), (cfg.after // 2, cfg.after))
     results = {name: each.survival(*measure) for name, each in played.items()}

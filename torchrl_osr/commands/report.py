@@ -39,7 +39,10 @@ def main() -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "runs", nargs="+", type=Path, help="folders of runs, or above them, or tables"
+        "runs",
+        nargs="+",
+        type=Path,
+        help="folders of runs, or above them, or tables of --pack",
     )
     parser.add_argument("--output", type=Path, default=Path("report"), help="a folder")
     parser.add_argument("--reference", help="method to compare with; default the first")
@@ -50,6 +53,8 @@ def main() -> None:
     if options.pack:
         if not options.pack.name.endswith(".jsonl.gz"):
             parser.error(f"--pack {options.pack}: a table's name ends in .jsonl.gz.")
+        if files := [str(each) for each in options.runs if each.is_file()]:
+            parser.error(f"--pack takes folders of runs, got {', '.join(files)}.")
         number = pack_runs(options.runs, options.pack)
         print(f"{counted(number, 'run')} in {options.pack}")
         return

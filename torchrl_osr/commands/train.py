@@ -43,6 +43,8 @@ from torchrl_osr.experiment.build import (
     make_learner,
     read_environment,
 )
+from torchrl_osr.experiment.dynamics import FILE as DYNAMICS
+from torchrl_osr.experiment.dynamics import load_dynamics
 from torchrl_osr.experiment.loggers import log_outcome, make_loggers
 from torchrl_osr.experiment.phases import (
     train_dynamics,
@@ -78,6 +80,8 @@ def train(cfg: DictConfig) -> float:
         trust += module_of(cfg.env.id)
         if cfg.data.path and Path(cfg.data.path).exists():  # seen from any folder
             cfg.data.path = str(Path(cfg.data.path).absolute())
+        if cfg.dynamics.path is not None:
+            cfg.dynamics.path = str(Path(cfg.dynamics.path).absolute())
     else:
         cfg = run_folder.resumed(folder, cfg, job.overrides.task)
     with run_folder.refusal_noted(folder):
@@ -99,6 +103,10 @@ def run(cfg: DictConfig, folder: Path) -> float:
     spec = environment_spec(cfg.env.id)
     sizes = spec.observation_size, spec.action_size
     in_keys = check_parts(cfg, *sizes)
+    if cfg.dynamics.use and cfg.dynamics.path and not (folder / DYNAMICS).exists():
+        load_dynamics(cfg.dynamics.path)  # there, and whole: before the data
+    told = about(cfg, folder) if cfg.logger.kind == "wandb" else {}
+    loggers = make_loggers(folder=folder, **cfg.logger, **told)
 
     # Transitions with standardised states. Each batch gets a perturbed state for every
     # state, which is the paper's mixed data set.
@@ -109,8 +117,6 @@ def run(cfg: DictConfig, folder: Path) -> float:
     data.buffer.append_transform(perturbation)
 
     learner = make_learner(cfg, *sizes, device)
-    told = about(cfg, folder) if cfg.logger.kind == "wandb" else {}
-    loggers = make_loggers(folder=folder, **cfg.logger, **told)
     components = {
         "perturbation": perturbation,
         "observation_norm": data.norm,

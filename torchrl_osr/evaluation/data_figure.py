@@ -44,7 +44,7 @@ def data_figure(
     """
     low, high = (np.asarray(each) for each in manifest.get("action_bounds", (-1, 1)))
     actions: NDArray[Any] = low + (data["action"].numpy() + 1) / 2 * (high - low)
-    if manifest.get("num_actions") is not None:
+    if manifest.get("num_actions") is not None and len(names["action"]) == 1:
         actions = data["action"].numpy().argmax(1)[:, None]
     returns, lengths = (
         [*manifest.get(f"episode_{each}", []), *manifest.get(f"incomplete_{each}", [])]

@@ -40,7 +40,7 @@ def inverse_dynamics_report(
         dimension's variance that the deterministic action explains, ``A`` numbers, and
         their mean ``"r2_mean"``; ``"coverage_90"``, share of actions
         inside the model's central 90 % interval, over all dimensions (0.9 is
-        calibrated); ``"rows"``.
+        calibrated).
 
     Raises:
         ValueError: if no row is left.

@@ -408,8 +408,8 @@ def robustness_table(title: str, summary: Sequence[Mapping[str, Any]]) -> str:
     lines = [title, *aligned_columns([header, *rows])]
     if unmet := [row["name"] for row in summary if not row["disturbed_share"]]:
         lines.append(
-            f"  {', '.join(unmet)}: no episode lasted until it came, so that nothing "
-            "is known of it; windows are steps of an episode."
+            f"  {', '.join(unmet)}: no episode lasted long enough to meet it, so "
+            "that nothing is known about it; windows count steps of an episode."
         )
     return "\n".join(lines)
 

@@ -98,14 +98,14 @@ def check_storage(cfg: DictConfig) -> str:
     """Where the data are: ``"memory"`` or ``"disk"``.
 
     Raises:
-        ValueError: it is no such place, or cannot be had with the other options.
+        ValueError: it is no such place, or cannot be combined with the other options.
     """
     storage = str(cfg.data.storage)
     check_choice("data.storage", storage, ("memory", "disk"))
     if storage == "disk" and cfg.trainer.cudagraph:
         raise ValueError(
-            "trainer.cudagraph=true cannot be had with data.storage=disk: a CUDA graph "
-            "reads no files. Take data.storage=memory, or trainer.cudagraph=false."
+            "trainer.cudagraph=true cannot be combined with data.storage=disk: a CUDA "
+            "graph reads no files. Take data.storage=memory or trainer.cudagraph=false."
         )
     return storage
 
@@ -303,12 +303,22 @@ def check_parts(
     ]  # fmt: skip
     if cfg.trainer.cudagraph and falling:
         raise ValueError(
-            f"optim.{falling[0]}={cfg.optim[falling[0]]} cannot be had with "
+            f"optim.{falling[0]}={cfg.optim[falling[0]]} cannot be combined with "
             "trainer.cudagraph=true: a CUDA graph repeats the learning rate that it "
             "was captured with. Take constant, or trainer.cudagraph=false."
         )
     check_networks(cfg, *sizes, cfg.trainer.device, training=True)
     learner = make_learner(cfg, *sizes)
+    if cfg.data.held_out in (0, 1):
+        raise ValueError(
+            f"data.held_out={cfg.data.held_out} must be above 0 and below 1: models "
+            "are judged on the held-out rows, and trained on the others."
+        )
+    if cfg.optim.policy_delay > 1 and not hasattr(learner.loss, "qvalue_network"):
+        raise ValueError(
+            f"optim.policy_delay={cfg.optim.policy_delay} updates critics in between, "
+            f"and {type(learner.loss).__name__} has none: take optim.policy_delay=1."
+        )
     if learner.model is not None:
         instantiate(cfg.inverse_dynamics.loss, _partial_=True)(learner.model)
     if cfg.perturbation.adversary is not None:

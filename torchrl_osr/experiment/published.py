@@ -40,7 +40,7 @@ def register_published() -> None:
 
 
 def check_published(cfg: DictConfig, choices: Mapping[str, str]) -> None:
-    """Warn if a method's authors have told settings for other data than a run's.
+    """Warn if a method's authors have published settings for other data than a run's.
 
     Raises:
         ValueError: if settings of another task or of other data would be taken.

@@ -249,7 +249,9 @@ def read_status(folder: Path) -> dict[str, Any]:
         free = False
     if free and said["host"] == platform.node():
         return said | {"status": "killed", "reason": f"{process} is gone"}
-    return said | {"reason": f"{process}, of which {platform.node()} cannot see more"}
+    return said | {
+        "reason": f"{process}; {platform.node()} cannot see whether it still runs"
+    }
 
 
 def check_ours(folder: Path) -> None:

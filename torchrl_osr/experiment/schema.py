@@ -199,20 +199,20 @@ class DynamicsConfig:
             null for one of the same settings in the cache, or a new one.
         terminations: auto for the rule by which the task ends, never for tasks that a
             time limit alone ends.
-        reverse_policy: cvae or uniform, by which actions a reverse model rolls out from
-            states of the data to where they came from: those of a conditional
-            autoencoder of the data, or any; null for the policy's, forwards.
+        reverse_policy: actions with which a reverse model rolls out from the data's
+            states to where they came from: cvae, those of a conditional autoencoder of
+            the data; uniform, random ones; null for no reverse model: the policy rolls
+            out forwards.
         adversarial_steps: gradient steps, before each further roll-out, by which the
             model is trained on the data and against the policy; 0 for none.
         adversarial_weight: of the policy's advantage in that training.
         adversarial_lr: learning rate of that training.
         rollout_steps: steps of a roll-out.
         rollout_starts: states of the data that roll-outs start from, each time.
-        disturbed_steps: steps with random actions in the model, at most, that lead from
-            those to where roll-outs begin; 0 for none.
-        action_noise: largest standard deviation of the noise on the policy's actions in
-            roll-outs, each row's is uniform below it; for policies that are
-            deterministic.
+        disturbed_steps: roll-outs begin after at most so many random actions in the
+            model; 0 for the data's states themselves.
+        action_noise: of the policy's actions in roll-outs; each row draws its standard
+            deviation between 0 and this. For policies that are deterministic.
         rollout_interval: gradient steps of the policy between roll-outs.
         generations: number of newest roll-outs that are trained on.
         real_ratio: share of real rows in a batch of the policy's; with 1 nothing is
@@ -270,10 +270,10 @@ class OptimConfig:
         actor_schedule: constant, or cosine: actor_lr falls to 0 along half a cosine
             over trainer.steps.
         qvalue_schedule: the same of qvalue_lr.
-        policy_average: how much of their exponential average the policy's weights
-            replace at each update, more in the first ones, so that it is never of more
-            than about the last tenth of a run. The average is what is evaluated, filmed
-            and exported; with 1 it is the weights themselves.
+        policy_average: share of the new weights in the exponential average of the
+            policy's weights, at each update; larger in the first ones, so that the
+            average never covers more than about the last tenth of a run. The average is
+            what is evaluated, filmed and exported; with 1 it is the weights themselves.
     """
 
     actor_lr: float = MISSING

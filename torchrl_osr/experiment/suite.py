@@ -24,6 +24,7 @@ from torchrl.modules import TanhNormal
 from torchrl_osr.envs import attacked_policy, critics_of
 from torchrl_osr.evaluation import Disturbance
 from torchrl_osr.experiment.trained_run import TrainedRun
+from torchrl_osr.objectives.distributions import CATEGORICAL
 
 DATA_UNIT = "data"
 """As a wrapper's ``unit``: the data's standard deviations."""
@@ -34,7 +35,8 @@ class DisturbanceConfig:
     """One kind of disturbance at one strength: either a wrapper or an attack.
 
     Attributes:
-        kind: what is disturbed; knock, push and start end, the others stay.
+        kind: what is disturbed; those of kind knock, push and start end, all others
+            last the whole episode.
         strength: for the figure's axis, in the unit of its kind.
         wrap: the wrapper of ``torchrl_osr.envs``, with ``_target_`` and ``_partial_``.
         attack: options of ``attacked_policy``.
@@ -163,6 +165,8 @@ def _obstacle(kind: str, trained: TrainedRun) -> str:
         )
     observation = torch.zeros_like(trained.observation_norm.loc)
     distribution = trained.actor.get_dist(TensorDict({"observation": observation}))
+    if isinstance(distribution, CATEGORICAL):
+        return "attacks are on policies of real actions, and the run's are discrete"
     if kind == "min_Q" and not hasattr(trained.loss, "qvalue_network"):
         return (
             f"min_Q asks critics, and {type(trained.loss).__name__} has none; leave it "

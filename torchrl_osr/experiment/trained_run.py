@@ -29,7 +29,7 @@ class TrainedRun(NamedTuple):
 
     Attributes:
         config: the run's configuration.
-        actor: the policy, with the average of its weights (``optim.policy_average``);
+        actor: the policy, with the average of its weights (``optim.policy_average``).
         inverse_dynamics: the model that taught the policy, with its frozen
             parameters; ``None`` if there was none, as in CQL and SAC-N.
         loss: holds the critics, too.

@@ -55,7 +55,8 @@ def load_switching_policy(
     judging = paths if judges is None else [Path(each) for each in judges]
     if not paths or not judging:
         raise ValueError("a switching policy needs at least one run and one judge.")
-    policies = {each: policy_from_run(each, trust) for each in (*paths, *judging)}
+    once = dict.fromkeys([*paths, *judging])
+    policies = {each: policy_from_run(each, trust) for each in once}
     for name in ("env_id", "discount"):
         found = {str(each.record["source"][name]) for each in policies.values()}
         if len(found) > 1:

@@ -81,15 +81,16 @@ class Difference(NamedTuple):
 
 
 def quantities(tables: RunTables) -> list[Quantity]:
-    """What methods are compared in: the score, and two numbers of each suite."""
-    found = [Quantity("undisturbed score", _values(recent(tables.episodes)))]
+    """What methods are compared in: the score or return, and two of each suite."""
+    measure = tables.measure.partition(" of ")[0].removeprefix("normalised ")
+    found = [Quantity(f"undisturbed {measure}", _values(recent(tables.episodes)))]
     for suite in tables.suites:
         rows = tables.episodes[tables.episodes["suite"] == suite]
         none = rows["disturbance"] == ""
         clean, under = _values(rows[none]), _values(rows[~none])
         found += [
-            Quantity(f"score under {suite}", under),
-            Quantity(f"points lost to {suite}", clean - under, sign=-1),
+            Quantity(f"{measure} under {suite}", under),
+            Quantity(f"{measure} lost to {suite}", clean - under, sign=-1),
         ]
     return found
 
@@ -196,8 +197,9 @@ def verdict(differences: Sequence[Difference], reference: str) -> list[str]:
     """Which method is better than the reference in what, in plain sentences.
 
     Returns:
-        What is told, what is not told apart and what cannot be told; over all data
-        sets, of a method that has only one on that.
+        First the verdicts, then what is not told apart, then what cannot be told. A
+        method with several data sets is judged over all of them, any other on its only
+        one.
     """
     everywhere = {each.method for each in differences if each.data == ALL_DATA}
     found = [
@@ -207,7 +209,7 @@ def verdict(differences: Sequence[Difference], reference: str) -> list[str]:
     ]
     sentences = [
         f"{each.method} is {each.verdict} than {reference} in {each.quantity.name} on "
-        f"{each.data}: {decimal(each.estimate.mean, '+')} points "
+        f"{each.data}: {decimal(each.estimate.mean, '+')} "
         f"{each.estimate.interval('+')}, {each.seeds} pairs of runs a data set."
         for each in found
         if each.told and each.estimate

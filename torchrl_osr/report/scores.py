@@ -98,7 +98,7 @@ class WayBack(NamedTuple):
 def decimal(value: float, sign: str = "") -> str:
     """Number with one decimal; ``sign="+"`` shows that of positive ones, too."""
     # A minus sign, unlike a hyphen, stays with its number at the end of a line.
-    return f"{value:{sign}.1f}".replace("-", "\N{MINUS SIGN}")
+    return f"{value:{sign}z.1f}".replace("-", "\N{MINUS SIGN}")
 
 
 def counted(number: int, noun: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from contextlib import closing
 
 import numpy as np
@@ -10,7 +11,11 @@ from recorded_logs import columns_of
 
 from torchrl_osr.data import load_dataset, load_file, write_memmap
 from torchrl_osr.data.collect.environment import open_environment
-from torchrl_osr.data.collect.record import record_episodes, write_log
+from torchrl_osr.data.collect.record import (
+    check_log_path,
+    record_episodes,
+    write_log,
+)
 
 
 def record(env_id, act=None, episodes=2, **options):
@@ -73,6 +78,15 @@ def test_discrete_actions_are_numbers_in_the_log_and_one_hot_in_the_data(tmp_pat
     write_memmap([data], tmp_path / "set", progress=False)
     with pytest.raises(ValueError, match="2 discrete ones"):
         load_dataset("x", "file", env_id="CartPole-v1", path=str(tmp_path / "set"))
+
+
+@pytest.mark.parametrize("suffix", ["parquet", "h5"])
+def test_a_missing_package_is_named_before_an_episode(tmp_path, monkeypatch, suffix):
+    for name in ("pyarrow", "h5py"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(ImportError, match=rf"\.{suffix} files need .*\[minari\]"):
+        check_log_path(tmp_path / f"log.{suffix}")
+    check_log_path(tmp_path / "log.npz")
 
 
 @pytest.mark.parametrize("wrong", [2, -1, 0.5])

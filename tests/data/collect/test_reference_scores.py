@@ -42,8 +42,9 @@ def test_references_of_ones_own() -> None:
     [
         ("pendulum", -1200.0, None, "env.expert_return=None: expected two"),
         ("pendulum", None, 0.0, "env.random_return=None"),
-        ("pendulum", 5.0, 5.0, "two different finite numbers"),
-        ("pendulum", 0.0, float("nan"), "two different finite numbers"),
+        ("pendulum", 5.0, 5.0, "the expert's above the random policy's"),
+        ("pendulum", 0.0, -1200.0, "the expert's above the random policy's"),
+        ("pendulum", 0.0, float("nan"), "two finite numbers"),
         ("hopper", 0.0, 1.0, "hopper is scored by D4RL's references"),
     ],
 )

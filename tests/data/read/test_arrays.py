@@ -164,7 +164,10 @@ def with_value(name, row, value):
         ({"truncated": None}, "lack truncated or episode"),
         ({"reward": None}, "lack reward"),
         ({"episode": [0, 0, 1, 1, 0, 0]}, "'episode' 0 comes back in row 4"),
-        ({"episode": np.linspace(0, 1, 6)}, "'episode' has type float64"),
+        (
+            {"episode": np.linspace(0, 1, 6)},
+            "'episode' holds 0.2 in row 1 of 6",
+        ),
         ({"terminated": None, "dones": [0] * 6}, "unknown columns 'dones'"),
         (
             {"observation": np.ma.masked_equal(log()["observation"], 7.0)},

@@ -138,6 +138,11 @@ def test_a_task_that_never_ends(write):
         ),
         ({"fell": [None] + [True] * 119}, WANTED, "'fell' has no value in row 0"),
         (
+            {"walk": [0.0] * 60 + [np.nan] * 2 + [1.0] * 58},
+            WANTED | {"episode": "walk"},
+            "'episode' holds nan in row 60 of 120; exp|'walk' has no value in row 60",
+        ),
+        (
             {"walk": ["a"] * 60 + [None] * 2 + ["b"] * 58},
             WANTED | {"episode": "walk"},
             "'walk' has no value in (2 rows, the first of them|row) 60",
@@ -282,6 +287,22 @@ def test_a_csv_file_in_parts_of_any_size(tmp_path_factory, part, chunk):
         patch.setattr(recording, "CHUNK_ROWS", chunk)
         stored, _ = load_file(path, on_disk=True, progress=False)
     assert (stored == expected).all()
+
+
+@pytest.mark.parametrize("part", [3, 8, 12, 100])
+def test_episodes_may_be_called_by_numbers_and_by_texts(tmp_path, monkeypatch, part):
+    """Whichever parts the file is read in, in memory and on disk."""
+    monkeypatch.setenv("TORCHRL_OSR_CACHE", str(tmp_path / "cache"))
+    frame = flat(make_columns(24)).drop(columns="truncated")
+    frame["episode"] = ["007"] * 10 + ["0"] * 4 + ["a"] * 10
+    frame.to_csv(tmp_path / "log.csv", index=False)
+    monkeypatch.setattr(csv_table, "ROWS_AT_A_TIME", part)
+    monkeypatch.setattr(recording, "CHUNK_ROWS", part)
+    for on_disk in (False, True):
+        options = {"on_disk": on_disk, "progress": False}
+        _, manifest = load_file(tmp_path / "log.csv", **options)
+        lengths = manifest["episode_lengths"] + manifest["incomplete_lengths"]
+        assert sorted(lengths) == [4, 10, 10]
 
 
 def test_bounds_come_from_the_environment_unless_they_are_given(tmp_path):

@@ -138,6 +138,15 @@ def test_one_value_is_no_column(tmp_path):
             load_file(path)
 
 
+def test_episodes_may_be_called_by_bytes(tmp_path):
+    columns = make_columns(20)
+    del columns["truncated"]
+    columns["episode"] = np.array([b"first"] * 12 + [b"second"] * 8)
+    np.savez(tmp_path / "log.npz", **columns)
+    _, manifest = load_file(tmp_path / "log.npz")
+    assert sorted(manifest["incomplete_lengths"]) == [8, 12]
+
+
 def test_lists_of_a_fixed_size_are_read(tmp_path):
     columns = {k: v for k, v in make_columns(60).items() if v.ndim == 1}
     for name in ("observation", "action"):

@@ -171,6 +171,14 @@ def test_nothing_is_fetched_unless_it_is_said(monkeypatch):
     with pytest.raises(FileNotFoundError, match=r"'test/far-v0' is not .*download="):
         load_minari("test/far-v0")
     assert asked == []
+
+    def fail(name):
+        raise ConnectionError("no route to host")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(minari.storage.hosting, "download_dataset", fail)
+        with pytest.raises(OSError, match="far-v0' cannot be downloaded .*no route"):
+            load_minari("test/far-v0", download=True)
     data, _ = load_minari("test/far-v0", download=True)
     assert (asked, len(data)) == (["test/far-v0"], sum(LENGTHS))
     load_minari("test/far-v0", download=True)
@@ -224,7 +232,7 @@ def damage_data(folder):
 def test_a_damaged_set_is_an_error_that_says_what_to_do(damage):
     damage(make("test/set-v0").storage.data_path)
     with pytest.raises(
-        ValueError, match=r"Minari cannot read test/set-v0 .*Take a whole copy"
+        ValueError, match=r"Minari cannot read test/set-v0 .*Put a whole copy"
     ):
         load_minari("test/set-v0")
 

@@ -99,11 +99,12 @@ def load_local_dataset(
             "quality; quality is random already."
         )
     request = request_of(env_name, quality, num_transitions, seed)
-    data, manifest = _rolled_out(root, request, progress)
     if not random_share:
+        data, manifest = _rolled_out(root, request, progress)
         return data if on_disk else data.clone(), manifest
-    request = request_of(env_name, "random", num_transitions, seed)
-    other, random = _rolled_out(root, request, progress)
+    other_request = request_of(env_name, "random", num_transitions, seed)
+    data, manifest = _rolled_out(root, request, progress)
+    other, random = _rolled_out(root, other_request, progress)
     manifest = _mixture_manifest(manifest, random, random_share)
 
     def mixed() -> TensorDict:

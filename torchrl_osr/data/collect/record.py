@@ -6,6 +6,7 @@ Shapes: ``N`` steps, ``S`` observation, ``A`` action.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -126,6 +127,7 @@ def check_log_path(path: Path) -> None:
     """Raise unless a log can be written there: a known suffix, and nothing there yet.
 
     Raises:
+        ImportError: the format's package is not installed.
         ValueError: the suffix is none of :data:`SUFFIXES`.
         FileExistsError: something is there.
     """
@@ -136,6 +138,11 @@ def check_log_path(path: Path) -> None:
             f"path={path} is there already and is not replaced: choose another path, "
             "or remove it yourself."
         )
+    with needed_by(f"{path.suffix} files need", "minari"):
+        if path.suffix == ".parquet":
+            import_module("pyarrow")
+        elif path.suffix != ".npz":
+            import_module("h5py")
 
 
 def write_log(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
@@ -152,20 +159,19 @@ def write_log(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     """
     check_log_path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with needed_by(f"{path.suffix} files need", "minari"):
-        if path.suffix == ".parquet":
-            import pyarrow
-            from pyarrow import parquet
+    if path.suffix == ".parquet":
+        import pyarrow
+        from pyarrow import parquet
 
-            lists = {name: list(each) for name, each in columns.items()}
-            with whole_file(path) as file:
-                parquet.write_table(pyarrow.table(lists), file)
-        elif path.suffix == ".npz":
-            with whole_file(path) as file:
-                np.savez(file, allow_pickle=False, **columns)
-        else:
-            import h5py
+        lists = {name: list(each) for name, each in columns.items()}
+        with whole_file(path) as file:
+            parquet.write_table(pyarrow.table(lists), file)
+    elif path.suffix == ".npz":
+        with whole_file(path) as file:
+            np.savez(file, allow_pickle=False, **columns)
+    else:
+        import h5py
 
-            with whole_file(path) as file, h5py.File(file, "w") as archive:
-                for name, each in columns.items():
-                    archive[name] = each
+        with whole_file(path) as file, h5py.File(file, "w") as archive:
+            for name, each in columns.items():
+                archive[name] = each

@@ -69,8 +69,8 @@ def reference_returns(
             neither for raw returns (default).
 
     Raises:
-        ValueError: only one is given, they are not two different finite numbers, or
-            the task has its own.
+        ValueError: only one is given, the expert's is not above the random policy's,
+            they are not finite, or the task has its own.
     """
     given = random_return, expert_return
     if given == (None, None):
@@ -81,10 +81,11 @@ def reference_returns(
             "and env.expert_return, or give another env.name."
         )
     low, high = given
-    if low is None or high is None or not 0 < abs(high - low) < math.inf:
+    if low is None or high is None or not 0 < high - low < math.inf:
         raise ValueError(
             f"env.random_return={low} and env.expert_return={high}: expected two "
-            "different finite numbers, or neither for raw returns."
+            "finite numbers, the expert's above the random policy's, or neither for "
+            "raw returns."
         )
     return ReferenceReturns(low, high)
 

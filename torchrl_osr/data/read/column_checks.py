@@ -172,9 +172,14 @@ def _changes(array: NDArray[Any], cast: NDArray[np.float32]) -> NDArray[np.int64
 
 
 def _as_whole_numbers(name: str, array: NDArray[Any]) -> NDArray[Any]:
-    whole = array.dtype.kind == "f" and bool((array == np.floor(array)).all())
-    if array.dtype.kind not in "iu" and not whole:
+    if array.dtype.kind not in "iuf":
         raise ValueError(f"{name!r} has type {array.dtype}; expected whole numbers.")
+    wrong = np.flatnonzero(array != np.floor(array))  # so is what is missing, a NaN
+    if len(wrong):
+        raise ValueError(
+            f"{name!r} holds {array[wrong[0]]} in row {wrong[0]} of {len(array)}; "
+            "expected whole numbers."
+        )
     return array.astype(np.int64)
 
 

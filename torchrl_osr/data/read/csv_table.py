@@ -7,7 +7,7 @@ import gzip
 import warnings
 import zlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +37,15 @@ def open_csv(path: Path) -> Table:
 
     def select(chosen: list[str]) -> tuple[int, ReadRows]:
         # All columns: asked for some, pandas overlooks lines that are too long.
-        rows = sum(map(len, _frames(path, names, names)))
-        return rows, _reader(path, names, chosen, rows)
+        rows, kinds = 0, {name: set[str]() for name in chosen}
+        for part in _frames(path, names, names):
+            rows += len(part)
+            for name in chosen:
+                text = pd.api.types.is_string_dtype(part[name])
+                kinds[name].add("text" if text else part[name].dtype.kind)
+        # pandas infers types part by part: 007 is 7 where all others are numbers, too.
+        texts = [name for name in chosen if {"text", "i"} <= kinds[name]]
+        return rows, _reader(path, names, chosen, rows, texts)
 
     return Table(names, select)
 
@@ -85,8 +92,10 @@ def _check_size(path: Path) -> None:
             check_unpacked_size(path, unpacked)
 
 
-def _frames(path: Path, names: list[str], chosen: list[str]) -> Iterator[pd.DataFrame]:
-    """Parts of some columns."""
+def _frames(
+    path: Path, names: list[str], chosen: list[str], texts: Sequence[str] = ()
+) -> Iterator[pd.DataFrame]:
+    """Parts of some columns, and ``texts`` of these as they are written."""
     try:
         with warnings.catch_warnings():
             # pandas drops what a line has beyond the header, with a warning.
@@ -97,6 +106,7 @@ def _frames(path: Path, names: list[str], chosen: list[str]) -> Iterator[pd.Data
                 header=0,
                 names=names,
                 usecols=chosen if chosen != names else None,
+                dtype=dict.fromkeys(texts, str),
                 index_col=False,
                 encoding="utf-8-sig",
                 low_memory=False,
@@ -110,7 +120,9 @@ def _frames(path: Path, names: list[str], chosen: list[str]) -> Iterator[pd.Data
         ) from error
 
 
-def _reader(path: Path, names: list[str], chosen: list[str], rows: int) -> ReadRows:
+def _reader(
+    path: Path, names: list[str], chosen: list[str], rows: int, texts: Sequence[str]
+) -> ReadRows:
     """What reads rows; to go back is to begin anew."""
     nothing = pd.DataFrame({name: np.empty(0) for name in chosen})
     frames, part, first = iter([nothing]), nothing, rows
@@ -119,7 +131,7 @@ def _reader(path: Path, names: list[str], chosen: list[str], rows: int) -> ReadR
         nonlocal frames, part, first
         check_unpacked_size(path, 8 * len(chosen) * (stop - start))
         if start < first:
-            frames, part, first = _frames(path, names, chosen), nothing, 0
+            frames, part, first = _frames(path, names, chosen, texts), nothing, 0
         parts, end = [part], first + len(part)
         while end < stop:
             parts.append(next(frames))

@@ -134,7 +134,8 @@ def open_file(
         "unused_columns": layout.unused,
     }
     if "step" in layout.columns:
-        read = _sorted(read_log(0, total), layout.columns["step"][0])
+        with naming(str(path)):
+            read = _sorted(read_log(0, total), layout.columns["step"][0])
     parts = partial(whole_trajectories, read, total)
     return Recording(
         parts, action_bounds, clip_actions, about, [path], total, num_actions

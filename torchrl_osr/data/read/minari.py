@@ -144,14 +144,14 @@ def open_minari(
 def _open(dataset: str, download: bool) -> minari.MinariDataset:
     path = Path(dataset).expanduser()
     here = get_dataset_path(dataset) / "data"
+    for folder in (path / "data", path):
+        if (folder / "metadata.json").is_file():
+            here = folder
+            break
+    else:
+        if download and not here.exists():
+            _download(dataset)
     try:
-        for folder in (path / "data", path):
-            if (folder / "metadata.json").is_file():
-                here = folder
-                break
-        else:
-            if download and not here.exists():
-                hosting.download_dataset(dataset)
         _check_folder(here)
         return minari.MinariDataset(here)
     except FileNotFoundError as error:
@@ -161,6 +161,16 @@ def _open(dataset: str, download: bool) -> minari.MinariDataset:
         ) from error
     except DAMAGE as error:
         raise _damaged(dataset, error) from error
+
+
+def _download(dataset: str) -> None:
+    try:
+        hosting.download_dataset(dataset)
+    except Exception as error:  # of whatever serves the set
+        raise OSError(
+            f"Minari set {dataset!r} cannot be downloaded ({type(error).__name__}: "
+            f"{error}): check its name and the network."
+        ) from error
 
 
 def _check_folder(folder: Path) -> None:
@@ -179,9 +189,9 @@ def _check_folder(folder: Path) -> None:
 
 def _damaged(dataset: str | Path, error: Exception) -> ValueError:
     return ValueError(
-        f"Minari cannot read {dataset} ({type(error).__name__}: {error}). Take a whole "
-        "copy in its place; one that was fetched can be fetched again "
-        "(data.download=true) once its folder is out of the way."
+        f"Minari cannot read {dataset} ({type(error).__name__}: {error}). Put a "
+        "whole copy in its place; if it was downloaded, remove its folder and download "
+        "it again (data.download=true)."
     )
 
 

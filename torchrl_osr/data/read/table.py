@@ -128,11 +128,10 @@ def assemble(
         for name, array in zip(names, parts, strict=True):
             if not array.ndim:
                 raise ValueError(f"{name!r} is one value; expected one for each row.")
-        if part == "episode" and parts[0].dtype.kind in "OU":
-            _refuse_nameless(names[0], parts[0])
-            numbers = [
-                episodes.setdefault(str(each), len(episodes)) for each in parts[0]
-            ]
+        if part == "episode" and parts[0].dtype.kind in "OSU":
+            texts = parts[0].astype(str) if parts[0].dtype.kind == "S" else parts[0]
+            _refuse_nameless(names[0], texts)
+            numbers = [episodes.setdefault(str(each), len(episodes)) for each in texts]
             columns[part] = np.array(numbers, np.int64)
             continue
         for name, array in zip(names, parts, strict=True):
