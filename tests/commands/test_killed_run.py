@@ -177,11 +177,6 @@ def test_other_settings_are_refused_by_name_unless_forced(runs, finished):
     assert "force: false" in path.read_text()
 
 
-def test_group_that_is_no_setting_is_refused(runs, finished):
-    assert runs.resume(finished, "preset=paper") == 1
-    assert "preset=paper is none of its settings" in runs.output
-
-
 def test_resumed_run_keeps_its_name_in_the_report(runs, tmp_path):
     folder = tmp_path / "run"
     assert runs.train(folder, "loss=cql") == 0, runs.output

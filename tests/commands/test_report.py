@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import os
-import runpy
 from pathlib import Path
 
 import pytest
+from report.fakes import write_run
 
 from torchrl_osr.__main__ import main
 
 ROOT = Path(__file__).parents[2]
-FAKES = ROOT / "tests" / "report" / "fakes.py"
 
 
 def test_report_of_several_folders(tmp_path, run):
-    write_run = runpy.run_path(str(FAKES))["write_run"]
     curve = {1000: [1.0, 2.0], 2000: [3.0, 4.0]}
     write_run(tmp_path / "a" / "0", curve, choice="cql", loss={"recovery_weight": 0.0})
     write_run(tmp_path / "b" / "0", curve, overrides=["loss=osr"])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from torchrl.record.loggers import CSVLogger
 
 from torchrl_osr.evaluation import (
-    learning_curve,
     read_scalars,
     score_table,
 )
@@ -25,13 +24,6 @@ def test_scalars_are_read_as_logged_and_the_later_row_counts(tmp_path):
             logger.log_scalar("policy/loss_x", value, step=step)
     scalars = read_scalars(tmp_path / "csv" / "scalars" / "policy")
     assert scalars == {"loss_x": [(1, 5.0), (2, 6.5), (3, 7.5)]}
-
-
-def test_learning_curve_is_a_picture(tmp_path):
-    path = tmp_path / "curve.png"
-    scalars = {"loss_qvalue": [(0, 1.0), (10, 2.0)], "unknown": [(0, 1.0)]}
-    learning_curve(evaluations(1, 2), scalars, path, title="t", data_mean=1.5)
-    assert path.read_bytes().startswith(b"\x89PNG")
 
 
 def test_table_has_last_recent_and_best(tmp_path):

@@ -96,8 +96,3 @@ def test_a_model_with_a_latent_is_built() -> None:
     _, learner = learner_of("inverse_dynamics=cvae", "loss=osr_official")
     assert "latent_loc" in learner.model.out_keys
     assert learner.loss.inverse_dynamics_network.out_keys == learner.model.out_keys
-
-
-def test_option_out_of_its_range_is_refused_by_name() -> None:
-    with pytest.raises(ValueError, match="recovery_direction must be one of"):
-        learner_of("loss.recovery_direction=sideways")

@@ -132,15 +132,12 @@ def test_a_model_in_training_is_continued_with_the_same_bits(tmp_path) -> None:
         assert not torch.is_tensor(value) or torch.equal(value, there[key]), key
 
 
-def test_a_weight_of_0_is_no_adversary(tmp_path) -> None:
-    folder = ran(tmp_path, *RAMBO, "dynamics.adversarial_weight=0", "trainer.steps=2")
-    assert "imagined_reward" in scalars(folder)
-    assert "adversary_objective" not in scalars(folder)
-
-
-def test_recovery_is_added_to_mopo(tmp_path) -> None:
-    found = scalars(ran(tmp_path, *RECOVERY, "trainer.steps=2"))
-    assert {"loss_recovery", "recovery_kl", "imagined_reward"} <= found.keys()
+def test_a_weight_of_0_is_no_adversary_and_rows_may_be_on_disk(tmp_path) -> None:
+    settings = ["dynamics.adversarial_weight=0", "data.storage=disk", "trainer.steps=2"]
+    found = scalars(ran(tmp_path, *RAMBO, *RECOVERY, *settings))
+    assert len(found["imagined_reward"]) == 2
+    assert {"loss_recovery", "recovery_kl"} <= found.keys()
+    assert "adversary_objective" not in found
 
 
 @pytest.mark.parametrize("steps", [0, 3])
@@ -402,11 +399,6 @@ def test_penalty_and_units_are_those_of_the_task(finished, tmp_path) -> None:
 def test_what_cannot_be_had_is_refused_before_the_data(overrides, message) -> None:
     with pytest.raises(ValueError, match=message):
         check_parts(small(*overrides), 11, 3)
-
-
-def test_a_policy_learns_from_what_is_imagined_of_rows_on_disk(tmp_path) -> None:
-    folder = ran(tmp_path, "data.storage=disk", "trainer.steps=2")
-    assert len(scalars(folder)["imagined_reward"]) == 2
 
 
 def test_a_loss_has_the_trained_model_and_nothing_is_imagined(tmp_path) -> None:

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 from composed import composed
-from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from torchrl_osr.experiment.run_config import (
@@ -127,17 +126,6 @@ def test_no_file_of_the_current_folder_takes_the_place_of_a_library(module):
     sys.modules.pop("tabnanny", None)
     check_targets(OmegaConf.create({}), ["my_module", "tabnanny"])
     assert Path(sys.modules["tabnanny"].__file__).parent != module.parent
-
-
-def test_the_crafted_configuration_would_work(tmp_path):
-    """What :func:`check_targets` is for."""
-    marker = tmp_path / "marker"
-    cfg = OmegaConf.create({"_target_": "os.mkdir", "path": str(marker)})
-    with pytest.raises(ValueError, match=r"'os\.mkdir'"):
-        check_targets(cfg)
-    assert not marker.exists()
-    instantiate(cfg)
-    assert marker.exists()
 
 
 @pytest.mark.parametrize(

@@ -132,12 +132,6 @@ def read_status(folder) -> dict:
     return json.loads((folder / "status.json").read_text())
 
 
-def test_status_says_running_then_done(tmp_path):
-    with run_folder.status(tmp_path):
-        assert read_status(tmp_path)["status"] == "running"
-    assert read_status(tmp_path) == {"status": "done"}
-
-
 @pytest.mark.parametrize("error", [ValueError("why"), KeyboardInterrupt("why")])
 def test_status_says_failed_and_why(tmp_path, error):
     with pytest.raises(type(error)), run_folder.status(tmp_path):

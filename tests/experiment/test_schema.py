@@ -7,7 +7,7 @@ from dataclasses import MISSING, fields, is_dataclass
 
 import pytest
 from composed import CONF, composed
-from hydra.errors import ConfigCompositionException, MissingConfigException
+from hydra.errors import ConfigCompositionException
 from hydra.utils import get_class, instantiate
 from omegaconf import OmegaConf, ValidationError
 
@@ -101,14 +101,6 @@ def test_quick_preset_knows_data_of_an_expert(env, weight):
         assert train(f"env={env}", *other).loss.min_q_weight == 5
     # Losses without the term have no use for it.
     assert train(f"env={env}", "data=medium-expert", "loss=mopo").loss.min_q_weight == 0
-
-
-@pytest.mark.parametrize("group", GROUPS)
-def test_unknown_option_lists_what_exists(group):
-    with pytest.raises(MissingConfigException) as error:
-        train(f"{group}=nothing")
-    for name in options(group):
-        assert name in str(error.value)
 
 
 # -- the schemas of the losses, derived from their signatures ----------------------

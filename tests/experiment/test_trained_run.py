@@ -65,11 +65,6 @@ def test_the_inverse_dynamics_model_is_the_one_that_was_saved(run, rows):
     assert torch.equal(saved.deterministic_sample, loaded.deterministic_sample)
 
 
-def test_runs_without_recovery_have_no_inverse_dynamics_model(tmp_path):
-    make_run(tmp_path / "run", "loss=cql")
-    assert load_trained(tmp_path / "run").inverse_dynamics is None
-
-
 def test_kept_checkpoints_come_oldest_first(run):
     folder, *_ = run
     files = checkpoints_of(folder)

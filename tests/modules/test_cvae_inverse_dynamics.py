@@ -105,31 +105,6 @@ def test_the_latent_is_its_mean_unless_draws_are_asked_for(kind) -> None:
     torch.testing.assert_close(params["loc"], decoded)
 
 
-def test_random_draws_of_the_latent_have_its_mean_and_scale() -> None:
-    model, batch = make_model(), make_states(1).expand(20_000)
-    core, seen = model.module[0].module, []
-    core.decoder.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[2]))
-    with set_interaction_type(RANDOM):
-        params = model.get_dist_params(batch.clone())
-    spread, mean = torch.std_mean(seen[0], 0)
-    # Four standard errors of a mean and of a standard deviation.
-    scale = params["latent_scale"][0]
-    error = 4 * scale / 20_000**0.5
-    assert ((mean - params["latent_loc"][0]).abs() < error).all()
-    assert ((spread - scale).abs() < error).all()
-    assert (params["loc"].std(0) > 1e-3).all()
-
-
-def test_draws_send_gradient_to_the_encoder() -> None:
-    model = make_model()
-    with set_interaction_type(RANDOM):
-        model.get_dist_params(make_states(7))["loc"].sum().backward()
-    gradients = [p.grad for p in model.module[0].module.encoder.parameters()]
-    # The last layer's halves: mean and scale of the latent.
-    for half in gradients[-1].chunk(2):
-        assert half.count_nonzero() == 4
-
-
 def test_the_policys_losses_and_the_report_never_draw() -> None:
     model, data = make_model(), make_states(7)
     data["action"] = torch.rand(7, 2)
@@ -172,20 +147,6 @@ def test_double_stays_double() -> None:
     assert all(out[key].dtype is torch.float64 for key in model.out_keys)
 
 
-class AuthorsHead(torch.nn.Module):
-    """``output[:, :dim]`` and ``output[:, :dim:]``: the mean's columns, both times."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.multiplier = torch.nn.Parameter(torch.tensor(1.0))
-        self.offset = torch.nn.Parameter(torch.tensor(-1.0))
-
-    def forward(self, param: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        dim = param.shape[-1] // 2
-        log_scale = self.multiplier * param[..., :dim:] + self.offset
-        return param[..., :dim], log_scale.exp()
-
-
 def heteroscedastic_world(size: int) -> tuple[TensorDict, torch.Tensor, torch.Tensor]:
     """Transitions, and mean and log standard deviation of their pre-tanh action.
 
@@ -221,17 +182,6 @@ def test_the_scale_learns_what_the_mean_does_not_know() -> None:
     prior = torch.tensor(0.0), torch.tensor(1.0)
     kl = gaussian_kl(out["latent_loc"], out["latent_scale"], *prior)
     assert kl.mean().item() < 0.05
-
-
-def test_the_authors_slice_ties_the_scale_to_the_mean() -> None:
-    # What the test above would find, had this model the released code's head.
-    batch, _, log_scale = heteroscedastic_world(2048)
-    model = make_model(num_cells=[32])
-    model.module[0].module.extractor = AuthorsHead()
-    out = fit(model, batch)
-    tied = correlation(out["scale"].log(), out["loc"]).abs()
-    torch.testing.assert_close(tied, torch.ones(2), rtol=1e-5, atol=0)
-    assert (correlation(out["scale"].log(), log_scale).abs() < 0.3).all()
 
 
 @pytest.mark.parametrize("seed", range(5))

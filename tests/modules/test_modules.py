@@ -6,7 +6,6 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import InteractionType, set_interaction_type
-from torchrl.modules import TanhNormal
 
 from torchrl_osr import OSRLoss
 from torchrl_osr.modules import (
@@ -89,15 +88,6 @@ def test_scale_has_a_floor(build) -> None:
     assert scale.min().item() == pytest.approx(1e-2)
 
 
-def test_policy_and_model_share_family_and_default_bounds() -> None:
-    policy, model = (
-        build(5, 2, num_cells=[8]).get_dist(states(4)) for build in BUILDERS
-    )
-    assert type(policy) is type(model) is TanhNormal
-    assert torch.equal(policy.low, model.low)
-    assert torch.equal(policy.high, model.high)
-
-
 def test_model_reads_both_states_and_the_policy_only_the_first() -> None:
     before = states(4)
     after = before.clone()
@@ -116,15 +106,6 @@ def test_critics_score_actions_and_differ(count) -> None:
     values = [critic(batch.clone())["state_action_value"] for critic in critics]
     assert [value.shape for value in values] == [(4, 1)] * count
     assert torch.stack(values).unique(dim=0).shape[0] == count
-
-
-def test_critics_read_state_and_action() -> None:
-    (critic,) = critic_ensemble(5, 2, num_qvalue_nets=1, num_cells=[8])
-    batch = states(4).set("action", torch.rand(4, 2))
-    base = critic(batch.clone())["state_action_value"]
-    for key in ("observation", "action"):
-        moved = critic(batch.clone().set(key, batch[key] + 1))["state_action_value"]
-        assert not torch.equal(moved, base)
 
 
 def test_critics_keep_torchs_default_initialisation_in_the_loss() -> None:

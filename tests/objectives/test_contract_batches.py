@@ -135,37 +135,10 @@ def test_copies_compute_the_same_and_train_apart(
 
 
 @pytest.mark.losses
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_losses_have_the_batch_dtype(family, family_batch, record, name, dtype) -> None:
-    loss = family(name).to(dtype)
+def test_losses_have_the_batch_dtype(family, family_batch, record, name) -> None:
+    loss = family(name).float()  # the family is of float64
     batch = family_batch(name, 10)
-    batch = batch.apply(lambda t: t.to(dtype) if t.is_floating_point() else t)
+    batch = batch.apply(lambda t: t.float() if t.is_floating_point() else t)
     for value in record(loss, batch):
-        assert value.dtype == dtype
+        assert value.dtype == torch.float32
         assert value.isfinite().all()
-
-
-# What is computed without a random draw.
-@pytest.mark.parametrize(
-    ("name", "key"),
-    [
-        ("osr", "recovery_kl"),
-        ("official", "recovery_kl"),
-        ("recovery", "loss_recovery"),
-        ("recovery-delta", "loss_recovery"),
-        ("recovery-plain", "loss_recovery"),
-        ("idm", "loss_inverse_dynamics"),
-        ("discrete-idm", "loss_inverse_dynamics"),
-        ("cql", "pred_value"),
-        ("osrv", "pred_value"),
-        ("edac", "diversity"),
-        ("td3bc", "loss_actor"),
-        ("discrete", "loss_qvalue"),
-        ("discrete", "loss_cql"),
-        ("discrete", "loss_actor"),
-    ],
-)
-def test_order_of_the_rows_does_not_matter(family, family_batch, name, key) -> None:
-    loss, batch = family(name), family_batch(name, 10)
-    out, flipped = loss(batch), loss(batch[torch.arange(9, -1, -1)])
-    torch.testing.assert_close(out[key], flipped[key])

@@ -165,7 +165,7 @@ def test_nested_and_renamed_keys_give_the_same_numbers(
 
 
 @pytest.mark.losses(having="critics")
-@pytest.mark.parametrize("estimator", ["before", "after", "never"])
+@pytest.mark.parametrize("estimator", ["before", "after"])
 def test_value_estimator_follows_the_renamed_keys(
     family, family_batch, seeded, assert_same, name, estimator
 ) -> None:

@@ -88,23 +88,6 @@ def test_the_temperature_stays_within_its_bounds(family, family_batch, name) -> 
 
 
 @BOTH
-def test_the_temperature_is_that_of_cql(family, family_batch, name) -> None:
-    """TorchRL's own clamp of the same log_alpha."""
-    bounds = {"min_alpha": 0.3, "max_alpha": 0.4}
-    networks, batch = family.networks(name), family_batch(name, 10)
-    theirs = CQLLoss(
-        networks.actor, networks.critics, target_entropy=-2.0, **bounds
-    ).double()
-    SoftUpdate(theirs, tau=0.1)
-    for start in (0.1, 0.35, 2.0):
-        ours = family(name, **bounds)
-        for loss in (ours, theirs):
-            loss.log_alpha.data.fill_(math.log(start))
-        expected = theirs(batch.clone())["alpha"]
-        torch.testing.assert_close(ours(batch)["alpha"], expected, check_dtype=False)
-
-
-@BOTH
 @pytest.mark.parametrize(
     ("options", "expected"),
     [

@@ -310,13 +310,6 @@ def test_second_derivatives_need_the_critics_all_at_once(
         second_derivative(chunked, batch, squared)
 
 
-@pytest.mark.parametrize("chunk_size", [0, -1])
-def test_chunks_without_a_state_are_refused(family, chunk_size) -> None:
-    expected = f"chunk_size must be at least 1, got {chunk_size}"
-    with pytest.raises(ValueError, match=expected):
-        family("cql", chunk_size=chunk_size)
-
-
 OTHERS = {
     "another activation": {"activation_class": nn.Tanh},
     "another activation of normalised layers": {"activation_class": nn.Tanh}

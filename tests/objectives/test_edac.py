@@ -16,7 +16,7 @@ from torch.distributions import Independent, Normal, TransformedDistribution
 from torch.distributions.transforms import AffineTransform, TanhTransform
 from torchrl.objectives import SoftUpdate
 
-from torchrl_osr import EDACLoss, OSRLoss
+from torchrl_osr import EDACLoss
 
 GAMMA, ALPHA, TARGET_ENTROPY, TARGET_SCALE = 0.875, 0.3, -1.5, 0.8
 
@@ -155,44 +155,3 @@ def test_metric_is_what_the_diversity_adds(make_networks, make_batch) -> None:
     loss.diversity_weight = 0.0
     added = out["loss_qvalue"] - losses_of(loss, batch)["loss_qvalue"]
     torch.testing.assert_close(added, 0.75 * similarity)
-
-
-def test_weight_zero_is_sac_n_as_osr_has_it(make_networks, make_batch) -> None:
-    networks, batch = make_networks(num_critics=3), make_batch(10)
-    sac_n = {
-        "recovery_weight": 0.0,
-        "min_q_weight": 0.0,
-        "actor_states": "clean",
-        "deterministic_backup": False,
-    }
-    ours = losses_of(make_loss(EDACLoss, networks, diversity_weight=0.0), batch)
-    theirs = losses_of(make_loss(OSRLoss, networks, **sac_n), batch)
-    assert ours.keys() == theirs.keys()
-    for key, value in ours.items():
-        torch.testing.assert_close(value, theirs[key], rtol=1e-12, atol=1e-12)
-
-
-def test_an_update_lowers_the_similarity(make_networks, make_batch) -> None:
-    networks, batch = make_networks(num_critics=3), make_batch(10)
-    loss = make_loss(EDACLoss, networks, diversity_weight=1e3)
-    params = list(loss.qvalue_network_params.parameters())
-    optimizer, seen = torch.optim.SGD(params, lr=1e-5), []
-    for _ in range(20):
-        out = loss(batch)
-        seen.append(out["diversity"].item())
-        optimizer.zero_grad()
-        out["loss_qvalue"].backward()
-        optimizer.step()
-    assert seen[-1] < seen[0] - 0.01
-
-
-@pytest.mark.parametrize(
-    ("critics", "options", "message"),
-    [
-        (1, {}, "num_qvalue_nets of at least 2"),
-        (2, {"diversity_weight": -1.0}, "diversity_weight must be at least 0, got -1"),
-    ],
-)
-def test_wrong_options_are_refused(make_networks, critics, options, message) -> None:
-    with pytest.raises(ValueError, match=message):
-        make_loss(EDACLoss, make_networks(num_critics=critics), **options)

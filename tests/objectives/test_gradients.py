@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 
 import pytest
@@ -75,7 +74,7 @@ def spoil(batch, flag: torch.Tensor, value: float):
 
 
 @pytest.mark.losses
-@pytest.mark.parametrize("garbage", [math.nan, math.inf, 1e6])
+@pytest.mark.parametrize("garbage", [math.nan, 1e6])
 def test_next_state_of_ended_rows_changes_no_bit_of_any_loss(
     family, family_batch, record, assert_same_bits, name, garbage
 ) -> None:
@@ -123,18 +122,3 @@ def test_next_state_of_done_rows_counts_on_neither_half_of_the_states(
     loss, batch = family(name, **options), family_batch(name, 10)
     spoiled = spoil(batch, batch["next", "done"], garbage)
     assert_same_bits(record(loss, spoiled), record(loss, batch))
-
-
-@pytest.mark.losses("osr", "cql", "cql-options", "osrv", "discrete", "edac")
-def test_the_lowest_critic_alone_decides_actor_and_target(
-    family, family_batch, seeded, name
-) -> None:
-    # One critic that is lower everywhere, among three or alone with its copy.
-    networks, alone = (family.networks(name, num_critics=3) for _ in range(2))
-    for each in (networks, alone):
-        each.critics[2].module[-1].bias.data -= 100.0
-    alone.critics = [alone.critics[2], copy.deepcopy(alone.critics[2])]
-    batch = family_batch(name, 10)
-    out, wanted = (seeded(family(name, each), batch) for each in (networks, alone))
-    for key in ("loss_actor", "target_value"):
-        torch.testing.assert_close(out[key], wanted[key], rtol=1e-12, atol=1e-12)

@@ -94,23 +94,6 @@ def test_multi_step_batches_are_refused_by_the_model(
     assert all(value.isfinite() for value in family(name)(batch).values())
 
 
-# The target is r + gamma^n V(s').
-@pytest.mark.losses(
-    "cql", "cql-perturbed", "cloning", "noisy-cloning", "edac", "td3bc", "discrete-cql"
-)
-def test_multi_step_batches_are_taken_without_a_model(
-    family, family_batch, record, assert_same, name
-) -> None:
-    batch = several_steps(family_batch(name, 2, 5))
-    two = batch[batch["steps_to_next_obs"] == 2]
-    assert len(two) == 4
-    found, expected = family(name), family(name)
-    found.make_value_estimator(gamma=0.5)
-    expected.make_value_estimator(gamma=0.25)
-    one = two.exclude("steps_to_next_obs", "gamma")
-    assert_same(record(found, two), record(expected, one))
-
-
 @pytest.mark.losses("osr", "cql", "osrv", "edac", "td3bc", "idm", "idm-mse", "cvae")
 @pytest.mark.parametrize("size", [1, 5])
 def test_action_of_another_size_is_named(family, family_batch, name, size) -> None:

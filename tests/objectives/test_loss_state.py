@@ -7,7 +7,7 @@ import copy
 import pytest
 import torch
 from torch import nn
-from torchrl.objectives import HardUpdate, SoftUpdate
+from torchrl.objectives import SoftUpdate
 
 
 def values(params) -> list[torch.Tensor]:
@@ -115,20 +115,6 @@ def test_soft_update_moves_targets_a_little(family, name) -> None:
     new = values(loss.target_qvalue_network_params)
     for before, after in zip(old, new, strict=True):
         torch.testing.assert_close(after, before + 0.25)
-
-
-@pytest.mark.losses(having="critics")
-def test_hard_update_copies_at_its_interval(family, name) -> None:
-    loss = family(name, updated=False)
-    updater = HardUpdate(loss, value_network_update_interval=2)
-    shift(loss.qvalue_network_params, 1.0)
-    equal = []
-    for _ in range(3):
-        updater.step()
-        target = values(loss.target_qvalue_network_params)
-        online = values(loss.qvalue_network_params)
-        equal.append(all(map(torch.equal, target, online)))
-    assert equal == [False, False, True]  # TorchRL counts two steps, then copies
 
 
 @pytest.mark.losses(having="critics")

@@ -298,51 +298,6 @@ def test_losses_and_gradients_equal_the_restatement(
     check(label, [each.grad for each in ours], wanted, tolerance=1e-12)
 
 
-def test_clipping_reaches_some_rows_and_sends_no_gradient(
-    make_networks, make_batch
-) -> None:
-    free, bound, all_bound = (
-        make_osr(
-            make_networks(),
-            clip_diff_min=clip_diff_min,
-            reduction="none",
-            scalar_output_mode="exclude",
-        )
-        for clip_diff_min in (-math.inf, 5.9, 1e3)
-    )
-    gaps = [losses_of(loss, make_batch(10))["loss_cql"] for loss in (free, bound)]
-    # Summed over critics: equal where neither is clipped.
-    assert 0 < (gaps[0] == gaps[1]).sum() < 10
-    losses_of(all_bound, make_batch(10))["loss_cql"].sum().backward()
-    for each in all_bound.qvalue_network_params.values(True, True):
-        assert each.grad.abs().max() == 0
-
-
-@pytest.mark.parametrize(("threshold", "rises"), [(-100.0, True), (100.0, False)])
-def test_multiplier_rises_while_the_gap_is_too_large(
-    make_networks, make_batch, threshold, rises
-) -> None:
-    loss = make_osr(make_networks(), lagrange_thresh=threshold, **CQL, **LAGRANGE)
-    optimizer = torch.optim.SGD([loss.log_alpha_prime], lr=1e-4)
-    sum(losses_of(loss, make_batch(10)).values()).backward()
-    optimizer.step()
-    assert (loss.log_alpha_prime.item() > LOG_PRIME) == rises
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (LAGRANGE | {"min_q_weight": 0.0}, "needs min_q_weight above 0"),
-        (SAC_N | {"max_q_backup": True}, "leave deterministic_backup=True"),
-    ],
-)
-def test_options_that_contradict_each_other_are_refused(
-    make_networks, options, message
-) -> None:
-    with pytest.raises(ValueError, match=message):
-        make_osr(make_networks(), **options)
-
-
 def test_metrics_say_what_they_are_called(make_networks, make_batch) -> None:
     networks, batch = make_networks(**UNIT), make_batch(10)
     loss, without = make_osr(networks), make_osr(networks, recovery_weight=0.0)

@@ -137,12 +137,6 @@ def test_rows_are_each_ones_own_and_masks_reach_all_terms(
     torch.testing.assert_close(masked, left)
 
 
-def test_a_batch_without_the_next_action_is_refused(make_networks, make_batch) -> None:
-    batch = make_batch(4).exclude(("next", "action"))
-    with pytest.raises(KeyError, match="no entry .*'next.*'action"):
-        make_loss(make_networks())(batch)
-
-
 @pytest.mark.parametrize("option", ["actor_bc_coef", "critic_bc_coef", "policy_noise"])
 def test_negative_weights_are_refused(make_networks, option) -> None:
     with pytest.raises(ValueError, match=f"{option} must be at least 0, got -1"):

@@ -222,15 +222,6 @@ def test_without_its_terms_it_is_sac_n_as_edac_has_it(
     assert loss.out_keys == [*found[0].keys()]
 
 
-def test_rows_share_the_draws(make_networks, make_batch) -> None:
-    loss, batch = make_loss(make_networks()), make_batch(3)
-    states = batch.select("observation")
-    noise = loss._around(states, 0.5)["observation"] - states["observation"]
-    assert noise.shape == (4, 3, 3)
-    torch.testing.assert_close(noise, noise[:, :1].expand_as(noise))
-    assert noise.abs().max() <= 0.5
-
-
 @pytest.mark.parametrize(
     ("critics", "options", "message"),
     [

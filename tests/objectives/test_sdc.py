@@ -15,7 +15,6 @@ from torchrl.objectives import SoftUpdate
 from uneven_dynamics import uneven_dynamics
 
 from torchrl_osr import OSRLoss, SDCLoss
-from torchrl_osr.functional import maximum_mean_discrepancy
 from torchrl_osr.modules import ConditionalVAE, DynamicsEnsemble
 
 SAMPLES, WIDTH, THRESHOLD, MULTIPLIER = 3, 0.7, 0.02, 1.7
@@ -119,39 +118,6 @@ def test_losses_and_gradients_equal_the_restatement(
     )
 
 
-def test_discrepancy_is_zero_of_equal_samples_and_two_of_far_ones() -> None:
-    here = torch.randn(4, 5, 3, dtype=torch.float64)
-    same = maximum_mean_discrepancy(here, here[[2, 0, 3, 1]], width=1.0)
-    torch.testing.assert_close(same, torch.zeros(5, dtype=torch.float64))
-    point = here[:1]
-    far = maximum_mean_discrepancy(point, point + 100, width=1.0)
-    torch.testing.assert_close(far, torch.full([5], 2.0, dtype=torch.float64))
-
-
-def test_the_multiplier_rises_where_the_constraint_is_broken(
-    make_networks, make_batch
-) -> None:
-    batch = make_batch(10)
-    for threshold, sign in ((0.0, -1), (2.0, 1)):
-        loss = make_loss(make_networks(), threshold=threshold)
-        out = loss(batch)
-        out["loss_multiplier"].backward()
-        assert loss.log_multiplier.grad.sign() == sign
-        assert all(each.grad is None for each in loss.actor_network_params.parameters())
-
-
-def test_the_models_are_frozen(make_networks, make_batch) -> None:
-    loss = make_loss(make_networks())
-    sum(
-        value for key, value in loss(make_batch(10)).items() if "loss" in key
-    ).backward()
-    trained = {each.data_ptr() for each in loss.parameters()}
-    for name in ("dynamics", "transition"):
-        frozen = list(getattr(loss, f"{name}_network_params").values(True, True))
-        assert not trained & {each.data_ptr() for each in frozen}
-        assert not any(each.requires_grad for each in frozen)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -164,8 +130,3 @@ def test_the_models_are_frozen(make_networks, make_batch) -> None:
 def test_options_are_checked(make_networks, options, message) -> None:
     with pytest.raises(ValueError, match=message):
         make_loss(make_networks(), **options)
-
-
-def test_a_batch_without_perturbed_states_is_named(make_networks, make_batch) -> None:
-    with pytest.raises(KeyError, match="No perturbed state in the batch"):
-        make_loss(make_networks())(make_batch(10, twin=False))

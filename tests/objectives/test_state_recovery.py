@@ -12,7 +12,7 @@ from torch.distributions import Normal, kl_divergence
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
 from torchrl.objectives import IQLLoss, SACLoss, SoftUpdate, TD3BCLoss
 
-from torchrl_osr import OSRLoss, StateRecoveryLoss
+from torchrl_osr import StateRecoveryLoss
 
 KEY, METRIC, ACTOR = "loss_recovery", "recovery_kl", "actor_network_params"
 NEXT, PERTURBED = ("next", "observation"), ("perturbed", "observation")
@@ -134,28 +134,6 @@ def test_gradient_is_finite_where_the_action_has_saturated(
     assert (gradients[-1] > 0).all() == (kind != "actor")
 
 
-@pytest.mark.parametrize("size", [(10,), (2, 5)])
-@pytest.mark.parametrize("weighted", [False, True])
-def test_term_is_that_of_osr(
-    make_networks, make_batch, assert_same, size, weighted
-) -> None:
-    batch, networks = make_batch(*size), make_networks()
-    if weighted:
-        batch["priority_weight"] = torch.rand(*size, dtype=torch.float64) + 0.1
-    ours = make_loss(make_networks())
-    osr = OSRLoss(networks.actor, networks.critics, networks.inverse_dynamics).double()
-    SoftUpdate(osr, tau=0.1)
-    out, metric = ours(batch), osr(batch)[METRIC]
-    torch.testing.assert_close(out[METRIC], metric, rtol=1e-12, atol=1e-12)
-    # The actor's loss holds the term; without its weight, all but the term.
-    gradients = []
-    for weight in (0.5, 0.0):
-        osr.recovery_weight = weight
-        gradients.append(value_and_gradients(osr, batch, "loss_actor"))
-    term = [whole - rest for whole, rest in zip(*gradients, strict=True)]
-    assert_same(value_and_gradients(ours, batch), term)
-
-
 def other_loss(other: str, networks, make_deterministic_actor):
     """A loss of TorchRL's and the actor in it."""
     actor, critics = networks.actor, networks.critics
@@ -262,23 +240,6 @@ def test_states_that_only_the_model_reads_are_asked_for(
         assert key in loss.in_keys
     expected = make_loss(make_networks())(make_batch(10))[KEY]
     assert torch.equal(loss(batch.select(*loss.in_keys))[KEY], expected)
-
-
-def test_action_of_a_plain_actor_can_have_another_name(
-    make_networks, make_deterministic_actor, make_batch
-) -> None:
-    batch, model = make_batch(10), make_networks().inverse_dynamics
-    same, actor = (
-        make_deterministic_actor("actor", action=key)
-        for key in ("action", ("agent", "action"))
-    )
-    loss, expected = (
-        StateRecoveryLoss(each, model, **REVERSE).double() for each in (actor, same)
-    )
-    with pytest.raises(KeyError, match=r"writes no 'action': call set_keys\(action="):
-        loss(batch)
-    loss.set_keys(action=("agent", "action"))
-    assert torch.equal(loss(batch)[KEY], expected(batch)[KEY])
 
 
 @pytest.mark.parametrize("kind", ["delta", "actor", "module"])

@@ -159,15 +159,6 @@ def test_multi_step_returns_are_discounted_by_their_steps(
 
 
 @pytest.mark.losses(having="model")
-def test_several_steps_are_refused_where_a_model_is_asked_for_one(
-    family, family_batch, name
-) -> None:
-    batch = MultiStep(GAMMA, STEPS)(family_batch(name, 2, 5))
-    with pytest.raises(ValueError, match="multi-step transitions .* up to 2"):
-        family(name)(batch)
-
-
-@pytest.mark.losses(having="model")
 def test_with_its_first_step_kept_a_model_sees_that_one(
     family, family_batch, name
 ) -> None:

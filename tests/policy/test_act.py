@@ -90,6 +90,8 @@ def test_a_run_without_critics_acts_and_has_no_values(tmp_path):
     torch.testing.assert_close(policy.act(rows), evaluated(rows), atol=2e-6, rtol=0)
     with pytest.raises(ValueError, match="no critics"):
         policy.value(rows)
+    with pytest.raises(ValueError, match="no critics"):
+        policy.export(tmp_path / "value.pt2", "value")
 
 
 def test_bounds_of_the_runs_environment(tmp_path):
@@ -219,18 +221,6 @@ def test_observations_that_are_refused(make_policy, observation, message):
 def test_actions_that_are_not_valued(make_policy, kind, action, message):
     with pytest.raises(ValueError, match=message):
         make_policy(kind).value(np.zeros((4, 3)), action)
-
-
-def test_without_critics_there_are_no_values(tmp_path):
-    template = linear_policy()
-    record = template.record | {"critics": LINEAR | {"number": 0}}
-    tensors = template.state_dict()
-    kept = {name: tensors[name] for name in tensors if not name.startswith("critics")}
-    policy = Policy(record, kept)
-    with pytest.raises(ValueError, match="no critics"):
-        policy.value(np.zeros(1))
-    with pytest.raises(ValueError, match="no critics"):
-        policy.export(tmp_path / "value.pt2", "value")
 
 
 def test_networks_that_a_policy_would_not_copy_whole():

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import runpy
-from pathlib import Path
-from types import SimpleNamespace
-
 import numpy as np
 import pandas as pd
 import pytest
+from report import fakes
 
 from torchrl_osr.report import compare, quantities
 from torchrl_osr.report.comparisons import (
@@ -20,7 +17,6 @@ from torchrl_osr.report.comparisons import (
     verdict,
 )
 
-fakes = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("fakes.py"))))
 SEEDS = range(MIN_SEEDS)
 
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import runpy
-from pathlib import Path
-from types import SimpleNamespace
+
+from report import fakes
 
 from torchrl_osr.report import comparison_notes, read_runs
 
-fakes = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("fakes.py"))))
 CURVE = {1000: [10.0, 20.0], 2000: [30.0, 50.0]}
 
 

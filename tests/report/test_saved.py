@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import runpy
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
+from report import fakes
 
 from torchrl_osr.report import read_runs, write_report
 from torchrl_osr.report.saved import saved_states
 
-fakes = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("fakes.py"))))
 GROUP = ["easy", "contested", *["recoverable"] * 4]
 DISTURBANCE = ["push 1", "push 1", "kick 2", "kick 10", "kick 2", "kick 10"]
 WALK = [0, 0, 1, 1, 2, 2]

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import runpy
-from pathlib import Path
-from types import SimpleNamespace
-
 import numpy as np
 import pandas as pd
 import pytest
+from report import fakes
 
 from torchrl_osr.report import read_runs
 from torchrl_osr.report.scores import (
@@ -23,7 +20,6 @@ from torchrl_osr.report.scores import (
     way_back,
 )
 
-fakes = SimpleNamespace(**runpy.run_path(str(Path(__file__).with_name("fakes.py"))))
 write, level, suite = fakes.write_hand, fakes.hand_level, fakes.hand_suite
 MINUS = "\N{MINUS SIGN}"
 

@@ -7,7 +7,6 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from torchrl_osr.trainers import WeightAverage
 
@@ -23,19 +22,3 @@ def test_shares_of_all_weights_so_far(share, values) -> None:
     kept = np.append(np.cumprod((1 - shares)[::-1])[::-1][1:], 1)
     expected = kept * shares @ values if values else network.weight.item()
     assert average.network.weight.item() == pytest.approx(expected, abs=1e-12)
-
-
-def test_later_it_is_torchs() -> None:
-    torch.manual_seed(0)
-    network = torch.nn.Linear(3, 2)
-    ours = WeightAverage(network, 0.1)
-    theirs = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(0.9))
-    for step in range(1, 6):
-        network.weight.data.normal_()
-        ours.update(200 + step)
-        if step == 1:
-            theirs.module.load_state_dict(ours.network.state_dict())
-            theirs.n_averaged += 1
-        else:
-            theirs.update_parameters(network)
-    assert torch.equal(ours.network.weight, theirs.module.weight)

@@ -14,7 +14,7 @@ from gymnasium import spaces
 
 from torchrl_osr.data import MAZE_IDS, environment_spec, make_environment
 from torchrl_osr.data.collect import environment
-from torchrl_osr.data.collect.environment import environment_id, environment_name
+from torchrl_osr.data.collect.environment import environment_id
 
 PLANE = spaces.Box(-1, 1, (2,), np.float32)
 SPACES = {
@@ -197,11 +197,6 @@ def test_an_episode_that_never_ends_is_not_waited_for(monkeypatch):
                 env.step(np.int64(0))
         with pytest.raises(RuntimeError, match="max_episode_steps"):
             env.step(np.int64(0))
-
-
-@pytest.mark.parametrize("name", [*MAZE_IDS, "hopper", "halfcheetah"])
-def test_names_and_ids_of_built_in_tasks_belong_together(name):
-    assert environment_name(environment_id(name)) == name
 
 
 def test_nothing_is_left_in_the_working_folder(tmp_path, monkeypatch):

@@ -62,20 +62,17 @@ def test_nearly_every_episode_reaches_its_goal(env_name, quality):
     assert (data["action"].abs() > 0.998).float().mean() < 0.3
     assert data["action"].std(0).min() > 0.4
     assert lengths.sum() <= 6000
-
-
-@pytest.mark.parametrize("env_name", PLAY_CELLS)
-def test_play_has_its_pairs_of_cells_and_no_others(env_name):
-    starts = starts_of(collect_quality(env_name, "play", 6000, progress=False).data)
-    pairs = zip(
-        cells_of(MAZE_IDS[env_name], starts[:, :2]),
-        cells_of(MAZE_IDS[env_name], starts[:, 2:4]),
-        strict=True,
-    )
-    seen = set(pairs)
-    assert seen <= set(PLAY_CELLS[env_name])
-    assert len(seen) >= 4
-    assert len(np.unique(starts[:, :4], axis=0)) == len(starts), "moved in their cells"
+    if quality == "play":
+        starts = starts_of(data)
+        pairs = zip(
+            cells_of(MAZE_IDS[env_name], starts[:, :2]),
+            cells_of(MAZE_IDS[env_name], starts[:, 2:4]),
+            strict=True,
+        )
+        seen = set(pairs)
+        assert seen <= set(PLAY_CELLS[env_name])
+        assert len(seen) >= 4
+        assert len(np.unique(starts[:, :4], axis=0)) == len(starts), "moved in cells"
 
 
 def test_the_controller_by_hand():

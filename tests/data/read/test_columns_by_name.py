@@ -8,8 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_settings import tried
 from recorded_logs import make_columns
 
 from torchrl_osr.data import load_dataset, load_file, transitions_from_rows
@@ -46,7 +47,7 @@ def robot(**changes):
 WANTED = NAMED | {"reward": "cost", "terminated": "fell"}
 
 
-@pytest.fixture(params=[".csv", ".csv.gz", ".parquet"])
+@pytest.fixture(params=[".csv", ".parquet"])
 def write(request, tmp_path):
     def write(frame):
         path = tmp_path / f"log{request.param}"
@@ -193,7 +194,7 @@ def test_an_entry_that_is_missing_is_named(write):
     assert data["observation"].shape[1] == 2
 
 
-@settings(max_examples=50, deadline=None, database=None, derandomize=True)
+@tried(50)
 @given(st.permutations([f"q{number}" for number in range(12)]), st.booleans())
 def test_entries_are_in_the_order_of_their_numbers(names, named):
     others = ["action_x", "reward", "terminated", "episode"]
@@ -267,18 +268,12 @@ def test_a_small_file_that_unpacks_to_a_large_one_is_refused(tmp_path, monkeypat
         load_file(path)
 
 
-@settings(
-    max_examples=10,
-    deadline=None,
-    database=None,
-    derandomize=True,
-    suppress_health_check=list(HealthCheck),
-)
+@tried(10)
 @given(part=st.integers(1, 200), chunk=st.integers(1, 200))
 def test_a_csv_file_in_parts_of_any_size(tmp_path_factory, part, chunk):
     folder = tmp_path_factory.mktemp("csv")
     columns = make_columns(150)
-    path = folder / "log.csv"
+    path = folder / "log.csv.gz"
     flat(columns).to_csv(path, index=False)
     expected, _ = transitions_from_rows(columns)
     with pytest.MonkeyPatch.context() as patch:

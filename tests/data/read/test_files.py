@@ -17,7 +17,7 @@ from torchrl_osr.data import load_file, transitions_from_rows
 EMPTY = pyarrow.list_(pyarrow.float32())
 
 
-@pytest.fixture(params=[".npz", ".hdf5", ".h5", ".parquet"])
+@pytest.fixture(params=[".npz", ".hdf5", ".parquet"])
 def path(request, tmp_path):
     return tmp_path / f"log{request.param}"
 
