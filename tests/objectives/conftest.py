@@ -573,6 +573,44 @@ def family_batch(make_batch, make_discrete_batch):
 
 
 @pytest.fixture
+def check_restated(check):
+    """Return a function that compares a loss, and its gradients, with a restatement.
+
+    The sum of ours is correct training; the plain one needs each group by itself.
+    """
+
+    def check_restated(
+        label,
+        loss,
+        losses,
+        expected,
+        actor,
+        critics,
+        log_alpha=None,
+        *,
+        tolerance=1e-12,
+    ):
+        assert set(losses) == set(expected)
+        values = [losses[key] for key in expected]
+        check(label, values, expected.values(), tolerance=tolerance)
+        parameters = list(actor.parameters())
+        wanted = list(torch.autograd.grad(expected["loss_actor"], parameters))
+        critic_part = expected["loss_qvalue"] + expected.get("loss_cql", 0)
+        for group in zip(*(each.parameters() for each in critics), strict=True):
+            gradients = torch.autograd.grad(critic_part, group, retain_graph=True)
+            wanted.append(torch.stack(gradients))
+        ours = [*loss.actor_network_params.values(True, True)]
+        ours += loss.qvalue_network_params.values(True, True)
+        if log_alpha is not None:
+            wanted += torch.autograd.grad(expected["loss_alpha"], log_alpha)
+            ours.append(loss.log_alpha)
+        sum(losses.values()).backward()
+        check(label, [each.grad for each in ours], wanted, tolerance=tolerance)
+
+    return check_restated
+
+
+@pytest.fixture
 def seeded():
     """Return a function that calls a loss with the same draws every time."""
 

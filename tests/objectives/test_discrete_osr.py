@@ -131,32 +131,18 @@ OPTIONS = [
 
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
 def test_losses_and_gradients_equal_the_restatement(
-    make_discrete_networks, make_discrete_batch, check, options
+    make_discrete_networks, make_discrete_batch, check_restated, options
 ) -> None:
     networks, batch = make_discrete_networks(), make_discrete_batch(10)
     restatement = Restatement(networks, **options)
     loss = make_loss(networks, **options)
     losses = {k: v for k, v in loss(batch).items() if k.startswith("loss_")}
     expected = restatement.losses(batch)
-    assert set(losses) == set(expected)
     label = "Discrete OSR" if restatement.weight else "Discrete CQL(H)"
-    values = [losses[key] for key in expected]
-    check(label, values, expected.values(), tolerance=1e-12)
-
-    # The sum of ours is correct training; the plain one needs each group by itself.
-    actor = list(restatement.policy_net.parameters())
-    wanted = list(torch.autograd.grad(expected["loss_actor"], actor))
-    critic_part = expected["loss_qvalue"] + expected["loss_cql"]
-    pairs = zip(*(critic.parameters() for critic in restatement.critics), strict=True)
-    for pair in pairs:
-        gradient = torch.autograd.grad(critic_part, pair, retain_graph=True)
-        wanted.append(torch.stack(gradient))
-    wanted += torch.autograd.grad(expected["loss_alpha"], restatement.log_alpha)
-    sum(losses.values()).backward()
-    ours = [*loss.actor_network_params.values(True, True)]
-    ours += [*loss.qvalue_network_params.values(True, True), loss.log_alpha]
-    gradients = [parameter.grad for parameter in ours]
-    check(label, gradients, wanted, tolerance=1e-12)
+    check_restated(
+        label, loss, losses, expected, restatement.policy_net, restatement.critics,
+        restatement.log_alpha,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("number", [1, 3])

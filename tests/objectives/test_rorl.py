@@ -136,7 +136,7 @@ WITHOUT = {
 @pytest.mark.parametrize("activation", [nn.Tanh, nn.ReLU])
 @pytest.mark.parametrize("without", WITHOUT)
 def test_losses_and_gradients_equal_the_restatement(
-    make_networks, make_batch, check, activation, without
+    make_networks, make_batch, check_restated, activation, without
 ) -> None:
     networks = make_networks(num_critics=3, critic_activation=activation)
     batch, reference = make_batch(10), copy.deepcopy(networks)
@@ -148,21 +148,8 @@ def test_losses_and_gradients_equal_the_restatement(
     out = loss(batch)
     expected = restated(reference, batch, log_alpha, options | {"weight": 1.2})
     losses = {key: out[key] for key in expected}
-    check("RORL", losses.values(), expected.values(), tolerance=1e-10)
-
-    # The sum of ours is correct training; the plain one needs each group by itself.
-    actor = list(reference.actor.parameters())
-    wanted = list(torch.autograd.grad(expected["loss_actor"], actor))
-    wanted += torch.autograd.grad(expected["loss_alpha"], log_alpha)
-    for pair in zip(*(q.parameters() for q in reference.critics), strict=True):
-        gradients = torch.autograd.grad(
-            expected["loss_qvalue"], pair, retain_graph=True
-        )
-        wanted.append(torch.stack(gradients))
-    sum(losses.values()).backward()
-    ours = [*loss.actor_network_params.values(True, True), loss.log_alpha]
-    ours += loss.qvalue_network_params.values(True, True)
-    check("RORL", [each.grad for each in ours], wanted, tolerance=1e-10)
+    networks = reference.actor, reference.critics, log_alpha
+    check_restated("RORL", loss, losses, expected, *networks, tolerance=1e-10)
 
 
 def test_the_weight_of_the_uncertainty_falls_to_its_floor(make_networks) -> None:
