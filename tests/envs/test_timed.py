@@ -26,9 +26,8 @@ def knocks(steps):
     return [step[-1]["knock_steps"] for step in steps]
 
 
-@pytest.mark.parametrize("steps", [15])
-def test_official_takes_extra_steps_at_500(steps, play, recorder):
-    bare = recorder()
+def test_official_takes_extra_steps_at_500(play, recorder):
+    steps, bare = 15, recorder()
     env = gymnasium.wrappers.TimeLimit(ActionKnock(bare, steps, mode="official"), 1000)
     played = play(env, 1000)
     assert len(bare.actions) == 1000 + steps

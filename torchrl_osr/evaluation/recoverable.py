@@ -243,10 +243,7 @@ def recovered_share(
         >>> recovered_share([[1, 1, 1, 0]], [[1, 0, 0, 0]], walk=[5, 5, 5, 5])[0]
         0.6666666666666666
     """
-    ours, sizes = _by_walk(method, walk)
-    theirs, _ = _by_walk(baseline, walk)
-    if paired:
-        _check_paired(ours, theirs)
+    ours, theirs, sizes = _both_by_walk(method, baseline, walk, paired)
     seeds, walks, others = _weights(len(ours), len(sizes), len(theirs))
     baseline_seeds = seeds if paired else others
     total = walks @ sizes
@@ -321,9 +318,7 @@ def saved_difference(
         >>> saved_difference([[1, 0, 1, 1]], [[0, 0, 0, 1]], walk=[0, 0, 1, 1])
         (0.5, 0.5, 0.5)
     """
-    ours, sizes = _by_walk(method, walk)
-    theirs, _ = _by_walk(baseline, walk)
-    _check_paired(ours, theirs)
+    ours, theirs, sizes = _both_by_walk(method, baseline, walk)
     return _share_of(ours - theirs, sizes)
 
 
@@ -353,12 +348,19 @@ def _by_walk(
     return rows @ member, member.sum(0)
 
 
-def _check_paired(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> None:
-    if len(ours) != len(theirs):
+def _both_by_walk(
+    method: ArrayLike, baseline: ArrayLike, walk: ArrayLike, paired: bool = True
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Those of two methods, whose rows have the same seeds if they are paired."""
+    ours, sizes = _by_walk(method, walk)
+    theirs, _ = _by_walk(baseline, walk)
+    if paired and len(ours) != len(theirs):
         raise ValueError(
             "paired rows of method and baseline have the same seeds; got "
-            f"{len(ours)} and {len(theirs)} of them."
+            f"{len(ours)} and {len(theirs)} of them (recovered_share has paired=False "
+            "for others)."
         )
+    return ours, theirs, sizes
 
 
 def _weights(*sizes: int) -> list[NDArray[np.float64]]:

@@ -67,6 +67,16 @@ def action_bounds(network: TensorDictModuleBase, name: str) -> tuple[Tensor, Ten
             f"{getattr(distribution, '__name__', distribution)}: the recovery term is "
             f"the divergence of two tanh-Gaussians. {cure}"
         )
+    return bounds_of(kwargs)
+
+
+def bounds_of(kwargs: dict[str, Any]) -> tuple[Tensor, Tensor]:
+    """Return the bounds among a squashing distribution's options, -1 and 1 by default.
+
+    Args:
+        kwargs: see :func:`head_of`; of a :class:`~torchrl.modules.TanhNormal` or a
+            :class:`~torchrl.modules.TanhDelta`.
+    """
     default = torch.get_default_dtype()
     low = torch.as_tensor(kwargs.get("low", -1.0), dtype=default)
     high = torch.as_tensor(kwargs.get("high", 1.0), dtype=default)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal, cast
 
-import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
@@ -30,6 +29,7 @@ from torchrl_osr.objectives.cloning import (
 )
 from torchrl_osr.objectives.distributions import (
     action_bounds,
+    bounds_of,
     check_num_actions,
     check_same_bounds,
     head_of,
@@ -205,9 +205,7 @@ class StateRecoveryLoss(BaseLoss):
         if not (self.is_deterministic or self.is_normal):
             check_same_bounds(action_bounds(network, "actor_network"), bounds)
         elif self.has_distribution and not self.is_normal:
-            kwargs = {"low": -1.0, "high": 1.0} | head_of(network)[1]
-            low, high = (torch.as_tensor(kwargs[key]) for key in ("low", "high"))
-            check_same_bounds((low.to(bounds[0]), high.to(bounds[1])), bounds)
+            check_same_bounds(bounds_of(head_of(network)[1]), bounds)
         self._hold_inverse_dynamics(model)
 
     def _input_keys(self) -> list[NestedKey]:

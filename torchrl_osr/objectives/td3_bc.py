@@ -18,7 +18,7 @@ from torchrl.modules import TanhDelta
 from torchrl_osr import functional
 from torchrl_osr._checks import check_literals, check_positive, check_weight
 from torchrl_osr.objectives.base import BaseLoss, Terms, TransitionKeys
-from torchrl_osr.objectives.distributions import check_action, head_of
+from torchrl_osr.objectives.distributions import bounds_of, check_action, head_of
 from torchrl_osr.objectives.step import Step, actor_critic_in_keys
 
 
@@ -165,8 +165,8 @@ def check_smoothing(
     distribution, options = head_of(actor_network)
     if distribution is not TanhDelta:
         return
-    for name, ours in (("low", low), ("high", high)):
-        theirs = torch.as_tensor(options.get(name, ours))
+    sides = zip(("low", "high"), (low, high), bounds_of(options), strict=True)
+    for name, ours, theirs in sides:
         if not bool((theirs == ours).all()):
             raise ValueError(
                 f"the loss has {name}={ours}, but its actor {name}={theirs.tolist()}: "

@@ -82,7 +82,7 @@ class Difference(NamedTuple):
 
 def quantities(tables: RunTables) -> list[Quantity]:
     """What methods are compared in: the score or return, and two of each suite."""
-    measure = tables.measure.partition(" of ")[0].removeprefix("normalised ")
+    measure = "score" if tables.measure == "normalised score" else "return"
     found = [Quantity(f"undisturbed {measure}", _values(recent(tables.episodes)))]
     for suite in tables.suites:
         rows = tables.episodes[tables.episodes["suite"] == suite]

@@ -22,7 +22,8 @@ from torchrl_osr._files import whole_file
 Act = Callable[[NDArray[Any]], ArrayLike]
 """Action in the environment's own units, ``[A]`` or a number, for a state ``[S]``."""
 
-SUFFIXES = (".npz", ".hdf5", ".h5", ".parquet")
+WRITERS = {".npz": "numpy", ".hdf5": "h5py", ".h5": "h5py", ".parquet": "pyarrow"}
+"""The package that writes each kind of file, by its suffix."""
 
 
 def record_episodes(
@@ -128,21 +129,18 @@ def check_log_path(path: Path) -> None:
 
     Raises:
         ImportError: the format's package is not installed.
-        ValueError: the suffix is none of :data:`SUFFIXES`.
+        ValueError: the suffix is none of :data:`WRITERS`.
         FileExistsError: something is there.
     """
-    if path.suffix not in SUFFIXES:
-        raise ValueError(f"path={path} must end in one of {', '.join(SUFFIXES)}.")
+    if path.suffix not in WRITERS:
+        raise ValueError(f"path={path} must end in one of {', '.join(WRITERS)}.")
     if path.exists():
         raise FileExistsError(
             f"path={path} is there already and is not replaced: choose another path, "
             "or remove it yourself."
         )
     with needed_by(f"{path.suffix} files need", "minari"):
-        if path.suffix == ".parquet":
-            import_module("pyarrow")
-        elif path.suffix != ".npz":
-            import_module("h5py")
+        import_module(WRITERS[path.suffix])
 
 
 def write_log(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:

@@ -171,37 +171,35 @@ def _changes(array: NDArray[Any], cast: NDArray[np.float32]) -> NDArray[np.int64
     return found
 
 
+def _refuse(
+    name: str, array: NDArray[Any], wrong: NDArray[np.bool_], expected: str
+) -> None:
+    """Raise a ValueError that names the first row of those that are wrong, ``[N]``."""
+    if rows := np.flatnonzero(wrong).tolist():
+        raise ValueError(
+            f"{name!r} holds {array[rows[0]]} in row {rows[0]} of {len(array)}; "
+            f"expected {expected}."
+        )
+
+
 def _as_whole_numbers(name: str, array: NDArray[Any]) -> NDArray[Any]:
     if array.dtype.kind not in "iuf":
         raise ValueError(f"{name!r} has type {array.dtype}; expected whole numbers.")
-    wrong = np.flatnonzero(array != np.floor(array))  # so is what is missing, a NaN
-    if len(wrong):
-        raise ValueError(
-            f"{name!r} holds {array[wrong[0]]} in row {wrong[0]} of {len(array)}; "
-            "expected whole numbers."
-        )
+    # What is missing, a NaN, is none either.
+    _refuse(name, array, array != np.floor(array), "whole numbers")
     return array.astype(np.int64)
 
 
 def _as_flags(name: str, array: NDArray[Any]) -> NDArray[np.bool_]:
-    wrong = np.flatnonzero((array != 0) & (array != 1))
-    if len(wrong):
-        raise ValueError(
-            f"{name!r} holds {array[wrong[0]]} in row {wrong[0]} of {len(array)}; "
-            "expected bool, or 0 and 1."
-        )
+    _refuse(name, array, (array != 0) & (array != 1), "bool, or 0 and 1")
     return np.asarray(array != 0)
 
 
 def _one_hot(action: NDArray[Any], num_actions: int) -> NDArray[np.float32]:
     """Rows ``[N, num_actions]`` with a 1 at each action's number."""
     known = (action >= 0) & (action < num_actions) & (action == np.floor(action))
-    wrong = np.flatnonzero(~known)
-    if len(wrong):
-        raise ValueError(
-            f"'action' holds {action[wrong[0]]} in row {wrong[0]} of {len(action)}; "
-            f"expected the number of a discrete action, from 0 to {num_actions - 1}."
-        )
+    expected = f"the number of a discrete action, from 0 to {num_actions - 1}"
+    _refuse("action", action, ~known, expected)
     return np.eye(num_actions, dtype=np.float32)[action.astype(np.int64)]
 
 
