@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 from composed import composed
+from gymnasium.spaces import Box
 from omegaconf import OmegaConf
 
 from torchrl_osr.commands import collect, evaluate, train
@@ -15,7 +18,7 @@ from torchrl_osr.data import environment_spec
 from torchrl_osr.experiment import run_folder
 from torchrl_osr.experiment.build import read_environment
 from torchrl_osr.policy import load_policy
-from torchrl_osr.report import read_runs, write_report
+from torchrl_osr.report import pack_runs, read_runs, write_report
 
 TINY = (
     "network.num_cells=[8]", "data.held_out=0.1", "trainer.batch_size=8",
@@ -108,6 +111,35 @@ def test_own_references_make_scores_and_pages_are_not_mixed(tmp_path):
     assert tables.measure == "normalised score"
     (left_out,) = tables.left_out
     assert "return of Pendulum-v1" in left_out.reason
+
+
+class Machine(gymnasium.Env):
+    """The pendulum's spaces, and nothing to play."""
+
+    observation_space = Box(-np.inf, np.inf, (3,))
+    action_space = Box(-2, 2, (1,))
+
+
+def test_without_a_simulator_a_log_still_makes_a_policy(tmp_path, capsys):
+    gymnasium.register("Machine-v0", Machine)
+    log, machine = tmp_path / "log.npz", "env.id=Machine-v0"
+    record(log, "env.id=Pendulum-v1", "episodes=3")
+    run = trained(tmp_path / "run", machine, f"data.path={log}")
+    assert "nothing was played, for Machine-v0 has no" in capsys.readouterr().out
+    assert (run / "curve.png").exists()
+    returns = json.loads((run / "returns.json").read_text())
+    assert returns["data_return"] is not None
+    assert returns["evaluations"] == []
+    saved = sorted(path.name for path in (run / "checkpoint" / "policy").iterdir())
+    assert saved == ["checkpoint-000000000010.torchrl"]
+    action = load_policy(run).act(np.zeros((2, 3), np.float32))
+    assert action.shape == (2, 1)
+    assert (abs(action) < 2).all()
+    for play in (partial(disturbed, run), partial(record, tmp_path / "x.npz", machine)):
+        with pytest.raises(RuntimeError, match="^Machine-v0 has no simulator"):
+            play()
+    with pytest.raises(ValueError, match="never played: there was no simulator"):
+        pack_runs([run], tmp_path / "table.jsonl.gz")
 
 
 @pytest.mark.parametrize(

@@ -71,6 +71,11 @@ def test_other_errors_are_one_sentence():
     )
     package = ModuleNotFoundError("No module named 'hydra'", name="hydra")
     assert sentence(package) == "'hydra' is missing: pip install 'torchrl-osr[train]'"
+    full = OSError(28, "Cannot write a.json: [Errno 28] No space left on device")
+    assert sentence(full) == "Cannot write a.json: No space left on device"
+    no_log = ValueError("Unable to configure handler 'file'")  # so does logging.config
+    no_log.__cause__ = PermissionError(13, "Permission denied", "run/train.log")
+    assert sentence(no_log) == "cannot write a log: Permission denied: 'run/train.log'"
     # A defect of ours: there is no sentence to it.
     assert sentence(KeyError("x")) == "KeyError: 'x'\nIts traceback: add --debug."
 

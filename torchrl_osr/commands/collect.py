@@ -23,7 +23,7 @@ from omegaconf import DictConfig
 
 from torchrl_osr.commands import CONF
 from torchrl_osr.commands.console import single_job
-from torchrl_osr.data.collect.environment import open_environment
+from torchrl_osr.data.collect.environment import check_simulated, open_environment
 from torchrl_osr.data.collect.record import (
     Act,
     check_log_path,
@@ -71,6 +71,7 @@ def main(cfg: DictConfig) -> None:
     if env_id is None:
         raise ValueError("env.id is not given: say which environment to play.")
     with closing(open_environment(env_id)) as env:
+        check_simulated(env, env_id)
         loss = "loss=discrete_osr " if isinstance(env.action_space, Discrete) else ""
         columns = record_episodes(
             env,

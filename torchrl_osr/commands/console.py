@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -74,14 +75,16 @@ def single_job(task: Callable[..., Any]) -> Callable[..., Any]:
     return run
 
 
-def sentence(error: Exception) -> str:
+def sentence(error: BaseException) -> str:
     """What went wrong, in words; of a defect also its type and how to see more."""
     if type(error).__module__.startswith(("hydra.", "omegaconf.")):
         return _configuration_error(error)
     if isinstance(error, ModuleNotFoundError) and error.name in EXTRAS:
         return f"{error.name!r} is missing: pip install 'torchrl-osr[train]'"
+    if "Unable to configure handler" in str(error) and error.__cause__:
+        return f"cannot write a log: {sentence(error.__cause__)}"  # Hydra's, of a run
     if isinstance(error, OURS) and str(error):
-        return str(error)
+        return re.sub(r"\[Errno \d+\] ", "", str(error))  # what follows says it
     return f"{type(error).__name__}: {error}\nIts traceback: add --debug."
 
 

@@ -15,6 +15,7 @@ docs/any_environment.md is about all others. A run leaves
 from __future__ import annotations
 
 import logging
+import math
 import sys
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,6 @@ from torchrl_osr.commands.console import single_job
 from torchrl_osr.data import environment_spec
 from torchrl_osr.evaluation import (
     learning_curve,
-    measure_of,
     read_scalars,
     score_table,
 )
@@ -42,6 +42,7 @@ from torchrl_osr.experiment.build import (
     check_parts,
     make_learner,
     read_environment,
+    references_of,
 )
 from torchrl_osr.experiment.dynamics import FILE as DYNAMICS
 from torchrl_osr.experiment.dynamics import load_dynamics
@@ -180,16 +181,14 @@ def report(
     trainer: OfflineTrainer,
     loggers: list[Logger],
 ) -> float:
-    """Write raw returns and the figure, print the table; return the last score."""
+    """Write raw returns and the figure, print the table; return the last score.
+
+    Without a simulator there are no evaluations, and the score is NaN.
+    """
     history, best = trainer.history, trainer.best()
-    assert best is not None  # there is an evaluation before the first update
-    measure = measure_of(best)
-    results = {
-        "versions": code_versions(),
-        f"data_{measure}": data_mean,
-        "last": history[-1],
-        "best": best,
-    }
+    measure = "return" if references_of(cfg) is None else "score"
+    rows = {"last": history[-1], "best": best} if best else {}
+    results = {"versions": code_versions(), f"data_{measure}": data_mean, **rows}
     write_json(folder / "returns.json", results | {"evaluations": history})
     name = f"{cfg.env.name} {cfg.data.quality}"
     parts = [each for each in (cfg.loss, cfg.recovery) if each is not None]
@@ -201,8 +200,11 @@ def report(
         title=f"{name}, {method}, seed {cfg.seed}",
         data_mean=data_mean,
     )
-    rows = {"last": history[-1], "best": best}
     log_outcome(loggers, rows, {"curve": folder / "curve.png"})
+    if best is None:
+        print(f"\n{name}: nothing was played, for {cfg.env.id} has no simulator")
+        print(f"  {'files':<26}{folder}")
+        return math.nan
     print("\n" + score_table(name, history, best, data_mean, folder))
     return float(history[-1][measure])
 

@@ -18,7 +18,8 @@ from torch import Tensor
 from torchrl.envs import ObservationNorm
 
 from torchrl_osr._checks import check_positive
-from torchrl_osr.data import ReferenceReturns, make_environment
+from torchrl_osr.data import ReferenceReturns
+from torchrl_osr.data.collect.environment import check_simulated, make_environment
 from torchrl_osr.evaluation.statistics import mean_interval, wilson_interval
 from torchrl_osr.objectives.distributions import ONE_HOT
 
@@ -102,6 +103,9 @@ class EpisodeEvaluator:
             rows; with a fixed number, an episode does not depend on when others end.
             Default ``False``.
 
+    Raises:
+        RuntimeError: the environment has no simulator.
+
     Examples:
         >>> import torch
         >>> evaluator = EpisodeEvaluator("Hopper-v5", num_episodes=2)
@@ -122,6 +126,7 @@ class EpisodeEvaluator:
     ) -> None:
         check_positive("num_episodes", num_episodes, minimum=1)
         self.environments = [make_environment(env_id) for _ in range(num_episodes)]
+        check_simulated(self.environments[0], env_id)
         if wrap is not None:
             self.environments = [wrap(each) for each in self.environments]
         self.seeds = seed + np.arange(num_episodes)

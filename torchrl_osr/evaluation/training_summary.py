@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from torchrl_osr.evaluation.drawing import (
     save_figure,
 )
 from torchrl_osr.evaluation.episodes import measure_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 NUM_RECENT = 5
 """Evaluations in the mean of the last ones.
@@ -106,7 +109,7 @@ def learning_curve(
     """Draw the score, or return, with its interval, and the losses.
 
     Args:
-        history: see :func:`score_table`.
+        history: see :func:`score_table`; without any the losses alone are drawn.
         scalars: see :func:`read_scalars`.
         path: the PNG to write.
 
@@ -114,11 +117,27 @@ def learning_curve(
         title, data_mean: see :func:`score_table`.
     """
     panels = [name for name in PANELS if scalars.get(name)]
-    figure = new_figure(9, 6.4, layout="constrained")
-    grid = figure.add_gridspec(2, max(len(panels), 1), height_ratios=(2, 1))
+    ratios = (2, 1) if history else (1,)
+    figure = new_figure(9, 2.1 * sum(ratios), layout="constrained")
+    grid = figure.add_gridspec(len(ratios), max(len(panels), 1), height_ratios=ratios)
     figure.suptitle(title)
+    if history:
+        _draw_scores(figure.add_subplot(grid[0, :]), history, data_mean)
+    for column, name in enumerate(panels):
+        small = figure.add_subplot(grid[-1, column])
+        small.plot(*zip(*scalars[name], strict=True), color=GREY, linewidth=1)
+        small.set_title(PANELS[name], fontsize=9)
+        small.tick_params(labelsize=8)
+        small.set_xlabel("gradient steps", fontsize=8)
+        small.ticklabel_format(axis="x", style="sci", scilimits=(3, 3))
+    for each in figure.axes:
+        each.spines[["top", "right"]].set_visible(False)
+    save_figure(figure, path)
 
-    axes = figure.add_subplot(grid[0, :])
+
+def _draw_scores(
+    axes: Axes, history: Sequence[Mapping[str, Any]], data_mean: float | None
+) -> None:
     steps = [row["step"] for row in history]
     measure = measure_of(history[0])
     low, high = (
@@ -134,13 +153,3 @@ def learning_curve(
         axes.axhline(data_mean, color=ORANGE, linestyle="--", label=label)
     axes.set(xlabel="gradient steps", ylabel=IN_WORDS[measure])
     axes.legend(loc="upper left", frameon=False)
-    for column, name in enumerate(panels):
-        small = figure.add_subplot(grid[1, column])
-        small.plot(*zip(*scalars[name], strict=True), color=GREY, linewidth=1)
-        small.set_title(PANELS[name], fontsize=9)
-        small.tick_params(labelsize=8)
-        small.set_xlabel("gradient steps", fontsize=8)
-        small.ticklabel_format(axis="x", style="sci", scilimits=(3, 3))
-    for each in figure.axes:
-        each.spines[["top", "right"]].set_visible(False)
-    save_figure(figure, path)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from torchrl.trainers import LRSchedulerHook
 
 from torchrl_osr import StatePerturbation
 from torchrl_osr._files import write_json
+from torchrl_osr.data import environment_spec
 from torchrl_osr.data.store.multi_step import take_multi_step
 from torchrl_osr.evaluation import (
     EpisodeEvaluator,
@@ -205,7 +206,14 @@ def train_policy(
         data.buffer.append_transform(take_multi_step)
     played = {"num_episodes": cfg.trainer.eval_episodes, "seed": EVALUATION_SEED}
     device = cfg.trainer.device
-    with closing(EpisodeEvaluator(cfg.env.id, **played, device=device)) as episodes:
+    with ExitStack() as opened:
+        evaluate = None
+        if environment_spec(cfg.env.id).simulated:
+            episodes = EpisodeEvaluator(cfg.env.id, **played, device=device)
+            opened.enter_context(closing(episodes))
+            evaluate = partial(
+                _evaluation, cfg, episodes, average.network, actor, data.norm
+            )
         trainer = new_trainer(
             objective,
             optimizer,
@@ -217,9 +225,7 @@ def train_policy(
             target_net_updater=targets,
             policy_delay=cfg.optim.policy_delay,
             policy_params=policy,
-            evaluate=partial(
-                _evaluation, cfg, episodes, average.network, actor, data.norm
-            ),
+            evaluate=evaluate,
             metric=("return" if references_of(cfg) is None else "score", "max"),
             eval_interval=cfg.trainer.eval_interval,
             description="policy",

@@ -327,9 +327,10 @@ def _training_episodes(
 ) -> pd.DataFrame:
     """Undisturbed episodes of the training's own evaluations."""
     at = [row["step"] for row in evaluations]
-    if not at or at[-1] != steps:
-        last = at[-1] if at else 0
-        raise ValueError(f"not finished, evaluated last at step {last} of {steps}")
+    if not at:
+        raise ValueError("its policy was never played: there was no simulator")
+    if at[-1] != steps:
+        raise ValueError(f"not finished, evaluated last at step {at[-1]} of {steps}")
     rows = [
         {
             "suite": "",

@@ -184,7 +184,7 @@ def test_tuples_become_vectors():
     ],
 )
 def test_spec_is_in_the_environments_own_units(env_id, spec):
-    assert environment_spec(env_id) == spec
+    assert environment_spec(env_id) == (*spec, True)
     assert environment_spec(env_id).discrete == (spec[2] is None)
 
 

@@ -76,12 +76,15 @@ class EnvironmentSpec(NamedTuple):
         action_low: lowest action in the task's own units, ``A`` numbers; ``None`` if
             actions are discrete.
         action_high: highest action, likewise.
+        simulated: whether it can be played: one without ``step`` says what a machine
+            observes and does, and no more.
     """
 
     observation_size: int
     action_size: int
     action_low: list[float] | None
     action_high: list[float] | None
+    simulated: bool = True
 
     @property
     def discrete(self) -> bool:
@@ -95,16 +98,32 @@ def environment_spec(env_id: str) -> EnvironmentSpec:
     Examples:
         >>> from torchrl_osr.data import environment_spec
         >>> environment_spec("Pendulum-v1")
-        EnvironmentSpec(observation_size=3, action_size=1, action_low=[-2.0], action_high=[2.0])
+        EnvironmentSpec(observation_size=3, action_size=1, action_low=[-2.0], action_high=[2.0], simulated=True)
     """  # noqa: E501
     with closing(open_environment(env_id)) as env:
         (observation_size,) = env.observation_space.shape or (0,)
         actions = env.action_space
         if isinstance(actions, spaces.Discrete):
-            return EnvironmentSpec(observation_size, int(actions.n), None, None)
-        assert isinstance(actions, spaces.Box)
-        low, high = actions.low.tolist(), actions.high.tolist()
-        return EnvironmentSpec(observation_size, len(low), low, high)
+            size, low, high = int(actions.n), None, None
+        else:
+            assert isinstance(actions, spaces.Box)
+            low, high = actions.low.tolist(), actions.high.tolist()
+            size = len(low)
+        return EnvironmentSpec(observation_size, size, low, high, is_simulated(env))
+
+
+def is_simulated(env: gymnasium.Env[Any, Any]) -> bool:
+    """Whether an environment can be played, see :class:`EnvironmentSpec`."""
+    return type(env.unwrapped).step is not gymnasium.Env.step
+
+
+def check_simulated(env: gymnasium.Env[Any, Any], env_id: str) -> None:
+    """Raise a RuntimeError unless an environment can be played."""
+    if not is_simulated(env):
+        raise RuntimeError(
+            f"{env_id} has no simulator (its class has no step), so that nothing can "
+            "be played in it: train and export do without."
+        )
 
 
 def make_environment(env_id: str) -> gymnasium.Env[Any, Any]:
