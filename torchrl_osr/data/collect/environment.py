@@ -84,7 +84,7 @@ class EnvironmentSpec(NamedTuple):
     action_size: int
     action_low: list[float] | None
     action_high: list[float] | None
-    simulated: bool = True
+    simulated: bool
 
     @property
     def discrete(self) -> bool:
