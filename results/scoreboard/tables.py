@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import inspect
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from torchrl_osr.evaluation.recoverable import (
     saved_difference,
 )
 from torchrl_osr.report import RunTables, read_runs
+from torchrl_osr.report.comparisons import compare, quantities
 from torchrl_osr.report.saved import came_back, percent, saved_states
 from torchrl_osr.report.scores import Estimate, by_run, estimate, recent
 
@@ -112,6 +114,24 @@ def overview(
         for method, row in means.sort_values("undisturbed").iloc[::-1].iterrows()
     ]
     return markdown([head, ["---"] * len(head), *rows])
+
+
+def differences(tables: RunTables) -> str:
+    """Markdown: OSR less each other method, over all data sets that both have."""
+    # All have as many evaluations, after different numbers of updates.
+    rank = tables.episodes.groupby(["data", "method", "suite"])["step"].rank("dense")
+    ranked = replace(tables, episodes=tables.episodes.assign(step=rank))
+    wanted = [each for each in quantities(ranked) if "lost" not in each.name]
+    head = ["less", "seeds", *(each.name for each in wanted)]
+    rows = [head, ["---"] * len(head)]
+    for method in tables.methods:
+        if method == "osr":
+            continue
+        found = [compare(ranked, "osr", method, each) for each in wanted]
+        if len(found[0]) == len(tables.data) + 1:  # and the mean over them
+            cells = [str(each[-1].estimate) for each in found]
+            rows.append([f"`{method}`", str(found[0][-1].seeds), *cells])
+    return markdown(rows)
 
 
 def ablation(tables: RunTables) -> str:
@@ -213,6 +233,10 @@ scores on D4RL v2, other data, after a hundred times the updates; `tables.py` ha
 sources. Intervals at 95 %; ²: two seeds, whose interval holds the mean every other
 time; ᵉ: one seed, over episodes, or over walks for the recoverable states."""
 
+DIFFERENCES = """Means over all six data sets, paired by seed and episode; seeds and
+episodes are resampled. *seeds*: the fewest of a data set; an interval over three is too
+narrow to rank anything."""
+
 ABLATION = """What the arms of OSR's ablation save of the recoverable states more than
 `cql_noisy_bc`, whose states, noise and updates are OSR's and whose label is the row's
 action; R is the share of what that one loses. Seeds and walks are resampled."""
@@ -246,6 +270,7 @@ def main() -> None:
     for quality in ("", "medium-expert", "medium-replay"):
         title = f"## Means over {quality or 'all six data sets'}"
         pages += [title, overview(tables, saved, quality)]
+    pages += ["## OSR less each other", DIFFERENCES, differences(tables)]
     pages += ["## Ablation", ABLATION, ablation(tables)]
     pages += ["## Lines", LINES, lines(tables)]
     write_atomically(HERE / "tables.md", "\n\n".join(pages) + "\n")
