@@ -131,7 +131,10 @@ def run(cfg: DictConfig, folder: Path) -> float:
         imagined, adversary = train_dynamics(
             cfg, folder, data, learner, perturbation, sizes, new_trainer
         )
-    trainer = train_policy(cfg, folder, data, learner, imagined, adversary, new_trainer)
+    trainer = train_policy(
+        cfg, folder, data, learner, imagined, adversary, new_trainer,
+        played=spec.simulated,
+    )  # fmt: skip
     return report(cfg, folder, data.mean, trainer, loggers)
 
 
@@ -187,7 +190,10 @@ def report(
     """
     history, best = trainer.history, trainer.best()
     measure = "return" if references_of(cfg) is None else "score"
-    rows = {"last": history[-1], "best": best} if best else {}
+    rows = {}
+    if history:
+        assert best is not None  # the first evaluation, if no other
+        rows = {"last": history[-1], "best": best}
     results = {"versions": code_versions(), f"data_{measure}": data_mean, **rows}
     write_json(folder / "returns.json", results | {"evaluations": history})
     name = f"{cfg.env.name} {cfg.data.quality}"
@@ -201,11 +207,11 @@ def report(
         data_mean=data_mean,
     )
     log_outcome(loggers, rows, {"curve": folder / "curve.png"})
-    if best is None:
+    if not rows:
         print(f"\n{name}: nothing was played, for {cfg.env.id} has no simulator")
         print(f"  {'files':<26}{folder}")
         return math.nan
-    print("\n" + score_table(name, history, best, data_mean, folder))
+    print("\n" + score_table(name, history, rows["best"], data_mean, folder))
     return float(history[-1][measure])
 
 

@@ -21,7 +21,6 @@ from torchrl.trainers import LRSchedulerHook
 
 from torchrl_osr import StatePerturbation
 from torchrl_osr._files import write_json
-from torchrl_osr.data import environment_spec
 from torchrl_osr.data.store.multi_step import take_multi_step
 from torchrl_osr.evaluation import (
     EpisodeEvaluator,
@@ -182,11 +181,13 @@ def train_policy(
     imagined: ImaginedReplayBuffer | None,
     adversary: ModelAdversary | None,
     new_trainer: NewTrainer,
+    *,
+    played: bool,
 ) -> OfflineTrainer:
     """Train the policy, by the critics and frozen models; its trainer, at the end.
 
     Batches are ``imagined`` ones in part, if there are any; the ``adversary`` trains
-    the model of the dynamics on.
+    the model of the dynamics on. It is evaluated if it can be ``played``.
     """
     actor, _, loss, objective = learner
     critics, policy = _parameters_of(learner)
@@ -204,12 +205,15 @@ def train_policy(
         components["imagined"] = imagined
     if imagined is None and cfg.optim.n_steps > 1:
         data.buffer.append_transform(take_multi_step)
-    played = {"num_episodes": cfg.trainer.eval_episodes, "seed": EVALUATION_SEED}
-    device = cfg.trainer.device
     with ExitStack() as opened:
         evaluate = None
-        if environment_spec(cfg.env.id).simulated:
-            episodes = EpisodeEvaluator(cfg.env.id, **played, device=device)
+        if played:
+            episodes = EpisodeEvaluator(
+                cfg.env.id,
+                num_episodes=cfg.trainer.eval_episodes,
+                seed=EVALUATION_SEED,
+                device=cfg.trainer.device,
+            )
             opened.enter_context(closing(episodes))
             evaluate = partial(
                 _evaluation, cfg, episodes, average.network, actor, data.norm
