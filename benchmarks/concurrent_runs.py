@@ -38,7 +38,7 @@ SWEEP = (
 )  # fmt: skip
 LOAD = f"""
 import sys
-from torchrl_osr.data import load_local_dataset
+from torchrl_osr.lab.data import load_local_dataset
 print("ready", flush=True)
 sys.stdin.readline()
 load_local_dataset("hopper", "medium-replay", num_transitions={ROWS}, progress=False)

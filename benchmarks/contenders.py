@@ -21,7 +21,7 @@ from torchrl.objectives import LossModule
 from torchrl_cql import cql_loss, cql_update
 
 from torchrl_osr import OSRLoss, OSRVLoss, StatePerturbation
-from torchrl_osr.data import make_replay_buffer
+from torchrl_osr.lab.data import make_replay_buffer
 from torchrl_osr.modules import (
     critic_ensemble,
     tanh_gaussian_actor,

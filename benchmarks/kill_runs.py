@@ -35,7 +35,7 @@ import torch
 import warm_runs
 from same_run import differences, file_names
 
-from torchrl_osr.experiment.run_folder import package_versions
+from torchrl_osr.lab.run.run_folder import package_versions
 
 OUTPUT = Path(__file__).resolve().parents[1] / "results" / "reliability"
 EVALUATE = ("suite=torque", "last=2", "episodes=2", "progress=false")

@@ -43,8 +43,8 @@ from torchrl.envs import ObservationNorm
 from torchrl.objectives import SoftUpdate
 
 from torchrl_osr import OSRLoss, StatePerturbation
-from torchrl_osr.commands import CONF
-from torchrl_osr.data import (
+from torchrl_osr.lab.cli import CONF
+from torchrl_osr.lab.data import (
     load_behavior_policy,
     load_d4rl,
     load_file,
@@ -54,18 +54,18 @@ from torchrl_osr.data import (
     make_replay_buffer,
     write_memmap,
 )
-from torchrl_osr.data.collect.behavior import BEHAVIOR_POLICIES_DIR
-from torchrl_osr.evaluation import deterministic_policy
-from torchrl_osr.experiment import schema
-from torchrl_osr.experiment.build import make_learner
-from torchrl_osr.experiment.trained_run import CHECKPOINTS, load_trained
+from torchrl_osr.lab.data.collect.behavior import BEHAVIOR_POLICIES_DIR
+from torchrl_osr.lab.evaluation import deterministic_policy
+from torchrl_osr.lab.report.runs import pack_runs, read_each
+from torchrl_osr.lab.run import schema
+from torchrl_osr.lab.run.build import make_learner
+from torchrl_osr.lab.run.trained_run import CHECKPOINTS, load_trained
 from torchrl_osr.modules import (
     critic_ensemble,
     tanh_gaussian_actor,
     tanh_gaussian_inverse_dynamics,
 )
 from torchrl_osr.policy import load_policy, policy_from_loss
-from torchrl_osr.report.runs import pack_runs, read_each
 from torchrl_osr.trainers import OfflineTrainer
 from torchrl_osr.trainers.checkpoints import safe_checkpoint
 

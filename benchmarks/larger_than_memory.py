@@ -37,7 +37,7 @@ from tensordict import TensorDict
 from torchrl.data import ReplayBuffer
 from torchrl.envs import ObservationNorm
 
-from torchrl_osr.data import (
+from torchrl_osr.lab.data import (
     held_out_rows,
     load_memmap,
     make_replay_buffer,

@@ -24,11 +24,11 @@ import onnxruntime
 import torch
 from torchrl.envs import ObservationNorm
 
-from torchrl_osr import OSRLoss, Policy
+from torchrl_osr import OSRLoss
 from torchrl_osr._files import write_json
-from torchrl_osr.evaluation import deterministic_policy
+from torchrl_osr.lab.evaluation import deterministic_policy
 from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
-from torchrl_osr.policy import policy_from_loss
+from torchrl_osr.policy import Policy, policy_from_loss
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTPUT = ROOT / "results" / "deploy" / "latency.json"

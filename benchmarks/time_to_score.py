@@ -55,9 +55,9 @@ COLORS = dict(zip(METHODS, ("#0072B2", "#D55E00", "#009E73", "#E69F00"), strict=
 
 def train_here(overrides: Sequence[str]) -> list[dict[str, float]]:
     """Train in this process; steps, processor seconds and scores of its evaluations."""
-    from torchrl_osr.commands import train
-    from torchrl_osr.evaluation import EpisodeEvaluator
-    from torchrl_osr.experiment import phases
+    from torchrl_osr.lab.cli import train
+    from torchrl_osr.lab.evaluation import EpisodeEvaluator
+    from torchrl_osr.lab.run import phases
 
     began, paused = 0.0, 0.0
     seconds: list[float] = []
@@ -132,7 +132,7 @@ def last_five(run: dict[str, Any]) -> float:
 
 def table(runs: list[dict[str, Any]]) -> str:
     """Markdown: last five evaluations over seeds, and the minutes that they took."""
-    from torchrl_osr.evaluation import mean_interval
+    from torchrl_osr.lab.evaluation import mean_interval
 
     rows = defaultdict(list)
     for run in runs:

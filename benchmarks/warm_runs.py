@@ -58,7 +58,7 @@ def warm_up() -> None:
     # A shell without job control has its background processes ignore Ctrl-C.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     torch.set_num_threads(1)
-    for name in (*(f"torchrl_osr.commands.{each}" for each in COMMANDS), *LATER):
+    for name in (*(f"torchrl_osr.lab.cli.{each}" for each in COMMANDS), *LATER):
         import_module(name)
 
 
@@ -106,7 +106,7 @@ def start(
             sys.argv, sys.path[0] = [command, *arguments], str(Path(command).parent)
             runpy.run_path(command, run_name="__main__")
         else:
-            import_module("torchrl_osr.__main__").main([command, *arguments])
+            import_module("torchrl_osr.lab.__main__").main([command, *arguments])
         code = 0
     except SystemExit as ended:
         code = ended.code if isinstance(ended.code, int) else 1

@@ -18,7 +18,7 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_osr.experiment import schema
+from torchrl_osr.lab.run import schema
 
 ROOT = Path(__file__).parents[1]
 PRESETS = ("quick", "paper")

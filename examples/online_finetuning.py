@@ -32,17 +32,17 @@ from torchrl.trainers.algorithms import OfflineToOnlineTrainer
 
 from torchrl_osr import StatePerturbation
 from torchrl_osr._files import write_json
-from torchrl_osr.data import make_environment
-from torchrl_osr.evaluation import (
+from torchrl_osr.lab.data import make_environment
+from torchrl_osr.lab.evaluation import (
     EpisodeEvaluator,
     deterministic_policy,
     measure_of,
     summarize,
 )
-from torchrl_osr.evaluation.drawing import IN_WORDS
-from torchrl_osr.experiment.build import references_of
-from torchrl_osr.experiment.trained_run import TrainedRun, load_trained
-from torchrl_osr.experiment.training_data import load_training_data
+from torchrl_osr.lab.evaluation.drawing import IN_WORDS
+from torchrl_osr.lab.run.build import references_of
+from torchrl_osr.lab.run.trained_run import TrainedRun, load_trained
+from torchrl_osr.lab.run.training_data import load_training_data
 
 FRAMES_PER_BATCH = 100
 

@@ -23,14 +23,14 @@ from torchrl.trainers import DefaultOptimizationStepper, Trainer
 
 from torchrl_osr import configs
 from torchrl_osr._files import write_json
-from torchrl_osr.data import (
+from torchrl_osr.lab.data import (
     load_dataset,
     make_replay_buffer,
     observation_statistics,
     reference_returns,
 )
-from torchrl_osr.data.collect.environment import environment_id
-from torchrl_osr.evaluation import EpisodeEvaluator, deterministic_policy, summarize
+from torchrl_osr.lab.data.collect.environment import environment_id
+from torchrl_osr.lab.evaluation import EpisodeEvaluator, deterministic_policy, summarize
 from torchrl_osr.trainers import ReplayBufferCollector
 
 configs.register()

@@ -2,7 +2,7 @@
 
 Writes a medium and an expert actor and eight snapshots from the start of training to
 the medium actor, with a card of their returns, in the layout that
-``torchrl_osr.data.load_behavior_policy(name, policy, folder=...)`` reads::
+``torchrl_osr.lab.data.load_behavior_policy(name, policy, folder=...)`` reads::
 
     python examples/train_behavior.py --env Hopper-v5 --steps 300000 --out policies
 
@@ -31,7 +31,7 @@ from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 from tqdm.auto import tqdm
 
-from torchrl_osr.data import (
+from torchrl_osr.lab.data import (
     REFERENCE_RETURNS,
     BehaviorPolicy,
     collect_transitions,
@@ -40,7 +40,7 @@ from torchrl_osr.data import (
     save_behavior_policy,
     update_behavior_card,
 )
-from torchrl_osr.data.collect.behavior import LOG_STD_MAX, LOG_STD_MIN, Affine
+from torchrl_osr.lab.data.collect.behavior import LOG_STD_MAX, LOG_STD_MIN, Affine
 
 WIDTH = 256
 FRAMES = 32  # environment steps between equally many gradient steps

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-
 from torchrl_osr.evaluation import mean_interval, measure_of, wilson_interval
 from torchrl_osr.report import read_records, read_runs
 from torchrl_osr.report.scores import by_run, estimate, recent, undisturbed

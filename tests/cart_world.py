@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from torchrl_osr.modules import DynamicsEnsemble
+from torchrl_osr.lab.dynamics import DynamicsEnsemble
 
 
 def cart(*bias: float, elites: int = 1, step: float = 1.0) -> DynamicsEnsemble:

@@ -7,7 +7,7 @@ from pathlib import Path
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-from torchrl_osr.experiment import schema, suite
+from torchrl_osr.lab.run import schema, suite
 
 CONF = Path(__file__).parents[1] / "conf"
 
@@ -19,7 +19,7 @@ def composed(config: str, *overrides: str) -> DictConfig:
     """
     schema.register()
     suite.register()
-    folder = CONF / "evaluation" if config in ("evaluate", "film") else CONF
+    folder = CONF / "evaluation" if config == "evaluate" else CONF
     with initialize_config_dir(str(folder), version_base="1.3"):
         return compose(config, list(overrides))
 

@@ -24,7 +24,9 @@ PRINTED = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
 def command(name: str, *arguments: str) -> list[str]:
     """An example of that file name, or a command of the package."""
     script = (
-        [str(EXAMPLES / name)] if name.endswith(".py") else ["-m", "torchrl_osr", name]
+        [str(EXAMPLES / name)]
+        if name.endswith(".py")
+        else ["-m", "torchrl_osr.lab", name]
     )
     return [sys.executable, *script, *arguments]
 

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from torchrl_osr._files import check_disk_space
-from torchrl_osr.data import load_local_dataset, make_replay_buffer
-from torchrl_osr.data.collect import local
+from torchrl_osr.lab.data import load_local_dataset, make_replay_buffer
+from torchrl_osr.lab.data.collect import local
 from torchrl_osr.modules import tanh_gaussian_inverse_dynamics
 from torchrl_osr.objectives import InverseDynamicsLoss
 from torchrl_osr.trainers import OfflineTrainer

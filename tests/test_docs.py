@@ -132,9 +132,7 @@ def test_public_functions_and_configuration_are_in_the_reference():
     with_members = [
         name for name, rest in DESCRIBE_ALL.findall(text) if "members" in rest
     ]
-    assert {"torchrl_osr.functional", "torchrl_osr.experiment.schema"} <= set(
-        with_members
-    )
+    assert {"torchrl_osr.functional", "torchrl_osr.lab.run.schema"} <= set(with_members)
 
 
 def test_settings_page_is_up_to_date():

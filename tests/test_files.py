@@ -26,7 +26,7 @@ from torchrl_osr._files import (
     read_text,
     refuse_archive,
 )
-from torchrl_osr.data import load_behavior_policy, load_dataset, load_file
+from torchrl_osr.lab.data import load_behavior_policy, load_dataset, load_file
 
 TEN_GIGABYTES = 10 * 10**9
 

@@ -30,9 +30,9 @@ from tensordict import TensorDict
 from torchrl.checkpoint import CheckpointError
 
 from torchrl_osr._files import checksummed
-from torchrl_osr.data import load_file, load_memmap, write_memmap
-from torchrl_osr.experiment.run_config import read_run, read_yaml
-from torchrl_osr.report.runs import LeftOut, read_each
+from torchrl_osr.lab.data import load_file, load_memmap, write_memmap
+from torchrl_osr.lab.report.runs import LeftOut, read_each
+from torchrl_osr.lab.run.run_config import read_run, read_yaml
 from torchrl_osr.trainers.checkpoints import find_damage, safe_checkpoint
 
 tried = property_settings.tried(20)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from torchrl_osr.modules import DynamicsEnsemble
+from torchrl_osr.lab.dynamics import DynamicsEnsemble
 
 
 def uneven_dynamics() -> DynamicsEnsemble:

@@ -11,9 +11,9 @@ from omegaconf import OmegaConf
 from torchrl.checkpoint import CheckpointRotation
 from torchrl.envs import ObservationNorm
 
-from torchrl_osr.evaluation import deterministic_policy
-from torchrl_osr.experiment.build import make_learner
-from torchrl_osr.experiment.trained_run import CHECKPOINTS
+from torchrl_osr.lab.evaluation import deterministic_policy
+from torchrl_osr.lab.run.build import make_learner
+from torchrl_osr.lab.run.trained_run import CHECKPOINTS
 from torchrl_osr.trainers.checkpoints import safe_checkpoint
 
 

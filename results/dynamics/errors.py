@@ -14,13 +14,13 @@ import sys
 from pathlib import Path
 
 import torch
-
-from torchrl_osr._files import finite_or_none
 from torchrl_osr.data import consecutive_rows, load_dataset
 from torchrl_osr.evaluation import dynamics_report
 from torchrl_osr.experiment.dynamics import FILE, REPORT, load_dynamics
 from torchrl_osr.experiment.run_config import read_run
 from torchrl_osr.experiment.run_folder import CONFIG
+
+from torchrl_osr._files import finite_or_none
 from torchrl_osr.policy.tensor_file import read_tensors
 
 SEED, ROWS, EVERY, LENGTH = 1, 20_000, 20, 20

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
-
 from torchrl_osr.report import RunTables, compare, quantities, read_runs
 from torchrl_osr.report.scores import by_run, decimal, estimate, recent
 

@@ -14,7 +14,6 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
-from torchrl_osr._files import read_json
 from torchrl_osr.evaluation.drawing import (
     BLUE,
     GREEN,
@@ -24,6 +23,8 @@ from torchrl_osr.evaluation.drawing import (
     save_figure,
 )
 from torchrl_osr.report import read_records
+
+from torchrl_osr._files import read_json
 
 HERE = Path(__file__).parent
 COLORS = {"osr": GREEN, "cql": GREY, "osr_v": ORANGE}

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-
 from torchrl_osr.evaluation import deterministic_policy
 from torchrl_osr.evaluation.recoverable import (
     GROUPS,

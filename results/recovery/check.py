@@ -16,13 +16,12 @@ import numpy as np
 from clones import SYSTEMS
 from search import CHANGES
 from states import generator, normal
-from world import SPEED_STEPS, Rows, World
-
 from torchrl_osr.evaluation.recoverable import (
     STATES,
     RecoverableStates,
     read_recoverable_states,
 )
+from world import SPEED_STEPS, Rows, World
 
 Policy = Callable[[np.ndarray, int], np.ndarray]
 """Action for an observation and the number of the step."""

@@ -26,9 +26,6 @@ from cloning import undisturbed
 from search import read_jsonl
 from states import PARTS
 from torch import Tensor
-from world import World
-
-from torchrl_osr._files import sha256_of
 from torchrl_osr.evaluation.recoverable import (
     GROUPS,
     STATES,
@@ -36,8 +33,11 @@ from torchrl_osr.evaluation.recoverable import (
     read_recoverable_states,
     recovers,
 )
-from torchrl_osr.policy import load_policy
 from torchrl_osr.policy.switching import load_switching_policy
+from world import World
+
+from torchrl_osr._files import sha256_of
+from torchrl_osr.policy import load_policy
 
 JUDGES = "disturbed starts"
 """Runs whose models and critics predict."""

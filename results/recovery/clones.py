@@ -17,12 +17,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import nn
-
-from torchrl_osr._files import read_arrays, write_json
 from torchrl_osr.data import collect_quality, normalized_score, save_behavior_policy
 from torchrl_osr.data.collect.behavior import Affine, BehaviorPolicy
 from torchrl_osr.data.collect.environment import environment_id
 from torchrl_osr.evaluation import EpisodeEvaluator
+
+from torchrl_osr._files import read_arrays, write_json
 
 FOLDER = Path(__file__).parent / "clones"
 JURORS = {"hopper": 4, "walker2d": 4, "halfcheetah": 4, "pointmaze-medium": 8}

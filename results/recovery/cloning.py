@@ -27,9 +27,6 @@ import torch
 from search import HOLD, hard_states, read_jsonl, read_lines
 from states import PARTS, generator, normal
 from torch import Tensor, nn
-from world import NoNoise, World
-
-from torchrl_osr._files import read_arrays, sha256_of
 from torchrl_osr.data import collect_quality, load_behavior_policy, normalized_score
 from torchrl_osr.data.collect.environment import environment_id
 from torchrl_osr.data.collect.mazes import waypoint_sampler
@@ -39,6 +36,9 @@ from torchrl_osr.evaluation.recoverable import (
     RecoverableStates,
     read_recoverable_states,
 )
+from world import NoNoise, World
+
+from torchrl_osr._files import read_arrays, sha256_of
 
 WIDTH, BATCH, RATE = 256, 256, 1e-3
 TABLE = 50_000

@@ -25,10 +25,10 @@ from matplotlib.figure import Figure
 from search import read_jsonl
 from states import DISTURBANCES, PARTS
 from tables import GROUPS, gather, table
+from torchrl_osr.evaluation.recoverable import RecoverableStates, recovers
 from world import World
 
 from torchrl_osr._files import write_atomically
-from torchrl_osr.evaluation.recoverable import RecoverableStates, recovers
 
 HERE = Path(__file__).parent
 FIGURES = HERE.parents[1] / "docs" / "figures"

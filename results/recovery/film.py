@@ -19,8 +19,6 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 import numpy as np
 import torch
 from check import Policy, planner, played, row_of
-from world import World
-
 from torchrl_osr.data import make_environment
 from torchrl_osr.evaluation import deterministic_policy
 from torchrl_osr.evaluation.recoverable import (
@@ -29,6 +27,7 @@ from torchrl_osr.evaluation.recoverable import (
 )
 from torchrl_osr.experiment.trained_run import TrainedRun, load_trained
 from torchrl_osr.film import Camera, Take, film_gif, film_strip
+from world import World
 
 FIGURES = Path(__file__).parents[2] / "docs" / "figures"
 COLUMNS = (0, 10, 20, 40, 60, 80, 110, 150, 220, 300)

@@ -22,15 +22,15 @@ import torch
 from tables import table
 from tensordict import TensorDict
 from torch import Tensor, nn
-
-from torchrl_osr import InverseDynamicsLoss, StatePerturbation, StateRecoveryLoss
-from torchrl_osr._files import write_atomically
 from torchrl_osr.data import (
     load_local_dataset,
     make_replay_buffer,
     observation_statistics,
     split_held_out,
 )
+
+from torchrl_osr import InverseDynamicsLoss, StatePerturbation, StateRecoveryLoss
+from torchrl_osr._files import write_atomically
 from torchrl_osr.functional import state_recovery
 from torchrl_osr.modules import tanh_gaussian_actor, tanh_gaussian_inverse_dynamics
 

@@ -24,7 +24,6 @@ from contextlib import suppress
 from pathlib import Path
 
 from tables import table
-
 from torchrl_osr.evaluation.recoverable import (
     GROUPS,
     recovered_share,

@@ -27,10 +27,6 @@ from search import read_jsonl
 from states import PARTS, PLAYERS, generator, normal, walk
 from tensordict import TensorDict
 from torch import Tensor, nn
-from world import Policy, World
-
-from torchrl_osr import DynamicsLoss
-from torchrl_osr._files import sha256_of
 from torchrl_osr.data import load_local_dataset, make_replay_buffer, split_held_out
 from torchrl_osr.data.collect.behavior import BehaviorPolicy
 from torchrl_osr.data.collect.environment import environment_id
@@ -48,6 +44,10 @@ from torchrl_osr.evaluation.recoverable import (
 )
 from torchrl_osr.experiment.trained_run import load_trained
 from torchrl_osr.imagination import LookAheadPolicy, termination
+from world import Policy, World
+
+from torchrl_osr import DynamicsLoss
+from torchrl_osr._files import sha256_of
 from torchrl_osr.modules import DynamicsEnsemble, EliteNetworks
 from torchrl_osr.policy.tensor_file import read_tensors, write_tensors
 

@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 from search import read_jsonl
 from states import PARTS
 from tables import table
-
-from torchrl_osr._files import sha256_of, write_atomically
 from torchrl_osr.evaluation.recoverable import (
     GROUPS,
     HALVES,
@@ -34,6 +32,8 @@ from torchrl_osr.evaluation.recoverable import (
 )
 from torchrl_osr.report import read_runs
 from torchrl_osr.report.saved import came_back
+
+from torchrl_osr._files import sha256_of, write_atomically
 
 FOLDER = Path(__file__).parent
 STUDIES = "cloning", "ways", "look-ahead"

@@ -15,13 +15,12 @@ import torch
 from cloning import rows_of
 from look_ahead import MODELS, LookAheadPolicy, ensemble, policy_of, survival
 from states import normal
-from world import World
-
 from torchrl_osr.evaluation.recoverable import (
     GROUPS,
     STATES,
     read_recoverable_states,
 )
+from world import World
 
 STEPS = 100
 

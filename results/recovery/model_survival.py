@@ -17,14 +17,13 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
-from world import World
-
 from torchrl_osr.evaluation import deterministic_policy
 from torchrl_osr.evaluation.recoverable import GROUPS, load_recoverable_states
 from torchrl_osr.experiment.dynamics import FILE, load_dynamics
 from torchrl_osr.experiment.trained_run import load_trained
 from torchrl_osr.imagination import termination
 from torchrl_osr.modules.dynamics import Prediction
+from world import World
 
 STEPS, TIMES, FACTORS = 100, 8, (1, 2, 3)
 

@@ -16,7 +16,6 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-
 from torchrl_osr.commands import train
 from torchrl_osr.experiment import phases
 from torchrl_osr.experiment.dynamics import dynamics_model

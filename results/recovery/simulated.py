@@ -17,12 +17,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 from torchrl.envs import ObservationNorm
-from world import World
-
 from torchrl_osr.commands import train
 from torchrl_osr.experiment import phases
 from torchrl_osr.experiment.dynamics import dynamics_model
 from torchrl_osr.modules.dynamics import Prediction
+from world import World
 
 CONTROL_COST = {"hopper": 1e-3, "walker2d": 1e-3, "halfcheetah": 0.1}
 

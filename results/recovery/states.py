@@ -17,11 +17,11 @@ from pathlib import Path
 
 import numpy as np
 from clones import JURORS, load_clone
+from torchrl_osr.data import load_behavior_policy
+from torchrl_osr.data.collect.mazes import PLAY_CELLS, waypoint_sampler
 from world import SPEED_STEPS, Policy, Rows, World
 
 from torchrl_osr._files import read_json, whole_file, write_json
-from torchrl_osr.data import load_behavior_policy
-from torchrl_osr.data.collect.mazes import PLAY_CELLS, waypoint_sampler
 
 PARTS = Path(__file__).parent / "parts"
 WALKS_A_FILE = 8

@@ -18,6 +18,13 @@ from cloning import rows_of
 from search import HOLD, STAGES, read_jsonl, read_lines
 from states import DISTURBANCES, PARTS, PLAYERS, generator, hard, normal
 from tensordict import TensorDict
+from torchrl_osr.data import collect_quality
+from torchrl_osr.evaluation import DataDistance, wilson_interval
+from torchrl_osr.evaluation.recoverable import (
+    HALVES,
+    STATES,
+    read_recoverable_states,
+)
 from world import World
 
 from torchrl_osr._files import (
@@ -26,13 +33,6 @@ from torchrl_osr._files import (
     whole_file,
     write_atomically,
     write_json,
-)
-from torchrl_osr.data import collect_quality
-from torchrl_osr.evaluation import DataDistance, wilson_interval
-from torchrl_osr.evaluation.recoverable import (
-    HALVES,
-    STATES,
-    read_recoverable_states,
 )
 
 FOLDER = Path(__file__).parent

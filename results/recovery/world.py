@@ -16,7 +16,6 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 from numpy.typing import NDArray
-
 from torchrl_osr.data import load_behavior_policy, make_environment
 from torchrl_osr.data.collect.environment import environment_id
 from torchrl_osr.data.collect.mazes import waypoint_sampler

@@ -15,8 +15,6 @@ import pandas as pd
 from hydra.utils import get_class
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-
-from torchrl_osr._files import write_atomically
 from torchrl_osr.evaluation.recoverable import (
     GROUPS,
     recovered_share,
@@ -26,6 +24,8 @@ from torchrl_osr.report import RunTables, read_runs
 from torchrl_osr.report.comparisons import compare, quantities
 from torchrl_osr.report.saved import came_back, percent, saved_states
 from torchrl_osr.report.scores import Estimate, by_run, estimate, recent
+
+from torchrl_osr._files import write_atomically
 
 HERE = Path(__file__).parent
 SUITES = {"oos": "oos", "push": "push", "observation_noise": "noise"}

@@ -19,7 +19,7 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives import SoftUpdate
 
 from torchrl_osr import OSRLoss, OSRVLoss, StatePerturbation, configs
-from torchrl_osr.data import make_replay_buffer
+from torchrl_osr.lab.data import make_replay_buffer
 from torchrl_osr.trainers import ReplayBufferCollector
 
 

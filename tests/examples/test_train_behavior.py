@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_osr.data import (
+from torchrl_osr.lab.data import (
     collect_transitions,
     load_behavior_card,
     load_behavior_policy,

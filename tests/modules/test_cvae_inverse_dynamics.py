@@ -9,8 +9,8 @@ from tensordict.nn import InteractionType, set_interaction_type
 from torchrl.modules import TanhNormal
 
 from torchrl_osr import InverseDynamicsLoss, StateRecoveryLoss
-from torchrl_osr.evaluation import inverse_dynamics_report
 from torchrl_osr.functional import gaussian_kl, state_recovery
+from torchrl_osr.lab.evaluation import inverse_dynamics_report
 from torchrl_osr.modules import (
     cvae_inverse_dynamics,
     tanh_gaussian_actor,

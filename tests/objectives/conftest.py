@@ -30,22 +30,21 @@ from torchrl.objectives import LossModule, SoftUpdate
 
 from torchrl_osr import (
     DiscreteOSRLoss,
-    EDACLoss,
     InverseDynamicsLoss,
     OSRLoss,
     OSRVLoss,
+    StateRecoveryLoss,
+)
+from torchrl_osr.lab.dynamics import ConditionalVAE, DynamicsEnsemble
+from torchrl_osr.lab.losses import (
+    EDACLoss,
     ReBRACLoss,
     RORLLoss,
     SCASLoss,
     SDCLoss,
-    StateRecoveryLoss,
     TD3BCLoss,
 )
-from torchrl_osr.modules import (
-    ConditionalVAE,
-    DynamicsEnsemble,
-    cvae_inverse_dynamics,
-)
+from torchrl_osr.modules import cvae_inverse_dynamics
 
 NUM_ACTIONS = 4
 

@@ -15,7 +15,7 @@ from torch.distributions import Normal, kl_divergence
 from torchrl.modules import TanhNormal
 
 from torchrl_osr import OSRLoss
-from torchrl_osr.objectives.adversary import Adversary
+from torchrl_osr.lab.losses.adversary import Adversary
 
 OBJECTIVES, METHODS = ["action_diff", "min_Q"], ["sample", "gradient"]
 KEYS = ["observation"]

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.distributions import Normal
 
-from torchrl_osr import BCLoss
+from torchrl_osr.lab.losses import BCLoss
 
 STATES = ["clean", "perturbed", "both"]
 

@@ -7,8 +7,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from torchrl_osr import ConditionalVAELoss
-from torchrl_osr.modules import ConditionalVAE
+from torchrl_osr.lab.dynamics import ConditionalVAE, ConditionalVAELoss
 
 KINDS = {
     "action": (2, {"condition_key": ("next", "observation"), "target_key": "action"}),

@@ -16,7 +16,8 @@ from torchrl.modules import (
     TruncatedNormal,
 )
 
-from torchrl_osr import EDACLoss, OSRVLoss
+from torchrl_osr import OSRVLoss
+from torchrl_osr.lab.losses import EDACLoss
 
 RECOVERING = ["osr", "osrv", "recovery"]
 

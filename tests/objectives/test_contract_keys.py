@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict, unravel_key
 
-from torchrl_osr import EDACLoss
+from torchrl_osr.lab.losses import EDACLoss
 
 REDUCTIONS = ["mean", "sum", "none"]
 

@@ -6,8 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from torchrl_osr import DynamicsLoss
-from torchrl_osr.modules import DynamicsEnsemble
+from torchrl_osr.lab.dynamics import DynamicsEnsemble, DynamicsLoss
 
 
 def make_model(num_cells=(6, 5)) -> DynamicsEnsemble:

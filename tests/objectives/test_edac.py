@@ -16,7 +16,7 @@ from torch.distributions import Independent, Normal, TransformedDistribution
 from torch.distributions.transforms import AffineTransform, TanhTransform
 from torchrl.objectives import SoftUpdate
 
-from torchrl_osr import EDACLoss
+from torchrl_osr.lab.losses import EDACLoss
 
 GAMMA, ALPHA, TARGET_ENTROPY, TARGET_SCALE = 0.875, 0.3, -1.5, 0.8
 

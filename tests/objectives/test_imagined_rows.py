@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchrl_osr import BCLoss
+from torchrl_osr.lab.losses import BCLoss
 
 # What is to be learned from the data's actions, or where they led.
 TERMS = {

@@ -16,7 +16,7 @@ from torch.distributions import Normal
 from torchrl import objectives
 from torchrl.objectives import SoftUpdate
 
-from torchrl_osr import IQLLoss
+from torchrl_osr.lab.losses import IQLLoss
 from torchrl_osr.modules import critic_ensemble, gaussian_actor, state_value
 
 GAMMA, BETA, TAU, TARGET_SCALE = 0.875, 2.0, 0.8, 0.5

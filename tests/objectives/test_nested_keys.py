@@ -15,8 +15,8 @@ from torchrl_osr import (
     OSRLoss,
     OSRVLoss,
     StatePerturbation,
-    TD3BCLoss,
 )
+from torchrl_osr.lab.losses import TD3BCLoss
 from torchrl_osr.modules import (
     categorical_actor,
     categorical_inverse_dynamics,

@@ -7,7 +7,8 @@ import torch
 from torch import nn
 from torchrl.modules import TanhNormal
 
-from torchrl_osr import BCLoss, InverseDynamicsLoss, OSRLoss
+from torchrl_osr import InverseDynamicsLoss, OSRLoss
+from torchrl_osr.lab.losses import BCLoss
 from torchrl_osr.modules import (
     critic_ensemble,
     cvae_inverse_dynamics,

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 
-from torchrl_osr import ReBRACLoss
+from torchrl_osr.lab.losses import ReBRACLoss
 
 GAMMA, NOISE, CLIP, TARGET_SCALE = 0.875, 0.6, 0.5, 0.8
 BETA_1, BETA_2, LOW, HIGH = 0.3, 0.7, -0.8, 0.7

@@ -14,8 +14,8 @@ from torch import Tensor
 from torchrl.objectives import SoftUpdate
 from uneven_dynamics import uneven_dynamics
 
-from torchrl_osr import SCASLoss
-from torchrl_osr.modules import DynamicsEnsemble
+from torchrl_osr.lab.dynamics import DynamicsEnsemble
+from torchrl_osr.lab.losses import SCASLoss
 
 GAMMA, NOISE, CLIP, TARGET_SCALE = 0.875, 0.6, 0.5, 0.8
 LOW, HIGH, SHARE, LARGEST = -0.8, 0.7, 0.3, 1.1

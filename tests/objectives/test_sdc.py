@@ -14,8 +14,9 @@ from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 from uneven_dynamics import uneven_dynamics
 
-from torchrl_osr import OSRLoss, SDCLoss
-from torchrl_osr.modules import ConditionalVAE, DynamicsEnsemble
+from torchrl_osr import OSRLoss
+from torchrl_osr.lab.dynamics import ConditionalVAE, DynamicsEnsemble
+from torchrl_osr.lab.losses import SDCLoss
 
 SAMPLES, WIDTH, THRESHOLD, MULTIPLIER = 3, 0.7, 0.02, 1.7
 CQL = {"recovery_weight": 0.0, "actor_states": "clean", "num_random": 3}

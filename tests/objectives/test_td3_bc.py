@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 
-from torchrl_osr import TD3BCLoss
+from torchrl_osr.lab.losses import TD3BCLoss
 from torchrl_osr.modules import critic_ensemble, deterministic_actor
 
 GAMMA, ALPHA, NOISE, CLIP, TARGET_SCALE = 0.875, 1.7, 0.6, 0.5, 0.8

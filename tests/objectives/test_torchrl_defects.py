@@ -10,7 +10,8 @@ import torchrl.objectives
 from torchrl.data.postprocs import MultiStep
 from torchrl.objectives import CQLLoss, SACLoss, SoftUpdate
 
-from torchrl_osr import OSRLoss, TD3BCLoss
+from torchrl_osr import OSRLoss
+from torchrl_osr.lab.losses import TD3BCLoss
 
 NUM_RANDOM = 10
 # With zero values a log-sum-exp of n importance weights tends to log(n |A|), because

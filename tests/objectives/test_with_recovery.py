@@ -6,7 +6,8 @@ import pytest
 import torch
 from torchrl.objectives import SoftUpdate
 
-from torchrl_osr import ReBRACLoss, StateRecoveryLoss
+from torchrl_osr import StateRecoveryLoss
+from torchrl_osr.lab.losses import ReBRACLoss
 from torchrl_osr.objectives.with_recovery import WithRecovery
 
 

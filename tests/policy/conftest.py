@@ -8,7 +8,8 @@ import pytest
 import torch
 from torchrl.envs import ObservationNorm
 
-from torchrl_osr import DiscreteOSRLoss, OSRLoss, Policy, TD3BCLoss
+from torchrl_osr import DiscreteOSRLoss, OSRLoss
+from torchrl_osr.lab.losses import TD3BCLoss
 from torchrl_osr.modules import (
     categorical_actor,
     critic_ensemble,
@@ -16,7 +17,7 @@ from torchrl_osr.modules import (
     discrete_critic_ensemble,
     tanh_gaussian_actor,
 )
-from torchrl_osr.policy import policy_from_loss
+from torchrl_osr.policy import Policy, policy_from_loss
 
 STATE, ACTION = 3, 2
 LOW, HIGH = [-2.0, 0.5], [4.0, 1.5]

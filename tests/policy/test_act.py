@@ -20,10 +20,12 @@ from torchrl.envs import ObservationNorm
 from torchrl.modules import MLP, NormalParamExtractor, ValueOperator
 from untrained_run import make_run
 
-from torchrl_osr import OSRLoss, Policy, TD3BCLoss, load_policy
-from torchrl_osr.envs import critics_of
+from torchrl_osr import OSRLoss, load_policy
+from torchrl_osr.lab.envs import critics_of
+from torchrl_osr.lab.losses import TD3BCLoss
+from torchrl_osr.lab.run.policy_of_run import load_run_policy
 from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
-from torchrl_osr.policy import policy_from_loss
+from torchrl_osr.policy import Policy, policy_from_loss
 
 KINDS = ("osr", "td3_bc", "discrete")
 LINEAR = {"num_cells": [], "activation": "ReLU", "layer_norm": False}
@@ -69,7 +71,7 @@ def test_against_hand_calculation():
 def test_a_run_acts_as_in_its_evaluation(tmp_path, loss):
     folder = tmp_path / "run"
     evaluated, networks = make_run(folder, *f"loss={loss}".split())
-    policy, rows = load_policy(folder), 2 + 3 * torch.randn(6, 11)
+    policy, rows = load_run_policy(folder), 2 + 3 * torch.randn(6, 11)
     actions = evaluated(rows)
     torch.testing.assert_close(policy.act(rows), actions, atol=2e-6, rtol=0)
     states = TensorDict({"observation": (rows - 2) / 3}, [6])
@@ -79,14 +81,14 @@ def test_a_run_acts_as_in_its_evaluation(tmp_path, loss):
     assert source["step"] == 900
     assert source["env_id"] == "Hopper-v5"
     assert source["data"]["quality"] == "medium-replay"
-    best = load_policy(folder / "checkpoint/policy/best.torchrl")
+    best = load_run_policy(folder / "checkpoint/policy/best.torchrl")
     assert best.record["source"]["step"] == 10
 
 
 def test_a_run_without_critics_acts_and_has_no_values(tmp_path):
     folder, bounds = tmp_path / "run", "[-1.0,-1.0,-1.0]"
     evaluated, _ = make_run(folder, "loss=bc", f"env.action_low={bounds}")
-    policy, rows = load_policy(folder), 2 + 3 * torch.randn(6, 11)
+    policy, rows = load_run_policy(folder), 2 + 3 * torch.randn(6, 11)
     torch.testing.assert_close(policy.act(rows), evaluated(rows), atol=2e-6, rtol=0)
     with pytest.raises(ValueError, match="no critics"):
         policy.value(rows)
@@ -104,7 +106,7 @@ def test_bounds_of_the_runs_environment(tmp_path):
     rows = torch.randn(6, 11)
     low, high = torch.tensor(low), torch.tensor(high)
     wanted = low + (evaluated(rows) + 1) / 2 * (high - low)
-    torch.testing.assert_close(load_policy(folder).act(rows), wanted)
+    torch.testing.assert_close(load_run_policy(folder).act(rows), wanted)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -258,7 +260,8 @@ import numpy, torchrl_osr
 print(torchrl_osr.load_policy("policy.safetensors").act(numpy.zeros(3)).shape)
 for name in train:
     del sys.modules[name]
-print(torchrl_osr.load_policy("run").act(numpy.zeros(11)).shape)
+from torchrl_osr.lab.run.policy_of_run import load_run_policy
+print(load_run_policy("run").act(numpy.zeros(11)).shape)
 """
 
 
@@ -275,11 +278,13 @@ def test_packages_that_are_missing_are_named(tmp_path, make_policy, monkeypatch)
     path = tmp_path / "policy.safetensors"
     make_policy("osr").save(path)
     for package, file, extra in [
-        ("torchrl_osr.experiment.trained_run", tmp_path, "train"),
+        ("torchrl_osr.lab.run.trained_run", tmp_path, "train"),
         ("safetensors", path, "export"),
     ]:
         monkeypatch.setitem(sys.modules, package, None)
-        monkeypatch.delitem(sys.modules, "torchrl_osr.policy.from_run", raising=False)
+        monkeypatch.delitem(
+            sys.modules, "torchrl_osr.lab.run.policy_of_run", raising=False
+        )
         with pytest.raises(ImportError, match=rf"install torchrl-osr\[{extra}\]"):
             load_policy(file)
 

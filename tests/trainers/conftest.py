@@ -12,14 +12,9 @@ from tensordict import TensorDict
 from torch.utils._pytree import tree_leaves
 from torchrl.objectives import SoftUpdate
 
-from torchrl_osr import (
-    EDACLoss,
-    InverseDynamicsLoss,
-    OSRLoss,
-    OSRVLoss,
-    StatePerturbation,
-)
-from torchrl_osr.data import make_replay_buffer
+from torchrl_osr import InverseDynamicsLoss, OSRLoss, OSRVLoss, StatePerturbation
+from torchrl_osr.lab.data import make_replay_buffer
+from torchrl_osr.lab.losses import EDACLoss
 from torchrl_osr.modules import (
     critic_ensemble,
     tanh_gaussian_actor,

@@ -18,7 +18,7 @@ from torchrl.checkpoint import CheckpointError
 from torchrl.data import SamplerWithoutReplacement
 
 from torchrl_osr import StatePerturbation
-from torchrl_osr.data import make_replay_buffer
+from torchrl_osr.lab.data import make_replay_buffer
 from torchrl_osr.trainers import OfflineTrainer, largest_value
 
 STEPS = 20

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torchrl.objectives import SoftUpdate
 
-from torchrl_osr.data import make_replay_buffer
+from torchrl_osr.lab.data import make_replay_buffer
 from torchrl_osr.trainers import OfflineTrainer, offline
 from torchrl_osr.transforms import StatePerturbation
 

@@ -8,16 +8,13 @@ import pytest
 import torch
 from torchrl.objectives import SoftUpdate
 
-from torchrl_osr import (
+from torchrl_osr import InverseDynamicsLoss, OSRLoss, OSRVLoss, StateRecoveryLoss
+from torchrl_osr.lab.losses import (
     BCLoss,
     EDACLoss,
-    InverseDynamicsLoss,
     IQLLoss,
-    OSRLoss,
-    OSRVLoss,
     ReBRACLoss,
     RORLLoss,
-    StateRecoveryLoss,
     TD3BCLoss,
 )
 from torchrl_osr.modules import (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torchrl import objectives
 
-from torchrl_osr import TD3BCLoss
+from torchrl_osr.lab.losses import TD3BCLoss
 from torchrl_osr.modules import critic_ensemble, deterministic_actor
 from torchrl_osr.trainers import SoftUpdate
 

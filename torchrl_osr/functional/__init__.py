@@ -12,11 +12,6 @@ Symbols: ``pi`` policy, ``I`` inverse dynamics model, ``s`` clean state, ``s^``
 perturbed state, ``s~`` a state of the mixed data set (clean and perturbed).
 """
 
-from torchrl_osr.functional.correction import (
-    correction_error,
-    maximum_mean_discrepancy,
-    value_gain_weight,
-)
 from torchrl_osr.functional.critics import (
     conservative_gap,
     gradient_diversity,
@@ -33,13 +28,6 @@ from torchrl_osr.functional.divergences import (
     jeffreys_divergence,
     state_recovery,
 )
-from torchrl_osr.functional.dynamics import (
-    adversarial_objective,
-    bounded_log_variance,
-    disagreement,
-    gaussian_error,
-    largest_deviation,
-)
 from torchrl_osr.functional.policy import (
     action_distance,
     bootstrap_value,
@@ -53,23 +41,16 @@ from torchrl_osr.functional.policy import (
 
 __all__ = [
     "action_distance",
-    "adversarial_objective",
     "bootstrap_value",
-    "bounded_log_variance",
     "categorical_kl",
     "cloning_error",
     "conservative_gap",
-    "correction_error",
     "deterministic_recovery",
-    "disagreement",
     "discrete_policy_value",
-    "gaussian_error",
     "gaussian_kl",
     "gradient_diversity",
     "jeffreys_divergence",
     "lagrange_terms",
-    "largest_deviation",
-    "maximum_mean_discrepancy",
     "rebrac_objective",
     "soft_maximum",
     "soft_policy_value",
@@ -78,6 +59,5 @@ __all__ = [
     "temperature_objective",
     "uncertainty_penalty",
     "value_constraint",
-    "value_gain_weight",
     "value_smoothness",
 ]

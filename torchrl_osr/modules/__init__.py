@@ -1,11 +1,10 @@
-"""Networks: the actor, the critics, the dynamics and the inverse dynamics models."""
+"""Networks: actors, critics and inverse dynamics models."""
 
 from torchrl_osr.modules.actor import (
     deterministic_actor,
     gaussian_actor,
     tanh_gaussian_actor,
 )
-from torchrl_osr.modules.conditional_vae import ConditionalVAE
 from torchrl_osr.modules.critic import critic_ensemble, state_value
 from torchrl_osr.modules.cvae_inverse_dynamics import cvae_inverse_dynamics
 from torchrl_osr.modules.discrete import (
@@ -13,14 +12,9 @@ from torchrl_osr.modules.discrete import (
     categorical_inverse_dynamics,
     discrete_critic_ensemble,
 )
-from torchrl_osr.modules.dynamics import DynamicsEnsemble
-from torchrl_osr.modules.elite_networks import EliteNetworks
 from torchrl_osr.modules.inverse_dynamics import tanh_gaussian_inverse_dynamics
 
 __all__ = [
-    "ConditionalVAE",
-    "DynamicsEnsemble",
-    "EliteNetworks",
     "categorical_actor",
     "categorical_inverse_dynamics",
     "critic_ensemble",

@@ -30,7 +30,6 @@ from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
 
 from torchrl_osr._checks import check_literals, check_positive
 from torchrl_osr._entries import nested
-from torchrl_osr.modules.dynamics import DynamicsEnsemble
 from torchrl_osr.modules.initial_weights import digest_of_weights, initial_digest
 from torchrl_osr.objectives.distributions import (
     action_bounds,
@@ -106,9 +105,6 @@ class BaseLoss(LossModule):
     inverse_dynamics_network: ProbabilisticTensorDictSequential
     inverse_dynamics_network_params: TensorDictParams
     target_inverse_dynamics_network_params: TensorDictParams
-    dynamics_network: DynamicsEnsemble
-    dynamics_network_params: TensorDictParams
-    target_dynamics_network_params: TensorDictParams
 
     def __init__(
         self,
@@ -510,7 +506,7 @@ class BaseLoss(LossModule):
 
 def _first_frame_outside() -> int:
     """The ``stacklevel`` at which a warning names the line that called this package."""
-    here = Path(__file__).parent
+    here = Path(__file__).parents[1]
     frame, level = inspect.currentframe(), 0
     while frame is not None and (
         here in Path(frame.f_code.co_filename).parents

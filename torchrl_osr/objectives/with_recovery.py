@@ -15,7 +15,8 @@ class WithRecovery(LossModule):
     the two share count once. Reduction, masks and weights are each one's own.
 
     Args:
-        loss: trains an actor, such as :class:`~torchrl_osr.ReBRACLoss` or TorchRL's
+        loss: trains an actor, such as :class:`~torchrl_osr.lab.losses.ReBRACLoss` or
+        TorchRL's
             ``IQLLoss``.
         recovery: of that very actor.
 
@@ -23,7 +24,8 @@ class WithRecovery(LossModule):
         ValueError: if ``recovery`` is of another actor.
 
     Examples:
-        >>> from torchrl_osr import ReBRACLoss, StateRecoveryLoss
+        >>> from torchrl_osr import StateRecoveryLoss
+        >>> from torchrl_osr.lab.losses import ReBRACLoss
         >>> from torchrl_osr.modules import (
         ...     critic_ensemble, deterministic_actor, tanh_gaussian_inverse_dynamics)
         >>> from torchrl_osr.objectives.with_recovery import WithRecovery

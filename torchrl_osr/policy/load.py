@@ -1,33 +1,24 @@
-"""Loading a policy, from its file or from the run that trained it."""
+"""Loading a policy from its file."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from torchrl_osr.policy.policy import SUFFIX, Policy
 from torchrl_osr.policy.tensor_file import read_tensors
 
 
-def load_policy(path: Path | str, *, trust: Sequence[str] = ()) -> Policy:
-    """Policy of a file or of a run, on the CPU; nothing is unpickled.
+def load_policy(path: Path | str) -> Policy:
+    """Load a policy that was saved or exported, on the CPU; nothing is unpickled.
 
     Args:
-        path: what :meth:`~torchrl_osr.Policy.save` wrote, which needs safetensors
-            only; a run's folder, for its last checkpoint, the one that tables show; or
-            a checkpoint's file in it, ``checkpoint/policy/best.torchrl`` for the best
-            evaluation. A run needs ``torchrl-osr[train]``, but no environment.
-
-    Keyword Args:
-        trust: modules of your own whose losses and networks a run may name, see
-            docs/extend.md. Default: none.
+        path: a ``.safetensors`` file of :meth:`~torchrl_osr.policy.Policy.save` or
+            ``torchrl-osr export``.
 
     Raises:
-        FileNotFoundError: there is nothing, no run, or no checkpoint yet.
-        ImportError: a package is missing, naming the extra that has it.
-        ValueError: the file is no policy, is damaged or of another version of the
-            format, or the run's networks are none of this package's.
-        CheckpointError: the checkpoint is damaged, or does not fit its run.
+        FileNotFoundError: there is no such file.
+        ImportError: safetensors is not installed.
+        ValueError: the file is no policy, damaged, or of another version.
 
     Examples:
         >>> import tempfile
@@ -45,7 +36,10 @@ def load_policy(path: Path | str, *, trust: Sequence[str] = ()) -> Policy:
     """
     path = Path(path)
     if path.suffix != SUFFIX:
-        return _policy_of_run(path, trust)
+        raise ValueError(
+            f"{path} does not end in {SUFFIX}: give a file that Policy.save or "
+            "`torchrl-osr export` wrote."
+        )
     try:
         tensors, record = read_tensors(path)
         return Policy(record, tensors)
@@ -55,14 +49,3 @@ def load_policy(path: Path | str, *, trust: Sequence[str] = ()) -> Policy:
             f"{path} cannot be read as a policy: {why}. Take a whole copy, or save it "
             "again."
         ) from error
-
-
-def _policy_of_run(path: Path, trust: Sequence[str]) -> Policy:
-    try:
-        from torchrl_osr.policy.from_run import policy_from_run
-    except ImportError as error:
-        raise ImportError(
-            f"a run's checkpoint needs {error.name!r}: pip install torchrl-osr[train], "
-            "or load a file that Policy.save wrote."
-        ) from error
-    return policy_from_run(path, trust)

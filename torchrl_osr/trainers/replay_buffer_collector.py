@@ -27,7 +27,7 @@ class ReplayBufferCollector(BaseCollector):
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl_osr.data import make_replay_buffer
+        >>> from torchrl_osr.lab.data import make_replay_buffer
         >>> from torchrl_osr.trainers import ReplayBufferCollector
         >>> data = TensorDict({"observation": torch.rand(100, 3)}, [100])
         >>> buffer = make_replay_buffer(data, batch_size=8, seed=0)

@@ -1,0 +1,211 @@
+"""Collect, train, evaluate and report in environments that nobody has prepared."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from composed import composed
+from gymnasium.spaces import Box
+from omegaconf import OmegaConf
+
+from torchrl_osr.lab.cli import collect, evaluate, train
+from torchrl_osr.lab.data import environment_spec
+from torchrl_osr.lab.report import pack_runs, read_runs, write_report
+from torchrl_osr.lab.run import run_folder
+from torchrl_osr.lab.run.build import read_environment
+from torchrl_osr.lab.run.policy_of_run import load_run_policy
+
+TINY = (
+    "network.num_cells=[8]", "data.held_out=0.1", "trainer.batch_size=8",
+    "trainer.inverse_dynamics_steps=10", "trainer.steps=10", "trainer.log_interval=10",
+    "trainer.eval_interval=10", "trainer.eval_episodes=2",
+    "trainer.checkpoint_interval=10", "trainer.progress=false",
+)  # fmt: skip
+
+
+def record(path: Path, *overrides: str) -> None:
+    collect.main(composed("collect", f"path={path}", "progress=false", *overrides))
+
+
+def trained(folder: Path, *overrides: str) -> Path:
+    """Train as the command does, which takes its folder from Hydra."""
+    cfg = composed("train", "data=file", *TINY, *overrides)
+    read_environment(cfg)
+    folder.mkdir()
+    job = {"overrides": {"task": []}, "runtime": {"choices": {"loss": "osr"}}}
+    claimed = run_folder.claimed(folder, cfg, OmegaConf.create(job))
+    with claimed, run_folder.status(folder):
+        train.run(cfg, folder)
+    return folder
+
+
+def disturbed(folder: Path, *overrides: str) -> dict:
+    given = (f"checkpoint={folder}", "episodes=2", "last=1", "progress=false")
+    evaluate.main(composed("evaluate", *given, *overrides))
+    return json.loads((folder / "robustness-oos.json").read_text())
+
+
+@pytest.mark.parametrize(
+    ("env_id", "loss", "bounds", "left_out"),
+    [
+        ("Pendulum-v1", "osr", ([-2.0], [2.0]), 4),
+        ("CartPole-v1", "discrete_osr", (None, None), 5),
+    ],
+)
+def test_from_nothing_to_a_report(env_id, loss, bounds, left_out, tmp_path, capsys):
+    log, run = tmp_path / "log.npz", tmp_path / "run"
+    record(log, f"env.id={env_id}", "episodes=20")
+    hint = f"train env.id={env_id} {'loss=discrete_osr ' * (loss != 'osr')}data=file"
+    assert hint in capsys.readouterr().out
+    trained(run, f"env.id={env_id}", f"loss={loss}", f"data.path={log}")
+    config = OmegaConf.load(run / "config.yaml")
+    assert (config.env.name, config.env.id) == (env_id, env_id)
+    assert (config.env.action_low, config.env.action_high) == bounds
+    returns = json.loads((run / "returns.json").read_text())
+    assert returns["last"]["return"] == np.mean(returns["last"]["returns"])
+    assert returns["data_return"] is not None
+    assert not [key for key in returns["last"] if "score" in key]
+    assert "return [95 % interval]" in capsys.readouterr().out
+
+    results = disturbed(run)
+    assert len(results["left_out"]) == left_out
+    assert len(results["summary"]) == 9 - left_out
+    assert {"clean_return", "return"} < results["summary"][0].keys()
+    printed = capsys.readouterr().out
+    assert printed.count("left out: ") == left_out
+    page = write_report(read_runs([tmp_path]), tmp_path / "page").read_text()
+    assert f"Return of {env_id}" in page
+    assert "Normalised score" not in page
+
+    better = tmp_path / "better.npz"
+    record(better, f"policy={run}", "episodes=2", "noise=0.1")
+    with np.load(better) as columns:
+        size = environment_spec(env_id).observation_size
+        assert columns["observation"].shape == (len(columns["reward"]), size)
+        assert set(columns["episode"]) == {0, 1}
+    with pytest.raises(ValueError, match="observation"):
+        record(tmp_path / "x.npz", f"policy={run}", "env.id=Hopper-v5")
+    policy = load_run_policy(run)
+    policy.record["source"]["env_id"] = f"json:{env_id}"
+    policy.save(saved := tmp_path / "stranger.safetensors")
+    with pytest.raises(ValueError, match="give env.id yourself"):
+        record(tmp_path / "x.npz", f"policy={saved}")
+    record(tmp_path / "x.npz", f"policy={saved}", f"env.id={env_id}", "episodes=1")
+
+
+def test_own_references_make_scores_and_pages_are_not_mixed(tmp_path):
+    log = tmp_path / "log.npz"
+    record(log, "env.id=Pendulum-v1", "episodes=3")
+    given = ("env.id=Pendulum-v1", f"data.path={log}")
+    scale = ("env.random_return=-1200", "env.expert_return=-200")
+    run = trained(tmp_path / "scored", *given, *scale)
+    last = json.loads((run / "returns.json").read_text())["last"]
+    assert last["score"] == pytest.approx((last["return"] + 1200) / 10)
+    trained(tmp_path / "raw", *given, "seed=1")
+    tables = read_runs([tmp_path / "scored", tmp_path / "raw"])
+    assert tables.measure == "normalised score"
+    (left_out,) = tables.left_out
+    assert "return of Pendulum-v1" in left_out.reason
+
+
+class Machine(gymnasium.Env):
+    """The pendulum's spaces, and nothing to play."""
+
+    observation_space = Box(-np.inf, np.inf, (3,))
+    action_space = Box(-2, 2, (1,))
+
+
+def test_without_a_simulator_a_log_still_makes_a_policy(tmp_path, capsys):
+    gymnasium.register("Machine-v0", Machine)
+    log, machine = tmp_path / "log.npz", "env.id=Machine-v0"
+    record(log, "env.id=Pendulum-v1", "episodes=3")
+    run = trained(tmp_path / "run", machine, f"data.path={log}")
+    assert "nothing was played, for Machine-v0 has no" in capsys.readouterr().out
+    assert (run / "curve.png").exists()
+    returns = json.loads((run / "returns.json").read_text())
+    assert returns["data_return"] is not None
+    assert returns["evaluations"] == []
+    saved = sorted(path.name for path in (run / "checkpoint" / "policy").iterdir())
+    assert saved == ["checkpoint-000000000010.torchrl"]
+    action = load_run_policy(run).act(np.zeros((2, 3), np.float32))
+    assert action.shape == (2, 1)
+    assert (abs(action) < 2).all()
+    for play in (partial(disturbed, run), partial(record, tmp_path / "x.npz", machine)):
+        with pytest.raises(RuntimeError, match="^Machine-v0 has no simulator"):
+            play()
+    with pytest.raises(ValueError, match="never played: there was no simulator"):
+        pack_runs([run], tmp_path / "table.jsonl.gz")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["env.id=CartPole-v1"], "discrete actions.*take loss=discrete_osr"),
+        (["env.id=Pendulum-v1", "loss=discrete_osr"], "real actions.*take loss=osr"),
+        (["env.id=Pendulum-v1", "env.action_low=[-1.0]"], "read from Pendulum-v1"),
+        (["env.id=Pendulum-v1", "env.random_return=0"], "expert_return=None"),
+        (["env.id=Pendulums-v1"], "env.id=Pendulums-v1 is no environment"),
+        (["env=hopper", "env.random_return=0", "env.expert_return=1"], "D4RL's"),
+    ],
+)
+def test_what_does_not_fit_is_refused_before_anything(overrides, message):
+    with pytest.raises(ValueError, match=message):
+        read_environment(composed("train", *overrides))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "error", "message"),
+    [
+        (["env.id=Pendulum-v1", "path=log.txt"], ValueError, "must end in one of"),
+        (["env.id=Pendulum-v1", "path=there.npz"], FileExistsError, "not replaced"),
+        (["path=log.npz"], ValueError, "env.id is not given"),
+        (["env=hopper", "path=a.npz", "policy=good"], ValueError, "neither random"),
+        (["env=hopper", "path=a.npz", "policy=no:act"], ValueError, "cannot be imp"),
+        (["env=hopper", "path=a.npz", "policy=own:no"], ValueError, "cannot be imp"),
+        (["env=hopper", "path=a.npz", "policy=own:act"], ValueError, r"shape \(1,\)"),
+        (["env=hopper", "path=a.npz", "noise=0.1"], ValueError, "random has none"),
+        (["env=hopper", "path=a.npz", "seed=-1"], ValueError, "seed"),
+    ],
+)
+def test_collect_refuses_in_a_sentence(
+    overrides, error, message, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "there.npz").write_bytes(b"mine")
+    (tmp_path / "own.py").write_text("def act(observation): return [0.5]")
+    with pytest.raises(error, match=message):
+        collect.main(composed("collect", *overrides))
+    assert (tmp_path / "there.npz").read_bytes() == b"mine"
+
+
+PACKAGE = """
+import gymnasium
+from gymnasium.envs.classic_control import PendulumEnv
+
+gymnasium.register("Robot-v0", PendulumEnv, max_episode_steps=20)
+
+
+def act(observation):
+    return [1.0 if observation[2] > 0 else -1.0]
+"""
+
+
+def test_a_package_in_the_current_folder(tmp_path, run):
+    (tmp_path / "my_robot.py").write_text(PACKAGE)
+    code, printed = run(
+        tmp_path, "collect", "env.id=my_robot:Robot-v0", "policy=my_robot:act",
+        "episodes=3", "path=logs/robot.npz",
+    )  # fmt: skip
+    assert code == 0, printed
+    assert "logs/robot.npz: 60 steps, 3 episodes" in printed
+    with np.load(tmp_path / "logs" / "robot.npz") as columns:
+        assert set(columns["action"].ravel()) == {-1.0, 1.0}
+    assert {path.name for path in tmp_path.iterdir()} - {"__pycache__"} == {
+        *("logs", "my_robot.py")
+    }

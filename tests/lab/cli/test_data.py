@@ -1,0 +1,144 @@
+"""A log is looked at before anything is trained on it."""
+
+from __future__ import annotations
+
+import re
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from composed import CONF, composed
+from omegaconf import OmegaConf
+from PIL import Image
+
+from torchrl_osr.lab.cli import data
+from torchrl_osr.lab.data import load_file, make_environment, write_memmap
+from torchrl_osr.lab.data.collect.record import record_episodes
+from torchrl_osr.lab.data.read.table import USUAL_NAMES
+
+
+@pytest.fixture
+def look(tmp_path, monkeypatch, capsys):
+    """Return a function that runs the command in a folder of its own."""
+    monkeypatch.chdir(tmp_path)
+
+    def look(*overrides):
+        cfg = composed("check_data", *overrides, "progress=false")
+        error = None
+        try:
+            data.main(cfg)
+        except SystemExit as end:
+            error = str(end)
+        return capsys.readouterr().out, error
+
+    return look
+
+
+def write_log(path, **changes):
+    rng = np.random.default_rng(0)
+    rows = np.arange(1200)
+    angle = rng.uniform(-3, 3, 1200)
+    columns = {"cos": np.cos(angle), "sin": np.sin(angle), "speed": 8 * np.sin(angle)}
+    columns["torque"] = rng.uniform(-2, 2, 1200)
+    columns |= {"reward": -(angle**2), "timeout": (rows % 200 == 199).astype(int)}
+    pd.DataFrame(columns).assign(**changes).to_csv(path, index=False)
+
+
+NAMED = [
+    "data.path=log.csv",
+    "data.columns.observation=[cos,sin,speed]",
+    "data.columns.action=torque",
+    "data.columns.terminated=false",
+]
+
+
+def test_a_picture_that_cannot_be_written_loses_no_table(look, capsys):
+    write_log("log.csv")
+    with pytest.raises(OSError, match="cannot write the file"):
+        look(*NAMED, "env.id=Pendulum-v1", "picture=/proc/x.png")
+    assert "looks wrong" in capsys.readouterr().out
+
+
+def test_discrete_actions_of_a_converted_set_are_drawn(look, tmp_path):
+    with closing(make_environment("CartPole-v1")) as env:
+        np.savez("log.npz", **record_episodes(env, None, 3, progress=False))
+    data, manifest = load_file("log.npz", num_actions=2)
+    write_memmap([data], "set", describe=lambda: manifest, progress=False)
+    output, error = look("data.path=set", "env.id=CartPole-v1")
+    assert error is None, error
+    assert "Picture: " in output
+
+
+def test_a_log_is_described_and_drawn(look, tmp_path):
+    write_log("log.csv", note=7)
+    output, error = look(*NAMED, "env.id=Pendulum-v1")
+    assert error is None
+    assert "log.csv: 1,200 rows, 6 episodes" in output
+    assert "0 terminated, 6 truncated, 0 unmarked" in output
+    assert "200 (200 to 200), 6 complete episodes" in output
+    assert "-2.0 to 2.0 become -1 to 1" in output
+    assert "not read  note" in output
+    assert output.count("observation  ") == 3
+    picture = Image.open(tmp_path / "log-data.png")
+    assert np.asarray(picture.convert("L")).std() > 10
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "log-data.png",
+        "log.csv",
+    ]
+
+
+def test_what_looks_wrong_is_numbered(look):
+    write_log("log.csv", speed=0.5)
+    swapped = [*NAMED[:1], "data.columns.observation=[speed,cos,sin]", *NAMED[2:]]
+    output, error = look(*swapped, "env.id=Pendulum-v1", "picture=here.png")
+    assert error is None
+    assert "1. speed is 0.5 in every row" in output
+    assert "here.png" in output
+    output, _ = look(*NAMED, "data.action_bounds=[-20,20]")
+    assert "torque uses 10% of the way to its bounds" in output
+
+
+@pytest.mark.parametrize(
+    ("changes", "overrides", "message"),
+    [
+        (
+            {},
+            ["data.columns.action=force"],
+            "there is no column 'force', named for act",
+        ),
+        ({"sin": "left"}, [], "'sin' holds 'left' in row 0 of 1200; expected numbers"),
+        ({"torque": 5.0}, [], "'action' leaves its bounds in 1200 of 1200 rows"),
+        ({"speed": np.nan}, [], "'observation' holds nan in row 0 of 1200"),
+        ({}, ["data.path=other.csv"], "there is no file"),
+        ({}, ["data.path=null"], "data=file needs data.path="),
+    ],
+)
+def test_what_cannot_be_trained_on_is_one_sentence(look, changes, overrides, message):
+    write_log("log.csv", **changes)
+    output, error = look(*NAMED, "data.action_bounds=[-2,2]", *overrides)
+    assert message in error
+    assert "cannot be trained on" in error
+    assert not list(Path().glob("*.png"))
+    if "nan" in message:
+        assert "1,200" in output, "the table says where the numbers are missing"
+
+
+def test_rolled_out_data_too(look, tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCHRL_OSR_CACHE", str(tmp_path / "cache"))
+    mixed = ["data.num_transitions=300", "data.random_share=0.5"]
+    assert look("data=medium", "env=hopper", *mixed)[1] is None
+    output, error = look("data=medium", "env=hopper", "data.num_transitions=300")
+    assert error is None
+    assert "300 rows" in output
+    assert "observation[10]" in output
+
+
+def test_help_fits_a_screen():
+    path = CONF / "check_data.yaml"
+    text = OmegaConf.load(path).hydra.help.template.strip()
+    assert len(text.splitlines()) <= 28
+    assert max(map(len, text.splitlines())) <= 80
+    parts = re.search(r"parts: ([\w,\s]+)\n +data", text)[1]
+    assert set(re.findall(r"\w+", parts)) == USUAL_NAMES.keys()

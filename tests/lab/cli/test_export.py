@@ -1,0 +1,76 @@
+"""The command writes a file and says how far it is from the policy."""
+
+from __future__ import annotations
+
+import pytest
+from untrained_run import make_run
+
+from torchrl_osr.lab.__main__ import main
+from torchrl_osr.lab.cli import export
+from torchrl_osr.lab.run.policy_of_run import load_run_policy
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch, capsys):
+    """Return a function that runs the command in an empty folder: code and output."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments: str) -> tuple[int | str, str]:
+        monkeypatch.setenv("HYDRA_FULL_ERROR", "0")  # the console sets it
+        code: int | str = 0
+        try:
+            main(["export", *arguments])
+        except SystemExit as stopped:
+            code = stopped.code or 0
+        return code, "".join(capsys.readouterr())
+
+    return run
+
+
+def test_from_a_run_to_each_kind_of_file(tmp_path, command):
+    make_run(tmp_path / "run")
+    for *arguments, size in [
+        ("run", "p.safetensors", 4_000),
+        ("p.safetensors", "p.pt2", 20_000),
+        ("run/checkpoint/policy/best.torchrl", "v.pt2", "--output", "value", 20_000),
+    ]:
+        code, output = command(*arguments)
+        assert code == 0, output
+        first, second = output.splitlines()
+        written = (tmp_path / arguments[1]).stat().st_size
+        assert size < written < 10 * size
+        step = 10 if "best" in arguments[0] else 900
+        origin = f"OSRLoss, Hopper-v5, step {step}"
+        assert first == f"{arguments[1]}: {written:,} bytes, {origin}"
+        assert second.startswith("largest deviation on 256 observations: ")
+        assert float(second.rpartition(" ")[2]) <= 1e-6
+
+
+def test_a_file_that_deviates_is_reported(tmp_path):
+    make_run(tmp_path / "run")
+    policy, path = load_run_policy(tmp_path / "run"), tmp_path / "p.safetensors"
+    policy.save(path)
+    assert export.check(policy, path, "action") == 0
+    policy.actor[-1].bias += 0.1
+    with pytest.raises(ValueError, match="was written, but deviates from the policy"):
+        export.check(policy, path, "action")
+
+
+def test_what_cannot_be_exported_is_one_line(tmp_path, command):
+    (tmp_path / "p.safetensors").write_bytes(b"no policy")
+    for arguments, kind, message in [
+        # A text is printed, with code 1.
+        (["nowhere", "p.onnx"], str, "there is no run and no checkpoint at nowhere."),
+        (["p.safetensors", "p.onnx"], str, "p.safetensors cannot be read as a policy"),
+        (["nowhere", "p.pt"], int, "must end in .safetensors, .onnx or .pt2.\n"),
+    ]:
+        code, output = command(*arguments)
+        assert isinstance(code, kind)
+        assert message in f"{code}{output}"
+        assert "Traceback" not in output
+
+
+def test_help_fits_a_screen(command):
+    code, output = command("--help")
+    assert code == 0
+    assert len(output.splitlines()) <= 24

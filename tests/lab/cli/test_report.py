@@ -1,0 +1,47 @@
+"""The report's command line."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from report.fakes import write_run
+
+from torchrl_osr.lab.__main__ import main
+
+ROOT = Path(__file__).parents[3]
+
+
+def test_report_of_several_folders(tmp_path, run):
+    curve = {1000: [1.0, 2.0], 2000: [3.0, 4.0]}
+    write_run(tmp_path / "a" / "0", curve, choice="cql", loss={"recovery_weight": 0.0})
+    write_run(tmp_path / "b" / "0", curve, overrides=["loss=osr"])
+    write_run(tmp_path / "b" / "1", curve, overrides=["loss=osr"], status="running")
+    options = ["a", "b", "--reference", "osr", "--output", "new/report"]
+    code, output = run(tmp_path, "report", *options)
+    assert code == 0, output
+    assert "left out: b/1: not finished, its status is running\n" in output
+    assert "note: Every method has one seed a data set" in output
+    assert output.endswith("2 runs in new/report/report.html\n")
+    page = (tmp_path / "new" / "report" / "report.html").read_text(encoding="utf-8")
+    assert "cql is worse than" not in page
+    assert "cannot be told: 1 seed" in page
+    assert "a b --reference osr --output new/report" in page
+
+
+def test_what_cannot_be_reported_is_one_line(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(os, "environ", dict(os.environ))  # it asks Hydra for errors
+    with pytest.raises(SystemExit) as stopped:
+        main(["report", "nowhere"])
+    assert stopped.value.code == "nowhere does not exist."  # printed, and code 1
+
+
+def test_a_table_replaces_no_other_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    (tmp_path / "log.csv").write_text("mine")
+    with pytest.raises(SystemExit):
+        main(["report", "nowhere", "--pack", "log.csv"])
+    assert (tmp_path / "log.csv").read_text() == "mine"

@@ -1,0 +1,196 @@
+"""The main example as a user runs it: in processes of its own, a few steps each."""
+
+from __future__ import annotations
+
+import json
+import re
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+SCRIPT = "train"
+
+
+@pytest.fixture(scope="module")
+def sizes(tiny) -> list[str]:
+    return tiny(
+        inverse_dynamics_steps=30, steps=40, eval_interval=20, eval_episodes=2,
+        checkpoint_interval=20,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory, run_fresh, sizes) -> tuple[Path, str]:
+    cwd = tmp_path_factory.mktemp("finished")
+    with pytest.MonkeyPatch.context() as patch:
+        # GNU's OpenMP says what it has read, when torch is imported.
+        patch.setenv("OMP_DISPLAY_ENV", "true")
+        patch.delenv("OMP_WAIT_POLICY", raising=False)
+        code, output = run_fresh(cwd, SCRIPT, *sizes, "hydra.run.dir=run")
+    assert code == 0, output
+    return cwd / "run", output
+
+
+def test_run_leaves_table_figure_returns_and_checkpoints(finished):
+    folder, output = finished
+    assert "held-out rows: NLL" in output
+    for label in ("data, mean episode", "policy, last", "policy, best evaluation"):
+        assert label in output
+    assert str(folder) in output
+    assert json.loads((folder / "status.json").read_text()) == {"status": "done"}
+    returns = json.loads((folder / "returns.json").read_text())
+    assert returns["versions"]["torchrl"] == version("torchrl")
+    assert [row["step"] for row in returns["evaluations"]] == [0, 20, 40]
+    assert len(returns["last"]["returns"]) == 2
+    assert returns["last"] == returns["evaluations"][-1]
+    assert (folder / "curve.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "csv" / "scalars" / "policy" / "recovery_kl.csv").exists()
+    assert (folder / "checkpoint" / "policy" / "best.torchrl").exists()
+    assert "Warning" not in output
+    assert "Traceback" not in output
+
+
+def test_log_has_a_line_for_each_evaluation(finished):
+    folder, output = finished
+    log = (folder / "train.log").read_text()
+    lines = re.findall(r"policy: step (\d+) of 40.*, score [\d.-]+$", log, re.MULTILINE)
+    assert lines == ["0", "20", "40"]
+    assert all(line in output for line in log.splitlines())
+
+
+@pytest.mark.parametrize(
+    ("overrides", "named"),
+    [
+        (["loss=rebrac", "env.id=Walker2d-v5"], "is walker2d: give env=walker2d."),
+        (["trainer.cudagraph=true"], "cudagraph=True needs a CUDA device"),
+        (["dynamics=ensemble", "dynamics.path=typo"], "typo"),
+        (["data.held_out=0"], "data.held_out=0.0 must be above 0"),
+        (
+            ["loss=bc", "recovery=osr", "optim.policy_delay=2"],
+            "BCLoss has none: take optim.policy_delay=1",
+        ),
+        (
+            ["env=pointmaze-umaze", "data=diverse", "data.random_share=0.5"],
+            "unknown quality 'random'",
+        ),
+    ],
+)
+def test_bad_input_is_named_before_data_are_made(
+    tmp_path, monkeypatch, run, overrides, named
+):
+    monkeypatch.setenv("TORCHRL_OSR_CACHE", str(tmp_path / "cache"))
+    code, output = run(tmp_path, SCRIPT, *overrides)
+    assert code != 0
+    assert named in output
+    assert not (tmp_path / "cache").exists()
+
+
+def test_waiting_threads_do_not_spin(finished):
+    assert "OMP_WAIT_POLICY = 'PASSIVE'" in finished[1]
+
+
+def test_multirun_names_the_failed_job(tmp_path, run, tiny):
+    arguments = [*tiny(steps="0,20"), "loss=cql", "hydra.sweep.dir=sweep"]
+    code, output = run(tmp_path, SCRIPT, "-m", *arguments)
+    assert code != 0, output
+    status = {
+        path.parent.name: json.loads(path.read_text())
+        for path in (tmp_path / "sweep").glob("*/status.json")
+    }
+    (failed,) = (name for name, each in status.items() if each["status"] == "failed")
+    (done,) = (name for name, each in status.items() if each["status"] == "done")
+    assert failed == "0_steps-0"
+    assert "trainer.steps must be between 1 and" in status[failed]["error"]
+    assert done == "1_steps-20"
+
+
+def test_every_other_loss_runs_to_its_end(tmp_path, run, sizes):
+    """One sweep over the classes that no other test here trains."""
+    losses = "osr_v,edac_10,iql,rorl"
+    arguments = [*sizes, f"loss={losses}", "hydra.sweep.dir=sweep"]
+    code, output = run(tmp_path, SCRIPT, "-m", *arguments)
+    assert code == 0, output
+    assert "Warning" not in output
+    folders = list((tmp_path / "sweep").glob("*/returns.json"))
+    assert len(folders) == 4
+    for path in folders:
+        assert json.loads(path.read_text())["last"]["step"] == 40
+
+
+def test_recovery_is_added_to_another_loss_from_training_to_the_page(
+    tmp_path, run, sizes
+):
+    def read(*arguments: str) -> str:
+        code, output = run(tmp_path, *arguments)
+        assert code == 0, output
+        assert "Warning" not in output
+        return output
+
+    chosen = ["loss=rebrac", "recovery=osr", "trainer.steps=20"]
+    read(SCRIPT, *sizes, *chosen, "hydra.run.dir=run")
+    read(SCRIPT, "resume=run", "env=hopper", "trainer.steps=40")  # said once more
+    scalars = tmp_path / "run" / "csv" / "scalars" / "policy"
+    for name in ("loss_recovery", "recovery_kl", "loss_qvalue"):
+        assert (scalars / f"{name}.csv").read_text()
+    read("evaluate", "checkpoint=run", "suite=start", "episodes=2", "last=1")
+    read("export", "run", "policy.safetensors")
+    read("report", "run")
+    page = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
+    assert "rebrac+osr" in page
+
+
+def test_official_preset_with_its_model_runs_in_half_precision(tmp_path, run, sizes):
+    arguments = [*sizes, "preset=official", "trainer.precision=bfloat16"]
+    code, output = run(tmp_path, SCRIPT, *arguments, "hydra.run.dir=run")
+    if "has no bfloat16" in output:
+        assert code != 0
+        return
+    assert code == 0, output
+    config = (tmp_path / "run" / "config.yaml").read_text()
+    assert "standardize: false" in config
+    assert "cvae_inverse_dynamics" in config
+
+
+def test_action_that_is_constant_trains_through(tmp_path, run, sizes):
+    """Its R2 does not exist: null in the file, a dash on the screen.
+
+    An adversary chooses the perturbed states meanwhile.
+    """
+    rng = np.random.default_rng(0)
+    action = rng.uniform(-0.9, 0.9, (600, 3))
+    action[:, 1] = 0.5
+    ends = np.arange(600) % 50 == 49
+    np.savez(
+        tmp_path / "log.npz",
+        observation=rng.normal(size=(600, 11)),
+        action=action,
+        reward=rng.normal(size=600),
+        terminated=np.zeros(600, bool),
+        truncated=ends,
+    )
+    arguments = [*sizes, "data=file", "data.path=log.npz", "hydra.run.dir=run"]
+    code, output = run(tmp_path, SCRIPT, *arguments, "perturbation=adversarial")
+    assert code == 0, output
+    assert "torchrl_osr.Adversary" in (tmp_path / "run" / "config.yaml").read_text()
+    results = json.loads((tmp_path / "run" / "inverse_dynamics.json").read_text())
+    assert results["r2_mean"] is results["r2"][1] is None
+    assert re.search(r"R2 -?\d\.\d\d, -, -?\d\.\d\d,", output)
+
+
+def test_help_offers_the_groups_of_this_script_and_fits_a_screen(tmp_path, run):
+    code, output = run(tmp_path, SCRIPT, "--help")
+    assert code == 0
+    lines = output.strip().splitlines()
+    assert len(lines) <= 28
+    assert max(map(len, lines)) <= 80
+    conf = Path(__file__).parents[3] / "conf"
+    offered = output.split("Groups, ")[1].split("Any key ")[0]
+    names = set(re.findall(r"[\w-]+(?=[,\n])", offered))
+    groups = (
+        *("env", "data", "inverse_dynamics", "dynamics", "loss", "recovery"),
+        *("perturbation", "logger", "preset"),
+    )
+    files = {path.stem for group in groups for path in conf.glob(f"{group}/*.yaml")}
+    assert names - {"basic"} == files | {"pool", "cluster"}

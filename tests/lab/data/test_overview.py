@@ -1,0 +1,128 @@
+"""What is said of a log before anything is trained on it."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from torchrl_osr.lab.cli.data import overview
+from torchrl_osr.lab.data import load_file, transitions_from_rows
+from torchrl_osr.lab.data.overview import describe_entries, findings, out_of_space
+from torchrl_osr.lab.evaluation.data_figure import data_figure
+
+
+def make_log(rows=1200, **changes):
+    """Return episodes of 40 steps that give no reason to complain."""
+    rng = np.random.default_rng(3)
+    ends = np.arange(rows) % 40 == 39
+    columns = {
+        "observation": rng.normal(size=(rows, 2)),
+        "action": rng.uniform(-0.9, 0.9, (rows, 1)),
+        "reward": rng.normal(size=rows),
+        "terminated": np.zeros(rows, bool),
+        "truncated": ends,
+    }
+    return {k: v for k, v in (columns | changes).items() if v is not None}
+
+
+def said(columns, **options):
+    data, manifest = transitions_from_rows(columns, **options)
+    return [*findings(data, manifest, describe_entries([columns], {}))]
+
+
+def test_a_sound_log_gives_no_reason_to_complain():
+    assert said(make_log()) == []
+
+
+FEW = {name: column[:80] for name, column in make_log().items()}
+ROWS = np.arange(1200)
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        (FEW, "only 78 rows"),
+        (make_log(reward=np.full(1200, 2.0)), "reward is 2 in every row: all policies"),
+        (
+            make_log(action=np.full((1200, 1), 0.7)),
+            r"action\[0\] is 0.7 in every row: n",
+        ),
+        (
+            make_log(observation=make_log()["observation"] * [1, 0] + [0, 5]),
+            r"observation\[1\] is 5 in every row: leave it out",
+        ),
+        (
+            make_log(observation=make_log()["observation"] * [1, 1e-4]),
+            r"observation\[1\] has a standard deviation of \S+ and is divided by 0.001",
+        ),
+        (
+            make_log(action=np.sign(make_log()["action"])),
+            "at one of its bounds in 100%",
+        ),
+        (make_log(action=0.1 * make_log()["action"]), r"uses 9% of the way to its bou"),
+        (
+            make_log(terminated=make_log()["truncated"], truncated=ROWS < 0),
+            "all 30 episodes are terminated after 40 steps: that looks like a time lim",
+        ),
+        (
+            make_log(truncated=None, episode=ROWS // 40),
+            "none of the 30 episodes has a f",
+        ),
+        (make_log(truncated=None, episode=ROWS * 0), "all rows are one episode"),
+        (
+            make_log(observation=np.repeat(make_log()["observation"][:600], 2, 0)),
+            "in 51% of the rows the next state is the state itself",
+        ),
+        (make_log(truncated=ROWS % 5 == 4), "240 of 1,200 rows are dropped"),
+        (
+            make_log(next_observation=make_log()["observation"] + 1),
+            "after 100% of the rows the next row does not begin where this one ended",
+        ),
+        (
+            make_log(observation=np.c_[make_log()["observation"][:, 0], 1.7e9 + ROWS]),
+            r"entry 1 of 'observation' changes 1,199 times .* vanish in float32",
+        ),
+    ],
+)
+def test_what_looks_wrong_is_said(columns, message):
+    assert [each for each in said(columns) if re.search(message, each)]
+
+
+def test_ranges_are_those_that_pandas_finds():
+    columns = make_log(observation=make_log()["observation"] * 1e-3 + [1e6, -3])
+    columns["observation"][5, 1] = np.nan
+    columns["observation"][6:9, 1] = np.inf
+    parts = [{k: v[i : i + 500] for k, v in columns.items()} for i in (0, 500, 1000)]
+    empty = {name: column[:0] for name, column in columns.items()}
+    entries = describe_entries([empty, *parts], {"observation": ["x", "y"]})
+    assert [entry.name for entry in entries] == ["x", "y", "action[0]", "reward"]
+    assert [entry.missing for entry in entries] == [0, 4, 0, 0]
+    table = np.c_[columns["observation"], columns["action"], columns["reward"]]
+    frame = pd.DataFrame(table).replace(np.inf, np.nan)
+    expected = frame.agg(["min", "max", "mean", "std"]).T.to_numpy()
+    found = np.array([[e.low, e.high, e.mean, e.deviation] for e in entries])
+    np.testing.assert_allclose(found, expected, rtol=1e-3)
+    np.testing.assert_allclose(found[:, :2], expected[:, :2], rtol=1e-12)
+
+
+def test_observations_outside_of_the_tasks_space_are_said():
+    entries = describe_entries([make_log()], {})
+    assert [*out_of_space(entries, [-np.inf, -9.0], [np.inf, 9.0])] == []
+    (sentence,) = out_of_space(entries, [-9.0, -1.0], [9.0, 1.0])
+    assert "where the environment's observation has -1 to 1" in sentence
+
+
+def test_discrete_actions_are_not_measured_by_bounds(tmp_path):
+    columns = make_log(action=np.arange(1200) % 2)
+    np.savez(tmp_path / "log.npz", **columns)
+    data, manifest = load_file(tmp_path / "log.npz", num_actions=2)
+    assert [*findings(data, manifest, describe_entries([columns], {}))] == []
+    assert "actions   discrete, 2; shares of the rows: 51.3% 0, 48.7% 1" in overview(
+        data, manifest, ["action"]
+    )
+    names = {"observation": ["x", "y"], "action": ["action"]}
+    data_figure(data, manifest, names, tmp_path / "log.png", title="log")
+    assert (tmp_path / "log.png").stat().st_size > 10_000

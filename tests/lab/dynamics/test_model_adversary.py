@@ -1,0 +1,195 @@
+"""RAMBO's model against its objective written out, and what becomes of the model.
+
+"RAMBO-RL: Robust Adversarial Model-Based Offline Reinforcement Learning" (Rigter et al.
+2022, https://arxiv.org/abs/2204.12581).
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+
+import pytest
+import torch
+from torch import Tensor
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.objectives import SoftUpdate
+from uneven_dynamics import uneven_dynamics
+
+from torchrl_osr import OSRLoss
+from torchrl_osr.lab.dynamics import DynamicsEnsemble, ModelAdversary
+
+GAMMA = 0.875
+SAC = {"recovery_weight": 0.0, "min_q_weight": 0.0, "actor_states": "clean"}
+
+
+def falls(state: Tensor) -> Tensor:
+    return state[..., 0] > 0.5
+
+
+OPTIONS = {
+    "steps": 5,
+    "weight": 0.5,
+    "rollout_steps": 2,
+    "batch_size": 8,
+    "gamma": GAMMA,
+    "terminated": falls,
+}
+
+
+def make_adversary(networks, make_batch, **options) -> ModelAdversary:
+    loss = OSRLoss(networks.actor, networks.critics, **SAC).double()
+    SoftUpdate(loss, tau=0.1)
+    real = ReplayBuffer(storage=LazyTensorStorage(50))
+    real.extend(make_batch(50, twin=False))
+    model = uneven_dynamics()
+    optimizer = torch.optim.Adam(model.parameters(), lr=1e-2)
+    return ModelAdversary(
+        model, loss, networks.actor, real, optimizer, **(OPTIONS | options)
+    )
+
+
+def restated(networks, model: DynamicsEnsemble, states: Tensor) -> Tensor:
+    """The objective, row by row, with the same draws."""
+    rows = len(states)
+    zeros = torch.zeros(rows, 2, dtype=torch.float64)
+    action_noise = torch.normal(zeros, torch.ones_like(zeros))
+    drawn = torch.randint(2, (rows,))
+    noise = torch.randn(rows, 4, dtype=torch.float64)
+    low, high = model.lowest_log_variance, model.highest_log_variance
+    critics = [each.module for each in networks.critics]
+    advantage, log_density = [], []
+
+    def policy(state: Tensor) -> tuple[Tensor, Tensor]:
+        return networks.actor[0][1](networks.actor[0][0](state))
+
+    def value(state: Tensor, action: Tensor) -> Tensor:
+        pair = torch.cat([state, action])
+        return min(critic(pair)[0].detach() for critic in critics)
+
+    for row, state in enumerate(states):
+        loc, scale = policy(state)
+        action = torch.tanh(loc + scale * action_noise[row]).detach()
+        gaussians = []
+        for number in (0, 2):
+            first, last = model.layers
+            inputs = (torch.cat([state, action]) - model.input_loc) / model.input_scale
+            hidden = first.weight[number].T @ inputs + first.bias[number, 0]
+            hidden = hidden * torch.sigmoid(hidden)
+            out = last.weight[number].T @ hidden + last.bias[number, 0]
+            free = high - torch.log(1 + torch.exp(high - out[4:]))
+            variance = torch.exp(low + torch.log(1 + torch.exp(free - low)))
+            mean = out[:4] * model.target_scale + model.target_loc
+            gaussians.append((mean, variance.sqrt() * model.target_scale))
+        mean, scale = gaussians[drawn[row]]
+        sample = (mean + scale * noise[row]).detach()
+        following, reward = state + sample[:3], sample[3]
+        after = (
+            0.0 if falls(following) else value(following, policy(following)[0].tanh())
+        )
+        advantage.append(reward + GAMMA * after - value(state, action))
+        densities = [
+            torch.exp(-(((sample - mean) / scale) ** 2) / 2)
+            / (scale * math.sqrt(2 * math.pi))
+            for mean, scale in gaussians
+        ]
+        log_density.append(torch.log(sum(each.prod() for each in densities) / 2))
+    advantage = torch.stack(advantage)
+    spread = ((advantage - advantage.mean()) ** 2).sum() / (rows - 1)
+    standardized = (advantage - advantage.mean()) / (spread.sqrt() + 1e-6)
+    return standardized * torch.stack(log_density)
+
+
+def test_objective_and_gradients_equal_the_restatement(
+    make_networks, make_batch, check
+) -> None:
+    networks = make_networks(num_critics=3)
+    plain, model = copy.deepcopy(networks), uneven_dynamics()
+    adversary = make_adversary(networks, make_batch)
+    states = make_batch(12, twin=False)["observation"]
+    torch.manual_seed(6)
+    got, _ = adversary.objective(states)
+    torch.manual_seed(6)
+    wanted = restated(plain, model, states)
+    gradients = (
+        torch.autograd.grad(value.mean(), list(each.parameters()))
+        for value, each in ((got, adversary.model), (wanted, model))
+    )
+    mine, theirs = gradients
+    check(
+        "RAMBO",
+        [got.detach(), *mine],
+        [wanted.detach(), *theirs],
+        tolerance=1e-10,
+    )
+    assert not any(each.grad is not None for each in adversary.loss.parameters())
+
+
+def test_a_model_learns_to_lead_to_worse_states(make_networks, make_batch) -> None:
+    """Its values fall with the weight, and hardly without."""
+    states, found = make_batch(50, twin=False)["observation"], {}
+    for weight in (0.0, 3.0):
+        networks = make_networks()
+        adversary = make_adversary(
+            networks, make_batch, weight=weight, steps=20, batch_size=16
+        )
+        adversary(1)
+        with torch.no_grad():
+            action = networks.actor(make_batch(50, twin=False))["action"]
+            mean, _ = adversary.model.predict(states, action)
+            change, reward = mean[adversary.model.elites].mean(0).split([3, 1], -1)
+            after = states + change
+            following = make_batch(50, twin=False).set("observation", after)
+            action = networks.actor(following)["action"]
+            value = adversary._value(after, action)
+            found[weight] = (reward.squeeze(-1) + GAMMA * value).mean().item()
+    assert found[3.0] < found[0.0] - 0.3
+
+
+def test_equal_numbers_draw_equally_and_leave_the_generator(
+    make_networks, make_batch
+) -> None:
+    first, second, other = (
+        make_adversary(make_networks(), make_batch) for _ in range(3)
+    )
+    torch.manual_seed(1)
+    generator = torch.get_rng_state()
+    first(1)
+    assert torch.equal(torch.get_rng_state(), generator)
+    torch.rand(3)
+    second(1)
+    other(2)
+    weights = [each.model.layers[0].weight for each in (first, second, other)]
+    assert torch.equal(weights[0], weights[1])
+    assert not torch.equal(weights[0], weights[2])
+    assert first.metrics == second.metrics
+
+
+def test_a_restored_adversary_goes_on_as_before(make_networks, make_batch) -> None:
+    whole, broken, fresh = (
+        make_adversary(make_networks(), make_batch) for _ in range(3)
+    )
+    for number in (1, 2):
+        whole(number)
+    broken(1)
+    fresh.load_state_dict(copy.deepcopy(broken.state_dict()))
+    assert fresh.metrics == broken.metrics
+    fresh(2)
+    for mine, theirs in zip(
+        fresh.model.parameters(), whole.model.parameters(), strict=True
+    ):
+        assert torch.equal(mine, theirs)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"steps": 0}, "steps must be at least 1"),
+        ({"weight": -1.0}, "weight must be at least 0"),
+        ({"rollout_steps": 0}, "rollout_steps must be at least 1"),
+        ({"batch_size": 1}, "batch_size must be at least 2"),
+    ],
+)
+def test_options_are_checked(make_networks, make_batch, options, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_adversary(make_networks(), make_batch, **options)

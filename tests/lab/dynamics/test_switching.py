@@ -1,0 +1,116 @@
+"""Switching in worlds in which the best policy is known."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from cart_world import cart
+from torch import Tensor
+
+from torchrl_osr.lab.dynamics import EliteNetworks, SwitchingPolicy
+
+
+def left(state: Tensor) -> Tensor:
+    return torch.full_like(state[:, :1], -1.0)
+
+
+def right(state: Tensor) -> Tensor:
+    return torch.full_like(state[:, :1], 1.0)
+
+
+def nothing(state: Tensor, action: Tensor) -> Tensor:
+    return torch.zeros(len(state))
+
+
+def test_returns_are_discounted_rewards_and_the_value_of_where_they_end() -> None:
+    # One network is pushed by 1, one by -1; the third is no elite.
+    parts = [EliteNetworks(cart(1.0, -1.0, 50.0, elites=2)), EliteNetworks(cart())]
+    switching = SwitchingPolicy(
+        [left, right], EliteNetworks.join(parts),
+        value=lambda state, action: 100 * state[:, 0] + action[:, 0],
+        terminated=lambda state: state[:, 1] > 3.5, steps=2, gamma=0.5,
+    )  # fmt: skip
+    # From x = 0, v = 1. To the left: v = 1, 1, 1, hence x = 2; v = 1, -1, -3, x = 0;
+    # v = 1, 0, -1, x = 1. Rewards are v of both steps, the value is at the end:
+    first = [1.5 + 199 / 4, 0.5 - 1 / 4, 1.0 + 99 / 4]
+    # To the right: v = 1, 3, and 5 has ended; 1, 1, 1, x = 2; 1, 2, 3, x = 3.
+    second = [2.5, 1.5 + 201 / 4, 2.0 + 301 / 4]
+    wanted = torch.tensor([[sum(first) / 3, sum(second) / 3]])
+    state = torch.tensor([[0.0, 1.0]])
+    torch.testing.assert_close(switching.returns(state), wanted)
+    assert switching(state).item() == 1.0
+    assert switching.chosen.tolist() == [1]
+
+
+def falls(policy, state: Tensor, steps: int = 12) -> Tensor:
+    """Who has left [-2, 2] of the velocity or [-9, 9] of the position."""
+    fallen = torch.zeros(len(state), dtype=torch.bool)
+    for _ in range(steps):
+        position, velocity = state.split(1, -1)
+        state = torch.cat([position + velocity, velocity + policy(state)], -1)
+        fallen |= over(state)
+    return fallen
+
+
+def over(state: Tensor) -> Tensor:
+    return (state[:, 0].abs() > 9) | (state[:, 1].abs() > 2)
+
+
+class Shuffled(SwitchingPolicy):
+    """Predictions of the other policies: what a choice owes to them."""
+
+    def returns(self, observation: Tensor) -> Tensor:
+        return super().returns(observation).flip(1)
+
+
+def test_together_they_survive_where_each_alone_falls_and_predictions_are_why() -> None:
+    states = torch.tensor([[8.0, 0.0], [-8.0, 0.0], [0.0, 2.0], [3.0, -2.0]])
+    options = {"terminated": over, "steps": 1, "hold": 1}
+
+    def centred(state: Tensor, action: Tensor) -> Tensor:
+        return 10 - (state[:, 0] + 2 * state[:, 1]).abs()
+
+    assert falls(left, states).all()
+    assert falls(right, states).all()
+    given = [left, right], EliteNetworks(cart()), centred
+    switching = SwitchingPolicy(*given, **options)
+    assert not falls(switching, states).any()
+    shuffled = Shuffled(*given, **options)
+    assert falls(shuffled, states).all()
+
+
+def test_a_choice_holds_until_it_is_reset_or_the_number_of_states_changes() -> None:
+    calls = []
+
+    def value(state: Tensor, action: Tensor) -> Tensor:
+        calls.append(len(state))
+        return state[:, 0] * action[:, 0]
+
+    switching = SwitchingPolicy([left, right], None, value, hold=3)
+    there, here = torch.tensor([[1.0, 0.0]]), torch.tensor([[-1.0, 0.0]])
+    acted = [switching(state).item() for state in (there, here, here, here)]
+    assert acted == [1.0, 1.0, 1.0, -1.0]
+    switching.reset()
+    assert switching(there).item() == 1.0
+    assert switching(torch.cat([here, there])).flatten().tolist() == [-1.0, 1.0]
+    assert calls == [2, 2, 2, 4]
+
+
+def test_a_model_that_breaks_down_ends_the_task() -> None:
+    model = EliteNetworks(cart(torch.inf))
+    switching = SwitchingPolicy([left], model, lambda state, action: state[:, 1])
+    torch.testing.assert_close(switching.returns(torch.ones(1, 2)), torch.zeros(1, 1))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"policies": []}, "there is no policy to choose from"),
+        ({"steps": 0}, "steps must be at least 1"),
+        ({"hold": 0}, "hold must be at least 1"),
+    ],
+)
+def test_bad_arguments_are_named(options, message) -> None:
+    given = {"policies": [left], "networks": None, "value": nothing} | options
+    with pytest.raises(ValueError, match=message):
+        SwitchingPolicy(**given)

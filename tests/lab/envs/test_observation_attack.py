@@ -1,0 +1,198 @@
+"""Attacked policies: the box, what each attack finds, and trained losses."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torchrl.envs import ObservationNorm
+from torchrl.modules import MLP, ValueOperator
+from torchrl.objectives import SACLoss
+
+from torchrl_osr import OSRLoss
+from torchrl_osr.functional import jeffreys_divergence
+from torchrl_osr.lab.envs import attacked_policy, critics_of
+from torchrl_osr.lab.evaluation import deterministic_policy
+from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
+
+KINDS = ["random", "action_diff", "min_Q"]
+EPSILON = 0.2
+each_kind = pytest.mark.parametrize("kind", KINDS)
+
+
+@pytest.fixture(scope="module")
+def trained():
+    """A loss, its networks and a standardisation."""
+    torch.manual_seed(0)
+    actor = tanh_gaussian_actor(11, 3, num_cells=[16])
+    critic, _ = critic_ensemble(11, 3, num_cells=[16])
+    loss = SACLoss(actor, critic, num_qvalue_nets=2, target_entropy=-3.0)
+    norm = ObservationNorm(
+        torch.randn(11), torch.rand(11) + 0.5, ["observation"], standard_normal=True
+    )
+    return SimpleNamespace(
+        actor=actor, policy=actor.get_dist, qvalue=critics_of(loss), norm=norm
+    )
+
+
+def states_of(observation):
+    return TensorDict({"observation": observation}, observation.shape[:-1])
+
+
+def shown(trained, observation, **arguments):
+    """What the attacked policy is shown in the place of standardised observations."""
+    seen = []
+
+    def policy(states):
+        seen.append(states["observation"])
+        return trained.policy(states)
+
+    attacked_policy(policy, trained.qvalue, **arguments)(observation)
+    return seen[-1]
+
+
+def divergence(trained, clean, observation):
+    p, q = (trained.policy(states_of(each)) for each in (clean, observation))
+    return jeffreys_divergence(p.loc, p.scale, q.loc, q.scale).detach()
+
+
+def value(trained, clean, observation):
+    """Mean value, at the true state, of the action at the observation."""
+    action = trained.policy(states_of(observation)).deterministic_sample
+    return trained.qvalue(states_of(clean), action).mean(0).detach()
+
+
+@given(
+    st.sampled_from(KINDS),
+    st.sampled_from(["sample", "gradient"]),
+    st.floats(0, 3),
+    st.integers(1, 5),
+    st.integers(0, 2**32),
+)
+@settings(deadline=None, max_examples=40)
+def test_observations_stay_in_the_box(trained, kind, method, epsilon, episodes, seed):
+    clean = torch.randn(episodes, 11, generator=torch.Generator().manual_seed(seed))
+    arguments = {"epsilon": epsilon, "num_samples": 3, "seed": seed}
+    observation = shown(trained, clean, kind=kind, method=method, **arguments)
+    # The sum of state and perturbation is rounded.
+    unit = torch.finfo(clean.dtype).eps * (clean.abs() + epsilon)
+    assert ((observation - clean).abs() <= epsilon + 2 * unit).all()
+    assert observation.shape == clean.shape
+    if epsilon > 1e-3:
+        assert not torch.equal(observation, clean) or kind == "min_Q"
+
+
+@each_kind
+def test_epsilon_0_is_the_bare_policy(trained, kind):
+    observation = torch.randn(8, 11)
+
+    policy = attacked_policy(
+        trained.policy, trained.qvalue, trained.norm, kind=kind, epsilon=0.0
+    )
+    bare = deterministic_policy(trained.actor, trained.norm)
+    assert torch.equal(policy(observation), bare(observation))
+
+
+@each_kind
+def test_boxes_are_in_units_of_the_datas_deviation(trained, kind):
+    standard = torch.randn(8, 11)
+    raw = standard * trained.norm.scale + trained.norm.loc
+    arguments = {"kind": kind, "epsilon": EPSILON, "seed": 3}
+    seen = shown(trained, raw, observation_norm=trained.norm, **arguments)
+    torch.testing.assert_close(seen, shown(trained, standard, **arguments))
+
+
+def test_random_is_uniform(trained):
+    clean = torch.randn(2000, 11)
+    noise = shown(trained, clean, kind="random", epsilon=EPSILON) - clean
+    assert (noise.abs() <= EPSILON + 1e-6).all()
+    # 22,000 draws of variance 1/3, five standard errors.
+    assert (noise / EPSILON).square().mean().item() == pytest.approx(1 / 3, abs=0.011)
+
+
+@pytest.mark.parametrize(
+    ("kind", "score"), [("action_diff", divergence), ("min_Q", value)]
+)
+def test_gradients_find_more_than_a_random_draw(trained, kind, score):
+    clean = torch.randn(40, 11)
+    random = shown(trained, clean, kind="random", epsilon=EPSILON)
+    found = shown(
+        trained, clean, kind=kind, epsilon=EPSILON, method="gradient", num_samples=20
+    )
+    sign = 1 if kind == "action_diff" else -1
+    better = sign * (score(trained, clean, found) - score(trained, clean, random))
+    assert better.mean() > 0
+    assert (better > 0).float().mean() > 0.9
+
+
+@pytest.mark.parametrize("keys", [{}, {"action": "a", "state_action_value": "q"}])
+@pytest.mark.parametrize("loss_class", [OSRLoss, SACLoss])
+def test_critics_of_a_loss_are_its_trained_ones(loss_class, keys):
+    head = MLP(14, 1, num_cells=[16])
+    critic = ValueOperator(
+        head,
+        ["observation", keys.get("action", "action")],
+        [keys.get("state_action_value", "state_action_value")],
+    )
+    actor = tanh_gaussian_actor(11, 3, num_cells=[16])
+    options = {"recovery_weight": 0} if loss_class is OSRLoss else {}
+    loss = loss_class(actor, critic, num_qvalue_nets=3, **options)
+    if keys:
+        loss.set_keys(**keys)
+    values = critics_of(loss)
+    states, action = states_of(torch.randn(4, 8, 11)), torch.rand(4, 8, 3)
+    before = values(states, action)
+    with torch.no_grad():  # as an optimizer changes them
+        for parameter in loss.qvalue_network_params.parameters():
+            parameter.mul_(1.5)
+    after = values(states, action)
+    assert before.shape == after.shape == (3, 4, 8)
+    assert not after.requires_grad
+    assert not torch.allclose(before, after)
+    for index in range(3):
+        head = MLP(14, 1, num_cells=[16])
+        for name, parameter in head.named_parameters():
+            key = ("module", *name.split("."))
+            parameter.data = loss.qvalue_network_params.get(key)[index].detach()
+        expected = head(torch.cat([states["observation"], action], -1)).squeeze(-1)
+        torch.testing.assert_close(after[index], expected)
+    assert list(states.keys()) == ["observation"]
+
+
+@each_kind
+def test_seeds_decide_and_the_global_generator_is_left_alone(trained, kind):
+    observation = torch.randn(8, 11)
+
+    def play(seed):
+        policy = attacked_policy(
+            trained.policy, trained.qvalue, kind=kind, epsilon=0.5, seed=seed
+        )
+        return torch.stack([policy(observation) for _ in range(3)])
+
+    state = torch.get_rng_state()
+    first = play(1)
+    assert torch.equal(state, torch.get_rng_state())
+    torch.manual_seed(5)
+    assert torch.equal(first, play(1))
+    assert not torch.equal(first, play(2))
+    assert not torch.equal(first[0], first[1]), "draws go on from call to call"
+    assert not first.requires_grad
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"kind": "hard"}, "kind must be one of .*'min_Q'.* got 'hard'"),
+        ({"epsilon": -0.1}, "epsilon must be at least 0, got -0.1"),
+        ({"num_samples": 0}, "num_samples must be at least 1, got 0"),
+        ({"method": "newton"}, "method must be one of .* got 'newton'"),
+    ],
+)
+def test_wrong_arguments(trained, arguments, message):
+    arguments = {"kind": "random", "epsilon": 0.1} | arguments
+    with pytest.raises(ValueError, match=message):
+        attacked_policy(trained.policy, trained.qvalue, **arguments)

@@ -1,0 +1,214 @@
+"""Knocks and pushes against sequences by hand and the released sampler."""
+
+from __future__ import annotations
+
+import math
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchrl_osr.lab.data import make_environment
+from torchrl_osr.lab.envs import ActionKnock, DynamicsChange, ExternalPush
+
+ROBOTS = ["Hopper-v5", "Walker2d-v5", "HalfCheetah-v5"]
+
+
+def column(steps, index):
+    return [step[index] for step in steps]
+
+
+def knocks(steps):
+    return [step[-1]["knock_steps"] for step in steps]
+
+
+def test_official_takes_extra_steps_at_500(play, recorder):
+    steps, bare = 15, recorder()
+    env = gymnasium.wrappers.TimeLimit(ActionKnock(bare, steps, mode="official"), 1000)
+    played = play(env, 1000)
+    assert len(bare.actions) == 1000 + steps
+    extra = np.array(bare.actions[500 : 500 + steps])
+    assert ((extra >= 0) & (extra < 1e-3)).all()
+    assert len(np.unique(extra)) == 2 * steps
+    agents = bare.actions[:500] + bare.actions[500 + steps :]
+    assert all((action == 0.5).all() for action in agents)
+    # The environment pays the number of each step: those of the knock are missing.
+    paid = [*range(1, 501), *range(501 + steps, 1001 + steps)]
+    assert column(played, 1) == paid
+    assert knocks(played) == [0] * 499 + [steps] + [0] * 500
+    assert [step[-1]["disturbed"] for step in played] == [
+        number == 499 for number in range(1000)
+    ]
+    assert column(played, 3) == [False] * 999 + [True]
+
+
+def test_official_by_hand(play, recorder):
+    # Steps 1, 2, 3 are the agent's, 4 to 8 the knock's, 9 and 10 the agent's again. It
+    # falls in step 5, within the knock, which nobody hears of, and in step 10.
+    env = ActionKnock(recorder(falls=[5, 10]), 5, mode="official", at=3)
+    played = play(env, 5)
+    assert [float(step[0][0]) for step in played] == [1, 2, 8, 9, 10]
+    assert column(played, 1) == [1, 2, 3, 9, 10]
+    assert column(played, 2) == [False, False, False, False, True]
+    assert knocks(played) == [0, 0, 5, 0, 0]
+
+
+@pytest.mark.parametrize("fall", [2, 3])
+def test_official_spares_who_fell_before(fall, play, recorder):
+    bare = recorder(falls=[fall])
+    env = ActionKnock(bare, 5, mode="official", at=3)
+    played = play(env, fall)
+    assert played[-1][2]
+    assert len(bare.actions) == fall
+    assert knocks(played) == [0] * fall
+
+
+def sampler(env, policy, observation, shakes, *, at, steps):
+    """The released TrajSampler's loop, on an environment without time limit."""
+    observations, rewards = [], []
+    for ii in range(steps):
+        if ii > 0 and ii == at:
+            for shake in shakes:
+                observation, *_ = env.step(shake)
+        action = policy(observation)
+        next_observation, reward, done, _, _ = env.step(action)
+        observations.append(observation)
+        rewards.append(reward)
+        observation = next_observation
+        if done:
+            break
+    return np.array(observations), np.array(rewards)
+
+
+@pytest.mark.parametrize("name", ["HalfCheetah-v5", "Hopper-v5"])
+def test_official_is_the_released_sampler(name):
+    at = {"HalfCheetah-v5": 500, "Hopper-v5": 8}[name]
+    env = ActionKnock(make_environment(name), 15, mode="official", at=at)
+    size = env.action_space.shape[0]
+
+    def policy(observation):
+        return np.tanh(observation[:size] * 3)
+
+    shakes, observations, rewards = [], [], []
+    bare_step = env.unwrapped.step
+    env.unwrapped.step = lambda action: shakes.append(action) or bare_step(action)
+    observation, _ = env.reset(seed=1)
+    over = False
+    while not over:
+        observations.append(observation)
+        observation, reward, terminated, truncated, _ = env.step(policy(observation))
+        rewards.append(reward)
+        over = terminated or truncated
+    assert len(shakes) == len(rewards) + 15
+    assert len(rewards) > at + 1, "it shall play on after the knock"
+
+    other = make_environment(name)
+    start, _ = other.reset(seed=1)
+    shakes = shakes[at : at + 15]
+    theirs = sampler(other.unwrapped, policy, start, shakes, at=at, steps=1000)
+    assert (np.array(observations) == theirs[0]).all()
+    assert (np.array(rewards) == theirs[1]).all()
+
+
+@pytest.mark.parametrize("mode", ["paper", "torque"])
+def test_counted_modes_replace_the_agents_actions(mode, play, recorder):
+    bare = recorder(falls=[9])
+    played = play(ActionKnock(bare, 3, mode=mode, at=4), 9)
+    own = [(action == 0.5).all() for action in bare.actions]
+    assert own == [True] * 4 + [False] * 3 + [True] * 2
+    assert column(played, 1) == [*range(1, 10)], "all steps are paid"
+    assert column(played, 2) == [False] * 8 + [True]
+    assert knocks(played) == [0] * 4 + [1] * 3 + [0] * 2
+    assert bare.actions[5].dtype == bare.action_space.dtype
+
+
+def test_paper_actions_are_normal_with_std_1e_3(play, recorder):
+    bare = recorder(size=4)
+    play(ActionKnock(bare, 2500, mode="paper", at=0), 2500)
+    actions = torch.from_numpy(np.array(bare.actions)).double().flatten().sort().values
+    steps = torch.arange(1, 10001) / 10000
+    cdf = torch.special.ndtr(actions / 1e-3)
+    distance = torch.maximum(steps - cdf, cdf - steps + 1e-4).max()
+    # Kolmogorov-Smirnov at the level 0.01.
+    assert distance < 1.63 / math.sqrt(10000)
+
+
+def test_torque_is_full_strength_of_either_sign(play, recorder):
+    bare = recorder(size=4, low=-2.0, high=3.0)
+    play(ActionKnock(bare, 2500, mode="torque", at=0), 2500)
+    actions = np.array(bare.actions)
+    assert set(np.unique(actions)) == {-2.0, 3.0}
+    # 10,000 fair coins, 5 standard errors of 0.005.
+    assert abs((actions == 3).mean() - 0.5) < 0.025
+
+
+def spy(env):
+    """Note the applied forces ``[bodies, 6]`` of every step of the simulation."""
+    bare, seen = env.unwrapped, []
+    step = bare.step
+    bare.step = lambda a: seen.append(bare.data.xfrc_applied.copy()) or step(a)
+    return seen
+
+
+@given(
+    st.integers(1, 30),
+    st.integers(1, 20),
+    st.integers(0, 2**40),
+    st.sampled_from(["official", "paper", "torque"]),
+)
+@settings(deadline=None, max_examples=50)
+def test_random_moments_lie_in_the_window_and_follow_the_seed(
+    recorder, start, width, seed, mode
+):
+    window = (start, start + width)
+    env = ActionKnock(recorder(), 2, mode=mode, at="random", window=window)
+    moments = []
+    for _ in range(2):
+        env.reset(seed=seed)
+        flags = [env.step(np.zeros(2))[-1]["disturbed"] for _ in range(sum(window))]
+        # Official: within the agent's last step before the moment.
+        moments.append(flags.index(True) + (mode == "official"))
+        assert sum(flags) == (1 if mode == "official" else 2)
+    assert start <= moments[0] < start + width
+    assert moments[0] == moments[1]
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_force_is_applied_and_removed(name, play):
+    env = ExternalPush(make_environment(name), 25.0, duration=3, at=2)
+    seen = spy(env)
+    forces = [step[-1]["push_force"] for step in play(env, 7)]
+    sign = np.sign(forces[2])
+    assert forces == [0, 0, 25 * sign, 25 * sign, 25 * sign, 0, 0]
+    torso = mujoco.mj_name2id(env.unwrapped.model, mujoco.mjtObj.mjOBJ_BODY, "torso")
+    for number, applied in enumerate(seen):
+        expected = np.zeros_like(applied)
+        expected[torso, 0] = forces[number]
+        assert (applied == expected).all()
+    assert not env.unwrapped.data.xfrc_applied.any()
+
+
+def test_both_directions_occur_and_the_seed_decides(recorder):
+    env = ExternalPush(make_environment("Hopper-v5"), 1.0, duration=1, at=0)
+    action, signs = env.action_space.low, []
+    for seed in [*range(40), *range(40)]:
+        env.reset(seed=seed)
+        signs.append(env.step(action)[-1]["push_force"])
+    assert signs[:40] == signs[40:]
+    # 40 fair coins, 4 standard errors of 3.2.
+    assert abs(signs[:40].count(1.0) - 20) < 13
+
+
+def test_units_of_body_weight():
+    # Gymnasium's models, weighed: their masses times 9.81 m/s².
+    for name, weight in zip(ROBOTS, (155.19, 232.27, 137.34), strict=True):
+        env = make_environment(name)
+        push = ExternalPush(env, 2.0, duration=1, unit="body_weight")
+        assert push.force == pytest.approx(2 * weight, abs=0.01)
+    heavy = DynamicsChange(make_environment("Hopper-v5"), mass=3.0)
+    push = ExternalPush(heavy, 1.0, duration=1, unit="body_weight")
+    assert push.force == pytest.approx(3 * 155.19, abs=0.05)

@@ -1,0 +1,126 @@
+"""The report on a dynamics model, of worlds whose answer is known."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_osr.lab.data import consecutive_rows
+from torchrl_osr.lab.dynamics import DynamicsEnsemble
+from torchrl_osr.lab.evaluation import (
+    describe_dynamics,
+    dynamics_report,
+    rollout_errors,
+)
+
+NOISE = 0.3
+
+
+def make_model(*, offset: float = 0.0, scale: float = NOISE) -> DynamicsEnsemble:
+    """s' = s + a up to noise, reward = s up to noise; two networks that agree."""
+    model = DynamicsEnsemble(1, 1, num_networks=2, num_elites=2, num_cells=[])
+    (layer,) = model.layers
+    with torch.no_grad():
+        layer.weight.zero_()
+        layer.bias.zero_()
+        layer.weight[:, 1, 0] = layer.weight[:, 0, 1] = 1
+        layer.bias[:, 0, 0] = offset
+        # Bounds far apart do not bend what lies between them.
+        model.lowest_log_variance.fill_(-60)
+        model.highest_log_variance.fill_(60)
+        layer.bias[:, 0, 2:] = 2 * math.log(scale)
+    return model
+
+
+def make_data(rows: int = 20_000, noise: float = NOISE) -> TensorDict:
+    """One trajectory."""
+    action = torch.randn(rows, 1)
+    steps = action + noise * torch.randn(rows, 1)
+    path = torch.cat([torch.zeros(1, 1), steps.cumsum(0)])
+    no = torch.zeros(rows, 1, dtype=torch.bool)
+    reward = path[:-1] + noise * torch.randn(rows, 1)
+    after = {"observation": path[1:].clone(), "reward": reward}
+    after |= {"done": no, "terminated": no.clone()}
+    return TensorDict(
+        {"observation": path[:-1], "action": action, "next": after}, [rows]
+    )
+
+
+def test_report_of_the_true_model() -> None:
+    report = dynamics_report(make_model(), make_data())
+    entropy = 2 * (0.5 * math.log(2 * math.pi * math.e) + math.log(NOISE))
+    assert report["nll"] == pytest.approx(entropy, abs=0.02)
+    assert report["within_1_sigma"] == pytest.approx(0.6827, abs=0.01)
+    assert report["within_2_sigma"] == pytest.approx(0.9545, abs=0.01)
+    assert report["mse"] == pytest.approx(NOISE**2, abs=2e-3)
+    # The change has a variance of 1 + .09, of which the noise is .09.
+    assert report["r2"][0] == pytest.approx(1 / 1.09, abs=0.01)
+    assert report["rows"] == 20_000
+    assert report["largest_disagreement"] == 0
+    assert "rollout" not in report
+
+
+def test_overconfident_model_covers_too_little() -> None:
+    report = dynamics_report(make_model(scale=NOISE / 2), make_data())
+    # P(|z| < 1/2) and P(|z| < 1) by the normal distribution.
+    assert report["within_1_sigma"] == pytest.approx(0.3829, abs=0.01)
+    assert report["within_2_sigma"] == pytest.approx(0.6827, abs=0.01)
+
+
+def test_disagreement_that_knows_the_error_has_rank_one() -> None:
+    model, data = make_model(), make_data(500, noise=0.0)
+    with torch.no_grad():
+        model.layers[0].weight[0, 1, 0] = 1.5  # one network errs with the action's size
+    data["next", "reward"].zero_()
+    data["observation"].zero_()
+    data["next", "observation"] = data["action"].clone()
+    report = dynamics_report(model, data)
+    assert report["disagreement_rank"] == pytest.approx(1.0)
+
+
+def test_rollout_errors_of_a_constant_error() -> None:
+    data = make_data(300, noise=0.0)
+    pieces = consecutive_rows(data, torch.arange(0, 280, 7), 20)
+    assert len(pieces) == 40
+    exact = rollout_errors(make_model(), pieces)
+    assert [each["steps"] for each in exact] == [1, 2, 5, 10, 20]
+    assert all(each["rmse"] < 1e-4 for each in exact)
+    model = make_model(offset=0.25)
+    model.input_scale[0] = 2.0  # the unit of the errors
+    with torch.no_grad():
+        model.layers[0].weight[:, 0, 1] = 0
+    off = rollout_errors(model, pieces, (1, 4))
+    assert [each["rmse"] for each in off] == pytest.approx([0.125, 0.5], abs=1e-4)
+    assert [each["median"] for each in off] == pytest.approx([0.125, 0.5], abs=1e-4)
+    moved = pieces["next", "observation"][:, 3] - pieces["observation"][:, 0]
+    wanted = (moved / 2).square().mean().sqrt().item()
+    assert off[1]["standing_still"] == pytest.approx(wanted, rel=1e-5)
+
+
+def test_pieces_do_not_run_from_one_trajectory_into_the_next() -> None:
+    data = make_data(30)
+    data["next", "done"][9] = True
+    data["next", "observation"][19] += 1.0  # a gap that nothing marks
+    pieces = consecutive_rows(data, torch.arange(30), 5)
+    firsts = data["observation"][[*range(6), *range(10, 16), *range(20, 26)]]
+    assert torch.equal(pieces["observation"][:, 0], firsts)
+
+
+def test_no_row_left_is_an_error() -> None:
+    data = make_data(4)
+    data["next", "terminated"] = torch.ones(4, 1, dtype=torch.bool)
+    data["next", "observation"] = data["observation"].clone()
+    with pytest.raises(ValueError, match="has a next state"):
+        dynamics_report(make_model(), data)
+
+
+def test_line_says_what_was_measured() -> None:
+    data = make_data(300)
+    pieces = consecutive_rows(data, torch.arange(0, 200, 50), 20)
+    line = describe_dynamics(dynamics_report(make_model(), data, pieces))
+    assert "300 held-out rows" in line
+    assert "error after steps" in line
+    assert "(20)" in line

@@ -1,0 +1,144 @@
+"""Batched episodes are the episodes that one environment would have played."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from torchrl.envs import ObservationNorm
+
+from torchrl_osr.lab.data import reference_returns
+from torchrl_osr.lab.evaluation import (
+    EpisodeEvaluator,
+    EpisodeResults,
+    deterministic_policy,
+    measure_of,
+    score_table,
+    summarize,
+)
+from torchrl_osr.modules import tanh_gaussian_actor
+
+HOPPER = reference_returns("hopper")
+
+
+def linear_policy(observation: torch.Tensor) -> torch.Tensor:
+    """A policy under which episodes end at different times; rows do not mix."""
+    return torch.tanh(observation[:, :3] * 3)
+
+
+def play_alone(seed: int) -> tuple[float, int]:
+    environment = gymnasium.make("Hopper-v5")
+    observation, _ = environment.reset(seed=seed)
+    total, steps, over = 0.0, 0, False
+    while not over:
+        row = torch.from_numpy(observation[None].astype(np.float32))
+        action = linear_policy(row)[0].numpy()
+        observation, reward, terminated, truncated, _ = environment.step(action)
+        total, steps, over = total + reward, steps + 1, terminated or truncated
+    return total, steps
+
+
+def test_each_episode_is_what_it_would_be_alone():
+    evaluator = EpisodeEvaluator("Hopper-v5", num_episodes=4, seed=5)
+    results = evaluator(linear_policy)
+    alone = [play_alone(seed) for seed in (5, 6, 7, 8)]
+    np.testing.assert_allclose(
+        results.returns, [total for total, _ in alone], rtol=1e-6
+    )
+    assert results.lengths.tolist() == [steps for _, steps in alone]
+    assert len(set(results.lengths)) > 1, "episodes shall end at different times here"
+    again = evaluator(linear_policy)
+    np.testing.assert_array_equal(results.returns, again.returns)
+
+
+def test_global_generators_are_left_alone():
+    before, state = np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
+    EpisodeEvaluator("Hopper-v5", num_episodes=2)(linear_policy)
+    assert torch.equal(state, torch.get_rng_state())
+    after = np.random.get_state()  # noqa: NPY002
+    assert all(map(np.array_equal, before, after))
+
+
+def test_policy_sees_standardised_observations():
+    actor = tanh_gaussian_actor(2, 1, num_cells=[4])
+    loc, scale = torch.tensor([1.0, 2.0]), torch.tensor([3.0, 4.0])
+    norm = ObservationNorm(loc, scale, in_keys=["observation"], standard_normal=True)
+    raw = torch.tensor([[4.0, -2.0]])
+    # By hand: (4 - 1) / 3 = 1 and (-2 - 2) / 4 = -1.
+    standard = torch.tensor([[1.0, -1.0]])
+    torch.testing.assert_close(
+        deterministic_policy(actor, norm)(raw), deterministic_policy(actor)(standard)
+    )
+    head = actor[0].module(standard)[0]
+    torch.testing.assert_close(deterministic_policy(actor)(standard), head.tanh())
+
+
+def test_summary_is_json_and_normalised():
+    results = EpisodeResults(
+        np.array([3234.3, -20.272305]), np.array([1000, 20]), np.array([0, 1])
+    )
+    summary = summarize(results, HOPPER)
+    assert summary["score"] == pytest.approx(50)
+    assert summary["score_low"] == pytest.approx(0)
+    assert summary["score_high"] == pytest.approx(100)
+    assert summary["returns"] == [3234.3, -20.272305]
+    assert summary["length"] == 510
+
+
+def test_without_references_there_is_no_score():
+    returns = np.array([-900.0, -1100.0])
+    results = EpisodeResults(returns, np.full(2, 200), np.arange(2))
+    summary = summarize(results, None)
+    assert measure_of(summary) == "return"
+    assert summary["return"] == -1000
+    assert (summary["return_low"], summary["return_high"]) == (-1100, -900)
+    assert not [key for key in summary if "score" in key]
+    table = score_table("p", [summary], summary | {"step": 1}, -1200.0, Path("run"))
+    assert table.startswith("p: return [95 % interval]")
+    assert "-1200.0" in table
+    assert "expert" not in table
+
+
+def test_tasks_without_successes_have_none():
+    results = EpisodeEvaluator("Hopper-v5", num_episodes=2)(linear_policy)
+    assert results.successes is None
+    assert not [key for key in summarize(results, HOPPER) if "success" in key]
+
+
+def test_successes_are_those_that_reached_the_goal():
+    evaluator = EpisodeEvaluator("PointMaze_UMaze-v3", num_episodes=8)
+
+    def sideways(observation: torch.Tensor) -> torch.Tensor:
+        """Reaches the goals in the same row; the others take all their time."""
+        way = (observation[:, 2:4] - observation[:, :2]).clamp(-0.5, 0.5)
+        return way * torch.tensor([1.0, 0.0])
+
+    results = evaluator(sideways)
+    assert results.successes.tolist() == (results.lengths < 300).tolist()
+    assert results.successes.tolist() == results.returns.astype(bool).tolist()
+    assert len(set(results.successes.tolist())) == 2, "some shall miss it here"
+    evaluator.close()
+
+
+def test_success_rate_has_wilsons_interval():
+    successes = np.array([True, True, False, False])
+    results = EpisodeResults(
+        successes.astype(float), np.full(4, 300), np.arange(4), successes
+    )
+    summary = summarize(results, reference_returns("pointmaze-umaze"))
+    assert (summary["score"], summary["success_rate"]) == (50, 0.5)
+    # By hand in test_statistics.
+    interval = summary["success_low"], summary["success_high"]
+    assert interval == pytest.approx((0.15004, 0.84996), abs=1e-5)
+    assert summary["successes"] == [True, True, False, False]
+    table = score_table("maze", [summary], summary | {"step": 1}, None, Path("run"))
+    (line,) = [line for line in table.splitlines() if "success" in line]
+    assert line.split()[3:] == [
+        *["50.0", "[15.0,", "85.0]", "%", "of", "4", "episodes,", "Wilson", "interval"]
+    ]
+    summary = {k: v for k, v in summary.items() if "success" not in k}
+    table = score_table("maze", [summary], summary | {"step": 1}, None, Path("run"))
+    assert "success" not in table

@@ -1,0 +1,130 @@
+"""Survival and the way back, on trajectories that were written down by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_osr.lab.evaluation import (
+    STEPS_AFTER,
+    STEPS_BEFORE,
+    Recorder,
+    Trajectory,
+    disturbed_at,
+    measure_recovery,
+)
+
+
+class Distance:
+    """The first number of an observation; up to 2 is in the data."""
+
+    threshold = 2.0
+
+    def __call__(self, rows: torch.Tensor) -> torch.Tensor:
+        return rows[:, 0]
+
+
+def trajectory(distances, disturbed=(), *, fell=False) -> Trajectory:
+    """Entry 0 is the reset."""
+    rows = [np.array([each, 9.0], dtype=np.float32) for each in distances]
+    return Trajectory(rows, [i in disturbed for i in range(len(rows))], fell)
+
+
+def measure(disturbed: Trajectory, clean: Trajectory | None = None):
+    return measure_recovery(disturbed, clean or trajectory([1.0] * 200), Distance())
+
+
+@pytest.mark.parametrize(
+    ("after", "fell", "survived", "alive", "steps"),
+    [
+        ([2.0, 3.0], False, True, None, 0),  # at the threshold is within
+        ([3.0, 2.1, 1.9, 5.0], False, True, None, 2),
+        ([3.0] * 50, False, True, None, None),  # never back before the end
+        ([3.0] * 120 + [1.0], False, True, True, 120),  # later than the curve
+        ([3.0], True, False, False, None),  # fell in the disturbance
+        ([1.0], True, False, False, None),  # and where it lies is in the data
+        ([3.0, 3.0, 1.0], True, True, False, None),  # the same, a little later
+        ([3.0, 1.0, 3.0], True, True, False, 1),  # back, and fell afterwards
+        ([3.0] * 101, True, True, False, None),  # fell in the last step that counts
+        ([3.0] * 102, True, True, True, None),  # fell one later
+        ([3.0] * 101, False, True, True, None),  # the time limit, just not too early
+        ([3.0] * 100, False, True, None, None),  # too early to say
+    ],
+)
+def test_one_episode(after, fell, survived, alive, steps):
+    before = [1.0, 1.0, 4.0]
+    recovery = measure(trajectory([*before, *after], {2, 3}, fell=fell))
+    assert recovery.ended_at == 2
+    assert recovery.survived == survived
+    assert recovery.alive_after == alive
+    assert recovery.steps == steps
+
+
+def test_episodes_without_the_disturbance_say_nothing():
+    recovery = measure(trajectory([1.0, 9.0, 9.0], fell=True))
+    *entries, distance, clean_distance = vars(recovery).values()
+    assert set(entries) == {None}
+    assert np.isnan([distance, clean_distance]).all()
+
+
+@pytest.mark.parametrize(
+    ("disturbed", "step"), [(set(), None), ({0}, 0), ({1}, 0), ({3, 4}, 2)]
+)
+def test_moment_counts_steps_from_zero(disturbed, step):
+    assert disturbed_at(trajectory([1.0] * 6, disturbed)) == step
+
+
+def test_the_first_of_two_disturbances_counts():
+    recovery = measure(trajectory([1, 1, 4, 3, 1, 1, 8, 8], {2, 6}))
+    assert recovery.ended_at == 1
+    assert recovery.steps == 2
+
+
+@pytest.mark.parametrize(
+    ("entries", "fell", "alive", "there_later"),
+    [(50, True, False, False), (150, True, True, True), (50, False, None, False)],
+)
+def test_the_undisturbed_episode_is_looked_at_at_the_same_step(
+    entries, fell, alive, there_later
+):
+    clean = trajectory([1.0] * entries, fell=fell)
+    recovery = measure(trajectory([1.0, 4.0, 1.0, 1.0], {1}), clean)
+    assert recovery.clean_alive_after == alive
+    there = ~np.isnan(recovery.clean_distance)
+    assert there[STEPS_BEFORE]
+    assert there[STEPS_BEFORE + 60] == there_later
+
+
+def test_distances_are_around_the_end_of_the_disturbance():
+    size, nan = STEPS_BEFORE + 1 + STEPS_AFTER, np.nan
+    around = slice(STEPS_BEFORE - 3, STEPS_BEFORE + 3)
+    # In units of the threshold, 2.
+    long = measure(trajectory([1.0] * 20 + [6.0] + [2.0] * 200, {20})).distance
+    np.testing.assert_array_equal(long[around], [0.5, 0.5, 0.5, 3.0, 1.0, 1.0])
+    assert len(long) == (~np.isnan(long)).sum() == size
+    short = measure(trajectory([1.0, 1.0, 4.0, 3.0], {2}, fell=True)).distance
+    np.testing.assert_array_equal(short[around], [nan, 0.5, 0.5, 2.0, 1.5, nan])
+    assert len(short) == size
+    assert (~np.isnan(short)).sum() == 4
+
+
+def test_recorder_keeps_what_it_was_told():
+    recorder = Recorder(2)
+    row = np.array([1.0, 2.0])
+    recorder(1, row, False, {})
+    row[:] = 7  # an environment may use its array again
+    recorder(1, row, True, {"disturbed": True})
+    kept = recorder.trajectories[1]
+    assert np.stack(kept.observations).tolist() == [[1, 2], [7, 7]]
+    assert kept.disturbed == [False, True]
+    assert kept.terminated
+    assert kept.last == 1
+    assert recorder.trajectories[0].observations == []
+
+
+def test_who_reaches_the_goal_has_not_fallen():
+    recorder = Recorder(2)
+    for episode, success in enumerate((True, False)):
+        recorder(episode, np.zeros(8), True, {"success": success})
+    assert [each.terminated for each in recorder.trajectories] == [False, True]

@@ -1,0 +1,1 @@
+"""The laboratory: what experiments with the plug-in need."""

@@ -1,0 +1,128 @@
+"""Write a trained policy to one file, and check the file against the policy.
+
+    torchrl-osr export outputs/hopper-medium-replay/osr-seed0-... policy.safetensors
+    torchrl-osr export policy.safetensors policy.onnx
+    torchrl-osr export policy.safetensors value.onnx --output value
+
+The source is a run's folder (its last checkpoint), a checkpoint's file in it, or a
+saved policy. The suffix of the new file decides: ``.safetensors`` for ``load_policy``,
+``.onnx`` for ONNX Runtime, ``.pt2`` for ``torch.export``. How to use each:
+docs/deploy.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchrl_osr.lab.run.policy_of_run import load_run_policy
+from torchrl_osr.policy import Policy, load_policy
+from torchrl_osr.policy.graph import SUFFIXES
+from torchrl_osr.policy.policy import SUFFIX
+
+ROWS = 256
+"""Observations that a written file is checked on."""
+
+TOLERANCE = 1e-5
+"""Largest deviation, relative to the larger of 1 and the number itself."""
+
+Function = Callable[..., Tensor]
+
+
+def main() -> None:
+    """Load, write, check, and say what was written."""
+    parser = argparse.ArgumentParser(
+        prog=sys.argv[0],
+        description=__doc__.split("\n")[0],
+        epilog="The suffix decides: .safetensors for load_policy, .onnx for ONNX "
+        "Runtime, .pt2 for torch.export. More in docs/deploy.md.",
+    )
+    parser.add_argument(
+        "source",
+        type=Path,
+        help="a run's folder, a checkpoint in it, or a .safetensors",
+    )
+    parser.add_argument("path", type=Path, help="the file to write")
+    parser.add_argument(
+        "--output",
+        choices=("action", "value"),
+        default="action",
+        help="what a graph computes (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--trust",
+        action="append",
+        default=[],
+        metavar="MODULE",
+        help="of your own, that the run may name; may be repeated",
+    )
+    options = parser.parse_args()
+    if options.path.suffix not in (SUFFIX, *SUFFIXES):
+        parser.error(f"the path must end in {SUFFIX}, {' or '.join(SUFFIXES)}.")
+    policy = load_run_policy(options.source, options.trust)
+    if options.path.suffix == SUFFIX:
+        policy.save(options.path)
+    else:
+        policy.export(options.path, options.output)
+    deviation = check(policy, options.path, options.output)
+    origin = {"env_id": "?", "step": "?"} | policy.record["source"]
+    print(
+        f"{options.path}: {options.path.stat().st_size:,} bytes, "
+        "{loss}, {env_id}, step {step}\n".format(**origin)
+        + f"largest deviation on {ROWS} observations: {deviation:.1e}"
+    )
+
+
+def check(policy: Policy, path: Path, output: str) -> float:
+    """Largest deviation of the written file from the policy, at random observations.
+
+    Raises:
+        ValueError: it is larger than :data:`TOLERANCE`.
+    """
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn(ROWS, policy.observation_size, generator=generator)
+    observation = policy.loc + policy.scale * noise
+    inputs = {"observation": observation}
+    wanted = policy.act(observation)
+    if output == "value":
+        inputs["action"], wanted = wanted, policy.value(observation)
+    deviation = (read(path, output)(**inputs) - wanted).abs() / wanted.abs().clamp(1)
+    largest = deviation.max().item()
+    if not largest <= TOLERANCE:
+        raise ValueError(
+            f"{path} was written, but deviates from the policy by {largest:.1e}, more "
+            f"than {TOLERANCE}: do not use it."
+        )
+    return largest
+
+
+def read(path: Path, output: str) -> Function:
+    """What a written file computes, as a function of named tensors."""
+    if path.suffix == SUFFIX:
+        policy = load_policy(path)
+        return policy.value if output == "value" else policy.act
+    if path.suffix == ".pt2":
+        return torch.export.load(path).module()
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise ImportError(
+            f"{path} was written; checking it needs onnxruntime: "
+            "pip install torchrl-osr[export]"
+        ) from error
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+
+    def run(**inputs: Tensor) -> Tensor:
+        arrays = {name: each.numpy() for name, each in inputs.items()}
+        return torch.from_numpy(session.run(None, arrays)[0])
+
+    return run
+
+
+if __name__ == "__main__":
+    main()

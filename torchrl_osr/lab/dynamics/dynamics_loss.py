@@ -1,0 +1,127 @@
+r"""The loss that trains an ensemble of dynamics models.
+
+Shapes: ``B`` batch (any leading dimensions), ``E`` networks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from tensordict import NestedKey, TensorDictBase
+
+from torchrl_osr._checks import check_weight
+from torchrl_osr._entries import nested
+from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble, has_next_state
+from torchrl_osr.lab.dynamics.equations import gaussian_error
+from torchrl_osr.objectives.base import BaseLoss, Terms
+from torchrl_osr.objectives.mixed_states import check_single_steps, first_step
+
+
+class DynamicsLoss(BaseLoss):
+    r"""Likelihood of the next state and the reward, and the bounds of the variance.
+
+    .. math::
+        L = \sum_{i=1}^{E} \frac1{D} \sum_d \mathbb E \Big[
+            \frac{(\mu_{i,d} - y_d)^2}{\sigma_{i,d}^2} + \log \sigma_{i,d}^2 \Big]
+            + w \sum_d \big( v^{max}_d - v^{min}_d \big)
+
+    with the standardised targets :math:`y = (s' - s, r)` and the learned bounds
+    :math:`v` of the log-variance: the objective of MOPO's code
+    (https://arxiv.org/abs/2005.13239, tianheyu927/mopo), whose weight decay is in
+    :meth:`~torchrl_osr.lab.dynamics.DynamicsEnsemble.parameter_groups`.
+
+    Every network has rows of its own: the batch is divided among them. There each has
+    a bootstrap sample of the data, too; that shuffled batches and different initial
+    weights are enough is the finding of "Simple and Scalable Predictive Uncertainty
+    Estimation using Deep Ensembles", https://arxiv.org/abs/1612.01474.
+
+    Args:
+        dynamics_network: to be trained; its standardisation stays as it is, see
+            :meth:`~torchrl_osr.lab.dynamics.DynamicsEnsemble.standardize_`.
+
+    Keyword Args:
+        bound_weight: ``w``. Default 0.01, MOPO's.
+        reduction: of the likelihood: ``"mean"`` (default) as above, ``"sum"`` or
+            ``"none"``, one number a row.
+
+    Raises:
+        ValueError: if ``bound_weight`` is negative; in the call, if the number of rows
+            is no multiple of ``E``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_osr.lab.dynamics import DynamicsLoss
+        >>> from torchrl_osr.lab.dynamics import DynamicsEnsemble
+        >>> model = DynamicsEnsemble(11, 3, num_networks=2, num_elites=1)
+        >>> loss = DynamicsLoss(model)
+        >>> batch = TensorDict({
+        ...     "observation": torch.randn(6, 11), "action": torch.rand(6, 3),
+        ...     "next": {"observation": torch.randn(6, 11), "reward": torch.ones(6, 1),
+        ...              "terminated": torch.zeros(6, 1, dtype=torch.bool)}}, [6])
+        >>> sorted(loss(batch).keys())
+        ['loss_bounds', 'loss_dynamics']
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """There is nothing to rename: the network names what it reads."""
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+
+    def __init__(
+        self,
+        dynamics_network: DynamicsEnsemble,
+        *,
+        bound_weight: float = 0.01,
+        reduction: Literal["none", "mean", "sum"] | None = None,
+    ) -> None:
+        check_weight("bound_weight", bound_weight)
+        super().__init__(
+            reduction=reduction,
+            use_prioritized_weights=False,
+            scalar_output_mode="exclude",
+        )
+        self.convert_to_functional(dynamics_network, "dynamics_network")
+        self.bound_weight = bound_weight
+
+    def _input_keys(self) -> list[NestedKey]:
+        key, action = self.dynamics_network.in_keys
+        following = [nested("next", each) for each in (key, "reward", "terminated")]
+        return [key, action, *following]
+
+    def _output_keys(self) -> tuple[list[NestedKey], list[NestedKey]]:
+        return ["loss_dynamics", "loss_bounds"], []
+
+    def _terms(self, tensordict: TensorDictBase) -> Terms:
+        tensordict = first_step(tensordict)
+        check_single_steps(tensordict, "the model of the dynamics")
+        model, rows = self.dynamics_network, tensordict.batch_size.numel()
+        if rows % model.num_networks:
+            raise ValueError(
+                f"The batch has {rows} rows for {model.num_networks} networks, each of "
+                "which has rows of its own: expected a multiple."
+            )
+        with self.dynamics_network_params.to_module(model):
+            inputs, targets = model.inputs_and_targets(tensordict)
+            targets = (targets - model.target_loc) / model.target_scale
+            inputs, targets = (
+                each.reshape(model.num_networks, -1, each.shape[-1])
+                for each in (inputs, targets)
+            )
+            mean, log_variance = model.standardized(inputs)
+            width = model.highest_log_variance - model.lowest_log_variance
+            bounds = self.bound_weight * width.sum()
+        error = gaussian_error(mean, log_variance, targets)
+        # Of the mean over E times as many rows as each network has.
+        value = error.reshape(tensordict.batch_size) * (
+            model.num_networks if self.reduction == "mean" else 1
+        )
+        valid = has_next_state(tensordict, model.in_keys[0])
+        loss = self._reduce(value, tensordict, valid)
+        if self.reduction == "none":
+            bounds = bounds.expand(tensordict.batch_size) / rows
+        losses = {"loss_dynamics": loss, "loss_bounds": bounds}
+        return losses, {}

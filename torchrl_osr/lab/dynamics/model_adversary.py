@@ -1,0 +1,177 @@
+"""RAMBO: a dynamics model that is trained against the policy's value.
+
+Shapes: ``B`` states, ``S`` observation, ``E`` elites, ``N`` critics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import (
+    InteractionType,
+    ProbabilisticTensorDictSequential,
+    set_interaction_type,
+)
+from torch import Tensor
+from torch.distributions import Normal
+from torchrl.data import ReplayBuffer
+
+from torchrl_osr._checks import check_positive, check_weight
+from torchrl_osr._entries import entry
+from torchrl_osr.lab.dynamics import DynamicsLoss
+from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
+from torchrl_osr.lab.dynamics.equations import adversarial_objective
+from torchrl_osr.lab.dynamics.termination import Termination, never
+from torchrl_osr.objectives import BaseLoss
+from torchrl_osr.objectives.step import qvalue
+
+SEED = 2**40
+"""Added to a seed, so that roll-outs with the same one draw other numbers."""
+
+
+class ModelAdversary:
+    r"""Train a model to predict the data, and to be bad for the policy elsewhere.
+
+    .. math::
+        L = L_{NLL} + \lambda\, \mathbb E \Big[ \bar A(s, a, s', r)\,
+            \log \frac1E \sum_{i=1}^{E} p_i(s', r \mid s, a) \Big], \quad
+        A = r + \gamma\,(1 - \text{terminated}) \min_j Q_j(s', \pi(s'))
+            - \min_j Q_j(s, a)
+
+    with the likelihood of :class:`~torchrl_osr.lab.dynamics.DynamicsLoss` on the data,
+    and with the
+    advantage standardised over the batch, :math:`\bar A`, on roll-outs of the policy in
+    the model, whose gradient is a policy gradient with the model as the policy:
+    transitions to worse states than expected become more likely. "RAMBO-RL: Robust
+    Adversarial Model-Based Offline Reinforcement Learning",
+    https://arxiv.org/abs/2204.12581, and its code (marc-rigter/rambo), where roll-outs
+    go on after an end, too.
+
+    Its state is the model's and the optimizer's.
+
+    Args:
+        model: trained already; trained further here.
+        loss: holds the critics.
+        actor: the policy.
+        real: the data. Rows are drawn with its generator, if it has one.
+        optimizer: of the model's parameters.
+
+    Keyword Args:
+        steps: gradient steps of a call.
+        weight: :math:`\lambda`; with 0 the model is trained on the data alone.
+        rollout_steps: steps of a roll-out, one for each gradient step.
+        batch_size: ``B``, at least 2.
+        gamma: discount factor.
+        terminated: of next states, see :func:`~torchrl_osr.lab.dynamics.imagine`.
+            Default: never.
+        seed: of the draws.
+
+    Raises:
+        ValueError: an option is out of its range.
+    """
+
+    def __init__(
+        self,
+        model: DynamicsEnsemble,
+        loss: BaseLoss,
+        actor: ProbabilisticTensorDictSequential,
+        real: ReplayBuffer,
+        optimizer: torch.optim.Optimizer,
+        *,
+        steps: int,
+        weight: float,
+        rollout_steps: int,
+        batch_size: int,
+        gamma: float,
+        terminated: Termination = never,
+        seed: int = 0,
+    ) -> None:
+        check_positive("steps", steps, minimum=1)
+        check_weight("weight", weight)
+        check_positive("rollout_steps", rollout_steps, minimum=1)
+        check_positive("batch_size", batch_size, minimum=2)  # advantages deviate
+        self.model = model.requires_grad_(True)
+        self.loss, self.actor, self.real, self.optimizer = loss, actor, real, optimizer
+        self.likelihood = DynamicsLoss(model)
+        self.steps, self.weight, self.rollout_steps = steps, weight, rollout_steps
+        self.batch_size, self.gamma, self.seed = batch_size, gamma, seed
+        self.terminated = terminated
+        self.metrics: dict[str, float] = {}
+
+    def __call__(self, number: int) -> None:
+        """Train the model, with draws of this number; torch's generator stays."""
+        device = self.model.elites.device
+        totals = torch.zeros(2, device=device)
+        with torch.random.fork_rng([device] if device.type == "cuda" else []):
+            torch.manual_seed(SEED + self.seed + number)
+            for begun in range(0, self.steps, self.rollout_steps):
+                state = entry(self.real.sample(self.batch_size), self.model.in_keys[0])
+                for _ in range(min(self.rollout_steps, self.steps - begun)):
+                    likelihood, objective, state = self._update(state)
+                    totals += torch.stack([likelihood, objective])
+        names = ("adversary_likelihood", "adversary_objective")
+        means = (totals / self.steps).tolist()
+        self.metrics = dict(zip(names, means, strict=True))
+
+    def _update(self, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """One gradient step; returns both terms, and the states that follow."""
+        rows = self.model.num_networks * self.batch_size
+        likelihood = sum(self.likelihood(self.real.sample(rows)).values())
+        objectives, following = self.objective(state)
+        objective = objectives.mean()
+        (likelihood + self.weight * objective).backward()
+        self.optimizer.step()
+        self.optimizer.zero_grad()
+        return likelihood.detach(), objective.detach(), following
+
+    def objective(self, state: Tensor) -> tuple[Tensor, Tensor]:
+        r"""What :math:`\lambda` weighs, ``[B]``, and states that follow, ``[B, S]``.
+
+        Args:
+            state: ``[B, S]``.
+        """
+        model = self.model
+        with torch.no_grad():
+            action = self._action(state, InteractionType.RANDOM)
+        prediction = model.predict(state, action)
+        with torch.no_grad():
+            sample = model.sample(prediction)
+            following, reward = state + sample[..., :-1], sample[..., -1]
+            goes_on = ~self.terminated(following)
+            after = self._action(following, InteractionType.DETERMINISTIC)
+            value = self._value(following, after)
+            advantage = reward + self.gamma * goes_on * value
+            advantage = advantage - self._value(state, action)
+        mean, scale = (each[model.elites] for each in prediction)
+        density = Normal(mean, scale)
+        log_prob = density.log_prob(sample).sum(-1)  # type: ignore[no-untyped-call]
+        return adversarial_objective(log_prob, advantage), following
+
+    def _action(self, state: Tensor, kind: InteractionType) -> Tensor:
+        batch = TensorDict({self.model.in_keys[0]: state}, state.shape[:-1])
+        with set_interaction_type(kind):
+            action: Tensor = self.actor(batch)[self.model.in_keys[1]]
+        return action
+
+    def _value(self, state: Tensor, action: Tensor) -> Tensor:
+        """The critics' smallest, ``[B]``."""
+        batch = TensorDict({self.model.in_keys[0]: state}, state.shape[:-1])
+        params = self.loss.qvalue_network_params
+        return qvalue(self.loss, batch, action, params).amin(0)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a continued run needs."""
+        return {
+            "model": self.model.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "metrics": self.metrics,
+        }
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Go on from a saved state."""
+        self.model.load_state_dict(state_dict["model"])
+        self.optimizer.load_state_dict(state_dict["optimizer"])
+        self.metrics = dict(state_dict["metrics"])

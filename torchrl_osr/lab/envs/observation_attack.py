@@ -1,0 +1,123 @@
+r"""Observations that an adversary perturbs, within a box around the true ones.
+
+The evaluation of "RORL: Robust Offline Reinforcement Learning via Conservative
+Smoothing" (Yang et al., NeurIPS 2022), https://arxiv.org/abs/2206.02829. An adversary
+needs the networks, so it acts between environment and policy, not in a wrapper.
+
+Shapes: ``E`` episodes, ``S`` observation, ``A`` action, ``N`` critics, ``M`` candidate
+perturbations of one state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs import ObservationNorm
+from torchrl.objectives import LossModule
+
+from torchrl_osr._checks import check_choice
+from torchrl_osr.lab.losses import Adversary
+from torchrl_osr.lab.losses.adversary import TanhNormalPolicy, Values
+
+
+def critics_of(loss: LossModule) -> Values:
+    """Values ``[N, M, E]`` of a loss's critics, as a function of states and actions.
+
+    The critics themselves, not their target networks, with the parameters that the loss
+    has at each call.
+
+    Args:
+        loss: a loss module with a ``qvalue_network``: :class:`~torchrl_osr.OSRLoss`,
+            :class:`~torchrl_osr.OSRVLoss`, TorchRL's SAC or CQL loss.
+    """
+
+    def values(states: TensorDictBase, action: Tensor) -> Tensor:
+        keys, each = loss.tensor_keys, []
+        for params in loss.qvalue_network_params.detach().unbind(0):
+            batch = states.copy().set(keys.action, action)
+            with params.to_module(loss.qvalue_network, preserve_module_state=False):
+                batch = loss.qvalue_network(batch)
+            each.append(batch.get(keys.state_action_value).squeeze(-1))
+        return torch.stack(each)
+
+    return values
+
+
+def attacked_policy(
+    policy_distribution: TanhNormalPolicy,
+    qvalue: Values,
+    observation_norm: ObservationNorm | None = None,
+    *,
+    kind: Literal["random", "action_diff", "min_Q"],
+    epsilon: float,
+    method: Literal["sample", "gradient"] = "sample",
+    num_samples: int = 50,
+    seed: int = 0,
+) -> Callable[[Tensor], Tensor]:
+    r"""Deterministic policy that sees perturbed observations.
+
+    Each entry of an observation is off by at most :math:`\epsilon` standard deviations:
+    uniformly (``"random"``), or as :class:`~torchrl_osr.lab.losses.Adversary` finds
+    it, with the
+    largest change of the policy (``"action_diff"``) or the action of lowest value
+    (``"min_Q"``).
+
+    Args:
+        policy_distribution: the actor's ``get_dist``, for instance.
+        qvalue: the critics, see :func:`critics_of`; only ``"min_Q"`` calls them.
+        observation_norm: how the training data were standardised
+            (``standard_normal=True``). Default: not at all.
+
+    Keyword Args:
+        kind: see above.
+        epsilon: half-width of the box; RORL's go from 0, the bare policy, to 0.3.
+        method: ``"sample"`` (default), or ``"gradient"``: RORL's first order with one
+            start, its mixed order with 20.
+        num_samples: draws, or starts of the gradient steps. Default 50.
+        seed: of the draws, which continue from call to call. Default 0.
+
+    Returns:
+        A function from raw observations ``[E, S]`` to actions ``[E, A]``, on the CPU.
+
+    Raises:
+        ValueError: if an argument is unknown or out of its range.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_osr import OSRLoss
+        >>> from torchrl_osr.lab.envs import attacked_policy, critics_of
+        >>> from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
+        >>> actor = tanh_gaussian_actor(11, 3)
+        >>> loss = OSRLoss(actor, critic_ensemble(11, 3), recovery_weight=0)
+        >>> critics = critics_of(loss)
+        >>> policy = attacked_policy(actor.get_dist, critics, kind="min_Q", epsilon=0.1)
+        >>> policy(torch.zeros(4, 11)).shape
+        torch.Size([4, 3])
+    """
+    check_choice("kind", kind, ("random", "action_diff", "min_Q"))
+    # Checks the other arguments, also for "random".
+    adversary = Adversary(
+        "min_Q" if kind == "min_Q" else "action_diff", method, epsilon, num_samples
+    )
+    generator = torch.Generator().manual_seed(seed)
+
+    @torch.no_grad()
+    def policy(observation: Tensor) -> Tensor:
+        if observation_norm is not None:
+            observation = (observation - observation_norm.loc) / observation_norm.scale
+        states = TensorDict({"observation": observation}, [len(observation)])
+        if kind == "random":
+            uniform = torch.rand(observation.shape, generator=generator)
+            states["observation"] = observation + epsilon * (2 * uniform - 1)
+        else:
+            states = adversary.perturb(
+                states, ["observation"], policy_distribution, qvalue, generator
+            )
+        action: Tensor = policy_distribution(states).deterministic_sample
+        return action
+
+    return policy

@@ -1,0 +1,235 @@
+"""Complete episodes of a policy, many at once, and the raw return of each.
+
+Shapes: ``E`` episodes, ``S`` observation, ``A`` action.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict
+from tensordict.nn import ProbabilisticTensorDictSequential
+from torch import Tensor
+from torchrl.envs import ObservationNorm
+
+from torchrl_osr._checks import check_positive
+from torchrl_osr.lab.data import ReferenceReturns
+from torchrl_osr.lab.data.collect.environment import check_simulated, make_environment
+from torchrl_osr.lab.evaluation.statistics import mean_interval, wilson_interval
+from torchrl_osr.objectives.distributions import ONE_HOT
+
+if TYPE_CHECKING:
+    import gymnasium
+
+Policy = Callable[[Tensor], Tensor]
+"""Maps observations ``[E, S]`` as the environment gives them to actions ``[E, A]``.
+
+Real actions are within -1 and 1, see :func:`~torchrl_osr.lab.data.make_environment`;
+discrete ones are their numbers, ``[E]``.
+"""
+
+Wrap: TypeAlias = "Callable[[gymnasium.Env[Any, Any]], gymnasium.Env[Any, Any]]"
+"""Puts wrappers around an environment."""
+
+Watch = Callable[[int, NDArray[Any], bool, dict[str, Any]], None]
+"""Gets episode, observation ``[S]``, terminated and info of each reset and step."""
+
+
+@dataclass(frozen=True)
+class EpisodeResults:
+    """Returns and lengths of an evaluation's episodes, ``[E]`` each.
+
+    Attributes:
+        returns: undiscounted sum of rewards.
+        lengths: steps until the end.
+        seeds: of ``env.reset``.
+        successes: ``info["success"]`` of the last step. Default: the task has no such
+            entry.
+    """
+
+    returns: NDArray[np.float64]
+    lengths: NDArray[np.int64]
+    seeds: NDArray[np.int64]
+    successes: NDArray[np.bool_] | None = None
+
+
+def deterministic_policy(
+    actor_network: ProbabilisticTensorDictSequential,
+    observation_norm: ObservationNorm | None = None,
+) -> Policy:
+    """The actor's deterministic action as a function of raw observations.
+
+    Of discrete actions it is the number of the likeliest.
+
+    Args:
+        actor_network: reads ``"observation"``.
+        observation_norm: how the training data were standardised
+            (``standard_normal=True``). Default: not at all.
+    """
+
+    @torch.no_grad()
+    def policy(observation: Tensor) -> Tensor:
+        if observation_norm is not None:
+            observation = (observation - observation_norm.loc) / observation_norm.scale
+        batch = TensorDict({"observation": observation}, [len(observation)])
+        distribution = actor_network.get_dist(batch)
+        action: Tensor = distribution.deterministic_sample
+        return action.argmax(-1) if isinstance(distribution, ONE_HOT) else action
+
+    return policy
+
+
+class EpisodeEvaluator:
+    """Runs one episode for each of a fixed list of seeds, to its end.
+
+    The policy is called once a step, with all unfinished episodes. The environments are
+    kept from one evaluation to the next.
+
+    Args:
+        env_id: a Gymnasium id, ``"Hopper-v5"`` for instance.
+
+    Keyword Args:
+        num_episodes: ``E``. Default 10.
+        seed: the episodes are seeded ``seed, seed + 1, ...``. Default 0.
+        device: where the policy is. Default CPU.
+        wrap: put around each environment. Default: nothing.
+        fixed_batch: call the policy with all ``E`` rows to the end, with the last
+            observation of finished episodes. torch's rounding depends on the number of
+            rows; with a fixed number, an episode does not depend on when others end.
+            Default ``False``.
+
+    Raises:
+        RuntimeError: the environment has no simulator.
+
+    Examples:
+        >>> import torch
+        >>> evaluator = EpisodeEvaluator("Hopper-v5", num_episodes=2)
+        >>> results = evaluator(lambda observation: torch.zeros(len(observation), 3))
+        >>> results.lengths.shape
+        (2,)
+    """
+
+    def __init__(
+        self,
+        env_id: str,
+        *,
+        num_episodes: int = 10,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+        wrap: Wrap | None = None,
+        fixed_batch: bool = False,
+    ) -> None:
+        check_positive("num_episodes", num_episodes, minimum=1)
+        self.environments = [make_environment(env_id) for _ in range(num_episodes)]
+        check_simulated(self.environments[0], env_id)
+        if wrap is not None:
+            self.environments = [wrap(each) for each in self.environments]
+        self.seeds = seed + np.arange(num_episodes)
+        self.device = device
+        self.fixed_batch = fixed_batch
+
+    def __call__(
+        self, policy: Policy, watch: Watch = lambda *_: None
+    ) -> EpisodeResults:
+        """Play one episode for each seed.
+
+        Args:
+            policy: the same for all episodes; its ``reset`` is called before, if it
+                has one.
+            watch: called at each reset and step. Default: nothing.
+        """
+        getattr(policy, "reset", lambda: None)()
+        episodes = len(self.environments)
+        returns, lengths = np.zeros(episodes), np.zeros(episodes, dtype=np.int64)
+        infos: list[dict[str, Any]] = [{} for _ in range(episodes)]
+        starts = []
+        for episode, environment in enumerate(self.environments):
+            start, info = environment.reset(seed=int(self.seeds[episode]))
+            watch(episode, start, False, info)
+            starts.append(start)
+        observations = np.stack(starts).astype(np.float32)
+        everyone = running = list(range(episodes))
+        while running:
+            rows = everyone if self.fixed_batch else running
+            batch = torch.from_numpy(observations[rows]).to(self.device)
+            actions = dict(zip(rows, policy(batch).cpu().numpy(), strict=True))
+            unfinished = []
+            for episode in running:
+                step = self.environments[episode].step(actions[episode])
+                observation, reward, terminated, truncated, info = step
+                watch(episode, observation, terminated, info)
+                observations[episode] = observation
+                returns[episode] += float(reward)
+                lengths[episode] += 1
+                infos[episode] = info
+                if not (terminated or truncated):
+                    unfinished.append(episode)
+            running = unfinished
+        successes = None
+        if all("success" in info for info in infos):
+            successes = np.array([bool(info["success"]) for info in infos])
+        return EpisodeResults(returns, lengths, self.seeds, successes)
+
+    def close(self) -> None:
+        """Close the environments."""
+        for environment in self.environments:
+            environment.close()
+
+
+def measure_of(row: Mapping[str, Any]) -> str:
+    """What a summary's episodes were judged by: ``"score"`` or ``"return"``.
+
+    Args:
+        row: of :func:`summarize` or
+            :func:`~torchrl_osr.lab.evaluation.summarize_disturbances`.
+    """
+    return "score" if "score" in row else "return"
+
+
+def summarize(
+    results: EpisodeResults, references: ReferenceReturns | None
+) -> dict[str, Any]:
+    """Mean score or return, its interval and the raw results, JSON-compatible.
+
+    Args:
+        results: of ``E`` episodes.
+        references: what returns are normalised by, see
+            :func:`~torchrl_osr.lab.data.reference_returns`; ``None`` for raw returns.
+
+    Returns:
+        ``"score"`` with its 95 % bootstrap interval ``"score_low"``, ``"score_high"``
+        over the episodes, unless there are no references: then ``"return_low"`` and
+        ``"return_high"``; ``"return"`` (mean), ``"length"`` (mean), and the lists
+        ``"returns"``, ``"lengths"`` and ``"seeds"``. Where the task reports successes,
+        also their share ``"success_rate"`` with Wilson's 95 % interval
+        ``"success_low"``, ``"success_high"``, and the list ``"successes"``.
+    """
+    measure, values = "return", results.returns
+    if references is not None:
+        measure, values = "score", references.score(results.returns)
+    mean, low, high = mean_interval(values)
+    summary = {
+        measure: mean,
+        f"{measure}_low": low,
+        f"{measure}_high": high,
+        "return": float(results.returns.mean()),
+        "length": float(results.lengths.mean()),
+        "returns": results.returns.tolist(),
+        "lengths": results.lengths.tolist(),
+        "seeds": results.seeds.tolist(),
+    }
+    if results.successes is None:
+        return summary
+    count, total = int(results.successes.sum()), len(results.successes)
+    low, high = wilson_interval(count, total)
+    return summary | {
+        "success_rate": count / total,
+        "success_low": low,
+        "success_high": high,
+        "successes": results.successes.tolist(),
+    }

@@ -1,0 +1,175 @@
+"""Survival and return to the data after a transient disturbance.
+
+Entry 0 of a trajectory is the reset, entry ``i + 1`` is step ``i``. Offsets count from
+the last entry in which the disturbance acted, offset 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchrl_osr.lab.evaluation.data_distance import DataDistance
+
+STEPS_BEFORE, STEPS_AFTER = 10, 100
+"""Steps around the end of a disturbance over which distances are averaged.
+
+An episode without a fall until :data:`STEPS_AFTER` steps after it counts as alive.
+"""
+
+
+@dataclass
+class Trajectory:
+    """One recorded episode.
+
+    Attributes:
+        observations: of the reset and of each step, float32 ``[S]`` each.
+        disturbed: ``info["disturbed"]`` of each.
+        terminated: whether it ended by a fall: not at the time limit or a goal.
+    """
+
+    observations: list[NDArray[np.float32]] = field(default_factory=list)
+    disturbed: list[bool] = field(default_factory=list)
+    terminated: bool = False
+
+    @property
+    def last(self) -> int:
+        """The last entry."""
+        return len(self.disturbed) - 1
+
+
+class Recorder:
+    """Keeps the trajectories of an evaluation's episodes, as its ``watch``."""
+
+    def __init__(self, num_episodes: int) -> None:
+        self.trajectories = [Trajectory() for _ in range(num_episodes)]
+
+    def __call__(
+        self, episode: int, observation: Any, terminated: bool, info: dict[str, Any]
+    ) -> None:
+        trajectory = self.trajectories[episode]
+        # astype copies: an environment may write into the same array again.
+        trajectory.observations.append(observation.astype(np.float32))
+        trajectory.disturbed.append(bool(info.get("disturbed", False)))
+        trajectory.terminated = bool(terminated) and not info.get("success", False)
+
+
+def _nowhere() -> NDArray[np.float64]:
+    return np.full(STEPS_BEFORE + 1 + STEPS_AFTER, np.nan)
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """Survival and recovery of one episode after a transient disturbance.
+
+    Everything is ``None``, and distances are NaN, if the disturbance never acted.
+
+    Attributes:
+        ended_at: last step in which the disturbance acted.
+        survived: had not fallen by then.
+        alive_after: had not fallen :data:`STEPS_AFTER` steps later; ``None`` if the
+            time limit came first.
+        clean_alive_after: the same for the undisturbed episode of the pair.
+        steps: from its end until the distance to the data is within the threshold;
+            ``None`` if the episode ended before.
+        distance: in units of the threshold, from :data:`STEPS_BEFORE` steps before the
+            end of the disturbance to :data:`STEPS_AFTER` after it; NaN at steps that
+            the episode does not have.
+        clean_distance: of the undisturbed episode, at the same steps.
+    """
+
+    ended_at: int | None = None
+    survived: bool | None = None
+    alive_after: bool | None = None
+    clean_alive_after: bool | None = None
+    steps: int | None = None
+    distance: NDArray[np.float64] = field(default_factory=_nowhere)
+    clean_distance: NDArray[np.float64] = field(default_factory=_nowhere)
+
+
+def disturbed_at(trajectory: Trajectory) -> int | None:
+    """Step of the first disturbance, from 0; ``None`` if there was none.
+
+    A disturbance of the start state counts as step 0.
+    """
+    block = _first_block(trajectory.disturbed)
+    return None if block is None else max(block[0] - 1, 0)
+
+
+def measure_recovery(
+    disturbed: Trajectory, clean: Trajectory, distance: DataDistance
+) -> Recovery:
+    """Survival, recovery and distances of one pair of episodes."""
+    block = _first_block(disturbed.disturbed)
+    if block is None:
+        return Recovery()
+    end = block[1]
+    curve = _around(disturbed, end, distance)
+    steps = _first_within(curve[STEPS_BEFORE:])
+    if steps is None:
+        later = _relative(disturbed.observations[end + STEPS_AFTER + 1 :], distance)
+        steps = _first_within(later, STEPS_AFTER + 1)
+    # The state of the fall itself does not count as recovered.
+    if disturbed.terminated and steps == disturbed.last - end:
+        steps = None
+    return Recovery(
+        ended_at=max(end - 1, 0),
+        survived=not (disturbed.terminated and disturbed.last == end),
+        alive_after=_alive_after(disturbed, end),
+        clean_alive_after=_alive_after(clean, end),
+        steps=steps,
+        distance=curve,
+        clean_distance=_around(clean, end, distance),
+    )
+
+
+def _around(
+    trajectory: Trajectory, end: int, distance: DataDistance
+) -> NDArray[np.float64]:
+    """Distances around entry ``end``, NaN where there is no such entry."""
+    curve = _nowhere()
+    start = max(end - STEPS_BEFORE, 0)
+    there = trajectory.observations[start : end + STEPS_AFTER + 1]
+    first = start - end + STEPS_BEFORE
+    curve[first : first + len(there)] = _relative(there, distance)
+    return curve
+
+
+def _alive_after(trajectory: Trajectory, end: int) -> bool | None:
+    """Whether there is no fall until :data:`STEPS_AFTER` steps after ``end``."""
+    later = trajectory.last - end
+    if trajectory.terminated and later <= STEPS_AFTER:
+        return False
+    return True if later >= STEPS_AFTER else None
+
+
+def _first_block(disturbed: Sequence[bool]) -> tuple[int, int] | None:
+    """First and last entry of the first disturbance."""
+    if True not in disturbed:
+        return None
+    first = last = disturbed.index(True)
+    while last + 1 < len(disturbed) and disturbed[last + 1]:
+        last += 1
+    return first, last
+
+
+def _relative(
+    observations: Sequence[NDArray[np.float32]], distance: DataDistance
+) -> NDArray[np.float64]:
+    """Distances in units of the threshold."""
+    if not observations:
+        return np.empty(0)
+    rows = torch.from_numpy(np.stack(observations))
+    relative: NDArray[np.float64] = distance(rows).double().numpy()
+    return relative / distance.threshold
+
+
+def _first_within(curve: NDArray[np.float64], offset: int = 0) -> int | None:
+    """First entry within the threshold, counted from ``offset``."""
+    within = np.flatnonzero(curve <= 1)
+    return offset + int(within[0]) if within.size else None

@@ -1,0 +1,230 @@
+r"""Perturbed states that an adversary chooses, with the networks at hand.
+
+The noise of equation (5) points anywhere; an adversary looks for the perturbation
+within a box that misleads the policy most. The attacks are those of "RORL: Robust
+Offline Reinforcement Learning via Conservative Smoothing" (Yang et al., NeurIPS 2022),
+https://arxiv.org/abs/2206.02829
+
+Shapes: ``B`` batch (any leading dimensions), ``A`` action, ``N`` critics, ``M``
+candidate perturbations of one state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.modules import TanhNormal
+
+from torchrl_osr._checks import check_choice, check_positive, check_weight
+from torchrl_osr._entries import entry, nested, select
+from torchrl_osr.functional import jeffreys_divergence
+from torchrl_osr.objectives.base import BaseLoss
+from torchrl_osr.objectives.step import distribution, observation_keys, qvalue
+
+TanhNormalPolicy = Callable[[TensorDictBase], TanhNormal]
+"""Maps states ``[M, B]`` (or ``[B]``) to the policy's distribution there."""
+
+Values = Callable[[TensorDictBase, Tensor], Tensor]
+"""Maps states ``[M, B]`` and actions ``[M, B, A]`` to all critics' ``[N, M, B]``."""
+
+_Objective = Callable[[tuple[Tensor, ...]], Tensor]
+
+
+@dataclass(frozen=True)
+class Adversary:
+    r"""Find, for each state, the perturbation in a box that an objective likes best.
+
+    The box is :math:`|\delta_i| \le \epsilon` for each number of an observation. The
+    objectives, with :math:`\hat s = s + \delta`:
+
+    * ``"action_diff"``: :math:`KL(\pi(s) \| \pi(\hat s)) + KL(\pi(\hat s) \| \pi(s))`;
+    * ``"min_Q"``: :math:`-\frac1N \sum_i Q_i(s, a)` with the deterministic action
+      :math:`a = \tanh(\mu(\hat s))`, within its bounds. The critics see the true
+      state: what counts is where the misled action leads from there.
+
+    The methods, with the names of the RORL attacks:
+
+    * ``"sample"`` (RORL's zero order): the best of ``num_samples`` uniform draws, for
+      ``"min_Q"`` also of no perturbation at all, where ``"action_diff"`` is smallest;
+    * ``"gradient"``: ``num_steps`` steps along the sign of the gradient, from each of
+      ``num_samples`` uniform draws and back into the box after each step; then the
+      best of the ends. One start is RORL's first order, 20 are its mixed order. Its
+      code makes a new Adam for every step, and Adam's first step is the sign. A start
+      moves at most ``num_steps * step_size`` half-widths: by default half the box.
+      Whether ``"min_Q"`` ends below the value without perturbation is not checked.
+
+    Here each row draws for itself; RORL's code draws once for the whole batch. All
+    candidates go through the networks together: as one batch in ``"sample"``, as one
+    forward and one backward pass for each step in ``"gradient"``. Both run whole under
+    :func:`torch.compile` (without a ``generator``) and within :func:`torch.no_grad`.
+
+    Args:
+        objective: ``"action_diff"`` (default) or ``"min_Q"``.
+        method: ``"sample"`` (default) or ``"gradient"``.
+        epsilon: half-width of the box in the observation's units, which are standard
+            deviations where observations are standardised. Default 0.01.
+        num_samples: draws, or starts of the gradient steps. Default 20.
+        num_steps: gradient steps. Default 10.
+        step_size: length of a gradient step in units of ``epsilon``. Default 0.1.
+
+    Raises:
+        ValueError: if an argument is out of its range.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
+        >>> from torchrl_osr.lab.losses.adversary import Adversary
+        >>> actor = tanh_gaussian_actor(3, 2, num_cells=[8])
+        >>> critics = critic_ensemble(3, 2, num_cells=[8])
+        >>> def qvalue(states, action):
+        ...     batch = states.copy().set("action", action)
+        ...     values = [critic(batch)["state_action_value"] for critic in critics]
+        ...     return torch.stack(values).squeeze(-1)
+        >>> states = TensorDict({"observation": torch.zeros(5, 3)}, [5])
+        >>> adversary = Adversary("min_Q", epsilon=0.1)
+        >>> worst = adversary.perturb(states, ["observation"], actor.get_dist, qvalue)
+        >>> bool((worst["observation"].abs() <= 0.1).all())
+        True
+    """
+
+    objective: Literal["action_diff", "min_Q"] = "action_diff"
+    method: Literal["sample", "gradient"] = "sample"
+    epsilon: float = 0.01
+    num_samples: int = 20
+    num_steps: int = 10
+    step_size: float = 0.1
+
+    def __post_init__(self) -> None:
+        check_choice("objective", self.objective, ("action_diff", "min_Q"))
+        check_choice("method", self.method, ("sample", "gradient"))
+        check_weight("epsilon", self.epsilon)
+        check_positive("num_samples", self.num_samples, minimum=1)
+        check_positive("num_steps", self.num_steps, minimum=1)
+        check_positive("step_size", self.step_size)
+
+    def __call__(self, loss: BaseLoss, tensordict: TensorDictBase) -> TensorDictBase:
+        """A batch whose perturbed states are the worst for a loss's networks.
+
+        It stands in the place of :class:`~torchrl_osr.StatePerturbation`: in a plain
+        loop ``loss(adversary(loss, buffer.sample()))``, with a trainer in the hook
+        ``process_optim_batch``.
+
+        Args:
+            loss: holds the policy and the critics, such as
+                :class:`~torchrl_osr.OSRLoss`.
+            tensordict: a batch ``[B]``, left as it is.
+        """
+        keys = observation_keys(loss)
+        critics = loss.qvalue_network_params.detach()
+
+        def policy(states: TensorDictBase) -> TanhNormal:
+            return distribution(loss.actor_network, loss.actor_network_params, states)
+
+        worst = self.perturb(
+            select(tensordict, keys),
+            keys,
+            policy,
+            lambda states, action: qvalue(loss, states, action, critics),
+        )
+        tensordict = tensordict.copy()
+        for key in keys:
+            tensordict.set(nested(loss.tensor_keys.perturbed, key), worst.get(key))
+        return tensordict
+
+    @torch.no_grad()
+    def perturb(
+        self,
+        states: TensorDictBase,
+        keys: Sequence[NestedKey],
+        policy: TanhNormalPolicy,
+        qvalue: Values,
+        generator: torch.Generator | None = None,
+    ) -> TensorDictBase:
+        """Return ``states`` with the entries ``keys`` perturbed, without gradient.
+
+        Args:
+            states: ``[B]``, left as it is.
+            keys: the observations to perturb, ``[B, ...]`` each.
+            policy: returns the policy's distribution at states of any batch size.
+            qvalue: returns the critics' values of actions; only ``"min_Q"`` asks.
+            generator: of the uniform draws. Default: torch's own.
+
+        Raises:
+            KeyError: if an observation is missing.
+            TypeError: if an observation is not floating point.
+        """
+        states = states.detach()
+        noise = tuple(self._draw(states, key, generator) for key in keys)
+        objective = self._objective(states, keys, policy, qvalue)
+        if self.method == "gradient":
+            noise = self._ascend(noise, objective)
+        best = objective(noise).argmax(0, keepdim=True)
+        worst = states.copy()
+        for key, candidates in zip(keys, noise, strict=True):
+            index = best.reshape(best.shape + (1,) * (candidates.ndim - best.ndim))
+            chosen = candidates.take_along_dim(index, 0).squeeze(0)
+            worst.set(key, states.get(key) + chosen)
+        return worst
+
+    def _draw(
+        self, states: TensorDictBase, key: NestedKey, generator: torch.Generator | None
+    ) -> Tensor:
+        """Return candidates for one observation, ``[M, B, ...]``."""
+        state = entry(states, key)
+        if not state.is_floating_point():
+            raise TypeError(
+                f"{key!r} must be floating point to be perturbed, got {state.dtype}."
+            )
+        uniform = torch.rand(
+            (self.num_samples, *state.shape),
+            generator=generator,
+            dtype=state.dtype,
+            device=state.device,
+        )
+        noise = self.epsilon * (2 * uniform - 1)
+        if self.objective == "min_Q" and self.method == "sample":
+            noise = torch.cat([torch.zeros_like(noise[:1]), noise])
+        return noise
+
+    def _objective(
+        self,
+        states: TensorDictBase,
+        keys: Sequence[NestedKey],
+        policy: TanhNormalPolicy,
+        qvalue: Values,
+    ) -> _Objective:
+        """Return the function to maximise, from perturbations to ``[M, B]``."""
+        clean = policy(states.copy()) if self.objective == "action_diff" else None
+
+        def objective(noise: tuple[Tensor, ...]) -> Tensor:
+            candidates = states.expand(len(noise[0]), *states.batch_size)
+            perturbed = candidates.copy()
+            for key, delta in zip(keys, noise, strict=True):
+                perturbed.set(key, candidates.get(key) + delta)
+            pi = policy(perturbed)
+            if clean is None:
+                return -qvalue(candidates, pi.deterministic_sample).mean(0)
+            return jeffreys_divergence(clean.loc, clean.scale, pi.loc, pi.scale)
+
+        return objective
+
+    def _ascend(
+        self, noise: tuple[Tensor, ...], objective: _Objective
+    ) -> tuple[Tensor, ...]:
+        """Return where the gradient steps end that start at ``noise``."""
+        # Not torch.autograd.grad: torch.compile cannot trace it, and this one is not
+        # switched off by no_grad, so that no parameter enters a graph.
+        gradient = torch.func.grad(lambda noise: objective(noise).sum())
+        step = self.step_size * self.epsilon
+        for _ in range(self.num_steps):
+            noise = tuple(
+                (delta + step * slope.sign()).clamp(-self.epsilon, self.epsilon)
+                for delta, slope in zip(noise, gradient(noise), strict=True)
+            )
+        return noise
