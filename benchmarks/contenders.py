@@ -21,6 +21,7 @@ from torchrl.objectives import LossModule
 from torchrl_cql import cql_loss, cql_update
 
 from torchrl_osr import OSRLoss, OSRVLoss, StatePerturbation
+from torchrl_osr.fast.traced_update import LossGradients
 from torchrl_osr.lab.data import make_replay_buffer
 from torchrl_osr.modules import (
     critic_ensemble,
@@ -28,7 +29,6 @@ from torchrl_osr.modules import (
     tanh_gaussian_inverse_dynamics,
 )
 from torchrl_osr.trainers import SoftUpdate
-from torchrl_osr.trainers.recording import LossGradients
 
 Update = Callable[[Any], Iterator[str]]
 

@@ -12,9 +12,9 @@ from torch import Tensor, nn
 from torchrl.modules import MLP, ValueOperator
 
 from torchrl_osr import functional
+from torchrl_osr.fast import critics as critic_kernel
+from torchrl_osr.fast.critics import PlainMLP, plain_mlp
 from torchrl_osr.modules import critic_ensemble
-from torchrl_osr.objectives import critic_kernel
-from torchrl_osr.objectives.critic_kernel import PlainMLP, plain_mlp
 
 CHUNKS = [1, 3, 64]
 CELLS = [8, 6, 4]

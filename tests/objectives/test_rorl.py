@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from torch.distributions import Normal, kl_divergence
 from torchrl.objectives import SoftUpdate
 
+from torchrl_osr.fast.traced_update import LossGradients
 from torchrl_osr.lab.losses import EDACLoss, RORLLoss
-from torchrl_osr.trainers.recording import LossGradients
 
 GAMMA, ALPHA, TARGET_SCALE = 0.875, 0.5, 0.8
 OPTIONS = {

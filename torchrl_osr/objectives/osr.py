@@ -23,7 +23,7 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 
 from torchrl_osr import functional
 from torchrl_osr._checks import check_literals, check_positive, check_weight
-from torchrl_osr.objectives import critic_kernel
+from torchrl_osr.fast import critics
 from torchrl_osr.objectives.base import BaseLoss, Terms, TransitionKeys
 from torchrl_osr.objectives.distributions import check_num_actions
 from torchrl_osr.objectives.mixed_states import States
@@ -358,9 +358,9 @@ class OSRLoss(BaseLoss):
         action, log_prob = self._proposals(step)
         state, params = step.states[0], self.qvalue_network_params
         # The one place where a kernel replaces a function of the same value.
-        mlp = critic_kernel.applicable(self, state, action)
+        mlp = critics.applicable(self, state, action)
         if self.chunk_size is not None and mlp is not None:
-            soft_maximum = critic_kernel.soft_maximum(
+            soft_maximum = critics.soft_maximum(
                 params,
                 mlp,
                 critic_state(self, state),

@@ -24,7 +24,7 @@ from torchrl.objectives.value import TD0Estimator
 
 from torchrl_osr import functional
 from torchrl_osr._entries import column, entry, nested, select, state_keys
-from torchrl_osr.objectives import critic_kernel
+from torchrl_osr.fast import critics
 from torchrl_osr.objectives.base import BaseLoss
 from torchrl_osr.objectives.distributions import check_action
 from torchrl_osr.objectives.mixed_states import (
@@ -135,9 +135,9 @@ def qvalue(
 ) -> Tensor:
     """The values of all critics, ``[N, B]``, of actions ``[B, A]`` at states."""
     keys, network = loss.tensor_keys, loss.qvalue_network
-    mlp = critic_kernel.plain_mlp(network, keys.action, keys.state_action_value)
+    mlp = critics.plain_mlp(network, keys.action, keys.state_action_value)
     if mlp is not None:
-        return critic_kernel.qvalue(params, mlp, critic_state(loss, states), action)
+        return critics.qvalue(params, mlp, critic_state(loss, states), action)
     batch = critic_inputs(loss, states).set(keys.action, action)
     return critic_output(loss, batch, params, keys.state_action_value).squeeze(-1)
 

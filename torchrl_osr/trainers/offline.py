@@ -28,6 +28,7 @@ from torchrl.trainers import OptimizationStepper, Trainer
 
 from torchrl_osr._checks import check_choice, check_positive
 from torchrl_osr._files import finite_or_none
+from torchrl_osr.fast.traced_update import LossGradients
 from torchrl_osr.trainers.checkpoints import Checkpoints, GeneratorState
 from torchrl_osr.trainers.csv_rows import cut_back
 from torchrl_osr.trainers.cudagraph import captured, check_capturable
@@ -40,7 +41,6 @@ from torchrl_osr.trainers.interruption import (
 )
 from torchrl_osr.trainers.nonfinite import NonfiniteCheck
 from torchrl_osr.trainers.progress import Progress
-from torchrl_osr.trainers.recording import LossGradients
 
 log = logging.getLogger(__name__)
 

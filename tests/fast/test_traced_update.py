@@ -9,6 +9,7 @@ import torch
 from torchrl.objectives import SoftUpdate
 
 from torchrl_osr import InverseDynamicsLoss, OSRLoss, OSRVLoss, StateRecoveryLoss
+from torchrl_osr.fast.traced_update import LossGradients
 from torchrl_osr.lab.losses import (
     BCLoss,
     EDACLoss,
@@ -26,7 +27,6 @@ from torchrl_osr.modules import (
     tanh_gaussian_inverse_dynamics,
 )
 from torchrl_osr.objectives.with_recovery import WithRecovery
-from torchrl_osr.trainers.recording import LossGradients
 
 SIZES = (3, 2)
 CELLS = {"num_cells": [8, 8]}
