@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[1]
 PRESETS = ("quick", "paper")
 # What everybody changes; the rest follows by group.
 COMMON = (
-    *("env.id", "data.quality", "seed", "resume", "trainer.steps"),
+    *("env.id", "data.source", "seed", "resume", "trainer.steps"),
     *("loss.recovery_weight", "perturbation.std", "optim.actor_lr", "optim.qvalue_lr"),
     "trainer.device",
 )

@@ -144,7 +144,7 @@ def main(arguments: Sequence[str]) -> None:
     options.output.mkdir(parents=True, exist_ok=True)
     record = {
         "env": run.config.env.name,
-        "data": run.config.data.quality,
+        "data": run.config.data.source,
         "loss": type(run.loss).__name__,
         "step": run.step,
         "min_q_weight": float(run.loss.min_q_weight),

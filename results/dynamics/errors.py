@@ -30,7 +30,7 @@ def new_episodes(folder: Path):
     """Transitions ``[N]`` that the run has not seen, as its model reads them."""
     cfg = read_run(folder / CONFIG)
     data, _ = load_dataset(
-        cfg.env.name, cfg.data.quality, num_transitions=ROWS, seed=SEED, progress=False
+        cfg.env.name, cfg.data.source, num_transitions=ROWS, seed=SEED, progress=False
     )
     _, record = read_tensors(folder / FILE)
     loc, scale = (
@@ -50,7 +50,7 @@ def main(folders: list[str]) -> None:
         pieces = consecutive_rows(data, torch.arange(0, ROWS, EVERY), LENGTH)
         found.append(
             {
-                "data": f"{cfg.env.name}-{cfg.data.quality}",
+                "data": f"{cfg.env.name}-{cfg.data.source}",
                 "rows": cfg.data.num_transitions,
                 "seed": cfg.seed,
                 "held_out": json.loads((folder / REPORT).read_text()),

@@ -39,7 +39,7 @@ def main() -> None:
     states, world = load_recoverable_states(env.name), World(env.name)
     ends = termination(env.id)
     torch.manual_seed(0)
-    print(f"{env.name} {trained.config.data.quality}, seed {trained.config.seed}")
+    print(f"{env.name} {trained.config.data.source}, seed {trained.config.seed}")
 
     def imagined(state: Tensor, factor: float) -> Tensor:
         """Share of the roll-outs from each state that stand, ``[M]``."""

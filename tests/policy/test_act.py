@@ -80,7 +80,7 @@ def test_a_run_acts_as_in_its_evaluation(tmp_path, loss):
     source = policy.record["source"]
     assert source["step"] == 900
     assert source["env_id"] == "Hopper-v5"
-    assert source["data"]["quality"] == "medium-replay"
+    assert source["data"]["source"] == "medium-replay"
     best = load_run_policy(folder / "checkpoint/policy/best.torchrl")
     assert best.record["source"]["step"] == 10
 

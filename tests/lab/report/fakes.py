@@ -25,7 +25,7 @@ LOSSES = {
 }
 CONFIG = {
     "env": {"name": "hopper", "id": "Hopper-v5"},
-    "data": {"quality": "medium-replay", "num_transitions": 1000, "random_share": 0.0,
+    "data": {"source": "medium-replay", "num_transitions": 1000, "random_share": 0.0,
              "path": None},
     "network": {"layer_norm": True},
     "perturbation": {"std": 0.001, "noise": "gaussian"},
@@ -67,7 +67,7 @@ def write_run(
     folder.mkdir(parents=True, exist_ok=True)
     config = OmegaConf.create(copy.deepcopy(CONFIG))
     config.env = {"name": env, "id": IDS[env]}
-    config.data.quality, config.seed = quality, seed
+    config.data.source, config.seed = quality, seed
     config.loss.update(loss or {})
     config.trainer.steps = max(scores, default=8000)
     for key, value in (changes or {}).items():

@@ -455,8 +455,8 @@ def test_defaults_are_said(caplog) -> None:
 
 def test_settings_of_other_data_or_of_another_task_are_refused() -> None:
     choices = {"loss": "osr", "env": "hopper", "data": "random", "preset": "quick"}
-    with pytest.raises(ValueError, match="data.quality=expert .* give data=expert"):
-        check_published(small("data.quality=expert"), choices)
+    with pytest.raises(ValueError, match="data.source=expert .* give data=expert"):
+        check_published(small("data.source=expert"), choices)
     choices["data"], cheetah = "medium-expert", "env.id=HalfCheetah-v5"
     with pytest.raises(ValueError, match="for hopper medium-expert.*env=halfcheetah"):
         check_published(small("data=medium-expert", cheetah), choices)

@@ -13,7 +13,7 @@ from torchrl_osr.lab.run.run_config import check_run, flatten
 SIZES = 11, 3
 
 # Any text will do, or what it has to be is known when the data are read.
-FREE_WORDS = ("env", "data.quality", "data.path", "logger.project", "resume", "trust")
+FREE_WORDS = ("env", "data.source", "data.path", "logger.project", "resume", "trust")
 
 
 @pytest.fixture(scope="module")

@@ -63,7 +63,7 @@ def main(cfg: DictConfig) -> None:
     read = ("columns", "action_bounds", "clip_actions", "download")
     reading = {name: options[name] for name in read}
     recipe = {name: options[name] for name in ("num_transitions", "seed")}
-    quality, path = cfg.data.quality, cfg.data.path
+    quality, path = cfg.data.source, cfg.data.path
     title = Path(path).name if path else f"{env_name or 'data'} {quality}"
     entries: list[Entry] = []
     try:

@@ -395,7 +395,7 @@ def evaluate(
             write_json(partial, checksummed(request | {"evaluations": evaluations}))
     return {
         "env": run.env.name,
-        "data": run.data.quality,
+        "data": run.data.source,
         "threshold": distance.threshold,
         "left_out": left_out,
         "evaluations": evaluations,

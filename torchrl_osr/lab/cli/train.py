@@ -144,7 +144,7 @@ def prepare_machine(
     """Say what is trained where, and set torch's threads; device and autocast type."""
     torchrl_logger.setLevel("WARNING")
     versions = ", ".join(f"{name} {each}" for name, each in code_versions().items())
-    log.info(f"{cfg.env.name} {cfg.data.quality}, seed {cfg.seed}, in {folder}")
+    log.info(f"{cfg.env.name} {cfg.data.source}, seed {cfg.seed}, in {folder}")
     log.info(versions)
     torch.set_num_threads(cfg.trainer.num_threads)
     torch.set_float32_matmul_precision(cfg.trainer.matmul_precision)
@@ -165,14 +165,14 @@ def code_versions() -> dict[str, str]:
 def about(cfg: DictConfig, folder: Path) -> dict[str, Any]:
     """What W&B shall know of the run: name, group of its seeds, tags, configuration."""
     began = read_yaml(folder / ".hydra" / "hydra.yaml")["hydra"]
-    data = f"{cfg.env.name}-{cfg.data.quality}"
+    data = f"{cfg.env.name}-{cfg.data.source}"
     method = schema.method_name(began["runtime"]["choices"])
     sweep = [folder.parent.name] if began["mode"] == "MULTIRUN" else []
     settings: Any = OmegaConf.to_container(cfg, resolve=True)
     return {
         "name": f"{data} {method} seed{cfg.seed}",
         "group": f"{data} {method}",
-        "tags": [cfg.env.name, cfg.data.quality, method, *sweep],
+        "tags": [cfg.env.name, cfg.data.source, method, *sweep],
         "config": settings | {"versions": code_versions()},
     }
 
@@ -196,7 +196,7 @@ def report(
         rows = {"last": history[-1], "best": best}
     results = {"versions": code_versions(), f"data_{measure}": data_mean, **rows}
     write_json(folder / "returns.json", results | {"evaluations": history})
-    name = f"{cfg.env.name} {cfg.data.quality}"
+    name = f"{cfg.env.name} {cfg.data.source}"
     parts = [each for each in (cfg.loss, cfg.recovery) if each is not None]
     method = " and ".join(each._target_.rpartition(".")[2] for each in parts)
     learning_curve(

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from torchrl_osr.lab.report.runs import QUALITY, LeftOut, read_each
+from torchrl_osr.lab.report.runs import SOURCE, LeftOut, read_each
 from torchrl_osr.lab.report.scores import counted
 from torchrl_osr.lab.run.run_folder import MAY_DIFFER
 
@@ -30,7 +30,7 @@ IGNORED = (
 )
 """Settings that decide how a number is computed, not which."""
 
-IDENTITY = ("seed", "env.", QUALITY, "data.random_share", "data.path")
+IDENTITY = ("seed", "env.", SOURCE, "data.random_share", "data.path")
 """Settings that the report sorts runs by."""
 
 METHOD = (

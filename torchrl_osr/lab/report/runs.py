@@ -27,8 +27,8 @@ from torchrl_osr.lab.run.run_config import flatten, read_yaml
 from torchrl_osr.lab.run.run_folder import CONFIG, read_status
 from torchrl_osr.lab.run.schema import method_name
 
-QUALITY = "data.quality"
-"""Setting that names the quality of the data set."""
+SOURCE = "data.source"
+"""Setting that names the source of the data set."""
 
 ROBUSTNESS_FORMAT = 1
 MAX_TABLE_BYTES = 4 * MAX_JSON_BYTES
@@ -263,7 +263,7 @@ def parse_run(record: Mapping[str, Any]) -> Run:
     facts = {
         "folder": str(record["folder"]),
         "method": str(record["method"]),
-        "data": f"{env} {config[QUALITY]}{f' {path}' if path else ''}"
+        "data": f"{env} {config[SOURCE]}{f' {path}' if path else ''}"
         + (f", {100 * share:g} % random" if share else ""),
         "seed": int(config["seed"]),
         "steps": int(steps),

@@ -85,7 +85,7 @@ def load_data(
     options: Any = OmegaConf.to_container(cfg.data)
     return load_dataset(
         cfg.env.name,
-        cfg.data.quality,
+        cfg.data.source,
         env_id=cfg.env.id,
         references=references_of(cfg),
         path=cfg.data.path,

@@ -88,7 +88,7 @@ def dynamics_model(
     elif not here.exists():
         everything = {"data": fits, "settings": settings}
         text = json.dumps(everything, sort_keys=True).encode()
-        name = f"{cfg.env.name}-{cfg.data.quality}-{hashlib.sha256(text).hexdigest()}"
+        name = f"{cfg.env.name}-{cfg.data.source}-{hashlib.sha256(text).hexdigest()}"
         cached = cache_root() / "dynamics" / f"{name[:-48]}.safetensors"
         cached.parent.mkdir(parents=True, exist_ok=True)
         # Other runs that need the same model wait for it.

@@ -45,25 +45,25 @@ def check_published(cfg: DictConfig, choices: Mapping[str, str]) -> None:
     Raises:
         ValueError: if settings of another task or of other data would be taken.
     """
-    if cfg.data.quality != choices["data"]:
+    if cfg.data.source != choices["data"]:
         raise ValueError(
-            f"settings go by the group data={choices['data']}, and data.quality="
-            f"{cfg.data.quality} is another: give data={cfg.data.quality}."
+            f"settings go by the group data={choices['data']}, and data.source="
+            f"{cfg.data.source} is another: give data={cfg.data.source}."
         )
     task = f"{choices['env']}-{choices['data']}"
     own = Path(CONF) / "preset" / "for_data" / f"{choices['preset']}-{task}.yaml"
     if own.exists() and cfg.env.name != choices["env"]:
         raise ValueError(
             f"preset={choices['preset']} would take its settings for {choices['env']} "
-            f"{cfg.data.quality}, but env.id={cfg.env.id} is {cfg.env.name}: give "
+            f"{cfg.data.source}, but env.id={cfg.env.id} is {cfg.env.name}: give "
             f"env={cfg.env.name}."
         )
-    loss, name = choices["loss"], f"{cfg.env.name}-{cfg.data.quality}"
+    loss, name = choices["loss"], f"{cfg.env.name}-{cfg.data.source}"
     table = published_settings().get(loss)
     if table and task not in table:
         log.warning(
             f"There are no published settings of loss={loss} for {cfg.env.name} "
-            f"{cfg.data.quality}: its defaults are taken. {FOLDER / loss}.yaml has "
+            f"{cfg.data.source}: its defaults are taken. {FOLDER / loss}.yaml has "
             "some."
         )
     elif table and cfg.env.name != choices["env"]:

@@ -80,7 +80,7 @@ def play_states(
         advance()
     return {
         "env": run.env.name,
-        "data": run.data.quality,
+        "data": run.data.source,
         "half": half,
         "group": states.group.tolist(),
         "disturbance": states.disturbance,

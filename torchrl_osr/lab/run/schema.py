@@ -91,7 +91,7 @@ class DataConfig:
     """Which data set: rolled out from the packaged behaviour policies, or recorded.
 
     Attributes:
-        quality: of the behaviour: random, medium, medium-replay, medium-expert or
+        source: of the behaviour: random, medium, medium-replay, medium-expert or
             expert; diverse or play in a maze; minari, d4rl or file for recorded data.
         path: recorded data to read, see docs/your_data.md.
         columns: what the columns of a file are called.
@@ -112,7 +112,7 @@ class DataConfig:
         reward_shift: added to these rewards; evaluation has the task's own.
     """
 
-    quality: str = MISSING
+    source: str = MISSING
     path: str | None = None
     columns: ColumnsConfig = field(default_factory=ColumnsConfig)
     action_bounds: Any = None

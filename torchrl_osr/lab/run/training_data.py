@@ -116,7 +116,7 @@ def load_training_data(
         except ValueError as error:
             raise ValueError(
                 f"{cfg.loss._target_} reads the data's next action, and "
-                f"data={cfg.data.quality} with data.path={cfg.data.path} and "
+                f"data={cfg.data.source} with data.path={cfg.data.path} and "
                 f"data.random_share={cfg.data.random_share} does not tell it: {error}"
             ) from error
     loc, scale = observation_statistics(data) if cfg.data.standardize else (0.0, 1.0)
