@@ -20,10 +20,10 @@ from torchrl.modules import ProbabilisticActor, TanhDelta
 from torchrl_osr.lab.cli import evaluate as example
 from torchrl_osr.lab.data import make_environment
 from torchrl_osr.lab.dynamics import DynamicsEnsemble
+from torchrl_osr.lab.dynamics.training import FILE, write_dynamics
 from torchrl_osr.lab.evaluation import check_disturbances, deterministic_policy
 from torchrl_osr.lab.evaluation.recoverable import load_recoverable_states, recovers
 from torchrl_osr.lab.report import read_runs
-from torchrl_osr.lab.run.dynamics import FILE, write_dynamics
 from torchrl_osr.lab.run.recoverable import states_for
 from torchrl_osr.lab.run.suite import make_disturbances
 from torchrl_osr.lab.run.switching import load_switching_policy

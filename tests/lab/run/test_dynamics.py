@@ -16,19 +16,19 @@ from tensordict import TensorDict
 
 from torchrl_osr.lab.cli import train
 from torchrl_osr.lab.data.store.cache import cache_root
-from torchrl_osr.lab.dynamics import turned
-from torchrl_osr.lab.run import run_folder
-from torchrl_osr.lab.run.build import check_parts, make_dynamics, make_learner
-from torchrl_osr.lab.run.dynamics import (
+from torchrl_osr.lab.dynamics import ImaginedReplayBuffer, turned
+from torchrl_osr.lab.dynamics.training import (
     FILE,
+    Phase,
     dynamics_model,
-    facts_of,
     imagined_replay_buffer,
     load_dynamics,
 )
+from torchrl_osr.lab.run import run_folder
+from torchrl_osr.lab.run.build import check_parts, dynamics_options, make_learner
 from torchrl_osr.lab.run.published import check_published
 from torchrl_osr.lab.run.trained_run import load_trained
-from torchrl_osr.lab.run.training_data import load_training_data
+from torchrl_osr.lab.run.training_data import load_training_data, model_data
 from torchrl_osr.policy.tensor_file import read_tensors, write_tensors
 from torchrl_osr.trainers import OfflineTrainer
 
@@ -57,6 +57,14 @@ pytestmark = pytest.mark.usefixtures("own_cache")
 
 def small(*overrides: str):
     return composed("train", *TINY, *overrides)
+
+
+def buffer_of(cfg, data, model, actor) -> ImaginedReplayBuffer:
+    return imagined_replay_buffer(
+        dynamics_options(cfg), model_data(cfg, data), model, actor, lambda batch: batch,
+        batch_size=cfg.trainer.batch_size, gamma=cfg.optim.gamma,
+        n_steps=cfg.optim.n_steps, seed=cfg.seed,
+    )  # fmt: skip
 
 
 def trained_model(folder: Path) -> dict[str, torch.Tensor]:
@@ -145,10 +153,10 @@ def test_rollouts_begin_in_states_of_the_data_or_beside_them(finished, steps) ->
     cfg = small(f"dynamics.disturbed_steps={steps}", "dynamics.unknown=refuse")
     data, model = load_training_data(cfg, CPU), load_dynamics(finished / FILE)
     actor = make_learner(cfg, 11, 3).actor
-    buffer = imagined_replay_buffer(cfg, data, model, actor, lambda batch: batch)
+    buffer = buffer_of(cfg, data, model, actor)
     buffer.sample()
     starts = buffer.imagined["observation"][:15]
-    known = data.rows(torch.arange(540))["observation"]
+    known = data.buffer.storage.get(torch.arange(540))["observation"]
     there = (starts.unsqueeze(1) == known).all(-1).any(1)
     assert not there.any() if steps else there.all()
 
@@ -158,7 +166,7 @@ def test_the_policys_own_actions_are_marked_and_may_have_noise(finished, noise) 
     cfg = small("loss=td3_bc", "dynamics.use=true", f"dynamics.action_noise={noise}")
     data, model = load_training_data(cfg, CPU), load_dynamics(finished / FILE)
     actor = make_learner(cfg, 11, 3).actor
-    buffer = imagined_replay_buffer(cfg, data, model, actor, lambda batch: batch)
+    buffer = buffer_of(cfg, data, model, actor)
     batch = buffer.sample()
     rows = batch[batch["imagined"].squeeze(-1)]
     assert len(rows) == round((1 - cfg.dynamics.real_ratio) * len(batch))
@@ -182,8 +190,8 @@ def test_the_task_ends_where_the_model_knows_less_than_it_should(shift) -> None:
     )
     data = load_training_data(cfg, CPU)
     torch.manual_seed(0)
-    model, actor = make_dynamics(cfg, 11, 3), make_learner(cfg, 11, 3).actor
-    buffer = imagined_replay_buffer(cfg, data, model, actor, lambda batch: batch)
+    model, actor = dynamics_options(cfg).ensemble(11, 3), make_learner(cfg, 11, 3).actor
+    buffer = buffer_of(cfg, data, model, actor)
     buffer.sample()
     first = buffer.imagined[: cfg.dynamics.rollout_starts]["next"]
     ended = first["terminated"].squeeze(-1)
@@ -195,15 +203,15 @@ def test_the_task_ends_where_the_model_knows_less_than_it_should(shift) -> None:
 
 
 def test_the_task_ends_forward_alone_and_with_a_discount() -> None:
-    with pytest.raises(ValueError, match="unknown=halt ends the task"):
+    with pytest.raises(ValueError, match="unknown=halt needs a forward"):
         check_parts(small("loss=romi", "dynamics.unknown=halt"), 11, 3)
-    with pytest.raises(ValueError, match="no answer for optim.gamma=1"):
+    with pytest.raises(ValueError, match="gamma below 1"):
         check_parts(small("dynamics.unknown=halt", "optim.gamma=1"), 11, 3)
 
 
 def test_disturbed_steps_are_forward() -> None:
     cfg = small("loss=romi", "dynamics.disturbed_steps=3")
-    with pytest.raises(ValueError, match="disturbed_steps=3 are steps forward"):
+    with pytest.raises(ValueError, match="disturbed_steps=3 needs a forward"):
         check_parts(cfg, 11, 3)
 
 
@@ -219,11 +227,14 @@ def test_rows_that_lead_into_the_data_are_imagined_backwards(tmp_path) -> None:
     cfg = small("loss=romi")
     data, model = load_training_data(cfg, CPU), load_dynamics(folder / FILE)
     actor = make_learner(cfg, 11, 3).actor
-    buffer = imagined_replay_buffer(cfg, data, model, actor, lambda batch: batch)
+    buffer = buffer_of(cfg, data, model, actor)
     buffer.sample()
     rows = buffer.imagined
     # The first generation's first rows, with any action, end in states of the data.
-    ends, known = rows["next", "observation"][:20], data.rows(torch.arange(540))
+    ends, known = (
+        rows["next", "observation"][:20],
+        data.buffer.storage.get(torch.arange(540)),
+    )
     same = (ends.unsqueeze(1) == known["observation"]).all(-1)
     assert same.any(1).all()
     assert rows["action"].abs().max() <= 1
@@ -246,8 +257,13 @@ def modelled(folder: Path, *overrides: str) -> list[OfflineTrainer]:
         trainers.append(OfflineTrainer(*arguments, progress=False, **options))
         return trainers[0]
 
-    data = load_training_data(cfg, CPU)
-    dynamics_model(cfg, data, folder, new_trainer, torch.optim.Adam)
+    data = model_data(cfg, load_training_data(cfg, CPU))
+    phase = Phase(folder, new_trainer, torch.optim.Adam, cfg.seed)
+    names = "device", "precision", "matmul_precision", "compile"
+    arithmetic = {name: cfg.trainer[name] for name in names}
+    dynamics_model(
+        dynamics_options(cfg), data, phase, name="hopper-random", arithmetic=arithmetic
+    )
     return trainers
 
 
@@ -328,16 +344,14 @@ def test_a_file_that_makes_no_model_is_refused(
 
 def test_from_disk_the_same_model_is_trained(finished) -> None:
     here, there = (
-        load_training_data(small(f"data.storage={storage}"), CPU)
-        for storage in ("memory", "disk")
+        model_data(cfg, load_training_data(cfg, CPU))
+        for cfg in (small(f"data.storage={each}") for each in ("memory", "disk"))
     )
     torch.testing.assert_close(here.pieces, there.pieces)
-    for data in (here, there):
-        data.buffer.sample()  # which has a generator of its own
     around = here.reverse(), there.reverse()
     samples = []
     for data in (here, there, *around):
-        rows = data.alone(8)
+        rows = data.buffer(8)
         rows.set_rng(
             torch.Generator().manual_seed(0)
         )  # of the storage, which is shared
@@ -351,9 +365,8 @@ def test_from_disk_the_same_model_is_trained(finished) -> None:
         step, other = around[0].pieces[0, 0], here.pieces[0, -1]
         torch.testing.assert_close(turned(step)[key], other[key])
     numbers = torch.tensor([3, 500, 7])
-    torch.testing.assert_close(here.rows(numbers), there.rows(numbers))
-    facts = [facts_of(small(), data) for data in (here, there)]
-    assert facts[0]["rows"] == facts[1]["rows"] == 540
+    torch.testing.assert_close(here.storage.get(numbers), there.storage.get(numbers))
+    assert here.facts()["rows"] == there.facts()["rows"] == 540
 
 
 def test_penalty_and_units_are_those_of_the_task(finished, tmp_path) -> None:
@@ -365,7 +378,7 @@ def test_penalty_and_units_are_those_of_the_task(finished, tmp_path) -> None:
         torch.manual_seed(0)
         actor = make_learner(cfg, 11, 3).actor
         model = load_dynamics(finished / "dynamics.safetensors")
-        buffer = imagined_replay_buffer(cfg, data, model, actor, lambda batch: batch)
+        buffer = buffer_of(cfg, data, model, actor)
         buffer.set_rng(torch.Generator().manual_seed(0))
         buffer.sample()
         found[penalty] = buffer.imagined

@@ -10,7 +10,7 @@ import torch
 from untrained_run import make_run
 
 from torchrl_osr.lab.dynamics import DynamicsEnsemble
-from torchrl_osr.lab.run.dynamics import FILE, load_dynamics, write_dynamics
+from torchrl_osr.lab.dynamics.training import FILE, load_dynamics, write_dynamics
 from torchrl_osr.lab.run.policy_of_run import load_run_policy
 from torchrl_osr.lab.run.switching import load_switching_policy
 

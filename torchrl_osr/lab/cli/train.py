@@ -32,6 +32,8 @@ from torchrl_osr._files import write_json
 from torchrl_osr.lab.cli import CONF
 from torchrl_osr.lab.cli.console import single_job
 from torchrl_osr.lab.data import environment_spec
+from torchrl_osr.lab.dynamics.training import FILE as DYNAMICS
+from torchrl_osr.lab.dynamics.training import load_dynamics
 from torchrl_osr.lab.evaluation import (
     learning_curve,
     read_scalars,
@@ -44,8 +46,6 @@ from torchrl_osr.lab.run.build import (
     read_environment,
     references_of,
 )
-from torchrl_osr.lab.run.dynamics import FILE as DYNAMICS
-from torchrl_osr.lab.run.dynamics import load_dynamics
 from torchrl_osr.lab.run.loggers import log_outcome, make_loggers
 from torchrl_osr.lab.run.phases import (
     train_dynamics,
@@ -129,7 +129,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
     imagined = adversary = None
     if cfg.dynamics.use:
         imagined, adversary = train_dynamics(
-            cfg, folder, data, learner, perturbation, sizes, new_trainer
+            cfg, folder, data, learner, perturbation, new_trainer
         )
     trainer = train_policy(
         cfg, folder, data, learner, imagined, adversary, new_trainer,

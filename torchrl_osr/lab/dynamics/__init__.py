@@ -18,6 +18,7 @@ from torchrl_osr.lab.dynamics.dynamics_loss import DynamicsLoss
 from torchrl_osr.lab.dynamics.elite_networks import EliteNetworks
 from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
 from torchrl_osr.lab.dynamics.model_adversary import ModelAdversary
+from torchrl_osr.lab.dynamics.options import DynamicsOptions
 from torchrl_osr.lab.dynamics.rollout import (
     Expected,
     Imagined,
@@ -37,6 +38,7 @@ __all__ = [
     "ConditionalVAELoss",
     "DynamicsEnsemble",
     "DynamicsLoss",
+    "DynamicsOptions",
     "EliteNetworks",
     "Expected",
     "Imagined",

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, TensorDictParams
 
 from torchrl_osr._checks import check_weight
 from torchrl_osr._entries import nested
@@ -70,6 +70,10 @@ class DynamicsLoss(BaseLoss):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
+
+    dynamics_network: DynamicsEnsemble
+    dynamics_network_params: TensorDictParams
+    target_dynamics_network_params: TensorDictParams
 
     def __init__(
         self,

@@ -21,7 +21,7 @@ from torchrl.data import ReplayBuffer
 
 from torchrl_osr._checks import check_positive, check_weight
 from torchrl_osr._entries import entry
-from torchrl_osr.lab.dynamics import DynamicsLoss
+from torchrl_osr.lab.dynamics.dynamics_loss import DynamicsLoss
 from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
 from torchrl_osr.lab.dynamics.equations import adversarial_objective
 from torchrl_osr.lab.dynamics.termination import Termination, never

@@ -4,16 +4,10 @@
 * :func:`evaluate_paired` plays them with and without a :class:`Disturbance`;
   :func:`summarize_disturbances` has the score lost, survival and time to recovery.
 * :class:`DataDistance` measures how far a state is from the data.
-* :func:`inverse_dynamics_report` judges an inverse dynamics model,
-  :func:`dynamics_report` a model of the dynamics.
+* :func:`inverse_dynamics_report` judges an inverse dynamics model.
 """
 
 from torchrl_osr.lab.evaluation.data_distance import DataDistance
-from torchrl_osr.lab.evaluation.dynamics_fit import (
-    describe_dynamics,
-    dynamics_report,
-    rollout_errors,
-)
 from torchrl_osr.lab.evaluation.episodes import (
     EpisodeEvaluator,
     EpisodeResults,
@@ -89,12 +83,10 @@ __all__ = [
     "Wrap",
     "check_disturbances",
     "decrease_interval",
-    "describe_dynamics",
     "describe_inverse_dynamics",
     "deterministic_policy",
     "distance_curves",
     "disturbed_at",
-    "dynamics_report",
     "evaluate_paired",
     "evaluation_json",
     "impossible_disturbances",
@@ -110,7 +102,6 @@ __all__ = [
     "read_scalars",
     "robustness_figure",
     "robustness_table",
-    "rollout_errors",
     "score_table",
     "stratified_resamples",
     "summarize",

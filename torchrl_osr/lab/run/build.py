@@ -15,14 +15,7 @@ from torchrl.objectives import LossModule
 
 from torchrl_osr._checks import check_choice
 from torchrl_osr.lab.data import ReferenceReturns, reference_returns
-from torchrl_osr.lab.dynamics import (
-    ConditionalVAE,
-    DynamicsEnsemble,
-    Termination,
-    never,
-    termination,
-)
-from torchrl_osr.lab.dynamics.rollout_buffer import check_real_ratio
+from torchrl_osr.lab.dynamics import DynamicsOptions
 from torchrl_osr.lab.losses import IQLLoss
 from torchrl_osr.lab.run.limits import check_networks
 from torchrl_osr.modules import state_value
@@ -117,53 +110,10 @@ def check_storage(cfg: DictConfig) -> str:
     return storage
 
 
-def make_dynamics(
-    cfg: DictConfig, observation_size: int, action_size: int
-) -> DynamicsEnsemble:
-    """An untrained model as ``dynamics`` of a configuration has it."""
-    return DynamicsEnsemble(
-        observation_size,
-        action_size,
-        num_networks=cfg.dynamics.num_networks,
-        num_elites=cfg.dynamics.num_elites,
-        num_cells=list(cfg.dynamics.num_cells),
-    )
-
-
-def termination_of(cfg: DictConfig) -> Termination:
-    """The rule by which imagined episodes end.
-
-    Raises:
-        ValueError: none is known for the task, and ``dynamics.terminations`` is not
-            ``never``.
-    """
-    return never if cfg.dynamics.terminations == "never" else termination(cfg.env.id)
-
-
-def make_transition_vae(cfg: DictConfig, observation_size: int) -> ConditionalVAE:
-    """An untrained model of the states that follow a state in the data."""
-    return ConditionalVAE(
-        observation_size,
-        observation_size,
-        condition_key="observation",
-        target_key=("next", "observation"),
-        change=True,
-        num_cells=list(cfg.dynamics.vae_num_cells),
-    )
-
-
-def make_reverse_vae(
-    cfg: DictConfig, observation_size: int, action_size: int
-) -> ConditionalVAE:
-    """An untrained model of the actions that led to a state of the data."""
-    return ConditionalVAE(
-        observation_size,
-        action_size,
-        condition_key=("next", "observation"),
-        target_key="action",
-        latent_bound=0.5,
-        num_cells=list(cfg.dynamics.vae_num_cells),
-    )
+def dynamics_options(cfg: DictConfig) -> DynamicsOptions:
+    """Return ``dynamics`` of a configuration."""
+    options: Any = OmegaConf.to_container(cfg.dynamics, resolve=True)
+    return DynamicsOptions(**options)
 
 
 class Learner(NamedTuple):
@@ -220,9 +170,10 @@ def make_learner(
     def built(part: DictConfig) -> LossModule:
         wanted = inspect.signature(get_class(part._target_)).parameters
         if "dynamics_network" in wanted:
-            networks["dynamics_network"] = make_dynamics(cfg, *sizes).to(device)
+            ensemble = dynamics_options(cfg).ensemble(*sizes)
+            networks["dynamics_network"] = ensemble.to(device)
         if "transition_network" in wanted:
-            vae = make_transition_vae(cfg, observation_size)
+            vae = dynamics_options(cfg).transition_vae(observation_size)
             networks["transition_network"] = vae.to(device)
         if "value_network" in wanted:
             networks["value_network"] = state_value(
@@ -346,26 +297,10 @@ def check_parts(
     if cfg.dynamics.use and cfg.dynamics.adversarial_steps:
         _check_model_adversary(cfg, learner.loss)
     if cfg.dynamics.use:
-        make_dynamics(cfg, *sizes)
+        dynamics_options(cfg).check(
+            cfg.env.id, batch_size=cfg.trainer.batch_size, gamma=cfg.optim.gamma
+        )
     if cfg.dynamics.use and cfg.dynamics.real_ratio < 1:
-        termination_of(cfg)
-        check_real_ratio(cfg.dynamics.real_ratio, cfg.trainer.batch_size)
-        if cfg.dynamics.disturbed_steps and cfg.dynamics.reverse_policy:
-            raise ValueError(
-                f"dynamics.disturbed_steps={cfg.dynamics.disturbed_steps} are steps "
-                "forward, and the model goes backward: take dynamics=ensemble, or set "
-                "it to 0."
-            )
-        if cfg.dynamics.unknown == "halt" and cfg.dynamics.reverse_policy:
-            raise ValueError(
-                "dynamics.unknown=halt ends the task where nobody knows what follows, "
-                "and the model goes backward: take refuse or take."
-            )
-        if cfg.dynamics.unknown == "halt" and cfg.optim.gamma == 1:
-            raise ValueError(
-                "dynamics.unknown=halt asks what a reward for ever is worth, which has "
-                "no answer for optim.gamma=1: take a smaller one."
-            )
         if isinstance(learner.loss, IQLLoss):
             raise ValueError(
                 f"{cfg.loss._target_} learns from the data's actions alone, and "

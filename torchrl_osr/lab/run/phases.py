@@ -13,7 +13,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from tensordict import TensorDict
 from tensordict.nn import ProbabilisticTensorDictSequential
-from torch.nn import Module, Parameter
+from torch.nn import Parameter
 from torch.optim.lr_scheduler import LambdaLR
 from torchrl.envs import ObservationNorm
 from torchrl.record.loggers import Logger
@@ -22,7 +22,7 @@ from torchrl.trainers import LRSchedulerHook
 from torchrl_osr import StatePerturbation
 from torchrl_osr._files import write_json
 from torchrl_osr.lab.data.store.multi_step import take_multi_step
-from torchrl_osr.lab.dynamics import ImaginedReplayBuffer, ModelAdversary
+from torchrl_osr.lab.dynamics import ImaginedReplayBuffer, ModelAdversary, training
 from torchrl_osr.lab.evaluation import (
     EpisodeEvaluator,
     describe_inverse_dynamics,
@@ -32,19 +32,8 @@ from torchrl_osr.lab.evaluation import (
     summarize,
 )
 from torchrl_osr.lab.run import run_folder
-from torchrl_osr.lab.run.build import (
-    Learner,
-    make_reverse_vae,
-    make_transition_vae,
-    references_of,
-)
-from torchrl_osr.lab.run.conditional_vae import train_vae
-from torchrl_osr.lab.run.dynamics import (
-    dynamics_model,
-    imagined_replay_buffer,
-    model_adversary,
-)
-from torchrl_osr.lab.run.training_data import TrainingData
+from torchrl_osr.lab.run.build import Learner, dynamics_options, references_of
+from torchrl_osr.lab.run.training_data import TrainingData, model_data
 from torchrl_osr.trainers import (
     OfflineTrainer,
     SoftUpdate,
@@ -130,47 +119,23 @@ def train_dynamics(
     data: TrainingData,
     learner: Learner,
     perturbation: StatePerturbation,
-    sizes: tuple[int, int],
     new_trainer: NewTrainer,
 ) -> tuple[ImaginedReplayBuffer | None, ModelAdversary | None]:
-    """Train a run's models of the dynamics, and give them to its loss.
-
-    Args:
-        cfg: a whole configuration of ``torchrl-osr train``.
-        folder: of the run.
-        data: what it trains on.
-        learner: networks and objective.
-        perturbation: what batches of the data get.
-        sizes: of an observation and an action.
-        new_trainer: of :func:`trainer_maker`.
-
-    Returns:
-        What draws batches that are in part imagined, and what trains the model on
-        against the policy; ``None`` for what the run has not.
-    """
-    actor, _, loss, _ = learner
-    adam, reverse = adam_of(cfg), cfg.dynamics.reverse_policy
-    of_model = data if reverse is None else data.reverse()
-    model = dynamics_model(cfg, of_model, folder, new_trainer, adam)
-    if hasattr(loss, "dynamics_network"):
-        loss.load_network("dynamics_network", model)
-    if hasattr(loss, "transition_network"):
-        vae = make_transition_vae(cfg, sizes[0])
-        train_vae(vae, cfg, data, folder, new_trainer, adam)
-        loss.load_network("transition_network", vae)
-    if cfg.dynamics.real_ratio == 1:
-        return None, None
-    imagining: Module = actor
-    if reverse == "cvae":
-        imagining = make_reverse_vae(cfg, *sizes)
-        train_vae(imagining, cfg, data, folder, new_trainer, adam)
-    adversary = None
-    if cfg.dynamics.adversarial_steps and cfg.dynamics.adversarial_weight:
-        adversary = model_adversary(cfg, data, model, actor, loss, adam)
-    imagined = imagined_replay_buffer(
-        cfg, data, model, imagining, perturbation, adversary
+    """Train a run's models of the dynamics, see ``lab/dynamics/training.py``."""
+    arithmetic = "device", "precision", "matmul_precision", "compile"
+    return training.train_dynamics(
+        dynamics_options(cfg),
+        model_data(cfg, data),
+        learner.loss,
+        learner.actor,
+        training.Phase(folder, new_trainer, adam_of(cfg), cfg.seed),
+        name=f"{cfg.env.name}-{cfg.data.source}",
+        arithmetic={name: cfg.trainer[name] for name in arithmetic},
+        batch_size=cfg.trainer.batch_size,
+        gamma=cfg.optim.gamma,
+        n_steps=cfg.optim.n_steps,
+        transform=perturbation,
     )
-    return imagined, adversary
 
 
 def train_policy(

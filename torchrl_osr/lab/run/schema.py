@@ -22,6 +22,7 @@ from omegaconf import MISSING, OmegaConf
 
 from torchrl_osr import objectives
 from torchrl_osr.lab import losses
+from torchrl_osr.lab.dynamics import DynamicsOptions
 from torchrl_osr.lab.run.published import register_published
 
 # File systems allow 255 bytes, and temporary names beside it need some of them.
@@ -186,80 +187,6 @@ class InverseDynamicsConfig:
 
 
 @dataclass
-class DynamicsConfig:
-    """A model of the dynamics, and what the policy learns from its roll-outs.
-
-    Attributes:
-        use: train a model, and the policy on its roll-outs besides the data.
-        num_networks: networks of the ensemble.
-        num_elites: how many of them are rolled out, the best on held-out rows.
-        num_cells: width of each hidden layer.
-        lr: learning rate of the model.
-        batch_size: rows of a gradient step, for each network.
-        steps: gradient steps of the model; the weights of its best evaluation are
-            taken.
-        vae_num_cells: width of each hidden layer of the conditional autoencoder of
-            loss=sdc or dynamics=reverse.
-        vae_steps: gradient steps of that autoencoder, with lr and batch_size.
-        path: a trained model to take, dynamics.safetensors of a run with the same data;
-            null for one of the same settings in the cache, or a new one.
-        terminations: auto for the rule by which the task ends, never for tasks that a
-            time limit alone ends.
-        reverse_policy: actions with which a reverse model rolls out from the data's
-            states to where they came from: cvae, those of a conditional autoencoder of
-            the data; uniform, random ones; null for no reverse model: the policy rolls
-            out forwards.
-        adversarial_steps: gradient steps, before each further roll-out, by which the
-            model is trained on the data and against the policy; 0 for none.
-        adversarial_weight: of the policy's advantage in that training.
-        adversarial_lr: learning rate of that training.
-        rollout_steps: steps of a roll-out.
-        rollout_starts: states of the data that roll-outs start from, each time.
-        disturbed_steps: roll-outs begin after at most so many random actions in the
-            model; 0 for the data's states themselves.
-        action_noise: of the policy's actions in roll-outs; each row draws its standard
-            deviation between 0 and this. For policies that are deterministic.
-        rollout_interval: gradient steps of the policy between roll-outs.
-        generations: number of newest roll-outs that are trained on.
-        real_ratio: share of real rows in a batch of the policy's; with 1 nothing is
-            imagined.
-        penalty: factor of the model's uncertainty, in the task's own units, that
-            imagined rewards lose.
-        unknown: what becomes of rows on which the elites disagree more than on held-out
-            ones: refuse leaves them out, halt ends the task there, take does nothing.
-        known_share: share of the held-out rows that count as known in that.
-        published: settings by data set or task, where a method has them.
-    """
-
-    use: bool = MISSING
-    num_networks: int = MISSING
-    num_elites: int = MISSING
-    num_cells: list[int] = MISSING
-    lr: float = MISSING
-    batch_size: int = MISSING
-    steps: int = MISSING
-    vae_num_cells: list[int] = MISSING
-    vae_steps: int = MISSING
-    path: str | None = None
-    terminations: str = MISSING
-    reverse_policy: str | None = None
-    adversarial_steps: int = MISSING
-    adversarial_weight: float = MISSING
-    adversarial_lr: float = MISSING
-    rollout_steps: int = MISSING
-    rollout_starts: int = MISSING
-    disturbed_steps: int = MISSING
-    action_noise: float = MISSING
-    rollout_interval: int = MISSING
-    generations: int = MISSING
-    real_ratio: float = MISSING
-    penalty: float = MISSING
-    unknown: str = MISSING
-    known_share: float = MISSING
-    published: dict[str, Any] = field(default_factory=dict)
-
-
-@dataclass
 class OptimConfig:
     """Adam's learning rates and what moves with them.
 
@@ -374,7 +301,7 @@ class TrainConfig:
     inverse_dynamics: InverseDynamicsConfig = field(
         default_factory=InverseDynamicsConfig
     )
-    dynamics: DynamicsConfig = field(default_factory=DynamicsConfig)
+    dynamics: DynamicsOptions = field(default_factory=DynamicsOptions)
     loss: Any = MISSING  # derived from the class that _target_ names
     optim: OptimConfig = field(default_factory=OptimConfig)
     trainer: TrainerConfig = field(default_factory=TrainerConfig)

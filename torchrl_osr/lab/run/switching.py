@@ -11,8 +11,8 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from torchrl_osr.lab.dynamics import EliteNetworks, SwitchingPolicy
-from torchrl_osr.lab.run.build import termination_of
-from torchrl_osr.lab.run.dynamics import FILE, load_dynamics
+from torchrl_osr.lab.dynamics.training import FILE, load_dynamics
+from torchrl_osr.lab.run.build import dynamics_options
 from torchrl_osr.lab.run.policy_of_run import policy_from_run
 from torchrl_osr.lab.run.run_config import read_run
 from torchrl_osr.lab.run.run_folder import CONFIG
@@ -89,7 +89,7 @@ def load_switching_policy(
         [policies[each] for each in paths],
         networks,
         value,
-        terminated=termination_of(configs[0]),
+        terminated=dynamics_options(configs[0]).termination(configs[0].env.id),
         gamma=configs[0].optim.gamma,
         **options,
     )

@@ -15,7 +15,7 @@ import torch
 from omegaconf import DictConfig
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import ImmutableDatasetWriter, ReplayBuffer
+from torchrl.data import ReplayBuffer
 from torchrl.envs import Compose, ObservationNorm, RewardScaling
 
 from torchrl_osr.lab.data import (
@@ -28,14 +28,11 @@ from torchrl_osr.lab.data import (
     split_held_out,
 )
 from torchrl_osr.lab.data.store.multi_step import multi_step
-from torchrl_osr.lab.dynamics import turned
+from torchrl_osr.lab.dynamics.training import ModelData
 from torchrl_osr.lab.run.build import check_storage, load_data, references_of
 
 MAX_HELD_OUT = 50_000
 """Held-out rows of a set on disk that are read into memory, at most."""
-
-ROWS_FOR_STATISTICS = 50_000
-"""Rows from which a model's inputs and targets are standardised."""
 
 NUM_PIECES, PIECE = 500, 20
 """Pieces of trajectories to judge a dynamics model by, at most, and their rows."""
@@ -52,7 +49,6 @@ class TrainingData(NamedTuple):
         mean: score of the behaviour, or return where there are no scores, if known.
         pieces: of trajectories, each from a held-out row on, ``[n, 20]``; the rows that
             follow may be trained on. ``None`` if there is no dynamics model.
-        backwards: whether :meth:`alone`, held-out rows and pieces are turned around.
     """
 
     buffer: ReplayBuffer
@@ -61,32 +57,20 @@ class TrainingData(NamedTuple):
     largest_reward: float
     mean: float | None
     pieces: TensorDict | None
-    backwards: bool = False
 
-    def rows(self, numbers: Tensor) -> TensorDict:
-        """Rows of :attr:`buffer` by their numbers ``[n]``, without its transforms."""
-        rows: TensorDict = self.buffer.storage.get(numbers)
-        return rows
 
-    def alone(self, batch_size: int | None = None) -> ReplayBuffer:
-        """The buffer's rows without what is appended to :attr:`buffer` later on."""
-        alone = ReplayBuffer(
-            storage=self.buffer.storage,
-            writer=ImmutableDatasetWriter(),
-            collate_fn=lambda batch: batch,
-            batch_size=batch_size,
-        )
-        if self.backwards:
-            alone.append_transform(turned)
-        return alone
-
-    def reverse(self) -> TrainingData:
-        """The same transitions against the direction of time, for a reverse model."""
-        return self._replace(
-            held_out=turned(self.held_out),
-            pieces=None if self.pieces is None else turned(self.pieces.flip(1)),
-            backwards=True,
-        )
+def model_data(cfg: DictConfig, data: TrainingData) -> ModelData:
+    """Return a run's data as models of the dynamics learn from them."""
+    return ModelData(
+        data.buffer.storage,
+        data.held_out,
+        data.pieces,
+        data.norm.loc,
+        data.norm.scale,
+        cfg.data.reward_scale,
+        cfg.data.reward_shift,
+        cfg.env.id,
+    )
 
 
 def load_training_data(

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 
 from torchrl_osr.lab.data import consecutive_rows
 from torchrl_osr.lab.dynamics import DynamicsEnsemble
-from torchrl_osr.lab.evaluation import (
+from torchrl_osr.lab.dynamics.fit import (
     describe_dynamics,
     dynamics_report,
     rollout_errors,
