@@ -1,61 +1,63 @@
-"""The updates that ``update_speed.py`` times: ours, TorchRL's CQL, the plain reference.
-
-Each is a generator that does one update and names each part of it when it is done, so
-that one clock outside can tell the parts apart. Losses are computed under bfloat16
-autocast where ``autocast`` says so.
-"""
+"""The updates that ``update_speed.py`` times: ours, TorchRL's CQL, plain PyTorch."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
-from matmul_bound import Pass, Products, count_flops, osr_passes, total_flops
-from plain_reference import Batch, PlainOSR
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import CudaGraphModule
-from torchrl.data import ReplayBuffer
-from torchrl.objectives import LossModule
-from torchrl_cql import cql_loss, cql_update
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.data import Bounded, TensorDictReplayBuffer
+from torchrl.data.replay_buffers.storages import LazyTensorStorage
+from torchrl.envs.utils import ExplorationType
+from torchrl.modules import (
+    MLP,
+    NormalParamExtractor,
+    ProbabilisticActor,
+    TanhNormal,
+    ValueOperator,
+)
+from torchrl.objectives import CQLLoss, LossModule, SoftUpdate, group_optimizers
 
 from torchrl_osr import OSRLoss, OSRVLoss, StatePerturbation
+from torchrl_osr.fast import SoftUpdate as FastSoftUpdate
 from torchrl_osr.fast.traced_update import LossGradients
-from torchrl_osr.lab.data import make_replay_buffer
 from torchrl_osr.modules import (
     critic_ensemble,
     tanh_gaussian_actor,
     tanh_gaussian_inverse_dynamics,
 )
-from torchrl_osr.trainers import SoftUpdate
 
-Update = Callable[[Any], Iterator[str]]
+sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
+from plain_osr import Batch, PlainOSR
+
+Update = Callable[[Any], Any]
 
 GAMMA, TAU, RATE, ROWS = 0.99, 5e-3, 3e-4, 100_000
-OURS = ("OSR", "CQL(H)", "OSR-v", "OSR-10")
-TORCHRL, PLAIN, PRODUCTS, SAMPLING = (
-    "TorchRL CQL",
-    "plain OSR",
-    "products",
-    "sampling",
+PLAIN, TORCHRL, EAGER, COMPILED = (
+    "plain PyTorch, OSR",
+    "TorchRL's CQLLoss",
+    "OSR, eager",
+    "OSR, compiled",
 )
-EAGER = "OSR, not recorded"
-COMPILED, GRAPH, BOTH = "OSR, compiled", "OSR, graph", "OSR, graph and compiled"
-ON_GPU = (COMPILED, GRAPH, BOTH)
-"""Those that take part on a GPU only."""
+CONTENDERS = ("OSR", EAGER, "CQL(H)", "OSR-v", "OSR-10", TORCHRL, PLAIN)
 DIMENSIONS = {"hopper": (11, 3), "walker2d": (17, 6), "halfcheetah": (17, 6)}
 
 
 @dataclass(frozen=True)
 class Size:
-    """A task's dimensions, and the sizes of networks and batches.
+    """Sizes of a task, its networks and its batches.
 
     Attributes:
         observations, actions: of a transition.
-        cells: the hidden layers of all networks.
+        cells: hidden layers of all networks.
         batch: transitions of an update.
-        num_random: ``K``, actions drawn of each kind.
+        num_random: ``K``, sampled actions of each kind.
         layer_norm: whether the critics have layer normalisation.
     """
 
@@ -68,200 +70,156 @@ class Size:
 
     @classmethod
     def parse(cls, name: str) -> Size:
-        """Size of a name such as ``hopper-2x256``, or ``hopper-quick``: that preset."""
+        """Return the size named ``hopper-2x256``, or ``hopper-quick``: the preset."""
         task, _, layers = name.partition("-")
         if layers == "quick":
             return cls(*DIMENSIONS[task], (128, 128), 64, 4, layer_norm=True)
         depth, width = (int(number) for number in layers.split("x"))
         return cls(*DIMENSIONS[task], (width,) * depth)
 
-    @property
-    def sizes(self) -> tuple[int, int, tuple[int, ...]]:
-        """Of an observation, an action and the hidden layers."""
-        return self.observations, self.actions, self.cells
 
-
-def make_buffer(size: Size, device: torch.device) -> ReplayBuffer:
-    """Replay buffer of the package, with random transitions and perturbed states."""
+def make_batches(size: Size, device: torch.device) -> list[TensorDictBase]:
+    """Return eight batches of random transitions with perturbed states."""
     ends = torch.rand(ROWS, 1) < 2e-3
-    next_step = {
-        "observation": torch.randn(ROWS, size.observations),
-        "reward": torch.randn(ROWS, 1),
-        "done": ends,
-        "terminated": ends & (torch.rand(ROWS, 1) < 0.5),
-    }
     data = {
         "observation": torch.randn(ROWS, size.observations),
         "action": torch.rand(ROWS, size.actions) * 1.8 - 0.9,
-        "next": next_step,
+        "next": {
+            "observation": torch.randn(ROWS, size.observations),
+            "reward": torch.randn(ROWS, 1),
+            "done": ends,
+            "terminated": ends & (torch.rand(ROWS, 1) < 0.5),
+        },
     }
-    return make_replay_buffer(
-        TensorDict(data, [ROWS]),
-        batch_size=size.batch,
-        seed=0,
-        transform=StatePerturbation(1e-3, seed=0),
-        device=device,
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(ROWS), batch_size=size.batch
     )
-
-
-def unpack(batch: TensorDictBase) -> Batch:
-    """Batch as the plain reference reads it."""
-    return Batch(
-        state=batch["observation"],
-        action=batch["action"],
-        reward=batch["next", "reward"].squeeze(-1),
-        next_state=batch["next", "observation"],
-        done=batch["next", "done"].squeeze(-1),
-        terminated=batch["next", "terminated"].squeeze(-1),
-        perturbed=batch["perturbed", "observation"],
-    )
+    buffer.extend(TensorDict(data, [ROWS]))
+    buffer.append_transform(StatePerturbation(1e-3, seed=0))
+    return [buffer.sample().exclude("index").to(device) for _ in range(8)]
 
 
 def our_loss(name: str, size: Size, device: torch.device) -> LossModule:
-    """One of the package's losses, with its defaults otherwise."""
-    options: dict[str, Any] = {"num_cells": list(size.cells)}
+    """Return one of the package's losses."""
+    sizes = size.observations, size.actions
+    cells = {"num_cells": list(size.cells)}
     critics = critic_ensemble(
-        size.observations,
-        size.actions,
+        *sizes,
         num_qvalue_nets=10 if name == "OSR-10" else 2,
         layer_norm=size.layer_norm,
-        **options,
+        **cells,
     )
-    if device.type == "cuda":
-        # TorchRL copies bounds that are numbers from the host at every call, which a
-        # CUDA graph cannot repeat.
-        high = torch.ones(size.actions, device=device)
-        options |= {"low": -high, "high": high}
-    actor = tanh_gaussian_actor(size.observations, size.actions, **options)
-    inverse_dynamics = tanh_gaussian_inverse_dynamics(
-        size.observations, size.actions, **options
-    )
-    number = {"num_random": size.num_random}
+    actor = tanh_gaussian_actor(*sizes, **cells)
+    inverse_dynamics = tanh_gaussian_inverse_dynamics(*sizes, **cells)
     if name == "OSR-v":
         loss = OSRVLoss(actor, critics, inverse_dynamics)
     elif name == "CQL(H)":
-        loss = OSRLoss(
-            actor, critics, recovery_weight=0, actor_states="clean", **number
-        )
+        options = {"recovery_weight": 0, "actor_states": "clean"}
+        loss = OSRLoss(actor, critics, num_random=size.num_random, **options)
     elif name == "OSR-10":
-        loss = OSRLoss(
-            actor,
-            critics,
-            inverse_dynamics,
-            min_q_weight=0,
-            deterministic_backup=False,
-        )
+        options = {"min_q_weight": 0, "deterministic_backup": False}
+        loss = OSRLoss(actor, critics, inverse_dynamics, **options)
     else:
-        loss = OSRLoss(actor, critics, inverse_dynamics, **number)
+        loss = OSRLoss(actor, critics, inverse_dynamics, num_random=size.num_random)
+    loss.make_value_estimator(gamma=GAMMA)
     return loss.to(device)
 
 
-def our_update(
-    loss: LossModule,
-    device: torch.device,
-    *,
-    autocast: bool,
-    record: bool = True,
-    capturable: bool = False,
-) -> Update:
-    """The trainer's update: one backward, one optimizer, losses recorded on a CPU."""
-    loss.make_value_estimator(gamma=GAMMA)
-    updater = SoftUpdate(loss, tau=TAU)
-    optimizer = torch.optim.Adam(
-        loss.parameters(), lr=RATE, fused=True, capturable=capturable
-    )
+def our_update(loss: LossModule, *, traced: bool) -> Update:
+    """Return the trainer's update: one backward, one optimizer, traced on a CPU."""
+    updater = FastSoftUpdate(loss, tau=TAU)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=RATE, fused=True)
+    gradients = LossGradients(loss, None, record=traced, warm_up=2)
 
-    gradients = LossGradients(
-        loss, torch.bfloat16 if autocast else None, record=record, warm_up=2
-    )
-
-    def update(batch: TensorDictBase) -> Iterator[str]:
+    def update(batch: TensorDictBase) -> None:
         gradients(batch.copy())
-        yield "forward and backward"
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
-        yield "optimizer"
         updater.step()
-        yield "targets"
 
     return update
 
 
-def graph_update(loss: LossModule, device: torch.device, *, autocast: bool) -> Update:
-    """:func:`our_update` as a CUDA graph, after five updates without."""
-    update = our_update(loss, device, autocast=autocast, capturable=True)
+def torchrl_update(size: Size, device: torch.device) -> Update:
+    """Return the update of TorchRL's own offline script, behaviour cloning included.
 
-    def whole(batch: TensorDictBase) -> None:
-        for _ in update(batch):
-            pass
-
-    graph = CudaGraphModule(whole, warmup=5, in_keys=[], out_keys=[], device=device)
-
-    def replay(batch: TensorDictBase) -> Iterator[str]:
-        graph(batch)
-        yield "update"
-
-    return replay
-
-
-def osr_products(
-    size: Size, device: torch.device, *, autocast: bool
-) -> tuple[list[Pass], int]:
-    """Matrix products of OSR's update, and the floating point operations counted in it.
-
-    ``OSRLoss`` has two ways for many sampled actions, by network and device; the one
-    that it takes is the one that has as many operations.
+    https://github.com/pytorch/rl/blob/main/sota-implementations/cql/cql_offline.py
     """
-    loss, batch = our_loss("OSR", size, device), make_buffer(size, device).sample()
-    update = our_update(loss, device, autocast=autocast, record=False)
-    counted = count_flops(lambda: update(batch))
-    counts = {"batch": size.batch, "num_random": size.num_random}
-    ways = [
-        osr_passes(*size.sizes, **counts, chunk=chunk)
-        for chunk in (None, loss.chunk_size)
+    observations, actions = size.observations, size.actions
+    like = {"num_cells": size.cells, "activation_class": nn.ReLU, "device": device}
+    head = nn.Sequential(
+        MLP(observations, 2 * actions, **like),
+        NormalParamExtractor(scale_mapping="biased_softplus_1.0", scale_lb=0.1),
+    )
+    low = -torch.ones(actions, device=device)
+    actor = ProbabilisticActor(
+        TensorDictModule(head, ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        spec=Bounded(low, -low),
+        distribution_class=TanhNormal,
+        distribution_kwargs={"low": low, "high": -low, "tanh_loc": False},
+        default_interaction_type=ExplorationType.RANDOM,
+    )
+    critic = MLP(observations + actions, 1, **like)
+    loss = CQLLoss(
+        actor,
+        ValueOperator(critic, ["observation", "action"]),
+        loss_function="l2",
+        deterministic_backup=False,
+        num_random=size.num_random,
+        with_lagrange=True,
+        lagrange_thresh=5.0,
+    )
+    loss.make_value_estimator(gamma=GAMMA)
+    updater = SoftUpdate(loss, tau=TAU)
+    groups = [
+        loss.actor_network_params.flatten_keys().values(),
+        loss.qvalue_network_params.flatten_keys().values(),
+        [loss.log_alpha],
+        [loss.log_alpha_prime],
     ]
-    return min(ways, key=lambda way: abs(total_flops(way) - counted)), counted
+    optimizer = group_optimizers(*[torch.optim.Adam(group, RATE) for group in groups])
+    terms = "loss_actor_bc", "loss_qvalue", "loss_cql", "loss_alpha", "loss_alpha_prime"
+
+    def update(batch: TensorDictBase) -> None:
+        losses = loss(batch.copy())
+        sum(losses[term] for term in terms).backward()
+        optimizer.step()
+        optimizer.zero_grad(set_to_none=True)
+        updater.step()
+
+    return update
+
+
+def unpack(batch: TensorDictBase) -> Batch:
+    """Return the batch as the plain script reads it."""
+    following = batch["next"]
+    return Batch(
+        batch["observation"],
+        batch["action"],
+        following["reward"].squeeze(-1),
+        following["observation"],
+        following["done"].squeeze(-1),
+        following["terminated"].squeeze(-1),
+        batch["perturbed", "observation"],
+    )
 
 
 def make_contender(
-    name: str, size: Size, device: torch.device, *, autocast: bool
+    name: str, size: Size, device: torch.device
 ) -> tuple[Update, list[Any]]:
-    """An update and the batches that it reads, the same for every name."""
-    buffer = make_buffer(size, device)
-    batches = [buffer.sample() for _ in range(8)]
-    if name == SAMPLING:
-
-        def sample(_: object) -> Iterator[str]:
-            buffer.sample()
-            yield "sampling"
-
-        return sample, batches
+    """Return an update and the batches that it reads, the same for every name."""
+    batches = make_batches(size, device)
     if name == PLAIN:
-        plain = PlainOSR(
-            *size.sizes,
-            num_random=size.num_random,
-            layer_norm=size.layer_norm,
-            device=device,
-            autocast=autocast,
-        )
+        options = {"num_random": size.num_random, "layer_norm": size.layer_norm}
+        plain = PlainOSR(size.observations, size.actions, list(size.cells), **options)
         return plain.update, [unpack(batch) for batch in batches]
-    if name == PRODUCTS:
-        passes, _ = osr_products(size, device, autocast=autocast)
-        dtype = torch.bfloat16 if autocast else torch.float32
-        return Products(passes, dtype, device).update, batches
     if name == TORCHRL:
-        loss = cql_loss(*size.sizes, num_random=size.num_random, device=device)
-        update = cql_update(loss, autocast=autocast)
-    else:
-        loss = our_loss(name, size, device)
-        if name in (COMPILED, BOTH):
-            loss.compile()
-        if name in (GRAPH, BOTH):
-            update = graph_update(loss, device, autocast=autocast)
-        else:
-            record = name != EAGER
-            update = our_update(loss, device, autocast=autocast, record=record)
-    # What a loss does not read, it need not carry.
+        update = torchrl_update(size, device)
+        return update, [batch.exclude("perturbed") for batch in batches]
+    loss = our_loss(name, size, device)
+    if name == COMPILED:
+        loss.compile()
     if ("perturbed", "observation") not in loss.in_keys:
         batches = [batch.exclude("perturbed") for batch in batches]
-    return update, batches
+    return our_update(loss, traced=name not in (EAGER, COMPILED)), batches

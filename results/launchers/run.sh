@@ -2,7 +2,7 @@
 # Two tiny runs by each launcher that can be had on one machine, by the commands of
 # docs/configuration.md. Needs: pip install "torchrl-osr[train,slurm,ray]".
 #
-#   bash results/launchers/run.sh /tmp/launchers > results/launchers/output.txt 2>&1
+#   bash results/launchers/run.sh /tmp/launchers
 set -uo pipefail
 mkdir -p "$1" && cd "$1" || exit 1
 tiny="data=random data.num_transitions=600 data.held_out=0.1 network.num_cells=[8]

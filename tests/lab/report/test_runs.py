@@ -13,7 +13,6 @@ from report import fakes
 
 from torchrl_osr.lab.report import pack_runs, read_records, read_runs
 
-ARCHIVE = Path(__file__).parents[3] / "results" / "osr_v" / "runs.jsonl.gz"
 CURVE = {1000: [10.0, 20.0], 2000: [30.0, 50.0]}
 
 
@@ -203,8 +202,3 @@ def test_a_table_that_unpacks_to_too_much_is_left_out(tmp_path, monkeypatch):
     tables = read_runs([tmp_path / "a", tmp_path / "bomb.jsonl.gz"])
     assert len(tables.runs) == 1
     assert "unpacks to more than 2,000,000 bytes" in tables.left_out[-1].reason
-
-
-def test_the_archive_is_read():
-    tables = fakes.read_all(ARCHIVE)
-    assert (len(tables.runs), len(tables.methods)) == (7, 6)

@@ -1,0 +1,177 @@
+"""Print the tables of an experiment in Markdown.
+
+    python results/tables.py results/scoreboard
+    python results/tables.py results/oos --reference cql_noisy_bc
+
+Reads ``runs.csv.xz``, ``episodes.csv.xz`` and, where they exist, ``recoverable.csv.xz``
+with ``states.csv.xz`` and ``published.csv``. Intervals at 95 % resample seeds, then
+episodes (of recoverable states: walks). A mark ² means two seeds, ᵉ one seed.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from torchrl_osr.lab.evaluation import (
+    mean_interval,
+    nested_resamples,
+    percentile_interval,
+)
+from torchrl_osr.lab.evaluation.recoverable import saved_share
+
+
+def read(folder: Path) -> pd.DataFrame:
+    """Return a row for each episode, with its run's data set, method and seed."""
+    runs = pd.read_csv(folder / "runs.csv.xz")
+    episodes = pd.read_csv(folder / "episodes.csv.xz").merge(runs, on="run")
+    for column in ("suite", "disturbance"):  # "" is undisturbed
+        episodes[column] = episodes[column].fillna("") if column in episodes else ""
+    trained = episodes["suite"] == ""
+    order = episodes[trained].groupby("run")["step"].rank("dense", ascending=False)
+    # The training's own evaluations: the last five count.
+    return episodes[~trained | (order.reindex(episodes.index) <= 5)]
+
+
+def conditions(episodes: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Yield the undisturbed episodes, then the disturbed ones of each suite."""
+    yield "undisturbed", episodes[episodes["suite"] == ""]
+    for suite in sorted(set(episodes["suite"]) - {""}):
+        rows = episodes["suite"] == suite
+        yield suite, episodes[rows & (episodes["disturbance"] != "")]
+
+
+def shown(mean: float, low: float, high: float, seeds: int) -> str:
+    """Return a mean with its interval, marked if there are few seeds."""
+    mark = {1: " ᵉ", 2: " ²"}.get(seeds, "")
+    text = f"{mean:z.1f} [{low:z.1f}, {high:z.1f}]{mark}"
+    return text.replace("-", "\N{MINUS SIGN}")
+
+
+def estimate(episodes: pd.DataFrame) -> str:
+    """Return the mean score over runs; episodes of one start state are averaged."""
+    if episodes.empty:
+        return ""
+    means = episodes.groupby(["run", "episode"])["score"].mean()
+    runs = [run.to_numpy() for _, run in means.groupby("run")]
+    values = runs[0] if len(runs) == 1 else [run.mean() for run in runs]
+    return shown(*mean_interval(values), len(runs))
+
+
+def differences(
+    episodes: pd.DataFrame, method: str, reference: str
+) -> tuple[str, str] | None:
+    """Return the fewest seeds, and the mean difference over all data sets.
+
+    Runs are paired by data set and seed, episodes by checkpoint and start state.
+    """
+    keys = ["data", "seed", "disturbance", "checkpoint", "episode"]
+    rank = episodes.groupby("run")["step"].rank("dense")  # budgets differ
+    values = episodes.assign(checkpoint=rank)
+    values = values[values["method"].isin((method, reference))]
+    table = values.pivot_table(index=keys, columns="method", values="score").dropna()
+    if set(table.columns) != {method, reference}:
+        return None
+    less = table[method] - table[reference]
+    less = less.groupby(["data", "seed", "episode"]).mean()
+    if set(less.index.unique("data")) != set(episodes["data"]):
+        return None
+    data_sets = [
+        [run.to_numpy()[:, None] for _, run in group.groupby("seed")]
+        for _, group in less.groupby("data")
+    ]
+    mean = np.mean([np.mean([run.mean() for run in each]) for each in data_sets])
+    resamples = [nested_resamples(each, seed=i) for i, each in enumerate(data_sets)]
+    low, high = percentile_interval(np.mean(resamples, axis=0).ravel())
+    seeds = min(map(len, data_sets))
+    return str(seeds), shown(float(mean), float(low), float(high), seeds)
+
+
+def recoverable(folder: Path) -> dict[tuple[str, str], tuple[str, float]]:
+    """Return the recovery rate in percent of each data set and method."""
+    if not (folder / "recoverable.csv.xz").exists():
+        return {}
+    runs = pd.read_csv(folder / "runs.csv.xz")
+    back = pd.read_csv(folder / "recoverable.csv.xz", dtype={"back": str})
+    states = pd.read_csv(folder / "states.csv.xz").groupby("states")
+    found = {}
+    keys = ["data", "method", "half", "states"]
+    for (data, method, _, mark), rows in back.merge(runs, on="run").groupby(keys):
+        of_each = states.get_group(mark)
+        hard = (of_each["group"] == "recoverable").to_numpy()
+        table = np.array([[int(digit) for digit in text] for text in rows["back"]])
+        table = table[:, hard] / rows["checkpoints"].to_numpy()[:, None]
+        share = [100 * x for x in saved_share(table, of_each["walk"].to_numpy()[hard])]
+        # The held-out half comes first, and wins over the public one.
+        found.setdefault((data, method), (shown(*share, len(table)), share[0]))
+    return found
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def main(folder: Path, reference: str) -> None:
+    """Print a table for each data set, means over all, and differences."""
+    episodes, saved = read(folder), recoverable(folder)
+    suites = [name for name, _ in conditions(episodes)]
+    quoted = folder / "published.csv"
+    published = pd.read_csv(quoted, index_col=0) if quoted.exists() else pd.DataFrame()
+
+    head = ["method", "seeds", "updates", *suites]
+    head += ["recoverable %"] * bool(saved) + ["published"] * (not published.empty)
+    for data, mine in episodes.groupby("data"):
+        rows = []
+        for method, of in mine.groupby("method"):
+            cells = [str(of["seed"].nunique()), f"{of['updates'].max():,}"]
+            cells += [estimate(part) for _, part in conditions(of)]
+            cells += [saved.get((data, method), ("", 0))[0]] if saved else []
+            if not published.empty:
+                cells.append(str(published.get(data, {}).get(method, "")))
+            mean = of[of["suite"] == ""].groupby("run")["score"].mean().mean()
+            rows.append((mean, [f"`{method}`", *cells]))
+        rows.sort(key=lambda row: -row[0])
+        print(f"## {data}\n\n{markdown(head, [cells for _, cells in rows])}\n")
+
+    if episodes["data"].nunique() == 1:
+        return
+    means = pd.DataFrame(
+        {
+            name: part.groupby(["method", "data", "run"])["score"].mean()
+            for name, part in conditions(episodes)
+        }
+    )
+    means = means.groupby(["method", "data"]).mean()
+    complete = means.groupby("method").size() == episodes["data"].nunique()
+    if saved:
+        share = {(method, data): each[1] for (data, method), each in saved.items()}
+        means["recoverable %"] = pd.Series(share)
+    means = means.groupby("method").mean()[complete].sort_values("undisturbed")
+    rows = [[f"`{each[0]}`", *(f"{x:.1f}" for x in each[1:])]
+            for each in means.iloc[::-1].itertuples()]  # fmt: skip
+    print(f"## Means over all data sets\n\n{markdown(['method', *means], rows)}\n")
+
+    rows = []
+    for method in sorted(set(episodes["method"]) - {reference}):
+        found = [
+            differences(part, reference, method) for _, part in conditions(episodes)
+        ]
+        if all(found):
+            cells = [each[1] for each in found if each]
+            rows.append([f"`{method}`", found[0][0] if found[0] else "", *cells])
+    print(f"## `{reference}` less each other method, over all data sets\n")
+    print(markdown(["less", "seeds", *suites], rows))
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--reference", default="osr")
+    given = parser.parse_args()
+    main(given.folder, given.reference)

@@ -1,0 +1,153 @@
+"""The plain page computes what OSRLoss and InverseDynamicsLoss compute."""
+
+from __future__ import annotations
+
+import runpy
+from types import SimpleNamespace
+
+import pytest
+import torch
+from processes import EXAMPLES
+from torchrl.objectives import SoftUpdate
+
+from torchrl_osr import InverseDynamicsLoss, OSRLoss
+from torchrl_osr.modules import (
+    critic_ensemble,
+    tanh_gaussian_actor,
+    tanh_gaussian_inverse_dynamics,
+)
+
+page = SimpleNamespace(**runpy.run_path(str(EXAMPLES / "plain_osr.py")))
+
+# Observation, action, hidden layers and batch; the first two are make_batch's.
+S, A, CELLS, B, K = 3, 2, [8, 8], 10, 4
+LOSSES = ["loss_actor", "loss_alpha", "loss_qvalue", "loss_cql"]
+
+
+def unpack(batch):
+    """Return the batch as the plain page reads it."""
+    following = batch["next"]
+    return page.Batch(
+        batch["observation"],
+        batch["action"],
+        following["reward"].squeeze(-1),
+        following["observation"],
+        following["done"].squeeze(-1),
+        following["terminated"].squeeze(-1),
+        batch["perturbed", "observation"],
+    )
+
+
+@pytest.fixture(params=[False, True], ids=["plain", "layer norm"])
+def both(request):
+    """Both with the same weights, target critics and temperatures off the start."""
+    # Numbers as bounds would be float32, and the actions equal to 1e-8 only.
+    bounds = {"low": -torch.ones(A).double(), "high": torch.ones(A).double()}
+    actor = tanh_gaussian_actor(S, A, num_cells=CELLS, **bounds)
+    norm = {"layer_norm": request.param}
+    critics = critic_ensemble(S, A, num_cells=CELLS, **norm)
+    model = tanh_gaussian_inverse_dynamics(S, A, num_cells=CELLS, **bounds)
+    plain = page.PlainOSR(S, A, CELLS, num_random=K, **norm)
+    pairs = [(actor, plain.actor), (model, plain.inverse_dynamics)]
+    pairs += [*zip(critics, plain.critics, strict=True)]
+    pairs += [*zip(critics, plain.targets, strict=True)]
+    for source, copied in pairs:
+        theirs = zip(copied.double().parameters(), source.parameters(), strict=True)
+        for parameter, value in theirs:
+            parameter.data.copy_(value.data)
+    loss = OSRLoss(actor, critics, model, num_random=K, alpha_init=0.3).double()
+    loss.make_value_estimator(gamma=plain.gamma)
+    plain.gamma = loss.value_estimator.gamma.item()  # TorchRL keeps it in float32
+    updater = SoftUpdate(loss, tau=plain.tau)
+    loss.target_qvalue_network_params.apply_(lambda tensor: tensor.mul_(0.8))
+    for target in plain.targets:
+        for parameter in target.parameters():
+            parameter.data.mul_(0.8)
+    plain.log_alpha.data = loss.log_alpha.data.clone()
+    return loss, updater, plain
+
+
+def draw_as_ours(*_):
+    """Torch's draws in the order in which OSRLoss makes them, K before B there."""
+
+    def swap(noise: torch.Tensor) -> torch.Tensor:
+        return noise.transpose(0, 1).reshape(-1, A)
+
+    like = {"dtype": torch.float64}
+    actor = torch.randn(2 * B, A, **like)
+    uniform = 2 * torch.rand(K, B, A, **like) - 1
+    proposals = torch.randn(K, 2, B, A, **like)
+    target = torch.randn(B, A, **like)
+    return page.Noise(
+        actor, target, swap(uniform), swap(proposals[:, 0]), swap(proposals[:, 1])
+    )
+
+
+def test_losses_and_gradients_equal_ours(both, make_batch, check):
+    loss, _, plain = both
+    torch.manual_seed(5)
+    ours = loss(make_batch(B))
+    torch.manual_seed(5)
+    reference = plain.losses(unpack(make_batch(B)), draw_as_ours())
+    assert set(reference) == set(LOSSES)
+    values = [[losses[key] for key in LOSSES] for losses in (ours, reference)]
+    check("plain OSR", *values, tolerance=1e-12)
+
+    sum(values[0]).backward()
+    critic = reference["loss_qvalue"] + reference["loss_cql"]
+    wanted = [
+        *torch.autograd.grad(reference["loss_actor"], list(plain.actor.parameters())),
+        *torch.autograd.grad(reference["loss_alpha"], [plain.log_alpha]),
+    ]
+    each = [list(critic.parameters()) for critic in plain.critics]
+    gradients = torch.autograd.grad(critic, each[0] + each[1])
+    half = len(each[0])
+    pairs = zip(gradients[:half], gradients[half:], strict=True)
+    wanted += [torch.stack(pair) for pair in pairs]
+    got = [p.grad for p in loss.actor_network_params.values(True, True)]
+    got.append(loss.log_alpha.grad)
+    got += [p.grad for p in loss.qvalue_network_params.values(True, True)]
+    check("plain OSR", got, wanted, tolerance=1e-8)
+
+
+def test_update_moves_the_same_weights_as_ours(both, make_batch, check):
+    loss, updater, plain = both
+    optimizer = torch.optim.Adam(loss.parameters(), lr=plain.rate)
+    plain.draw = draw_as_ours
+    for seed in range(3):
+        torch.manual_seed(seed)
+        losses = loss(make_batch(B))
+        sum(losses[key] for key in LOSSES).backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        updater.step()
+        torch.manual_seed(seed)
+        plain.update(unpack(make_batch(B)))
+    got = list(loss.actor_network_params.values(True, True))
+    wanted = list(plain.actor.parameters())
+    for params, critics in (
+        (loss.qvalue_network_params, plain.critics),
+        (loss.target_qvalue_network_params, plain.targets),
+    ):
+        got += params.values(True, True)
+        pairs = zip(*(critic.parameters() for critic in critics), strict=True)
+        wanted += [torch.stack(pair) for pair in pairs]
+    check("plain OSR, after three updates", got, wanted, tolerance=1e-6)
+
+
+def test_inverse_dynamics_loss_equals_ours(both, make_batch, check):
+    _, _, plain = both
+    bounds = {"low": -torch.ones(A).double(), "high": torch.ones(A).double()}
+    network = tanh_gaussian_inverse_dynamics(S, A, num_cells=CELLS, **bounds).double()
+    theirs = zip(network.parameters(), plain.inverse_dynamics.parameters(), strict=True)
+    for parameter, value in theirs:
+        parameter.data.copy_(value.data)
+    batch = make_batch(B)
+    ours = InverseDynamicsLoss(network)(batch)["loss_inverse_dynamics"]
+    reference = plain.inverse_dynamics_loss(unpack(batch))
+    check("plain inverse dynamics", [ours], [reference], tolerance=1e-12)
+
+
+def test_toy_runs(capsys):
+    page.main()
+    assert "loss_qvalue" in capsys.readouterr().out
