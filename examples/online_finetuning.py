@@ -39,7 +39,7 @@ from torchrl_osr.lab.evaluation import (
     measure_of,
     summarize,
 )
-from torchrl_osr.lab.evaluation.drawing import IN_WORDS
+from torchrl_osr.lab.evaluation.figures import IN_WORDS
 from torchrl_osr.lab.run.build import references_of
 from torchrl_osr.lab.run.trained_run import TrainedRun, load_trained
 from torchrl_osr.lab.run.training_data import load_training_data

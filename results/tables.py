@@ -17,12 +17,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from torchrl_osr.lab.evaluation import (
+from torchrl_osr.lab.evaluation.statistics import (
     mean_interval,
     nested_resamples,
     percentile_interval,
+    saved_share,
 )
-from torchrl_osr.lab.evaluation.recoverable import saved_share
 
 
 def read(folder: Path) -> pd.DataFrame:

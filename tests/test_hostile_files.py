@@ -24,8 +24,8 @@ import yaml
 from composed import composed
 from hypothesis import given
 from hypothesis import strategies as st
+from lab.report.fakes import write_run
 from omegaconf import OmegaConf
-from report.fakes import write_run
 from tensordict import TensorDict
 from torchrl.checkpoint import CheckpointError
 

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
-from report.fakes import write_run
+from lab.report.fakes import write_run
 
 from torchrl_osr.lab.__main__ import main
 

@@ -11,7 +11,7 @@ import pytest
 from torchrl_osr.lab.cli.data import overview
 from torchrl_osr.lab.data import load_file, transitions_from_rows
 from torchrl_osr.lab.data.overview import describe_entries, findings, out_of_space
-from torchrl_osr.lab.evaluation.data_figure import data_figure
+from torchrl_osr.lab.evaluation.figures import data_figure
 
 
 def make_log(rows=1200, **changes):

@@ -13,7 +13,6 @@ from torchrl.envs import ObservationNorm
 from torchrl.modules import MLP, ValueOperator
 from torchrl.objectives import SACLoss
 
-from torchrl_osr import OSRLoss
 from torchrl_osr.functional import jeffreys_divergence
 from torchrl_osr.lab.envs import attacked_policy, critics_of
 from torchrl_osr.lab.evaluation import deterministic_policy
@@ -97,15 +96,6 @@ def test_epsilon_0_is_the_bare_policy(trained, kind):
     assert torch.equal(policy(observation), bare(observation))
 
 
-@each_kind
-def test_boxes_are_in_units_of_the_datas_deviation(trained, kind):
-    standard = torch.randn(8, 11)
-    raw = standard * trained.norm.scale + trained.norm.loc
-    arguments = {"kind": kind, "epsilon": EPSILON, "seed": 3}
-    seen = shown(trained, raw, observation_norm=trained.norm, **arguments)
-    torch.testing.assert_close(seen, shown(trained, standard, **arguments))
-
-
 def test_random_is_uniform(trained):
     clean = torch.randn(2000, 11)
     noise = shown(trained, clean, kind="random", epsilon=EPSILON) - clean
@@ -129,30 +119,20 @@ def test_gradients_find_more_than_a_random_draw(trained, kind, score):
     assert (better > 0).float().mean() > 0.9
 
 
-@pytest.mark.parametrize("keys", [{}, {"action": "a", "state_action_value": "q"}])
-@pytest.mark.parametrize("loss_class", [OSRLoss, SACLoss])
-def test_critics_of_a_loss_are_its_trained_ones(loss_class, keys):
+def test_critics_of_a_loss_are_its_trained_ones():
     head = MLP(14, 1, num_cells=[16])
-    critic = ValueOperator(
-        head,
-        ["observation", keys.get("action", "action")],
-        [keys.get("state_action_value", "state_action_value")],
-    )
+    critic = ValueOperator(head, ["observation", "a"], ["q"])
     actor = tanh_gaussian_actor(11, 3, num_cells=[16])
-    options = {"recovery_weight": 0} if loss_class is OSRLoss else {}
-    loss = loss_class(actor, critic, num_qvalue_nets=3, **options)
-    if keys:
-        loss.set_keys(**keys)
+    loss = SACLoss(actor, critic, num_qvalue_nets=3)
+    loss.set_keys(action="a", state_action_value="q")
     values = critics_of(loss)
     states, action = states_of(torch.randn(4, 8, 11)), torch.rand(4, 8, 3)
-    before = values(states, action)
     with torch.no_grad():  # as an optimizer changes them
         for parameter in loss.qvalue_network_params.parameters():
             parameter.mul_(1.5)
     after = values(states, action)
-    assert before.shape == after.shape == (3, 4, 8)
+    assert after.shape == (3, 4, 8)
     assert not after.requires_grad
-    assert not torch.allclose(before, after)
     for index in range(3):
         head = MLP(14, 1, num_cells=[16])
         for name, parameter in head.named_parameters():
@@ -181,18 +161,3 @@ def test_seeds_decide_and_the_global_generator_is_left_alone(trained, kind):
     assert not torch.equal(first, play(2))
     assert not torch.equal(first[0], first[1]), "draws go on from call to call"
     assert not first.requires_grad
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"kind": "hard"}, "kind must be one of .*'min_Q'.* got 'hard'"),
-        ({"epsilon": -0.1}, "epsilon must be at least 0, got -0.1"),
-        ({"num_samples": 0}, "num_samples must be at least 1, got 0"),
-        ({"method": "newton"}, "method must be one of .* got 'newton'"),
-    ],
-)
-def test_wrong_arguments(trained, arguments, message):
-    arguments = {"kind": "random", "epsilon": 0.1} | arguments
-    with pytest.raises(ValueError, match=message):
-        attacked_policy(trained.policy, trained.qvalue, **arguments)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import gymnasium
 import numpy as np
 import pytest
@@ -13,12 +11,11 @@ from torchrl.envs import ObservationNorm
 from torchrl_osr.lab.data import reference_returns
 from torchrl_osr.lab.evaluation import (
     EpisodeEvaluator,
-    EpisodeResults,
     deterministic_policy,
     measure_of,
-    score_table,
     summarize,
 )
+from torchrl_osr.lab.evaluation.episodes import EpisodeResults
 from torchrl_osr.modules import tanh_gaussian_actor
 
 HOPPER = reference_returns("hopper")
@@ -96,16 +93,6 @@ def test_without_references_there_is_no_score():
     assert summary["return"] == -1000
     assert (summary["return_low"], summary["return_high"]) == (-1100, -900)
     assert not [key for key in summary if "score" in key]
-    table = score_table("p", [summary], summary | {"step": 1}, -1200.0, Path("run"))
-    assert table.startswith("p: return [95 % interval]")
-    assert "-1200.0" in table
-    assert "expert" not in table
-
-
-def test_tasks_without_successes_have_none():
-    results = EpisodeEvaluator("Hopper-v5", num_episodes=2)(linear_policy)
-    assert results.successes is None
-    assert not [key for key in summarize(results, HOPPER) if "success" in key]
 
 
 def test_successes_are_those_that_reached_the_goal():
@@ -134,11 +121,3 @@ def test_success_rate_has_wilsons_interval():
     interval = summary["success_low"], summary["success_high"]
     assert interval == pytest.approx((0.15004, 0.84996), abs=1e-5)
     assert summary["successes"] == [True, True, False, False]
-    table = score_table("maze", [summary], summary | {"step": 1}, None, Path("run"))
-    (line,) = [line for line in table.splitlines() if "success" in line]
-    assert line.split()[3:] == [
-        *["50.0", "[15.0,", "85.0]", "%", "of", "4", "episodes,", "Wilson", "interval"]
-    ]
-    summary = {k: v for k, v in summary.items() if "success" not in k}
-    table = score_table("maze", [summary], summary | {"step": 1}, None, Path("run"))
-    assert "success" not in table

@@ -64,10 +64,3 @@ def test_ended_rows_do_not_count():
     data["next", "done"][:10] = True
     data["next", "observation"][:10] = float("nan")
     assert inverse_dynamics_report(make_model(), data) == expected
-
-
-def test_no_transition_left_is_an_error():
-    data = make_data(5)
-    data["next", "done"][:] = True
-    with pytest.raises(ValueError, match="all are done"):
-        inverse_dynamics_report(make_model(), data)

@@ -1,4 +1,4 @@
-"""Survival and the way back, on trajectories that were written down by hand."""
+"""Survival and recovery, on trajectories by hand."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_osr.lab.evaluation import (
+from torchrl_osr.lab.evaluation.recovery import (
     STEPS_AFTER,
     STEPS_BEFORE,
     Recorder,
     Trajectory,
-    disturbed_at,
     measure_recovery,
 )
 
@@ -61,18 +60,15 @@ def test_one_episode(after, fell, survived, alive, steps):
     assert recovery.steps == steps
 
 
-def test_episodes_without_the_disturbance_say_nothing():
-    recovery = measure(trajectory([1.0, 9.0, 9.0], fell=True))
-    *entries, distance, clean_distance = vars(recovery).values()
-    assert set(entries) == {None}
-    assert np.isnan([distance, clean_distance]).all()
+def test_episodes_without_the_disturbance_have_no_recovery():
+    assert measure(trajectory([1.0, 9.0, 9.0], fell=True)) is None
 
 
 @pytest.mark.parametrize(
-    ("disturbed", "step"), [(set(), None), ({0}, 0), ({1}, 0), ({3, 4}, 2)]
+    ("disturbed", "block"), [(set(), None), ({0}, (0, 0)), ({3, 4}, (3, 4))]
 )
-def test_moment_counts_steps_from_zero(disturbed, step):
-    assert disturbed_at(trajectory([1.0] * 6, disturbed)) == step
+def test_first_and_last_entry_of_a_disturbance(disturbed, block):
+    assert trajectory([1.0] * 5, disturbed).disturbance() == block
 
 
 def test_the_first_of_two_disturbances_counts():
@@ -85,7 +81,7 @@ def test_the_first_of_two_disturbances_counts():
     ("entries", "fell", "alive", "there_later"),
     [(50, True, False, False), (150, True, True, True), (50, False, None, False)],
 )
-def test_the_undisturbed_episode_is_looked_at_at_the_same_step(
+def test_the_undisturbed_episode_is_measured_at_the_same_step(
     entries, fell, alive, there_later
 ):
     clean = trajectory([1.0] * entries, fell=fell)
@@ -109,7 +105,7 @@ def test_distances_are_around_the_end_of_the_disturbance():
     assert (~np.isnan(short)).sum() == 4
 
 
-def test_recorder_keeps_what_it_was_told():
+def test_recorder_copies_observations():
     recorder = Recorder(2)
     row = np.array([1.0, 2.0])
     recorder(1, row, False, {})
@@ -119,11 +115,10 @@ def test_recorder_keeps_what_it_was_told():
     assert np.stack(kept.observations).tolist() == [[1, 2], [7, 7]]
     assert kept.disturbed == [False, True]
     assert kept.terminated
-    assert kept.last == 1
     assert recorder.trajectories[0].observations == []
 
 
-def test_who_reaches_the_goal_has_not_fallen():
+def test_reaching_the_goal_is_no_fall():
     recorder = Recorder(2)
     for episode, success in enumerate((True, False)):
         recorder(episode, np.zeros(8), True, {"success": success})

@@ -1,7 +1,8 @@
-"""Pairs of episodes: equal until they are disturbed, and different only then."""
+"""Pairs of episodes under disturbances, and their summary."""
 
 from __future__ import annotations
 
+import json
 from functools import partial
 
 import gymnasium
@@ -10,7 +11,6 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_osr import OSRLoss
 from torchrl_osr.lab.data import load_behavior_policy
 from torchrl_osr.lab.envs import (
     ActionKnock,
@@ -18,10 +18,15 @@ from torchrl_osr.lab.envs import (
     ExternalPush,
     ObservationNoise,
     attacked_policy,
-    critics_of,
 )
-from torchrl_osr.lab.evaluation import DataDistance, Disturbance, evaluate_paired
-from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
+from torchrl_osr.lab.evaluation import (
+    DataDistance,
+    Disturbance,
+    evaluate_paired,
+    summarize_disturbances,
+)
+from torchrl_osr.lab.evaluation.robustness import robustness_table
+from torchrl_osr.modules import tanh_gaussian_actor
 
 LINE = "Line-v0"
 LIMIT = 150
@@ -90,44 +95,60 @@ def line_results():
     )  # fmt: skip
     gymnasium.registry.pop(LINE)
     assert len(calls) == 1 + len(disturbances)
-    return results.clean, {each.disturbance.name: each for each in results.disturbed}
+    assert json.loads(json.dumps(results, allow_nan=False)) == results
+    return results
 
 
-def of(results, name: str) -> list:
-    """One entry of the recovery of each episode."""
-    return [getattr(each, name) for each in results.recovery]
+@pytest.fixture
+def levels(line_results):
+    return {each["name"]: each for each in line_results["levels"]}
 
 
-def test_known_returns_and_recovery_steps(line_results):
-    clean, disturbed = line_results
-    six = disturbed["six"]
-    assert clean.returns.tolist() == [LIMIT] * 3
-    assert clean.seeds.tolist() == [4, 5, 6]
+def test_known_returns_and_recovery_steps(line_results, levels):
+    clean, six = line_results["clean"], levels["six"]
+    assert clean["returns"] == six["returns"] == [LIMIT] * 3
+    assert clean["seeds"] == [4, 5, 6]
     # At 0.5, action 0: shoved to 6.5, then 5.5 ... 0.5, the sixth step is back.
-    assert of(six, "steps") == [6, 6, 6]
-    assert six.disturbed_at == of(six, "ended_at") == [5, 5, 5]
-    assert of(six, "survived") == of(six, "alive_after") == [True] * 3
-    assert six.results.returns.tolist() == [LIMIT] * 3
+    assert six["recovery_steps"] == [6, 6, 6]
+    assert six["disturbed_at"] == six["ended_at"] == [5, 5, 5]
+    assert six["survived_knock"] == six["alive_after"] == [True] * 3
+    distance = six["distance"]
+    assert distance["offset"] == [*range(-10, 101)]
+    assert distance["count"][3:12] == [0, 3, 3, 3, 3, 3, 3, 3, 3]
+    assert distance["mean"][3] is None
+    assert distance["mean"][10] > 1 > distance["clean_mean"][10]
 
 
-def test_who_falls_is_not_back(line_results):
-    deadly = line_results[1]["deadly"]
-    assert deadly.results.lengths.tolist() == deadly.results.returns.tolist() == [6] * 3
-    assert of(deadly, "survived") == of(deadly, "alive_after") == [False] * 3
-    assert of(deadly, "steps") == [None] * 3
+def test_a_fall_is_no_recovery(levels):
+    deadly = levels["deadly"]
+    assert deadly["lengths"] == deadly["returns"] == [6] * 3
+    assert deadly["survived_knock"] == deadly["alive_after"] == [False] * 3
+    assert deadly["recovery_steps"] == [None] * 3
 
 
-def test_the_time_limit_censors(line_results):
-    late = line_results[1]["late"]
-    assert late.disturbed_at == [LIMIT - 3] * 3
-    assert of(late, "survived") == [True] * 3
-    assert of(late, "alive_after") == of(late, "steps") == [None] * 3
+def test_the_time_limit_censors(levels):
+    late = levels["late"]
+    assert late["disturbed_at"] == [LIMIT - 3] * 3
+    assert late["survived_knock"] == [True] * 3
+    assert late["alive_after"] == late["recovery_steps"] == [None] * 3
 
 
-def test_no_disturbance_no_entries(line_results):
-    never, always = line_results[1]["never"], line_results[1]["always"]
-    assert never.disturbed_at == of(never, "survived") == [None] * 3
-    assert always.recovery is None
+def test_no_disturbance_no_entries(levels):
+    never, always = levels["never"], levels["always"]
+    assert never["disturbed_at"] == never["survived_knock"] == [None] * 3
+    assert always["recovery_steps"] is always["distance"] is None
+
+
+def test_an_environment_that_ignores_its_seed_warns():
+    class Deaf(Line):
+        def reset(self, *, seed=None, options=None):
+            return super().reset(seed=None)
+
+    gymnasium.register("Deaf-v0", Deaf, max_episode_steps=3)
+    rows = TensorDict({"observation": torch.randn(100, 1)}, [100])
+    with pytest.warns(UserWarning, match="Deaf-v0 ignores its seed"):
+        evaluate_paired(to_a_half, "Deaf-v0", [], DataDistance(rows), num_episodes=2)
+    gymnasium.registry.pop("Deaf-v0")
 
 
 def linear_policy(observation: torch.Tensor) -> torch.Tensor:
@@ -149,8 +170,7 @@ def play(*disturbances: Disturbance, policy=linear_policy, episodes: int = 4):
 
 def test_strength_zero_is_the_clean_episodes_bit_for_bit():
     actor = tanh_gaussian_actor(11, 3, num_cells=[16])
-    critics = critics_of(OSRLoss(actor, critic_ensemble(11, 3), recovery_weight=0))
-    attack = partial(attacked_policy, actor.get_dist, critics, kind="action_diff")
+    attack = partial(attacked_policy, actor.get_dist, None, kind="action_diff")
     bare = attack(epsilon=0.0)
     results = play(
         Disturbance("push", "push", 0.0, partial(ExternalPush, force=0.0, duration=5)),
@@ -162,14 +182,17 @@ def test_strength_zero_is_the_clean_episodes_bit_for_bit():
         Disturbance("attacked", "attack", 0.5, policy=attack(epsilon=0.5)),
         policy=bare,
     )
-    for each in results.disturbed:
-        same = np.array_equal(each.results.returns, results.clean.returns)
-        disturbance = each.disturbance
-        assert same == (disturbance.strength in (0.0, 1.0)), disturbance.name
-        assert each.results.seeds.tolist() == results.clean.seeds.tolist()
-    moments = {each.disturbance.name: each.disturbed_at for each in results.disturbed}
-    assert moments["attacked"] == moments["heavy"] == [0] * 4
-    assert moments["push"] == moments["noise"] == [None] * 4
+    levels = {each["name"]: each for each in results["levels"]}
+    for name, each in levels.items():
+        same = each["returns"] == results["clean"]["returns"]
+        assert same == (each["strength"] in (0.0, 1.0)), name
+        assert each["seeds"] == results["clean"]["seeds"]
+    assert (
+        levels["attacked"]["disturbed_at"] == levels["heavy"]["disturbed_at"] == [0] * 4
+    )
+    assert (
+        levels["push"]["disturbed_at"] == levels["noise"]["disturbed_at"] == [None] * 4
+    )
 
 
 def test_an_episode_depends_on_its_own_disturbance_alone():
@@ -182,34 +205,90 @@ def test_an_episode_depends_on_its_own_disturbance_alone():
     # Who is knocked early falls while the others, some never knocked, walk on.
     wrap = partial(ActionKnock, steps=20, mode="torque", at="random", window=(9, 900))
     results = play(Disturbance("knock", "knock", 20, wrap), policy=policy, episodes=8)
-    (knocked,) = results.disturbed
-    met = np.array([moment is not None for moment in knocked.disturbed_at])
-    assert 0 < met.sum() < 8, "the test needs both kinds of episodes"
-    same = knocked.results.returns == results.clean.returns
-    np.testing.assert_array_equal(same, ~met)
+    (knocked,) = results["levels"]
+    met = [moment is not None for moment in knocked["disturbed_at"]]
+    assert 0 < sum(met) < 8, "the test needs both kinds of episodes"
+    pairs = zip(knocked["returns"], results["clean"]["returns"], strict=True)
+    assert [one != other for one, other in pairs] == met
 
 
-@pytest.mark.parametrize(
-    ("disturbances", "episodes", "named"),
-    [
-        ([Disturbance("a", "push", 1.0)], 1, "num_episodes must be at least 2"),
-        (
-            [Disturbance("a", "push", 1.0), Disturbance("a", "push", 2.0)],
-            2,
-            r"\['a', 'a'\]",
+@pytest.fixture
+def evaluations():
+    """Two checkpoints of three pairs, a knock and a change that does not end."""
+
+    def level(name, kind, scores, moments, **recovery):
+        names = ("survived_knock", "alive_after", "clean_alive_after", "recovery_steps")
+        of_each = dict.fromkeys(names) | recovery
+        entries = {"name": name, "kind": kind, "strength": 1.0, "scores": scores}
+        return entries | {"disturbed_at": moments} | of_each
+
+    def evaluation(clean, knocked, heavy, moments, steps, alive):
+        survived = [None if at is None else True for at in moments]
+        recovery = {"recovery_steps": steps, "alive_after": alive}
+        recovery |= {"survived_knock": survived, "clean_alive_after": survived}
+        knock = level("knock", "knock", knocked, moments, **recovery)
+        mass = level("mass", "dynamics", heavy, [0, 0, 0])
+        return {"clean": {"scores": clean}, "levels": [knock, mass]}
+
+    return [
+        evaluation(
+            [40, 60, 50], [20, 30, 50], [10, 10, 10],
+            [7, 8, None], [4, None, None], [True, False, None],
         ),
-        ([], 2, "disturbances need one name each"),
-        (
-            [
-                Disturbance(
-                    "b", "push", 1.0, partial(ExternalPush, force=1.0, duration=0)
-                )
-            ],
-            2,
-            "'b' is not possible for Hopper-v5: duration",
+        evaluation(
+            [50, 50, 80], [40, 50, 80], [20, 20, 20],
+            [9, None, 6], [0, None, 12], [None, None, True],
         ),
-    ],
-)
-def test_bad_input_is_named(disturbances, episodes, named):
-    with pytest.raises(ValueError, match=named):
-        play(*disturbances, episodes=episodes)
+    ]  # fmt: skip
+
+
+def test_summary_is_over_all_checkpoints(evaluations):
+    knock, mass = summarize_disturbances(evaluations)
+    assert knock["clean_score"] == pytest.approx(55)
+    assert knock["score"] == pytest.approx(45)
+    assert knock["decrease"] == pytest.approx(100 * 10 / 55)
+    assert knock["decrease_low"] < knock["decrease"] < knock["decrease_high"]
+    assert knock["disturbed_share"] == pytest.approx(4 / 6)
+    # Those who met it: 40, 60, 50, 80 and 20, 30, 40, 80.
+    assert knock["clean_score_disturbed"] == pytest.approx(57.5)
+    assert knock["score_disturbed"] == pytest.approx(42.5)
+    assert knock["decrease_disturbed"] == pytest.approx(100 * 15 / 57.5)
+    assert knock["survived"] == 1
+    assert knock["survival"] == pytest.approx(2 / 3)  # one is not known
+    assert knock["recovered_share"] == pytest.approx(3 / 4)
+    assert knock["recovery_median"] == 8  # of 0, 4, 12 and never
+    assert mass["decrease"] == pytest.approx(100 * 40 / 55)
+    for name in ("survival", "recovered_share", "recovery_median"):
+        assert mass[name] is None
+
+
+def test_without_scores_it_is_returns(evaluations):
+    for played in evaluations:
+        for each in (played["clean"], *played["levels"]):
+            each["returns"] = [score - 1000 for score in each.pop("scores")]
+    knock, mass = summary = summarize_disturbances(evaluations)
+    assert knock["clean_return"] == pytest.approx(-945)
+    assert knock["return"] == pytest.approx(-955)
+    assert mass["decrease"] is None, "no percentage of what is below 0"
+    table = robustness_table("t", summary).splitlines()
+    assert table[2].split()[:4] == ["knock", "-945.0", "-955.0", "-"]
+
+
+def test_a_disturbance_that_no_episode_met_has_no_loss(evaluations):
+    for each in evaluations:
+        each["levels"][0]["disturbed_at"] = [None] * 3
+        each["levels"][0]["alive_after"] = [None] * 3
+    knock, _ = summarize_disturbances(evaluations)
+    assert knock["disturbed_share"] == 0
+    for name in ("decrease", "decrease_disturbed", "survival", "recovered_share"):
+        assert knock[name] is None
+    table = robustness_table("title", [knock])
+    assert "knock: every episode ended before it came" in table
+    assert table.splitlines()[2].split()[3] == "-"
+
+
+def test_table_is_aligned(evaluations):
+    lines = robustness_table("hopper", summarize_disturbances(evaluations)).splitlines()
+    assert len({len(line) for line in lines[1:]}) == 1
+    assert lines[2].split()[:4] == ["knock", "55.0", "45.0", "18.2"]
+    assert lines[3].split()[-4:] == ["-"] * 4

@@ -7,11 +7,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchrl_osr.lab.evaluation import (
+from torchrl_osr.lab.evaluation.statistics import (
+    decrease_interval,
+    estimate,
     interquartile_mean,
+    iqm,
+    mean_difference,
     mean_interval,
     nested_resamples,
-    performance_profile,
+    recovered_share,
+    saved_difference,
+    saved_share,
+    scores_and_decreases,
     stratified_resamples,
     wilson_interval,
 )
@@ -39,13 +46,9 @@ def test_coverage_of_a_normal_sample():
 
 
 @pytest.mark.parametrize("values", [[], [1.0, np.nan], [np.inf]])
-@pytest.mark.parametrize(
-    "statistic",
-    [mean_interval, interquartile_mean, lambda each: performance_profile(each, [0])],
-)
-def test_no_or_non_finite_values_are_an_error(statistic, values):
+def test_no_or_non_finite_values_are_an_error(values):
     with pytest.raises(ValueError, match="finite"):
-        statistic(values)
+        mean_interval(values)
 
 
 def test_interquartile_mean_is_that_of_the_sorted_middle():
@@ -58,15 +61,6 @@ def test_interquartile_mean_is_that_of_the_sorted_middle():
     rows = np.random.default_rng(0).normal(size=(5, 12))
     wanted = [sum(sorted(row)[3:9]) / 6 for row in rows.tolist()]
     np.testing.assert_allclose(interquartile_mean(rows), wanted)
-
-
-def test_profile_of_a_known_sample():
-    # Strictly above, so a score counts for no threshold that equals it.
-    scores = [[0.0, 10.0, 10.0, 40.0], [50.0, 60.0, 70.0, 80.0]]
-    profile = performance_profile(scores, [-1, 0, 10, 39, 45, 80])
-    np.testing.assert_array_equal(
-        profile, [[1, 0.75, 0.25, 0.25, 0, 0], [1, 1, 1, 1, 1, 0]]
-    )
 
 
 def test_strata_keep_their_places_and_sizes():
@@ -117,22 +111,113 @@ def test_numbers_of_an_episode_stay_together():
     np.testing.assert_allclose(resamples.sum(1), 3)
 
 
-@pytest.mark.parametrize("runs", [[], [np.ones((0, 2))], [np.ones(3)]])
-def test_no_episodes_are_an_error(runs):
-    with pytest.raises(ValueError, match="episodes"):
-        nested_resamples(runs)
-
-
-@pytest.mark.parametrize("strata", [[], [[1.0], []]])
-def test_an_empty_stratum_is_an_error(strata):
-    with pytest.raises(ValueError, match="every stratum"):
-        stratified_resamples(strata)
-
-
 def test_wilson_interval_is_that_of_the_formula():
     # p = 0.5, n = 4, z^2 = 3.8415: 0.5 -+ 1.95996 * sqrt(1 + 0.96036) / 7.84146.
     low, high = wilson_interval(2, 4)
     assert (low, high) == pytest.approx((0.15004, 0.84996), abs=1e-5)
     assert wilson_interval(0, 20)[0] == pytest.approx(0, abs=1e-12)
-    with pytest.raises(ValueError, match="3 of 2"):
-        wilson_interval(3, 2)
+
+
+@pytest.mark.parametrize(
+    ("runs", "over"), [(1, "episodes"), (2, "two seeds"), (3, "seeds")]
+)
+def test_an_interval_says_what_it_is_over(runs, over):
+    scores = [np.array([1.0, 3.0]) + run for run in range(runs)]
+    assert estimate(scores).over == iqm([scores]).over == over
+    assert estimate(scores).mean == pytest.approx(2 + (runs - 1) / 2)
+    assert mean_difference([scores, scores * 2]).mean == estimate(scores).mean
+
+
+def test_decreases_of_several_runs_by_hand():
+    # Clean 10 and 30, disturbed half of it in every episode: no doubt about the half.
+    clean = np.array([10.0, 30.0])
+    run = np.stack([clean, clean / 2], axis=1)
+    (_, none), (score, lost) = scores_and_decreases([run, 3 * run])
+    assert none[:3] == (0, 0, 0)
+    assert score.mean == pytest.approx(20)
+    assert lost[:3] == pytest.approx((50, 50, 50))
+    assert scores_and_decreases([-run])[1][1] is None
+
+
+def test_decrease_by_hand():
+    # Two pairs: a resample is (1, 1), (2, 2) or, half of the time, both.
+    # Decreases: 100 (1 - 10/20) = 50; 100 (1 - 60/80) = 25; 100 (1 - 70/100) = 30.
+    assert decrease_interval([20, 80], [10, 60]) == pytest.approx((30, 25, 50))
+    # An equal factor in every pair leaves no doubt, however the episodes differ.
+    clean = np.array([1.0, 10.0, 100.0, 55.0])
+    assert decrease_interval(clean, 0.8 * clean) == pytest.approx((20, 20, 20))
+    # Unpaired, the same numbers in another order say much less.
+    _, low, high = decrease_interval(clean, 0.8 * clean[::-1])
+    assert low < 0 < high
+
+
+def test_nothing_to_lose_is_no_number():
+    assert decrease_interval([1.0], [1.0]) == (None, None, None)
+    assert decrease_interval([-1, 0.5], [3, 3]) == (None, None, None)
+    decrease, low, high = decrease_interval([-1, 2], [-1, 1])
+    assert decrease == pytest.approx(100)
+    assert low is high is None
+
+
+def test_the_recovered_share_of_known_tables() -> None:
+    baseline = [[1, 0, 0, 0, 0, 0, 0, 0], [0, 0, 1, 0, 0, 0, 0, 0]]
+    method = [[1, 1, 0, 0, 0, 0, 0, 0], [1, 1, 1, 0, 0, 0, 0, 0]]
+    walk = [0, 0, 1, 1, 2, 2, 3, 3]
+    assert recovered_share(np.ones((2, 8)), baseline, walk) == (1, 1, 1)
+    assert recovered_share(baseline, baseline, walk) == (0, 0, 0)
+    # 5 of 16 against 2 of 16.
+    assert recovered_share(method, baseline, walk)[0] == pytest.approx(3 / 14)
+    # With one walk the seeds alone vary: (2 - 1) / 7, (3 - 1) / 7, or between.
+    one = recovered_share(method, baseline, [7] * 8)
+    assert one == pytest.approx((3 / 14, 1 / 7, 2 / 7))
+    # With one seed the walks alone vary, the states of one together.
+    two = [0, 0, 0, 0, 1, 1, 1, 1]
+    single = recovered_share(method[:1], np.zeros((1, 8)), two)
+    assert single == pytest.approx((1 / 4, 0, 1 / 2))
+
+
+def test_the_saved_share_of_known_tables() -> None:
+    back, walk = [[1, 1, 0, 0], [1, 0, 0, 0]], [0, 0, 1, 1]
+    # All walks alike: with one of them the seeds alone vary, from 1 / 4 to 2 / 4.
+    assert saved_share(back, [7] * 4) == pytest.approx((3 / 8, 1 / 4, 1 / 2))
+    # With one seed the walks alone vary, from none of a walk to all.
+    assert saved_share(back[:1], walk) == pytest.approx((1 / 2, 0, 1))
+    # Nothing varies where all come back: Wilson's interval of two walks, 2 / (2 + z^2).
+    all_of_them = saved_share(np.ones((3, 4)), walk)
+    assert all_of_them == pytest.approx((1, 0.342380, 1), abs=1e-6)
+    none = saved_share(np.zeros((3, 4)), walk)
+    assert none == pytest.approx((0, 0, 0.657620), abs=1e-6)
+    # A walk with more states counts for more.
+    assert saved_share([[1, 1, 1, 0]], [0, 0, 0, 1])[0] == 3 / 4
+
+
+def test_the_saved_difference_of_known_tables() -> None:
+    method, baseline, walk = [[1, 1, 1, 0]], [[1, 0, 0, 0]], [0, 0, 1, 1]
+    assert saved_difference(method, baseline, walk) == (1 / 2, 1 / 2, 1 / 2)
+    # One more of four states with one seed, one fewer with the other.
+    both = [[1, 1, 0, 0], [1, 0, 0, 0]], [[1, 0, 0, 0], [1, 1, 0, 0]]
+    assert saved_difference(*both, [7] * 4) == (0, -1 / 4, 1 / 4)
+    # A tie is no share of none: it says nothing about what either saves.
+    assert saved_difference(method, method, walk) == (0, 0, 0)
+
+
+def test_the_interval_of_the_recovered_share_covers_the_truth() -> None:
+    """Seeds and walks differ; of 30 intervals of 95 % at least 25 hold the truth."""
+    rng, held = np.random.default_rng(0), 0
+    walk = np.repeat(np.arange(40), 3)
+    for _ in range(30):
+        seed = rng.normal(0, 0.05, (20, 1))
+        place = np.repeat(rng.normal(0, 0.1, 40), 3)
+        draws = rng.random((2, 20, 120))
+        baseline = draws[0] < np.clip(0.15 + seed + place, 0, 1)
+        method = draws[1] < np.clip(0.40 + seed + place, 0, 1)
+        _, low, high = recovered_share(method, baseline, walk)
+        held += low <= 0.2902 <= high  # by 10^7 draws of the two shares
+    assert held >= 25
+
+
+def test_seeds_that_are_not_paired_vary_by_themselves() -> None:
+    """One walk: method 2 / 4; baseline 1 / 4 or 3 / 4 with either seed, or between."""
+    method, baseline = [[1, 1, 0, 0]], [[1, 0, 0, 0], [1, 1, 1, 0]]
+    share = recovered_share(method, baseline, [7] * 4, paired=False)
+    assert share == pytest.approx((0, -1, 1 / 3))

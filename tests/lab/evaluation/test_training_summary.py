@@ -1,20 +1,22 @@
-"""The table and the figure of a training run."""
+"""The table of a training run."""
 
 from __future__ import annotations
 
 from torchrl.record.loggers import CSVLogger
 
-from torchrl_osr.lab.evaluation import (
-    read_scalars,
-    score_table,
-)
+from torchrl_osr.lab.evaluation.training_summary import read_scalars, score_table
 
 
-def evaluations(*scores: float) -> list[dict]:
+def evaluations(*scores: float, **more) -> list[dict]:
     return [
-        {"step": 10 * i, "score": s, "score_low": s - 1, "score_high": s + 1}
+        {"step": 10 * i, "score": s, "score_low": s - 1, "score_high": s + 1} | more
         for i, s in enumerate(scores)
     ]
+
+
+def cells(table: str) -> dict[str, list[str]]:
+    pairs = (line.strip().split("  ", 1) for line in table.split("\n")[1:])
+    return {name: rest.split() for name, rest in pairs}
 
 
 def test_scalars_are_read_as_logged_and_the_later_row_counts(tmp_path):
@@ -28,10 +30,21 @@ def test_scalars_are_read_as_logged_and_the_later_row_counts(tmp_path):
 
 def test_table_has_last_recent_and_best(tmp_path):
     history = evaluations(0, 90, 10, 20, 30, 40)
-    table = score_table("hopper", history, history[1], 15.6, tmp_path)
-    lines = dict(line.split("  ", 1) for line in map(str.strip, table.split("\n")[1:]))
-    assert lines["data, mean episode"].split() == ["15.6"]
-    assert lines["policy, last"].split() == ["40.0", "[39.0,", "41.0]"]
-    assert lines["policy, mean of last 5"].split() == ["38.0"]
-    assert lines["policy, best evaluation"].split()[0] == "90.0"
-    assert lines["files"].strip() == str(tmp_path)
+    rows = cells(score_table("hopper", history, history[1], 15.6, tmp_path))
+    assert rows["data, mean episode"] == ["15.6"]
+    assert rows["policy, last"] == ["40.0", "[39.0,", "41.0]"]
+    assert rows["policy, mean of last 5"] == ["38.0"]
+    assert rows["policy, best evaluation"][0] == "90.0"
+
+
+def test_the_untrained_policy_is_in_no_mean(tmp_path):
+    history = evaluations(100, 20, 40)
+    rows = cells(score_table("hopper", history, history[2], None, tmp_path))
+    assert rows["policy, mean of last 2"] == ["30.0"]
+
+
+def test_success_rates_have_their_own_row(tmp_path):
+    rate = {"success_rate": 0.5, "success_low": 0.1, "success_high": 0.9}
+    history = evaluations(1, 2, **rate, successes=[True, False])
+    rows = cells(score_table("maze", history, history[1], None, tmp_path))
+    assert rows["policy, last, success"][:4] == ["50.0", "[10.0,", "90.0]", "%"]

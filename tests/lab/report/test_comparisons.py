@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
-from report import fakes
+from lab.report import fakes
 
 from torchrl_osr.lab.report import compare, quantities
 from torchrl_osr.lab.report.comparisons import (

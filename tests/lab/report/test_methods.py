@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from report import fakes
+from lab.report import fakes
 
 from torchrl_osr.lab.report import comparison_notes, read_runs
 

@@ -10,7 +10,7 @@ from html.parser import HTMLParser
 from types import SimpleNamespace
 
 import pytest
-from report import fakes
+from lab.report import fakes
 
 from torchrl_osr.lab.cli.report import main
 from torchrl_osr.lab.report import read_runs, write_report

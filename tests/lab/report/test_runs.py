@@ -9,7 +9,7 @@ import platform
 from pathlib import Path
 
 import pytest
-from report import fakes
+from lab.report import fakes
 
 from torchrl_osr.lab.report import pack_runs, read_records, read_runs
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from report import fakes
+from lab.report import fakes
 
 from torchrl_osr.lab.report import read_runs, write_report
 from torchrl_osr.lab.report.saved import saved_states
@@ -95,7 +95,6 @@ def test_the_page_has_the_table(top, tmp_path) -> None:
         ({"format": 2}, "its format is 2, known is 1"),
         ({"group": GROUP[:-1]}, "5 states, and answers of the shape (1, 6)"),
         ({"walk": WALK[:-1]}, "same length"),
-        ({"disturbance": ["push"] * 6}, "not enough values to unpack"),
         ({"evaluations": []}, "answers of the shape (0,)"),
         ({"evaluations": [{"back": [2] * 6}]}, "not 0 or 1"),
         ({"group": ["lost"] * 6}, "groups are none of"),

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from torchrl_osr.lab.evaluation import read_scalars
+from torchrl_osr.lab.evaluation.training_summary import read_scalars
 from torchrl_osr.lab.run import loggers
 from torchrl_osr.lab.run.loggers import log_outcome, make_loggers
 

@@ -39,7 +39,7 @@ from torchrl_osr.lab.data.overview import (
 from torchrl_osr.lab.data.sources import open_recorded
 from torchrl_osr.lab.data.store.cache import CHUNK_ROWS
 from torchrl_osr.lab.data.store.memmap import is_memmap_folder
-from torchrl_osr.lab.evaluation.data_figure import data_figure
+from torchrl_osr.lab.evaluation.figures import data_figure
 from torchrl_osr.lab.run import schema
 from torchrl_osr.lab.run.limits import check_values
 from torchrl_osr.lab.run.run_config import check_types, chosen_environment, flatten

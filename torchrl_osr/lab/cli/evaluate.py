@@ -50,15 +50,16 @@ from torchrl_osr.lab.evaluation import (
     Policy,
     deterministic_policy,
     evaluate_paired,
-    evaluation_json,
-    impossible_disturbances,
     measure_of,
-    robustness_figure,
-    robustness_table,
     summarize_disturbances,
 )
+from torchrl_osr.lab.evaluation.figures import robustness_figure
 from torchrl_osr.lab.evaluation.recoverable import GROUPS
-from torchrl_osr.lab.evaluation.robustness import aligned_columns
+from torchrl_osr.lab.evaluation.robustness import (
+    aligned_columns,
+    impossible_disturbances,
+    robustness_table,
+)
 from torchrl_osr.lab.report.runs import find_runs
 from torchrl_osr.lab.run import run_folder
 from torchrl_osr.lab.run.build import load_data, references_of
@@ -389,9 +390,10 @@ def evaluate(
                 distance,
                 num_episodes=cfg.episodes,
                 seed=seed,
+                references=references,
                 advance=lambda: progress.update(next(played)),
             )
-            evaluations.append(evaluation_json(trained.step, paired, references))
+            evaluations.append({"step": trained.step} | paired)
             write_json(partial, checksummed(request | {"evaluations": evaluations}))
     return {
         "env": run.env.name,

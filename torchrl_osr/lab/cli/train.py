@@ -34,11 +34,8 @@ from torchrl_osr.lab.cli.console import single_job
 from torchrl_osr.lab.data import environment_spec
 from torchrl_osr.lab.dynamics.training import FILE as DYNAMICS
 from torchrl_osr.lab.dynamics.training import load_dynamics
-from torchrl_osr.lab.evaluation import (
-    learning_curve,
-    read_scalars,
-    score_table,
-)
+from torchrl_osr.lab.evaluation.figures import learning_curve
+from torchrl_osr.lab.evaluation.training_summary import read_scalars, score_table
 from torchrl_osr.lab.run import run_folder, schema
 from torchrl_osr.lab.run.build import (
     check_parts,

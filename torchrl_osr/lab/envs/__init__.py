@@ -1,20 +1,22 @@
-"""Out-of-sample events of a robustness evaluation, as Gymnasium wrappers.
+"""Disturbances for robustness evaluation, as Gymnasium wrappers.
 
-The wrappers work in TorchRL (:class:`~torchrl.envs.GymWrapper`) and in plain Gymnasium
-loops. They have in common:
+They work in TorchRL (:class:`~torchrl.envs.GymWrapper`) and in plain Gymnasium loops:
 
-* ``reset(seed=...)`` seeds the disturbance of an episode. It draws from a generator of
-  its own, so the start state is that of the bare environment with the same seed, and
-  episodes with and without the disturbance can be compared in pairs;
+* ``reset(seed=...)`` seeds the disturbance, too. It draws from a generator of its own,
+  so that episodes with and without it start in the same state;
 * strength 0 is the bare environment, bit for bit;
-* ``info["disturbed"]`` is true in each step in which a disturbance acted, this one or
-  one inside it. Disturbances that always act set it in every step.
+* ``info["disturbed"]`` is true in each step in which a disturbance acted.
 
-Order matters where several are combined. From the task outwards: changes of dynamics
-and start state, knocks and pushes, actuators, sensors. Attacks on observations need the
-networks: :func:`attacked_policy` makes an attacked policy from a policy.
+To combine several, wrap the task first in changes of dynamics and start state, then in
+knocks and pushes, actuators, and sensors. Attacks on observations need the networks:
+:func:`attacked_policy` makes an attacked policy from a policy.
 
-Gymnasium and MuJoCo come with ``torchrl-osr[train]``.
+Examples:
+    >>> from torchrl_osr.lab.data import make_environment
+    >>> env = ObservationNoise(make_environment("Hopper-v5"), 0.1)
+    >>> observation, info = env.reset(seed=0)
+    >>> bool(info["disturbed"])
+    True
 """
 
 from torchrl_osr._extras import needed_by

@@ -1,87 +1,66 @@
-"""What disturbances have in common: random stream, flag, checked arguments."""
+"""Random stream, flag and checks that all disturbances share."""
 
 from __future__ import annotations
 
-import math
 import zlib
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import gymnasium
 import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
 from numpy.typing import NDArray
 
+from torchrl_osr._checks import check_positive
+
 Vector: TypeAlias = NDArray[Any]
-"""An observation ``[S]`` or an action ``[A]``."""
+"""Observation ``[S]`` or action ``[A]``."""
 
 Step: TypeAlias = tuple[Vector, Any, bool, bool, dict[str, Any]]
-"""What ``step`` returns: observation, reward, terminated, truncated, info."""
+"""Observation, reward, terminated, truncated, info."""
+
+At: TypeAlias = int | Literal["random"]
+"""Steps of the agent before a disturbance; ``"random"`` averages over the gait."""
 
 
 class NotPossible(TypeError):
-    """A disturbance needs what the environment lacks: MuJoCo, or real actions."""
+    """The environment lacks what a disturbance needs: MuJoCo, or real actions."""
 
 
-def check_strength(name: str, value: float) -> None:
-    """Raise a ValueError unless ``value`` is finite and at least 0."""
-    if not 0 <= value < math.inf:
-        raise ValueError(f"{name} must be a finite number, at least 0, got {value!r}.")
+def box_of(
+    space: gymnasium.Space[Any], name: str, *, bounded: bool = False
+) -> gymnasium.spaces.Box:
+    """Return the space; raise NotPossible unless it is a (bounded) Box."""
+    if isinstance(space, gymnasium.spaces.Box) and (space.is_bounded() or not bounded):
+        return space
+    wanted = "finite bounds" if bounded else "real numbers"
+    raise NotPossible(f"The {name} are {space}; expected a Box of {wanted}.")
 
 
-def check_count(name: str, value: object, least: int) -> None:
-    """Raise a ValueError unless ``value`` is an integer of at least ``least``."""
-    integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    if not integer or value < least:  # type: ignore[operator]
-        raise ValueError(f"{name} must be an integer, at least {least}; got {value!r}.")
+def mujoco_task(env: gymnasium.Env[Any, Any]) -> Any:
+    """Return the bare environment; raise NotPossible unless it is a MuJoCo task.
 
-
-def vector_box(space: gymnasium.Space[Any], name: str) -> gymnasium.spaces.Box:
-    """The space itself; raise NotPossible unless it is a Box."""
-    if not isinstance(space, gymnasium.spaces.Box):
-        raise NotPossible(f"The {name} are {space}; expected a Box of real numbers.")
-    return space
-
-
-def bounded_box(space: gymnasium.Space[Any]) -> gymnasium.spaces.Box:
-    """The action space itself; raise unless it is a Box with finite bounds."""
-    box = vector_box(space, "actions")
-    if not box.is_bounded():
-        raise ValueError(
-            f"The actions are {box}; expected finite bounds, in whose units the "
-            "disturbance is: wrap the environment in "
-            "gymnasium.wrappers.RescaleAction or ClipAction first."
-        )
-    return box
-
-
-def mujoco_task(env: gymnasium.Env[Any, Any], name: str) -> Any:
-    """The bare environment; raise NotPossible unless it is Gymnasium's own MuJoCo task.
-
-    Others, such as the mazes, have their simulation in another environment inside them.
+    Others, such as the mazes, keep their simulation in another environment.
     """
-    if not isinstance(env.unwrapped, MujocoEnv):
-        raise NotPossible(
-            f"{name} acts on the simulation of Gymnasium's own MuJoCo tasks, "
-            f"'Hopper-v5' for instance; got {env.unwrapped}."
-        )
-    return env.unwrapped
+    if isinstance(env.unwrapped, MujocoEnv):
+        return env.unwrapped
+    raise NotPossible(
+        "This disturbance acts on the simulation of Gymnasium's own MuJoCo tasks, "
+        f"'Hopper-v5' for instance; got {env.unwrapped}."
+    )
 
 
 def flag(info: dict[str, Any], disturbed: bool) -> dict[str, Any]:
-    """Set ``info["disturbed"]``: whether this disturbance, or one inside it, acted."""
-    # A NumPy scalar, like all numbers that wrappers put into info: TorchRL reads no
-    # Python bool.
+    """Set ``info["disturbed"]`` if this disturbance, or one inside it, acted."""
+    # A NumPy scalar: TorchRL reads no Python bool from info.
     info["disturbed"] = np.bool_(disturbed or info.get("disturbed", False))
     return info
 
 
 class DisturbanceWrapper(gymnasium.Wrapper[Vector, Vector, Vector, Vector]):
-    """Abstract base of the wrappers of this package.
+    """Base of the disturbances: override :meth:`begin`, :meth:`act` or :meth:`observe`.
 
-    The episode's seed also seeds the wrapper's own generator, together with the name of
-    its class and the number of wrappers of that class inside it: the environment draws
-    what it would draw without the wrapper. A reset without a seed continues the
-    generator.
+    A reset with a seed also seeds :attr:`generator`, which differs by class and by the
+    number of wrappers of that class inside; a reset without a seed continues it.
 
     Args:
         env: the environment.
@@ -92,24 +71,59 @@ class DisturbanceWrapper(gymnasium.Wrapper[Vector, Vector, Vector, Vector]):
         self, env: gymnasium.Env[Vector, Vector], *, always: bool = False
     ) -> None:
         super().__init__(env)
-        self._always = always
-        self._generator = np.random.default_rng()
+        self.always, self.acted = always, False
+        self.generator = np.random.default_rng()
         inside = 0
         while isinstance(env, gymnasium.Wrapper):
             inside += type(env) is type(self)
             env = env.env
-        self._tag = (zlib.crc32(type(self).__name__.encode()), inside)
+        self.key = zlib.crc32(type(self).__name__.encode()), inside
+
+    def begin(self) -> None:
+        """Draw what an episode needs."""
+
+    def act(self, action: Vector) -> Vector:
+        """Return the action to execute; set :attr:`acted` if it is another."""
+        return action
+
+    def observe(self, observation: Vector) -> Vector:
+        """Return the observation that the agent gets."""
+        return observation
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Vector, dict[str, Any]]:
         observation, info = super().reset(seed=seed, options=options)
         if seed is not None:
-            sequence = np.random.SeedSequence([seed, *self._tag])
-            self._generator = np.random.default_rng(sequence)
-        return observation, flag(info, self._always)
+            sequence = np.random.SeedSequence([seed, *self.key])
+            self.generator = np.random.default_rng(sequence)
+        self.begin()
+        return self.observe(observation), flag(info, self.always)
 
     def step(self, action: Vector) -> Step:
-        result = self.env.step(action)
-        flag(result[-1], self._always)
-        return result
+        self.acted = self.always
+        observation, reward, terminated, truncated, info = super().step(
+            self.act(action)
+        )
+        flag(info, self.acted)
+        return self.observe(observation), reward, terminated, truncated, info
+
+
+class Moment:
+    """Time of a disturbance that acts once an episode, at the earliest ``first``."""
+
+    def __init__(self, at: At, window: tuple[int, int], first: int = 0) -> None:
+        check_positive("the length of window", window[1] - window[0], minimum=1)
+        earliest = window[0] if at == "random" else at
+        check_positive("at, or the start of window,", earliest, minimum=first)
+        self.at, self.window, self.next_step = at, (window[0], window[1]), 0
+
+    def begin(self, generator: np.random.Generator) -> None:
+        """Draw the time for an episode."""
+        at = generator.integers(*self.window) if self.at == "random" else self.at
+        self.next_step = -int(at)
+
+    def count(self) -> int:
+        """Count a step; return its number, 0 at the moment, negative before."""
+        self.next_step += 1
+        return self.next_step - 1

@@ -1,68 +1,45 @@
-"""Faults of actuators and sensors: noisy, late and repeated actions, noisy readings."""
+"""Faulty actuators and sensors: noisy, late and repeated actions, noisy readings."""
 
 from __future__ import annotations
 
 from collections import deque
-from typing import Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike
 
-from torchrl_osr.lab.envs.disturbance import (
-    DisturbanceWrapper,
-    Step,
-    Vector,
-    bounded_box,
-    check_count,
-    check_strength,
-    flag,
-    vector_box,
-)
+from torchrl_osr._checks import check_positive, check_weight
+from torchrl_osr.lab.envs.disturbance import DisturbanceWrapper, Vector, box_of
 
 
 class ActionNoise(DisturbanceWrapper):
-    """Gaussian noise on every action, clipped to the action box.
+    """Add Gaussian noise to every action and clip it to the action box.
 
     The random perturbation of "Robust Gymnasium" (https://arxiv.org/abs/2502.19652).
 
     Args:
-        env: the environment, with bounded actions.
+        env: the environment, with bounded real actions.
         std: standard deviation in half-widths of the box; 0 is off.
-
-    Raises:
-        ValueError: if ``std`` is negative or actions are unbounded.
-        NotPossible: if actions are not a Box.
-
-    Examples:
-        >>> from torchrl_osr.lab.data import make_environment
-        >>> from torchrl_osr.lab.envs import ActionNoise
-        >>> env = ActionNoise(make_environment("Hopper-v5"), 0.05)
-        >>> _, info = env.reset(seed=0)
-        >>> bool(info["disturbed"])
-        True
     """
 
     def __init__(self, env: gymnasium.Env[Vector, Vector], std: float) -> None:
-        check_strength("std", std)
+        check_weight("std", std)
         super().__init__(env, always=std > 0)
-        self.std = std
-        box = bounded_box(env.action_space)
-        self._low, self._high, self._dtype = box.low, box.high, box.dtype
-        low, high = box.low.astype(np.float64), box.high.astype(np.float64)
-        self._scale = std * (high - low) / 2
+        self.box = box_of(env.action_space, "actions", bounded=True)
+        low, high = (each.astype(np.float64) for each in (self.box.low, self.box.high))
+        self.scale = std * (high - low) / 2
 
-    def step(self, action: Vector) -> Step:
-        if self.std > 0:
-            noise = self._scale * self._generator.standard_normal(self._scale.shape)
-            noisy = (action + noise).astype(self._dtype)
-            # np.clip is three times slower on a few numbers.
-            action = np.minimum(np.maximum(noisy, self._low), self._high)
-        return super().step(action)
+    def act(self, action: Vector) -> Vector:
+        if not self.always:
+            return action
+        noise = self.scale * self.generator.standard_normal(self.scale.shape)
+        noisy = (action + noise).astype(self.box.dtype)
+        # np.clip is three times slower on a few numbers.
+        return np.minimum(np.maximum(noisy, self.box.low), self.box.high)
 
 
 class ActionDelay(DisturbanceWrapper):
-    """Delay of every action by some steps; zeros until the first one arrives.
+    """Delay every action by some steps; execute zeros until the first one arrives.
 
     Constant delays of "Reinforcement Learning with Random Delays"
     (https://arxiv.org/abs/2010.02966).
@@ -70,148 +47,85 @@ class ActionDelay(DisturbanceWrapper):
     Args:
         env: the environment, with real actions.
         steps: of the delay; 0 is off.
-
-    Raises:
-        ValueError: if ``steps`` is negative or no integer.
-        NotPossible: if actions are not a Box.
-
-    Examples:
-        >>> from torchrl_osr.lab.data import make_environment
-        >>> from torchrl_osr.lab.envs import ActionDelay
-        >>> env = ActionDelay(make_environment("Hopper-v5"), 2)
-        >>> _, info = env.reset(seed=0)
-        >>> bool(info["disturbed"])
-        True
     """
 
     def __init__(self, env: gymnasium.Env[Vector, Vector], steps: int) -> None:
-        check_count("steps", steps, 0)
+        check_positive("steps", steps, minimum=0)
         super().__init__(env, always=steps > 0)
-        self.steps = steps
-        box = vector_box(env.action_space, "actions")
-        self._zero = np.zeros(box.shape, box.dtype)
-        self._pending: deque[Vector] = deque()
+        self.box = box_of(env.action_space, "actions")
+        self.steps, self.pending = steps, deque[Vector]()
 
-    def reset(self, **options: Any) -> tuple[Vector, dict[str, Any]]:
-        self._pending = deque([self._zero] * self.steps)
-        return super().reset(**options)
+    def begin(self) -> None:
+        self.pending = deque([np.zeros(self.box.shape, self.box.dtype)] * self.steps)
 
-    def step(self, action: Vector) -> Step:
-        if self.steps:
-            # A copy: the caller may write the next action into the same array.
-            self._pending.append(np.array(action))
-            action = self._pending.popleft()
-        return super().step(action)
+    def act(self, action: Vector) -> Vector:
+        # A copy: the caller may write the next action into the same array.
+        self.pending.append(np.array(action))
+        return self.pending.popleft()
 
 
 class StickyAction(DisturbanceWrapper):
-    """Repetition of the previous action, with some probability in each step.
+    """Execute the previous action once more, with some probability in each step.
 
-    From "Revisiting the Arcade Learning Environment" (https://arxiv.org/abs/1709.06009),
-    where it is 0.25. The previous action is the executed one, not the agent's; the
-    first action of an episode is always the agent's.
+    :class:`gymnasium.wrappers.StickyAction` with a random stream of its own, from
+    "Revisiting the Arcade Learning Environment" (https://arxiv.org/abs/1709.06009),
+    where the probability is 0.25.
 
     Args:
         env: the environment.
-        probability: of a repetition, from 0 (off) to 1 (the first action forever).
-
-    Raises:
-        ValueError: if ``probability`` is not between 0 and 1.
+        probability: of a repetition, from 0 (off) to below 1.
 
     Examples:
         >>> from torchrl_osr.lab.data import make_environment
-        >>> from torchrl_osr.lab.envs import StickyAction
-        >>> env = StickyAction(make_environment("Hopper-v5"), 1.0)
-        >>> observation, _ = env.reset(seed=0)
+        >>> env = StickyAction(make_environment("Hopper-v5"), 0.999)
+        >>> _ = env.reset(seed=0)
         >>> [int(env.step(env.action_space.high)[-1]["disturbed"]) for _ in range(3)]
         [0, 1, 1]
     """
 
     def __init__(self, env: gymnasium.Env[Vector, Vector], probability: float) -> None:
-        if not 0 <= probability <= 1:
-            raise ValueError(f"probability must be in [0, 1], got {probability!r}.")
         super().__init__(env)
-        self.probability = probability
-        self._previous: Vector | None = None
+        # Around an empty environment, whose random stream becomes that of the wrapper.
+        self.sticky = gymnasium.wrappers.StickyAction(gymnasium.Env(), probability)
 
-    def reset(self, **options: Any) -> tuple[Vector, dict[str, Any]]:
-        self._previous = None
-        return super().reset(**options)
+    def begin(self) -> None:
+        self.sticky.np_random = self.generator
+        self.sticky.last_action = None
 
-    def step(self, action: Vector) -> Step:
-        sticks = False
-        if self._previous is not None and self.probability:
-            sticks = bool(self._generator.random() < self.probability)
-        if self._previous is None or not sticks:
-            self._previous = np.array(action)
-        result = super().step(self._previous)
-        flag(result[-1], sticks)
-        return result
+    def act(self, action: Vector) -> Vector:
+        previous = self.sticky.last_action
+        # A copy: the caller may write the next action into the same array.
+        executed: Vector = self.sticky.action(np.array(action))
+        self.acted = executed is previous
+        return executed
 
 
 class ObservationNoise(DisturbanceWrapper):
-    """Gaussian noise on every observation; the simulated state is unchanged.
+    """Add Gaussian noise to every observation; the simulated state is unchanged.
 
-    The noise of "DMBP: Diffusion Model-Based Predictor for Robust Offline
-    Reinforcement Learning against State Observation Perturbations" (ICLR 2024), which
-    is absolute; with ``unit`` it is relative to the data, as in RORL,
-    https://arxiv.org/abs/2206.02829. The first observation of an episode is noisy, too.
-    Bounds of the observation space are not enforced.
+    Absolute noise is that of DMBP (Yang and Xu, ICLR 2024), noise relative to the data
+    that of RORL, https://arxiv.org/abs/2206.02829. The first observation of an episode
+    is noisy, too. Bounds of the observation space are not enforced.
 
     Args:
         env: the environment, with real observations.
         std: standard deviation, in ``unit``; 0 is off.
 
     Keyword Args:
-        unit: the data's standard deviation in each dimension, in the shape of an
-            observation. Default: 1, ``std`` is in the observation's own units.
-
-    Raises:
-        ValueError: if ``std`` or a number of ``unit`` is negative, or ``unit`` of
-            another shape.
-        NotPossible: if observations are not a Box.
-
-    Examples:
-        >>> from torchrl_osr.lab.data import make_environment
-        >>> from torchrl_osr.lab.envs import ObservationNoise
-        >>> env = ObservationNoise(make_environment("Hopper-v5"), 0.1)
-        >>> observation, _ = env.reset(seed=0)
-        >>> clean, _ = make_environment("Hopper-v5").reset(seed=0)
-        >>> bool((abs(observation - clean) > 0).all())
-        True
+        unit: the data's standard deviation of each number of an observation, ``[S]``.
+            Default: 1, so that ``std`` is in the observation's own units.
     """
 
     def __init__(
-        self,
-        env: gymnasium.Env[Vector, Vector],
-        std: float,
-        *,
-        unit: ArrayLike | None = None,
+        self, env: gymnasium.Env[Vector, Vector], std: float, *, unit: ArrayLike = 1.0
     ) -> None:
-        check_strength("std", std)
+        check_weight("std", std)
         super().__init__(env, always=std > 0)
-        shape = vector_box(env.observation_space, "observations").shape
-        scale = np.ones(shape) if unit is None else np.asarray(unit, dtype=np.float64)
-        if scale.shape != shape:
-            raise ValueError(
-                f"unit has shape {scale.shape}, but observations have {shape}; pass "
-                "one standard deviation for each number of an observation."
-            )
-        if not (np.isfinite(scale) & (scale >= 0)).all():
-            raise ValueError(f"unit must be finite and at least 0, got {scale}.")
-        self.std = std
-        self._scale = std * scale
+        shape = box_of(env.observation_space, "observations").shape
+        self.scale = std * np.broadcast_to(np.asarray(unit, np.float64), shape)
 
-    def reset(self, **options: Any) -> tuple[Vector, dict[str, Any]]:
-        observation, info = super().reset(**options)
-        return self._seen(observation), info
-
-    def step(self, action: Vector) -> Step:
-        observation, *rest = super().step(action)
-        return self._seen(observation), *rest
-
-    def _seen(self, observation: Vector) -> Vector:
-        if self.std == 0:
+    def observe(self, observation: Vector) -> Vector:
+        if not self.always:
             return observation
-        noise = self._generator.standard_normal(observation.shape)
-        return (observation + self._scale * noise).astype(observation.dtype)
+        noise = self.generator.standard_normal(observation.shape)
+        return (observation + self.scale * noise).astype(observation.dtype)

@@ -1,11 +1,8 @@
-r"""Observations that an adversary perturbs, within a box around the true ones.
+r"""Attacks on observations, within a box around the true ones.
 
 The evaluation of "RORL: Robust Offline Reinforcement Learning via Conservative
 Smoothing" (Yang et al., NeurIPS 2022), https://arxiv.org/abs/2206.02829. An adversary
 needs the networks, so it acts between environment and policy, not in a wrapper.
-
-Shapes: ``E`` episodes, ``S`` observation, ``A`` action, ``N`` critics, ``M`` candidate
-perturbations of one state.
 """
 
 from __future__ import annotations
@@ -25,14 +22,13 @@ from torchrl_osr.lab.losses.adversary import TanhNormalPolicy, Values
 
 
 def critics_of(loss: LossModule) -> Values:
-    """Values ``[N, M, E]`` of a loss's critics, as a function of states and actions.
+    """Return the values of a loss's critics as a function of states and actions.
 
-    The critics themselves, not their target networks, with the parameters that the loss
-    has at each call.
+    ``N`` critics, ``M`` perturbations and ``E`` episodes give ``[N, M, E]``. The
+    critics are not the target networks and have the loss's current parameters.
 
     Args:
-        loss: a loss module with a ``qvalue_network``: :class:`~torchrl_osr.OSRLoss`,
-            :class:`~torchrl_osr.OSRVLoss`, TorchRL's SAC or CQL loss.
+        loss: a loss module with a ``qvalue_network``.
     """
 
     def values(states: TensorDictBase, action: Tensor) -> Tensor:
@@ -58,13 +54,12 @@ def attacked_policy(
     num_samples: int = 50,
     seed: int = 0,
 ) -> Callable[[Tensor], Tensor]:
-    r"""Deterministic policy that sees perturbed observations.
+    r"""Return a deterministic policy that sees perturbed observations.
 
-    Each entry of an observation is off by at most :math:`\epsilon` standard deviations:
-    uniformly (``"random"``), or as :class:`~torchrl_osr.lab.losses.Adversary` finds
-    it, with the
-    largest change of the policy (``"action_diff"``) or the action of lowest value
-    (``"min_Q"``).
+    Each number of an observation is off by at most :math:`\epsilon` standard
+    deviations: uniformly (``"random"``), or as
+    :class:`~torchrl_osr.lab.losses.Adversary` finds it, with the largest change of the
+    policy (``"action_diff"``) or the action of lowest value (``"min_Q"``).
 
     Args:
         policy_distribution: the actor's ``get_dist``, for instance.
@@ -83,26 +78,19 @@ def attacked_policy(
     Returns:
         A function from raw observations ``[E, S]`` to actions ``[E, A]``, on the CPU.
 
-    Raises:
-        ValueError: if an argument is unknown or out of its range.
-
     Examples:
         >>> import torch
-        >>> from torchrl_osr import OSRLoss
-        >>> from torchrl_osr.lab.envs import attacked_policy, critics_of
-        >>> from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
+        >>> from torchrl_osr.modules import tanh_gaussian_actor
         >>> actor = tanh_gaussian_actor(11, 3)
-        >>> loss = OSRLoss(actor, critic_ensemble(11, 3), recovery_weight=0)
-        >>> critics = critics_of(loss)
-        >>> policy = attacked_policy(actor.get_dist, critics, kind="min_Q", epsilon=0.1)
+        >>> policy = attacked_policy(actor.get_dist, None, kind="random", epsilon=0.1)
         >>> policy(torch.zeros(4, 11)).shape
         torch.Size([4, 3])
     """
     check_choice("kind", kind, ("random", "action_diff", "min_Q"))
+    objective: Literal["min_Q", "action_diff"]
+    objective = "min_Q" if kind == "min_Q" else "action_diff"
     # Checks the other arguments, also for "random".
-    adversary = Adversary(
-        "min_Q" if kind == "min_Q" else "action_diff", method, epsilon, num_samples
-    )
+    adversary = Adversary(objective, method, epsilon, num_samples)
     generator = torch.Generator().manual_seed(seed)
 
     @torch.no_grad()

@@ -29,8 +29,7 @@ class DataDistance:
 
     with :math:`s_{(k)}` the ``k``-th nearest of a random subset of the data's states
     and :math:`\sigma` their standard deviation in each dimension. A state counts as in
-    the data up to :attr:`threshold`: 95 % of the data's held-out states, which are not
-    in the subset, are within it.
+    the data up to :attr:`threshold`, which 95 % of held-out states are within.
 
     Args:
         data: transitions ``[N]`` with raw ``observation`` ``[N, S]``, in memory or on
@@ -38,19 +37,17 @@ class DataDistance:
 
     Keyword Args:
         max_reference: size of the subset, at most. Default 20,000.
-        seed: of the two random subsets. Default 0.
+        seed: of the random subset and of the held-out states. Default 0.
 
     Attributes:
-        threshold: see above, in the unit of the distance: standard deviations.
+        threshold: see above, in standard deviations.
 
     Raises:
         ValueError: if there are too few rows for ``K`` neighbours and a held-out state.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_osr.lab.evaluation import DataDistance
         >>> rows = torch.randn(1000, 3, generator=torch.Generator().manual_seed(0))
+        >>> from tensordict import TensorDict
         >>> distance = DataDistance(TensorDict({"observation": rows}, [1000]))
         >>> far = torch.tensor([[0.0, 0.0, 0.0], [9.0, 9.0, 9.0]])
         >>> (distance(far) <= distance.threshold).tolist()
@@ -58,11 +55,7 @@ class DataDistance:
     """
 
     def __init__(
-        self,
-        data: TensorDictBase,
-        *,
-        max_reference: int = 20_000,
-        seed: int = 0,
+        self, data: TensorDictBase, *, max_reference: int = 20_000, seed: int = 0
     ) -> None:
         held_out = min(MAX_HELD_OUT, len(data) // 5)
         reference = min(max_reference, len(data) - held_out)
@@ -82,21 +75,17 @@ class DataDistance:
         )
         self._states = self._standard(states)
         self._squares = self._states.square().sum(-1)
-        distances = self(others)
-        self.threshold = float(torch.quantile(distances.double(), 0.95))
+        self.threshold = float(torch.quantile(self(others).double(), 0.95))
 
     def __call__(self, observation: Tensor) -> Tensor:
         """Distance of raw observations ``[M, S]``, float32 ``[M]``."""
-        distances = [
-            self._chunk(self._standard(rows))
-            for rows in torch.split(observation.cpu(), ROWS_AT_A_TIME)
-        ]
-        return torch.cat(distances).float()
+        chunks = torch.split(self._standard(observation.cpu()), ROWS_AT_A_TIME)
+        return torch.cat([self._distance(states) for states in chunks]).float()
 
     def _standard(self, observation: Tensor) -> Tensor:
         return (observation.double() - self._loc) / self._scale
 
-    def _chunk(self, states: Tensor) -> Tensor:
+    def _distance(self, states: Tensor) -> Tensor:
         # |s - r|^2 = |s|^2 + |r|^2 - 2 s r cancels digits where s and r are near:
         # double precision has enough of them, and takes a third longer.
         others = torch.addmm(self._squares, states, self._states.T, alpha=-2)

@@ -62,12 +62,11 @@ def deterministic_policy(
     actor_network: ProbabilisticTensorDictSequential,
     observation_norm: ObservationNorm | None = None,
 ) -> Policy:
-    """The actor's deterministic action as a function of raw observations.
-
-    Of discrete actions it is the number of the likeliest.
+    """Return the actor's deterministic action as a function of raw observations.
 
     Args:
-        actor_network: reads ``"observation"``.
+        actor_network: reads ``"observation"``. Of discrete actions the function returns
+            the number of the likeliest.
         observation_norm: how the training data were standardised
             (``standard_normal=True``). Default: not at all.
     """
@@ -85,7 +84,7 @@ def deterministic_policy(
 
 
 class EpisodeEvaluator:
-    """Runs one episode for each of a fixed list of seeds, to its end.
+    """Play one episode for each of a fixed list of seeds, to its end.
 
     The policy is called once a step, with all unfinished episodes. The environments are
     kept from one evaluation to the next.
@@ -96,7 +95,7 @@ class EpisodeEvaluator:
     Keyword Args:
         num_episodes: ``E``. Default 10.
         seed: the episodes are seeded ``seed, seed + 1, ...``. Default 0.
-        device: where the policy is. Default CPU.
+        device: of the policy. Default CPU.
         wrap: put around each environment. Default: nothing.
         fixed_batch: call the policy with all ``E`` rows to the end, with the last
             observation of finished episodes. torch's rounding depends on the number of
@@ -107,7 +106,6 @@ class EpisodeEvaluator:
         RuntimeError: the environment has no simulator.
 
     Examples:
-        >>> import torch
         >>> evaluator = EpisodeEvaluator("Hopper-v5", num_episodes=2)
         >>> results = evaluator(lambda observation: torch.zeros(len(observation), 3))
         >>> results.lengths.shape
@@ -130,8 +128,7 @@ class EpisodeEvaluator:
         if wrap is not None:
             self.environments = [wrap(each) for each in self.environments]
         self.seeds = seed + np.arange(num_episodes)
-        self.device = device
-        self.fixed_batch = fixed_batch
+        self.device, self.fixed_batch = device, fixed_batch
 
     def __call__(
         self, policy: Policy, watch: Watch = lambda *_: None
@@ -161,12 +158,11 @@ class EpisodeEvaluator:
             unfinished = []
             for episode in running:
                 step = self.environments[episode].step(actions[episode])
-                observation, reward, terminated, truncated, info = step
-                watch(episode, observation, terminated, info)
+                observation, reward, terminated, truncated, infos[episode] = step
+                watch(episode, observation, terminated, infos[episode])
                 observations[episode] = observation
                 returns[episode] += float(reward)
                 lengths[episode] += 1
-                infos[episode] = info
                 if not (terminated or truncated):
                     unfinished.append(episode)
             running = unfinished
@@ -182,12 +178,7 @@ class EpisodeEvaluator:
 
 
 def measure_of(row: Mapping[str, Any]) -> str:
-    """What a summary's episodes were judged by: ``"score"`` or ``"return"``.
-
-    Args:
-        row: of :func:`summarize` or
-            :func:`~torchrl_osr.lab.evaluation.summarize_disturbances`.
-    """
+    """Return ``"score"`` if a summary has scores, else ``"return"``."""
     return "score" if "score" in row else "return"
 
 
@@ -203,11 +194,11 @@ def summarize(
 
     Returns:
         ``"score"`` with its 95 % bootstrap interval ``"score_low"``, ``"score_high"``
-        over the episodes, unless there are no references: then ``"return_low"`` and
-        ``"return_high"``; ``"return"`` (mean), ``"length"`` (mean), and the lists
-        ``"returns"``, ``"lengths"`` and ``"seeds"``. Where the task reports successes,
-        also their share ``"success_rate"`` with Wilson's 95 % interval
-        ``"success_low"``, ``"success_high"``, and the list ``"successes"``.
+        over the episodes, or without references ``"return_low"`` and ``"return_high"``;
+        ``"return"`` (mean), ``"length"`` (mean), and the lists ``"returns"``,
+        ``"lengths"`` and ``"seeds"``. If the task reports successes, also their share
+        ``"success_rate"`` with Wilson's 95 % interval ``"success_low"``,
+        ``"success_high"``, and the list ``"successes"``.
     """
     measure, values = "return", results.returns
     if references is not None:
@@ -223,13 +214,9 @@ def summarize(
         "lengths": results.lengths.tolist(),
         "seeds": results.seeds.tolist(),
     }
-    if results.successes is None:
-        return summary
-    count, total = int(results.successes.sum()), len(results.successes)
-    low, high = wilson_interval(count, total)
-    return summary | {
-        "success_rate": count / total,
-        "success_low": low,
-        "success_high": high,
-        "successes": results.successes.tolist(),
-    }
+    if results.successes is not None:
+        count, total = int(results.successes.sum()), len(results.successes)
+        summary["success_rate"] = count / total
+        summary["success_low"], summary["success_high"] = wilson_interval(count, total)
+        summary["successes"] = results.successes.tolist()
+    return summary

@@ -34,47 +34,36 @@ def inverse_dynamics_report(
         data: held-out rows, ``[N]``; ``done`` rows are left out.
 
     Returns:
-        Of discrete actions ``"nll"``, mean negative log-likelihood in nats,
-        ``"accuracy"``, share of the rows whose action is the likeliest, and ``"rows"``.
-        Of real ones ``"nll"`` and ``"rows"`` likewise; ``"r2"``, share of each action
-        dimension's variance that the deterministic action explains, ``A`` numbers, and
-        their mean ``"r2_mean"``; ``"coverage_90"``, share of actions
-        inside the model's central 90 % interval, over all dimensions (0.9 is
-        calibrated).
-
-    Raises:
-        ValueError: if no row is left.
+        ``"nll"``, mean negative log-likelihood in nats, and ``"rows"``. Of discrete
+        actions also ``"accuracy"``, share of rows whose action is the likeliest. Of
+        real ones ``"r2"``, share of each action dimension's variance that the
+        deterministic action explains, ``A`` numbers, their mean ``"r2_mean"``, and
+        ``"coverage_90"``, share of actions inside the model's central 90 % interval,
+        over all dimensions (0.9 is calibrated).
     """
     data = data[~data.get(("next", "done")).squeeze(-1)]
-    if not len(data):
-        raise ValueError("No held-out row is a true transition: all are done.")
     # Latent variables at their mean, as the policy's losses use the model.
     with set_interaction_type(InteractionType.DETERMINISTIC):
         distribution = inverse_dynamics_network.get_dist(
             data.select(*inverse_dynamics_network.in_keys)
         )
     action = data.get("action")
+    report = {"nll": -distribution.log_prob(action).mean().item(), "rows": len(data)}
     if isinstance(distribution, ONE_HOT):
-        return {
-            "nll": -distribution.log_prob(action).mean().item(),
-            "accuracy": (distribution.mode * action).sum(-1).mean().item(),
-            "rows": len(data),
-        }
+        accuracy = (distribution.mode * action).sum(-1).mean().item()
+        return report | {"accuracy": accuracy}
     error = (action - distribution.deterministic_sample).square().sum(0)
-    spread = (action - action.mean(0)).square().sum(0)
-    r2 = 1 - error / spread
+    r2 = 1 - error / (action - action.mean(0)).square().sum(0)
     # The squash is monotonic: a quantile of the Gaussian is one of the action.
     half_width = NORMAL_QUANTILE_95 * distribution.scale
     squash = distribution.transforms[0]
     inside = (squash(distribution.loc - half_width) <= action) & (
         action <= squash(distribution.loc + half_width)
     )
-    return {
-        "nll": -distribution.log_prob(action).mean().item(),
+    return report | {
         "r2_mean": r2.mean().item(),
         "r2": r2.tolist(),
         "coverage_90": inside.float().mean().item(),
-        "rows": len(data),
     }
 
 

@@ -1,4 +1,4 @@
-"""Survival and return to the data after a transient disturbance.
+"""Survival and return to the data after a disturbance that ends.
 
 Entry 0 of a trajectory is the reset, entry ``i + 1`` is step ``i``. Offsets count from
 the last entry in which the disturbance acted, offset 0.
@@ -37,14 +37,27 @@ class Trajectory:
     disturbed: list[bool] = field(default_factory=list)
     terminated: bool = False
 
-    @property
-    def last(self) -> int:
-        """The last entry."""
-        return len(self.disturbed) - 1
+    def disturbance(self) -> tuple[int, int] | None:
+        """First and last entry of the first disturbance; ``None`` if there is none."""
+        if True not in self.disturbed:
+            return None
+        first = self.disturbed.index(True)
+        rest = self.disturbed[first:]
+        return first, first + (rest.index(False) if False in rest else len(rest)) - 1
+
+    def alive_after(self, end: int) -> bool | None:
+        """Whether there is no fall until :data:`STEPS_AFTER` entries after ``end``.
+
+        ``None`` if the time limit came first.
+        """
+        later = len(self.disturbed) - 1 - end
+        if self.terminated and later <= STEPS_AFTER:
+            return False
+        return True if later >= STEPS_AFTER else None
 
 
 class Recorder:
-    """Keeps the trajectories of an evaluation's episodes, as its ``watch``."""
+    """Keep the trajectories of an evaluation's episodes, as its ``watch``."""
 
     def __init__(self, num_episodes: int) -> None:
         self.trajectories = [Trajectory() for _ in range(num_episodes)]
@@ -52,6 +65,7 @@ class Recorder:
     def __call__(
         self, episode: int, observation: Any, terminated: bool, info: dict[str, Any]
     ) -> None:
+        """Record a reset or a step."""
         trajectory = self.trajectories[episode]
         # astype copies: an environment may write into the same array again.
         trajectory.observations.append(observation.astype(np.float32))
@@ -59,15 +73,9 @@ class Recorder:
         trajectory.terminated = bool(terminated) and not info.get("success", False)
 
 
-def _nowhere() -> NDArray[np.float64]:
-    return np.full(STEPS_BEFORE + 1 + STEPS_AFTER, np.nan)
-
-
 @dataclass(frozen=True)
 class Recovery:
-    """Survival and recovery of one episode after a transient disturbance.
-
-    Everything is ``None``, and distances are NaN, if the disturbance never acted.
+    """Survival and recovery of one episode after a disturbance that ends.
 
     Attributes:
         ended_at: last step in which the disturbance acted.
@@ -83,45 +91,37 @@ class Recovery:
         clean_distance: of the undisturbed episode, at the same steps.
     """
 
-    ended_at: int | None = None
-    survived: bool | None = None
-    alive_after: bool | None = None
-    clean_alive_after: bool | None = None
-    steps: int | None = None
-    distance: NDArray[np.float64] = field(default_factory=_nowhere)
-    clean_distance: NDArray[np.float64] = field(default_factory=_nowhere)
-
-
-def disturbed_at(trajectory: Trajectory) -> int | None:
-    """Step of the first disturbance, from 0; ``None`` if there was none.
-
-    A disturbance of the start state counts as step 0.
-    """
-    block = _first_block(trajectory.disturbed)
-    return None if block is None else max(block[0] - 1, 0)
+    ended_at: int
+    survived: bool
+    alive_after: bool | None
+    clean_alive_after: bool | None
+    steps: int | None
+    distance: NDArray[np.float64]
+    clean_distance: NDArray[np.float64]
 
 
 def measure_recovery(
     disturbed: Trajectory, clean: Trajectory, distance: DataDistance
-) -> Recovery:
-    """Survival, recovery and distances of one pair of episodes."""
-    block = _first_block(disturbed.disturbed)
+) -> Recovery | None:
+    """Survival and recovery of one pair; ``None`` if the disturbance never acted."""
+    block = disturbed.disturbance()
     if block is None:
-        return Recovery()
+        return None
     end = block[1]
+    last = len(disturbed.disturbed) - 1
     curve = _around(disturbed, end, distance)
     steps = _first_within(curve[STEPS_BEFORE:])
     if steps is None:
         later = _relative(disturbed.observations[end + STEPS_AFTER + 1 :], distance)
         steps = _first_within(later, STEPS_AFTER + 1)
     # The state of the fall itself does not count as recovered.
-    if disturbed.terminated and steps == disturbed.last - end:
+    if disturbed.terminated and steps == last - end:
         steps = None
     return Recovery(
         ended_at=max(end - 1, 0),
-        survived=not (disturbed.terminated and disturbed.last == end),
-        alive_after=_alive_after(disturbed, end),
-        clean_alive_after=_alive_after(clean, end),
+        survived=not (disturbed.terminated and last == end),
+        alive_after=disturbed.alive_after(end),
+        clean_alive_after=clean.alive_after(end),
         steps=steps,
         distance=curve,
         clean_distance=_around(clean, end, distance),
@@ -132,30 +132,12 @@ def _around(
     trajectory: Trajectory, end: int, distance: DataDistance
 ) -> NDArray[np.float64]:
     """Distances around entry ``end``, NaN where there is no such entry."""
-    curve = _nowhere()
+    curve = np.full(STEPS_BEFORE + 1 + STEPS_AFTER, np.nan)
     start = max(end - STEPS_BEFORE, 0)
     there = trajectory.observations[start : end + STEPS_AFTER + 1]
     first = start - end + STEPS_BEFORE
     curve[first : first + len(there)] = _relative(there, distance)
     return curve
-
-
-def _alive_after(trajectory: Trajectory, end: int) -> bool | None:
-    """Whether there is no fall until :data:`STEPS_AFTER` steps after ``end``."""
-    later = trajectory.last - end
-    if trajectory.terminated and later <= STEPS_AFTER:
-        return False
-    return True if later >= STEPS_AFTER else None
-
-
-def _first_block(disturbed: Sequence[bool]) -> tuple[int, int] | None:
-    """First and last entry of the first disturbance."""
-    if True not in disturbed:
-        return None
-    first = last = disturbed.index(True)
-    while last + 1 < len(disturbed) and disturbed[last + 1]:
-        last += 1
-    return first, last
 
 
 def _relative(

@@ -1,22 +1,19 @@
-"""Episodes with and without a disturbance, in pairs: same policy, same start state.
+"""Episodes with and without disturbances, in pairs: same policy, same start state.
 
-Played by :func:`evaluate_paired`, kept as JSON by :func:`evaluation_json`, averaged by
-:func:`summarize_disturbances`. How it is measured is in ``docs/robustness.md``.
-
-Shapes: ``E`` pairs of episodes.
+How it is measured is in ``docs/robustness.md``. Shapes: ``E`` pairs of episodes.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from torchrl_osr._checks import check_positive
 from torchrl_osr.lab.data import ReferenceReturns
 from torchrl_osr.lab.evaluation.data_distance import DataDistance
 from torchrl_osr.lab.evaluation.episodes import (
@@ -31,29 +28,12 @@ from torchrl_osr.lab.evaluation.recovery import (
     STEPS_BEFORE,
     Recorder,
     Recovery,
-    disturbed_at,
     measure_recovery,
 )
-from torchrl_osr.lab.evaluation.statistics import (
-    NUM_RESAMPLES,
-    mean_interval,
-    percentile_interval,
-)
+from torchrl_osr.lab.evaluation.statistics import decrease_interval, mean_interval
 
 TRANSIENT = ("knock", "push", "start")
 """Kinds of disturbance that end, so that there is something to recover from."""
-
-RECOVERY_ENTRIES = (
-    "ended_at", "survived_knock", "alive_after", "clean_alive_after", "recovery_steps",
-    "distance",
-)  # fmt: skip
-"""Of a disturbance's JSON; ``None`` if it does not end."""
-
-COLUMNS = (
-    "loss %", "[95 %]", "met it", f"alive +{STEPS_AFTER}", "(clean)", "back",
-    "steps back",
-)  # fmt: skip
-"""Of the table, behind the disturbance and the score or return without and with it."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +45,7 @@ class Disturbance:
         kind: of the disturbance; those of :data:`TRANSIENT` end.
         strength: in the unit of its kind.
         wrap: puts the disturbance around an environment. Default: nothing.
-        policy: an attacked one, in the place of the evaluated one. Default: none.
+        policy: an attacked one, instead of the evaluated one. Default: none.
     """
 
     name: str
@@ -73,30 +53,6 @@ class Disturbance:
     strength: float
     wrap: Wrap | None = None
     policy: Policy | None = None
-
-
-class DisturbanceResults(NamedTuple):
-    """Episodes under one disturbance.
-
-    Attributes:
-        disturbance: which one.
-        results: returns, lengths and seeds, ``[E]`` each.
-        disturbed_at: step of the first disturbance of each episode, from 0; ``None``
-            where the episode ended before it, or there is none.
-        recovery: of each episode, ``[E]``; ``None`` if the disturbance does not end.
-    """
-
-    disturbance: Disturbance
-    results: EpisodeResults
-    disturbed_at: list[int | None]
-    recovery: list[Recovery] | None
-
-
-class PairedResults(NamedTuple):
-    """Clean episodes, and those with the same seeds under each of the disturbances."""
-
-    clean: EpisodeResults
-    disturbed: list[DisturbanceResults]
 
 
 def evaluate_paired(
@@ -107,13 +63,14 @@ def evaluate_paired(
     *,
     num_episodes: int = 10,
     seed: int = 0,
+    references: ReferenceReturns | None = None,
     advance: Callable[[], object] = lambda: None,
-) -> PairedResults:
+) -> dict[str, Any]:
     """Play clean episodes once, and the same episodes under each disturbance.
 
     Episodes of a pair have the same seed, hence the same start state, and the policy
     is called with batches of one size: until the disturbance acts they are equal, bit
-    for bit. Every disturbance has environments of its own.
+    for bit. Warns if the environment ignores its seed.
 
     Args:
         policy: to be evaluated, on the CPU.
@@ -122,16 +79,19 @@ def evaluate_paired(
         distance: to the data that the policy was trained on.
 
     Keyword Args:
-        num_episodes: ``E``, at least 2. Default 10.
+        num_episodes: ``E``. Default 10.
         seed: the episodes are seeded ``seed, seed + 1, ...``. Default 0.
+        references: what returns are normalised by. Default: no scores.
         advance: called after the clean episodes and after each disturbance.
 
-    Raises:
-        ValueError: if ``num_episodes`` is below 2, two disturbances have one name, or
-            one of them is not possible for this environment.
+    Returns:
+        JSON-compatible. ``"clean"``: lists ``"returns"``, ``"lengths"``, ``"seeds"``
+        and, with references, ``"scores"``, one entry an episode. ``"levels"``: the same
+        for each disturbance, with ``"name"``, ``"kind"``, ``"strength"``, the step at
+        which each episode was ``"disturbed_at"`` (``None``: it ended before), and, if
+        the disturbance ends, the entries of
+        :class:`~torchrl_osr.lab.evaluation.recovery.Recovery`; else these are ``None``.
     """
-    check_positive("num_episodes", num_episodes, minimum=2)
-    check_disturbances(env_id, disturbances)
 
     def play(policy: Policy, wrap: Wrap | None) -> tuple[EpisodeResults, Recorder]:
         evaluator = EpisodeEvaluator(
@@ -139,42 +99,48 @@ def evaluate_paired(
         )
         recorder = Recorder(num_episodes)
         with closing(evaluator):
+            if wrap is None:
+                start, again = (
+                    evaluator.environments[0].reset(seed=seed)[0] for _ in range(2)
+                )
+                if not np.array_equal(start, again):
+                    warnings.warn(
+                        f"{env_id} ignores its seed: two resets with seed {seed} give "
+                        "different observations, and the pairs are not pairs.",
+                        stacklevel=3,
+                    )
             results = evaluator(policy, recorder)
         advance()
         return results, recorder
 
     clean, undisturbed = play(policy, None)
-    played = []
+    levels = []
     for each in disturbances:
         results, recorder = play(each.policy or policy, each.wrap)
         moments: list[int | None] = [0] * num_episodes  # an attack: in every step
         if each.policy is None:
-            moments = [disturbed_at(episode) for episode in recorder.trajectories]
+            blocks = [episode.disturbance() for episode in recorder.trajectories]
+            # A disturbance of the start state counts as step 0.
+            moments = [
+                None if block is None else max(block[0] - 1, 0) for block in blocks
+            ]
         recovery = None
         if each.kind in TRANSIENT:
             pairs = zip(recorder.trajectories, undisturbed.trajectories, strict=True)
             recovery = [measure_recovery(*pair, distance) for pair in pairs]
-        played.append(DisturbanceResults(each, results, moments, recovery))
-    return PairedResults(clean, played)
-
-
-def check_disturbances(env_id: str, disturbances: Sequence[Disturbance]) -> None:
-    """Raise a ValueError unless all have their own names and fit the environment."""
-    names = [each.name for each in disturbances]
-    if len(set(names)) < len(names) or not names:
-        raise ValueError(f"disturbances need one name each, got {names}.")
-    for name, reason in impossible_disturbances(env_id, disturbances).items():
-        raise ValueError(_not_possible(name, env_id, reason))
+        levels.append(
+            {"name": each.name, "kind": each.kind, "strength": each.strength}
+            | _episodes_json(results, references)
+            | {"disturbed_at": moments}
+            | _recovery_json(recovery)
+        )
+    return {"clean": _episodes_json(clean, references), "levels": levels}
 
 
 def impossible_disturbances(
     env_id: str, disturbances: Sequence[Disturbance]
 ) -> dict[str, str]:
-    """Those that need what the environment lacks, and why, by name.
-
-    Raises:
-        ValueError: a disturbance is not what any environment could have.
-    """
+    """Names of those that need what the environment lacks, and why."""
     from torchrl_osr.lab.envs import NotPossible  # needs MuJoCo, and the rest does not
 
     reasons = {}
@@ -183,116 +149,42 @@ def impossible_disturbances(
             EpisodeEvaluator(env_id, num_episodes=1, wrap=each.wrap).close()
         except NotPossible as error:
             reasons[each.name] = str(error)
-        except (TypeError, ValueError) as error:
-            raise ValueError(_not_possible(each.name, env_id, error)) from error
     return reasons
-
-
-def _not_possible(name: str, env_id: str, reason: object) -> str:
-    return f"disturbance {name!r} is not possible for {env_id}: {reason}"
-
-
-def decrease_interval(
-    clean: ArrayLike, disturbed: ArrayLike
-) -> tuple[float | None, float | None, float | None]:
-    """Decrease of the mean score in percent, with its 95 % paired-bootstrap interval.
-
-    Pairs of episodes are resampled together, so that what both have in common does not
-    widen the interval.
-
-    Args:
-        clean, disturbed: scores or returns of the pairs, ``[E]`` each.
-
-    Returns:
-        ``100 (1 - mean(disturbed) / mean(clean))``, lower and upper end. All three are
-        ``None`` for fewer than two pairs or a clean mean that is not above 0, the ends
-        alone if that is so in a resample.
-
-    Examples:
-        >>> decrease_interval([40.0, 60.0], [20.0, 30.0])
-        (50.0, 50.0, 50.0)
-    """
-    pairs = np.stack([np.asarray(clean, float), np.asarray(disturbed, float)])
-    if pairs.shape[1] < 2 or pairs[0].mean() <= 0:
-        return None, None, None
-    clean_mean, disturbed_mean = pairs.mean(1)
-    decrease = float(100 * (1 - disturbed_mean / clean_mean))
-    rng = np.random.default_rng(0)
-    rows = rng.integers(pairs.shape[1], size=(NUM_RESAMPLES, pairs.shape[1]))
-    resampled_clean, resampled = pairs[:, rows].mean(-1)
-    if (resampled_clean <= 0).any():
-        return decrease, None, None
-    low, high = percentile_interval(100 * (1 - resampled / resampled_clean))
-    return decrease, float(low), float(high)
-
-
-def evaluation_json(
-    step: int, paired: PairedResults, references: ReferenceReturns | None
-) -> dict[str, Any]:
-    """Raw results of the checkpoint after ``step`` gradient steps, JSON-compatible.
-
-    Besides the returns ``"scores"`` that are normalised by the references, if any.
-    """
-    return {
-        "step": step,
-        "clean": _episodes_json(paired.clean, references),
-        "levels": [_disturbance_json(each, references) for each in paired.disturbed],
-    }
 
 
 def _episodes_json(
     results: EpisodeResults, references: ReferenceReturns | None
 ) -> dict[str, Any]:
-    raw = {
-        "returns": results.returns.tolist(),
-        "lengths": results.lengths.tolist(),
-        "seeds": results.seeds.tolist(),
-    }
+    names = ("returns", "lengths", "seeds")
+    raw = {name: getattr(results, name).tolist() for name in names}
     if references is None:
         return raw
     return raw | {"scores": references.score(results.returns).tolist()}
 
 
-def _disturbance_json(
-    results: DisturbanceResults, references: ReferenceReturns | None
-) -> dict[str, Any]:
-    return {
-        "name": results.disturbance.name,
-        "kind": results.disturbance.kind,
-        "strength": results.disturbance.strength,
-        **_episodes_json(results.results, references),
-        "disturbed_at": results.disturbed_at,
-        **_recovery_json(results.recovery),
+def _recovery_json(recovery: Sequence[Recovery | None] | None) -> dict[str, Any]:
+    """Lists of the entries of each episode's recovery, and mean distances."""
+    entries = {
+        "ended_at": "ended_at",
+        "survived_knock": "survived",
+        "alive_after": "alive_after",
+        "clean_alive_after": "clean_alive_after",
+        "recovery_steps": "steps",
     }
-
-
-def _recovery_json(recovery: Sequence[Recovery] | None) -> dict[str, Any]:
     if recovery is None:
-        return dict.fromkeys(RECOVERY_ENTRIES)
-    mean, count = _mean_curve([each.distance for each in recovery])
-    clean_mean, clean_count = _mean_curve([each.clean_distance for each in recovery])
-    return {
-        "ended_at": [each.ended_at for each in recovery],
-        "survived_knock": [each.survived for each in recovery],
-        "alive_after": [each.alive_after for each in recovery],
-        "clean_alive_after": [each.clean_alive_after for each in recovery],
-        "recovery_steps": [each.steps for each in recovery],
-        "distance": {
-            "offset": list(range(-STEPS_BEFORE, STEPS_AFTER + 1)),
-            "mean": mean,
-            "count": count,
-            "clean_mean": clean_mean,
-            "clean_count": clean_count,
-        },
+        return dict.fromkeys([*entries, "distance"])
+    nowhere = np.full(STEPS_BEFORE + 1 + STEPS_AFTER, np.nan)
+    curves: dict[str, Any] = {"offset": list(range(-STEPS_BEFORE, STEPS_AFTER + 1))}
+    for prefix in ("", "clean_"):
+        rows = [getattr(each, f"{prefix}distance", nowhere) for each in recovery]
+        known = np.ma.masked_invalid(rows)
+        curves[f"{prefix}mean"] = known.mean(0).tolist()  # None without a step
+        curves[f"{prefix}count"] = known.count(0).tolist()
+    lists = {
+        key: [getattr(each, name, None) for each in recovery]
+        for key, name in entries.items()
     }
-
-
-def _mean_curve(
-    curves: Sequence[NDArray[np.float64]],
-) -> tuple[list[float | None], list[int]]:
-    """Mean over the episodes that have a step at each offset, and their number."""
-    known = np.ma.masked_invalid(curves)
-    return known.mean(0).tolist(), known.count(0).tolist()  # None without a step
+    return lists | {"distance": curves}
 
 
 def summarize_disturbances(
@@ -301,125 +193,109 @@ def summarize_disturbances(
     """Means of each disturbance over the episodes of all checkpoints.
 
     Args:
-        evaluations: see :func:`evaluation_json`; the same disturbances in all.
+        evaluations: see :func:`evaluate_paired`; the same disturbances in all.
 
     Returns:
         A row for each disturbance. Over all pairs of episodes: ``"clean_score"``,
-        ``"score"`` and ``"decrease"`` (see :func:`decrease_interval`), and
+        ``"score"`` and ``"decrease"`` (see
+        :func:`~torchrl_osr.lab.evaluation.statistics.decrease_interval`), and
         ``"disturbed_share"``, the share that the disturbance acted in. Over those
         alone: ``"clean_score_disturbed"``, ``"score_disturbed"``,
         ``"decrease_disturbed"``, the shares alive at its end (``"survived"``) and 100
         steps later (``"survival"``; ``"clean_survival"`` of the undisturbed ones),
         ``"recovered_share"`` and ``"recovery_median"``, steps until back in the data.
-        ``None`` where there is nothing to average, or the median is infinite. Where
+        ``None`` where there is nothing to average, no episode met the disturbance, or
+        the median is infinite. Where
         evaluations have returns alone, ``"clean_return"``, ``"return"`` and so on.
     """
     rows = []
     measure = "score" if "scores" in evaluations[0]["clean"] else "return"
     for position, first in enumerate(evaluations[0]["levels"]):
-        played = [each["levels"][position] for each in evaluations]
-
-        def joined(key: str, played: Sequence[Mapping[str, Any]] = played) -> list[Any]:
-            return [value for each in played for value in each[key] or ()]
-
-        key = f"{measure}s"
-        clean = np.array(
-            [value for each in evaluations for value in each["clean"][key]]
-        )
-        values = np.array(joined(key))
-        hit = np.array([moment is not None for moment in joined("disturbed_at")])
+        levels = [each["levels"][position] for each in evaluations]
+        entries = {
+            key: [value for level in levels for value in level[key] or ()]
+            for key in first
+            if isinstance(first[key], list)
+        }
+        clean = np.concatenate([each["clean"][f"{measure}s"] for each in evaluations])
+        values = np.array(entries[f"{measure}s"])
+        hit = np.array([moment is not None for moment in entries["disturbed_at"]])
         mean, low, high = mean_interval(values)
-        rows.append(
-            {
-                "name": first["name"],
-                "kind": first["kind"],
-                "strength": first["strength"],
-                f"clean_{measure}": float(clean.mean()),
-                measure: mean,
-                f"{measure}_low": low,
-                f"{measure}_high": high,
-                **_decrease("decrease", clean, values),
-                "disturbed_share": float(hit.mean()),
-                f"clean_{measure}_disturbed": _mean(clean[hit]),
-                f"{measure}_disturbed": _mean(values[hit]),
-                **_decrease("decrease_disturbed", clean[hit], values[hit]),
-                "survived": _share(joined("survived_knock")),
-                "survival": _share(joined("alive_after")),
-                "clean_survival": _share(joined("clean_alive_after")),
-                **_recovered(joined("recovery_steps"), hit),
-            }
-        )
+        row = {key: first[key] for key in ("name", "kind", "strength")}
+        row |= {f"clean_{measure}": float(clean.mean()), measure: mean}
+        row |= {f"{measure}_low": low, f"{measure}_high": high}
+        met = slice(None) if hit.any() else slice(0)  # an unmet one has no loss
+        row |= _decrease("decrease", clean[met], values[met])
+        row |= {
+            "disturbed_share": float(hit.mean()),
+            f"clean_{measure}_disturbed": _mean(clean[hit]),
+            f"{measure}_disturbed": _mean(values[hit]),
+        }
+        row |= _decrease("decrease_disturbed", clean[hit], values[hit])
+        for name, key in (
+            ("survived", "survived_knock"),
+            ("survival", "alive_after"),
+            ("clean_survival", "clean_alive_after"),
+        ):
+            known = [value for value in entries.get(key, ()) if value is not None]
+            row[name] = _mean(np.array(known))
+        median = share = None
+        if "recovery_steps" in entries and hit.any():
+            steps = entries["recovery_steps"]
+            late = np.array([np.inf if each is None else each for each in steps])[hit]
+            share = float(np.isfinite(late).mean())
+            median = float(np.median(late)) if np.isfinite(np.median(late)) else None
+        rows.append(row | {"recovery_median": median, "recovered_share": share})
     return rows
 
 
-def _decrease(name: str, clean: ArrayLike, scores: ArrayLike) -> dict[str, Any]:
+def _decrease(name: str, clean: NDArray[Any], values: NDArray[Any]) -> dict[str, Any]:
     names = (name, f"{name}_low", f"{name}_high")
-    return dict(zip(names, decrease_interval(clean, scores), strict=True))
+    return dict(zip(names, decrease_interval(clean, values), strict=True))
 
 
 def _mean(values: NDArray[Any]) -> float | None:
     return float(values.mean()) if values.size else None
 
 
-def _share(values: Sequence[bool | None]) -> float | None:
-    return _mean(np.array([value for value in values if value is not None]))
-
-
-def _recovered(
-    steps: Sequence[int | None], hit: NDArray[np.bool_]
-) -> dict[str, float | None]:
-    """Median and share of the disturbed episodes; the others have no steps."""
-    if not steps or not hit.any():
-        return {"recovery_median": None, "recovered_share": None}
-    late = np.array([np.inf if each is None else each for each in steps])[hit]
-    median = float(np.median(late))
-    return {
-        "recovery_median": median if np.isfinite(median) else None,
-        "recovered_share": float(np.isfinite(late).mean()),
-    }
-
-
 def robustness_table(title: str, summary: Sequence[Mapping[str, Any]]) -> str:
     """Text table of a summary, see :func:`summarize_disturbances`."""
 
-    def number(value: float | None, digits: int = 1) -> str:
-        return "-" if value is None else f"{value:.{digits}f}"
+    def number(value: float | None) -> str:
+        return "-" if value is None else f"{value:.1f}"
 
     def percent(value: float | None) -> str:
         return "-" if value is None else f"{100 * value:.0f} %"
 
-    measure = measure_of(summary[0])
-    rows = [
-        (
-            row["name"],
-            number(row[f"clean_{measure}"]),
-            number(row[measure]),
-            number(row["decrease"]),
-            f"[{number(row['decrease_low'])}, {number(row['decrease_high'])}]",
-            percent(row["disturbed_share"]),
-            percent(row["survival"]),
-            percent(row["clean_survival"]),
-            percent(row["recovered_share"]),
-            number(row["recovery_median"]),
-        )
-        for row in summary
-    ]
-    header = ("disturbance", "clean", measure, *COLUMNS)
-    lines = [title, *aligned_columns([header, *rows])]
+    measure, rows = measure_of(summary[0]), []
+    for row in summary:
+        low, high = (number(row[f"decrease_{end}"]) for end in ("low", "high"))
+        cells = {
+            "disturbance": row["name"],
+            "clean": number(row[f"clean_{measure}"]),
+            measure: number(row[measure]),
+            "loss %": number(row["decrease"]),
+            "[95 %]": f"[{low}, {high}]",
+            "met it": percent(row["disturbed_share"]),
+            f"alive +{STEPS_AFTER}": percent(row["survival"]),
+            "(clean)": percent(row["clean_survival"]),
+            "back": percent(row["recovered_share"]),
+            "steps back": number(row["recovery_median"]),
+        }
+        rows.append(tuple(cells.values()))
+    lines = [title, *aligned_columns([tuple(cells), *rows])]
     if unmet := [row["name"] for row in summary if not row["disturbed_share"]]:
-        lines.append(
-            f"  {', '.join(unmet)}: no episode lasted long enough to meet it, so "
-            "that nothing is known about it; windows count steps of an episode."
-        )
+        lines.append(f"  {', '.join(unmet)}: every episode ended before it came.")
     return "\n".join(lines)
 
 
 def aligned_columns(rows: Sequence[Sequence[str]]) -> list[str]:
     """Lines of a text table: the first column to the left, the others to the right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = []
-    for first, *cells in rows:
-        pairs = zip(cells, widths[1:], strict=True)
-        aligned = [cell.rjust(width) for cell, width in pairs]
-        lines.append("  ".join(["", first.ljust(widths[0]), *aligned]))
-    return lines
+    return [
+        "  ".join(
+            ["", first.ljust(widths[0])]
+            + [cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True)]
+        )
+        for first, *cells in rows
+    ]

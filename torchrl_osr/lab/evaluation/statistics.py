@@ -1,35 +1,85 @@
-"""Means of scores and their 95 % confidence intervals.
+"""Means, shares and differences with their 95 % confidence intervals.
 
-Shapes: ``E`` episodes of a run, ``K`` numbers of an episode, ``R`` resamples, ``N``
-runs, ``T`` thresholds.
+All intervals of the package come from here. Bootstraps have fixed seeds: the same
+numbers give the same interval. Shapes: ``E`` episodes of a run, ``K`` numbers of an
+episode, ``R`` resamples, ``N`` seeds, ``M`` states, ``W`` walks.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-NUM_RESAMPLES = 2000
-"""Bootstrap resamples of every interval."""
+Array: TypeAlias = NDArray[np.float64]
+
+NUM_RESAMPLES, NUM_SHARE_RESAMPLES = 2000, 10_000
+"""Bootstrap resamples of intervals, and of those of shares of states."""
 
 NORMAL_QUANTILE_975 = 1.959963984540054
-"""A normal variable is below this many standard deviations with probability 0.975."""
 
 TAIL = 50 * (1 - 0.95)
 """Percent of the resamples below an interval, and above it."""
+
+
+class Estimate(NamedTuple):
+    """A mean with its 95 % interval.
+
+    Attributes:
+        mean: the mean.
+        low: lower end.
+        high: upper end.
+        over: what was resampled: ``"seeds"``; ``"two seeds"``, whose interval is hardly
+            more than the two of them; ``"episodes"`` or ``"walks"`` of a single seed.
+    """
+
+    mean: float
+    low: float
+    high: float
+    over: str = "seeds"
+
+    def __str__(self) -> str:
+        """Mean and interval."""
+        return f"{decimal(self.mean)} {self.interval()}"
+
+    def interval(self, sign: str = "") -> str:
+        """Interval in brackets, with a mark if it is not over seeds."""
+        mark = {"seeds": "", "two seeds": " ²"}.get(self.over, " ᵉ")
+        return f"[{decimal(self.low, sign)}, {decimal(self.high, sign)}]{mark}"
+
+
+def decimal(value: float, sign: str = "") -> str:
+    """Number with one decimal; ``sign="+"`` shows that of positive ones, too."""
+    # A minus sign, unlike a hyphen, stays with its number at the end of a line.
+    return f"{value:{sign}z.1f}".replace("-", "\N{MINUS SIGN}")
+
+
+def over_what(groups: Sequence[Sequence[object]], alone: str = "episodes") -> str:
+    """What an interval is over, given the runs of each data set; ``alone`` with one."""
+    return {1: alone, 2: "two seeds"}.get(min(map(len, groups)), "seeds")
+
+
+def percentile_interval(resamples: Array) -> tuple[Array, Array]:
+    """Ends of the 95 % percentile interval of resamples ``[R, ...]``."""
+    low, high = np.percentile(resamples, [TAIL, 100 - TAIL], axis=0)
+    return low, high
+
+
+def interval(point: float, resamples: ArrayLike, over: str = "seeds") -> Estimate:
+    """A number with the percentile interval of its resamples ``[R]``."""
+    low, high = percentile_interval(np.asarray(resamples, np.float64))
+    return Estimate(float(point), float(low), float(high), over)
 
 
 def mean_interval(values: ArrayLike) -> tuple[float, float, float]:
     """Mean and its 95 % percentile-bootstrap interval.
 
     Args:
-        values: independent results, returns of episodes for instance, ``[E]``.
-
-    Returns:
-        Mean, lower and upper end. With a single value all three are that value.
+        values: independent results, returns of episodes for instance, ``[E]``. With a
+            single one the interval has no width.
 
     Raises:
         ValueError: if there are no values, or some are not finite.
@@ -39,29 +89,20 @@ def mean_interval(values: ArrayLike) -> tuple[float, float, float]:
         >>> mean, low <= mean <= high
         (2.5, True)
     """
-    sample = _finite(values, "mean_interval").ravel()
-    low, high = percentile_interval(stratified_resamples([sample]).mean(1))
-    return float(sample.mean()), float(low), float(high)
+    sample = np.asarray(values, np.float64).ravel()
+    if not sample.size or not np.isfinite(sample).all():
+        raise ValueError(f"mean_interval needs finite values, got {sample}.")
+    return interval(sample.mean(), stratified_resamples([sample]).mean(1))[:3]
 
 
 def wilson_interval(count: int, total: int) -> tuple[float, float]:
     """Wilson's 95 % interval of a share, which keeps its coverage near 0 and 1.
 
-    Args:
-        count: successes.
-        total: trials.
-
-    Raises:
-        ValueError: without trials, or with more successes than trials.
-
     Examples:
-        >>> from torchrl_osr.lab.evaluation import wilson_interval
         >>> low, high = wilson_interval(20, 20)
         >>> round(low, 3), round(high, 3)
         (0.839, 1.0)
     """
-    if not 0 <= count <= total or total < 1:
-        raise ValueError(f"wilson_interval needs trials, got {count} of {total}.")
     square = NORMAL_QUANTILE_975**2
     centre = (count + square / 2) / (total + square)
     spread = math.sqrt(count * (total - count) / total + square / 4)
@@ -69,17 +110,27 @@ def wilson_interval(count: int, total: int) -> tuple[float, float]:
     return centre - half, min(centre + half, 1.0)
 
 
-def percentile_interval(
-    resamples: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Ends of the 95 % percentile interval of resamples ``[R, ...]``."""
-    low, high = np.percentile(resamples, [TAIL, 100 - TAIL], axis=0)
-    return low, high
+def stratified_resamples(strata: Sequence[ArrayLike]) -> Array:
+    """Bootstrap resamples that keep the number of runs of every stratum.
+
+    Args:
+        strata: a number of each run, a sequence for each data set.
+
+    Returns:
+        The runs of all strata side by side, ``[R, N]``.
+    """
+    rng = np.random.default_rng(0)
+    samples = [np.asarray(stratum, dtype=np.float64) for stratum in strata]
+    return np.concatenate(
+        [
+            sample[rng.integers(sample.size, size=(NUM_RESAMPLES, sample.size))]
+            for sample in samples
+        ],
+        axis=1,
+    )
 
 
-def nested_resamples(
-    runs: Sequence[ArrayLike], *, seed: int = 0
-) -> NDArray[np.float64]:
+def nested_resamples(runs: Sequence[ArrayLike], *, seed: int = 0) -> Array:
     """Bootstrap means over resampled runs and, in each of them, resampled episodes.
 
     The numbers of an episode stay together, so that a ratio or a difference of them is
@@ -94,22 +145,12 @@ def nested_resamples(
     Returns:
         Means, every run with equal weight, ``[R, K]``.
 
-    Raises:
-        ValueError: if there are no runs, one has no episodes, or ``K`` differs.
-
     Examples:
         >>> resamples = nested_resamples([[[1.0, 5.0]] * 3, [[1.0, 5.0]] * 4])
         >>> resamples.shape, resamples[0].tolist()
         ((2000, 2), [1.0, 5.0])
     """
     tables = [np.asarray(run, dtype=np.float64) for run in runs]
-    shapes = [table.shape for table in tables]
-    if (
-        not tables
-        or any(table.ndim != 2 or not len(table) for table in tables)
-        or len({each[1] for each in shapes}) > 1
-    ):
-        raise ValueError(f"nested_resamples needs episodes [E, K], got {shapes}.")
     rng = np.random.default_rng(seed)
     drawn = rng.integers(len(tables), size=(NUM_RESAMPLES, len(tables)))
     total = np.zeros((NUM_RESAMPLES, tables[0].shape[1]))
@@ -123,75 +164,226 @@ def nested_resamples(
     return total / len(tables)
 
 
-def stratified_resamples(strata: Sequence[ArrayLike]) -> NDArray[np.float64]:
-    """Bootstrap resamples that keep the number of runs of every stratum.
+def estimate(runs: Sequence[Array]) -> Estimate:
+    """Mean over runs, and its interval over their means; of one run over its episodes.
 
     Args:
-        strata: a number of each run, a sequence for each data set.
-
-    Returns:
-        The runs of all strata side by side, ``[R, N]``.
-
-    Raises:
-        ValueError: if there are no strata, or one of them is empty.
+        runs: scores of each run's episodes, ``[E]``.
     """
-    samples = [np.asarray(stratum, dtype=np.float64) for stratum in strata]
-    if not samples or not all(sample.size for sample in samples):
-        raise ValueError("stratified_resamples needs a value in every stratum.")
-    rng = np.random.default_rng(0)
-    resamples = [
-        sample[rng.integers(sample.size, size=(NUM_RESAMPLES, sample.size))]
-        for sample in samples
-    ]
-    return np.concatenate(resamples, axis=1)
+    over = over_what([runs])
+    values = runs[0] if over == "episodes" else [run.mean() for run in runs]
+    return Estimate(*mean_interval(values), over)
 
 
-def interquartile_mean(values: ArrayLike) -> NDArray[np.float64]:
+def interquartile_mean(values: ArrayLike) -> Array:
     """Mean without the lowest and the highest quarter, over the last axis.
 
     As rliable has it (Agarwal et al., 2021, https://arxiv.org/abs/2108.13264): of ``N``
     values ``N // 4`` are left out at each end.
 
-    Raises:
-        ValueError: if there are no values, or some are not finite.
-
     Examples:
         >>> float(interquartile_mean([0.0, 3.0, 5.0, 1000.0]))
         4.0
     """
-    ordered = np.sort(_finite(values, "interquartile_mean"), axis=-1)
+    ordered = np.sort(np.asarray(values, np.float64), axis=-1)
     cut = ordered.shape[-1] // 4
-    mean: NDArray[np.float64] = ordered[..., cut : ordered.shape[-1] - cut].mean(-1)
+    mean: Array = ordered[..., cut : ordered.shape[-1] - cut].mean(-1)
     return mean
 
 
-def performance_profile(
-    values: ArrayLike, thresholds: ArrayLike
-) -> NDArray[np.float64]:
-    """Share of values above each threshold, over the last axis.
+def iqm(groups: Sequence[Sequence[Array]]) -> Estimate:
+    """Interquartile mean of the runs of all data sets.
+
+    Runs are resampled within their data sets. If one of these has a single run, the
+    interval is over the runs' episodes instead.
 
     Args:
-        values: scores, ``[..., N]``.
-        thresholds: ``[T]``.
+        groups: scores of each run's episodes, ``[E]``, data set by data set.
+    """
+    scores = [[run.mean() for run in group] for group in groups]
+    over = over_what(groups)
+    if over == "episodes":
+        runs = [run for group in groups for run in group]
+        each = [nested_resamples([run[:, None]], seed=n) for n, run in enumerate(runs)]
+        resamples = np.concatenate(each, axis=1)
+    else:
+        resamples = stratified_resamples(scores)
+    point = interquartile_mean(np.concatenate(scores))
+    return interval(float(point), interquartile_mean(resamples), over)
+
+
+def mean_difference(data_sets: Sequence[Sequence[Array]]) -> Estimate:
+    """Mean difference, every data set and every seed with equal weight.
+
+    Args:
+        data_sets: differences of each seed's episodes, ``[E]``, data set by data set.
+    """
+    point = np.mean([np.mean([run.mean() for run in each]) for each in data_sets])
+    # A seed for each data set: with one, they would be drawn alike.
+    resamples = [
+        nested_resamples([run[:, None] for run in each], seed=index)
+        for index, each in enumerate(data_sets)
+    ]
+    mean = np.mean(resamples, axis=0).ravel()
+    return interval(float(point), mean, over_what(data_sets))
+
+
+def decrease_interval(
+    clean: ArrayLike, disturbed: ArrayLike
+) -> tuple[float | None, float | None, float | None]:
+    """Decrease of the mean score in percent, with its 95 % paired-bootstrap interval.
+
+    Args:
+        clean, disturbed: scores or returns of the pairs of one run, ``[E]`` each.
 
     Returns:
-        Shares between 0 and 1, ``[..., T]``.
-
-    Raises:
-        ValueError: if there are no values, or some are not finite.
+        ``100 (1 - mean(disturbed) / mean(clean))``, lower and upper end. All three are
+        ``None`` for fewer than two pairs or a clean mean that is not above 0, the ends
+        alone if that is so in a resample.
 
     Examples:
-        >>> performance_profile([10.0, 20.0, 30.0, 40.0], [0.0, 20.0, 50.0]).tolist()
-        [1.0, 0.5, 0.0]
+        >>> decrease_interval([40.0, 60.0], [20.0, 30.0])
+        (50.0, 50.0, 50.0)
     """
-    table = _finite(values, "performance_profile")
-    # One threshold after the other: all at once would fill the memory.
-    shares = [(table > each).mean(-1) for each in np.asarray(thresholds)]
-    return np.stack(shares, axis=-1)
+    pairs = np.stack([np.asarray(clean, float), np.asarray(disturbed, float)])
+    if pairs.shape[1] < 2 or pairs[0].mean() <= 0:
+        return None, None, None
+    clean_mean, disturbed_mean = pairs.mean(1)
+    rng = np.random.default_rng(0)
+    rows = rng.integers(pairs.shape[1], size=(NUM_RESAMPLES, pairs.shape[1]))
+    resampled_clean, resampled = pairs[:, rows].mean(-1)
+    point = float(100 * (1 - disturbed_mean / clean_mean))
+    if (resampled_clean <= 0).any():
+        return point, None, None
+    return interval(point, 100 * (1 - resampled / resampled_clean))[:3]
 
 
-def _finite(values: ArrayLike, name: str) -> NDArray[np.float64]:
-    table = np.asarray(values, dtype=np.float64)
-    if not table.size or not np.isfinite(table).all():
-        raise ValueError(f"{name} needs finite values, got {table}.")
-    return table
+def scores_and_decreases(
+    runs: Sequence[ArrayLike],
+) -> list[tuple[Estimate, Estimate | None]]:
+    """Scores of several runs, and their decreases in percent of the clean score.
+
+    Seeds are resampled, then episodes with all of their scores.
+
+    Args:
+        runs: scores of each run's episodes, ``[E, K]``: first the clean one, then one
+            for each disturbance.
+
+    Returns:
+        ``K`` pairs. A decrease is ``None`` where a clean mean is not above 0.
+    """
+    over = over_what([runs])
+    means = np.mean([np.mean(np.asarray(run, float), axis=0) for run in runs], axis=0)
+    resamples = nested_resamples(runs)
+    positive = means[0] > 0 and (resamples[:, 0] > 0).all()
+    found = []
+    for mean, column in zip(means, resamples.T, strict=True):
+        lost = None
+        if positive:
+            ratios = 100 * (1 - column / resamples[:, 0])
+            lost = interval(100 * (1 - mean / means[0]), ratios, over)
+        found.append((interval(mean, column, over), lost))
+    return found
+
+
+def saved_share(back: ArrayLike, walk: ArrayLike) -> tuple[float, float, float]:
+    """Share of the states that a policy comes back from, with its 95 % interval.
+
+    Seeds are resampled, and walks with all of their states. If all states are saved, or
+    none, the interval is Wilson's, with the walks as trials.
+
+    Args:
+        back: whether it came back, or how often, for each seed and state, ``[N, M]``.
+        walk: of each state, ``[M]``.
+
+    Examples:
+        >>> saved_share([[1, 0, 1, 0]], walk=[0, 0, 1, 1])
+        (0.5, 0.5, 0.5)
+        >>> share, low, high = saved_share([[0, 0, 0, 0]], walk=[0, 1, 2, 3])
+        >>> share, low, round(high, 2)
+        (0.0, 0.0, 0.49)
+    """
+    table, sizes = _by_walk(back, walk)
+    for share, whole in ((0.0, 0.0 * sizes), (1.0, sizes)):
+        if (table == whole).all():
+            return (share, *wilson_interval(round(share * len(sizes)), len(sizes)))
+    return _share(table, sizes)
+
+
+def saved_difference(
+    method: ArrayLike, baseline: ArrayLike, walk: ArrayLike
+) -> tuple[float, float, float]:
+    """Share that a method saves less the share that a baseline saves.
+
+    Args:
+        method, baseline: as in :func:`saved_share`; row by row of the same seeds.
+        walk: of each state, ``[M]``.
+
+    Examples:
+        >>> saved_difference([[1, 0, 1, 1]], [[0, 0, 0, 1]], walk=[0, 0, 1, 1])
+        (0.5, 0.5, 0.5)
+    """
+    ours, sizes = _by_walk(method, walk)
+    return _share(ours - _by_walk(baseline, walk)[0], sizes)
+
+
+def recovered_share(
+    method: ArrayLike, baseline: ArrayLike, walk: ArrayLike, *, paired: bool = True
+) -> tuple[float, float, float]:
+    r"""R: share of the states that a baseline loses that a method saves.
+
+    .. math::
+        R = \frac{p_{method} - p_{baseline}}{1 - p_{baseline}}
+
+    with :math:`p` the share of states that each comes back from.
+
+    Args:
+        method, baseline, walk: see :func:`saved_difference`.
+
+    Keyword Args:
+        paired: whether row by row the seeds are the same, and resampled together.
+            Otherwise the numbers of seeds may differ. Default ``True``.
+
+    Raises:
+        ValueError: if the baseline saves all states, in the data or in a resample.
+
+    Examples:
+        >>> recovered_share([[1, 1, 1, 0]], [[1, 0, 0, 0]], walk=[5, 5, 5, 5])[0]
+        0.6666666666666666
+    """
+    ours, sizes = _by_walk(method, walk)
+    theirs, _ = _by_walk(baseline, walk)
+    seeds, walks, others = _weights(len(ours), len(sizes), len(theirs))
+    saved = ((seeds @ ours) * walks).sum(-1) / len(ours)
+    before = (((seeds if paired else others) @ theirs) * walks).sum(-1) / len(theirs)
+    lost = walks @ sizes - before
+    if (lost <= 0).any():
+        raise ValueError("The baseline saves all states: R is not defined.")
+    shares = (saved - before) / lost
+    return interval(shares[0], shares[1:])[:3]
+
+
+def _by_walk(table: ArrayLike, walk: ArrayLike) -> tuple[Array, Array]:
+    """Sums over the states of each walk, ``[N, W]``, and their numbers, ``[W]``."""
+    walks, number = np.unique(np.asarray(walk), return_inverse=True)
+    member = np.eye(len(walks))[number]
+    return np.asarray(table, np.float64) @ member, member.sum(0)
+
+
+def _share(table: Array, sizes: Array) -> tuple[float, float, float]:
+    """Sums by seed and walk over the number of states, with their interval."""
+    seeds, walks = _weights(len(table), len(sizes))
+    saved = ((seeds @ table) * walks).sum(-1) / len(table)
+    shares = saved / (walks @ sizes)
+    return interval(shares[0], shares[1:])[:3]
+
+
+def _weights(*sizes: int) -> list[Array]:
+    """How often each counts: once, then in each resample, ``[1 + R, size]``."""
+    rng = np.random.default_rng(0)
+    draws = (
+        rng.multinomial(size, np.full(size, 1 / size), NUM_SHARE_RESAMPLES)
+        for size in sizes
+    )
+    # In floating point: products of integers are slow.
+    return [np.concatenate([np.ones((1, each.shape[1])), each]) for each in draws]

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from torchrl_osr.lab.evaluation import nested_resamples, percentile_interval
+from torchrl_osr.lab.evaluation.statistics import nested_resamples, percentile_interval
 from torchrl_osr.lab.report.methods import RunTables
 from torchrl_osr.lab.report.scores import Estimate, counted, decimal, over_what, recent
 

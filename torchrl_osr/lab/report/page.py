@@ -13,7 +13,8 @@ import pandas as pd
 
 from torchrl_osr._extras import needed_by
 from torchrl_osr._files import write_atomically
-from torchrl_osr.lab.evaluation import NUM_RECENT, NUM_RESAMPLES
+from torchrl_osr.lab.evaluation.statistics import NUM_RESAMPLES
+from torchrl_osr.lab.evaluation.training_summary import NUM_RECENT
 from torchrl_osr.lab.report.comparisons import (
     ALL_DATA,
     MIN_SEEDS,

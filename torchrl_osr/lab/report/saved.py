@@ -11,12 +11,8 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from torchrl_osr.lab.evaluation.recoverable import (
-    GROUPS,
-    disturbances_of,
-    recovered_share,
-    saved_share,
-)
+from torchrl_osr.lab.evaluation.recoverable import GROUPS, disturbances_of
+from torchrl_osr.lab.evaluation.statistics import recovered_share, saved_share
 from torchrl_osr.lab.report.methods import RunTables
 from torchrl_osr.lab.report.scores import Estimate, over_what
 

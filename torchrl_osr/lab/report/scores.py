@@ -13,15 +13,14 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from torchrl_osr.lab.evaluation import (
-    NUM_RECENT,
+from torchrl_osr.lab.evaluation.statistics import (
     interquartile_mean,
     mean_interval,
     nested_resamples,
     percentile_interval,
-    performance_profile,
     stratified_resamples,
 )
+from torchrl_osr.lab.evaluation.training_summary import NUM_RECENT
 
 Array = NDArray[np.float64]
 
@@ -298,6 +297,11 @@ def mean_distance(curves: pd.DataFrame) -> Band:
         resamples[:] = np.nan
     x = runs.columns.to_numpy(dtype=np.float64)
     return Band(x, runs.mean().to_numpy(), *percentile_interval(resamples))
+
+
+def performance_profile(values: Array, thresholds: Array) -> Array:
+    """Share of values above each threshold, over the last axis."""
+    return np.stack([(values > each).mean(-1) for each in thresholds], axis=-1)
 
 
 def _strata(episodes: pd.DataFrame) -> list[list[Array]]:

@@ -21,9 +21,9 @@ from torchrl_osr.lab.evaluation.recoverable import (
     disturbances_of,
     load_recoverable_states,
     recovers,
-    saved_share,
 )
 from torchrl_osr.lab.evaluation.robustness import aligned_columns
+from torchrl_osr.lab.evaluation.statistics import saved_share
 from torchrl_osr.lab.run.trained_run import load_trained
 
 

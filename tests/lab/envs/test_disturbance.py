@@ -1,27 +1,36 @@
-"""What all disturbances promise: off is the bare environment, streams of their own."""
+"""Common properties: off is the bare environment, random streams, flags, suites."""
 
 from __future__ import annotations
 
 from contextlib import closing
+from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
+from omegaconf import OmegaConf
 from torchrl.envs import GymWrapper
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_osr.lab.data import make_environment
+from torchrl_osr.lab.data import environment_spec, make_environment
 from torchrl_osr.lab.envs import (
     ActionDelay,
     ActionKnock,
     ActionNoise,
     DynamicsChange,
     ExternalPush,
+    NotPossible,
     ObservationNoise,
     StartStateNoise,
     StickyAction,
 )
+from torchrl_osr.lab.evaluation.robustness import impossible_disturbances
+from torchrl_osr.lab.run.suite import SuiteConfig, make_disturbances
+
+SUITES = Path(__file__).parents[3] / "conf" / "evaluation" / "suite"
+MAZE = "PointMaze_UMaze-v3"
 
 OFF = {
     "knock": lambda env: ActionKnock(env, 5, mode="torque", at=10**6),
@@ -80,7 +89,7 @@ def bare():
 
 @each_off
 @pytest.mark.parametrize("name", ["Hopper-v5", "HalfCheetah-v5"])
-def test_off_is_the_bare_environment_to_the_last_bit(wrap, name, bare):
+def test_off_is_the_bare_environment_bit_for_bit(wrap, name, bare):
     env = wrap(make_environment(name))
     assert (trajectory(env, steps=400) == bare[name]).all()
     _, info = env.reset(seed=0)
@@ -89,7 +98,7 @@ def test_off_is_the_bare_environment_to_the_last_bit(wrap, name, bare):
 
 
 @each_on
-def test_on_is_another_trajectory_and_the_same_for_the_same_seeds(wrap, bare):
+def test_same_seeds_give_the_same_trajectory(wrap, bare):
     env = wrap(make_environment("Hopper-v5"))
     seeds = range(10, 50)
     once = trajectory(env, steps=100, seeds=seeds)
@@ -108,7 +117,7 @@ def test_on_is_another_trajectory_and_the_same_for_the_same_seeds(wrap, bare):
 
 
 @each_on
-def test_the_environments_own_random_stream_is_that_of_the_bare_one(wrap):
+def test_environment_draws_as_the_bare_one(wrap):
     env, other = wrap(make_environment("Hopper-v5")), make_environment("Hopper-v5")
     for seed in (5, None, None):
         env.reset(seed=seed)
@@ -147,7 +156,7 @@ def test_flags_of_nested_disturbances_are_joined(play, recorder):
 def test_two_of_a_kind_draw_differently(recorder):
     env = ObservationNoise(ObservationNoise(recorder(sensors=3), 1.0), 1.0)
     env.reset(seed=0)
-    assert env._generator.random() != env.env._generator.random()
+    assert env.generator.random() != env.env.generator.random()
 
 
 @each_on
@@ -160,87 +169,77 @@ def test_they_are_torchrl_environments(wrap):
     env.close()
 
 
-def test_torchrl_reads_the_flags():
-    knock = ActionKnock(make_environment("HalfCheetah-v5"), 3, mode="official", at=4)
-    env = GymWrapper(knock).auto_register_info_dict()
-    env.set_seed(0)
-    rollout = env.rollout(6)
-    assert rollout["next", "disturbed"].flatten().tolist() == [0, 0, 0, 1, 0, 0]
-    assert rollout["next", "knock_steps"].flatten().tolist() == [0, 0, 0, 3, 0, 0]
-
-
-MAZE = "PointMaze_UMaze-v3"
-
-
-@pytest.mark.parametrize("mode", ["official", "paper", "torque"])
-def test_knocks_fit_a_maze(mode):
-    with closing(ActionKnock(make_environment(MAZE), 5, mode=mode, at=3)) as env:
-        observation, _ = env.reset(seed=0)
-        for _ in range(10):
-            observation, *_, info = env.step(np.zeros(2, np.float32))
-            assert observation.shape == (8,)
-            # As the environment lies now, also right after the official knock.
+def test_the_official_knock_fits_a_maze():
+    env = ActionKnock(make_environment(MAZE), 5, mode="official", at=3)
+    with closing(env):
+        env.reset(seed=0)
+        for _ in range(5):
+            observation, *_ = env.step(np.zeros(2, np.float32))
+            # As the environment lies now, also right after the knock.
             inside = env.unwrapped.point_env.data
             assert np.array_equal(observation[:2], inside.qpos)
             assert np.array_equal(observation[-2:], inside.qvel)
-        assert info["knock_steps"] == 0
-
-
-@pytest.mark.parametrize("env_id", [MAZE, "Pendulum-v1"])
-@pytest.mark.parametrize("name", ["push", "dynamics", "start"])
-def test_another_simulation_is_refused_by_name(env_id, name):
-    with (
-        closing(gymnasium.make(env_id)) as env,
-        pytest.raises(TypeError, match="acts on the simulation .*'Hopper-v5'"),
-    ):
-        ON[name](env)
 
 
 @pytest.mark.parametrize(
-    "name", ["knock, official", "knock, paper", "action noise", "delay"]
-)
-def test_actions_must_be_a_box(name):
-    with pytest.raises(TypeError, match="expected a Box"):
-        ON[name](gymnasium.make("CartPole-v1"))
-
-
-KNOCK = {"steps": 5, "mode": "official"}
-PUSH = {"force": 1.0, "duration": 1}
-
-
-@pytest.mark.parametrize(
-    ("wrapper", "arguments", "message"),
+    ("env_id", "names"),
     [
-        (ActionKnock, KNOCK | {"mode": "hard"}, "mode must be one of .* got 'hard'"),
-        (ActionKnock, KNOCK | {"steps": 0}, "steps must be .*, at least 1; got 0"),
-        (ActionKnock, KNOCK | {"steps": 2.5}, "steps must be an integer.* got 2.5"),
-        (ActionKnock, KNOCK | {"at": 0}, "at, unless 'random', must be .* 1; got 0"),
-        (ActionKnock, KNOCK | {"at": "later"}, "at, unless 'random', .*got 'later'"),
-        (ActionKnock, KNOCK | {"window": (9, 9)}, "end of window must .* 10; got 9"),
-        (ActionKnock, KNOCK | {"window": (0, 9)}, "start of window must .* 1; got 0"),
-        (ExternalPush, PUSH | {"force": -1.0}, "force must be a finite number"),
-        (ExternalPush, PUSH | {"force": float("nan")}, "force must be"),
-        (ExternalPush, PUSH | {"duration": 0}, "duration must be .* least 1; got 0"),
-        (ExternalPush, PUSH | {"unit": "pounds"}, "unit must be .* got 'pounds'"),
-        (ActionNoise, {"std": -0.1}, "std must be a finite number, at least 0"),
-        (ActionDelay, {"steps": -1}, "steps must be an integer, at least 0; got -1"),
-        (ActionDelay, {"steps": True}, "steps must be an integer"),
-        (StickyAction, {"probability": 1.1}, r"probability must be in \[0, 1\]"),
-        (StickyAction, {"probability": float("nan")}, "probability must be"),
-        (ObservationNoise, {"std": float("inf")}, "std must be"),
-        (ObservationNoise, {"std": 1, "unit": [1.0]}, r"shape \(1,\), .* have \(11,\)"),
-        (ObservationNoise, {"std": 1, "unit": [-1.0] * 11}, "unit must be finite"),
-        (StartStateNoise, {"std": -0.1}, "std must be a finite number, at least 0"),
-        (DynamicsChange, {"mass": 0.0}, "mass must be above 0"),
-        (DynamicsChange, {"friction": -1.0}, "friction must be a finite .* got -1.0"),
+        (MAZE, ["push", "dynamics", "start"]),
+        ("Pendulum-v1", ["push", "dynamics", "start"]),
+        ("CartPole-v1", ["knock, official", "knock, paper", "action noise", "delay"]),
     ],
 )
-def test_wrong_arguments_are_named(wrapper, arguments, message):
-    with pytest.raises(ValueError, match=message):
-        wrapper(make_environment("Hopper-v5"), **arguments)
+def test_what_the_environment_lacks_is_not_possible(env_id, names):
+    with closing(gymnasium.make(env_id)) as env:
+        for name in names:
+            with pytest.raises(NotPossible, match=r"MuJoCo tasks|expected a Box"):
+                ON[name](env)
 
 
 def test_strengths_in_units_of_the_action_need_bounds(recorder):
-    for wrap in (ON["action noise"], ON["knock"]):
-        with pytest.raises(ValueError, match="RescaleAction or ClipAction"):
-            wrap(recorder(high=np.inf))
+    for name in ("action noise", "knock"):
+        with pytest.raises(NotPossible, match="finite bounds"):
+            ON[name](recorder(high=np.inf))
+
+
+@pytest.mark.parametrize(
+    ("wrapper", "options"),
+    [
+        (ActionKnock, {"steps": 0, "mode": "paper"}),
+        (ActionKnock, {"steps": 5, "mode": "official", "at": 0}),
+        (
+            ActionKnock,
+            {"steps": 5, "mode": "official", "at": "random", "window": (0, 9)},
+        ),
+        (ExternalPush, {"force": 1.0, "duration": 1, "window": (9, 9)}),
+        (ExternalPush, {"force": float("nan"), "duration": 1}),
+        (ObservationNoise, {"std": -0.1}),
+        (ObservationNoise, {"std": 1.0, "unit": [1.0, 2.0]}),
+        (ActionDelay, {"steps": -1}),
+        (StartStateNoise, {"std": -0.1}),
+        (DynamicsChange, {"mass": 0.0}),
+    ],
+)
+def test_values_that_would_silently_do_nothing_are_refused(wrapper, options):
+    with pytest.raises(ValueError, match=r"must be|broadcast"):
+        wrapper(make_environment("Hopper-v5"), **options)
+
+
+@pytest.mark.parametrize("env_id", ["InvertedPendulum-v5", "Swimmer-v5", "Pusher-v5"])
+def test_the_default_suite_is_for_every_mujoco_robot(env_id):
+    assert left_out(env_id, "oos") == {}
+
+
+def test_what_a_suite_needs_is_left_out_elsewhere():
+    needs_mujoco = {"push-1.0", "push-2.0", "start-noise-0.2", "mass-1.5"}
+    assert left_out("Pendulum-v1", "oos").keys() == needs_mujoco
+    assert left_out("CartPole-v1", "oos").keys() == needs_mujoco | {"knock-official-15"}
+    assert left_out("Pendulum-v1", "action") == {}
+
+
+def left_out(env_id, suite):
+    loaded = OmegaConf.load(SUITES / f"{suite}.yaml")
+    configs = OmegaConf.merge(OmegaConf.structured(SuiteConfig), loaded).disturbances
+    scale = np.ones(environment_spec(env_id).observation_size)
+    made = make_disturbances(configs, SimpleNamespace(), scale)
+    return impossible_disturbances(env_id, made)

@@ -1,0 +1,251 @@
+"""Figures of data sets, training runs and evaluations under disturbances."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tensordict import TensorDict
+
+from torchrl_osr._extras import needed_by
+from torchrl_osr._files import whole_file
+from torchrl_osr.lab.data import sampled_observations
+from torchrl_osr.lab.evaluation.episodes import measure_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Okabe and Ito's palette, which colour-blind readers can distinguish.
+BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
+
+IN_WORDS = {"score": "normalised score", "return": "return"}
+"""Axis labels of the measure of an episode."""
+
+UNDISTURBED = "undisturbed"
+
+PANELS = {
+    "loss_qvalue": "TD error (critics)",
+    "loss_cql": "conservative term (critics)",
+    "recovery_kl": "state recovery (policy)",
+    "recovery_nll": "recovery to the data's actions (policy)",
+    "pred_value": "Q of the data's actions",
+}
+"""Logged scalars below the learning curve, and their titles."""
+
+COLUMNS, MOST_PANELS = 5, 30
+"""Histograms in a row and in a figure."""
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Matplotlib figure, ``width`` x ``height`` inches, that needs no display."""
+    with needed_by("figures need", "train"):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save_figure(figure: Figure, path: Path | str, *, dpi: int = 150) -> None:
+    """Write a figure as PNG; a file of that name is replaced once it is whole."""
+    for axes in figure.axes:
+        axes.spines[["top", "right"]].set_visible(False)
+    with whole_file(Path(path)) as file:
+        figure.savefig(file, dpi=dpi, format="png")
+
+
+def data_figure(
+    data: TensorDict,
+    manifest: Mapping[str, Any],
+    names: Mapping[str, Sequence[str]],
+    path: Path | str,
+    *,
+    title: str,
+) -> None:
+    """Draw histograms of the episodes' returns and lengths and of every entry.
+
+    Args:
+        data: transitions ``[N]``.
+        manifest: of the readers.
+        names: of the entries of ``"observation"`` and ``"action"``.
+        path: of the PNG file.
+
+    Keyword Args:
+        title: above the figure.
+    """
+    low, high = (np.asarray(each) for each in manifest.get("action_bounds", (-1, 1)))
+    actions: NDArray[Any] = low + (data["action"].numpy() + 1) / 2 * (high - low)
+    if manifest.get("num_actions") is not None and len(names["action"]) == 1:
+        actions = data["action"].numpy().argmax(1)[:, None]
+    panels: list[tuple[str, Any, str]] = []
+    for name, kind in (("return of an episode", "returns"), ("steps", "lengths")):
+        values = [
+            manifest.get(f"{part}_{kind}", []) for part in ("episode", "incomplete")
+        ]
+        panels.append((name, np.concatenate(values), GREEN))
+    panels.append(("reward", data["next", "reward"][:, 0].numpy(), GREY))
+    observations = sampled_observations(data).numpy()
+    panels += [(*each, ORANGE) for each in zip(names["action"], actions.T, strict=True)]
+    columns = zip(names["observation"], observations.T, strict=True)
+    panels += [(*each, BLUE) for each in columns]
+    rows = -(-min(len(panels), MOST_PANELS) // COLUMNS)
+    figure = new_figure(2.6 * COLUMNS, 2.0 * rows + 0.6)
+    left = max(len(panels) - MOST_PANELS, 0)
+    figure.suptitle(title + (f" ({left} more entries are not shown)" if left else ""))
+    grid = figure.subplots(rows, COLUMNS, squeeze=False).ravel()
+    for axes, (name, values, colour) in zip(grid, panels, strict=False):
+        if len(values):
+            axes.hist(values, bins=40, color=colour)
+        axes.set_title(name, fontsize=9)
+        axes.tick_params(labelsize=7)
+        axes.set_yticks([])
+    for axes in grid[len(panels) :]:
+        axes.set_axis_off()
+    save_figure(figure, path, dpi=110)
+
+
+def learning_curve(
+    history: Sequence[Mapping[str, Any]],
+    scalars: Mapping[str, Sequence[tuple[int, float]]],
+    path: Path | str,
+    *,
+    title: str,
+    data_mean: float | None,
+) -> None:
+    """Draw the score, or return, with its interval, and the losses.
+
+    Args:
+        history: evaluations with their ``"step"``, see
+            :func:`~torchrl_osr.lab.evaluation.summarize`; may be empty.
+        scalars: see :func:`~torchrl_osr.lab.evaluation.training_summary.read_scalars`.
+        path: of the PNG file.
+
+    Keyword Args:
+        title: above the figure.
+        data_mean: mean score, or return, of the data's episodes, if known.
+    """
+    panels = [name for name in PANELS if scalars.get(name)]
+    ratios = (2, 1) if history else (1,)
+    figure = new_figure(9, 2.1 * sum(ratios))
+    grid = figure.add_gridspec(len(ratios), max(len(panels), 1), height_ratios=ratios)
+    figure.suptitle(title)
+    if history:
+        axes = figure.add_subplot(grid[0, :])
+        measure, steps = measure_of(history[0]), [row["step"] for row in history]
+        mean, low, high = (
+            [row[f"{measure}{end}"] for row in history] for end in ("", "_low", "_high")
+        )
+        axes.fill_between(steps, low, high, color=BLUE, alpha=0.2, linewidth=0)
+        label = "policy (mean of the episodes, 95 % interval)"
+        axes.plot(steps, mean, "o-", color=BLUE, markersize=4, label=label)
+        if data_mean is not None:
+            label = "data (mean episode)"
+            axes.axhline(data_mean, color=ORANGE, linestyle="--", label=label)
+        axes.set(xlabel="gradient steps", ylabel=IN_WORDS[measure])
+        # Outside: inside it would cover the curve.
+        figure.legend(loc="outside upper right", frameon=False, fontsize=8)
+    for column, name in enumerate(panels):
+        small = figure.add_subplot(grid[-1, column])
+        small.plot(*zip(*scalars[name], strict=True), color=GREY, linewidth=1)
+        small.set_title(PANELS[name], fontsize=9)
+        small.tick_params(labelsize=8)
+        small.set_xlabel("gradient steps", fontsize=8)
+        small.ticklabel_format(axis="x", style="sci", scilimits=(3, 3))
+    save_figure(figure, path)
+
+
+def robustness_figure(
+    summary: Sequence[Mapping[str, Any]],
+    evaluations: Sequence[Mapping[str, Any]],
+    path: Path | str,
+    *,
+    title: str,
+) -> None:
+    """Draw scores under disturbances and, after those that end, distances to the data.
+
+    Args:
+        summary: see :func:`~torchrl_osr.lab.evaluation.summarize_disturbances`.
+        evaluations: that it is of.
+        path: of the PNG file.
+
+    Keyword Args:
+        title: above the figure.
+    """
+    curves = distance_curves(evaluations)
+    figure = new_figure(11 if curves else 6.5, 4.6)
+    figure.suptitle(title)
+    axes = figure.subplots(1, 2 if curves else 1, squeeze=False)[0]
+    measure = measure_of(summary[0])
+    rows = summary[::-1]
+    mean = np.array([row[measure] for row in rows])
+    low, high = (
+        np.array([row[f"{measure}_{end}"] for row in rows]) for end in ("low", "high")
+    )
+    axes[0].errorbar(
+        mean, range(len(rows)), xerr=np.abs([low - mean, high - mean]), fmt="o",
+        color=BLUE, capsize=3, label="disturbed (mean, 95 % interval)",
+    )  # fmt: skip
+    clean = rows[0][f"clean_{measure}"]
+    axes[0].axvline(clean, color=GREY, linestyle="--", linewidth=1, label=UNDISTURBED)
+    names = [
+        row["name"] + ("" if row["disturbed_share"] else " (not met)") for row in rows
+    ]
+    axes[0].set_yticks(range(len(rows)), names)
+    axes[0].set(xlabel=IN_WORDS[measure], xlim=(0, None) if low.min() >= 0 else None)
+    axes[0].legend(frameon=False, fontsize=8)
+    if curves:
+        _draw_distances(axes[1], curves)
+    save_figure(figure, path)
+
+
+def distance_curves(
+    evaluations: Sequence[Mapping[str, Any]],
+) -> dict[str, tuple[list[int], list[float]]]:
+    """Mean distance to the data around the end of each disturbance.
+
+    Returns:
+        Offsets and distances in units of the threshold, by name of the disturbance;
+        those of all undisturbed episodes are named ``"undisturbed"``. Offsets with
+        fewer than a tenth of the episodes at offset 0 are left out.
+    """
+    parts: dict[str, list[tuple[Any, Any]]] = {}
+    offset: list[int] = []
+    for level in (level for each in evaluations for level in each["levels"]):
+        if (distance := level["distance"]) is None:
+            continue
+        offset = distance["offset"]
+        for name, prefix in ((level["name"], ""), (UNDISTURBED, "clean_")):
+            pair = distance[f"{prefix}mean"], distance[f"{prefix}count"]
+            parts.setdefault(name, []).append(pair)
+    curves = {}
+    for name, pairs in parts.items():
+        mean, count = (np.array(each, dtype=float) for each in zip(*pairs, strict=True))
+        episodes = count.sum(0)
+        shown = episodes >= max(0.1 * episodes[offset.index(0)], 1)
+        total = np.where(count > 0, mean * count, 0).sum(0)  # None became NaN
+        if shown.any():
+            offsets, means = np.array(offset)[shown], total[shown] / episodes[shown]
+            curves[name] = offsets.tolist(), means.tolist()
+    return curves
+
+
+def _draw_distances(
+    axes: Axes, curves: Mapping[str, tuple[list[int], list[float]]]
+) -> None:
+    from matplotlib import colormaps
+
+    disturbed = [name for name in curves if name != UNDISTURBED]
+    shades = colormaps["viridis"](np.linspace(0, 0.9, len(disturbed)))
+    colors = dict(zip(disturbed, shades, strict=True))
+    for name, curve in curves.items():
+        axes.plot(*curve, color=colors.get(name, GREY), linewidth=1.5, label=name)
+    axes.axhline(1, color=GREY, linestyle="--", linewidth=1, label="95 % of the data")
+    axes.axvline(0, color=GREY, linewidth=0.5)
+    axes.set(xlabel="steps since the disturbance ended", ylim=(0, None))
+    axes.set_ylabel("distance to the data / threshold")
+    axes.set_title("mean of the episodes that still run", fontsize=9)
+    axes.legend(frameon=False, fontsize=8)
