@@ -11,7 +11,6 @@ from tensordict import TensorDict
 from torchrl_osr.lab.data import consecutive_rows
 from torchrl_osr.lab.dynamics import DynamicsEnsemble
 from torchrl_osr.lab.dynamics.fit import (
-    describe_dynamics,
     dynamics_report,
     rollout_errors,
 )
@@ -59,7 +58,6 @@ def test_report_of_the_true_model() -> None:
     # The change has a variance of 1 + .09, of which the noise is .09.
     assert report["r2"][0] == pytest.approx(1 / 1.09, abs=0.01)
     assert report["rows"] == 20_000
-    assert report["largest_disagreement"] == 0
     assert "rollout" not in report
 
 
@@ -94,19 +92,9 @@ def test_rollout_errors_of_a_constant_error() -> None:
         model.layers[0].weight[:, 0, 1] = 0
     off = rollout_errors(model, pieces, (1, 4))
     assert [each["rmse"] for each in off] == pytest.approx([0.125, 0.5], abs=1e-4)
-    assert [each["median"] for each in off] == pytest.approx([0.125, 0.5], abs=1e-4)
     moved = pieces["next", "observation"][:, 3] - pieces["observation"][:, 0]
     wanted = (moved / 2).square().mean().sqrt().item()
     assert off[1]["standing_still"] == pytest.approx(wanted, rel=1e-5)
-
-
-def test_pieces_do_not_run_from_one_trajectory_into_the_next() -> None:
-    data = make_data(30)
-    data["next", "done"][9] = True
-    data["next", "observation"][19] += 1.0  # a gap that nothing marks
-    pieces = consecutive_rows(data, torch.arange(30), 5)
-    firsts = data["observation"][[*range(6), *range(10, 16), *range(20, 26)]]
-    assert torch.equal(pieces["observation"][:, 0], firsts)
 
 
 def test_no_row_left_is_an_error() -> None:
@@ -115,12 +103,3 @@ def test_no_row_left_is_an_error() -> None:
     data["next", "observation"] = data["observation"].clone()
     with pytest.raises(ValueError, match="has a next state"):
         dynamics_report(make_model(), data)
-
-
-def test_line_says_what_was_measured() -> None:
-    data = make_data(300)
-    pieces = consecutive_rows(data, torch.arange(0, 200, 50), 20)
-    line = describe_dynamics(dynamics_report(make_model(), data, pieces))
-    assert "300 held-out rows" in line
-    assert "error after steps" in line
-    assert "(20)" in line

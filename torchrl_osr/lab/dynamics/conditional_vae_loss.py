@@ -1,4 +1,4 @@
-r"""The loss that trains a conditional variational autoencoder.
+"""Loss of a conditional variational autoencoder.
 
 Shapes: ``B`` batch (any leading dimensions), ``T`` target, ``Z`` latent.
 """
@@ -21,15 +21,14 @@ from torchrl_osr.objectives.mixed_states import check_single_steps, first_step
 
 
 class ConditionalVAELoss(BaseLoss):
-    r"""Squared error of the target, and the divergence of the latent from its prior.
+    r"""Squared error of the target, and the latent's divergence from its prior.
 
     .. math::
         L = \mathbb E_D\Big[ \frac1T \|f(c, z) - t\|^2
             + w\,\frac1Z \sum_i KL(q_i(z \mid c, t) \,\|\, N(0, 1)) \Big], \quad
             z \sim q
 
-    as in BCQ's code (https://arxiv.org/abs/1812.02900), with the standardised target
-    where the network has one. Rows without a next state do not count.
+    as in BCQ's code. Rows without a next state do not count.
 
     Args:
         vae_network: to be trained.
@@ -37,24 +36,6 @@ class ConditionalVAELoss(BaseLoss):
     Keyword Args:
         latent_weight: ``w``. Default 0.5, BCQ's.
         reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
-
-    Raises:
-        ValueError: if ``latent_weight`` is negative.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_osr.lab.dynamics import ConditionalVAELoss
-        >>> from torchrl_osr.lab.dynamics import ConditionalVAE
-        >>> model = ConditionalVAE(
-        ...     11, 3, condition_key=("next", "observation"), target_key="action",
-        ...     num_cells=[32])
-        >>> batch = TensorDict({
-        ...     "observation": torch.randn(4, 11), "action": torch.rand(4, 3),
-        ...     "next": {"observation": torch.randn(4, 11),
-        ...              "terminated": torch.zeros(4, 1, dtype=torch.bool)}}, [4])
-        >>> ConditionalVAELoss(model)(batch)["loss_vae"].shape
-        torch.Size([])
     """
 
     @dataclass

@@ -1,6 +1,6 @@
-r"""The loss that trains an ensemble of dynamics models.
+"""Loss of an ensemble of dynamics models.
 
-Shapes: ``B`` batch (any leading dimensions), ``E`` networks.
+Shapes: ``B`` batch (any leading dimensions), ``E`` networks, ``D`` predicted entries.
 """
 
 from __future__ import annotations
@@ -9,17 +9,28 @@ from dataclasses import dataclass
 from typing import Literal
 
 from tensordict import NestedKey, TensorDictBase, TensorDictParams
+from torch import Tensor
 
 from torchrl_osr._checks import check_weight
 from torchrl_osr._entries import nested
 from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble, has_next_state
-from torchrl_osr.lab.dynamics.equations import gaussian_error
 from torchrl_osr.objectives.base import BaseLoss, Terms
 from torchrl_osr.objectives.mixed_states import check_single_steps, first_step
 
 
+def gaussian_error(mean: Tensor, log_variance: Tensor, target: Tensor) -> Tensor:
+    r"""Return twice the negative log-likelihood a target entry, ``[B]``.
+
+    .. math::
+        \frac1D \sum_{d=1}^{D} \frac{(\mu_d - y_d)^2}{\sigma_d^2} + \log \sigma_d^2
+
+    without the constant :math:`\log 2\pi`. All arguments are ``[B, D]``.
+    """
+    return ((mean - target).square() * (-log_variance).exp() + log_variance).mean(-1)
+
+
 class DynamicsLoss(BaseLoss):
-    r"""Likelihood of the next state and the reward, and the bounds of the variance.
+    r"""Negative log-likelihood of next state and reward, and bounds of the variance.
 
     .. math::
         L = \sum_{i=1}^{E} \frac1{D} \sum_d \mathbb E \Big[
@@ -27,35 +38,27 @@ class DynamicsLoss(BaseLoss):
             + w \sum_d \big( v^{max}_d - v^{min}_d \big)
 
     with the standardised targets :math:`y = (s' - s, r)` and the learned bounds
-    :math:`v` of the log-variance: the objective of MOPO's code
-    (https://arxiv.org/abs/2005.13239, tianheyu927/mopo), whose weight decay is in
-    :meth:`~torchrl_osr.lab.dynamics.DynamicsEnsemble.parameter_groups`.
-
-    Every network has rows of its own: the batch is divided among them. There each has
-    a bootstrap sample of the data, too; that shuffled batches and different initial
-    weights are enough is the finding of "Simple and Scalable Predictive Uncertainty
-    Estimation using Deep Ensembles", https://arxiv.org/abs/1612.01474.
+    :math:`v` of the log-variance, as in MOPO's code (https://arxiv.org/abs/2005.13239,
+    tianheyu927/mopo). MOPO's weight decay is in
+    :meth:`~torchrl_osr.lab.dynamics.DynamicsEnsemble.parameter_groups`. The batch is
+    divided among the networks, where MOPO draws bootstrap samples. Rows without a next
+    state do not count.
 
     Args:
-        dynamics_network: to be trained; its standardisation stays as it is, see
-            :meth:`~torchrl_osr.lab.dynamics.DynamicsEnsemble.standardize_`.
+        dynamics_network: to be trained, standardised already.
 
     Keyword Args:
         bound_weight: ``w``. Default 0.01, MOPO's.
-        reduction: of the likelihood: ``"mean"`` (default) as above, ``"sum"`` or
-            ``"none"``, one number a row.
+        reduction: of the likelihood, ``"mean"`` (default), ``"sum"`` or ``"none"``.
 
     Raises:
-        ValueError: if ``bound_weight`` is negative; in the call, if the number of rows
-            is no multiple of ``E``.
+        ValueError: in the call, if the number of rows is no multiple of ``E``.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl_osr.lab.dynamics import DynamicsLoss
-        >>> from torchrl_osr.lab.dynamics import DynamicsEnsemble
-        >>> model = DynamicsEnsemble(11, 3, num_networks=2, num_elites=1)
-        >>> loss = DynamicsLoss(model)
+        >>> from torchrl_osr.lab.dynamics import DynamicsEnsemble, DynamicsLoss
+        >>> loss = DynamicsLoss(DynamicsEnsemble(11, 3, num_networks=2, num_elites=1))
         >>> batch = TensorDict({
         ...     "observation": torch.randn(6, 11), "action": torch.rand(6, 3),
         ...     "next": {"observation": torch.randn(6, 11), "reward": torch.ones(6, 1),

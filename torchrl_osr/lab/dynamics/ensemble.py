@@ -1,46 +1,41 @@
-"""The dynamics model: an ensemble of networks that predict the next state and reward.
+"""Ensemble of probabilistic dynamics models.
 
 Shapes: ``B`` batch (any leading dimensions), ``S`` observation, ``A`` action, ``E``
-networks, ``D`` predicted entries: ``S`` differences of the state, and the reward.
+networks, ``D = S + 1`` predicted entries: the change of the state, and the reward.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from itertools import pairwise
 from typing import Any, NamedTuple, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+from torch.linalg import vector_norm
+from torch.nn.functional import softplus
 
-from torchrl_osr._checks import check_positive
 from torchrl_osr._entries import column, entry, nested
-from torchrl_osr.lab.dynamics.equations import bounded_log_variance, disagreement
 
 LOG_VARIANCE_BOUNDS = (-10.0, 0.5)
-"""Where the learned bounds of the log-variance begin, as in PETS and MOPO."""
+"""Initial values of the learned bounds, as in PETS and MOPO."""
 
 WEIGHT_DECAY = (2.5e-5, 5e-5, 7.5e-5, 7.5e-5)
 OUTPUT_WEIGHT_DECAY = 1e-4
-"""Of MOPO's four hidden layers, and of its last one; a further one has the fourth's."""
+"""Of MOPO's four hidden layers and its last one; further layers use the fourth's."""
 
 
 class Prediction(NamedTuple):
-    """Gaussians of all networks, in the units of the data.
-
-    Attributes:
-        mean: ``[E, B, D]``; the first ``S`` entries are added to the state.
-        scale: standard deviations, likewise.
-    """
+    """Gaussians of all networks, in the units of the data, ``[E, B, D]``."""
 
     mean: Tensor
     scale: Tensor
 
 
-class DynamicsEnsemble(TensorDictModuleBase):
-    r"""Gaussians of the state's change and of the reward, of several networks.
+class DynamicsEnsemble(nn.Module):
+    r"""Predict Gaussians of the state's change and the reward with several networks.
 
     .. math::
         \big(s' - s,\, r\big) \sim
@@ -48,28 +43,24 @@ class DynamicsEnsemble(TensorDictModuleBase):
         \quad i = 1 \dots E
 
     as in PETS (https://arxiv.org/abs/1805.12114) and MOPO
-    (https://arxiv.org/abs/2005.13239). All networks are stacked: each layer is one
-    batched product. Log-variances are bounded smoothly, by bounds that are learned.
-
-    Unlike there, the targets are standardised as well as the inputs (see
-    :meth:`standardize_`), so that no entry outweighs the others because of its unit.
+    (https://arxiv.org/abs/2005.13239). Each layer of all networks is one batched
+    product. Unlike there, targets are standardised as well as inputs, so that the
+    entries' units do not matter.
 
     Args:
-        observation_dim: size of the observation, ``S``.
-        action_dim: size of the action, ``A``; of discrete actions their number.
+        observation_dim: ``S``.
+        action_dim: ``A``; the number of discrete actions.
 
     Keyword Args:
-        num_networks: ``E``. Default 7, MOPO's.
-        num_elites: how many of them are rolled out, see :meth:`calibrate_`. Default 5,
-            MOPO's.
-        num_cells: width of each hidden layer. Default four of 200, MOPO's.
-        activation_class: activation between the layers. Default
-            :class:`torch.nn.SiLU`.
-        observation_key, action_key: the entries it reads. Default ``"observation"``
-            and ``"action"``.
+        num_networks: ``E``. Default 7.
+        num_elites: networks that roll-outs use, see :meth:`calibrate_`. Default 5.
+        num_cells: width of each hidden layer. Default four of 200.
+        activation_class: Default :class:`torch.nn.SiLU`.
+        observation_key, action_key: entries to read. Default ``"observation"`` and
+            ``"action"``.
 
     Raises:
-        ValueError: there are no networks, or more elites than networks.
+        ValueError: ``num_elites`` is not between 1 and ``num_networks``.
 
     Examples:
         >>> import torch
@@ -80,6 +71,10 @@ class DynamicsEnsemble(TensorDictModuleBase):
         torch.Size([3, 4, 12])
     """
 
+    input_loc: Tensor
+    input_scale: Tensor
+    target_loc: Tensor
+    target_scale: Tensor
     elites: Tensor
 
     def __init__(
@@ -95,7 +90,6 @@ class DynamicsEnsemble(TensorDictModuleBase):
         action_key: NestedKey = "action",
     ) -> None:
         super().__init__()
-        check_positive("num_networks", num_networks, minimum=1)
         if not 1 <= num_elites <= num_networks:
             raise ValueError(
                 f"num_elites must be between 1 and num_networks={num_networks}, got "
@@ -104,29 +98,30 @@ class DynamicsEnsemble(TensorDictModuleBase):
         self.observation_dim, self.action_dim = observation_dim, action_dim
         self.num_networks = num_networks
         self.in_keys = [observation_key, action_key]
-        self.out_keys = ["loc", "scale"]
         inputs, outputs = observation_dim + action_dim, observation_dim + 1
         widths = [inputs, *num_cells, 2 * outputs]
-        self.layers = nn.ModuleList(
-            _StackedLinear(num_networks, *sizes) for sizes in pairwise(widths)
-        )
+        layers = [_StackedLinear(num_networks, *sizes) for sizes in pairwise(widths)]
+        self.layers = nn.ModuleList(layers)
         self.activation = activation_class()
-        for name, bound in zip(("lowest", "highest"), LOG_VARIANCE_BOUNDS, strict=True):
-            value = torch.full([outputs], bound)
-            self.register_parameter(f"{name}_log_variance", nn.Parameter(value))
+        lowest, highest = LOG_VARIANCE_BOUNDS
+        self.lowest_log_variance = nn.Parameter(torch.full([outputs], lowest))
+        self.highest_log_variance = nn.Parameter(torch.full([outputs], highest))
         for name, size in (("input", inputs), ("target", outputs)):
             self.register_buffer(f"{name}_loc", torch.zeros(size))
             self.register_buffer(f"{name}_scale", torch.ones(size))
         self.register_buffer("elites", torch.arange(num_elites))
 
-    # -- predictions ------------------------------------------------------------
+    @property
+    def linear_layers(self) -> list[_StackedLinear]:
+        """The layers, with their type."""
+        return [cast(_StackedLinear, layer) for layer in self.layers]
 
     def standardized(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and log-variance ``[E, B, D]`` of the standardised targets.
+        """Return mean and log-variance ``[E, B, D]`` of the standardised targets.
 
         Args:
-            inputs: states and actions in the data's units, joined: ``[B, S + A]`` for
-                all networks, or ``[E, B, S + A]``, each network's own.
+            inputs: joined states and actions in the data's units, ``[B, S + A]`` for
+                all networks or ``[E, B, S + A]``, one batch for each.
         """
         hidden = (inputs - self.input_loc) / self.input_scale
         if hidden.ndim == 2:
@@ -135,59 +130,46 @@ class DynamicsEnsemble(TensorDictModuleBase):
         for layer in hidden_layers:
             hidden = self.activation(layer(hidden))
         mean, free = last(hidden).chunk(2, -1)
-        bounds = self.lowest_log_variance, self.highest_log_variance
-        return mean, bounded_log_variance(free, *bounds)
+        # Smoothly between the learned bounds: PETS, appendix A.1.
+        lowest, highest = self.lowest_log_variance, self.highest_log_variance
+        below = highest - softplus(highest - free)
+        return mean, lowest + softplus(below - lowest)
 
     def predict(self, observation: Tensor, action: Tensor) -> Prediction:
-        """Gaussians of all networks at ``[B, S]`` and ``[B, A]``."""
+        """Return the Gaussians of all networks at ``[B, S]`` and ``[B, A]``."""
         batch = observation.shape[:-1]
         inputs = torch.cat([observation, action], -1).flatten(0, -2)
         mean, log_variance = self.standardized(inputs)
-        return Prediction(
-            (mean * self.target_scale + self.target_loc).unflatten(1, batch),
-            (log_variance.mul(0.5).exp() * self.target_scale).unflatten(1, batch),
-        )
+        mean = mean * self.target_scale + self.target_loc
+        scale = log_variance.mul(0.5).exp() * self.target_scale
+        shape = self.num_networks, *batch, -1
+        return Prediction(mean.view(shape), scale.view(shape))
 
     def sample(self, prediction: Prediction) -> Tensor:
-        """Draw from the Gaussian of an elite that is drawn for each row, ``[B, D]``.
-
-        Args:
-            prediction: of :meth:`predict`; there are gradients by it.
-        """
+        """Draw an elite for each row, and from its Gaussian, ``[B, D]``."""
         batch = prediction.mean.shape[1:-1]
         drawn = torch.randint(len(self.elites), batch, device=self.elites.device)
         chosen = self.elites[drawn].unsqueeze(-1).expand_as(prediction.mean[:1])
         mean, scale = (each.gather(0, chosen).squeeze(0) for each in prediction)
         return mean + scale * torch.randn_like(mean)
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``"loc"`` and ``"scale"``, ``[B, E, D]``, of a batch ``[B]``."""
-        found = self.predict(*(entry(tensordict, key) for key in self.in_keys))
-        for key, value in zip(self.out_keys, found, strict=True):
-            tensordict.set(key, value.movedim(0, -2))
-        return tensordict
-
     def disagreement(self, mean: Tensor) -> Tensor:
-        """How far the elites' predictions lie apart, in units of the targets' spread.
+        r"""Return the largest distance of an elite from the elites' mean, ``[B]``.
+
+        .. math:: \max_i \lVert \mu_i - \bar\mu \rVert_2
+
+        in standard deviations of the targets. MOReL (https://arxiv.org/abs/2005.05951)
+        takes the largest distance of two networks.
 
         Args:
             mean: of :meth:`predict`, ``[E, B, D]``.
-
-        Returns:
-            ``[B]``, see :func:`~torchrl_osr.lab.dynamics.equations.disagreement`;
-            every entry
-            counts in units of its target's standard deviation.
         """
-        return disagreement(mean[self.elites] / self.target_scale)
-
-    # -- what data say ------------------------------------------------------------
+        mean = mean[self.elites] / self.target_scale
+        distance: Tensor = vector_norm(mean - mean.mean(0), dim=-1)
+        return distance.amax(0)
 
     def inputs_and_targets(self, data: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """States and actions ``[B, S + A]``, and what follows from them, ``[B, D]``.
-
-        Args:
-            data: transitions ``[B]``.
-        """
+        """Return ``[B, S + A]`` and ``[B, D]`` of transitions ``[B]``."""
         key, action_key = self.in_keys
         observation, action = entry(data, key), entry(data, action_key)
         change = entry(data, nested("next", key)) - observation
@@ -197,13 +179,9 @@ class DynamicsEnsemble(TensorDictModuleBase):
 
     @torch.no_grad()
     def standardize_(self, data: TensorDictBase) -> None:
-        """Take means and standard deviations of inputs and targets from data.
+        """Take means and standard deviations of inputs and targets from rows ``[N]``.
 
-        An entry that does not vary keeps a standard deviation of 1.
-
-        Args:
-            data: transitions ``[N]``; rows without a next state are left out, see
-                :func:`has_next_state`.
+        Constant entries keep a standard deviation of 1.
         """
         rows = data[has_next_state(data, self.in_keys[0])]
         names = ("input", "target")
@@ -214,14 +192,7 @@ class DynamicsEnsemble(TensorDictModuleBase):
 
     @torch.no_grad()
     def calibrate_(self, held_out: TensorDictBase) -> None:
-        """Choose the elites by their error on held-out rows.
-
-        They are the networks with the smallest mean squared error of standardised
-        targets.
-
-        Args:
-            held_out: transitions ``[N]``.
-        """
+        """Choose the networks with the smallest error on held-out rows as elites."""
         rows = held_out[has_next_state(held_out, self.in_keys[0])]
         inputs, targets = self.inputs_and_targets(rows)
         mean, _ = self.standardized(inputs)
@@ -230,12 +201,12 @@ class DynamicsEnsemble(TensorDictModuleBase):
         self.elites.copy_(error.argsort()[: len(self.elites)].sort().values)
 
     def parameter_groups(self) -> Iterator[dict[str, Any]]:
-        """Groups for an optimizer: weights with MOPO's decay, the rest without.
+        """Yield groups for :class:`torch.optim.Adam`, with MOPO's weight decay.
 
-        With :class:`torch.optim.Adam` the decay is that of MOPO's code: half the
-        squared norm of each layer's weights, times its factor, is added to the loss.
+        MOPO's code adds half the squared norm of each layer's weights, times its
+        factor, to the loss.
         """
-        *hidden, last = (cast(_StackedLinear, layer) for layer in self.layers)
+        *hidden, last = self.linear_layers
         for number, layer in enumerate(hidden):
             decay = WEIGHT_DECAY[min(number, len(WEIGHT_DECAY) - 1)]
             yield {"params": [layer.weight], "weight_decay": decay}
@@ -261,25 +232,82 @@ class _StackedLinear(nn.Module):
         return torch.baddbmm(self.bias, value, self.weight)
 
 
-def loc_and_scale(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of each entry of ``[N, D]``, float64.
+class EliteNetworks:
+    """Predict mean changes and rewards with the frozen elites of a model.
 
-    An entry that does not vary has a standard deviation of 1: it is divided by.
+    States and actions are in the environment's units, rewards in the model's. All
+    scaling is folded into the first and the last layer, for speed at action time.
+
+    Args:
+        model: is copied.
+        loc, scale: were subtracted from the environment's states, and divided them,
+            ``[S]``. Default 0 and 1.
+        low, high: the environment's actions for the data's -1 and 1, ``[A]``. Default
+            -1 and 1.
+
+    Attributes:
+        num_networks: ``E``.
     """
+
+    @torch.no_grad()
+    def __init__(
+        self,
+        model: DynamicsEnsemble,
+        loc: Tensor | float = 0.0,
+        scale: Tensor | float = 1.0,
+        low: Tensor | float = -1.0,
+        high: Tensor | float = 1.0,
+    ) -> None:
+        ones = model.target_loc.new_ones
+        states, actions = ones(model.observation_dim), ones(model.action_dim)
+        center = torch.cat([loc * states, (low + high) / 2 * actions]).double()
+        unit = torch.cat([scale * states, (high - low) / 2 * actions]).double()
+        layers = model.linear_layers
+        weights = [each.weight[model.elites].double() for each in layers]
+        biases = [each.bias[model.elites].double() for each in layers]
+        weights[0] /= (unit * model.input_scale).unsqueeze(-1)
+        shift = (center + unit * model.input_loc) @ weights[0]
+        biases[0] -= shift.unsqueeze(1)
+        size = len(model.target_loc)  # log-variances follow
+        out = torch.cat([scale * states, ones(1)]).double()
+        weights[-1] = weights[-1][..., :size] * model.target_scale * out
+        biases[-1] = biases[-1][..., :size] * model.target_scale * out
+        biases[-1] += model.target_loc * out
+        self.weights = [each.float() for each in weights]
+        self.biases = [each.float() for each in biases]
+        self.activation = model.activation
+        self.num_networks = len(model.elites)
+
+    @classmethod
+    def join(cls, parts: Sequence[EliteNetworks]) -> EliteNetworks:
+        """Return the networks of several models as one; their layers must be alike."""
+        joined = copy(parts[0])
+        weights, biases = zip(*((p.weights, p.biases) for p in parts), strict=True)
+        joined.weights = [torch.cat(layer) for layer in zip(*weights, strict=True)]
+        joined.biases = [torch.cat(layer) for layer in zip(*biases, strict=True)]
+        joined.num_networks = sum(each.num_networks for each in parts)
+        return joined
+
+    def __call__(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Return ``[E, n, D]`` at ``[E, n, S]`` and ``[E, n, A]``."""
+        hidden = torch.cat([observation, action], -1)
+        *layers, last = zip(self.biases, self.weights, strict=True)
+        for bias, weight in layers:
+            hidden = self.activation(torch.baddbmm(bias, hidden, weight))
+        return torch.baddbmm(last[0], hidden, last[1])
+
+
+def loc_and_scale(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Return mean and standard deviation of ``[N, D]``; 1 for constant entries."""
     scale, loc = torch.std_mean(values.double(), 0, correction=0)
     return loc, torch.where(scale > 1e-8, scale, torch.ones_like(scale))
 
 
 def has_next_state(data: TensorDictBase, key: NestedKey = "observation") -> Tensor:
-    """Which rows say where their action has led, bool ``[B]``.
+    """Return which of the transitions ``[B]`` have a next state, bool ``[B]``.
 
-    Where a recording ends with a terminated row that lacks its next state, the readers
-    of this package repeat the state (see docs/your_data.md). Such rows say nothing
-    about the dynamics; all others do, also the last ones of an episode.
-
-    Args:
-        data: transitions ``[B]``.
-        key: of the state. Default ``"observation"``.
+    Where a recording lacks the next state of a terminated row, the readers repeat the
+    state. Such rows say nothing about the dynamics.
     """
     same = (entry(data, nested("next", key)) == entry(data, key)).all(-1)
     return ~(same & column(data, ("next", "terminated")).bool())

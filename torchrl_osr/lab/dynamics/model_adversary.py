@@ -1,10 +1,11 @@
 """RAMBO: a dynamics model that is trained against the policy's value.
 
-Shapes: ``B`` states, ``S`` observation, ``E`` elites, ``N`` critics.
+Shapes: ``B`` states, ``S`` observation, ``E`` elites.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -19,17 +20,33 @@ from torch import Tensor
 from torch.distributions import Normal
 from torchrl.data import ReplayBuffer
 
-from torchrl_osr._checks import check_positive, check_weight
+from torchrl_osr._checks import check_positive
 from torchrl_osr._entries import entry
 from torchrl_osr.lab.dynamics.dynamics_loss import DynamicsLoss
 from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
-from torchrl_osr.lab.dynamics.equations import adversarial_objective
-from torchrl_osr.lab.dynamics.termination import Termination, never
+from torchrl_osr.lab.dynamics.rollouts import Termination, never
 from torchrl_osr.objectives import BaseLoss
 from torchrl_osr.objectives.step import qvalue
 
 SEED = 2**40
 """Added to a seed, so that roll-outs with the same one draw other numbers."""
+
+
+def adversarial_objective(log_prob: Tensor, advantage: Tensor) -> Tensor:
+    r"""Return RAMBO's objective of a model against the policy, ``[B]``.
+
+    .. math::
+        \frac{A - \bar A}{\operatorname{std} A + 10^{-6}}\,
+        \log \frac1E \sum_{i=1}^{E} p_i(s', r \mid s, a)
+
+    https://arxiv.org/abs/2204.12581, equation (9), and its code (marc-rigter/rambo).
+
+    Args:
+        log_prob: of a sampled transition by each network, ``[E, B]``.
+        advantage: :math:`A` of the transition, without gradient, ``[B]``.
+    """
+    standardized = (advantage - advantage.mean()) / (advantage.std() + 1e-6)
+    return standardized * (log_prob.logsumexp(0) - math.log(len(log_prob)))
 
 
 class ModelAdversary:
@@ -41,36 +58,26 @@ class ModelAdversary:
         A = r + \gamma\,(1 - \text{terminated}) \min_j Q_j(s', \pi(s'))
             - \min_j Q_j(s, a)
 
-    with the likelihood of :class:`~torchrl_osr.lab.dynamics.DynamicsLoss` on the data,
-    and with the
-    advantage standardised over the batch, :math:`\bar A`, on roll-outs of the policy in
-    the model, whose gradient is a policy gradient with the model as the policy:
-    transitions to worse states than expected become more likely. "RAMBO-RL: Robust
-    Adversarial Model-Based Offline Reinforcement Learning",
-    https://arxiv.org/abs/2204.12581, and its code (marc-rigter/rambo), where roll-outs
-    go on after an end, too.
-
-    Its state is the model's and the optimizer's.
+    The first term is :class:`~torchrl_osr.lab.dynamics.DynamicsLoss` on the data. The
+    second is a policy gradient with the model as the policy, on roll-outs of the actor:
+    transitions to worse states than expected become more likely. Roll-outs go on after
+    an end of the task, as in the code of RAMBO (https://arxiv.org/abs/2204.12581).
 
     Args:
-        model: trained already; trained further here.
-        loss: holds the critics.
+        model: trained already.
+        loss: has the critics.
         actor: the policy.
-        real: the data. Rows are drawn with its generator, if it has one.
+        real: the data, sampled with the buffer's own generator, if it has one.
         optimizer: of the model's parameters.
 
     Keyword Args:
         steps: gradient steps of a call.
-        weight: :math:`\lambda`; with 0 the model is trained on the data alone.
+        weight: :math:`\lambda`; 0 trains on the data alone.
         rollout_steps: steps of a roll-out, one for each gradient step.
         batch_size: ``B``, at least 2.
         gamma: discount factor.
-        terminated: of next states, see :func:`~torchrl_osr.lab.dynamics.imagine`.
-            Default: never.
+        terminated: of next states. Default: never.
         seed: of the draws.
-
-    Raises:
-        ValueError: an option is out of its range.
     """
 
     def __init__(
@@ -89,10 +96,7 @@ class ModelAdversary:
         terminated: Termination = never,
         seed: int = 0,
     ) -> None:
-        check_positive("steps", steps, minimum=1)
-        check_weight("weight", weight)
-        check_positive("rollout_steps", rollout_steps, minimum=1)
-        check_positive("batch_size", batch_size, minimum=2)  # advantages deviate
+        check_positive("batch_size", batch_size, minimum=2)  # else std(A) is NaN
         self.model = model.requires_grad_(True)
         self.loss, self.actor, self.real, self.optimizer = loss, actor, real, optimizer
         self.likelihood = DynamicsLoss(model)
@@ -102,7 +106,7 @@ class ModelAdversary:
         self.metrics: dict[str, float] = {}
 
     def __call__(self, number: int) -> None:
-        """Train the model, with draws of this number; torch's generator stays."""
+        """Train the model with the seed of this number; torch's generator stays."""
         device = self.model.elites.device
         totals = torch.zeros(2, device=device)
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
@@ -117,7 +121,7 @@ class ModelAdversary:
         self.metrics = dict(zip(names, means, strict=True))
 
     def _update(self, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """One gradient step; returns both terms, and the states that follow."""
+        """Take a gradient step; return both terms and the next states."""
         rows = self.model.num_networks * self.batch_size
         likelihood = sum(self.likelihood(self.real.sample(rows)).values())
         objectives, following = self.objective(state)
@@ -128,7 +132,7 @@ class ModelAdversary:
         return likelihood.detach(), objective.detach(), following
 
     def objective(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        r"""What :math:`\lambda` weighs, ``[B]``, and states that follow, ``[B, S]``.
+        r"""Return the term with :math:`\lambda`, ``[B]``, and next states, ``[B, S]``.
 
         Args:
             state: ``[B, S]``.
@@ -142,9 +146,9 @@ class ModelAdversary:
             following, reward = state + sample[..., :-1], sample[..., -1]
             goes_on = ~self.terminated(following)
             after = self._action(following, InteractionType.DETERMINISTIC)
-            value = self._value(following, after)
+            value = self.value(following, after)
             advantage = reward + self.gamma * goes_on * value
-            advantage = advantage - self._value(state, action)
+            advantage = advantage - self.value(state, action)
         mean, scale = (each[model.elites] for each in prediction)
         density = Normal(mean, scale)
         log_prob = density.log_prob(sample).sum(-1)  # type: ignore[no-untyped-call]
@@ -156,8 +160,8 @@ class ModelAdversary:
             action: Tensor = self.actor(batch)[self.model.in_keys[1]]
         return action
 
-    def _value(self, state: Tensor, action: Tensor) -> Tensor:
-        """The critics' smallest, ``[B]``."""
+    def value(self, state: Tensor, action: Tensor) -> Tensor:
+        """Return the smallest value of the critics, ``[B]``."""
         batch = TensorDict({self.model.in_keys[0]: state}, state.shape[:-1])
         params = self.loss.qvalue_network_params
         return qvalue(self.loss, batch, action, params).amin(0)
@@ -171,7 +175,7 @@ class ModelAdversary:
         }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Go on from a saved state."""
+        """Continue from a state."""
         self.model.load_state_dict(state_dict["model"])
         self.optimizer.load_state_dict(state_dict["optimizer"])
         self.metrics = dict(state_dict["metrics"])

@@ -5,84 +5,49 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from torch import Tensor
+
 from torchrl_osr.lab.dynamics.conditional_vae import ConditionalVAE
 from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
 from torchrl_osr.lab.dynamics.rollout_buffer import check_real_ratio
-from torchrl_osr.lab.dynamics.termination import Termination, never, termination
+from torchrl_osr.lab.dynamics.rollouts import Termination, never, termination
 
 
 @dataclass
 class DynamicsOptions:
-    """A model of the dynamics, and what the policy learns from its roll-outs.
+    """Which models a run trains, and how its policy is rolled out in them."""
 
-    Attributes:
-        use: train a model, and the policy on its roll-outs besides the data.
-        num_networks: networks of the ensemble.
-        num_elites: how many of them are rolled out, the best on held-out rows.
-        num_cells: width of each hidden layer.
-        lr: learning rate of the model.
-        batch_size: rows of a gradient step, for each network.
-        steps: gradient steps of the model; the weights of its best evaluation are
-            taken.
-        vae_num_cells: width of each hidden layer of the conditional autoencoder of
-            loss=sdc or dynamics=reverse.
-        vae_steps: gradient steps of that autoencoder, with lr and batch_size.
-        path: a trained model to take, dynamics.safetensors of a run with the same data;
-            null for one of the same settings in the cache, or a new one.
-        terminations: auto for the rule by which the task ends, never for tasks that a
-            time limit alone ends.
-        reverse_policy: actions with which a reverse model rolls out from the data's
-            states to where they came from: cvae, those of a conditional autoencoder of
-            the data; uniform, random ones; null for no reverse model: the policy rolls
-            out forwards.
-        adversarial_steps: gradient steps, before each further roll-out, by which the
-            model is trained on the data and against the policy; 0 for none.
-        adversarial_weight: of the policy's advantage in that training.
-        adversarial_lr: learning rate of that training.
-        rollout_steps: steps of a roll-out.
-        rollout_starts: states of the data that roll-outs start from, each time.
-        disturbed_steps: roll-outs begin after at most so many random actions in the
-            model; 0 for the data's states themselves.
-        action_noise: of the policy's actions in roll-outs; each row draws its standard
-            deviation between 0 and this. For policies that are deterministic.
-        rollout_interval: gradient steps of the policy between roll-outs.
-        generations: number of newest roll-outs that are trained on.
-        real_ratio: share of real rows in a batch of the policy's; with 1 nothing is
-            imagined.
-        penalty: factor of the model's uncertainty, in the task's own units, that
-            imagined rewards lose.
-        unknown: what becomes of rows on which the elites disagree more than on held-out
-            ones: refuse leaves them out, halt ends the task there, take does nothing.
-        known_share: share of the held-out rows that count as known in that.
-        published: settings by data set or task, where a method has them.
-    """
-
-    use: bool = False
+    use: bool = False  # train a model, and the policy on its roll-outs
+    # The ensemble. Defaults are MOPO's.
     num_networks: int = 7
-    num_elites: int = 5
+    num_elites: int = 5  # networks that are rolled out, the best on held-out rows
     num_cells: list[int] = field(default_factory=lambda: [200, 200, 200, 200])
-    lr: float = 0.001
-    batch_size: int = 256
-    steps: int = 40_000
+    lr: float = 1e-3
+    batch_size: int = 256  # rows of a gradient step, for each network
+    steps: int = 40_000  # gradient steps; the best evaluation counts
+    path: str | None = None  # a model to take, dynamics.safetensors of another run
+    # The conditional autoencoder of loss=sdc or dynamics=reverse.
     vae_num_cells: list[int] = field(default_factory=lambda: [750, 750])
     vae_steps: int = 100_000
-    path: str | None = None
-    terminations: str = "auto"
-    reverse_policy: str | None = None
-    adversarial_steps: int = 0
-    adversarial_weight: float = 0.0003
-    adversarial_lr: float = 0.0003
+    # Roll-outs.
+    real_ratio: float = 0.05  # share of real rows in a batch; 1: no roll-outs
     rollout_steps: int = 5
-    rollout_starts: int = 50_000
-    disturbed_steps: int = 0
-    action_noise: float = 0.0
-    rollout_interval: int = 1000
-    generations: int = 5
-    real_ratio: float = 0.05
-    penalty: float = 0.0
-    unknown: str = "refuse"
-    known_share: float = 1.0
-    published: dict[str, Any] = field(default_factory=dict)
+    rollout_starts: int = 50_000  # states of the data that roll-outs start from
+    perturbed_start_steps: int = 0  # random actions before a roll-out, at most
+    action_noise: float = 0.0  # largest deviation of noise on deterministic policies
+    rollout_interval: int = 1000  # gradient steps of the policy between roll-outs
+    generations: int = 5  # newest roll-outs that are trained on
+    terminations: str = "auto"  # rule that ends roll-outs; "never": only a time limit
+    penalty: float = 0.0  # of the model's uncertainty, in the task's reward
+    unknown: str = "refuse"  # rows of high disagreement: "refuse", "halt" or "take"
+    known_share: float = 1.0  # of the held-out rows that are no such rows
+    # "cvae" or "uniform": roll a reverse model out with these actions, as in ROMI.
+    reverse_policy: str | None = None
+    # RAMBO's training of the model against the policy, before each further roll-out.
+    adversarial_steps: int = 0
+    adversarial_weight: float = 3e-4
+    adversarial_lr: float = 3e-4
+    published: dict[str, Any] = field(default_factory=dict)  # settings by data set
 
     def ensemble(self, observation_size: int, action_size: int) -> DynamicsEnsemble:
         """Build an untrained ensemble."""
@@ -91,7 +56,7 @@ class DynamicsOptions:
             action_size,
             num_networks=self.num_networks,
             num_elites=self.num_elites,
-            num_cells=list(self.num_cells),
+            num_cells=self.num_cells,
         )
 
     def transition_vae(self, observation_size: int) -> ConditionalVAE:
@@ -102,7 +67,7 @@ class DynamicsOptions:
             condition_key="observation",
             target_key=("next", "observation"),
             change=True,
-            num_cells=list(self.vae_num_cells),
+            num_cells=self.vae_num_cells,
         )
 
     def reverse_vae(self, observation_size: int, action_size: int) -> ConditionalVAE:
@@ -113,39 +78,35 @@ class DynamicsOptions:
             condition_key=("next", "observation"),
             target_key="action",
             latent_bound=0.5,
-            num_cells=list(self.vae_num_cells),
+            num_cells=self.vae_num_cells,
         )
 
-    def termination(self, env_id: str) -> Termination:
-        """Return the rule that ends roll-outs; raise a ValueError if none is known."""
-        return never if self.terminations == "never" else termination(env_id)
+    def termination(
+        self, env_id: str, loc: Tensor | float = 0.0, scale: Tensor | float = 1.0
+    ) -> Termination:
+        """Return the rule that ends roll-outs, for observations ``(s - loc) / scale``.
+
+        Raises:
+            ValueError: no rule is known for the task.
+        """
+        rule = never if self.terminations == "never" else termination(env_id)
+        return lambda state: rule(state * scale + loc)
 
     def check(self, env_id: str, *, batch_size: int, gamma: float) -> None:
-        """Raise a ValueError if the options contradict each other or the task.
-
-        Args:
-            env_id: Gymnasium id of the task.
-
-        Keyword Args:
-            batch_size: rows of a batch for the policy.
-            gamma: discount factor.
-        """
+        """Raise a ValueError if the options contradict each other or the task."""
         self.ensemble(1, 1)
         if self.real_ratio == 1:
             return
         self.termination(env_id)
         check_real_ratio(self.real_ratio, batch_size)
-        if self.disturbed_steps and self.reverse_policy:
+        forward = self.perturbed_start_steps > 0 or self.unknown == "halt"
+        if self.reverse_policy and forward:
             raise ValueError(
-                f"dynamics.disturbed_steps={self.disturbed_steps} needs a forward "
-                "model. Take dynamics=ensemble, or set it to 0."
-            )
-        if self.unknown == "halt" and self.reverse_policy:
-            raise ValueError(
-                "dynamics.unknown=halt needs a forward model. Take refuse or take."
+                "dynamics.perturbed_start_steps and dynamics.unknown=halt need a "
+                "forward model: take dynamics=ensemble, or leave them out."
             )
         if self.unknown == "halt" and gamma == 1:
             raise ValueError(
                 "dynamics.unknown=halt needs optim.gamma below 1: the value of a "
-                "state that repeats its reward for ever is infinite."
+                "reward for ever is infinite."
             )

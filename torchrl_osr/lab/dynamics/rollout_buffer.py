@@ -1,7 +1,4 @@
-"""Batches in part of real rows, in part of rows that a model has imagined.
-
-Shapes: ``B`` batch.
-"""
+"""Batches of recorded and of synthetic transitions."""
 
 from __future__ import annotations
 
@@ -15,25 +12,24 @@ from tensordict import TensorDictBase
 from torch import nn
 from torchrl.data import OfflineToOnlineReplayBuffer, ReplayBuffer
 
-from torchrl_osr._checks import check_positive
-from torchrl_osr.lab.dynamics.rollout import Imagined
+from torchrl_osr.lab.dynamics.rollouts import Rollout
 
 
 def check_real_ratio(real_ratio: float, batch_size: int) -> None:
-    """Raise a ValueError unless a batch has real rows and others."""
+    """Raise a ValueError unless batches have rows of both kinds."""
     real = round(real_ratio * batch_size)
     if not 0 < real < batch_size:
         raise ValueError(
             f"real_ratio={real_ratio} of {batch_size} rows are {real}; expected real "
-            "and imagined rows in each batch."
+            "and synthetic rows in each batch."
         )
 
 
 class _Rows:
-    """Rows to draw from, with replacement.
+    """Rows to sample from, with replacement.
 
-    No ReplayBuffer: TorchRL 0.14.1's and its storage hold each other, so that every
-    generation would stay in memory until the garbage collector happens to come by.
+    TorchRL 0.14.1's ReplayBuffer and its storage refer to each other, so that every
+    generation would stay in memory until the garbage collector runs.
     """
 
     def __init__(self, rows: TensorDictBase, rng: torch.Generator | None) -> None:
@@ -48,63 +44,44 @@ class _Rows:
     def sample(self, batch_size: int) -> TensorDictBase:
         device = None if self.rng is None else self.rng.device
         size = (batch_size,)
-        index = torch.randint(len(self), size, generator=self.rng, device=device)
+        index = torch.randint(len(self.rows), size, generator=self.rng, device=device)
         return self.rows[index]
 
 
-class ImaginedReplayBuffer(OfflineToOnlineReplayBuffer):
-    """TorchRL's buffer of two parts, the second of which is imagined anew now and then.
+class RolloutReplayBuffer(OfflineToOnlineReplayBuffer):
+    """Mix recorded rows with roll-outs of the policy's newest copies.
 
-    Before the first batch, and again after every ``interval`` batches, a copy of the
-    policy imagines a generation of rows; the last ``generations`` of them are drawn
-    from. Each has a seed of its own and leaves torch's global generator alone.
-
-    Its state holds not the rows but the policies that have imagined them, which are
-    small. Loading it imagines the same rows again, bit for bit on the same
-    machine.
+    Before the first batch, and after every ``interval`` batches, a copy of the policy
+    is rolled out; the last ``generations`` of roll-outs are sampled from. Each has its
+    own seed and leaves torch's global generator alone. The state dict holds the
+    policies instead of the rows; loading it repeats the roll-outs.
 
     Args:
-        real: the data, a buffer that has no batch size of its own.
-        policy: as it is trained; copied for each generation.
-        rows_of: what a policy imagines, as :func:`~torchrl_osr.lab.dynamics.imagine`
-            returns it, with torch's global generator as its only source of chance. The
-            rows have the entries of the real ones.
+        real: the data, a buffer without a batch size.
+        policy: as it is trained.
+        rollout: makes the rows of a policy, with torch's global generator as its only
+            source of randomness.
 
     Keyword Args:
-        real_ratio: share of real rows in a batch, above 0 and below 1.
-        batch_size: ``B``.
-        interval: batches between generations.
-        generations: how many of the newest are drawn from.
-        seed: of the first generation; the next one has the next seed.
-        transform: applied to each batch. Default: none.
-        before: called with the number of each generation but the first, 0, before the
+        real_ratio: share of real rows in a batch.
+        batch_size: rows of a batch, the real ones first.
+        interval: batches between roll-outs.
+        generations: number of newest roll-outs that are kept.
+        seed: of the first roll-out; the next one has the next seed.
+        transform: of each batch. Default: none.
+        before: called with the number of each roll-out but the first, before the
             policy is copied. Default: nothing.
 
     Raises:
-        ValueError: an option is out of its range, or leaves a batch without real or
-            without imagined rows; in :meth:`sample`, if a generation has no rows.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl.data import LazyTensorStorage, ReplayBuffer
-        >>> from torchrl_osr.lab.dynamics import Imagined, ImaginedReplayBuffer
-        >>> real = ReplayBuffer(storage=LazyTensorStorage(100))
-        >>> indices = real.extend(TensorDict({"state": torch.zeros(100, 1)}, [100]))
-        >>> def rows_of(policy):
-        ...     return Imagined(TensorDict({"state": torch.rand(9, 1) + 1}, [9]), 0)
-        >>> buffer = ImaginedReplayBuffer(
-        ...     real, torch.nn.Linear(1, 1), rows_of, real_ratio=0.25, batch_size=8,
-        ...     interval=1000, generations=5, seed=0)
-        >>> int((buffer.sample()["state"] == 0).sum())
-        2
+        ValueError: batches lack real or synthetic rows; in :meth:`sample`, if a
+            roll-out has no rows.
     """
 
     def __init__(
         self,
         real: ReplayBuffer,
         policy: nn.Module,
-        rows_of: Callable[[nn.Module], Imagined],
+        rollout: Callable[[nn.Module], Rollout],
         *,
         real_ratio: float,
         batch_size: int,
@@ -114,8 +91,6 @@ class ImaginedReplayBuffer(OfflineToOnlineReplayBuffer):
         transform: Callable[[TensorDictBase], TensorDictBase] | None = None,
         before: Callable[[int], None] | None = None,
     ) -> None:
-        check_positive("interval", interval, minimum=1)
-        check_positive("generations", generations, minimum=1)
         check_real_ratio(real_ratio, batch_size)
         super().__init__(
             real,
@@ -124,81 +99,81 @@ class ImaginedReplayBuffer(OfflineToOnlineReplayBuffer):
             batch_size=batch_size,
             transform=transform,
         )
-        self.policy, self.rows_of, self.before = policy, rows_of, before
+        self.policy, self.rollout, self.before = policy, rollout, before
         self.interval, self.generations, self.seed = interval, generations, seed
-        self.drawn = 0  # batches
+        self.num_batches = 0
         self._rng: torch.Generator | None = None
         self._copy = deepcopy(policy).requires_grad_(False)
         self._policies: list[dict[str, Any]] = []
-        self._imagined: list[Imagined] = []
+        self._rollouts: list[Rollout] = []
 
     def set_rng(self, generator: torch.Generator) -> None:
-        """Let both parts draw their rows with this generator."""
+        """Sample both kinds of rows with this generator."""
         self._rng = generator
         for buffer in (self._offline_buffer, self._online_buffer):
             buffer.set_rng(generator)
 
     def sample(self, batch_size: int | None = None) -> TensorDictBase:
-        """Draw a batch ``[B]``; imagine a generation before, if one is due."""
-        if self.drawn % self.interval == 0:
-            if self.drawn and self.before is not None:
-                self.before(self.drawn // self.interval)
+        """Return a batch; roll the policy out before, if that is due."""
+        if self.num_batches % self.interval == 0:
+            number = self.num_batches // self.interval
+            if number and self.before is not None:
+                self.before(number)
             state = self.policy.state_dict()
             weights = {key: value.cpu().clone() for key, value in state.items()}
             self._policies = [*self._policies, weights][-self.generations :]
-            latest = self._imagine(weights, self.drawn // self.interval)
-            self._hold([*self._imagined, latest][-self.generations :])
-        self.drawn += 1
+            latest = self._rolled_out(weights, number)
+            self._keep([*self._rollouts, latest][-self.generations :])
+        self.num_batches += 1
         return super().sample(batch_size)
 
     def metrics(self) -> dict[str, float]:
-        """Share of refused rows, and of the others those that end; mean reward."""
-        refused, rows = sum(each.refused for each in self._imagined), self.imagined
+        """Return the share of rejected rows, and of the others that end the task."""
+        rejected = sum(each.num_rejected for each in self._rollouts)
+        following = self.synthetic["next"]
         return {
-            "imagined_refused": refused / (refused + len(rows)),
-            "imagined_ended": rows["next", "terminated"].float().mean().item(),
-            "imagined_reward": rows["next", "reward"].mean().item(),
+            "rollout_rejected": rejected / (rejected + len(following)),
+            "rollout_terminated": following["terminated"].float().mean().item(),
+            "rollout_reward": following["reward"].mean().item(),
         }
 
-    def _imagine(self, weights: Mapping[str, Any], number: int) -> Imagined:
-        """Rows of the policy with these weights, with the seed of this generation."""
+    def _rolled_out(self, weights: Mapping[str, Any], number: int) -> Rollout:
         self._copy.load_state_dict(weights)
         device = next(self._copy.parameters()).device
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
             torch.manual_seed(self.seed + number)
-            found = self.rows_of(self._copy)
+            found = self.rollout(self._copy)
         if not len(found.rows):
             raise ValueError(
-                "no imagined row was taken: the model knows none of the policy's "
-                "actions. Train it longer (dynamics.steps), or take its rows all the "
-                "same (dynamics.unknown=take)."
+                "The model rejects all rows of a roll-out. Train it longer "
+                "(dynamics.steps), or keep them (dynamics.unknown=take)."
             )
         return found
 
-    def _hold(self, generations: list[Imagined]) -> None:
-        """Draw from these rows, in their order."""
-        rows = torch.cat([each.rows for each in generations])
-        ends = [0, *accumulate(len(each.rows) for each in generations)]
-        self._imagined = [  # of slices, so that rows are held once
-            Imagined(rows[start:end], each.refused)
-            for (start, end), each in zip(pairwise(ends), generations, strict=True)
+    def _keep(self, rollouts: list[Rollout]) -> None:
+        """Sample from these rows, in their order."""
+        rows = torch.cat([each.rows for each in rollouts])
+        ends = [0, *accumulate(len(each.rows) for each in rollouts)]
+        self._rollouts = [  # of slices, so that rows are in memory once
+            Rollout(rows[start:end], each.num_rejected)
+            for (start, end), each in zip(pairwise(ends), rollouts, strict=True)
         ]
         self._online_buffer = _Rows(rows, self._rng)
 
     @property
-    def imagined(self) -> TensorDictBase:
-        """All rows of the generations that are drawn from, oldest first, ``[n]``."""
+    def synthetic(self) -> TensorDictBase:
+        """All rows of the roll-outs, oldest first, ``[n]``."""
         return self._online_buffer.rows
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the number of batches so far, and the policies of the generations."""
-        return {"drawn": self.drawn, "policies": self._policies}
+        """Return the number of batches and the policies that were rolled out."""
+        return {"num_batches": self.num_batches, "policies": self._policies}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Imagine the rows of a saved state again, and go on from there."""
-        self.drawn, self._policies = state_dict["drawn"], list(state_dict["policies"])
-        following = -(-self.drawn // self.interval)  # rounded up
-        first = following - len(self._policies)
-        numbers = range(first, following)
+        """Repeat the roll-outs of a state."""
+        self.num_batches = state_dict["num_batches"]
+        self._policies = list(state_dict["policies"])
+        following = -(-self.num_batches // self.interval)  # rounded up
+        numbers = range(following - len(self._policies), following)
         if self._policies:
-            self._hold(list(map(self._imagine, self._policies, numbers)))
+            self._keep(list(map(self._rolled_out, self._policies, numbers)))

@@ -1,4 +1,4 @@
-"""Train the models of a run's dynamics, and roll its policy out in them.
+"""Train the dynamics models of a run, and roll its policy out in them.
 
 A trained ensemble is kept in the cache folder: runs with the same data, settings and
 seed train it once. Every run has a copy in its folder.
@@ -11,7 +11,6 @@ import json
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
 
@@ -38,16 +37,15 @@ from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
 from torchrl_osr.lab.dynamics.fit import describe_dynamics, dynamics_report
 from torchrl_osr.lab.dynamics.model_adversary import ModelAdversary
 from torchrl_osr.lab.dynamics.options import DynamicsOptions
-from torchrl_osr.lab.dynamics.rollout import (
-    Imagined,
-    any_action,
-    disturbed,
-    imagine,
-    imagine_backwards,
-    turned,
+from torchrl_osr.lab.dynamics.rollout_buffer import RolloutReplayBuffer
+from torchrl_osr.lab.dynamics.rollouts import (
+    Rollout,
+    perturbed_starts,
+    reverse_rollout,
+    reverse_transitions,
+    rollout,
+    uniform_policy,
 )
-from torchrl_osr.lab.dynamics.rollout_buffer import ImaginedReplayBuffer
-from torchrl_osr.lab.dynamics.termination import Termination
 from torchrl_osr.objectives import BaseLoss
 from torchrl_osr.policy.tensor_file import read_tensors, write_tensors
 from torchrl_osr.trainers import OfflineTrainer
@@ -56,7 +54,7 @@ from torchrl_osr.trainers.checkpoints import safe_checkpoint
 log = logging.getLogger(__name__)
 
 FILE, REPORT = "dynamics.safetensors", "dynamics.json"
-"""The model and what is known of its errors, in the folder of a run."""
+"""The model and its errors, in the folder of a run."""
 
 KIND = "dynamics model"
 
@@ -69,18 +67,16 @@ FITTED = ("num_networks", "num_elites", "num_cells", "lr", "batch_size", "steps"
 
 @dataclass(frozen=True)
 class ModelData:
-    """Transitions that dynamics models learn from, and the units that they are in.
+    """Transitions that dynamics models learn from, and their units.
 
     Attributes:
         storage: rows to train on.
         held_out: rows to judge models by.
         pieces: of trajectories, ``[n, L]``, to judge roll-outs by.
-        loc, scale: what was subtracted from the task's observations, and what they were
-            divided by.
+        loc, scale: were subtracted from the task's observations, and divided them.
         reward_scale, reward_shift: rewards are ``scale * r + shift``.
         env_id: Gymnasium id of the task.
-        backward: whether state and next state are exchanged in batches, held-out rows
-            and pieces.
+        backward: exchange state and next state.
     """
 
     storage: Storage
@@ -94,7 +90,7 @@ class ModelData:
     backward: bool = False
 
     def buffer(self, batch_size: int | None = None) -> ReplayBuffer:
-        """Return a buffer that samples the rows to train on, without transforms."""
+        """Return a buffer of the rows to train on, without other transforms."""
         buffer = ReplayBuffer(
             storage=self.storage,
             writer=ImmutableDatasetWriter(),
@@ -102,24 +98,21 @@ class ModelData:
             batch_size=batch_size,
         )
         if self.backward:
-            buffer.append_transform(turned)
+            buffer.append_transform(reverse_transitions)
         return buffer
 
     def reverse(self) -> ModelData:
         """Return the same transitions against the direction of time."""
-        return replace(
-            self,
-            held_out=turned(self.held_out),
-            pieces=None if self.pieces is None else turned(self.pieces.flip(1)),
-            backward=True,
-        )
+        held_out, pieces = reverse_transitions(self.held_out), self.pieces
+        if pieces is not None:
+            pieces = reverse_transitions(pieces.flip(1))
+        return replace(self, held_out=held_out, pieces=pieces, backward=True)
 
     def facts(self) -> dict[str, Any]:
         """Return what a model shares with its data, JSON-compatible."""
         digest = hashlib.sha256()
-        held_out = self.held_out.cpu()
         for key in DATASET_KEYS:
-            values = held_out[key].contiguous().view(torch.uint8)
+            values = self.held_out[key].cpu().contiguous().view(torch.uint8)
             digest.update(values.numpy().tobytes())
         return {
             "environment": self.env_id,
@@ -132,26 +125,26 @@ class ModelData:
             "direction of time": "backward" if self.backward else "forward",
         }
 
-    def standardized(self, rule: Termination) -> Termination:
-        """Return a rule for standardised observations, from one in the task's units."""
-        return lambda state: rule(state * self.scale + self.loc)
-
 
 @dataclass(frozen=True)
 class Phase:
-    """What all phases of a run's training share.
+    """Settings that all training phases of a run share.
 
     Attributes:
-        folder: of the run; each phase has checkpoints of its own.
+        folder: of the run; each phase has its own checkpoints.
         new_trainer: makes the trainer of a phase.
         adam: makes an optimizer from parameters.
         seed: of the run.
+        name: of the data, for a model's file in the cache.
+        arithmetic: other settings that decide what a trained model is.
     """
 
     folder: Path
     new_trainer: Callable[..., OfflineTrainer]
     adam: Callable[..., torch.optim.Optimizer]
     seed: int
+    name: str
+    arithmetic: Mapping[str, Any]
 
 
 def train_dynamics(
@@ -161,34 +154,28 @@ def train_dynamics(
     actor: ProbabilisticTensorDictSequential,
     phase: Phase,
     *,
-    name: str,
-    arithmetic: Mapping[str, Any],
-    batch_size: int,
     gamma: float,
-    n_steps: int,
-    transform: Callable[[TensorDictBase], TensorDictBase],
-) -> tuple[ImaginedReplayBuffer | None, ModelAdversary | None]:
-    """Train a run's models of the dynamics, and give them to its loss.
+    **batches: Any,
+) -> tuple[RolloutReplayBuffer | None, ModelAdversary | None]:
+    """Train a run's dynamics models, and give them to its loss.
 
     Args:
-        options: of the models and their roll-outs.
-        data: what models learn from.
+        options: of models and roll-outs.
+        data: for models.
         loss: of the policy.
         actor: the policy.
-        phase: what trains a model.
+        phase: trains a model.
 
     Keyword Args:
-        name: of the data, for a model's file in the cache.
-        arithmetic: other settings that decide what a trained model is.
-        batch_size, gamma, n_steps: of the policy's training.
-        transform: of the policy's batches.
+        gamma: discount factor.
+        batches: other options of :func:`rollout_buffer`.
 
     Returns:
-        The buffer of real and synthetic rows, and what trains the model against the
-        policy; ``None`` for what the options do not ask for.
+        The policy's buffer with roll-outs, and the adversary that trains the model
+        between them; ``None`` for what the options do not ask for.
     """
-    model_data = data if options.reverse_policy is None else data.reverse()
-    model = dynamics_model(options, model_data, phase, name=name, arithmetic=arithmetic)
+    reverse = options.reverse_policy is not None
+    model = dynamics_model(options, data.reverse() if reverse else data, phase)
     sizes = model.observation_dim, model.action_dim
     if hasattr(loss, "dynamics_network"):
         cast(BaseLoss, loss).load_network("dynamics_network", model)
@@ -215,66 +202,41 @@ def train_dynamics(
             rollout_steps=options.rollout_steps,
             batch_size=options.batch_size,
             gamma=gamma,
-            terminated=data.standardized(options.termination(data.env_id)),
+            terminated=options.termination(data.env_id, data.loc, data.scale),
             seed=phase.seed,
         )
-    buffer = imagined_replay_buffer(
-        options,
-        data,
-        model,
-        policy,
-        transform,
-        adversary,
-        batch_size=batch_size,
-        gamma=gamma,
-        n_steps=n_steps,
-        seed=phase.seed,
+    buffer = rollout_buffer(
+        options, data, model, policy, adversary, gamma=gamma, seed=phase.seed, **batches
     )
     return buffer, adversary
 
 
 def dynamics_model(
-    options: DynamicsOptions,
-    data: ModelData,
-    phase: Phase,
-    *,
-    name: str,
-    arithmetic: Mapping[str, Any],
+    options: DynamicsOptions, data: ModelData, phase: Phase
 ) -> DynamicsEnsemble:
-    """Return the frozen model of a run, with a report in its folder.
-
-    Args:
-        options: of the model.
-        data: what it learns from.
-        phase: what trains it.
-
-    Keyword Args:
-        name: of the data, for the file in the cache.
-        arithmetic: other settings that decide what a trained model is.
+    """Train a run's ensemble, or take it from a file; with a report in its folder.
 
     Raises:
-        ValueError: ``options.path`` names another file, or a model of other data.
+        ValueError: ``options.path`` is no model, or one of other data.
     """
-    facts, given = data.facts(), options.path
-    here = phase.folder / FILE
-    if not here.exists() and given is not None:
-        write_dynamics(here, load_dynamics(given, facts), facts)
+    facts, here = data.facts(), phase.folder / FILE
+    if not here.exists() and options.path is not None:
+        write_dynamics(here, load_dynamics(options.path, facts), facts)
     elif not here.exists():
         chosen = {key: asdict(options)[key] for key in FITTED}
         stamp = {"version": __version__, "seed": phase.seed} | chosen
-        everything = {"data": facts, "settings": stamp | dict(arithmetic)}
+        everything = {"data": facts, "settings": stamp | dict(phase.arithmetic)}
         text = json.dumps(everything, sort_keys=True).encode()
-        digest = hashlib.sha256(text).hexdigest()[:16]
-        cached = cache_root() / "dynamics" / f"{name}-{digest}.safetensors"
+        name = f"{phase.name}-{hashlib.sha256(text).hexdigest()[:16]}"
+        cached = cache_root() / "dynamics" / f"{name}.safetensors"
         cached.parent.mkdir(parents=True, exist_ok=True)
-        # Other runs that need the same model wait for it.
-        with FileLock(f"{cached}.lock"):
+        with FileLock(f"{cached}.lock"):  # runs that need the same model wait for it
             try:
                 model = load_dynamics(cached, facts)
                 log.info(f"dynamics: the model is {cached}")
-            except (OSError, ValueError) as flaw:
+            except (OSError, ValueError) as error:
                 if cached.exists():
-                    log.warning(f"Training {cached} anew: {flaw}")
+                    log.warning(f"Training {cached} anew: {error}")
                 # The rest of the run draws the same numbers with a model from a file.
                 with torch.random.fork_rng(devices=[]):
                     model = _trained(options, data, phase)
@@ -292,7 +254,7 @@ def dynamics_model(
 def _trained(
     options: DynamicsOptions, data: ModelData, phase: Phase
 ) -> DynamicsEnsemble:
-    """Train a model; the weights of its best evaluation are taken."""
+    """Train a model; return the weights of its best evaluation."""
     held_out = data.held_out
     sizes = held_out["observation"].shape[-1], held_out["action"].shape[-1]
     torch.manual_seed(phase.seed)
@@ -360,144 +322,100 @@ def _rows_for_statistics(data: ModelData, phase: Phase) -> TensorDictBase:
     return sample
 
 
-# -- files ---------------------------------------------------------------------------
-
-
 def write_dynamics(
     path: Path, model: DynamicsEnsemble, facts: Mapping[str, Any]
 ) -> None:
-    """Write a model and the facts of its data to one file of tensors."""
-    write_tensors(path, model.state_dict(), {"kind": KIND, "data": dict(facts)})
+    """Write a model and :meth:`ModelData.facts` to one file of tensors."""
+    sizes = {
+        "observation_dim": model.observation_dim,
+        "action_dim": model.action_dim,
+        "num_networks": model.num_networks,
+        "num_elites": len(model.elites),
+        "num_cells": [each.weight.shape[-1] for each in model.linear_layers[:-1]],
+    }
+    record = {"kind": KIND, "sizes": sizes, "data": dict(facts)}
+    write_tensors(path, model.state_dict(), record)
 
 
 def load_dynamics(
     path: Path | str, facts: Mapping[str, Any] | None = None
 ) -> DynamicsEnsemble:
-    """Load a model that a run has trained; nothing is unpickled.
-
-    torch's global generator is left as it was.
+    """Load a model that a run has trained; torch's global generator stays.
 
     Args:
         path: of the file, ``dynamics.safetensors`` in the folder of a run.
-        facts: :meth:`ModelData.facts` of the data that it has to fit. Default: any.
+        facts: those of :meth:`ModelData.facts` that have to agree. Default: none.
 
     Raises:
-        OSError: it cannot be read.
-        ValueError: it holds something else, or was trained on other data; what differs
-            is named.
+        ValueError: it is no such file, or of a model of other data.
     """
-    path = Path(path)
     try:
-        tensors, record = read_tensors(path)
-        if record.get("kind") != KIND:
-            raise ValueError("it holds no dynamics model")
+        tensors, record = read_tensors(Path(path))
         with torch.random.fork_rng(devices=[]):
-            model = _model_of(tensors)
-    except (KeyError, IndexError, RuntimeError, ValueError) as error:
+            model = DynamicsEnsemble(**record["sizes"])
+        model.load_state_dict(tensors)
+    except (KeyError, TypeError, RuntimeError, ValueError) as error:
         raise ValueError(
-            f"{path}: {error}. Take {FILE} from the folder of a run."
+            f"{path} holds no dynamics model: {error}. Take {FILE} from the folder of "
+            "a run."
         ) from error
-    there = record.get("data") or {}
-    others = [
-        f"{name}: {_short(there.get(name))} there, {_short(wanted)} here"
-        for name, wanted in json.loads(json.dumps(facts or {})).items()
-        if there.get(name) != wanted
-    ]
+    wanted, there = json.loads(json.dumps(facts or {})), record["data"]
+    others = [name for name, value in wanted.items() if there.get(name) != value]
     if others:
         raise ValueError(
-            f"{path} was trained on other data than this run's ({'; '.join(others)}): "
-            "take a model of the same data, or leave dynamics.path out to train one."
+            f"{path} was trained on other data; these differ: {', '.join(others)}. "
+            "Take a model of the same data, or leave dynamics.path out to train one."
         )
     return model
 
 
-def _model_of(tensors: Mapping[str, Tensor]) -> DynamicsEnsemble:
-    """A model of the sizes that its tensors have."""
-    observation_dim = len(tensors["target_loc"]) - 1
-    weights = [
-        each
-        for name, each in sorted(tensors.items(), key=lambda item: _layer(item[0]))
-        if name.endswith(".weight")
-    ]
-    networks, inputs = len(weights[0]), len(tensors["input_loc"])
-    widths = [inputs, *(each.shape[-1] for each in weights)]
-    # Before it is built: a small file shall not ask for a large model.
-    if [tuple(each.shape) for each in weights] != [
-        (networks, *sizes) for sizes in pairwise(widths)
-    ]:
-        raise ValueError("its layers do not fit together")
-    model = DynamicsEnsemble(
-        observation_dim,
-        inputs - observation_dim,
-        num_networks=networks,
-        num_elites=len(tensors["elites"]),
-        num_cells=widths[1:-1],
-    )
-    model.load_state_dict(tensors)
-    if not bool(((model.elites >= 0) & (model.elites < model.num_networks)).all()):
-        raise ValueError("its elites are none of its networks")
-    return model
-
-
-def _layer(name: str) -> int:
-    """Number of the layer in a name such as ``layers.10.weight``."""
-    return next((int(part) for part in name.split(".") if part.isdigit()), -1)
-
-
-def _short(value: Any) -> str:
-    text = str(value)
-    return text if len(text) <= 40 else f"{text[:40]}..."
-
-
-# -- roll-outs -----------------------------------------------------------------------
-
-
-def imagined_replay_buffer(
+def rollout_buffer(
     options: DynamicsOptions,
     data: ModelData,
     model: DynamicsEnsemble,
     policy: nn.Module,
-    transform: Callable[[TensorDictBase], TensorDictBase],
     adversary: ModelAdversary | None = None,
     *,
     batch_size: int,
     gamma: float,
     n_steps: int,
     seed: int,
-) -> ImaginedReplayBuffer:
-    """Batches of which the share ``options.real_ratio`` is real.
+    transform: Callable[[TensorDictBase], TensorDictBase],
+) -> RolloutReplayBuffer:
+    """Return a buffer of real rows and of roll-outs as the options describe them.
 
     Args:
         options: of the roll-outs.
         data: the real rows.
-        model: of the dynamics, or with ``options.reverse_policy`` of their reverse.
-        policy: whose actions are drawn: an actor, or of a reverse model a
+        model: of the dynamics, a reverse one with ``options.reverse_policy``.
+        policy: an actor, or for a reverse model a
             :class:`~torchrl_osr.lab.dynamics.ConditionalVAE`.
-        transform: applied to each batch.
-        adversary: trains the model before each generation. Default: none.
+        adversary: trains the model before each roll-out. Default: none.
 
     Keyword Args:
         batch_size: rows of a batch.
         gamma: discount factor.
-        n_steps: of the data's rows; synthetic rows are single steps.
+        n_steps: of the real rows; synthetic ones are single steps.
         seed: of the roll-outs.
+        transform: of each batch.
     """
-    real = data.buffer()
     sizes = data.scale.expand(model.observation_dim)
     units = torch.cat([sizes, sizes.new_tensor([1 / data.reward_scale])])
-    bounds: dict[str, Any] = {
-        "terminated": data.standardized(options.termination(data.env_id)),
-        **_unknown(options, data, model, gamma),
-    }
-    backward = options.reverse_policy is not None
+    terminated = options.termination(data.env_id, data.loc, data.scale)
+    bounds: dict[str, Any] = {"terminated": terminated}
+    bounds |= _bounds_of_unknown(options, data, model, gamma)
+    reverse = options.reverse_policy is not None
+    roll_out = reverse_rollout if reverse else rollout
+    uniform = uniform_policy(model.action_dim)
 
-    def rows_of(copied: nn.Module) -> Imagined:
-        # What is trained is copied, for a generation can be imagined again.
+    def rows_of(copied: nn.Module) -> Rollout:
+        # The adversary's model is copied too: a roll-out must be repeatable.
         policy, inside = (copied, model) if adversary is None else copied.children()
+        inside = cast(DynamicsEnsemble, inside)
 
         def act(state: Tensor) -> Tensor:
             if options.reverse_policy == "uniform":
-                return any_action(model)(state)
+                return uniform(state)
             if isinstance(policy, ConditionalVAE):
                 return policy.sample(state)
             batch = TensorDict({"observation": state}, state.shape[:-1])
@@ -508,31 +426,30 @@ def imagined_replay_buffer(
                 action = (action + scale * torch.randn_like(action)).clamp(-1, 1)
             return action
 
-        inside = cast(DynamicsEnsemble, inside)
-        rows = data.storage.get(torch.randint(len(real), [options.rollout_starts]))
-        starts: Tensor = rows["observation"]
-        if steps := options.disturbed_steps:
-            starts = disturbed(inside, starts, steps=steps, **bounds)
-        rows, refused = (imagine_backwards if backward else imagine)(
+        index = torch.randint(len(data.storage), [options.rollout_starts])
+        starts: Tensor = data.storage.get(index)["observation"]
+        if steps := options.perturbed_start_steps:
+            starts = perturbed_starts(inside, starts, steps=steps, **bounds)
+        rows, rejected = roll_out(
             inside, act, starts, steps=options.rollout_steps, units=units, **bounds
         )
         penalty = options.penalty * data.reward_scale
         rows["next", "reward"] -= penalty * rows["uncertainty"]
         rows = rows.select(*DATASET_KEYS)
-        if n_steps > 1:  # of the data's rows; these are single steps
+        if n_steps > 1:
             ones = torch.ones_like(rows["next", "done"], dtype=torch.long)
             rows["multi_step"] = rows["next"].copy().set("steps", ones)
-        return Imagined(rows, refused)
+        return Rollout(rows, rejected)
 
     def finished(batch: TensorDictBase) -> TensorDictBase:
         batch = transform(batch)
-        if not backward:  # the policy's own actions, which teach it nothing as labels
+        if not reverse:  # the policy's own actions are no labels for it
             number = torch.arange(len(batch), device=batch.device).unsqueeze(-1)
             batch["imagined"] = number >= round(options.real_ratio * len(batch))
         return take_multi_step(batch) if n_steps > 1 else batch
 
-    return ImaginedReplayBuffer(
-        real,
+    return RolloutReplayBuffer(
+        data.buffer(),
         policy if adversary is None else nn.ModuleList([policy, model]),
         rows_of,
         real_ratio=options.real_ratio,
@@ -546,10 +463,10 @@ def imagined_replay_buffer(
 
 
 @torch.no_grad()
-def _unknown(
+def _bounds_of_unknown(
     options: DynamicsOptions, data: ModelData, model: DynamicsEnsemble, gamma: float
 ) -> dict[str, float]:
-    """Options of :func:`imagine` for rows on which the networks disagree."""
+    """Return options of :func:`rollout` for rows on which the networks disagree."""
     held_out = data.held_out
     if options.unknown == "take":
         return {}
@@ -557,7 +474,7 @@ def _unknown(
     known = model.disagreement(mean).quantile(options.known_share)
     bounds = {"max_disagreement": known.item()}
     if options.unknown == "halt":
-        # An end must not be better than what the data's worst rewards add up to.
+        # An end must not be better than the data's worst rewards for ever.
         worst = held_out["next", "reward"].quantile(0.01).clamp(max=0)
         bounds["halt_reward"] = worst.item() / (1 - gamma)
     return bounds

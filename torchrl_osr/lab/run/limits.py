@@ -49,7 +49,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "dynamics.adversarial_lr": (0, LARGEST),
     "dynamics.rollout_steps": (1, 10_000),
     "dynamics.rollout_starts": _COUNT,
-    "dynamics.disturbed_steps": (0, 10_000),
+    "dynamics.perturbed_start_steps": (0, 10_000),
     "dynamics.action_noise": (0, LARGEST),
     "dynamics.rollout_interval": _COUNT,
     "dynamics.generations": (1, 1000),

@@ -22,7 +22,7 @@ from torchrl.trainers import LRSchedulerHook
 from torchrl_osr import StatePerturbation
 from torchrl_osr._files import write_json
 from torchrl_osr.lab.data.store.multi_step import take_multi_step
-from torchrl_osr.lab.dynamics import ImaginedReplayBuffer, ModelAdversary, training
+from torchrl_osr.lab.dynamics import ModelAdversary, RolloutReplayBuffer, training
 from torchrl_osr.lab.evaluation import (
     EpisodeEvaluator,
     describe_inverse_dynamics,
@@ -120,17 +120,23 @@ def train_dynamics(
     learner: Learner,
     perturbation: StatePerturbation,
     new_trainer: NewTrainer,
-) -> tuple[ImaginedReplayBuffer | None, ModelAdversary | None]:
+) -> tuple[RolloutReplayBuffer | None, ModelAdversary | None]:
     """Train a run's models of the dynamics, see ``lab/dynamics/training.py``."""
-    arithmetic = "device", "precision", "matmul_precision", "compile"
+    names = "device", "precision", "matmul_precision", "compile"
+    phase = training.Phase(
+        folder,
+        new_trainer,
+        adam_of(cfg),
+        cfg.seed,
+        name=f"{cfg.env.name}-{cfg.data.source}",
+        arithmetic={name: cfg.trainer[name] for name in names},
+    )
     return training.train_dynamics(
         dynamics_options(cfg),
         model_data(cfg, data),
         learner.loss,
         learner.actor,
-        training.Phase(folder, new_trainer, adam_of(cfg), cfg.seed),
-        name=f"{cfg.env.name}-{cfg.data.source}",
-        arithmetic={name: cfg.trainer[name] for name in arithmetic},
+        phase,
         batch_size=cfg.trainer.batch_size,
         gamma=cfg.optim.gamma,
         n_steps=cfg.optim.n_steps,
@@ -143,7 +149,7 @@ def train_policy(
     folder: Path,
     data: TrainingData,
     learner: Learner,
-    imagined: ImaginedReplayBuffer | None,
+    imagined: RolloutReplayBuffer | None,
     adversary: ModelAdversary | None,
     new_trainer: NewTrainer,
     *,
@@ -264,7 +270,7 @@ def _evaluation(
 
 def _log_imagined(
     trainer: OfflineTrainer,
-    imagined: ImaginedReplayBuffer,
+    imagined: RolloutReplayBuffer,
     adversary: ModelAdversary | None,
 ) -> None:
     """Log what the rows are like that the policy learns from besides the data."""

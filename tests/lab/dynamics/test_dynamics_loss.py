@@ -50,7 +50,7 @@ def plain_loss(model: DynamicsEnsemble, batch, weight: float) -> torch.Tensor:
     return total
 
 
-@pytest.mark.parametrize("weight", [0.0, 0.01, 2.0])
+@pytest.mark.parametrize("weight", [0.0, 2.0])
 @pytest.mark.parametrize("num_cells", [(), (6, 5)])
 def test_loss_and_gradients_equal_the_plain_likelihood(
     make_batch, check, weight, num_cells
@@ -99,13 +99,7 @@ def test_decay_is_half_the_squared_norm_of_the_weights(make_batch) -> None:
         torch.testing.assert_close(one, other, rtol=0, atol=1e-14)
 
 
-def test_rows_that_cannot_be_divided_are_refused(make_batch) -> None:
-    loss = DynamicsLoss(make_model())
-    with pytest.raises(ValueError, match="9 rows for 2 networks"):
-        loss(make_batch(9, twin=False))
-
-
-def test_a_model_learns_single_steps(make_batch) -> None:
+def test_a_model_learns_single_steps_and_divides_the_batch(make_batch) -> None:
     single = make_batch(10, twin=False)
     several = single.clone().set("next", single["next"].roll(1, 0))
     several["steps_to_next_obs"] = torch.full((10, 1), 5)
@@ -114,3 +108,5 @@ def test_a_model_learns_single_steps(make_batch) -> None:
         loss(several)
     kept = several.set("one_step", single["next"])
     assert torch.equal(loss(kept)["loss_dynamics"], loss(single)["loss_dynamics"])
+    with pytest.raises(ValueError, match="9 rows for 2 networks"):
+        loss(make_batch(9, twin=False))

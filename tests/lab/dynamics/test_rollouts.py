@@ -1,0 +1,162 @@
+"""Roll-outs in worlds that can be computed by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from torchrl_osr.lab.data import make_environment
+from torchrl_osr.lab.dynamics import (
+    DynamicsEnsemble,
+    perturbed_starts,
+    reverse_rollout,
+    reverse_transitions,
+    rollout,
+    termination,
+)
+
+
+def linear_world(
+    *, change: float = 1.0, spread: float = 0.0, log_variance: float = -40.0
+) -> DynamicsEnsemble:
+    """The state grows by the action, plus or minus ``spread``; the reward is the state.
+
+    Network 0 adds the spread, 1 subtracts it, 2 is far away and no elite.
+    """
+    model = DynamicsEnsemble(1, 1, num_networks=3, num_elites=2, num_cells=[])
+    (layer,) = model.layers
+    with torch.no_grad():
+        layer.weight.zero_()
+        layer.bias.zero_()
+        layer.weight[:, 1, 0] = change  # action to change
+        layer.weight[:, 0, 1] = 1  # state to reward
+        layer.bias[:, 0, 0] = torch.tensor([spread, -spread, 1e6])
+        # Bounds far apart do not bend what lies between them.
+        model.lowest_log_variance.fill_(-60)
+        model.highest_log_variance.fill_(60)
+        layer.bias[:, 0, 2:] = log_variance
+    return model
+
+
+def one(state: Tensor) -> Tensor:
+    return torch.ones_like(state)
+
+
+def test_rows_are_those_of_a_known_world_until_the_task_ends() -> None:
+    rows, rejected = rollout(
+        linear_world(), one, torch.tensor([[0.0], [10.0]]), steps=3,
+        terminated=lambda state: state[:, 0] == 12,
+    )  # fmt: skip
+    assert rejected == 0
+    assert rows["observation"].flatten().tolist() == [0, 10, 1, 11, 2]
+    after = rows["next", "observation"]
+    torch.testing.assert_close(after, rows["observation"] + 1)
+    torch.testing.assert_close(rows["next", "reward"], rows["observation"])
+    assert rows["step"].flatten().tolist() == [0, 0, 1, 1, 2]
+    assert torch.equal(rows["next", "terminated"], after == 12)
+    assert torch.equal(rows["next", "done"], rows["next", "terminated"])
+    assert not rows["next", "truncated"].any()
+
+
+def test_unknown_rows_are_rejected_or_end_the_task() -> None:
+    starts, world = torch.tensor([[2.0], [math.inf]]), linear_world(spread=0.5)
+    for limit, number in {0.4: 0, 0.6: 3}.items():
+        rows, rejected = rollout(world, one, starts, steps=3, max_disagreement=limit)
+        assert (len(rows), rejected) == (number, 2 - (number > 0))
+    torch.testing.assert_close(rows["disagreement"], torch.full([3, 1], 0.5))
+    options = {"steps": 3, "max_disagreement": 0.4, "halt_reward": -7.0}
+    rows, rejected = rollout(world, one, starts, **options)
+    assert (len(rows), rejected) == (1, 1)
+    assert rows["next", "observation"].item() == 2
+    assert rows["next", "reward"].item() == -7
+    assert rows["next", "terminated"].all()
+    with pytest.raises(ValueError, match="ends the task after every random action"):
+        perturbed_starts(world, starts, **options)
+
+
+def test_each_row_is_drawn_from_the_gaussian_of_an_elite() -> None:
+    world = linear_world(spread=3.0, log_variance=math.log(0.25))
+    rows, _ = rollout(world, one, torch.zeros(20_000, 1), steps=1)
+    change = rows["next", "observation"].flatten() - 1
+    upper = change > 0
+    # Gaussians of deviation .5 around 3 and -3; the third network is never used.
+    assert upper.float().mean().item() == pytest.approx(0.5, abs=0.02)
+    for side, mean in ((upper, 3.0), (~upper, -3.0)):
+        assert change[side].mean().item() == pytest.approx(mean, abs=0.02)
+        assert change[side].std().item() == pytest.approx(0.5, abs=0.02)
+
+
+def test_uncertainty_is_of_all_networks_and_in_the_given_units() -> None:
+    world = linear_world(log_variance=math.log(4.0))
+    units = torch.tensor([10.0, 0.5])
+    rows, _ = rollout(world, one, torch.zeros(3, 1), steps=1, units=units)
+    wanted = math.hypot(2 * 10.0, 2 * 0.5)  # deviations of 2 in both entries
+    torch.testing.assert_close(rows["uncertainty"], torch.full([3, 1], wanted))
+
+
+def test_perturbed_starts_are_where_random_actions_lead_in_the_task() -> None:
+    states = perturbed_starts(linear_world(), torch.zeros(60_000, 1), steps=3)
+    assert states.abs().max() <= 3
+    # One, two or three draws from [-1, 1], whose variance is 1 / 3.
+    assert states.mean().item() == pytest.approx(0, abs=0.02)
+    assert states.var().item() == pytest.approx(2 / 3, rel=0.03)
+    world, starts = linear_world(), torch.zeros(100, 1)
+    states = perturbed_starts(world, starts, steps=5, terminated=lambda s: s[:, 0] < 0)
+    assert (states >= 0).all()
+
+
+def test_reverse_rollouts_lead_into_the_given_states() -> None:
+    rows, rejected = reverse_rollout(
+        linear_world(change=-1.0), one, torch.tensor([[0.0], [3.0]]), steps=4,
+        terminated=lambda state: state[:, 0] < -1.5,
+    )  # fmt: skip
+    assert rows["observation"].flatten().tolist() == [-1, 2, 1, 0, -1]
+    assert rejected == 1  # nobody acts after the end
+    # The forward world agrees with these rows.
+    after = rows["next", "observation"]
+    torch.testing.assert_close(rows["observation"] + rows["action"], after)
+    torch.testing.assert_close(rows["next", "reward"], after)
+    for key in ("done", "terminated"):
+        assert not rows["next", key].any()
+
+
+def test_reversed_transitions_exchange_states_and_nothing_else(transitions) -> None:
+    rows = transitions(6)
+    before = rows.clone()
+    reverse = reverse_transitions(rows)
+    assert torch.equal(reverse["observation"], rows["next", "observation"])
+    assert torch.equal(reverse["next", "observation"], rows["observation"])
+    for key in ("action", ("next", "reward"), ("next", "terminated")):
+        assert torch.equal(reverse[key], rows[key])
+    for each in (rows, reverse_transitions(reverse)):
+        assert (each == before).all()
+
+
+@pytest.mark.parametrize("env_id", ["Hopper-v5", "Walker2d-v5", "HalfCheetah-v5"])
+def test_terminations_are_the_simulators(env_id) -> None:
+    env = make_environment(env_id)
+    env.reset(seed=0)
+    bare, generator = env.unwrapped, np.random.default_rng(0)
+    states, ended = [], []
+    for _ in range(300):
+        position, velocity = np.array(bare.init_qpos), np.array(bare.init_qvel)
+        position[1:3] += generator.uniform([-1.2, -1.2], [1.2, 1.2])
+        velocity += generator.normal(0, 2, velocity.shape)
+        bare.set_state(position, velocity)
+        state, _, terminated, _, _ = bare.step(env.action_space.sample())
+        states.append(state)
+        ended.append(terminated)
+    env.close()
+    found = termination(env_id)(torch.tensor(np.array(states)))
+    assert found.tolist() == ended
+    assert (0 < sum(ended) < 300) == (env_id != "HalfCheetah-v5")
+
+
+def test_a_task_without_a_rule_is_named() -> None:
+    assert termination("Hopper-v5")(torch.full([2, 11], float("nan"))).all()
+    with pytest.raises(ValueError, match=r"mine:Hop-v0 ends.*terminations=never"):
+        termination("mine:Hop-v0")
