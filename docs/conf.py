@@ -2,12 +2,18 @@
 
 import inspect
 import os
+import pkgutil
 import re
+import sys
+from pathlib import Path
 
 from sphinx.util.inspect import stringify_signature
 from torchrl.objectives import LossModule
 
 import torchrl_osr
+
+sys.path.insert(0, str(Path(__file__).parent))
+import settings
 
 project = "torchrl-osr"
 author = "The torchrl-osr authors"
@@ -15,7 +21,7 @@ copyright = "2026, The torchrl-osr authors"
 version = release = torchrl_osr.__version__
 
 extensions = [
-    "myst_nb",  # pages in Markdown, and the tutorials, which are executed
+    "myst_parser",  # pages in Markdown
     "sphinx.ext.autodoc",
     "sphinx.ext.mathjax",
     "sphinx.ext.napoleon",
@@ -33,11 +39,6 @@ html_css_files = ["tables.css"]
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 2
 
-nb_execution_mode = "force"
-nb_execution_raise_on_error = True
-nb_execution_timeout = 600
-nb_merge_streams = True
-
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"
@@ -46,9 +47,12 @@ napoleon_use_ivar = True
 python_maximum_signature_line_length = 80
 add_module_names = False
 
-# A link to a name of ours that is not in the reference is an error.
+# A link to a name of ours that does not exist is an error.
 nitpicky = True
-nitpick_ignore_regex = [("py:.*", r"(?!torchrl_osr\b).*")]
+nitpick_ignore_regex = [
+    ("py:.*", r"(?!torchrl_osr\b).*"),
+    ("py:.*", r".*\.(_AcceptedKeys|Array)"),  # in annotations
+]
 
 # Links into the neighbours' documentation need a network, and the build shall not.
 if os.environ.get("TORCHRL_OSR_DOCS_ONLINE"):
@@ -59,6 +63,62 @@ if os.environ.get("TORCHRL_OSR_DOCS_ONLINE"):
         "torch": ("https://docs.pytorch.org/docs/stable", None),
         "torchrl": ("https://pytorch.org/rl/stable", None),
     }
+
+GENERATED = Path(__file__).parent / "generated"
+REFERENCE = """# {title}
+
+```{{eval-rst}}
+{body}
+```
+"""
+
+
+def rooms():
+    """Directives for all public modules, by the page on which they are documented."""
+    pages = {}
+    for found in pkgutil.walk_packages(torchrl_osr.__path__, "torchrl_osr."):
+        parts = found.name.split(".")[1:]
+        if any(part.startswith("_") for part in parts) or parts[:2] == ["lab", "cli"]:
+            continue
+        depth = 2 if parts[0] == "lab" else 1
+        # What a package exports is documented where it is defined.
+        members = "" if found.ispkg else "\n   :members:"
+        directive = f".. automodule:: {found.name}{members}\n"
+        pages.setdefault(".".join(parts[:depth]), []).append(directive)
+    del pages["lab"]
+    return pages
+
+
+def write_pages(app):
+    """Write the settings and the reference, a page for each room, before the build."""
+    GENERATED.mkdir(exist_ok=True)
+    lines = ["# Reference\n", "Exported by `torchrl_osr`:\n"]
+    exported = [name for name in torchrl_osr.__all__ if not name.startswith("_")]
+    lines += [f"- {{py:obj}}`~torchrl_osr.{name}`" for name in exported]
+    lines += ["\n```{toctree}\n:maxdepth: 1\n", *rooms(), "```\n"]
+    pages = {"settings": settings.page(), "reference": "\n".join(lines)}
+    for page, directives in rooms().items():
+        body = "\n".join(directives)
+        pages[page] = REFERENCE.format(title=f"torchrl_osr.{page}", body=body)
+    for page, text in pages.items():
+        path = GENERATED / f"{page}.md"
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+
+
+def resolve_exported_name(app, env, node, contnode):
+    """Resolve a link to a name that a package exports: it is where it is defined."""
+    domain, parts = env.get_domain("py"), node.get("reftarget", "").split(".")
+    if parts[0] != "torchrl_osr":
+        return None
+    # A class with its member, or a single name, below the package.
+    first = next((i for i, part in enumerate(parts) if part[:1].isupper()), -1)
+    package, name = ".".join(parts[:first]) + ".", "." + ".".join(parts[first:])
+    found = [each for each in domain.objects if each.endswith(name)]
+    found = [each for each in found if each.startswith(package)]
+    return found and domain.resolve_xref(
+        env, node["refdoc"], app.builder, "obj", min(found, key=len), node, contnode
+    )
 
 
 def constructor_signature(app, what, name, obj, options, signature, returns):
@@ -84,6 +144,8 @@ def one_field_each(app, what, name, obj, options, lines):
 
 
 def setup(app):
+    app.connect("builder-inited", write_pages)
+    app.connect("missing-reference", resolve_exported_name)
     app.connect("autodoc-process-signature", constructor_signature)
     # After Napoleon, whose priority is 500.
     app.connect("autodoc-process-docstring", one_field_each, priority=600)

@@ -1,8 +1,8 @@
-"""Write ``settings.md``: every key of the training script, from the schemas themselves.
+"""The page of settings: every key of ``torchrl-osr train``, from the schemas.
 
-Run it with ``python docs/settings.py`` from the repository's root. Names and types are
-those of the schemas and of the losses' signatures, meanings those of their docstrings,
-values those of the two presets.
+``conf.py`` writes it when the documentation is built. Names and types are those of the
+schemas and of the losses' signatures, meanings those of their docstrings, values those
+of the two presets.
 """
 
 from __future__ import annotations
@@ -32,8 +32,7 @@ HEAD = """# Settings
 
 Every key of `torchrl-osr train` with its value in two presets. The options of a
 loss are those of its class, here those of {py:class}`~torchrl_osr.OSRLoss`;
-`torchrl-osr train loss=osr_v --cfg job` prints those of another. This page
-is written by `python docs/settings.py`.
+`torchrl-osr train loss=osr_v --cfg job` prints those of another.
 """
 
 
@@ -129,10 +128,6 @@ def page() -> str:
         ]
         for key in keys:
             cells = [shown(each[key]) for each in values]
-            lines.append(f"| `{key}` | {' | '.join(cells)} | {markdown(known[key])} |")
+            lines.append(f"| `{key}` | {' | '.join(cells)} | {markdown(known.get(key, ''))} |")
         lines.append("")
     return "\n".join(lines)
-
-
-if __name__ == "__main__":
-    (ROOT / "docs" / "settings.md").write_text(page(), encoding="utf-8")

@@ -49,7 +49,7 @@ def load_dataset(
     Args:
         env_name: short name of the task.
         quality: one of ``QUALITIES``, see
-        :func:`~torchrl_osr.lab.data.load_local_dataset`;
+            :func:`~torchrl_osr.lab.data.load_local_dataset`;
             or ``"minari"``, ``"d4rl"`` or ``"file"``, see the loaders of that name.
 
     Keyword Args:

@@ -52,7 +52,7 @@ class SDCLoss(OSRLoss):
     Keyword Args:
         num_samples: ``n`` of :math:`M` and of :math:`U`. Default 4.
         kernel_width: of
-        :func:`~torchrl_osr.lab.losses.correction.maximum_mean_discrepancy`, in
+            :func:`~torchrl_osr.lab.losses.correction.maximum_mean_discrepancy`, in
             units of the observation. Default 1.
         threshold: :math:`\eta`. Default 0.05.
         recovery_weight: OSR's term is there for ``recovery_target="data"`` alone.

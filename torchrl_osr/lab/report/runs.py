@@ -85,7 +85,7 @@ class Run(NamedTuple):
         settings: the configuration as texts, with dotted keys.
         protocols: how each suite was played; only like ones are compared.
         episodes: a row for each episode, see
-        :class:`~torchrl_osr.lab.report.RunTables`.
+            :class:`~torchrl_osr.lab.report.RunTables`.
         distances: a row for each step of a distance curve, see there.
         saved: a row for each recoverable state, see there.
         unusable: files of disturbances or states that could not be used.
