@@ -128,6 +128,7 @@ def page() -> str:
         ]
         for key in keys:
             cells = [shown(each[key]) for each in values]
-            lines.append(f"| `{key}` | {' | '.join(cells)} | {markdown(known.get(key, ''))} |")
+            meaning = markdown(known.get(key, ""))
+            lines.append(f"| `{key}` | {' | '.join(cells)} | {meaning} |")
         lines.append("")
     return "\n".join(lines)
