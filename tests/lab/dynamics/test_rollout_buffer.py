@@ -5,51 +5,67 @@ from __future__ import annotations
 import gc
 import io
 import weakref
+from dataclasses import replace
 
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
-from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.data import LazyTensorStorage
 
-from torchrl_osr.lab.dynamics import Rollout, RolloutReplayBuffer
+from torchrl_osr.lab.dynamics import (
+    DynamicsOptions,
+    ModelData,
+    Rollout,
+    RolloutReplayBuffer,
+)
+from torchrl_osr.modules import deterministic_actor
+
+TINY = DynamicsOptions(
+    num_networks=3, num_elites=2, num_cells=[8], rollout_starts=20, rollout_interval=3,
+    generations=2, real_ratio=0.25,
+)  # fmt: skip
 
 
-def rollout_of(policy: nn.Linear) -> Rollout:
+class Numbered(RolloutReplayBuffer):
     """Nine rows that say whose they are, with noise below 1."""
-    state = policy.weight.detach() + torch.rand(9, 1)
-    following = {
-        "reward": torch.ones(9, 1),
-        "terminated": torch.arange(9).unsqueeze(-1) == 0,
-    }
-    return Rollout(TensorDict({"state": state, "next": following}, [9]), 3)
+
+    def roll_out(self, copied: nn.Linear) -> Rollout:
+        state = copied.weight.detach() + torch.rand(9, 1)
+        following = {
+            "reward": torch.ones(9, 1),
+            "terminated": torch.arange(9).unsqueeze(-1) == 0,
+        }
+        return Rollout(TensorDict({"state": state, "next": following}, [9]), 3)
 
 
-def make_buffer(**options) -> RolloutReplayBuffer:
+def make_buffer(data: ModelData, transform=lambda batch: batch) -> Numbered:
     policy = nn.Linear(1, 1, bias=False)
     nn.init.zeros_(policy.weight)
-    real = ReplayBuffer(storage=LazyTensorStorage(50))
     following = {
         "reward": torch.zeros(50, 1),
         "terminated": torch.zeros(50, 1, dtype=torch.bool),
     }
-    real.extend(TensorDict({"state": -torch.ones(50, 1), "next": following}, [50]))
-    options = {"real_ratio": 0.25, "batch_size": 40} | options
-    buffer = RolloutReplayBuffer(
-        real, policy, rollout_of, interval=3, generations=2, seed=0, **options
-    )
+    rows = TensorDict({"state": -torch.ones(50, 1), "next": following}, [50])
+    storage = LazyTensorStorage(50)
+    storage.set(range(50), rows)
+    buffer = Numbered(
+        replace(TINY, unknown="take"), replace(data, storage=storage),
+        TINY.ensemble(11, 3), policy, batch_size=40, gamma=0.9, n_steps=1, seed=0,
+        transform=transform,
+    )  # fmt: skip
     buffer.set_rng(torch.Generator().manual_seed(5))
     return buffer
 
 
-def test_batches_have_the_share_of_real_rows_and_the_newest_generations() -> None:
+def test_batches_have_the_share_of_real_rows_and_the_newest_generations(data) -> None:
     found, sizes = [], []
 
     def note(batch: TensorDict) -> TensorDict:
         sizes.append(len(batch))
         return batch
 
-    buffer = make_buffer(transform=note)
+    buffer = make_buffer(data, note)
     before = torch.get_rng_state()
     for number in range(12):
         nn.init.constant_(buffer.policy.weight, float(number))
@@ -68,9 +84,9 @@ def test_batches_have_the_share_of_real_rows_and_the_newest_generations() -> Non
 
 
 @pytest.mark.parametrize("stop", [1, 3, 8])
-def test_a_continued_buffer_draws_the_same_batches(stop) -> None:
+def test_a_continued_buffer_draws_the_same_batches(data, stop) -> None:
     """Whether or not a generation is due at the break."""
-    whole, resumed = make_buffer(), make_buffer()
+    whole, resumed = make_buffer(data), make_buffer(data)
     for number in range(stop):
         nn.init.constant_(whole.policy.weight, float(number))
         whole.sample()
@@ -90,21 +106,16 @@ def test_a_continued_buffer_draws_the_same_batches(stop) -> None:
         assert (whole.sample() == resumed.sample()).all()
 
 
-@pytest.mark.parametrize(("ratio", "rows"), [(0.01, 0), (0.99, 40)])
-def test_a_batch_of_one_kind_is_refused(ratio, rows) -> None:
-    with pytest.raises(ValueError, match=f"of 40 rows are {rows}; expected real"):
-        make_buffer(real_ratio=ratio)
-
-
-def test_a_rollout_without_rows_is_an_error() -> None:
-    buffer = make_buffer()
-    buffer.rollout = lambda policy: Rollout(rollout_of(policy).rows[:0], 9)
+def test_a_rollout_without_rows_is_an_error(data) -> None:
+    buffer = make_buffer(data)
+    found = buffer.roll_out(buffer.policy)
+    buffer.roll_out = lambda copied: found._replace(rows=found.rows[:0])
     with pytest.raises(ValueError, match="rejects all rows"):
         buffer.sample()
 
 
-def test_old_generations_are_freed() -> None:
-    buffer, held = make_buffer(), []
+def test_old_generations_are_freed(data) -> None:
+    buffer, held = make_buffer(data), []
     gc.disable()
     try:
         for number in range(18):
@@ -114,3 +125,76 @@ def test_old_generations_are_freed() -> None:
     finally:
         gc.enable()
     assert [each() is not None for each in held] == [False] * 5 + [True]
+
+
+def buffer_of(data: ModelData, options: DynamicsOptions, **batches):
+    """Return a buffer of roll-outs, a batch, the untrained model and the actor."""
+    torch.manual_seed(0)
+    model, actor = options.ensemble(11, 3), deterministic_actor(11, 3, num_cells=[8])
+    batches = {"batch_size": 8, "gamma": 0.99, "n_steps": 1} | batches
+    buffer = RolloutReplayBuffer(
+        options, data, model, actor, seed=0, transform=lambda batch: batch, **batches
+    )
+    return buffer, buffer.sample(), model, actor
+
+
+@pytest.mark.parametrize("steps", [0, 3])
+def test_rollouts_start_in_states_of_the_data_or_beside_them(data, steps) -> None:
+    buffer, *_ = buffer_of(data, replace(TINY, perturbed_start_steps=steps))
+    starts = buffer.synthetic["observation"][:10]
+    known = data.storage.get(torch.arange(540))["observation"]
+    there = (starts.unsqueeze(1) == known).all(-1).any(1)
+    assert not there.any() if steps else there.all()
+
+
+@pytest.mark.parametrize(("noise", "n_steps"), [(0.0, 1), (0.3, 1), (0.0, 3)])
+def test_synthetic_rows_are_marked_and_may_have_noise(data, noise, n_steps) -> None:
+    options = replace(TINY, action_noise=noise)
+    if n_steps > 1:
+        rows = data.storage.get(range(540))
+        steps = torch.full((540, 1), n_steps)
+        rows["multi_step"] = rows["next"].clone().set("steps", steps)
+        storage = LazyTensorStorage(540)
+        storage.set(range(540), rows)
+        data = replace(data, storage=storage)
+    _, batch, _, actor = buffer_of(data, options, n_steps=n_steps)
+    assert batch["imagined"].flatten().tolist() == [False] * 2 + [True] * 6
+    rows = batch[2:]
+    apart = (rows["action"] - actor(rows.select("observation"))["action"]).abs()
+    assert (0.01 < apart.max() < 2) if noise else (apart.max() < 1e-6)
+    if n_steps > 1:
+        steps = batch["steps_to_next_obs"].flatten().tolist()
+        assert steps == [n_steps] * 2 + [1] * 6
+
+
+@pytest.mark.parametrize("shift", [0.0, -100.0])
+def test_the_task_ends_where_the_model_is_unsure(data, shift) -> None:
+    data.held_out["next", "reward"] += shift
+    options = replace(
+        TINY, unknown="halt", known_share=0.5, rollout_starts=400, terminations="never"
+    )
+    buffer, *_ = buffer_of(data, options)
+    first = buffer.synthetic[:400]["next"]
+    ended = first["terminated"].squeeze(-1)
+    assert 0.3 < ended.float().mean() < 0.7
+    worst = min(data.held_out["next", "reward"].quantile(0.01).item(), 0)
+    wanted = torch.full([int(ended.sum()), 1], worst / (1 - 0.99))
+    torch.testing.assert_close(first["reward"][ended], wanted)
+
+
+def test_penalty_and_ends_are_in_the_units_of_the_task(data) -> None:
+    options = replace(TINY, unknown="take", rollout_steps=1)
+    buffer, _, model, _ = buffer_of(data, options)
+    free = buffer.synthetic
+    lowered = buffer_of(data, replace(options, penalty=1.5))[0].synthetic
+    assert torch.equal(free["next", "observation"], lowered["next", "observation"])
+    _, scale = model.predict(free["observation"], free["action"])
+    scale[..., :-1] *= data.scale
+    scale[..., -1] /= data.reward_scale
+    wanted = 1.5 * data.reward_scale * scale.norm(dim=-1).max(0).values
+    lost = (free["next", "reward"] - lowered["next", "reward"]).squeeze(-1)
+    torch.testing.assert_close(lost, wanted)
+    state = free["next", "observation"] * data.scale + data.loc
+    fallen = (state[:, 0] <= 0.7) | (state[:, 1].abs() >= 0.2)
+    assert torch.equal(free["next", "terminated"].squeeze(-1), fallen)
+    assert fallen.any()

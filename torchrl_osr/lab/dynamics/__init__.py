@@ -2,15 +2,15 @@
 
 from torchrl_osr.lab.dynamics.conditional_vae import ConditionalVAE
 from torchrl_osr.lab.dynamics.conditional_vae_loss import ConditionalVAELoss
+from torchrl_osr.lab.dynamics.data import ModelData
 from torchrl_osr.lab.dynamics.dynamics_loss import DynamicsLoss
-from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble, EliteNetworks
+from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
 from torchrl_osr.lab.dynamics.fit import describe_dynamics, dynamics_report
 from torchrl_osr.lab.dynamics.model_adversary import ModelAdversary
 from torchrl_osr.lab.dynamics.options import DynamicsOptions
 from torchrl_osr.lab.dynamics.rollout_buffer import RolloutReplayBuffer
 from torchrl_osr.lab.dynamics.rollouts import (
     Rollout,
-    mean_rollout,
     never,
     perturbed_starts,
     reverse_rollout,
@@ -19,7 +19,7 @@ from torchrl_osr.lab.dynamics.rollouts import (
     termination,
     uniform_policy,
 )
-from torchrl_osr.lab.dynamics.switching import SwitchingPolicy
+from torchrl_osr.lab.dynamics.switching import EliteNetworks, SwitchingPolicy
 
 __all__ = [
     "ConditionalVAE",
@@ -29,12 +29,12 @@ __all__ = [
     "DynamicsOptions",
     "EliteNetworks",
     "ModelAdversary",
+    "ModelData",
     "Rollout",
     "RolloutReplayBuffer",
     "SwitchingPolicy",
     "describe_dynamics",
     "dynamics_report",
-    "mean_rollout",
     "never",
     "perturbed_starts",
     "reverse_rollout",

@@ -7,7 +7,6 @@ networks, ``D = S + 1`` predicted entries: the change of the state, and the rewa
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from copy import copy
 from itertools import pairwise
 from typing import Any, NamedTuple, cast
 
@@ -230,71 +229,6 @@ class _StackedLinear(nn.Module):
 
     def forward(self, value: Tensor) -> Tensor:
         return torch.baddbmm(self.bias, value, self.weight)
-
-
-class EliteNetworks:
-    """Predict mean changes and rewards with the frozen elites of a model.
-
-    States and actions are in the environment's units, rewards in the model's. All
-    scaling is folded into the first and the last layer, for speed at action time.
-
-    Args:
-        model: is copied.
-        loc, scale: were subtracted from the environment's states, and divided them,
-            ``[S]``. Default 0 and 1.
-        low, high: the environment's actions for the data's -1 and 1, ``[A]``. Default
-            -1 and 1.
-
-    Attributes:
-        num_networks: ``E``.
-    """
-
-    @torch.no_grad()
-    def __init__(
-        self,
-        model: DynamicsEnsemble,
-        loc: Tensor | float = 0.0,
-        scale: Tensor | float = 1.0,
-        low: Tensor | float = -1.0,
-        high: Tensor | float = 1.0,
-    ) -> None:
-        ones = model.target_loc.new_ones
-        states, actions = ones(model.observation_dim), ones(model.action_dim)
-        center = torch.cat([loc * states, (low + high) / 2 * actions]).double()
-        unit = torch.cat([scale * states, (high - low) / 2 * actions]).double()
-        layers = model.linear_layers
-        weights = [each.weight[model.elites].double() for each in layers]
-        biases = [each.bias[model.elites].double() for each in layers]
-        weights[0] /= (unit * model.input_scale).unsqueeze(-1)
-        shift = (center + unit * model.input_loc) @ weights[0]
-        biases[0] -= shift.unsqueeze(1)
-        size = len(model.target_loc)  # log-variances follow
-        out = torch.cat([scale * states, ones(1)]).double()
-        weights[-1] = weights[-1][..., :size] * model.target_scale * out
-        biases[-1] = biases[-1][..., :size] * model.target_scale * out
-        biases[-1] += model.target_loc * out
-        self.weights = [each.float() for each in weights]
-        self.biases = [each.float() for each in biases]
-        self.activation = model.activation
-        self.num_networks = len(model.elites)
-
-    @classmethod
-    def join(cls, parts: Sequence[EliteNetworks]) -> EliteNetworks:
-        """Return the networks of several models as one; their layers must be alike."""
-        joined = copy(parts[0])
-        weights, biases = zip(*((p.weights, p.biases) for p in parts), strict=True)
-        joined.weights = [torch.cat(layer) for layer in zip(*weights, strict=True)]
-        joined.biases = [torch.cat(layer) for layer in zip(*biases, strict=True)]
-        joined.num_networks = sum(each.num_networks for each in parts)
-        return joined
-
-    def __call__(self, observation: Tensor, action: Tensor) -> Tensor:
-        """Return ``[E, n, D]`` at ``[E, n, S]`` and ``[E, n, A]``."""
-        hidden = torch.cat([observation, action], -1)
-        *layers, last = zip(self.biases, self.weights, strict=True)
-        for bias, weight in layers:
-            hidden = self.activation(torch.baddbmm(bias, hidden, weight))
-        return torch.baddbmm(last[0], hidden, last[1])
 
 
 def loc_and_scale(values: Tensor) -> tuple[Tensor, Tensor]:

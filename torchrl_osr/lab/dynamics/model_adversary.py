@@ -20,10 +20,10 @@ from torch import Tensor
 from torch.distributions import Normal
 from torchrl.data import ReplayBuffer
 
-from torchrl_osr._checks import check_positive
 from torchrl_osr._entries import entry
 from torchrl_osr.lab.dynamics.dynamics_loss import DynamicsLoss
 from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
+from torchrl_osr.lab.dynamics.options import DynamicsOptions
 from torchrl_osr.lab.dynamics.rollouts import Termination, never
 from torchrl_osr.objectives import BaseLoss
 from torchrl_osr.objectives.step import qvalue
@@ -64,6 +64,7 @@ class ModelAdversary:
     an end of the task, as in the code of RAMBO (https://arxiv.org/abs/2204.12581).
 
     Args:
+        options: of the training; ``adversarial_weight`` is :math:`\lambda`.
         model: trained already.
         loss: has the critics.
         actor: the policy.
@@ -71,10 +72,6 @@ class ModelAdversary:
         optimizer: of the model's parameters.
 
     Keyword Args:
-        steps: gradient steps of a call.
-        weight: :math:`\lambda`; 0 trains on the data alone.
-        rollout_steps: steps of a roll-out, one for each gradient step.
-        batch_size: ``B``, at least 2.
         gamma: discount factor.
         terminated: of next states. Default: never.
         seed: of the draws.
@@ -82,51 +79,46 @@ class ModelAdversary:
 
     def __init__(
         self,
+        options: DynamicsOptions,
         model: DynamicsEnsemble,
         loss: BaseLoss,
         actor: ProbabilisticTensorDictSequential,
         real: ReplayBuffer,
         optimizer: torch.optim.Optimizer,
         *,
-        steps: int,
-        weight: float,
-        rollout_steps: int,
-        batch_size: int,
         gamma: float,
         terminated: Termination = never,
         seed: int = 0,
     ) -> None:
-        check_positive("batch_size", batch_size, minimum=2)  # else std(A) is NaN
-        self.model = model.requires_grad_(True)
+        self.options, self.model = options, model.requires_grad_(True)
         self.loss, self.actor, self.real, self.optimizer = loss, actor, real, optimizer
         self.likelihood = DynamicsLoss(model)
-        self.steps, self.weight, self.rollout_steps = steps, weight, rollout_steps
-        self.batch_size, self.gamma, self.seed = batch_size, gamma, seed
-        self.terminated = terminated
+        self.gamma, self.terminated, self.seed = gamma, terminated, seed
         self.metrics: dict[str, float] = {}
 
     def __call__(self, number: int) -> None:
         """Train the model with the seed of this number; torch's generator stays."""
-        device = self.model.elites.device
+        options, device = self.options, self.model.elites.device
+        steps, length = options.adversarial_steps, options.rollout_steps
         totals = torch.zeros(2, device=device)
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
             torch.manual_seed(SEED + self.seed + number)
-            for begun in range(0, self.steps, self.rollout_steps):
-                state = entry(self.real.sample(self.batch_size), self.model.in_keys[0])
-                for _ in range(min(self.rollout_steps, self.steps - begun)):
-                    likelihood, objective, state = self._update(state)
-                    totals += torch.stack([likelihood, objective])
+            for step in range(steps):
+                if step % length == 0:
+                    rows = self.real.sample(options.batch_size)
+                    state = entry(rows, self.model.in_keys[0])
+                likelihood, objective, state = self._update(state)
+                totals += torch.stack([likelihood, objective])
         names = ("adversary_likelihood", "adversary_objective")
-        means = (totals / self.steps).tolist()
-        self.metrics = dict(zip(names, means, strict=True))
+        self.metrics = dict(zip(names, (totals / steps).tolist(), strict=True))
 
     def _update(self, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Take a gradient step; return both terms and the next states."""
-        rows = self.model.num_networks * self.batch_size
+        rows = self.model.num_networks * self.options.batch_size
         likelihood = sum(self.likelihood(self.real.sample(rows)).values())
         objectives, following = self.objective(state)
         objective = objectives.mean()
-        (likelihood + self.weight * objective).backward()
+        (likelihood + self.options.adversarial_weight * objective).backward()
         self.optimizer.step()
         self.optimizer.zero_grad()
         return likelihood.detach(), objective.detach(), following

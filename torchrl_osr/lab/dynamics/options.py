@@ -9,7 +9,6 @@ from torch import Tensor
 
 from torchrl_osr.lab.dynamics.conditional_vae import ConditionalVAE
 from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
-from torchrl_osr.lab.dynamics.rollout_buffer import check_real_ratio
 from torchrl_osr.lab.dynamics.rollouts import Termination, never, termination
 
 
@@ -98,15 +97,22 @@ class DynamicsOptions:
         if self.real_ratio == 1:
             return
         self.termination(env_id)
-        check_real_ratio(self.real_ratio, batch_size)
+        real = round(self.real_ratio * batch_size)
         forward = self.perturbed_start_steps > 0 or self.unknown == "halt"
-        if self.reverse_policy and forward:
-            raise ValueError(
-                "dynamics.perturbed_start_steps and dynamics.unknown=halt need a "
-                "forward model: take dynamics=ensemble, or leave them out."
+        if not 0 < real < batch_size:
+            why = (
+                f"real_ratio={self.real_ratio}: {real} of {batch_size} rows would be "
+                "real, and a batch needs real and synthetic rows"
             )
-        if self.unknown == "halt" and gamma == 1:
-            raise ValueError(
-                "dynamics.unknown=halt needs optim.gamma below 1: the value of a "
-                "reward for ever is infinite."
+        elif self.reverse_policy and forward:
+            why = (
+                "perturbed_start_steps and unknown=halt need a forward model: choose "
+                "dynamics=ensemble"
             )
+        elif self.unknown == "halt" and gamma == 1:
+            why = "unknown=halt needs optim.gamma below 1"
+        elif self.adversarial_steps and self.batch_size < 2:
+            why = "batch_size must be at least 2: advantages are standardised"
+        else:
+            return
+        raise ValueError(f"dynamics.{why}.")

@@ -5,24 +5,28 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from copy import deepcopy
 from itertools import accumulate, pairwise
-from typing import Any
+from typing import Any, cast
 
 import torch
-from tensordict import TensorDictBase
-from torch import nn
-from torchrl.data import OfflineToOnlineReplayBuffer, ReplayBuffer
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import InteractionType, set_interaction_type
+from torch import Tensor, nn
+from torchrl.data import OfflineToOnlineReplayBuffer
 
-from torchrl_osr.lab.dynamics.rollouts import Rollout
-
-
-def check_real_ratio(real_ratio: float, batch_size: int) -> None:
-    """Raise a ValueError unless batches have rows of both kinds."""
-    real = round(real_ratio * batch_size)
-    if not 0 < real < batch_size:
-        raise ValueError(
-            f"real_ratio={real_ratio} of {batch_size} rows are {real}; expected real "
-            "and synthetic rows in each batch."
-        )
+from torchrl_osr.lab.data.store.multi_step import take_multi_step
+from torchrl_osr.lab.data.store.validation import DATASET_KEYS
+from torchrl_osr.lab.dynamics.conditional_vae import ConditionalVAE
+from torchrl_osr.lab.dynamics.data import ModelData
+from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
+from torchrl_osr.lab.dynamics.model_adversary import ModelAdversary
+from torchrl_osr.lab.dynamics.options import DynamicsOptions
+from torchrl_osr.lab.dynamics.rollouts import (
+    Rollout,
+    perturbed_starts,
+    reverse_rollout,
+    rollout,
+    uniform_policy,
+)
 
 
 class _Rows:
@@ -51,61 +55,76 @@ class _Rows:
 class RolloutReplayBuffer(OfflineToOnlineReplayBuffer):
     """Mix recorded rows with roll-outs of the policy's newest copies.
 
-    Before the first batch, and after every ``interval`` batches, a copy of the policy
-    is rolled out; the last ``generations`` of roll-outs are sampled from. Each has its
-    own seed and leaves torch's global generator alone. The state dict holds the
-    policies instead of the rows; loading it repeats the roll-outs.
+    Before the first batch, and after every ``options.rollout_interval`` batches, a copy
+    of the policy is rolled out; the last ``options.generations`` of roll-outs are
+    sampled from. Each has its own seed and leaves torch's global generator alone. The
+    state dict holds policies instead of rows; loading it repeats the roll-outs.
 
     Args:
-        real: the data, a buffer without a batch size.
-        policy: as it is trained.
-        rollout: makes the rows of a policy, with torch's global generator as its only
-            source of randomness.
+        options: of the roll-outs.
+        data: the recorded rows, which come first in a batch.
+        model: of the dynamics, a reverse one with ``options.reverse_policy``.
+        policy: an actor, or for a reverse model a
+            :class:`~torchrl_osr.lab.dynamics.ConditionalVAE`.
+        adversary: trains the model before each further roll-out. Default: none.
 
     Keyword Args:
-        real_ratio: share of real rows in a batch.
-        batch_size: rows of a batch, the real ones first.
-        interval: batches between roll-outs.
-        generations: number of newest roll-outs that are kept.
+        batch_size: rows of a batch.
+        gamma: discount factor.
+        n_steps: of the recorded rows; synthetic ones are single steps.
         seed: of the first roll-out; the next one has the next seed.
-        transform: of each batch. Default: none.
-        before: called with the number of each roll-out but the first, before the
-            policy is copied. Default: nothing.
-
-    Raises:
-        ValueError: batches lack real or synthetic rows; in :meth:`sample`, if a
-            roll-out has no rows.
+        transform: of each batch.
     """
 
     def __init__(
         self,
-        real: ReplayBuffer,
+        options: DynamicsOptions,
+        data: ModelData,
+        model: DynamicsEnsemble,
         policy: nn.Module,
-        rollout: Callable[[nn.Module], Rollout],
+        adversary: ModelAdversary | None = None,
         *,
-        real_ratio: float,
         batch_size: int,
-        interval: int,
-        generations: int,
+        gamma: float,
+        n_steps: int,
         seed: int,
-        transform: Callable[[TensorDictBase], TensorDictBase] | None = None,
-        before: Callable[[int], None] | None = None,
+        transform: Callable[[TensorDictBase], TensorDictBase],
     ) -> None:
-        check_real_ratio(real_ratio, batch_size)
         super().__init__(
-            real,
+            data.buffer(),
             online_capacity=1,
-            offline_fraction=real_ratio,
+            offline_fraction=options.real_ratio,
             batch_size=batch_size,
-            transform=transform,
+            transform=self._finished,
         )
-        self.policy, self.rollout, self.before = policy, rollout, before
-        self.interval, self.generations, self.seed = interval, generations, seed
+        self.options, self.data, self.model = options, data, model
+        self.adversary, self.seed, self.n_steps = adversary, seed, n_steps
+        self.batch_transform = transform
+        # The adversary's model is copied too: a roll-out must be repeatable.
+        self.policy = policy if adversary is None else nn.ModuleList([policy, model])
+        terminated = options.termination(data.env_id, data.loc, data.scale)
+        self.bounds: dict[str, Any] = {"terminated": terminated}
+        self.bounds |= self._bounds_of_unknown(gamma)
         self.num_batches = 0
         self._rng: torch.Generator | None = None
-        self._copy = deepcopy(policy).requires_grad_(False)
+        self._copy = deepcopy(self.policy).requires_grad_(False)
         self._policies: list[dict[str, Any]] = []
         self._rollouts: list[Rollout] = []
+
+    @torch.no_grad()
+    def _bounds_of_unknown(self, gamma: float) -> dict[str, float]:
+        """Return options of :func:`rollout` for rows on which the networks disagree."""
+        options, held_out = self.options, self.data.held_out
+        if options.unknown == "take":
+            return {}
+        mean, _ = self.model.predict(held_out["observation"], held_out["action"])
+        known = self.model.disagreement(mean).quantile(options.known_share)
+        bounds = {"max_disagreement": known.item()}
+        if options.unknown == "halt":
+            # An end must not be better than the data's worst rewards for ever.
+            worst = held_out["next", "reward"].quantile(0.01).clamp(max=0)
+            bounds["halt_reward"] = worst.item() / (1 - gamma)
+        return bounds
 
     def set_rng(self, generator: torch.Generator) -> None:
         """Sample both kinds of rows with this generator."""
@@ -115,34 +134,71 @@ class RolloutReplayBuffer(OfflineToOnlineReplayBuffer):
 
     def sample(self, batch_size: int | None = None) -> TensorDictBase:
         """Return a batch; roll the policy out before, if that is due."""
-        if self.num_batches % self.interval == 0:
-            number = self.num_batches // self.interval
-            if number and self.before is not None:
-                self.before(number)
+        if self.num_batches % self.options.rollout_interval == 0:
+            number = self.num_batches // self.options.rollout_interval
+            if number and self.adversary is not None:
+                self.adversary(number)
             state = self.policy.state_dict()
             weights = {key: value.cpu().clone() for key, value in state.items()}
-            self._policies = [*self._policies, weights][-self.generations :]
-            latest = self._rolled_out(weights, number)
-            self._keep([*self._rollouts, latest][-self.generations :])
+            newest = slice(-self.options.generations, None)
+            self._policies = [*self._policies, weights][newest]
+            latest = self._repeatable(weights, number)
+            self._keep([*self._rollouts, latest][newest])
         self.num_batches += 1
         return super().sample(batch_size)
 
-    def metrics(self) -> dict[str, float]:
-        """Return the share of rejected rows, and of the others that end the task."""
-        rejected = sum(each.num_rejected for each in self._rollouts)
-        following = self.synthetic["next"]
-        return {
-            "rollout_rejected": rejected / (rejected + len(following)),
-            "rollout_terminated": following["terminated"].float().mean().item(),
-            "rollout_reward": following["reward"].mean().item(),
-        }
+    def _finished(self, batch: TensorDictBase) -> TensorDictBase:
+        batch = self.batch_transform(batch)
+        if self.options.reverse_policy is None:  # own actions are no labels
+            number = torch.arange(len(batch), device=batch.device).unsqueeze(-1)
+            batch["imagined"] = number >= round(self.options.real_ratio * len(batch))
+        return take_multi_step(batch) if self.n_steps > 1 else batch
 
-    def _rolled_out(self, weights: Mapping[str, Any], number: int) -> Rollout:
+    def roll_out(self, copied: nn.Module) -> Rollout:
+        """Return rows of a copy of the policy, by torch's global generator alone."""
+        options, data, policy, model = self.options, self.data, copied, self.model
+        if self.adversary is not None:
+            policy, model = cast(tuple[nn.Module, DynamicsEnsemble], copied.children())
+        uniform = uniform_policy(self.model.action_dim)
+
+        def act(state: Tensor) -> Tensor:
+            if options.reverse_policy == "uniform":
+                return uniform(state)
+            if isinstance(policy, ConditionalVAE):
+                return policy.sample(state)
+            batch = TensorDict({"observation": state}, state.shape[:-1])
+            with set_interaction_type(InteractionType.RANDOM):
+                action: Tensor = policy(batch)["action"]
+            if noise := options.action_noise:
+                scale = noise * torch.rand(len(action), 1, device=action.device)
+                action = (action + scale * torch.randn_like(action)).clamp(-1, 1)
+            return action
+
+        index = torch.randint(len(data.storage), [options.rollout_starts])
+        starts: Tensor = data.storage.get(index)["observation"]
+        if steps := options.perturbed_start_steps:
+            starts = perturbed_starts(model, starts, steps=steps, **self.bounds)
+        sizes = data.scale.expand(model.observation_dim)
+        units = torch.cat([sizes, sizes.new_tensor([1 / data.reward_scale])])
+        roll_out = rollout if options.reverse_policy is None else reverse_rollout
+        rows, rejected = roll_out(
+            model, act, starts, steps=options.rollout_steps, units=units, **self.bounds
+        )
+        penalty = options.penalty * data.reward_scale
+        rows["next", "reward"] -= penalty * rows["uncertainty"]
+        rows = rows.select(*DATASET_KEYS)
+        if self.n_steps > 1:
+            ones = torch.ones_like(rows["next", "done"], dtype=torch.long)
+            rows["multi_step"] = rows["next"].copy().set("steps", ones)
+        return Rollout(rows, rejected)
+
+    def _repeatable(self, weights: Mapping[str, Any], number: int) -> Rollout:
+        """Roll out a policy with these weights, with the seed of this number."""
         self._copy.load_state_dict(weights)
         device = next(self._copy.parameters()).device
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
             torch.manual_seed(self.seed + number)
-            found = self.rollout(self._copy)
+            found = self.roll_out(self._copy)
         if not len(found.rows):
             raise ValueError(
                 "The model rejects all rows of a roll-out. Train it longer "
@@ -165,6 +221,16 @@ class RolloutReplayBuffer(OfflineToOnlineReplayBuffer):
         """All rows of the roll-outs, oldest first, ``[n]``."""
         return self._online_buffer.rows
 
+    def metrics(self) -> dict[str, float]:
+        """Return the share of rejected rows, and of the others that end the task."""
+        rejected = sum(each.num_rejected for each in self._rollouts)
+        following = self.synthetic["next"]
+        return {
+            "rollout_rejected": rejected / (rejected + len(following)),
+            "rollout_terminated": following["terminated"].float().mean().item(),
+            "rollout_reward": following["reward"].mean().item(),
+        }
+
     def state_dict(self) -> dict[str, Any]:
         """Return the number of batches and the policies that were rolled out."""
         return {"num_batches": self.num_batches, "policies": self._policies}
@@ -173,7 +239,7 @@ class RolloutReplayBuffer(OfflineToOnlineReplayBuffer):
         """Repeat the roll-outs of a state."""
         self.num_batches = state_dict["num_batches"]
         self._policies = list(state_dict["policies"])
-        following = -(-self.num_batches // self.interval)  # rounded up
+        following = -(-self.num_batches // self.options.rollout_interval)  # rounded up
         numbers = range(following - len(self._policies), following)
         if self._policies:
-            self._keep(list(map(self._rolled_out, self._policies, numbers)))
+            self._keep(list(map(self._repeatable, self._policies, numbers)))

@@ -1,7 +1,7 @@
 """Roll-outs of a policy in a dynamics model, and the rules that end them.
 
-Shapes: ``B`` starts, ``S`` observation, ``A`` action, ``E`` networks, ``D = S + 1``
-predicted entries, ``n`` transitions, at most ``B`` times the steps.
+Shapes: ``B`` starts, ``S`` observation, ``A`` action, ``n`` transitions, at most ``B``
+times the steps.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble, EliteNetworks
+from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
 
 Termination = Callable[[Tensor], Tensor]
 """Maps next observations ``[B, S]`` to bool ``[B]``."""
@@ -41,14 +41,11 @@ def walker2d(observation: Tensor) -> Tensor:
 
 
 RULES = {"HalfCheetah": never, "Hopper": hopper, "Walker2d": walker2d}
-"""By the name of the task, for the versions 2 to 5 of Gymnasium, which agree."""
+"""For the versions 2 to 5 of Gymnasium, which agree."""
 
 
 def termination(env_id: str) -> Termination:
     """Return the rule by which a Gymnasium task ends, time limits apart.
-
-    Raises:
-        ValueError: the package has no rule for this task.
 
     Examples:
         >>> import torch
@@ -69,11 +66,10 @@ def termination(env_id: str) -> Termination:
 
 
 class Rollout(NamedTuple):
-    """Transitions from a model.
+    """Synthetic transitions.
 
     Attributes:
-        rows: ``[n]`` with the entries of a data set, and ``"step"``,
-            ``"disagreement"`` and ``"uncertainty"``, ``[n, 1]``.
+        rows: ``[n]`` with the entries of a data set, and ``"uncertainty"``, ``[n, 1]``.
         num_rejected: rows that were dropped and ended their roll-outs.
     """
 
@@ -91,7 +87,7 @@ def rollout(
     terminated: Termination = never,
     max_disagreement: float = math.inf,
     halt_reward: float | None = None,
-    units: Tensor | None = None,
+    units: Tensor | float = 1.0,
 ) -> Rollout:
     r"""Sample transitions of a policy in a model.
 
@@ -106,124 +102,55 @@ def rollout(
     Keyword Args:
         steps: largest length of a roll-out.
         terminated: of next states, in the same units. Default: never.
-        max_disagreement: rows with more
-            :meth:`~torchrl_osr.lab.dynamics.DynamicsEnsemble.disagreement` are
-            rejected, as are rows that are not finite. Default: infinity.
+        max_disagreement: of the elites; rows with more, or that are not finite, are
+            rejected. Default: infinity.
         halt_reward: keep rows with more disagreement, as ends of the task with this
             reward in their own state: the HALT of MOReL
             (https://arxiv.org/abs/2005.05951). Default: reject them.
-        units: factors ``[D]`` of the predictions in ``"uncertainty"``,
-            :math:`\max_i \lVert \sigma_i \rVert_2` over all networks, MOPO's penalty.
-            Default: 1.
+        units: factors ``[S + 1]`` of predictions in ``"uncertainty"``,
+            :math:`\max_i \lVert \sigma_i \rVert_2` of all networks, MOPO's penalty.
 
     Examples:
         >>> import torch
-        >>> from torchrl_osr.lab.dynamics import DynamicsEnsemble, rollout, termination
+        >>> from torchrl_osr.lab.dynamics import DynamicsEnsemble, rollout
         >>> model = DynamicsEnsemble(11, 3, num_networks=2, num_elites=2)
-        >>> starts = torch.zeros(4, 11)
-        >>> starts[:, 0] = 1.25
         >>> rows, num_rejected = rollout(
-        ...     model, lambda state: torch.rand(len(state), 3), starts, steps=5,
-        ...     terminated=termination("Hopper-v5"))
-        >>> rows["next", "observation"].shape[-1], num_rejected
-        (11, 0)
+        ...     model, lambda state: torch.rand(4, 3), torch.zeros(4, 11), steps=5)
+        >>> rows["next", "observation"].shape, num_rejected
+        (torch.Size([20, 11]), 0)
     """
     state, rejected, kept = starts, 0, []
-    for step in range(steps):
+    for _ in range(steps):
         action = policy(state)
         mean, scale = prediction = model.predict(state, action)
-        apart = model.disagreement(mean)
-        deviation = vector_norm(scale if units is None else scale * units, dim=-1)
         sample = model.sample(prediction)
         following, reward = state + sample[:, :-1], sample[:, -1:]
         finite = sample.isfinite().all(-1)
-        known = finite & (apart <= max_disagreement)
+        known = finite & (model.disagreement(mean) <= max_disagreement)
         ended = terminated(following).unsqueeze(-1)
         if halt_reward is not None:
             unknown = ~known.unsqueeze(-1)
             following = torch.where(unknown, state, following)
             reward = torch.where(unknown, halt_reward, reward)
             ended, known = ended | unknown, finite
-        row = TensorDict(
-            {
-                "observation": state,
-                "action": action,
-                "next": {
-                    "observation": following,
-                    "reward": reward,
-                    "done": ended,
-                    "terminated": ended,
-                    "truncated": torch.zeros_like(ended),
-                },
-                "step": torch.full_like(ended, step, dtype=torch.long),
-                "disagreement": apart.unsqueeze(-1),
-                "uncertainty": deviation.amax(0).unsqueeze(-1),
+        entries = {
+            "observation": state,
+            "action": action,
+            "next": {
+                "observation": following,
+                "reward": reward,
+                "done": ended,
+                "terminated": ended,
+                "truncated": torch.zeros_like(ended),
             },
-            [len(state)],
-        )
+            "uncertainty": vector_norm(scale * units, dim=-1).amax(0).unsqueeze(-1),
+        }
         rejected += int((~known).sum())
-        kept.append(row[known])
+        kept.append(TensorDict(entries, [len(state)])[known])
         state = following[known & ~ended.squeeze(-1)]
         if not len(state):
             break
     return Rollout(torch.cat(kept), rejected)
-
-
-class MeanRollout(NamedTuple):
-    """Mean predictions of each network for ``T`` steps.
-
-    Attributes:
-        reward: of each step, 0 after the end, ``[T, E B]``, the first network's first.
-        alive: whether the task goes on after each step, bool ``[T, E B]``.
-        state: the last one, or the one before the end, ``[E B, S]``.
-    """
-
-    reward: Tensor
-    alive: Tensor
-    state: Tensor
-
-
-@torch.no_grad()
-def mean_rollout(
-    networks: EliteNetworks,
-    policy: Callable[[Tensor], Tensor],
-    starts: Tensor,
-    *,
-    steps: int,
-    terminated: Termination = never,
-) -> MeanRollout:
-    """Roll each network out by itself, with its mean predictions.
-
-    A prediction that is not finite ends the task without a reward.
-
-    Args:
-        networks: of the dynamics, ``E``.
-        policy: maps states ``[E B, S]``, the first network's first, to actions.
-        starts: ``[B, S]``.
-
-    Keyword Args:
-        steps: ``T``.
-        terminated: of next states. Default: never.
-    """
-    number = networks.num_networks
-    state = starts.repeat(number, 1)
-    going = torch.ones_like(state[:, 0], dtype=torch.bool)
-    reward = torch.zeros(steps, len(going), device=starts.device)
-    alive = torch.zeros_like(reward, dtype=torch.bool)
-    for step in range(steps):
-        rows = number, len(starts), -1
-        action = policy(state).reshape(rows)
-        change = networks(state.view(rows), action).flatten(0, 1)
-        going = going & change.isfinite().all(-1)
-        reward[step] = change[:, -1].where(going, 0.0)
-        following = state + change[:, :-1]
-        going = going & ~terminated(following)
-        alive[step] = going
-        # States after the end must not grow until they overflow.
-        state = torch.where(going.unsqueeze(-1), following, state)
-        if not going.any():
-            break
-    return MeanRollout(reward, alive, state)
 
 
 def uniform_policy(action_dim: int) -> Callable[[Tensor], Tensor]:
@@ -234,16 +161,18 @@ def uniform_policy(action_dim: int) -> Callable[[Tensor], Tensor]:
 def perturbed_starts(
     model: DynamicsEnsemble, starts: Tensor, *, steps: int, **options: Any
 ) -> Tensor:
-    """Sample states that random actions lead to in a model, ``[B, S]``.
+    """Sample states in which the task goes on after 1 to ``steps`` uniform actions.
 
     Args:
         model: of the dynamics.
         starts: ``[B, S]``.
 
     Keyword Args:
-        steps: states after 1 to ``steps`` uniform actions count, if the task goes on.
-        options: ``terminated``, ``max_disagreement`` and ``halt_reward`` of
-            :func:`rollout`.
+        steps: see above.
+        options: others of :func:`rollout`.
+
+    Returns:
+        ``[B, S]``, drawn with replacement.
     """
     policy = uniform_policy(model.action_dim)
     rows, _ = rollout(model, policy, starts, steps=steps, **options)
@@ -261,15 +190,12 @@ def reverse_rollout(
     model: DynamicsEnsemble,
     policy: Callable[[Tensor], Tensor],
     ends: Tensor,
-    *,
-    terminated: Termination = never,
     **options: Any,
 ) -> Rollout:
     """Sample transitions that lead into given states, as in ROMI.
 
     "Offline Reinforcement Learning with Reverse Model-based Imagination",
-    https://arxiv.org/abs/2110.00188. Rows that begin where the task has ended are
-    rejected.
+    https://arxiv.org/abs/2110.00188. Rows that begin after the task's end are rejected.
 
     Args:
         model: trained on :func:`reverse_transitions`.
@@ -277,13 +203,12 @@ def reverse_rollout(
         ends: next states of the first rows, ``[B, S]``.
 
     Keyword Args:
-        terminated: of states. Default: never.
-        options: others of :func:`rollout`.
+        options: of :func:`rollout`.
 
     Returns:
         Rows in the direction of time, none of them terminated.
     """
-    rows, rejected = rollout(model, policy, ends, terminated=terminated, **options)
+    rows, rejected = rollout(model, policy, ends, **options)
     acted = ~rows["next", "terminated"].squeeze(-1)
     return Rollout(reverse_transitions(rows[acted]), rejected + int((~acted).sum()))
 

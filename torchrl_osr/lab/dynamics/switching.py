@@ -7,6 +7,7 @@ the dynamics, ``T`` steps of a roll-out.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 
 import numpy as np
 import torch
@@ -14,8 +15,71 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from torchrl_osr._checks import check_positive
-from torchrl_osr.lab.dynamics.ensemble import EliteNetworks
-from torchrl_osr.lab.dynamics.rollouts import Termination, mean_rollout, never
+from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
+from torchrl_osr.lab.dynamics.rollouts import Termination, never
+
+
+class EliteNetworks:
+    """Predict mean changes of the state and rewards with a model's frozen elites.
+
+    States and actions are in the environment's units, rewards in the model's. All
+    scaling is folded into the first and the last layer, for speed at action time.
+
+    Args:
+        model: is copied.
+        loc, scale: were subtracted from the environment's states, and divided them.
+        low, high: the environment's actions for the data's -1 and 1.
+    """
+
+    @torch.no_grad()
+    def __init__(
+        self,
+        model: DynamicsEnsemble,
+        loc: Tensor | float = 0.0,
+        scale: Tensor | float = 1.0,
+        low: Tensor | float = -1.0,
+        high: Tensor | float = 1.0,
+    ) -> None:
+        ones = model.target_loc.new_ones
+        states, actions = ones(model.observation_dim), ones(model.action_dim)
+        center = torch.cat([loc * states, (low + high) / 2 * actions]).double()
+        unit = torch.cat([scale * states, (high - low) / 2 * actions]).double()
+        layers = model.linear_layers
+        weights = [each.weight[model.elites].double() for each in layers]
+        biases = [each.bias[model.elites].double() for each in layers]
+        weights[0] /= (unit * model.input_scale).unsqueeze(-1)
+        shift = (center + unit * model.input_loc) @ weights[0]
+        biases[0] -= shift.unsqueeze(1)
+        size = len(model.target_loc)  # log-variances follow
+        out = torch.cat([scale * states, ones(1)]).double()
+        weights[-1] = weights[-1][..., :size] * model.target_scale * out
+        biases[-1] = biases[-1][..., :size] * model.target_scale * out
+        biases[-1] += model.target_loc * out
+        self.weights = [each.float() for each in weights]
+        self.biases = [each.float() for each in biases]
+        self.activation = model.activation
+
+    @property
+    def num_networks(self) -> int:
+        """``E``."""
+        return len(self.weights[0])
+
+    @classmethod
+    def join(cls, parts: Sequence[EliteNetworks]) -> EliteNetworks:
+        """Return the networks of several models as one; their layers must be alike."""
+        joined = copy(parts[0])
+        weights, biases = zip(*((p.weights, p.biases) for p in parts), strict=True)
+        joined.weights = [torch.cat(layer) for layer in zip(*weights, strict=True)]
+        joined.biases = [torch.cat(layer) for layer in zip(*biases, strict=True)]
+        return joined
+
+    def __call__(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Return ``[E, n, S + 1]`` at ``[E, n, S]`` and ``[E, n, A]``."""
+        hidden = torch.cat([observation, action], -1)
+        *layers, last = zip(self.biases, self.weights, strict=True)
+        for bias, weight in layers:
+            hidden = self.activation(torch.baddbmm(bias, hidden, weight))
+        return torch.baddbmm(last[0], hidden, last[1])
 
 
 class SwitchingPolicy:
@@ -107,25 +171,38 @@ class SwitchingPolicy:
         """Return each policy's predicted return, ``[B, N]``, for ``[B, S]``."""
         starts = observation.repeat_interleave(len(self.policies), 0)
         if self.networks is None:
-            return self._values(starts).view(-1, len(self.policies))
-        reward, alive, last = mean_rollout(
-            self.networks,
-            self._actions,
-            starts,
-            steps=self.steps,
-            terminated=self.terminated,
-        )
+            found = self.value(starts, self._actions(starts))
+        else:
+            found = self._rolled_out(self.networks, starts).mean(0)
+        return found.view(-1, len(self.policies))
+
+    def _rolled_out(self, networks: EliteNetworks, starts: Tensor) -> Tensor:
+        """Return the return predicted by each network, ``[E, B N]``, for ``[B N, S]``.
+
+        A prediction that is not finite ends the task without a reward.
+        """
+        rows = networks.num_networks, len(starts), -1
+        state = starts.repeat(networks.num_networks, 1)
+        going = torch.ones_like(state[:, 0], dtype=torch.bool)
+        reward = torch.zeros(self.steps, len(going), device=starts.device)
+        for step in range(self.steps):
+            action = self._actions(state).reshape(rows)
+            change = networks(state.view(rows), action).flatten(0, 1)
+            going = going & change.isfinite().all(-1)
+            reward[step] = change[:, -1].where(going, 0.0)
+            following = state + change[:, :-1]
+            going = going & ~self.terminated(following)
+            # States after the end must not grow until they overflow.
+            state = torch.where(going.unsqueeze(-1), following, state)
+            if not going.any():
+                break
         discount = self.gamma ** torch.arange(self.steps, device=starts.device)
-        value = self._values(last).where(alive[-1], 0.0)
+        value = self.value(state, self._actions(state)).where(going, 0.0)
         found = discount @ reward + self.gamma**self.steps * value
-        return found.view(-1, len(starts)).mean(0).view(-1, len(self.policies))
+        return found.view(-1, len(starts))
 
     def _actions(self, state: Tensor) -> Tensor:
         """Return actions for ``[n N, S]``, by each policy in turn."""
         rows = state.view(-1, len(self.policies), state.shape[-1]).unbind(1)
         pairs = zip(self.policies, rows, strict=True)
         return torch.stack([policy(each) for policy, each in pairs], 1).flatten(0, 1)
-
-    def _values(self, state: Tensor) -> Tensor:
-        """Return the values of these actions, ``[n N]``."""
-        return self.value(state, self._actions(state))

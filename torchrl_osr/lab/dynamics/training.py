@@ -10,42 +10,27 @@ import hashlib
 import json
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast
 
 import torch
 from filelock import FileLock
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import (
-    InteractionType,
-    ProbabilisticTensorDictSequential,
-    set_interaction_type,
-)
-from torch import Tensor, nn
-from torchrl.data import ImmutableDatasetWriter, ReplayBuffer, Storage
+from tensordict.nn import ProbabilisticTensorDictSequential
+from torch import nn
 
 from torchrl_osr import __version__
 from torchrl_osr._files import write_json
 from torchrl_osr.lab.data.store.cache import cache_root
-from torchrl_osr.lab.data.store.multi_step import take_multi_step
-from torchrl_osr.lab.data.store.validation import DATASET_KEYS
 from torchrl_osr.lab.dynamics.conditional_vae import ConditionalVAE
 from torchrl_osr.lab.dynamics.conditional_vae_loss import ConditionalVAELoss
+from torchrl_osr.lab.dynamics.data import ModelData
 from torchrl_osr.lab.dynamics.dynamics_loss import DynamicsLoss
 from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
 from torchrl_osr.lab.dynamics.fit import describe_dynamics, dynamics_report
 from torchrl_osr.lab.dynamics.model_adversary import ModelAdversary
 from torchrl_osr.lab.dynamics.options import DynamicsOptions
 from torchrl_osr.lab.dynamics.rollout_buffer import RolloutReplayBuffer
-from torchrl_osr.lab.dynamics.rollouts import (
-    Rollout,
-    perturbed_starts,
-    reverse_rollout,
-    reverse_transitions,
-    rollout,
-    uniform_policy,
-)
 from torchrl_osr.objectives import BaseLoss
 from torchrl_osr.policy.tensor_file import read_tensors, write_tensors
 from torchrl_osr.trainers import OfflineTrainer
@@ -56,74 +41,11 @@ log = logging.getLogger(__name__)
 FILE, REPORT = "dynamics.safetensors", "dynamics.json"
 """The model and its errors, in the folder of a run."""
 
-KIND = "dynamics model"
-
 ROWS_FOR_STATISTICS = 50_000
 """Rows from which a model's inputs and targets are standardised."""
 
 FITTED = ("num_networks", "num_elites", "num_cells", "lr", "batch_size", "steps")
 """Options that decide what a trained model is."""
-
-
-@dataclass(frozen=True)
-class ModelData:
-    """Transitions that dynamics models learn from, and their units.
-
-    Attributes:
-        storage: rows to train on.
-        held_out: rows to judge models by.
-        pieces: of trajectories, ``[n, L]``, to judge roll-outs by.
-        loc, scale: were subtracted from the task's observations, and divided them.
-        reward_scale, reward_shift: rewards are ``scale * r + shift``.
-        env_id: Gymnasium id of the task.
-        backward: exchange state and next state.
-    """
-
-    storage: Storage
-    held_out: TensorDict
-    pieces: TensorDict | None
-    loc: Tensor
-    scale: Tensor
-    reward_scale: float
-    reward_shift: float
-    env_id: str
-    backward: bool = False
-
-    def buffer(self, batch_size: int | None = None) -> ReplayBuffer:
-        """Return a buffer of the rows to train on, without other transforms."""
-        buffer = ReplayBuffer(
-            storage=self.storage,
-            writer=ImmutableDatasetWriter(),
-            collate_fn=lambda batch: batch,
-            batch_size=batch_size,
-        )
-        if self.backward:
-            buffer.append_transform(reverse_transitions)
-        return buffer
-
-    def reverse(self) -> ModelData:
-        """Return the same transitions against the direction of time."""
-        held_out, pieces = reverse_transitions(self.held_out), self.pieces
-        if pieces is not None:
-            pieces = reverse_transitions(pieces.flip(1))
-        return replace(self, held_out=held_out, pieces=pieces, backward=True)
-
-    def facts(self) -> dict[str, Any]:
-        """Return what a model shares with its data, JSON-compatible."""
-        digest = hashlib.sha256()
-        for key in DATASET_KEYS:
-            values = self.held_out[key].cpu().contiguous().view(torch.uint8)
-            digest.update(values.numpy().tobytes())
-        return {
-            "environment": self.env_id,
-            "rows": len(self.storage),
-            "observation mean": self.loc.tolist(),
-            "observation scale": self.scale.tolist(),
-            "reward scale": self.reward_scale,
-            "reward shift": self.reward_shift,
-            "held-out rows": digest.hexdigest(),
-            "direction of time": "backward" if self.backward else "forward",
-        }
 
 
 @dataclass(frozen=True)
@@ -168,7 +90,7 @@ def train_dynamics(
 
     Keyword Args:
         gamma: discount factor.
-        batches: other options of :func:`rollout_buffer`.
+        batches: other options of :class:`RolloutReplayBuffer`.
 
     Returns:
         The policy's buffer with roll-outs, and the adversary that trains the model
@@ -180,32 +102,27 @@ def train_dynamics(
     if hasattr(loss, "dynamics_network"):
         cast(BaseLoss, loss).load_network("dynamics_network", model)
     if hasattr(loss, "transition_network"):
-        vae = options.transition_vae(sizes[0])
-        train_vae(vae, options, data, phase)
+        vae = train_vae(options.transition_vae(sizes[0]), options, data, phase)
         cast(BaseLoss, loss).load_network("transition_network", vae)
     if options.real_ratio == 1:
         return None, None
     policy: nn.Module = actor
     if options.reverse_policy == "cvae":
-        policy = options.reverse_vae(*sizes)
-        train_vae(policy, options, data, phase)
+        policy = train_vae(options.reverse_vae(*sizes), options, data, phase)
     adversary = None
     if options.adversarial_steps and options.adversarial_weight:
         adversary = ModelAdversary(
+            options,
             model,
             cast(BaseLoss, loss),
             actor,
             data.buffer(),
             phase.adam(model.parameter_groups(), lr=options.adversarial_lr),
-            steps=options.adversarial_steps,
-            weight=options.adversarial_weight,
-            rollout_steps=options.rollout_steps,
-            batch_size=options.batch_size,
             gamma=gamma,
             terminated=options.termination(data.env_id, data.loc, data.scale),
             seed=phase.seed,
         )
-    buffer = rollout_buffer(
+    buffer = RolloutReplayBuffer(
         options, data, model, policy, adversary, gamma=gamma, seed=phase.seed, **batches
     )
     return buffer, adversary
@@ -256,11 +173,11 @@ def _trained(
 ) -> DynamicsEnsemble:
     """Train a model; return the weights of its best evaluation."""
     held_out = data.held_out
-    sizes = held_out["observation"].shape[-1], held_out["action"].shape[-1]
     torch.manual_seed(phase.seed)
-    model = options.ensemble(*sizes)
-    model.to(held_out.device or "cpu")
-    model.standardize_(_rows_for_statistics(data, phase))
+    model = options.ensemble(
+        held_out["observation"].shape[-1], held_out["action"].shape[-1]
+    )
+    _standardize(model, data, phase)
     loss = DynamicsLoss(model)
 
     def evaluate() -> dict[str, Any]:
@@ -288,17 +205,16 @@ def _trained(
 
 def train_vae(
     model: ConditionalVAE, options: DynamicsOptions, data: ModelData, phase: Phase
-) -> None:
-    """Train a conditional autoencoder for ``vae_steps``, and freeze it."""
-    held_out = data.held_out
-    model.to(held_out.device or "cpu")
+) -> ConditionalVAE:
+    """Train a conditional autoencoder for ``vae_steps``; return it frozen."""
+    model.to(data.held_out.device or "cpu")
     if model.change:
-        model.standardize_(_rows_for_statistics(data, phase))
+        _standardize(model, data, phase)
     loss = ConditionalVAELoss(model)
 
     @torch.no_grad()
     def evaluate() -> dict[str, float]:
-        return {"vae_error": loss(held_out)["loss_vae"].item()}
+        return {"vae_error": loss(data.held_out)["loss_vae"].item()}
 
     phase.new_trainer(
         loss,
@@ -312,14 +228,16 @@ def train_vae(
         eval_interval=options.vae_steps,
         description="vae",
     ).train()
-    model.requires_grad_(False)
+    return model.requires_grad_(False)
 
 
-def _rows_for_statistics(data: ModelData, phase: Phase) -> TensorDictBase:
+def _standardize(
+    model: DynamicsEnsemble | ConditionalVAE, data: ModelData, phase: Phase
+) -> None:
+    """Move a model to the data, and take their statistics."""
     rows, device = data.buffer(), data.held_out.device or "cpu"
     rows.set_rng(torch.Generator(device).manual_seed(phase.seed))
-    sample: TensorDictBase = rows.sample(ROWS_FOR_STATISTICS)
-    return sample
+    model.to(device).standardize_(rows.sample(ROWS_FOR_STATISTICS))
 
 
 def write_dynamics(
@@ -333,8 +251,7 @@ def write_dynamics(
         "num_elites": len(model.elites),
         "num_cells": [each.weight.shape[-1] for each in model.linear_layers[:-1]],
     }
-    record = {"kind": KIND, "sizes": sizes, "data": dict(facts)}
-    write_tensors(path, model.state_dict(), record)
+    write_tensors(path, model.state_dict(), {"sizes": sizes, "data": dict(facts)})
 
 
 def load_dynamics(
@@ -367,114 +284,3 @@ def load_dynamics(
             "Take a model of the same data, or leave dynamics.path out to train one."
         )
     return model
-
-
-def rollout_buffer(
-    options: DynamicsOptions,
-    data: ModelData,
-    model: DynamicsEnsemble,
-    policy: nn.Module,
-    adversary: ModelAdversary | None = None,
-    *,
-    batch_size: int,
-    gamma: float,
-    n_steps: int,
-    seed: int,
-    transform: Callable[[TensorDictBase], TensorDictBase],
-) -> RolloutReplayBuffer:
-    """Return a buffer of real rows and of roll-outs as the options describe them.
-
-    Args:
-        options: of the roll-outs.
-        data: the real rows.
-        model: of the dynamics, a reverse one with ``options.reverse_policy``.
-        policy: an actor, or for a reverse model a
-            :class:`~torchrl_osr.lab.dynamics.ConditionalVAE`.
-        adversary: trains the model before each roll-out. Default: none.
-
-    Keyword Args:
-        batch_size: rows of a batch.
-        gamma: discount factor.
-        n_steps: of the real rows; synthetic ones are single steps.
-        seed: of the roll-outs.
-        transform: of each batch.
-    """
-    sizes = data.scale.expand(model.observation_dim)
-    units = torch.cat([sizes, sizes.new_tensor([1 / data.reward_scale])])
-    terminated = options.termination(data.env_id, data.loc, data.scale)
-    bounds: dict[str, Any] = {"terminated": terminated}
-    bounds |= _bounds_of_unknown(options, data, model, gamma)
-    reverse = options.reverse_policy is not None
-    roll_out = reverse_rollout if reverse else rollout
-    uniform = uniform_policy(model.action_dim)
-
-    def rows_of(copied: nn.Module) -> Rollout:
-        # The adversary's model is copied too: a roll-out must be repeatable.
-        policy, inside = (copied, model) if adversary is None else copied.children()
-        inside = cast(DynamicsEnsemble, inside)
-
-        def act(state: Tensor) -> Tensor:
-            if options.reverse_policy == "uniform":
-                return uniform(state)
-            if isinstance(policy, ConditionalVAE):
-                return policy.sample(state)
-            batch = TensorDict({"observation": state}, state.shape[:-1])
-            with set_interaction_type(InteractionType.RANDOM):
-                action: Tensor = policy(batch)["action"]
-            if noise := options.action_noise:
-                scale = noise * torch.rand(len(action), 1, device=action.device)
-                action = (action + scale * torch.randn_like(action)).clamp(-1, 1)
-            return action
-
-        index = torch.randint(len(data.storage), [options.rollout_starts])
-        starts: Tensor = data.storage.get(index)["observation"]
-        if steps := options.perturbed_start_steps:
-            starts = perturbed_starts(inside, starts, steps=steps, **bounds)
-        rows, rejected = roll_out(
-            inside, act, starts, steps=options.rollout_steps, units=units, **bounds
-        )
-        penalty = options.penalty * data.reward_scale
-        rows["next", "reward"] -= penalty * rows["uncertainty"]
-        rows = rows.select(*DATASET_KEYS)
-        if n_steps > 1:
-            ones = torch.ones_like(rows["next", "done"], dtype=torch.long)
-            rows["multi_step"] = rows["next"].copy().set("steps", ones)
-        return Rollout(rows, rejected)
-
-    def finished(batch: TensorDictBase) -> TensorDictBase:
-        batch = transform(batch)
-        if not reverse:  # the policy's own actions are no labels for it
-            number = torch.arange(len(batch), device=batch.device).unsqueeze(-1)
-            batch["imagined"] = number >= round(options.real_ratio * len(batch))
-        return take_multi_step(batch) if n_steps > 1 else batch
-
-    return RolloutReplayBuffer(
-        data.buffer(),
-        policy if adversary is None else nn.ModuleList([policy, model]),
-        rows_of,
-        real_ratio=options.real_ratio,
-        batch_size=batch_size,
-        interval=options.rollout_interval,
-        generations=options.generations,
-        seed=seed,
-        transform=finished,
-        before=adversary,
-    )
-
-
-@torch.no_grad()
-def _bounds_of_unknown(
-    options: DynamicsOptions, data: ModelData, model: DynamicsEnsemble, gamma: float
-) -> dict[str, float]:
-    """Return options of :func:`rollout` for rows on which the networks disagree."""
-    held_out = data.held_out
-    if options.unknown == "take":
-        return {}
-    mean, _ = model.predict(held_out["observation"], held_out["action"])
-    known = model.disagreement(mean).quantile(options.known_share)
-    bounds = {"max_disagreement": known.item()}
-    if options.unknown == "halt":
-        # An end must not be better than the data's worst rewards for ever.
-        worst = held_out["next", "reward"].quantile(0.01).clamp(max=0)
-        bounds["halt_reward"] = worst.item() / (1 - gamma)
-    return bounds

@@ -28,7 +28,7 @@ from torchrl_osr.lab.data import (
     split_held_out,
 )
 from torchrl_osr.lab.data.store.multi_step import multi_step
-from torchrl_osr.lab.dynamics.training import ModelData
+from torchrl_osr.lab.dynamics import ModelData
 from torchrl_osr.lab.run.build import check_storage, load_data, references_of
 
 MAX_HELD_OUT = 50_000
