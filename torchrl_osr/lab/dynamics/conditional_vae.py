@@ -35,11 +35,10 @@ class ConditionalVAE(nn.Module):
 
     Keyword Args:
         condition_key, target_key: entries of a batch.
-        change: see above. Default ``False``.
-        num_cells: width of each hidden layer. Default two of 750, BCQ's.
+        change: see above.
+        num_cells: width of each hidden layer. Default: BCQ's.
         latent_dim: ``Z``. Default ``2 * T``, BCQ's.
-        latent_bound: largest magnitude of a sampled latent. Default infinity; BCQ's is
-            0.5.
+        latent_bound: largest magnitude of a sampled latent; BCQ's is 0.5.
 
     Examples:
         >>> import torch
@@ -77,12 +76,7 @@ class ConditionalVAE(nn.Module):
         self.register_buffer("target_scale", torch.ones(target_dim))
 
     def encode(self, condition: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and standard deviation of the latent, ``[B, Z]``.
-
-        Args:
-            condition: ``[B, C]``.
-            target: of :meth:`standardized`, ``[B, T]``.
-        """
+        """Return mean and scale ``[B, Z]`` of the latent, for a standardised target."""
         loc, log_scale = self.encoder(condition, target).chunk(2, -1)
         return loc, log_scale.clamp(*LATENT_LOG_SCALE_BOUNDS).exp()
 

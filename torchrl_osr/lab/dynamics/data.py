@@ -21,8 +21,8 @@ class ModelData:
 
     Attributes:
         storage: rows to train on.
-        held_out: rows to judge models by.
-        pieces: of trajectories, ``[n, L]``, to judge roll-outs by.
+        held_out: rows to evaluate models on.
+        pieces: of trajectories, ``[n, L]``, to evaluate roll-outs on.
         loc, scale: were subtracted from the task's observations, and divided them.
         reward_scale, reward_shift: rewards are ``scale * r + shift``.
         env_id: Gymnasium id of the task.

@@ -19,12 +19,9 @@ from torchrl_osr.objectives.mixed_states import check_single_steps, first_step
 
 
 def gaussian_error(mean: Tensor, log_variance: Tensor, target: Tensor) -> Tensor:
-    r"""Return twice the negative log-likelihood a target entry, ``[B]``.
+    r"""Return :math:`\frac1D \sum_d (\mu_d - y_d)^2 / \sigma_d^2 + \log \sigma_d^2`.
 
-    .. math::
-        \frac1D \sum_{d=1}^{D} \frac{(\mu_d - y_d)^2}{\sigma_d^2} + \log \sigma_d^2
-
-    without the constant :math:`\log 2\pi`. All arguments are ``[B, D]``.
+    This is twice the negative log-likelihood without its constant, ``[B]``.
     """
     return ((mean - target).square() * (-log_variance).exp() + log_variance).mean(-1)
 
@@ -50,9 +47,6 @@ class DynamicsLoss(BaseLoss):
     Keyword Args:
         bound_weight: ``w``. Default 0.01, MOPO's.
         reduction: of the likelihood, ``"mean"`` (default), ``"sum"`` or ``"none"``.
-
-    Raises:
-        ValueError: in the call, if the number of rows is no multiple of ``E``.
 
     Examples:
         >>> import torch

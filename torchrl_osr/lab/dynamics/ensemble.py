@@ -42,24 +42,18 @@ class DynamicsEnsemble(nn.Module):
         \quad i = 1 \dots E
 
     as in PETS (https://arxiv.org/abs/1805.12114) and MOPO
-    (https://arxiv.org/abs/2005.13239). Each layer of all networks is one batched
-    product. Unlike there, targets are standardised as well as inputs, so that the
-    entries' units do not matter.
+    (https://arxiv.org/abs/2005.13239), which sets the defaults. Unlike there, targets
+    are standardised as well as inputs, so that the entries' units do not matter.
 
     Args:
         observation_dim: ``S``.
         action_dim: ``A``; the number of discrete actions.
 
     Keyword Args:
-        num_networks: ``E``. Default 7.
-        num_elites: networks that roll-outs use, see :meth:`calibrate_`. Default 5.
-        num_cells: width of each hidden layer. Default four of 200.
-        activation_class: Default :class:`torch.nn.SiLU`.
-        observation_key, action_key: entries to read. Default ``"observation"`` and
-            ``"action"``.
-
-    Raises:
-        ValueError: ``num_elites`` is not between 1 and ``num_networks``.
+        num_networks: ``E``.
+        num_elites: networks that roll-outs use, see :meth:`calibrate_`.
+        num_cells: width of each hidden layer.
+        observation_key, action_key: entries to read.
 
     Examples:
         >>> import torch
@@ -84,7 +78,6 @@ class DynamicsEnsemble(nn.Module):
         num_networks: int = 7,
         num_elites: int = 5,
         num_cells: Sequence[int] = (200, 200, 200, 200),
-        activation_class: type[nn.Module] = nn.SiLU,
         observation_key: NestedKey = "observation",
         action_key: NestedKey = "action",
     ) -> None:
@@ -95,13 +88,14 @@ class DynamicsEnsemble(nn.Module):
                 f"{num_elites}."
             )
         self.observation_dim, self.action_dim = observation_dim, action_dim
-        self.num_networks = num_networks
+        self.num_networks, self.num_elites = num_networks, num_elites
+        self.num_cells = list(num_cells)
         self.in_keys = [observation_key, action_key]
         inputs, outputs = observation_dim + action_dim, observation_dim + 1
         widths = [inputs, *num_cells, 2 * outputs]
         layers = [_StackedLinear(num_networks, *sizes) for sizes in pairwise(widths)]
         self.layers = nn.ModuleList(layers)
-        self.activation = activation_class()
+        self.activation = nn.SiLU()
         lowest, highest = LOG_VARIANCE_BOUNDS
         self.lowest_log_variance = nn.Parameter(torch.full([outputs], lowest))
         self.highest_log_variance = nn.Parameter(torch.full([outputs], highest))
@@ -119,8 +113,7 @@ class DynamicsEnsemble(nn.Module):
         """Return mean and log-variance ``[E, B, D]`` of the standardised targets.
 
         Args:
-            inputs: joined states and actions in the data's units, ``[B, S + A]`` for
-                all networks or ``[E, B, S + A]``, one batch for each.
+            inputs: states and actions, ``[B, S + A]`` or ``[E, B, S + A]``.
         """
         hidden = (inputs - self.input_loc) / self.input_scale
         if hidden.ndim == 2:
@@ -153,15 +146,10 @@ class DynamicsEnsemble(nn.Module):
         return mean + scale * torch.randn_like(mean)
 
     def disagreement(self, mean: Tensor) -> Tensor:
-        r"""Return the largest distance of an elite from the elites' mean, ``[B]``.
+        r"""Return :math:`\max_i \lVert \mu_i - \bar\mu \rVert_2` of the elites, ``[B]``.
 
-        .. math:: \max_i \lVert \mu_i - \bar\mu \rVert_2
-
-        in standard deviations of the targets. MOReL (https://arxiv.org/abs/2005.05951)
+        In standard deviations of the targets. MOReL (https://arxiv.org/abs/2005.05951)
         takes the largest distance of two networks.
-
-        Args:
-            mean: of :meth:`predict`, ``[E, B, D]``.
         """
         mean = mean[self.elites] / self.target_scale
         distance: Tensor = vector_norm(mean - mean.mean(0), dim=-1)
@@ -178,10 +166,7 @@ class DynamicsEnsemble(nn.Module):
 
     @torch.no_grad()
     def standardize_(self, data: TensorDictBase) -> None:
-        """Take means and standard deviations of inputs and targets from rows ``[N]``.
-
-        Constant entries keep a standard deviation of 1.
-        """
+        """Take means and standard deviations of inputs and targets from rows ``[N]``."""
         rows = data[has_next_state(data, self.in_keys[0])]
         names = ("input", "target")
         for name, values in zip(names, self.inputs_and_targets(rows), strict=True):
@@ -200,20 +185,15 @@ class DynamicsEnsemble(nn.Module):
         self.elites.copy_(error.argsort()[: len(self.elites)].sort().values)
 
     def parameter_groups(self) -> Iterator[dict[str, Any]]:
-        """Yield groups for :class:`torch.optim.Adam`, with MOPO's weight decay.
-
-        MOPO's code adds half the squared norm of each layer's weights, times its
-        factor, to the loss.
-        """
+        """Yield groups for :class:`torch.optim.Adam`, with MOPO's weight decay."""
         *hidden, last = self.linear_layers
         for number, layer in enumerate(hidden):
             decay = WEIGHT_DECAY[min(number, len(WEIGHT_DECAY) - 1)]
             yield {"params": [layer.weight], "weight_decay": decay}
         yield {"params": [last.weight], "weight_decay": OUTPUT_WEIGHT_DECAY}
         weights = {id(layer.weight) for layer in (*hidden, last)}
-        yield {
-            "params": [each for each in self.parameters() if id(each) not in weights]
-        }
+        rest = [each for each in self.parameters() if id(each) not in weights]
+        yield {"params": rest}
 
 
 class _StackedLinear(nn.Module):

@@ -25,7 +25,7 @@ def dynamics_report(
     held_out: TensorDictBase,
     pieces: TensorDictBase | None = None,
 ) -> dict[str, Any]:
-    """Measure an ensemble's errors, and how well it predicts them, on ``[N]`` rows.
+    """Measure an ensemble's errors, and how well it predicts them.
 
     Args:
         model: the ensemble.
@@ -34,14 +34,10 @@ def dynamics_report(
 
     Returns:
         ``"nll"`` of the elites in nats, summed over entries; ``"mse"`` of standardised
-        targets, of all networks; ``"r2"`` of the elites' mean, ``D`` numbers, the last
-        of the reward, and ``"r2_mean"``; ``"within_1_sigma"`` and ``"within_2_sigma"``,
-        shares of errors (0.683 and 0.954 are calibrated); ``"disagreement_rank"``,
-        Spearman's correlation of disagreement and error; ``"rows"``; with pieces
-        ``"rollout"``.
-
-    Raises:
-        ValueError: no row has a next state.
+        targets, of all networks; ``"r2"`` of the elites' mean for each entry, the last
+        of the reward; ``"within_1_sigma"`` and ``"within_2_sigma"``, shares of errors
+        (0.683 and 0.954 are calibrated); ``"disagreement_rank"``, Spearman's
+        correlation of disagreement and error; ``"rollout"``.
     """
     rows = held_out[has_next_state(held_out, model.in_keys[0])]
     if not len(rows):
@@ -87,7 +83,7 @@ def rollout_errors(
         horizons: numbers of steps.
 
     Returns:
-        For each horizon up to ``L`` the ``"steps"``, the ``"rmse"`` in standard
+        The ``"steps"`` of each horizon up to ``L``, the ``"rmse"`` in standard
         deviations of each entry, and ``"standing_still"``, that of the first state.
     """
     key, action_key = model.in_keys

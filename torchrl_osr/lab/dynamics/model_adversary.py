@@ -33,11 +33,7 @@ SEED = 2**40
 
 
 def adversarial_objective(log_prob: Tensor, advantage: Tensor) -> Tensor:
-    r"""Return RAMBO's objective of a model against the policy, ``[B]``.
-
-    .. math::
-        \frac{A - \bar A}{\operatorname{std} A + 10^{-6}}\,
-        \log \frac1E \sum_{i=1}^{E} p_i(s', r \mid s, a)
+    r"""Return RAMBO's :math:`\bar A \log \frac1E \sum_i p_i(s', r \mid s, a)`, ``[B]``.
 
     https://arxiv.org/abs/2204.12581, equation (9), and its code (marc-rigter/rambo).
 

@@ -30,11 +30,7 @@ from torchrl_osr.lab.dynamics.rollouts import (
 
 
 class _Rows:
-    """Rows to sample from, with replacement.
-
-    TorchRL 0.14.1's ReplayBuffer and its storage refer to each other, so that every
-    generation would stay in memory until the garbage collector runs.
-    """
+    """Rows to sample from; TorchRL 0.14.1's ReplayBuffer is freed late, by a cycle."""
 
     def __init__(self, rows: TensorDictBase, rng: torch.Generator | None) -> None:
         self.rows, self.rng = rows, rng
@@ -69,11 +65,10 @@ class RolloutReplayBuffer(OfflineToOnlineReplayBuffer):
         adversary: trains the model before each further roll-out. Default: none.
 
     Keyword Args:
-        batch_size: rows of a batch.
+        batch_size, transform: of all rows.
         gamma: discount factor.
         n_steps: of the recorded rows; synthetic ones are single steps.
         seed: of the first roll-out; the next one has the next seed.
-        transform: of each batch.
     """
 
     def __init__(

@@ -94,22 +94,18 @@ class SwitchingPolicy:
     predictions and the policy :math:`\pi_n`; no reward and no value follow after an
     end. This is policy switching (Chang, Givan and Chong, "Parallel Rollout for Online
     Solution of Partially Observable Markov Decision Processes", 2004) with learned
-    dynamics and values. Without a model it is generalised policy improvement
-    (https://arxiv.org/abs/1606.05312) over policies.
-
-    A choice holds for several calls. Call :meth:`reset` at the start of an episode.
+    dynamics and values. Call :meth:`reset` at the start of an episode.
 
     Args:
         policies: each maps observations ``[n, S]`` to actions ``[n, A]``.
-        networks: of one or several models, in the policies' units. ``None``: the
-            values alone choose.
-        value: of observations ``[n, S]`` and actions ``[n, A]``, ``[n]``.
+        networks: of one or several models; ``None``: the values alone choose.
+        value: of observations and actions, ``[n]``.
 
     Keyword Args:
         terminated: of next observations. Default: never.
-        steps: ``T``. Default 20.
-        gamma: discount factor. Default 0.99.
-        hold: calls for which the chosen policy acts. Default 4.
+        steps: ``T``.
+        gamma: discount factor.
+        hold: calls for which the chosen policy acts.
 
     Attributes:
         chosen: number of the acting policy in each state, ``[B]``; ``None`` at first.

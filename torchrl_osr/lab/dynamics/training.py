@@ -50,23 +50,14 @@ FITTED = ("num_networks", "num_elites", "num_cells", "lr", "batch_size", "steps"
 
 @dataclass(frozen=True)
 class Phase:
-    """Settings that all training phases of a run share.
+    """Settings that all training phases of a run share."""
 
-    Attributes:
-        folder: of the run; each phase has its own checkpoints.
-        new_trainer: makes the trainer of a phase.
-        adam: makes an optimizer from parameters.
-        seed: of the run.
-        name: of the data, for a model's file in the cache.
-        arithmetic: other settings that decide what a trained model is.
-    """
-
-    folder: Path
+    folder: Path  # of the run
     new_trainer: Callable[..., OfflineTrainer]
-    adam: Callable[..., torch.optim.Optimizer]
+    adam: Callable[..., torch.optim.Optimizer]  # of parameters
     seed: int
-    name: str
-    arithmetic: Mapping[str, Any]
+    name: str  # of the data, for a model's file in the cache
+    arithmetic: Mapping[str, Any]  # other settings that decide what a trained model is
 
 
 def train_dynamics(
@@ -84,8 +75,7 @@ def train_dynamics(
     Args:
         options: of models and roll-outs.
         data: for models.
-        loss: of the policy.
-        actor: the policy.
+        loss, actor: of the policy.
         phase: trains a model.
 
     Keyword Args:
@@ -244,13 +234,8 @@ def write_dynamics(
     path: Path, model: DynamicsEnsemble, facts: Mapping[str, Any]
 ) -> None:
     """Write a model and :meth:`ModelData.facts` to one file of tensors."""
-    sizes = {
-        "observation_dim": model.observation_dim,
-        "action_dim": model.action_dim,
-        "num_networks": model.num_networks,
-        "num_elites": len(model.elites),
-        "num_cells": [each.weight.shape[-1] for each in model.linear_layers[:-1]],
-    }
+    names = "observation_dim", "action_dim", "num_networks", "num_elites", "num_cells"
+    sizes = {name: getattr(model, name) for name in names}
     write_tensors(path, model.state_dict(), {"sizes": sizes, "data": dict(facts)})
 
 
@@ -260,23 +245,21 @@ def load_dynamics(
     """Load a model that a run has trained; torch's global generator stays.
 
     Args:
-        path: of the file, ``dynamics.safetensors`` in the folder of a run.
+        path: of ``dynamics.safetensors`` in the folder of a run.
         facts: those of :meth:`ModelData.facts` that have to agree. Default: none.
-
-    Raises:
-        ValueError: it is no such file, or of a model of other data.
     """
     try:
         tensors, record = read_tensors(Path(path))
         with torch.random.fork_rng(devices=[]):
             model = DynamicsEnsemble(**record["sizes"])
         model.load_state_dict(tensors)
+        there = record["data"]
     except (KeyError, TypeError, RuntimeError, ValueError) as error:
         raise ValueError(
             f"{path} holds no dynamics model: {error}. Take {FILE} from the folder of "
             "a run."
         ) from error
-    wanted, there = json.loads(json.dumps(facts or {})), record["data"]
+    wanted = json.loads(json.dumps(facts or {}))
     others = [name for name, value in wanted.items() if there.get(name) != value]
     if others:
         raise ValueError(
