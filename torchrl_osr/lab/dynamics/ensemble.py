@@ -146,7 +146,7 @@ class DynamicsEnsemble(nn.Module):
         return mean + scale * torch.randn_like(mean)
 
     def disagreement(self, mean: Tensor) -> Tensor:
-        r"""Return :math:`\max_i \lVert \mu_i - \bar\mu \rVert_2` of the elites, ``[B]``.
+        r"""Return the elites' :math:`\max_i \lVert \mu_i - \bar\mu \rVert_2`, ``[B]``.
 
         In standard deviations of the targets. MOReL (https://arxiv.org/abs/2005.05951)
         takes the largest distance of two networks.
@@ -166,7 +166,7 @@ class DynamicsEnsemble(nn.Module):
 
     @torch.no_grad()
     def standardize_(self, data: TensorDictBase) -> None:
-        """Take means and standard deviations of inputs and targets from rows ``[N]``."""
+        """Take mean and standard deviation of inputs and targets from rows ``[N]``."""
         rows = data[has_next_state(data, self.in_keys[0])]
         names = ("input", "target")
         for name, values in zip(names, self.inputs_and_targets(rows), strict=True):
