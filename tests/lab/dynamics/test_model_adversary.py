@@ -119,31 +119,6 @@ def test_objective_and_gradients_equal_the_restatement(
     assert not any(each.grad is not None for each in adversary.loss.parameters())
 
 
-def test_a_model_learns_to_lead_to_worse_states(make_networks, make_batch) -> None:
-    """Its values fall with the weight, and hardly without."""
-    states, found = make_batch(50, twin=False)["observation"], {}
-    for weight in (0.0, 3.0):
-        networks = make_networks()
-        adversary = make_adversary(
-            networks,
-            make_batch,
-            adversarial_weight=weight,
-            adversarial_steps=20,
-            batch_size=16,
-        )
-        adversary(1)
-        with torch.no_grad():
-            action = networks.actor(make_batch(50, twin=False))["action"]
-            mean, _ = adversary.model.predict(states, action)
-            change, reward = mean[adversary.model.elites].mean(0).split([3, 1], -1)
-            after = states + change
-            following = make_batch(50, twin=False).set("observation", after)
-            action = networks.actor(following)["action"]
-            value = adversary.value(after, action)
-            found[weight] = (reward.squeeze(-1) + GAMMA * value).mean().item()
-    assert found[3.0] < found[0.0] - 0.3
-
-
 def test_equal_numbers_draw_equally_and_a_state_is_continued(
     make_networks, make_batch
 ) -> None:

@@ -54,33 +54,6 @@ def test_returns_are_discounted_rewards_and_the_value_of_the_last_state() -> Non
     assert switching.chosen.tolist() == [1]
 
 
-def over(state: Tensor) -> Tensor:
-    return (state[:, 0].abs() > 9) | (state[:, 1].abs() > 2)
-
-
-def falls(policy, state: Tensor) -> Tensor:
-    fallen = torch.zeros(len(state), dtype=torch.bool)
-    for _ in range(12):
-        position, velocity = state.split(1, -1)
-        state = torch.cat([position + velocity, velocity + policy(state)], -1)
-        fallen |= over(state)
-    return fallen
-
-
-def test_policies_survive_together_where_each_alone_falls() -> None:
-    states = torch.tensor([[8.0, 0.0], [-8.0, 0.0], [0.0, 2.0], [3.0, -2.0]])
-
-    def centred(state: Tensor, action: Tensor) -> Tensor:
-        return 10 - (state[:, 0] + 2 * state[:, 1]).abs()
-
-    assert falls(left, states).all()
-    assert falls(right, states).all()
-    networks = EliteNetworks(cart(0.0))
-    policies, options = [left, right], {"terminated": over, "steps": 1, "hold": 1}
-    switching = SwitchingPolicy(policies, networks, centred, **options)
-    assert not falls(switching, states).any()
-
-
 def test_a_choice_holds_until_it_is_reset_or_the_number_of_states_changes() -> None:
     calls = []
 
