@@ -15,6 +15,7 @@ from torchrl_osr.lab.dynamics import DynamicsOptions
         ({"unknown": "halt", "reverse_policy": "cvae"}, "need a forward model"),
         ({"perturbed_start_steps": 3, "reverse_policy": "cvae"}, "need a forward"),
         ({"unknown": "halt"}, "needs optim.gamma below 1"),
+        ({"unknown": "halts"}, "dynamics.unknown must be one of"),
         ({"adversarial_steps": 9, "batch_size": 1}, "batch_size must be at least 2"),
     ],
 )

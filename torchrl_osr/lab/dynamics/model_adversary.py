@@ -32,19 +32,6 @@ SEED = 2**40
 """Added to a seed, so that roll-outs with the same one draw other numbers."""
 
 
-def adversarial_objective(log_prob: Tensor, advantage: Tensor) -> Tensor:
-    r"""Return RAMBO's :math:`\bar A \log \frac1E \sum_i p_i(s', r \mid s, a)`, ``[B]``.
-
-    https://arxiv.org/abs/2204.12581, equation (9), and its code (marc-rigter/rambo).
-
-    Args:
-        log_prob: of a sampled transition by each network, ``[E, B]``.
-        advantage: :math:`A` of the transition, without gradient, ``[B]``.
-    """
-    standardized = (advantage - advantage.mean()) / (advantage.std() + 1e-6)
-    return standardized * (log_prob.logsumexp(0) - math.log(len(log_prob)))
-
-
 class ModelAdversary:
     r"""Train a model to predict the data, and to be bad for the policy elsewhere.
 
@@ -57,7 +44,8 @@ class ModelAdversary:
     The first term is :class:`~torchrl_osr.lab.dynamics.DynamicsLoss` on the data. The
     second is a policy gradient with the model as the policy, on roll-outs of the actor:
     transitions to worse states than expected become more likely. Roll-outs go on after
-    an end of the task, as in the code of RAMBO (https://arxiv.org/abs/2204.12581).
+    an end of the task, as in RAMBO's code (https://arxiv.org/abs/2204.12581,
+    marc-rigter/rambo).
 
     Args:
         options: of the training; ``adversarial_weight`` is :math:`\lambda`.
@@ -134,13 +122,16 @@ class ModelAdversary:
             following, reward = state + sample[..., :-1], sample[..., -1]
             goes_on = ~self.terminated(following)
             after = self._action(following, InteractionType.DETERMINISTIC)
-            value = self.value(following, after)
+            value = self._value(following, after)
             advantage = reward + self.gamma * goes_on * value
-            advantage = advantage - self.value(state, action)
+            advantage = advantage - self._value(state, action)
         mean, scale = (each[model.elites] for each in prediction)
         density = Normal(mean, scale)
         log_prob = density.log_prob(sample).sum(-1)  # type: ignore[no-untyped-call]
-        return adversarial_objective(log_prob, advantage), following
+        log_density = log_prob.logsumexp(0) - math.log(len(log_prob))
+        # Equation (9), standardised as in the code.
+        standardized = (advantage - advantage.mean()) / (advantage.std() + 1e-6)
+        return standardized * log_density, following
 
     def _action(self, state: Tensor, kind: InteractionType) -> Tensor:
         batch = TensorDict({self.model.in_keys[0]: state}, state.shape[:-1])
@@ -148,8 +139,7 @@ class ModelAdversary:
             action: Tensor = self.actor(batch)[self.model.in_keys[1]]
         return action
 
-    def value(self, state: Tensor, action: Tensor) -> Tensor:
-        """Return the smallest value of the critics, ``[B]``."""
+    def _value(self, state: Tensor, action: Tensor) -> Tensor:
         batch = TensorDict({self.model.in_keys[0]: state}, state.shape[:-1])
         params = self.loss.qvalue_network_params
         return qvalue(self.loss, batch, action, params).amin(0)

@@ -7,9 +7,16 @@ from typing import Any
 
 from torch import Tensor
 
+from torchrl_osr._checks import check_choice
 from torchrl_osr.lab.dynamics.conditional_vae import ConditionalVAE
 from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
 from torchrl_osr.lab.dynamics.rollouts import Termination, never, termination
+
+CHOICES = {
+    "terminations": ("auto", "never"),
+    "unknown": ("refuse", "halt", "take"),
+    "reverse_policy": (None, "cvae", "uniform"),
+}
 
 
 @dataclass
@@ -94,6 +101,8 @@ class DynamicsOptions:
     def check(self, env_id: str, *, batch_size: int, gamma: float) -> None:
         """Raise a ValueError if the options contradict each other or the task."""
         self.ensemble(1, 1)
+        for name, known in CHOICES.items():
+            check_choice(f"dynamics.{name}", getattr(self, name), known)
         if self.real_ratio == 1:
             return
         self.termination(env_id)
