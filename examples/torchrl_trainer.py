@@ -29,7 +29,7 @@ from torchrl_osr.lab.data import (
     observation_statistics,
     reference_returns,
 )
-from torchrl_osr.lab.data.collect.environment import environment_id
+from torchrl_osr.lab.data.environment import environment_id
 from torchrl_osr.lab.evaluation import EpisodeEvaluator, deterministic_policy, summarize
 from torchrl_osr.trainers import ReplayBufferCollector
 
@@ -40,7 +40,7 @@ OmegaConf.register_new_resolver("frames", lambda steps, rows: steps * rows)
 def load_buffer(cfg: DictConfig) -> tuple[ReplayBuffer, ObservationNorm]:
     """The data, standardised, in a buffer that adds perturbed states."""
     data, _ = load_dataset(
-        cfg.env, cfg.quality, num_transitions=cfg.num_transitions, progress=False
+        cfg.env, cfg.data, num_transitions=cfg.num_transitions, progress=False
     )
     keys = ["observation", ("next", "observation")]
     norm = ObservationNorm(

@@ -32,15 +32,18 @@ from torchrl.objectives import SACLoss, SoftUpdate
 from tqdm.auto import tqdm
 
 from torchrl_osr.lab.data import (
-    REFERENCE_RETURNS,
-    BehaviorPolicy,
     collect_transitions,
     make_environment,
-    normalized_score,
+    reference_returns,
+)
+from torchrl_osr.lab.data.behavior import (
+    LOG_STD_MAX,
+    LOG_STD_MIN,
+    Affine,
+    BehaviorPolicy,
     save_behavior_policy,
     update_behavior_card,
 )
-from torchrl_osr.lab.data.collect.behavior import LOG_STD_MAX, LOG_STD_MIN, Affine
 
 WIDTH = 256
 FRAMES = 32  # environment steps between equally many gradient steps
@@ -212,8 +215,8 @@ def main(arguments: list[str] | None = None) -> None:
         save_behavior_policy(file, kept.actor, half=half)
         # Fresh episodes: those that a snapshot was chosen by flatter it.
         entry = measure(env, kept.actor, args.card_steps, args.seed + 1)
-        if args.name in REFERENCE_RETURNS:
-            score = normalized_score(args.name, entry["stochastic_return"][0])
+        if references := reference_returns(args.name):
+            score = references.score(entry["stochastic_return"][0])
             entry["normalized"] = score
         entry |= {"steps": kept.step, "dtype": "float16" if half else "float32"}
         entries[name] = entry

@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from torchrl_osr._files import check_disk_space
-from torchrl_osr.lab.data import load_local_dataset, make_replay_buffer
-from torchrl_osr.lab.data.collect import local
+from torchrl_osr.lab.data import load_dataset, make_replay_buffer, sources
 from torchrl_osr.modules import tanh_gaussian_inverse_dynamics
 from torchrl_osr.objectives import InverseDynamicsLoss
 from torchrl_osr.trainers import OfflineTrainer
@@ -92,9 +91,9 @@ def test_training_does_not_begin_without_room(tmp_path, make_batch, free):
 
 def test_collection_does_not_begin_without_room(tmp_path, free, monkeypatch):
     asked = free(1000)
-    monkeypatch.setattr(local, "collect_quality", pytest.fail)
+    monkeypatch.setattr(sources, "collect_source", pytest.fail)
     # Hopper: twice 11 numbers, 3 and the reward, and three flags.
     match = "107.0 kB are needed for the data set.*TORCHRL_OSR_CACHE=/path"
     with pytest.raises(OSError, match=match):
-        load_local_dataset("hopper", "random", num_transitions=1000, cache_dir=tmp_path)
+        load_dataset("hopper", "random", num_transitions=1000, cache_dir=tmp_path)
     assert asked

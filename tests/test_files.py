@@ -12,12 +12,10 @@ import zipfile
 from pathlib import Path
 
 import numpy as np
-import pyarrow
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays, scalar_dtypes
-from pyarrow import parquet
 
 from torchrl_osr._files import (
     check_unpacked_size,
@@ -26,7 +24,7 @@ from torchrl_osr._files import (
     read_text,
     refuse_archive,
 )
-from torchrl_osr.lab.data import load_behavior_policy, load_dataset, load_file
+from torchrl_osr.lab.data import load_behavior_policy, load_dataset
 
 TEN_GIGABYTES = 10 * 10**9
 
@@ -109,7 +107,7 @@ def test_announced_sizes_are_looked_at_before_anything_is_read(tmp_path, monkeyp
     (tmp_path / "log.npz").write_bytes(content)
     monkeypatch.setattr(zipfile.ZipFile, "open", None)
     with pytest.raises(ValueError, match=r"would unpack to 12,884,901,882"):
-        load_file(tmp_path / "log.npz")
+        load_dataset(path=tmp_path / "log.npz")
 
 
 def test_a_file_may_be_as_large_as_it_is(tmp_path):
@@ -131,7 +129,7 @@ def test_an_array_that_announces_more_rows_than_it_has(tmp_path):
     with zipfile.ZipFile(tmp_path / "log.npz", "w") as archive:
         archive.writestr("reward.npy", header.getvalue() + b"1234")
     with pytest.raises(ValueError, match="no NumPy archive of plain arrays"):
-        load_file(tmp_path / "log.npz")
+        load_dataset(path=tmp_path / "log.npz")
 
 
 def policy_with(folder: Path, **arrays) -> Path:
@@ -147,7 +145,7 @@ def test_objects_are_not_unpickled(tmp_path):
     objects = np.array([Marker(marker)] * 3, dtype=object)
     np.savez(tmp_path / "log.npz", reward=objects)
     with pytest.raises(ValueError, match="no NumPy archive of plain arrays"):
-        load_file(tmp_path / "log.npz")
+        load_dataset(path=tmp_path / "log.npz")
     folder = policy_with(tmp_path / "policies", **{"hidden0.weight": objects})
     with pytest.raises(ValueError, match=r"medium\.npz is no NumPy archive"):
         load_behavior_policy("mine", "medium", folder=folder)
@@ -173,17 +171,6 @@ def test_a_manifest_of_a_gigabyte_is_not_read(tmp_path, monkeypatch):
     path.write_text("[" * 100_000)
     with pytest.raises(ValueError, match=r"manifest\.json is no JSON"):
         read_json(path)
-
-
-def test_a_parquet_file_that_announces_too_much(tmp_path, monkeypatch):
-    path = tmp_path / "log.parquet"
-    # A million equal numbers have a few kB; a billion would take this test too long.
-    names = ("observation", "action", "reward", "terminated", "episode")
-    parquet.write_table(pyarrow.table(dict.fromkeys(names, np.zeros(10**6))), path)
-    assert path.stat().st_size < 50_000
-    monkeypatch.setattr("torchrl_osr._files.MAX_UNPACKED_BYTES", 10**6)
-    with pytest.raises(ValueError, match=r"log\.parquet would unpack to 40,000,000"):
-        load_file(path)
 
 
 def test_no_loading_touches_the_network(tmp_path, monkeypatch):

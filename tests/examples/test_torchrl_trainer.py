@@ -151,7 +151,7 @@ def test_the_example_trains_on_real_data(tmp_path, run) -> None:
     code, printed = run(
         tmp_path,
         "torchrl_trainer.py",
-        *("quality=random", "num_transitions=500", "steps=6", "batch_size=16"),
+        *("data=random", "num_transitions=500", "steps=6", "batch_size=16"),
         *("inverse_dynamics_steps=4", "episodes=1", "trainer.progress_bar=false"),
         *("loss.recovery_weight=0.75", f"hydra.run.dir={tmp_path}"),
     )

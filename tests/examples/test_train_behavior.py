@@ -7,10 +7,10 @@ import pytest
 
 from torchrl_osr.lab.data import (
     collect_transitions,
-    load_behavior_card,
     load_behavior_policy,
     make_environment,
 )
+from torchrl_osr.lab.data.behavior import load_behavior_card
 
 
 @pytest.fixture(scope="module")

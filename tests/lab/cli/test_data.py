@@ -14,9 +14,13 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from torchrl_osr.lab.cli import data
-from torchrl_osr.lab.data import load_file, make_environment, write_memmap
-from torchrl_osr.lab.data.collect.record import record_episodes
-from torchrl_osr.lab.data.read.table import USUAL_NAMES
+from torchrl_osr.lab.data import (
+    make_environment,
+    transitions_from_columns,
+    write_memmap,
+)
+from torchrl_osr.lab.data.record import record_episodes
+from torchrl_osr.lab.data.table import USUAL_NAMES
 
 
 @pytest.fixture
@@ -63,8 +67,8 @@ def test_a_picture_that_cannot_be_written_loses_no_table(look, capsys):
 
 def test_discrete_actions_of_a_converted_set_are_drawn(look, tmp_path):
     with closing(make_environment("CartPole-v1")) as env:
-        np.savez("log.npz", **record_episodes(env, None, 3, progress=False))
-    data, manifest = load_file("log.npz", num_actions=2)
+        log = record_episodes(env, None, 3, progress=False)
+    data, manifest = transitions_from_columns(log, num_actions=2)
     write_memmap([data], "set", describe=lambda: manifest, progress=False)
     output, error = look("data.path=set", "env.id=CartPole-v1")
     assert error is None, error
@@ -106,11 +110,11 @@ def test_what_looks_wrong_is_numbered(look):
         (
             {},
             ["data.columns.action=force"],
-            "there is no column 'force', named for act",
+            "action=force names no column",
         ),
         ({"sin": "left"}, [], "'sin' holds 'left' in row 0 of 1200; expected numbers"),
         ({"torque": 5.0}, [], "'action' leaves its bounds in 1200 of 1200 rows"),
-        ({"speed": np.nan}, [], "'observation' holds nan in row 0 of 1200"),
+        ({"speed": np.nan}, [], "'observation' has no value in row 0 of 1200"),
         ({}, ["data.path=other.csv"], "there is no file"),
         ({}, ["data.path=null"], "data=file needs data.path="),
     ],

@@ -14,7 +14,7 @@ from composed import composed
 from minari.data_collector import EpisodeBuffer
 
 from torchrl_osr.lab.cli import evaluate
-from torchrl_osr.lab.data import load_minari, make_environment
+from torchrl_osr.lab.data import load_dataset, make_environment
 
 # Minari asks for an author's address, and more, whenever a set is made.
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:minari")
@@ -93,7 +93,7 @@ def test_recorded_ants_are_trained_on(train, tmp_path):
         episodes = [[step[0] for step in steps] for steps in play_ants(env)]
     observations = np.concatenate([np.stack(rows[:-1]) for rows in episodes])
     record_ants()
-    data, manifest = load_minari(ANTS)
+    data, manifest = load_dataset(source="minari", path=ANTS)
     expected = observations.astype(np.float32)
     assert np.array_equal(data["observation"], expected), "one order of the entries"
     assert manifest["observation_layout"] == [

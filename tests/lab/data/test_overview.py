@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from torchrl_osr.lab.cli.data import overview
-from torchrl_osr.lab.data import load_file, transitions_from_rows
+from torchrl_osr.lab.data import transitions_from_columns
 from torchrl_osr.lab.data.overview import describe_entries, findings, out_of_space
 from torchrl_osr.lab.evaluation.figures import data_figure
 
@@ -29,7 +29,7 @@ def make_log(rows=1200, **changes):
 
 
 def said(columns, **options):
-    data, manifest = transitions_from_rows(columns, **options)
+    data, manifest = transitions_from_columns(columns, **options)
     return [*findings(data, manifest, describe_entries([columns], {}))]
 
 
@@ -52,7 +52,7 @@ ROWS = np.arange(1200)
         ),
         (
             make_log(observation=make_log()["observation"] * [1, 0] + [0, 5]),
-            r"observation\[1\] is 5 in every row: leave it out",
+            r"observation\[1\] is 5 in every row: it says nothing",
         ),
         (
             make_log(observation=make_log()["observation"] * [1, 1e-4]),
@@ -65,7 +65,7 @@ ROWS = np.arange(1200)
         (make_log(action=0.1 * make_log()["action"]), r"uses 9% of the way to its bou"),
         (
             make_log(terminated=make_log()["truncated"], truncated=ROWS < 0),
-            "all 30 episodes are terminated after 40 steps: that looks like a time lim",
+            "all 30 episodes are terminated after 40 steps, like at a time limit",
         ),
         (
             make_log(truncated=None, episode=ROWS // 40),
@@ -117,8 +117,7 @@ def test_observations_outside_of_the_tasks_space_are_said():
 
 def test_discrete_actions_are_not_measured_by_bounds(tmp_path):
     columns = make_log(action=np.arange(1200) % 2)
-    np.savez(tmp_path / "log.npz", **columns)
-    data, manifest = load_file(tmp_path / "log.npz", num_actions=2)
+    data, manifest = transitions_from_columns(columns, num_actions=2)
     assert [*findings(data, manifest, describe_entries([columns], {}))] == []
     assert "actions   discrete, 2; shares of the rows: 51.3% 0, 48.7% 1" in overview(
         data, manifest, ["action"]
@@ -126,3 +125,33 @@ def test_discrete_actions_are_not_measured_by_bounds(tmp_path):
     names = {"observation": ["x", "y"], "action": ["action"]}
     data_figure(data, manifest, names, tmp_path / "log.png", title="log")
     assert (tmp_path / "log.png").stat().st_size > 10_000
+
+
+def machine(shift=0, rows=3000):
+    """A point that is pushed; its actions are recorded so many rows late."""
+    rng = np.random.default_rng(0)
+    forces, state, states = rng.uniform(-0.9, 0.9, rows), np.zeros(2), []
+    for row in range(rows):
+        if row % 100 == 0:
+            state = rng.uniform(-10, 10, 2) * [1, 0]
+        states.append(state)
+        change = [0.1 * state[1], 0.3 * forces[row] - 0.1 * state[1]]
+        state = np.add(state, change)
+    return {
+        "observation": np.array(states),
+        "action": np.roll(forces, shift)[:, None],
+        "reward": rng.normal(size=rows),
+        "terminated": np.zeros(rows),
+        "truncated": np.arange(rows) % 100 == 99,
+    }
+
+
+def test_actions_of_another_row_are_found():
+    assert said(machine()) == []
+    assert any("the row after explains" in each for each in said(machine(1)))
+    assert any("the row before explains" in each for each in said(machine(-1)))
+
+
+def test_flags_that_are_a_row_late_are_found():
+    late = machine() | {"truncated": np.arange(3000) % 100 == 0}
+    assert any("the state jumps" in each for each in said(late))

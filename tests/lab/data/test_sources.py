@@ -1,138 +1,228 @@
-"""What a configuration names is what is loaded."""
+"""The one door: rolled-out sets and their cache, recorded sets and their options."""
 
 from __future__ import annotations
 
+import json
 import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
-from recorded_logs import columns_of, save, save_d4rl
+from recorded_logs import columns_of, make_columns, save, save_d4rl
 
 from torchrl_osr.lab.data import (
-    RECORDED,
-    export_minari,
-    is_memory_mapped,
     load_dataset,
-    load_file,
-    load_local_dataset,
-    normalized_score,
+    sources,
+    transitions_from_columns,
     write_memmap,
 )
-from torchrl_osr.lab.data.read import recording
-
-MIXTURE = {"random_share": 0.0, "num_transitions": 500, "seed": 0}
-
+from torchrl_osr.lab.data.scores import REFERENCE_RETURNS
+from torchrl_osr.lab.data.store import is_memory_mapped
 
 pytestmark = pytest.mark.usefixtures("cache")
 
 
+def roll_out(source="random", **options):
+    options = {"num_transitions": 300, "progress": False} | options
+    return load_dataset("hopper", source, **options)
+
+
 @pytest.fixture
-def hopper():
-    return load_local_dataset("hopper", "medium", num_transitions=500)
+def collections(monkeypatch) -> list[str]:
+    """Record each real collection."""
+    calls: list[str] = []
+    original = sources.collect_source
+
+    def recorded(env_name, source, *args, **kwargs):
+        calls.append(source)
+        return original(env_name, source, *args, **kwargs)
+
+    monkeypatch.setattr(sources, "collect_source", recorded)
+    return calls
 
 
-def test_qualities_are_rolled_out(hopper):
-    data, manifest = load_dataset("hopper", "medium", env_id="Hopper-v5", **MIXTURE)
-    assert (data == hopper[0]).all()
-    assert manifest == hopper[1]
+def test_a_set_is_collected_once(collections):
+    first, manifest = roll_out()
+    second, again = roll_out()
+    mapped, also = roll_out(on_disk=True)
+    assert collections == ["random"]
+    assert (first == second).all()
+    assert (first == mapped).all()
+    assert manifest == again == also
+    assert is_memory_mapped(mapped)
+    assert not is_memory_mapped(second)
 
 
-def write_recording(quality, folder, data):
-    """Write data as a source of that kind; return its path."""
-    if quality == "minari":
-        export_minari(data, "mine/hopper-v0")
-        return "mine/hopper-v0"
-    if quality == "d4rl":
-        return str(save_d4rl(folder / "hopper.hdf5", columns_of(data)))
-    return str(save(folder / "hopper.npz", columns_of(data)))
+def test_other_versions_make_the_set_anew(collections, monkeypatch):
+    first, _ = roll_out()
+    with monkeypatch.context() as patch:
+        patch.setattr(sources, "version", lambda package: "1.0")
+        second, manifest = roll_out()
+    assert manifest["versions"]["numpy"] == "1.0"
+    assert len(collections) == 2
+    assert (first == second).all()
+    roll_out()
+    assert len(collections) == 3
 
 
-@pytest.mark.parametrize("quality", RECORDED)
-def test_recorded_data_are_read(hopper, quality, tmp_path):
-    path = write_recording(quality, tmp_path, hopper[0])
-    data, manifest = load_dataset(
-        "hopper", quality, path=path, env_id="Hopper-v5", **MIXTURE
-    )
-    assert (data == hopper[0]).all()
-    assert manifest["quality"] == quality
-    score = normalized_score("hopper", manifest["return"]["mean"])
-    assert manifest["normalized_score"] == score
-    _, other = load_dataset("another", quality, path=path)
-    assert other["normalized_score"] is None
-    assert other["return"] == manifest["return"]
-    with pytest.raises(ValueError, match=r"11 observation and 3 .*Walker2d-v5 has 17"):
-        load_dataset("walker2d", quality, path=path, env_id="Walker2d-v5")
+def test_manifest_describes_the_set(cache):
+    _, manifest = roll_out(seed=3)
+    folder = cache / "collected" / "hopper-random-300-seed3"
+    assert manifest == json.loads((folder / "manifest.json").read_text())
+    returns = np.array(manifest["episode_returns"])
+    assert manifest["env_id"] == "Hopper-v5"
+    assert (manifest["source"], manifest["seed"]) == ("random", 3)
+    assert manifest["num_complete_episodes"] == len(returns) > 3
+    assert manifest["return"]["mean"] == pytest.approx(returns.mean())
+    # (mean - random) / (expert - random), the constants of D4RL.
+    expected = 100 * (returns.mean() + 20.272305) / (3234.3 + 20.272305)
+    assert manifest["normalized_score"] == pytest.approx(expected)
+    assert set(manifest["versions"]) == {"numpy", "gymnasium", "mujoco"}
 
 
-def test_a_set_without_a_complete_episode_has_no_score(tmp_path):
-    data, _ = load_local_dataset("hopper", "expert", num_transitions=100)
-    columns = columns_of(data) | {"truncated": np.zeros(100)}
-    del columns["next_observation"]
-    save(tmp_path / "part.npz", columns)
-    _, manifest = load_dataset("hopper", "file", path=str(tmp_path / "part.npz"))
-    assert manifest["normalized_score"] is None
-    assert manifest["dropped_rows"] == 1
-    assert load_file(tmp_path / "part.npz")[1]["return"] is None
+CHILD = """
+import sys
+import torch
+from torchrl_osr.lab.data import sources
+
+torch.set_num_threads(1)
+original = sources.collect_source
+
+def announced(*args, **kwargs):
+    print("collected", flush=True)
+    return original(*args, **kwargs)
+
+sources.collect_source = announced
+print("ready", flush=True)
+sys.stdin.readline()
+data, manifest = sources.load_dataset(
+    "hopper", "medium", num_transitions=5000, cache_dir=sys.argv[1], progress=False
+)
+print(manifest["rows_sha256"], data["observation"].double().sum().item(), flush=True)
+"""
 
 
-def test_settings_that_do_not_go_together_are_refused():
-    with pytest.raises(ValueError, match=r"data=minari needs data\.path="):
-        load_dataset("hopper", "minari")
-    with pytest.raises(ValueError, match=r"data\.path=x has no use with data=medium"):
-        load_dataset("hopper", "medium", path="x", **MIXTURE)
-    with pytest.raises(ValueError, match=r"random_share=0\.5 .*it must be 0"):
-        load_dataset("hopper", "file", path="x.npz", random_share=0.5)
-    with pytest.raises(ValueError, match="unknown quality 'simple'"):
-        load_dataset("hopper", "simple", **MIXTURE)
-
-
-@pytest.mark.parametrize("share", [0.0, 0.5])
-def test_rolled_out_data_on_disk_are_those_in_memory(share):
-    recipe = MIXTURE | {"random_share": share}
-    data, manifest = load_dataset("hopper", "medium", **recipe)
-    stored, described = load_dataset("hopper", "medium", **recipe, on_disk=True)
-    assert is_memory_mapped(stored)
-    assert (stored == data).all()
-    assert described["normalized_score"] == manifest["normalized_score"]
-
-
-@pytest.mark.parametrize("quality", RECORDED)
-def test_recorded_data_on_disk_are_those_in_memory(
-    hopper, quality, tmp_path, monkeypatch
-):
-    monkeypatch.setattr(recording, "CHUNK_ROWS", 130)
-    path = write_recording(quality, tmp_path, hopper[0])
-    options = {"env_id": "Hopper-v5", "path": path}
-    data, manifest = load_dataset("hopper", quality, **options)
-    stored, described = load_dataset("hopper", quality, **options, on_disk=True)
-    assert is_memory_mapped(stored)
-    assert (stored == data).all()
-    assert manifest.items() <= described.items()
-    with pytest.raises(ValueError, match="has 11 observation and 3 action entries"):
-        load_dataset("walker2d", quality, path=path, env_id="Walker2d-v5", on_disk=True)
-
-
-def test_a_source_that_has_changed_is_converted_anew(hopper, cache, tmp_path):
-    path = tmp_path / "hopper.hdf5"
-    save_d4rl(path, columns_of(hopper[0]))
-    options = {"path": str(path), "on_disk": True}
-    for _ in range(2):
-        stored, _ = load_dataset("hopper", "d4rl", **options)
-        assert len(stored) == 500
-        assert len(list((cache / "recorded").glob("d4rl-*/"))) == 1
-    path.unlink()
-    save_d4rl(path, columns_of(hopper[0][:400]))
-    os.utime(path, ns=(0, 0))  # clocks may be coarse
-    stored, _ = load_dataset("hopper", "d4rl", **options)
-    assert len(stored) == 400
-
-
-def test_a_set_that_was_written_by_hand(hopper, tmp_path):
-    write_memmap([hopper[0]], tmp_path / "mine", progress=False)
-    for on_disk in (False, True):
-        data, manifest = load_dataset(
-            "hopper", "file", path=str(tmp_path / "mine"), on_disk=on_disk
+def test_two_processes_at_once_collect_once(tmp_path):
+    children = [
+        subprocess.Popen(
+            [sys.executable, "-c", CHILD, str(tmp_path)],
+            cwd=Path(__file__).parents[3],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
         )
+        for _ in range(2)
+    ]
+    for child in children:
+        assert child.stdout.readline() == "ready\n"
+    for child in children:
+        child.stdin.write("go\n")
+        child.stdin.flush()
+    outputs = [child.communicate(timeout=60)[0].splitlines() for child in children]
+    assert [child.returncode for child in children] == [0, 0]
+    assert sum(lines.count("collected") for lines in outputs) == 1
+    assert outputs[0][-1] == outputs[1][-1]
+
+
+@pytest.mark.parametrize("on_disk", [False, True])
+def test_a_mixture_has_exact_shares(on_disk):
+    request = {"num_transitions": 2000, "seed": 3}
+    valuable, random = (roll_out(name, **request)[0] for name in ("medium", "random"))
+    data, manifest = roll_out("medium", random_share=0.9, on_disk=on_disk, **request)
+    assert is_memory_mapped(data) == on_disk
+    assert manifest["rows"] == {"medium": 200, "random": 1800}
+    for rows, source in ((data[:200], valuable), (data[200:], random)):
+        known = {tuple(row.tolist()) for row in source["observation"]}
+        assert all(tuple(row.tolist()) in known for row in rows["observation"])
+    scores = {n: each["normalized_score"] for n, each in manifest["sources"].items()}
+    expected = 0.1 * scores["medium"] + 0.9 * scores["random"]
+    assert manifest["normalized_score"] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("source", ["d4rl", "file"])
+@pytest.mark.parametrize("on_disk", [False, True])
+def test_recorded_data_are_read(source, on_disk, tmp_path):
+    rows, _ = roll_out("medium")
+    write = save_d4rl if source == "d4rl" else save
+    path = str(write(tmp_path / "hopper.hdf5", columns_of(rows)))
+    options = {"path": path, "on_disk": on_disk, "progress": False}
+    data, manifest = load_dataset("hopper", source, env_id="Hopper-v5", **options)
+    assert (data == rows).all()
+    assert is_memory_mapped(data) == on_disk
+    score = REFERENCE_RETURNS["hopper"].score(manifest["return"]["mean"])
+    assert (manifest["source"], manifest["normalized_score"]) == (source, score)
+    _, other = load_dataset("another", source, **options)
+    assert other["normalized_score"] is None
+    with pytest.raises(ValueError, match=r"11 observation and 3 .*Walker2d-v5 has 17"):
+        load_dataset("walker2d", source, env_id="Walker2d-v5", **options)
+
+
+def test_a_changed_source_is_converted_anew(cache, tmp_path):
+    path = save(tmp_path / "log.hdf5", make_columns())
+    options = {"on_disk": True, "progress": False}
+    for _ in range(2):
+        assert len(load_dataset(path=path, **options)[0]) > 200
+        assert len(list((cache / "recorded").glob("file-*/"))) == 1
+    save(path, make_columns(100))
+    os.utime(path, ns=(0, 0))  # clocks may be coarse
+    assert len(load_dataset(path=path, **options)[0]) < 100
+
+
+def test_a_set_that_was_written_by_hand(tmp_path):
+    rows, _ = roll_out("medium")
+    write_memmap([rows], tmp_path / "mine", progress=False)
+    for on_disk in (False, True):
+        data, _ = load_dataset("hopper", path=str(tmp_path / "mine"), on_disk=on_disk)
         assert is_memory_mapped(data) == on_disk
-        assert (data == hopper[0]).all()
-        assert manifest["normalized_score"] is None
+        assert (data == rows).all()
+
+
+def test_bounds_come_from_the_environment_unless_given(tmp_path):
+    columns = make_columns()
+    columns["action"] = 2 * columns["action"][:, :1]
+    path = str(save(tmp_path / "log.npz", columns))
+    data, _ = load_dataset(path=path, env_id="Pendulum-v1")
+    expected, _ = transitions_from_columns(columns, action_bounds=(-2, 2))
+    assert (data == expected).all()
+    options = {"env_id": "Pendulum-v1", "action_bounds": [[-4.0], [4.0]]}
+    data, manifest = load_dataset(path=path, **options)
+    assert manifest["action_bounds"] == [[-4.0], [4.0]]
+    expected, _ = transitions_from_columns(columns, action_bounds=(-4, 4))
+    assert (data == expected).all()
+
+
+@pytest.mark.parametrize(
+    ("source", "options", "message"),
+    [
+        ("minari", {}, r"data=minari needs data\.path="),
+        ("medium", {"path": "x"}, r"data\.path=x has no effect with data=medium"),
+        ("medium", {"clip_actions": True}, r"clip_actions=True has no effect"),
+        ("medium", {"columns": {"observation": ["x"]}}, r"data\.columns=.* no effect"),
+        (
+            "file",
+            {"path": "x.npz", "random_share": 0.5},
+            r"share=0\.5 has no",
+        ),
+        ("file", {"path": "x.npz", "missing": "some"}, r"data.missing must be one of"),
+        (
+            "d4rl",
+            {"path": "x.h5", "columns": {"reward": "x"}},
+            r"\.reward=x has",
+        ),
+        ("minari", {"path": "x", "columns": {"action": "u"}}, r"columns\.action=u has"),
+        ("simple", {}, "unknown data='simple'; there are: random"),
+        ("random", {"random_share": 0.5}, "mixes random rows into data=random"),
+        ("medium", {"env_id": "Walker2d-v5"}, "leave out env.name=hopper"),
+        (
+            "medium",
+            {"env_id": "Pendulum-v1"},
+            "no built-in data of Pendulum-v1.*'torchrl-osr collect env.id=Pendulum-v1 "
+            "path=Pendulum-v1.npz'.*data=file data.path=Pendulum-v1.npz",
+        ),
+    ],
+)
+def test_useless_options_are_refused(source, options, message):
+    with pytest.raises(ValueError, match=message):
+        load_dataset("hopper", source, num_transitions=100, **options)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_osr.lab.data import consecutive_rows
+from torchrl_osr.lab.data.rows import consecutive_rows
 from torchrl_osr.lab.dynamics import DynamicsEnsemble
 from torchrl_osr.lab.dynamics.fit import (
     dynamics_report,

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrl_osr._files import sha256_of
 from torchrl_osr.lab.data import load_behavior_policy, make_environment
-from torchrl_osr.lab.data.collect.environment import environment_id
+from torchrl_osr.lab.data.environment import environment_id
 from torchrl_osr.lab.evaluation.recoverable import (
     GROUPS,
     HALVES,

@@ -56,7 +56,7 @@ def test_what_is_wrong_with_somebodys_run_is_named(tmp_path, key, value, reason)
     [
         "os.mkdir",
         "torchrl_osr._files.os.mkdir",
-        "torchrl_osr.lab.data.load_file",
+        "torchrl_osr.lab.data.load_dataset",
         "torchrl_osr.load_policy",  # it takes a path, and modules to be trusted
         "torchrl_osr",
         "mine.Loss",

@@ -12,13 +12,11 @@ from hydra.utils import get_class, instantiate
 from omegaconf import OmegaConf, ValidationError
 
 from torchrl_osr import InverseDynamicsLoss, OSRLoss, objectives
-from torchrl_osr.lab.data import (
-    MAZE_IDS,
-    MAZE_QUALITIES,
-    QUALITIES,
-    RECORDED,
-    load_behavior_card,
-)
+from torchrl_osr.lab.data.behavior import load_behavior_card
+from torchrl_osr.lab.data.environment import MAZE_IDS
+from torchrl_osr.lab.data.mazes import MAZE_SOURCES
+from torchrl_osr.lab.data.rollout import BEHAVIORS
+from torchrl_osr.lab.data.sources import RECORDED
 from torchrl_osr.lab.losses import Adversary
 from torchrl_osr.lab.run import schema as config
 from torchrl_osr.lab.run.run_config import read_run
@@ -67,7 +65,7 @@ def test_every_experiment_composes_and_sweeps_over_values_that_compose(name):
 
 
 def test_groups_name_what_the_package_has():
-    assert options("data") == sorted([*QUALITIES, *MAZE_QUALITIES, *RECORDED])
+    assert options("data") == sorted([*BEHAVIORS, *MAZE_SOURCES, *RECORDED])
     assert options("env") == sorted([*load_behavior_card(), *MAZE_IDS])
     for name, env_id in MAZE_IDS.items():
         env = train(f"env={name}").env

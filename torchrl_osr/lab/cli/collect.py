@@ -23,8 +23,8 @@ from omegaconf import DictConfig
 
 from torchrl_osr.lab.cli import CONF
 from torchrl_osr.lab.cli.console import single_job
-from torchrl_osr.lab.data.collect.environment import check_simulated, open_environment
-from torchrl_osr.lab.data.collect.record import (
+from torchrl_osr.lab.data.environment import check_simulated, open_environment
+from torchrl_osr.lab.data.record import (
     Act,
     check_log_path,
     record_episodes,

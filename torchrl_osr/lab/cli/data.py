@@ -22,12 +22,7 @@ from torchrl import torchrl_logger
 
 from torchrl_osr.lab.cli import CONF
 from torchrl_osr.lab.cli.console import single_job
-from torchrl_osr.lab.data import (
-    RECORDED,
-    environment_spec,
-    load_dataset,
-    make_environment,
-)
+from torchrl_osr.lab.data import environment_spec, load_dataset, make_environment
 from torchrl_osr.lab.data.overview import (
     PARTS,
     Entry,
@@ -36,9 +31,8 @@ from torchrl_osr.lab.data.overview import (
     findings,
     out_of_space,
 )
-from torchrl_osr.lab.data.sources import open_recorded
-from torchrl_osr.lab.data.store.cache import CHUNK_ROWS
-from torchrl_osr.lab.data.store.memmap import is_memmap_folder
+from torchrl_osr.lab.data.sources import RECORDED, open_recorded
+from torchrl_osr.lab.data.store import CHUNK_ROWS, is_memmap_folder
 from torchrl_osr.lab.evaluation.figures import data_figure
 from torchrl_osr.lab.run import schema
 from torchrl_osr.lab.run.limits import check_values
@@ -60,26 +54,27 @@ def main(cfg: DictConfig) -> None:
     env_id = chosen_environment(cfg)
     env_name = None if env_id is None else cfg.env.get("name")
     options: Any = OmegaConf.to_container(cfg.data)
-    read = ("columns", "action_bounds", "clip_actions", "download")
+    read = ("columns", "action_bounds", "clip_actions", "missing", "download")
     reading = {name: options[name] for name in read}
     recipe = {name: options[name] for name in ("num_transitions", "seed")}
-    quality, path = cfg.data.source, cfg.data.path
-    title = Path(path).name if path else f"{env_name or 'data'} {quality}"
+    source, path = cfg.data.source, options["path"]
+    files = [path] if isinstance(path, str) else path
+    title = Path(files[0]).name if path else f"{env_name or 'data'} {source}"
     entries: list[Entry] = []
     try:
-        if quality not in RECORDED and env_id is None:
-            raise ValueError(f"data={quality} needs its task, as in env=hopper.")
-        if quality in RECORDED and path and not is_memmap_folder(path):
+        if source not in RECORDED and env_id is None:
+            raise ValueError(f"data={source} needs its task, as in env=hopper.")
+        if source in RECORDED and path and not is_memmap_folder(files[0]):
             # As it was recorded; also of a log that is then refused.
             spec = None if env_id is None else environment_spec(env_id)
             log = open_recorded(
-                quality, path, spec=spec, progress=cfg.progress, **reading
+                source, path, spec=spec, progress=cfg.progress, **reading
             )
             names = log.about.get("columns", {})
-            entries = describe_entries(log.parts(CHUNK_ROWS), names)
+            entries = describe_entries(log.parts(None), names)
         data, manifest = load_dataset(
             str(env_name),
-            quality,
+            source,
             env_id=env_id,
             path=path,
             progress=cfg.progress,
@@ -154,6 +149,8 @@ def overview(
         actions = [str(number) for number in range(len(shares))]
     each = [f"{share:.1%} {name}" for name, share in zip(actions, shares, strict=True)]
     lines.append(f"  actions   {known}: {', '.join(each)}")
+    lines += [f"  note      {note}" for note in manifest.get("notes", ())]
+    lines += [f"  note      {note}" for note in manifest.get("notes", ())]
     if unused := manifest.get("unused_columns"):
         lines.append(f"  not read  {', '.join(unused)}")
     return "\n".join(lines)

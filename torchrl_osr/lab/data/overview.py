@@ -1,4 +1,4 @@
-"""What a recording looks like before anything is trained on it, and what looks wrong.
+"""Describe a recording before anything is trained on it, and find what looks wrong.
 
 Shapes: ``N`` rows, ``S`` observation, ``A`` action.
 """
@@ -9,18 +9,27 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict
+from torch import Tensor
 
-from torchrl_osr.lab.data.store.statistics import MIN_OBSERVATION_SCALE
-from torchrl_osr.lab.data.store.validation import ACTION_LIMIT
+from torchrl_osr.lab.data.rows import is_followed
+from torchrl_osr.lab.data.statistics import MIN_OBSERVATION_SCALE
+from torchrl_osr.lab.data.transitions import ACTION_LIMIT
 
 PARTS = ("observation", "action", "reward")
-"""What is described entry by entry."""
+"""Parts that are described entry by entry."""
 
 FEW_ROWS = 1000
 SOME = 0.1
 MOST = 0.5
+
+JUMP = 20
+"""A jump is so many times the change that nine in ten rows stay below."""
+
+MOST_ROWS = 20_000
+"""Rows that actions are compared on."""
 
 
 class Entry(NamedTuple):
@@ -50,42 +59,40 @@ def describe_entries(
     Args:
         rows: some rows at a time, ``observation`` ``[n, S]``, ``action`` ``[n, A]``
             and ``reward`` ``[n]``, as they were recorded.
-        columns: names of the file's columns, by part. A part without them has its
-            entries numbered.
+        columns: names of the file's columns, by part. Default names are numbered.
     """
-    first: dict[str, NDArray[np.float64]] = {}
     sums: dict[str, NDArray[np.float64]] = {}
-    ranges: dict[str, NDArray[np.float64]] = {}
+    first: dict[str, NDArray[np.float64]] = {}
     for some, part in ((some, part) for some in rows for part in PARTS):
-        if len(some[part]):
-            array = np.asarray(some[part], np.float64).reshape(len(some[part]), -1)
-            known = np.isfinite(array)
-            # From the first row on: sums of squares of large numbers lose digits.
-            start = first.setdefault(part, np.where(known[0], array[0], 0.0))
-            moved = np.where(known, array - start, 0.0)
-            found = [(~known).sum(0), known.sum(0), moved.sum(0), (moved**2).sum(0)]
-            sums[part] = sums.get(part, 0.0) + np.array(found)
-            options: dict[str, Any] = {"axis": 0, "where": known, "initial": np.inf}
-            outer = np.array([array.min(**options), (-array).min(**options)])
-            ranges[part] = np.minimum(ranges.get(part, np.inf), outer)
+        if not len(some[part]):
+            continue
+        array = np.asarray(some[part], np.float64).reshape(len(some[part]), -1)
+        known = np.isfinite(array)
+        # From the first row on: sums of squares of large numbers lose digits.
+        start = first.setdefault(part, np.where(known[0], array[0], 0.0))
+        moved = np.where(known, array - start, 0.0)
+        low = np.where(known, array, np.inf).min(0)
+        high = np.where(known, array, -np.inf).max(0)
+        found = [(~known).sum(0), known.sum(0), moved.sum(0), (moved**2).sum(0)]
+        before = sums.get(part, np.array([*np.zeros((4, len(low))), low, high]))
+        added = before[:4] + found
+        sums[part] = np.array(
+            [*added, np.minimum(before[4], low), np.maximum(before[5], high)]
+        )
     entries = []
-    for part, (missing, count, moved, squares) in sums.items():
-        mean = moved / np.maximum(count, 1)
-        variance = np.maximum(squares / np.maximum(count, 1) - mean**2, 0)
-        low, high = ranges[part][0], -ranges[part][1]
-        table = np.c_[missing, low, high, first[part] + mean, np.sqrt(variance)]
-        names = _names(part, len(table), columns.get(part, ()))
+    for part, (missing, count, moved, squares, low, high) in sums.items():
+        count = np.maximum(count, 1)
+        deviation = np.sqrt(np.maximum(squares / count - (moved / count) ** 2, 0))
+        table = np.c_[missing, low, high, first[part] + moved / count, deviation]
+        names = list(columns.get(part, ()))
+        if len(names) != len(table):
+            numbered = [f"{part}[{entry}]" for entry in range(len(table))]
+            names = [part] if part == "reward" else numbered
         entries += [
             Entry(name, part, int(row[0]), *row[1:])
             for name, row in zip(names, table.tolist(), strict=True)
         ]
     return entries
-
-
-def _names(part: str, size: int, columns: Sequence[str]) -> Sequence[str]:
-    if len(columns) == size:
-        return columns
-    return [part] if part == "reward" else [f"{part}[{entry}]" for entry in range(size)]
 
 
 def findings(
@@ -98,23 +105,24 @@ def findings(
     yield from _about_entries([e for e in entries if e.part != "reward" or not falls])
     if manifest.get("num_actions") is None:
         yield from _about_actions(data, [e.name for e in entries if e.part == "action"])
-    yield from _about_episodes(data, manifest)
+    if len(data) < FEW_ROWS:
+        yield f"there are only {len(data)} rows: record more."
+    if "unmarked_ends" in manifest:
+        yield from _about_episodes(manifest)
     yield from _about_next_states(data, manifest)
+    yield from _about_order(data)
 
 
 def _about_entries(entries: Sequence[Entry]) -> Iterator[str]:
     for name, part, _, low, _, _, deviation in entries:
         if deviation == 0:
-            yield (
-                f"{name} is {low:g} in every row: "
-                + {
-                    "observation": "leave it out (data.columns.observation=[...]).",
-                    "action": "nothing can be learnt of what it does; leave it out "
-                    "(data.columns.action=[...]) unless the task needs it.",
-                    "reward": "all policies are equally good; name another column "
-                    "(data.columns.reward=...).",
-                }[part]
-            )
+            constant = {
+                "observation": "it says nothing about the state.",
+                "action": "nothing can be learnt about its effect.",
+                "reward": "all policies are equally good; name another column "
+                "(data.columns.reward=...).",
+            }
+            yield f"{name} is {low:g} in every row: {constant[part]}"
         elif part == "observation" and deviation < MIN_OBSERVATION_SCALE:
             yield (
                 f"{name} has a standard deviation of {deviation:.2g} and is divided by "
@@ -125,9 +133,8 @@ def _about_entries(entries: Sequence[Entry]) -> Iterator[str]:
 
 def _about_actions(data: TensorDict, names: Sequence[str]) -> Iterator[str]:
     largest = data["action"].abs().amax(0).tolist()
-    for name, most, bound in zip(
-        names, largest, actions_at_bounds(data).tolist(), strict=True
-    ):
+    at_bounds = actions_at_bounds(data).tolist()
+    for name, most, bound in zip(names, largest, at_bounds, strict=True):
         if bound > MOST:
             yield (
                 f"{name} is at one of its bounds in {bound:.0%} of the rows: unless "
@@ -137,21 +144,18 @@ def _about_actions(data: TensorDict, names: Sequence[str]) -> Iterator[str]:
         elif most < MOST:
             yield (
                 f"{name} uses {most:.0%} of the way to its bounds: if it was recorded "
-                "in another unit, say what the bounds are in that unit "
+                "in another unit, give the bounds in that unit "
                 "(data.action_bounds=[low,high])."
             )
 
 
-def actions_at_bounds(data: TensorDict) -> Any:
+def actions_at_bounds(data: TensorDict) -> Tensor:
     """Share of rows in which each action is at one of its bounds, ``[A]``."""
-    return (data["action"].abs() >= ACTION_LIMIT - 1e-6).double().mean(0)
+    at_bound: Tensor = data["action"].abs() >= ACTION_LIMIT - 1e-6
+    return at_bound.double().mean(0)
 
 
-def _about_episodes(data: TensorDict, manifest: Mapping[str, Any]) -> Iterator[str]:
-    if len(data) < FEW_ROWS:
-        yield f"there are only {len(data)} rows: record more."
-    if "unmarked_ends" not in manifest:
-        return
+def _about_episodes(manifest: Mapping[str, Any]) -> Iterator[str]:
     fell, cut, unmarked = (
         manifest[f"{kind}_ends"] for kind in ("terminated", "truncated", "unmarked")
     )
@@ -163,15 +167,15 @@ def _about_episodes(data: TensorDict, manifest: Mapping[str, Any]) -> Iterator[s
         )
     elif fell > 2 and not cut + unmarked and len(set(lengths)) == 1:
         yield (
-            f"all {fell} episodes are terminated after {lengths[0]} steps: that looks "
-            "like a time limit; name the column as truncated "
+            f"all {fell} episodes are terminated after {lengths[0]} steps, like at a "
+            "time limit: name the column as truncated "
             "(data.columns.truncated=... data.columns.terminated=false)."
         )
     elif unmarked > 1 and not fell + cut:
         yield (
             f"none of the {unmarked} episodes has a flag at its end, so that they "
-            "count as cut and have no return: if they are whole, name or add a column "
-            "that is 1 in their last rows (data.columns.truncated=...)."
+            "count as cut and have no return: if they are whole, add a column that is "
+            "1 in their last rows (data.columns.truncated=...)."
         )
 
 
@@ -190,22 +194,61 @@ def _about_next_states(data: TensorDict, manifest: Mapping[str, Any]) -> Iterato
             "state was recorded for the last of an episode: record it "
             "(data.columns.next_observation=...)."
         )
+    change = (after - before).abs()
+    usual = change[:: len(change) // MOST_ROWS + 1].quantile(0.9, dim=0)
+    large = (change > JUMP * usual) & (change > SOME * before.std(0)) & (usual > 0)
+    jumps = large.any(1).nonzero()[:, 0].tolist()
+    if jumps:
+        yield (
+            f"in {len(jumps):,} rows, such as {jumps[0]}, the state jumps by more than "
+            f"{JUMP} times its usual change: an episode may end there without a flag, "
+            "or flags may be a row late."
+        )
+
+
+def _about_order(data: TensorDict) -> Iterator[str]:
+    """Findings about rows that follow one another."""
+    followed = is_followed(data)
     inside = ~data["next", "done"][:-1, 0]
-    breaks = (
-        (before[1:] - after[:-1]).abs() > 1e-4 * before[1:].abs().clamp_min(1.0)
-    ).any(1)
-    if len(data) > 1 and (share := breaks[inside].double().mean().item()) > SOME:
+    share = 1 - followed[:-1][inside].double().mean().item() if inside.any() else 0
+    if share > SOME:
         yield (
             f"after {share:.0%} of the rows the next row does not begin where this one "
             "ended: that is fine for single transitions; else sort them "
             "(data.columns.step=...)."
         )
+    rows = (followed[:-1] & followed[1:]).nonzero()[:MOST_ROWS, 0] + 1
+    if len(rows) >= FEW_ROWS:
+        same, early, late = (_explained(data, rows, shift) for shift in (0, -1, 1))
+        shift, best = max((-1, early), (1, late), key=lambda each: each[1])
+        if best > 0.2 and same < best / 4:
+            where = "before" if shift < 0 else "after"
+            yield (
+                f"the action of the row {where} explains {best:.0%} of the change of "
+                f"the state, that of the row itself {same:.0%}: actions may be "
+                "recorded one row too late or too early."
+            )
+
+
+def _explained(data: TensorDict, rows: Tensor, shift: int) -> float:
+    """Share of the change of the state that actions explain linearly, given it."""
+    state = data["observation"][rows].double()
+    change = data["next", "observation"][rows].double() - state
+    known = torch.cat([torch.ones(len(rows), 1), state], 1).double()
+    both = torch.cat([known, data["action"][rows + shift].double()], 1)
+    left = [
+        (change - x @ torch.linalg.lstsq(x, change, driver="gelsd").solution)
+        .square()
+        .sum(0)
+        for x in (known, both)
+    ]
+    return float((1 - left[1] / left[0].clamp_min(1e-12)).max())
 
 
 def out_of_space(
     entries: Sequence[Entry], low: Sequence[float], high: Sequence[float]
 ) -> Iterator[str]:
-    """Yield which observations leave the range that their task's space has."""
+    """Yield which observations leave the range of their task's space."""
     observed = [entry for entry in entries if entry.part == "observation"]
     for entry, least, most in zip(observed, low, high, strict=True):
         slack = 1e-3 * max(1.0, abs(entry.low), abs(entry.high))

@@ -1,263 +1,365 @@
-"""One door for every data set that a configuration can name."""
+"""Load any supported data set: rolled out on this machine, or recorded."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 from tensordict import TensorDict
-from torch import Tensor
+from torchrl import torchrl_logger
 
-from torchrl_osr.lab.data.collect.behavior import load_behavior_card
-from torchrl_osr.lab.data.collect.environment import (
+from torchrl_osr import __version__
+from torchrl_osr._extras import needed_by
+from torchrl_osr._files import check_disk_space
+from torchrl_osr.lab.data.behavior import load_behavior_card
+from torchrl_osr.lab.data.environment import (
     MAZE_IDS,
     EnvironmentSpec,
+    environment_id,
     environment_name,
     environment_spec,
 )
-from torchrl_osr.lab.data.collect.local import load_local_dataset
-from torchrl_osr.lab.data.collect.reference_scores import (
-    REFERENCE_RETURNS,
-    ReferenceReturns,
+from torchrl_osr.lab.data.recording import Recording
+from torchrl_osr.lab.data.rollout import behavior_of, collect_source
+from torchrl_osr.lab.data.rows import mix_datasets
+from torchrl_osr.lab.data.scores import REFERENCE_RETURNS, ReferenceReturns
+from torchrl_osr.lab.data.statistics import describe_episodes
+from torchrl_osr.lab.data.store import (
+    CACHE_VARIABLE,
+    CHUNK_ROWS,
+    cache_root,
+    is_memmap_folder,
+    load_memmap,
+    load_or_write,
 )
-from torchrl_osr.lab.data.read.column_checks import ActionBounds
-from torchrl_osr.lab.data.read.recording import Recording
-from torchrl_osr.lab.data.store.cache import CHUNK_ROWS
-from torchrl_osr.lab.data.store.memmap import is_memmap_folder, load_memmap
+from torchrl_osr.lab.data.transitions import ActionBounds, Reading
+
+log = logging.getLogger(__name__)
 
 RECORDED = ("minari", "d4rl", "file")
-"""What ``quality`` may be besides the qualities that are rolled out: our readers."""
+"""Sources that are recorded; the others are rolled out."""
+
+# Raise it whenever the roll-outs change: older sets are then made anew.
+RECIPE_VERSION = 1
 
 
 def load_dataset(
-    env_name: str,
-    quality: str,
+    env_name: str | None = None,
+    source: str = "file",
     *,
     env_id: str | None = None,
     references: ReferenceReturns | None = None,
-    path: str | None = None,
+    path: str | Path | Sequence[str] | None = None,
     columns: Mapping[str, Any] | None = None,
     action_bounds: ActionBounds | None = None,
     clip_actions: bool = False,
+    missing: str = "error",
     download: bool = False,
-    progress: bool = True,
+    num_transitions: int = 200_000,
+    random_share: float = 0.0,
+    seed: int = 0,
+    cache_dir: Path | str | None = None,
     on_disk: bool = False,
-    **recipe: Any,
+    progress: bool = True,
 ) -> tuple[TensorDict, dict[str, Any]]:
-    """Load a rolled-out data set by its quality, or a recorded one by its path.
+    """Load a data set that is rolled out on this machine, or a recorded one.
+
+    A rolled-out set is collected at first use, about 10,000 transitions a second, and
+    read from the cache folder ever after. The same seed gives the same data on one
+    machine and one set of library versions: contact dynamics are chaotic.
 
     Args:
-        env_name: short name of the task.
-        quality: one of ``QUALITIES``, see
-            :func:`~torchrl_osr.lab.data.load_local_dataset`;
-            or ``"minari"``, ``"d4rl"`` or ``"file"``, see the loaders of that name.
+        env_name: short name of the task: ``"hopper"``, ``"walker2d"``,
+            ``"halfcheetah"``, ``"pointmaze-umaze"``, ``-medium`` or ``-large``; any, or
+            ``None``, for recorded data.
+        source: ``"random"``, ``"medium"``, ``"medium-replay"``, ``"medium-expert"`` or
+            ``"expert"``; of a maze ``"diverse"`` or ``"play"``; ``"minari"``,
+            ``"d4rl"`` or ``"file"``. Default: ``"file"``.
 
     Keyword Args:
         env_id: Gymnasium id of the task. The actions of a ``"file"`` are then in its
-            units, and data that do not fit it are refused at once, not at the first
-            evaluation. Default: actions within -1 and 1, not compared.
-        references: what recorded episodes are scored by. Default: D4RL's of the name,
-            if there are any.
-        path: of recorded data: what the reader takes; with ``"file"`` also a folder
-            that :func:`~torchrl_osr.lab.data.write_memmap` has written. They are used
-            whole.
-        columns: with ``"file"``, the names of the columns, see
-            :func:`~torchrl_osr.lab.data.load_file`; with ``"minari"``, ``observation``
-            alone: the entries of a dictionary. Default: the usual names.
-        action_bounds: what the recording has for the task's lowest and highest action.
-            Default: of ``"minari"`` its action space; otherwise the task's own bounds,
-            or -1 and 1 without ``env_id``.
-        clip_actions: see :func:`~torchrl_osr.lab.data.transitions_from_rows`.
-        download: let the reader fetch a set that it knows by name. Default: ``False``.
+            units, and data that do not fit it are refused. Default: actions within -1
+            and 1, not compared.
+        references: scale of the scores. Default: D4RL's of the name, if there are any.
+        path: of recorded data. ``"file"``: CSV, Parquet, HDF5 or NumPy archive, a list
+            or a pattern (``"logs/*.csv"``) of files that make one log, or a folder that
+            :func:`~torchrl_osr.lab.data.write_memmap` has written. ``"minari"`` and
+            ``"d4rl"``: a name, such as ``"mujoco/hopper/medium-v0"`` or
+            ``"hopper-medium-v2"``, or a path.
+        columns: of a ``"file"``, names of columns by their part: ``observation``,
+            ``action``, ``reward``, ``terminated``, ``truncated``, ``episode``,
+            ``next_observation``, as in
+            :func:`~torchrl_osr.lab.data.transitions_from_columns`, and ``step``, by
+            which the rows of an episode are sorted: numbers, or time stamps in ISO
+            format. Names may be patterns (``"obs_*"``), or lists, one name an entry.
+            ``terminated=False`` says that nothing ends the task. Of ``"minari"``,
+            ``observation`` alone: entries of a dictionary. Default: the usual names.
+        action_bounds: lowest and highest action of the recording. Default: of
+            ``"minari"`` its action space; otherwise the task's own bounds.
+        clip_actions, missing: see
+            :func:`~torchrl_osr.lab.data.transitions_from_columns`.
+        download: fetch a set that is known by its name. Default: ``False``.
+        num_transitions: exact number of rolled-out transitions. Default: 200,000.
+        random_share: share of the rolled-out rows that are random instead: limited
+            valuable data, section 5.3 of the paper. Default: 0.
+        seed: of the roll-outs, and of the choice of random rows. Default: 0.
+        cache_dir: cache folder of rolled-out data. Default: ``TORCHRL_OSR_CACHE``, else
+            the user's.
+        on_disk: leave the rows memory-mapped. Parquet and Minari are converted in
+            parts, other files from memory. Default: ``False``.
         progress: show a progress bar when on a terminal. Default: ``True``.
-        on_disk: leave the rows memory-mapped. At first use they are written into the
-            cache folder: recorded data in chunks, what is rolled out from memory.
-            Default: ``False``.
-        **recipe: ``random_share``, ``num_transitions`` and ``seed``, of data that are
-            rolled out; with recorded data the share must be 0.
 
     Returns:
         The transitions ``[N]`` and their manifest; ``"normalized_score"`` in it is
         ``None`` without reference returns or without a complete episode.
 
     Raises:
-        ValueError: an option is missing or has no use, a task of which there are no
-            data to roll out, or data that do not fit it.
+        ValueError: an option is missing or has no effect, a task or a source is
+            unknown, or the data do not fit the task.
+        FileNotFoundError: there is no such file or set, and ``download`` is false.
+
+    Examples:
+        >>> import tempfile, numpy as np
+        >>> from torchrl_osr.lab.data import load_dataset
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     np.savez(
+        ...         f"{folder}/log.npz",
+        ...         observation=np.random.rand(6, 3),
+        ...         action=np.random.uniform(-1, 1, (6, 2)),
+        ...         reward=np.ones(6),
+        ...         terminated=np.array([0, 0, 1, 0, 0, 0]),
+        ...         episode=np.array([0, 0, 0, 1, 1, 1]),
+        ...     )
+        ...     data, manifest = load_dataset(path=f"{folder}/log.npz")
+        >>> len(data), manifest["dropped_rows"]
+        (5, 1)
     """
-    given: dict[str, Any] = {
-        "columns": _named(columns),
+    columns = {part: name for part, name in (columns or {}).items() if name is not None}
+    reading: dict[str, Any] = {
+        "columns": columns,
         "action_bounds": action_bounds,
-        "path": path,
         "clip_actions": clip_actions,
+        "missing": missing,
         "download": download,
     }
-    if quality not in RECORDED:
-        if env_id is not None:
-            _check_rolled_out(env_name, env_id, quality)
-        for option, value in given.items():
-            if value:
-                raise ValueError(
-                    f"data.{option}={value} has no use with data={quality}, which is "
-                    f"rolled out; it goes with data={', '.join(RECORDED)}."
-                )
-        return load_local_dataset(
-            env_name, quality, progress=progress, on_disk=on_disk, **recipe
-        )
+    if source not in RECORDED:
+        _refuse(reading | {"path": path}, f"data={source}, which is rolled out")
+        _check_rolled_out(env_name, env_id, source)
+        recipe = {"num_transitions": num_transitions, "seed": seed}
+        root, name = cache_root(cache_dir), str(env_name)
+        return _rolled_out(root, name, source, recipe, random_share, on_disk, progress)
     if path is None:
-        raise ValueError(f"data={quality} needs data.path=..., the name or path of it.")
-    if recipe.get("random_share"):
-        raise ValueError(
-            f"data.random_share={recipe['random_share']} is for data that are rolled "
-            f"out; with data={quality} it must be 0."
-        )
+        raise ValueError(f"data={source} needs data.path=...")
+    _refuse({"random_share": random_share}, f"data={source}")
     spec = None if env_id is None else environment_spec(env_id)
-    if quality == "file" and is_memmap_folder(path):
-        _refuse_options(path, given)
+    if source == "file" and isinstance(path, (str, Path)) and is_memmap_folder(path):
+        _refuse(reading, f"{path}, which is converted")
         data, manifest = load_memmap(path)
         data = data if on_disk else data.clone()
     else:
-        recording = open_recorded(
-            quality,
-            path,
-            spec=spec,
-            columns=columns,
-            action_bounds=action_bounds,
-            clip_actions=clip_actions,
-            download=download,
-            progress=progress and not on_disk,
-        )
+        recording = open_recorded(source, path, spec=spec, progress=progress, **reading)
         data, manifest = recording.load(on_disk=on_disk, progress=progress)
-    if spec is not None and env_id is not None:
-        _check_fit(data, env_id, spec, path)
+    if spec is not None:
+        _check_fit(data, manifest, str(env_id), spec)
     mean = (manifest.get("return") or {}).get("mean")
-    references = references or REFERENCE_RETURNS.get(env_name)
+    references = references or REFERENCE_RETURNS.get(str(env_name))
     score = None if mean is None or references is None else references.score(mean)
-    return data, manifest | {
-        "env_name": env_name,
-        "quality": quality,
-        "normalized_score": score,
-    }
+    added = {"env_name": env_name, "source": source, "normalized_score": score}
+    return data, manifest | added
 
 
-def _check_rolled_out(env_name: str, env_id: str, quality: str) -> None:
-    known, name = [*load_behavior_card(), *MAZE_IDS], environment_name(env_id)
-    if name not in known:
-        raise ValueError(
-            f"there are no built-in data of {env_id}, only of {', '.join(known)}: "
-            f"record some with 'torchrl-osr collect env.id={env_id} path={name}.npz', "
-            f"then add data=file data.path={name}.npz."
-        )
-    if name != env_name:
-        raise ValueError(
-            f"data={quality} is rolled out for the task {name}: leave out "
-            f"env.name={env_name}, or bring data of your own with data=file."
-        )
+def _refuse(options: Mapping[str, Any], source: str) -> None:
+    """Raise if an option that has no effect with a source is not its default."""
+    for name, value in options.items():
+        if value and value != "error":
+            raise ValueError(f"data.{name}={value} has no effect with {source}.")
 
 
 def open_recorded(
-    quality: str,
-    path: str,
+    source: str,
+    path: str | Path | Sequence[str],
     *,
     spec: EnvironmentSpec | None = None,
     columns: Mapping[str, Any] | None = None,
     action_bounds: ActionBounds | None = None,
     clip_actions: bool = False,
+    missing: str = "error",
     download: bool = False,
     progress: bool = True,
 ) -> Recording:
-    """Open recorded data, none of whose rows is read yet; see :func:`load_dataset`."""
-    columns = _named(columns)
-    options: dict[str, Any] = {"clip_actions": clip_actions}
-    if spec is not None and spec.discrete and quality != "file":
-        raise ValueError(f"data={quality} has no discrete actions; data=file has.")
-    # Each reader needs a library of its own, and only the one that is asked for.
-    if quality == "minari":
-        from torchrl_osr.lab.data.read.minari import open_minari
+    """Open recorded data, no row of which is read yet; see :func:`load_dataset`."""
+    columns = {part: name for part, name in (columns or {}).items() if name is not None}
+    known = {"minari": {"observation"}, "d4rl": set(columns) and set()}
+    for part in columns.keys() - known.get(source, columns.keys()):
+        _refuse({f"columns.{part}": columns[part]}, f"data={source}")
+    number = spec.action_size if spec is not None and spec.discrete else None
+    if number is not None:
+        _refuse({"action_bounds": action_bounds}, "discrete actions")
+    elif spec is not None and action_bounds is None and source != "minari":
+        low, high = spec.action_low or [], spec.action_high or []
+        # Numbers where they are the same for all: they fit data of another size.
+        alike = len({*low}) == len({*high}) == 1
+        action_bounds = (low[0], high[0]) if alike else (low, high)
+    if action_bounds is None and source != "minari":
+        action_bounds = -1.0, 1.0
+    options = Reading(action_bounds, clip_actions, number, missing)
+    # Each reader needs a library of its own.
+    if source == "minari":
+        from torchrl_osr.lab.data.minari import open_minari
 
-        if others := columns.keys() - {"observation"}:
-            raise ValueError(
-                f"data.columns.{others.pop()} has no use with data=minari, which has "
-                "its own names; data.columns.observation=[...] takes some entries of a "
-                "dictionary."
-            )
-        return open_minari(
-            path,
-            download=download,
-            observation_keys=columns.get("observation"),
-            action_bounds=action_bounds,
-            progress=progress,
-            **options,
-        )
-    options |= _actions(spec, action_bounds)
-    if quality == "file":
-        from torchrl_osr.lab.data.read.files import open_file
+        entries = columns.get("observation")
+        return open_minari(path, options, entries, download=download, progress=progress)
+    if source == "d4rl":
+        from torchrl_osr.lab.data.d4rl import open_d4rl
 
-        return open_file(path, columns=columns, **options)
-    from torchrl_osr.lab.data.read.d4rl import open_d4rl
+        return open_d4rl(path, options, download=download, progress=progress)
+    from torchrl_osr.lab.data.table import open_log
 
-    if columns:
+    return open_log(path, columns, options)
+
+
+def _check_rolled_out(env_name: str | None, env_id: str | None, source: str) -> None:
+    name = env_name if env_id is None else environment_name(env_id)
+    known = [*load_behavior_card(), *MAZE_IDS]
+    if name not in known:
         raise ValueError(
-            "data.columns has no use with data=d4rl, which has D4RL's own names; "
-            "data=file reads HDF5 files with others."
+            f"there are no built-in data of {env_id or env_name}, only of "
+            f"{', '.join(known)}: record some with 'torchrl-osr collect "
+            f"env.id={env_id} path={name}.npz', then add data=file "
+            f"data.path={name}.npz."
         )
-    return open_d4rl(path, download=download, progress=progress, **options)
+    if name != env_name:
+        raise ValueError(
+            f"data={source} is rolled out for the task {name}: leave out "
+            f"env.name={env_name}, or bring data of your own with data=file."
+        )
 
 
-def _named(columns: Mapping[str, Any] | None) -> dict[str, Any]:
-    """What the user has named; ``None`` stands for the usual names."""
-    return {part: name for part, name in (columns or {}).items() if name is not None}
-
-
-def _refuse_options(path: str, given: Mapping[str, Any]) -> None:
-    for option in ("columns", "action_bounds"):
-        if given[option]:
-            raise ValueError(
-                f"data.{option} has no use with {path}, which write_memmap has "
-                "written: its columns are known and its actions lie between -1 and 1."
-            )
-
-
-def _actions(
-    spec: EnvironmentSpec | None, action_bounds: ActionBounds | None
-) -> dict[str, Any]:
-    """Options of a reader: bounds as given, else the task's own; -1 and 1 without."""
-    if spec is not None and spec.discrete:
-        if action_bounds:
-            raise ValueError("data.action_bounds has no use with discrete actions.")
-        return {"num_actions": spec.action_size}
-    if action_bounds or spec is None or spec.action_low is None:
-        return {"action_bounds": action_bounds or (-1.0, 1.0)}
-    low, high = set(spec.action_low), set(spec.action_high or [])
-    # As numbers where they are the same for all: data of another size are told as such.
-    if len(low) == len(high) == 1:
-        return {"action_bounds": (low.pop(), high.pop())}
-    return {"action_bounds": (spec.action_low, spec.action_high)}
-
-
-def _check_fit(data: TensorDict, env_id: str, spec: EnvironmentSpec, path: str) -> None:
+def _check_fit(
+    data: TensorDict, manifest: Mapping[str, Any], env_id: str, spec: EnvironmentSpec
+) -> None:
     """Raise unless the data have the task's observations and actions."""
     ours = [data[name].shape[-1] for name in ("observation", "action")]
-    if ours != [spec.observation_size, spec.action_size]:
+    parts = data["action"].split(CHUNK_ROWS)
+    hot = all(bool((p.sum(1) == 1).all() and (p * (1 - p) == 0).all()) for p in parts)
+    if ours != [spec.observation_size, spec.action_size] or spec.discrete > hot:
         cure = "choose the env that the data are of."
         if environment_name(env_id).startswith("antmaze"):
             cure += (
-                " Its observations hold the goal. D4RL's own files of the ant do not, "
-                "and are of a mirrored maze: data=minari, see docs/mazes.md."
+                " Its observations hold the goal; D4RL's own files of the ant do not, "
+                "and are of a mirrored maze: take data=minari, see docs/mazes.md."
             )
-        kind = f"from {spec.action_low} to {spec.action_high}"
+        kind = "discrete" if spec.discrete else "real"
         raise ValueError(
-            f"{path} has {ours[0]} observation and {ours[1]} action entries, {env_id} "
-            f"has {spec.observation_size} and {spec.action_size} "
-            f"({'one of them is chosen' if spec.discrete else kind}): {cure}"
+            f"the data have {ours[0]} observation and {ours[1]} action entries, "
+            f"{env_id} has {spec.observation_size} and {spec.action_size} ({kind}): "
+            f"{cure}"
         )
-    if spec.discrete and not all(map(_one_hot, data["action"].split(CHUNK_ROWS))):
-        raise ValueError(
-            f"{path} has actions that are real numbers, {env_id} has "
-            f"{spec.action_size} discrete ones: choose the env that the data are of."
-        )
+    if manifest.get("source") == "minari" and not spec.discrete:
+        bounds, task = manifest["action_bounds"], [spec.action_low, spec.action_high]
+        if not np.allclose(
+            [np.broadcast_to(b, ours[1]) for b in bounds], np.array(task)
+        ):
+            torchrl_logger.warning(
+                f"The actions of the Minari set have the bounds {bounds}, those of "
+                f"{env_id} {task}: actions are rescaled. If the environment clipped "
+                "them, give data.action_bounds=[low,high] and data.clip_actions=true."
+            )
 
 
-def _one_hot(action: Tensor) -> bool:
-    """Whether each row ``[A]`` is one 1 among zeros."""
-    ones = (action == 1).sum(-1)
-    return bool((ones == 1).all() and ((action != 0).sum(-1) == 1).all())
+def _rolled_out(
+    root: Path,
+    env_name: str,
+    source: str,
+    recipe: dict[str, int],
+    random_share: float,
+    on_disk: bool,
+    progress: bool,
+) -> tuple[TensorDict, dict[str, Any]]:
+    """Open a rolled-out set, with a share of random rows; collect it if need be."""
+    data, manifest = _collected(root, env_name, source, recipe, progress)
+    if not random_share:
+        return data if on_disk else data.clone(), manifest
+    if source == "random":
+        raise ValueError("data.random_share mixes random rows into data=random.")
+    other, random = _collected(root, env_name, "random", recipe, progress)
+    number = round(random_share * len(data))
+    rows = {source: len(data) - number, "random": number}
+    scores = [each["normalized_score"] for each in (manifest, random)]
+    score = None if None in scores else np.average(scores, weights=[*rows.values()])
+    mixture = {
+        "env_name": env_name,
+        "source": source,
+        **recipe,
+        "random_share": random_share,
+        "rows": rows,
+        "normalized_score": None if score is None else float(score),
+        "sources": {source: manifest, "random": random},
+    }
+
+    def mixed() -> TensorDict:
+        seed = recipe["seed"]
+        return mix_datasets(data, other, random_share=random_share, seed=seed)
+
+    if not on_disk:
+        return mixed(), mixture
+    folder = (
+        root / "collected" / f"{_name(env_name, source, recipe)}-random{random_share}"
+    )
+    return load_or_write(
+        folder, mixture, lambda: mixed().split(CHUNK_ROWS), progress=False
+    )
+
+
+def _collected(
+    root: Path, env_name: str, source: str, recipe: dict[str, int], progress: bool
+) -> tuple[TensorDict, dict[str, Any]]:
+    """Open one source's own set, memory-mapped; collect it first if need be."""
+    folder = root / "collected" / _name(env_name, source, recipe)
+    maze = env_name in MAZE_IDS
+    # Other versions of these give other data for the same seed.
+    packages = ["numpy", "gymnasium", "mujoco"] + ["gymnasium-robotics"] * maze
+    with needed_by("collecting data needs", "mazes" if maze else "train"):
+        versions = {package: version(package) for package in packages}
+    request = {
+        "recipe_version": RECIPE_VERSION,
+        "env_name": env_name,
+        "env_id": environment_id(env_name),
+        "source": source,
+        **recipe,
+        **behavior_of(env_name, source),
+        "versions": versions,
+    }
+    episodes: dict[str, Any] = {}
+
+    def collect() -> Iterator[TensorDict]:
+        rows = recipe["num_transitions"]
+        spec = environment_spec(request["env_id"])
+        size = 4 * (2 * spec.observation_size + spec.action_size + 1) + 3  # three flags
+        what = f"the data set ({CACHE_VARIABLE}=/path chooses the folder)"
+        check_disk_space(folder, rows * size, what)
+        log.info(f"rolls out {rows:,} transitions of {env_name} {source} to {folder}")
+        data, returns, lengths = collect_source(
+            env_name, source, rows, seed=recipe["seed"], progress=progress
+        )
+        episodes.update(describe_episodes(returns, lengths), normalized_score=None)
+        if len(returns):
+            mean = float(returns.mean())
+            episodes["normalized_score"] = REFERENCE_RETURNS[env_name].score(mean)
+        yield from data.split(CHUNK_ROWS)
+
+    return load_or_write(
+        folder,
+        request,
+        collect,
+        describe=lambda: {"torchrl_osr_version": __version__, **episodes},
+        progress=False,
+    )
+
+
+def _name(env_name: str, source: str, recipe: Mapping[str, int]) -> str:
+    return f"{env_name}-{source}-{recipe['num_transitions']}-seed{recipe['seed']}"

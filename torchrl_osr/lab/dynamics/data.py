@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, ReplayBuffer, Storage
 
-from torchrl_osr.lab.data.store.validation import DATASET_KEYS
+from torchrl_osr.lab.data.transitions import DATASET_KEYS
 from torchrl_osr.lab.dynamics.rollouts import reverse_transitions
 
 

@@ -13,8 +13,8 @@ from tensordict.nn import InteractionType, set_interaction_type
 from torch import Tensor, nn
 from torchrl.data import OfflineToOnlineReplayBuffer
 
-from torchrl_osr.lab.data.store.multi_step import take_multi_step
-from torchrl_osr.lab.data.store.validation import DATASET_KEYS
+from torchrl_osr.lab.data.rows import take_multi_step
+from torchrl_osr.lab.data.transitions import DATASET_KEYS
 from torchrl_osr.lab.dynamics.conditional_vae import ConditionalVAE
 from torchrl_osr.lab.dynamics.data import ModelData
 from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble

@@ -19,7 +19,7 @@ from torchrl.envs import ObservationNorm
 
 from torchrl_osr._checks import check_positive
 from torchrl_osr.lab.data import ReferenceReturns
-from torchrl_osr.lab.data.collect.environment import check_simulated, make_environment
+from torchrl_osr.lab.data.environment import check_simulated, make_environment
 from torchrl_osr.lab.evaluation.statistics import mean_interval, wilson_interval
 from torchrl_osr.objectives.distributions import ONE_HOT
 

@@ -12,7 +12,7 @@ from tensordict import TensorDict
 
 from torchrl_osr._extras import needed_by
 from torchrl_osr._files import whole_file
-from torchrl_osr.lab.data import sampled_observations
+from torchrl_osr.lab.data.statistics import sampled_observations
 from torchrl_osr.lab.evaluation.episodes import measure_of
 
 if TYPE_CHECKING:

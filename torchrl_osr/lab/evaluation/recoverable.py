@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from torchrl_osr._checks import check_choice
 from torchrl_osr._files import read_arrays
-from torchrl_osr.lab.data.collect.environment import MAZE_IDS, environment_id
+from torchrl_osr.lab.data.environment import MAZE_IDS, environment_id
 from torchrl_osr.lab.evaluation.episodes import EpisodeEvaluator, Policy
 
 GROUPS = ("easy", "contested", "recoverable")

@@ -21,7 +21,7 @@ from torchrl.trainers import LRSchedulerHook
 
 from torchrl_osr import StatePerturbation
 from torchrl_osr._files import write_json
-from torchrl_osr.lab.data.store.multi_step import take_multi_step
+from torchrl_osr.lab.data.rows import take_multi_step
 from torchrl_osr.lab.dynamics import ModelAdversary, RolloutReplayBuffer, training
 from torchrl_osr.lab.evaluation import (
     EpisodeEvaluator,

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
-from torchrl_osr.lab.data.collect.environment import environment_id
+from torchrl_osr.lab.data.environment import environment_id
 from torchrl_osr.lab.evaluation import Policy, deterministic_policy
 from torchrl_osr.lab.evaluation.recoverable import (
     GROUPS,

@@ -94,12 +94,13 @@ class DataConfig:
     Attributes:
         source: of the behaviour: random, medium, medium-replay, medium-expert or
             expert; diverse or play in a maze; minari, d4rl or file for recorded data.
-        path: recorded data to read, see docs/your_data.md.
+        path: recorded data to read, see docs/your_data.md; a list of files is one log.
         columns: what the columns of a file are called.
         action_bounds: lowest and highest action as the recording has them, two numbers
             or two lists; null for those of the environment, or of a Minari set.
         clip_actions: bring recorded actions that are outside of their bounds back to
             them, as many environments do, rather than refuse them.
+        missing: error, row or episode: what is left out where values are missing.
         download: fetch the set that path names.
         num_transitions: number of rows.
         seed: random seed of the roll-outs and of the held-out rows.
@@ -114,10 +115,11 @@ class DataConfig:
     """
 
     source: str = MISSING
-    path: str | None = None
+    path: Any = None
     columns: ColumnsConfig = field(default_factory=ColumnsConfig)
     action_bounds: Any = None
     clip_actions: bool = MISSING
+    missing: str = MISSING
     download: bool = MISSING
     num_transitions: int = MISSING
     seed: int = MISSING
@@ -422,7 +424,7 @@ def _config_type(annotation: Any) -> Any:
 
 
 def _environment_name(env_id: str) -> str:
-    from torchrl_osr.lab.data.collect.environment import (
+    from torchrl_osr.lab.data.environment import (
         environment_name,  # needs Gymnasium
     )
 

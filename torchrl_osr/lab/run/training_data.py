@@ -18,16 +18,15 @@ from torch import Tensor
 from torchrl.data import ReplayBuffer
 from torchrl.envs import Compose, ObservationNorm, RewardScaling
 
-from torchrl_osr.lab.data import (
+from torchrl_osr.lab.data import make_replay_buffer, observation_statistics
+from torchrl_osr.lab.data.rows import (
     check_order,
     consecutive_rows,
     held_out_rows,
-    make_replay_buffer,
+    multi_step,
     next_action,
-    observation_statistics,
     split_held_out,
 )
-from torchrl_osr.lab.data.store.multi_step import multi_step
 from torchrl_osr.lab.dynamics import ModelData
 from torchrl_osr.lab.run.build import check_storage, load_data, references_of
 

@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+from contextlib import closing
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_osr.lab.data import (
+    collect_transitions,
+    load_behavior_policy,
+    make_environment,
+)
+from torchrl_osr.lab.data.behavior import (
+    BehaviorPolicy,
+    load_behavior_card,
+    save_behavior_policy,
+    update_behavior_card,
+)
+
+CARD = load_behavior_card()
+ALL_POLICIES = [(env, name) for env in CARD for name in CARD[env]["policies"]]
+
+
+def torch_network(policy: BehaviorPolicy) -> torch.nn.Sequential:
+    """Restate the network with torch layers: outputs [mean, log_std]."""
+    head_size = 2 * policy.action_size
+    network = torch.nn.Sequential(
+        torch.nn.Linear(policy.observation_size, 256),
+        torch.nn.ReLU(),
+        torch.nn.Linear(256, 256),
+        torch.nn.ReLU(),
+        torch.nn.Linear(256, head_size),
+    )
+    heads = [
+        np.concatenate(parts) for parts in zip(policy.mean, policy.log_std, strict=True)
+    ]
+    layers = [policy.hidden0, policy.hidden1, heads]
+    for linear, (weight, bias) in zip(network[::2], layers, strict=True):
+        linear.weight.data = torch.from_numpy(weight)
+        linear.bias.data = torch.from_numpy(bias)
+    return network
+
+
+@pytest.mark.parametrize(("env_name", "policy_name"), ALL_POLICIES)
+def test_forward_pass_agrees_with_torch(env_name: str, policy_name: str) -> None:
+    policy = load_behavior_policy(env_name, policy_name)
+    with closing(make_environment(CARD[env_name]["env"])) as env:
+        data, *_ = collect_transitions(env, [policy.sample], 64, progress=False)
+    observation = data["observation"].numpy()
+    with torch.no_grad():
+        outputs = torch_network(policy)(data["observation"])
+    mean, log_std = outputs.chunk(2, dim=-1)
+    noise = np.random.default_rng(1).standard_normal(mean.shape, dtype=np.float32)
+    sampled = torch.tanh(mean + log_std.clamp(-20, 2).exp() * torch.from_numpy(noise))
+    np.testing.assert_allclose(
+        policy.deterministic(observation), mean.tanh().numpy(), rtol=0, atol=5e-6
+    )
+    np.testing.assert_allclose(
+        policy.sample(observation, np.random.default_rng(1)),
+        sampled.numpy(),
+        rtol=0,
+        atol=5e-6,
+    )
+
+
+def test_one_observation_is_a_batch_without_its_axis() -> None:
+    policy = load_behavior_policy("halfcheetah", "expert")
+    observation = np.random.default_rng(0).standard_normal(policy.observation_size)
+    single = policy.sample(observation, np.random.default_rng(1))
+    batched = policy.sample(observation[None], np.random.default_rng(1))
+    assert single.shape == (6,)
+    assert single.dtype == np.float32
+    np.testing.assert_allclose(single, batched[0], atol=1e-6)
+
+
+def test_unknown_names_list_what_exists() -> None:
+    with pytest.raises(ValueError, match=r"'ant'; there are policies for hopper"):
+        load_behavior_policy("ant", "medium")
+    with pytest.raises(ValueError, match=r"'simple'.*medium, expert, replay_1"):
+        load_behavior_policy("hopper", "simple")
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_saved_policy_loads_from_a_folder(tmp_path, half: bool) -> None:
+    policy = load_behavior_policy("hopper", "medium")
+    save_behavior_policy(tmp_path / "toy" / "medium.npz", policy, half=half)
+    update_behavior_card(tmp_path, "other", "Other-v0", {})
+    update_behavior_card(tmp_path, "toy", "Toy-v0", {"medium": {"steps": 1}})
+    assert list(load_behavior_card(tmp_path)) == ["other", "toy"]
+    loaded = load_behavior_policy("toy", "medium", folder=tmp_path)
+    for ours, theirs in zip(
+        (policy.hidden0, policy.log_std), (loaded.hidden0, loaded.log_std), strict=True
+    ):
+        np.testing.assert_allclose(ours.weight, theirs.weight, rtol=1e-3, atol=1e-4)
+    assert [path.name for path in (tmp_path / "toy").iterdir()] == ["medium.npz"]
+
+
+def test_file_without_an_array_is_named(tmp_path) -> None:
+    (tmp_path / "toy").mkdir()
+    np.savez(tmp_path / "toy" / "medium.npz", **{"hidden0.weight": np.ones((2, 2))})
+    update_behavior_card(tmp_path, "toy", "Toy-v0", {"medium": {}})
+    with pytest.raises(ValueError, match=r"has no array .hidden0\.bias"):
+        load_behavior_policy("toy", "medium", folder=tmp_path)

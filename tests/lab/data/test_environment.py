@@ -1,0 +1,191 @@
+"""Tasks of Gymnasium and of gymnasium-robotics, as everything else gets them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from contextlib import closing
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from torchrl_osr.lab.data import environment, environment_spec, make_environment
+from torchrl_osr.lab.data.environment import MAZE_IDS, environment_id
+
+PLANE = spaces.Box(-1, 1, (2,), np.float32)
+SPACES = {
+    "test/Endless-v0": (PLANE, spaces.Box(-np.inf, np.inf, (1,), np.float32)),
+    "test/Buttons-v0": (PLANE, spaces.MultiDiscrete([2, 2])),
+    "test/Shifted-v0": (PLANE, spaces.Discrete(3, start=-1)),
+    "test/Lazy-v0": (PLANE, spaces.Discrete(3)),
+    "test/Tuple-v0": (spaces.Tuple([PLANE, spaces.Discrete(3)]), PLANE),
+}
+
+
+class Bare(gymnasium.Env):
+    """Random observations for ever; the reward is the action."""
+
+    def __init__(self, observations, actions):
+        self.observation_space, self.action_space = observations, actions
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        return self.observation_space.sample(), float(action), False, False, {}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _bare_environments():
+    for env_id, (observations, actions) in SPACES.items():
+        kwargs = {"observations": observations, "actions": actions}
+        gymnasium.register(env_id, Bare, kwargs=kwargs)
+    yield
+    for env_id in SPACES:
+        del gymnasium.registry[env_id]
+
+
+WIDTHS = {"pointmaze": 8, "antmaze": 31}  # goal reached, goal wanted, point or ant
+
+
+@pytest.mark.parametrize("name", MAZE_IDS)
+def test_mazes_observe_a_vector_with_the_goal_in_front(name, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with closing(make_environment(environment_id(name))) as env:
+        observation, info = env.reset(seed=3)
+        bare = env.unwrapped
+        parts = bare.observation_space.spaces
+        assert list(parts) == ["achieved_goal", "desired_goal", "observation"]
+        assert observation.shape == (WIDTHS[name.split("-")[0]],)
+        assert np.array_equal(observation[2:4], bare.goal)
+        assert np.array_equal(observation[:2], bare.data.qpos[:2])
+        assert np.array_equal(observation[-2:], bare.data.qvel[-2:])
+        assert info["success"] is False
+        assert (env.action_space.low == -1).all()
+        assert (env.action_space.high == 1).all()
+    assert list(tmp_path.iterdir()) == [], "the model's file is not left"
+
+
+def test_an_episode_ends_at_the_goal_with_its_only_reward():
+    with closing(make_environment("PointMaze_UMaze-v3")) as env:
+        observation, _ = env.reset(seed=0, options={"reset_cell": np.array([1, 1])})
+        env.unwrapped.goal[:] = observation[:2] + np.array([0.6, 0])
+        rewards = []
+        for _ in range(100):
+            _, reward, terminated, truncated, info = env.step(np.float32([0.3, 0]))
+            rewards.append(float(reward))
+            assert info["success"] is bool(terminated) is bool(reward)
+            if terminated:
+                break
+    assert not truncated
+    assert rewards == [0.0] * (len(rewards) - 1) + [1.0]
+    assert len(rewards) > 1
+
+
+IN_A_FRESH_PROCESS = """
+import sys, warnings
+from torchrl_osr.lab.data import make_environment
+
+warnings.simplefilter("error")
+make_environment("Hopper-v5")
+assert "gymnasium_robotics" not in sys.modules
+sys.modules["gymnasium_robotics"] = None  # as if it were not installed
+make_environment("Walker2d-v5")
+try:
+    make_environment("PointMaze_UMaze-v3")
+except ImportError as error:
+    print(error)
+del sys.modules["gymnasium_robotics"]
+make_environment("AntMaze_UMaze-v4")
+assert "gymnasium_robotics" in sys.modules
+"""
+
+
+def test_robotics_is_imported_for_its_own_tasks_and_says_nothing():
+    completed = subprocess.run(
+        [sys.executable, "-c", IN_A_FRESH_PROCESS], capture_output=True, text=True
+    )
+    assert completed.returncode == 0, completed.stderr
+    assert completed.stderr == "", "neither notes nor warnings"
+    (line,) = completed.stdout.splitlines()
+    assert line.startswith("Gymnasium itself has no 'PointMaze_UMaze-v3'")
+    assert line.endswith("pip install torchrl-osr[mazes]")
+
+
+@pytest.mark.parametrize(
+    ("env_id", "error", "message"),
+    [
+        ("Hoper-v5", ValueError, r"env.id=Hoper-v5 is no environment.*Hopper"),
+        ("Hopper-v99", ValueError, "v99"),
+        ("nowhere/Arm-v0", ValueError, "Namespace nowhere"),
+        ("not_there:Arm-v0", ImportError, "'not_there' first.*No module named"),
+        ("FrozenLake-v1", ValueError, r"has observations Discrete\(16\)"),
+        ("Blackjack-v1", ValueError, "int64.*expected a vector of real numbers"),
+        ("test/Endless-v0", ValueError, "expected bounded real numbers"),
+        ("test/Buttons-v0", ValueError, r"has actions MultiDiscrete"),
+        ("test/Shifted-v0", ValueError, "or Discrete from 0"),
+    ],
+)
+def test_what_cannot_be_acted_in_is_refused_in_a_sentence(env_id, error, message):
+    with pytest.raises(error, match=message):
+        make_environment(env_id)
+
+
+def test_unknown_names_list_the_known_ones():
+    with pytest.raises(ValueError, match=r"'ant'.*hopper.*pointmaze-umaze"):
+        environment_id("ant")
+
+
+def test_other_action_bounds_are_rescaled():
+    with closing(make_environment("InvertedPendulum-v5")) as env:
+        assert (env.action_space.low, env.action_space.high) == (-1, 1)
+        assert env.unwrapped.action_space.high == 3
+        env.reset(seed=0)
+        env.step(np.float32([0.5]))
+        assert env.unwrapped.data.ctrl == pytest.approx([1.5])
+
+
+def test_discrete_actions_are_numbered_from_zero():
+    with closing(make_environment("CartPole-v1")) as env:
+        assert env.action_space == spaces.Discrete(2)
+
+
+def test_tuples_become_vectors():
+    with closing(make_environment("test/Tuple-v0")) as env:
+        observation, _ = env.reset(seed=0)
+        assert env.observation_space.contains(observation)
+        assert observation.shape == (5,)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "spec"),
+    [
+        ("Pendulum-v1", (3, 1, [-2.0], [2.0])),
+        ("InvertedPendulum-v5", (4, 1, [-3.0], [3.0])),
+        ("CartPole-v1", (4, 2, None, None)),
+    ],
+)
+def test_spec_is_in_the_environments_own_units(env_id, spec):
+    assert environment_spec(env_id) == (*spec, True)
+    assert environment_spec(env_id).discrete == (spec[2] is None)
+
+
+def test_an_episode_that_never_ends_is_not_waited_for(monkeypatch):
+    monkeypatch.setattr(environment, "MAX_EPISODE", 50)
+    with closing(make_environment("test/Lazy-v0")) as env:
+        for _ in range(2):  # it begins anew at each reset
+            env.reset(seed=0)
+            for _ in range(50):
+                env.step(np.int64(0))
+        with pytest.raises(RuntimeError, match="max_episode_steps"):
+            env.step(np.int64(0))
+
+
+def test_nothing_is_left_in_the_working_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    make_environment("HalfCheetah-v5").close()
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,244 @@
+"""Minari sets, read as Minari itself gives them."""
+
+from __future__ import annotations
+
+import json
+from contextlib import closing
+
+import gymnasium
+import minari
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from minari.data_collector import EpisodeBuffer
+from torchrl import torchrl_logger
+
+from torchrl_osr.lab.data import check_dataset, load_dataset, make_environment
+
+# Minari asks for an author's address, and more, whenever a set is made.
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:minari")
+
+FORMATS = ["hdf5", "arrow", "parquet"]
+LENGTHS = [5, 1, 12, 3, 2, 4, 1, 2, 3, 6, 2, 5]  # more than ten: 10 sorts before 2
+
+VECTOR = spaces.Box(-np.inf, np.inf, (3,))
+NESTED = spaces.Dict(
+    {
+        "observation": spaces.Box(-np.inf, np.inf, (2,)),
+        "desired_goal": spaces.Box(-10, 10, (2, 2), np.float32),
+        "achieved": spaces.Dict(
+            {"speed": spaces.Box(-1, 1, (), np.float32), "place": VECTOR}
+        ),
+    }
+)
+UNIT = spaces.Box(-1, 1, (2,))
+
+
+@pytest.fixture(autouse=True)
+def _home(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+
+
+def load(path, **options):
+    return load_dataset(None, "minari", path=path, progress=False, **options)
+
+
+def stacked(space, rows):
+    if isinstance(space, spaces.Dict):
+        return {key: stacked(space[key], [row[key] for row in rows]) for key in space}
+    return np.stack(rows)
+
+
+def make(name, observations=VECTOR, actions=UNIT, data_format="hdf5", **buffer):
+    observations.seed(0)
+    actions.seed(0)
+    buffers = []
+    for number, steps in enumerate(LENGTHS):
+        fell = number % 3 == 0
+        end = np.arange(steps) == steps - 1
+        columns = {
+            "observations": stacked(
+                observations, [observations.sample() for _ in range(steps + 1)]
+            ),
+            "actions": np.stack([actions.sample() for _ in range(steps)]),
+            "rewards": np.random.default_rng(number).normal(size=steps),
+            "terminations": end & fell,
+            "truncations": end & (not fell),
+        }
+        buffers.append(EpisodeBuffer(**(columns | buffer)))
+    return minari.create_dataset_from_buffers(
+        name,
+        buffers,
+        observation_space=observations,
+        action_space=actions,
+        data_format=data_format,
+    )
+
+
+@pytest.mark.parametrize("data_format", FORMATS)
+@pytest.mark.parametrize("space", [VECTOR, NESTED], ids=["vector", "dictionary"])
+def test_every_row_is_minaris_own(space, data_format):
+    made = make("test/set-v0", space, data_format=data_format)
+    data, manifest = load("test/set-v0")
+    check_dataset(data)
+    episodes = [*minari.load_dataset("test/set-v0").iterate_episodes()]
+    states = [flat(space, each.observations, len(each) + 1) for each in episodes]
+    columns = {
+        "observation": [each[:-1] for each in states],
+        ("next", "observation"): [each[1:] for each in states],
+        "action": [each.actions.clip(-0.999, 0.999) for each in episodes],
+        ("next", "reward"): [each.rewards[:, None] for each in episodes],
+        ("next", "terminated"): [each.terminations[:, None] for each in episodes],
+        ("next", "truncated"): [each.truncations[:, None] for each in episodes],
+    }
+    for key, parts in columns.items():
+        column = data[key].numpy()
+        assert np.array_equal(column, np.concatenate(parts).astype(column.dtype))
+    assert manifest["episode_lengths"] == LENGTHS
+    assert manifest["dropped_rows"] == 0
+    again, _ = load(made.storage.data_path.parent)
+    assert (again == data).all()
+
+
+def flat(space, observations, steps):
+    def at(node, step):
+        if isinstance(node, dict):
+            return {key: at(value, step) for key, value in node.items()}
+        return node[step]
+
+    return np.stack([spaces.flatten(space, at(observations, t)) for t in range(steps)])
+
+
+def test_entries_of_a_dictionary_can_be_chosen():
+    make("test/set-v0", NESTED)
+    everything, manifest = load("test/set-v0")
+    sizes = dict(map(tuple, manifest["observation_layout"]))
+    assert [*sizes.items()] == [
+        ("achieved/place", 3),
+        ("achieved/speed", 1),
+        ("desired_goal", 4),
+        ("observation", 2),
+    ]
+    parts = dict(
+        zip(sizes, everything["observation"].split([*sizes.values()], 1), strict=True)
+    )
+    keys = ["observation", "achieved/speed"]
+    data, _ = load("test/set-v0", columns={"observation": keys})
+    assert data["observation"].equal(torch.cat([parts[key] for key in keys], 1))
+    for wrong in (["achieved"], [], "observation"):
+        with pytest.raises(
+            ValueError, match=r"expected a list of some of achieved/place, "
+        ):
+            load("test/set-v0", columns={"observation": wrong})
+
+
+def test_the_action_space_is_mapped_to_the_unit_box():
+    made = make("test/set-v0", actions=spaces.Box(np.float32(-4), np.float32(0), (2,)))
+    data, manifest = load("test/set-v0")
+    raw = np.concatenate([e.actions for e in made.iterate_episodes()])
+    expected = ((raw.astype(float) + 4) / 4 * 2 - 1).clip(-0.999, 0.999)
+    assert np.array_equal(data["action"], expected.astype(np.float32))
+    assert manifest["action_bounds"] == [[-4, -4], [0, 0]]
+
+
+@pytest.mark.parametrize(
+    ("space", "message"),
+    [
+        ({"actions": spaces.MultiBinary(3)}, "expected a Box"),
+        (
+            {"observations": spaces.Box(0, 255, (4, 4), np.uint8)},
+            "expected real v",
+        ),
+        ({"actions": VECTOR}, r"action_bounds=.*-inf.*data.action_bounds"),
+    ],
+)
+def test_other_spaces_are_refused(space, message):
+    make("test/set-v0", **space)
+    with pytest.raises(ValueError, match=message):
+        load("test/set-v0")
+
+
+def test_nothing_is_fetched_unless_asked_for(monkeypatch):
+    asked = []
+
+    def fetch(name):
+        asked.append(name)
+        make(name)
+
+    monkeypatch.setattr(minari.storage.hosting, "download_dataset", fetch)
+    with pytest.raises(FileNotFoundError, match=r"'test/far-v0' is not .*download="):
+        load("test/far-v0")
+    assert asked == []
+    data, _ = load("test/far-v0", download=True)
+    load("test/far-v0", download=True)
+    assert (asked, len(data)) == (["test/far-v0"], sum(LENGTHS))
+
+
+def test_the_environment_of_the_metadata_is_not_made():
+    """Minari asks it for spaces that are missing; it can be any function."""
+    path = make("test/crafted-v0").storage.data_path / "metadata.json"
+    content = json.loads(path.read_text())
+    del content["action_space"]
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"metadata\.json names no spaces"):
+        load("test/crafted-v0")
+
+
+def test_a_set_with_fewer_steps_than_announced_is_refused():
+    path = make("test/set-v0").storage.data_path / "metadata.json"
+    content = json.loads(path.read_text()) | {"total_steps": sum(LENGTHS) + 1}
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match="holds 46 steps where its metadata say 47"):
+        load("test/set-v0")
+
+
+def test_discrete_actions_become_one_hot():
+    made = make("test/set-v0", actions=spaces.Discrete(3, start=1))
+    data, manifest = load("test/set-v0")
+    numbers = np.concatenate([each.actions for each in made.iterate_episodes()]) - 1
+    assert np.array_equal(data["action"], np.eye(3)[numbers])
+    assert manifest["num_actions"] == 3
+
+
+class Pair(gymnasium.Env):
+    """Observes a dictionary whose keys are not in alphabetical order."""
+
+    observation_space = spaces.Dict(
+        speed=spaces.Box(-9, 9, (2,)), angle=spaces.Tuple([spaces.Box(-9, 9, (1,))])
+    )
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return {"speed": np.float32([1, 2]), "angle": (np.float32([3]),)}, {}
+
+    def step(self, action):
+        return self.reset()[0], 0.0, False, False, {}
+
+
+def test_environment_and_data_have_one_order_of_entries():
+    space = spaces.Dict(
+        [("speed", spaces.Box(-9, 9, (2,))), ("angle", spaces.Box(-9, 9, (1,)))]
+    )
+    made = make("test/set-v0", space)
+    data, manifest = load("test/set-v0")
+    episode = next(iter(made.iterate_episodes()))
+    assert (
+        data["observation"][0, 1:].tolist() == episode.observations["speed"][0].tolist()
+    )
+    assert manifest["observation_layout"] == [["angle", 1], ["speed", 2]]
+    gymnasium.register("Pair-v0", Pair, max_episode_steps=5)
+    with closing(make_environment("Pair-v0")) as env:
+        assert env.reset(seed=0)[0].tolist() == [3, 1, 2]
+        assert env.observation_space.shape == (3,)
+    del gymnasium.registry["Pair-v0"]
+
+
+def test_other_action_bounds_than_the_tasks_are_a_warning(monkeypatch):
+    said = []
+    monkeypatch.setattr(torchrl_logger, "warning", said.append)
+    for high in (2, 4):
+        make(f"test/{high}-v0", actions=spaces.Box(-high, high, (1,), np.float32))
+        load(f"test/{high}-v0", env_id="Pendulum-v1")
+        assert len(said) == (high == 4)

@@ -1,0 +1,201 @@
+"""A log that is recorded here is read back as what was played."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import closing
+
+import gymnasium
+import numpy as np
+import pytest
+from recorded_logs import columns_of
+
+from torchrl_osr.lab.data import (
+    load_dataset,
+    transitions_from_columns,
+    write_memmap,
+)
+from torchrl_osr.lab.data.environment import open_environment
+from torchrl_osr.lab.data.record import check_log_path, record_episodes, write_log
+
+
+def record(env_id, act=None, episodes=2, **options):
+    with closing(open_environment(env_id)) as env:
+        return record_episodes(env, act, episodes, progress=False, **options)
+
+
+def forwards(observation):
+    return [1.5]
+
+
+def test_columns_are_what_the_environment_was_given_and_gave():
+    columns = record("Pendulum-v1", forwards)
+    with closing(open_environment("Pendulum-v1")) as env:
+        observation, _ = env.reset(seed=1)  # of the second episode
+        for row in range(200, 400):
+            following, reward, *ends, _ = env.step(np.float32([1.5]))
+            assert (columns["observation"][row] == observation).all()
+            assert (columns["next_observation"][row] == following).all()
+            assert columns["reward"][row] == np.float32(reward)
+            assert [columns["terminated"][row], columns["truncated"][row]] == ends
+            observation = following
+    assert (columns["action"] == 1.5).all()
+    assert columns["episode"].tolist() == [0] * 200 + [1] * 200
+
+
+@pytest.mark.parametrize("suffix", ["npz", "hdf5", "parquet"])
+def test_what_is_written_is_read_in_the_units_of_the_losses(suffix, tmp_path):
+    columns, path = record("Pendulum-v1"), tmp_path / "new" / f"log.{suffix}"
+    write_log(path, columns)
+    data, manifest = load_dataset(
+        "Pendulum-v1", "file", env_id="Pendulum-v1", path=str(path)
+    )
+    assert np.abs(columns["action"]).max() > 1
+    np.testing.assert_allclose(
+        data["action"], (columns["action"] / 2).clip(-0.999, 0.999), atol=1e-7
+    )
+    np.testing.assert_array_equal(data["observation"], columns["observation"])
+    assert (manifest["num_complete_episodes"], manifest["dropped_rows"]) == (2, 0)
+    assert manifest["normalized_score"] is None
+    assert list(path.parent.iterdir()) == [path], "nothing is left beside it"
+    with pytest.raises(FileExistsError, match="is not replaced"):
+        write_log(path, columns)
+
+
+def test_discrete_actions_are_numbers_in_the_log_and_one_hot_in_the_data(tmp_path):
+    columns, path = record("CartPole-v1"), tmp_path / "log.npz"
+    assert columns["action"].dtype.kind == "i"
+    assert set(columns["action"]) == {0, 1}
+    write_log(path, columns)
+    options = {"env_id": "CartPole-v1", "path": str(path)}
+    data, _ = load_dataset("CartPole-v1", "file", **options)
+    np.testing.assert_array_equal(data["action"], np.eye(2)[columns["action"]])
+    write_memmap([data], tmp_path / "set", progress=False)
+    again, _ = load_dataset(
+        "CartPole-v1", "file", env_id="CartPole-v1", path=str(tmp_path / "set")
+    )
+    assert (again == data).all()
+    data["action"] *= 0.5
+    write_memmap([data], tmp_path / "set", progress=False)
+    with pytest.raises(ValueError, match="discrete"):
+        load_dataset("x", "file", env_id="CartPole-v1", path=str(tmp_path / "set"))
+
+
+@pytest.mark.parametrize("suffix", ["parquet", "h5"])
+def test_a_missing_package_is_named_before_an_episode(tmp_path, monkeypatch, suffix):
+    for name in ("pyarrow", "h5py"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(ImportError, match=rf"\.{suffix} files need .*\[minari\]"):
+        check_log_path(tmp_path / f"log.{suffix}")
+    check_log_path(tmp_path / "log.npz")
+
+
+@pytest.mark.parametrize("wrong", [2, -1, 0.5])
+def test_a_number_of_no_action_is_named_with_its_row(wrong):
+    columns = record("CartPole-v1")
+    columns["action"] = columns["action"].astype(np.float64)
+    columns["action"][3] = wrong
+    with pytest.raises(ValueError, match=f"{float(wrong)} in row 3 .*actions, 0 to 1"):
+        transitions_from_columns(columns, num_actions=2)
+
+
+def test_noise_stays_within_the_bounds_and_zero_is_none():
+    clean = record("Pendulum-v1", forwards, noise=0.0)
+    noisy = record("Pendulum-v1", forwards, noise=0.25)["action"]
+    assert (clean["action"] == 1.5).all()
+    assert noisy.max() == 2, "clipped at the bound"
+    inside = noisy[noisy < 2]
+    assert len(inside) < len(noisy)
+    # 0.25 half-widths of 2: a Gaussian about 1.5, cut off one deviation above. Half of
+    # it is below 1.5, and by the error function 0.1587 at the bound; 400 draws.
+    assert np.mean(noisy < 1.5) == pytest.approx(0.5, abs=0.1)
+    assert np.mean(noisy == 2) == pytest.approx(0.1587, abs=0.08)
+    again = record("Pendulum-v1", forwards, noise=0.25)["action"]
+    np.testing.assert_array_equal(noisy, again)
+
+
+def test_noise_on_discrete_actions_is_their_random_share():
+    actions = record("CartPole-v1", lambda _: 1, episodes=60, noise=0.5)["action"]
+    # Half of the actions are drawn, and half of these are 0.
+    assert np.mean(actions == 0) == pytest.approx(0.25, abs=0.08)
+    assert set(record("CartPole-v1", lambda _: 1)["action"]) == {1}
+
+
+@pytest.mark.parametrize(
+    ("env_id", "act", "options", "message"),
+    [
+        ("Pendulum-v1", lambda _: [2.5], {}, r"action \[2.5\] .* is not in"),
+        (
+            "Pendulum-v1",
+            lambda _: [0.0, 0.0],
+            {},
+            r"of shape \(2,\) is not in",
+        ),
+        ("CartPole-v1", lambda _: 2, {}, r"action 2 of shape \(\) is not in"),
+        ("Pendulum-v1", None, {"episodes": 0}, "at least 1 episode"),
+        ("Pendulum-v1", None, {"noise": -1.0}, "noise from 0"),
+        ("CartPole-v1", None, {"noise": 1.5}, "noise from 0 to 1"),
+    ],
+)
+def test_bad_input_is_named(env_id, act, options, message):
+    with pytest.raises(ValueError, match=message):
+        record(env_id, act, **options)
+
+
+def test_data_of_another_environment_are_refused_with_sizes_and_bounds(tmp_path):
+    write_log(tmp_path / "log.npz", record("Pendulum-v1"))
+    path = str(tmp_path / "log.npz")
+    message = r"3 observation and 1 action entries, .* has 4 and 1 \(real\)"
+    with pytest.raises(ValueError, match=message):
+        load_dataset("x", "file", env_id="InvertedPendulum-v5", path=path)
+    wide = columns_of(load_dataset(path=path, action_bounds=(-2, 2))[0])
+    wide["action"] = wide["action"] * 5
+    np.savez(tmp_path / "wide.npz", **wide)
+    with pytest.raises(ValueError, match=r"leaves its bounds.*\[-2.0\] and \[2.0\]"):
+        load_dataset("x", "file", env_id="Pendulum-v1", path=str(tmp_path / "wide.npz"))
+
+
+class Strange(gymnasium.Env):
+    """Gives what no log may hold after some steps."""
+
+    observation_space = gymnasium.spaces.Box(-9, 9, (2,), np.float64)
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    wrong = None
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return np.array([1.0, 2.0]), {}
+
+    def step(self, action):
+        self.steps += 1
+        found = {"observation": np.array([1.0, self.steps]), "reward": 0.0}
+        if self.steps == 3:
+            found |= self.wrong or {}
+        ended = self.steps == 5
+        return found["observation"], found["reward"], False, ended, {}
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"reward": np.nan},
+        {"reward": np.ones(2)},
+        {"observation": np.ones(3)},
+        {"observation": np.array([1, np.inf])},
+    ],
+)
+def test_a_step_that_no_log_may_hold_is_named(wrong):
+    env = Strange()
+    env.wrong = wrong
+    with pytest.raises(ValueError, match="step 3 of .*Strange.* expected finite"):
+        record_episodes(env, None, 2, progress=False)
+
+
+def test_a_policy_that_writes_into_its_argument_changes_no_log():
+    def normalise(observation):
+        observation /= 100
+        return [0.5]
+
+    columns = record_episodes(Strange(), normalise, 1, progress=False)
+    assert columns["observation"].tolist() == [[1, 2], [1, 1], [1, 2], [1, 3], [1, 4]]

@@ -1,0 +1,180 @@
+"""Rows of a data set: held out, mixed, in order, several steps together."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from numbered_episodes import LENGTHS, episodes
+from property_settings import tried
+from tensordict import TensorDict
+
+from torchrl_osr.lab.data import make_replay_buffer, write_memmap
+from torchrl_osr.lab.data.rows import (
+    check_order,
+    consecutive_rows,
+    mix_datasets,
+    multi_step,
+    next_action,
+    split_held_out,
+    take_multi_step,
+)
+
+
+def numbered(rows: int, start: int = 0) -> TensorDict:
+    return TensorDict({"row": torch.arange(start, start + rows)}, [rows])
+
+
+@given(rows=st.integers(1, 50), share=st.floats(0, 1), seed=st.integers(0, 1000))
+def test_rows_are_drawn_without_replacement_in_exact_shares(rows, share, seed) -> None:
+    mixed = mix_datasets(
+        numbered(rows), numbered(60, start=100), random_share=share, seed=seed
+    )["row"].tolist()
+    number = round(share * rows)
+    assert len(mixed) == len(set(mixed)) == rows
+    assert sum(row >= 100 for row in mixed) == number
+    assert all(row < rows for row in mixed[: rows - number])
+    again = mix_datasets(
+        numbered(rows), numbered(60, start=100), random_share=share, seed=seed
+    )
+    assert again["row"].tolist() == mixed
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.1])
+def test_a_share_out_of_range_is_refused(share) -> None:
+    with pytest.raises(ValueError, match=rf"random_share={share} .*from 0 to 1"):
+        mix_datasets(numbered(10), numbered(10), random_share=share, seed=0)
+
+
+def test_too_few_random_rows_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"random_share=0.5 of 10 rows, with 4 random"):
+        mix_datasets(numbered(10), numbered(4), random_share=0.5, seed=0)
+
+
+@pytest.mark.parametrize(("held_out", "expected"), [(7, 7), (0.2, 10)])
+def test_split_keeps_every_row_once(held_out: int | float, expected: int) -> None:
+    data = numbered(50)
+    train, rest = split_held_out(data, held_out, seed=1)
+    again, _ = split_held_out(data, held_out, seed=1)
+    other, _ = split_held_out(data, held_out, seed=2)
+    assert len(rest) == expected
+    both = torch.cat([train["row"], rest["row"]])
+    assert torch.equal(both.sort().values, torch.arange(50))
+    assert torch.equal(train["row"], again["row"])
+    assert not torch.equal(train["row"], other["row"])
+
+
+@pytest.mark.parametrize("held_out", [0, 50, 0.0, 1.0, -1])
+def test_split_with_an_empty_side_is_refused(held_out: int | float) -> None:
+    with pytest.raises(ValueError, match="at least one row on each side"):
+        split_held_out(numbered(50), held_out, seed=0)
+
+
+@tried(20)
+@given(LENGTHS)
+def test_it_is_what_the_episode_did_next(lengths) -> None:
+    data = episodes(lengths)
+    check_order(data)
+    wanted, row = [], 0
+    for length in lengths:
+        wanted += [data["action"][row + step].item() for step in range(1, length)] + [0]
+        row += length
+    assert next_action(data).squeeze(-1).tolist() == wanted
+
+
+@tried(20)
+@given(LENGTHS, st.randoms(use_true_random=False))
+def test_drawn_from_disk_it_is_the_same(tmp_path_factory, lengths, random) -> None:
+    data = episodes([*lengths, 3])
+    chosen = random.sample(range(len(data)), k=random.randrange(len(data)))
+    left_out = torch.tensor(sorted(chosen), dtype=torch.long)
+    stored, _ = write_memmap([data], tmp_path_factory.mktemp("set") / "data")
+
+    def read(data, rows):
+        batch = data[rows]
+        batch["next", "action"] = next_action(data, rows)
+        return batch
+
+    options = {"batch_size": 64, "seed": 0, "read": read}
+    buffer = make_replay_buffer(stored, left_out=left_out, **options)
+    data["next", "action"] = next_action(data)
+    batch = buffer.sample()
+    rows = (batch["observation"] == data["observation"].squeeze(-1)).int().argmax(-1)
+    assert not set(rows.tolist()) & set(chosen)
+    assert (batch == data[rows]).all()
+
+
+def test_rows_in_no_order_are_refused_by_number() -> None:
+    data = episodes([4, 5])
+    for wrong in (data[[0, 2, 3, 4, 5, 6, 7, 8]], data[[0, 2, 1, 3]]):
+        with pytest.raises(ValueError, match="row 0 the first, end no episode"):
+            check_order(wrong)
+    with pytest.raises(ValueError, match="1 of the 8 rows, row 7 the first"):
+        check_order(data[:-1])
+    check_order(data[4:])
+
+
+def test_consecutive_rows_are_of_one_trajectory() -> None:
+    data = episodes([2, 3])
+    pieces = consecutive_rows(data, torch.arange(5), 2)["observation"][..., 0]
+    assert pieces.tolist() == [[1, 2], [4, 5], [5, 6]]
+
+
+@tried(30)
+@given(LENGTHS, st.integers(1, 8))
+def test_it_is_what_the_steps_add_up_to(lengths, n_steps) -> None:
+    data = episodes(lengths)
+    found = multi_step(
+        data,
+        n_steps=n_steps,
+        gamma=0.9,
+        reward_scale=2.0,
+        reward_shift=-1.0,
+        with_next_action=True,
+    )
+    ends = torch.tensor(lengths).cumsum(0).tolist()
+    for row in range(len(data)):
+        end = min(each for each in ends if each > row)
+        steps = range(row, min(row + n_steps, end))
+        rewards = [2.0 * data["next", "reward"][step].item() - 1.0 for step in steps]
+        total = sum(0.9**k * reward for k, reward in enumerate(rewards))
+        last = data[steps[-1]]
+        torch.testing.assert_close(
+            found["reward"][row].item(), total, rtol=0, atol=1e-5
+        )
+        for key in ("observation", "done", "terminated"):
+            assert torch.equal(found[key][row], last["next", key])
+        assert found["steps"][row] == len(steps)
+        ended = last["next", "done"]
+        wanted = 0.0 if ended else data["action"][steps[-1] + 1].item()
+        assert found["action"][row].item() == wanted
+
+
+@tried(20)
+@given(LENGTHS, st.randoms(use_true_random=False))
+def test_some_rows_are_those_of_all(lengths, random) -> None:
+    data = episodes(lengths)
+    rows = torch.tensor([random.randrange(len(data)) for _ in range(4)])
+    options = {"n_steps": 3, "gamma": 0.9}
+    assert (
+        multi_step(data, rows, **options) == multi_step(data, **options)[rows]
+    ).all()
+
+
+def test_rows_in_no_order_are_single_steps() -> None:
+    data = episodes([4, 4])[[0, 2, 4, 6, 7]]
+    found = multi_step(data, n_steps=3, gamma=0.9)
+    assert found["steps"].flatten().tolist() == [1, 1, 1, 2, 1]
+    alone = found.exclude("steps")[:3]
+    assert (alone == data["next"][:3]).all()
+
+
+def test_a_batch_takes_them_and_keeps_its_single_steps() -> None:
+    data = episodes([4])
+    data["multi_step"] = multi_step(data, n_steps=2, gamma=0.9)
+    batch = take_multi_step(data.clone())
+    assert (batch["one_step"] == data["next"]).all()
+    assert (batch["next"] == data["multi_step"].exclude("steps")).all()
+    assert batch["steps_to_next_obs"].flatten().tolist() == [2, 2, 2, 1]
+    assert "multi_step" not in batch

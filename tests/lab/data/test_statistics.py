@@ -1,0 +1,64 @@
+"""Means and standard deviations, the same however the rows are cut."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_osr.lab.data import observation_statistics, statistics
+from torchrl_osr.lab.data.statistics import sampled_observations
+
+
+@pytest.fixture
+def said(monkeypatch) -> list[str]:
+    """What was warned of."""
+    messages: list[str] = []
+    monkeypatch.setattr(statistics.torchrl_logger, "warning", messages.append)
+    return messages
+
+
+def test_statistics_by_hand(said) -> None:
+    rows = torch.tensor([[1.0, 7.0, 0.0], [3.0, 7.0, 1e-5]])
+    loc, scale = observation_statistics(TensorDict({"observation": rows}, [2]))
+    torch.testing.assert_close(loc, torch.tensor([2.0, 7.0, 5e-6]))
+    torch.testing.assert_close(scale, torch.tensor([1.0, 1e-3, 1e-3]))
+    (message,) = said
+    assert message.endswith("divided by 0.001 when standardised: 1 (0), 2 (5e-06).")
+
+
+def test_nothing_is_said_of_entries_that_move(said) -> None:
+    rows = torch.tensor([[1.0, 0.0], [3.0, 0.002]])
+    _, scale = observation_statistics(TensorDict({"observation": rows}, [2]))
+    torch.testing.assert_close(scale, torch.tensor([1.0, 1e-3]))
+    assert said == []
+
+
+def test_statistics_survive_a_large_offset() -> None:
+    # Sums in float32 would be off in the second digit.
+    rows = 1e4 + torch.tensor([-1.0, 1.0]).repeat(500_000)[:, None]
+    data = TensorDict({"observation": rows}, [len(rows)])
+    loc, scale = observation_statistics(data)
+    torch.testing.assert_close(loc, torch.tensor([1e4]))
+    torch.testing.assert_close(scale, torch.tensor([1.0]))
+    assert loc.dtype == torch.float32
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e4])
+@pytest.mark.parametrize("rows_at_a_time", [1, 7, 60, 100])
+def test_statistics_do_not_depend_on_chunks(
+    monkeypatch, make_transitions, rows_at_a_time, offset
+):
+    monkeypatch.setattr(statistics, "ROWS_AT_A_TIME", rows_at_a_time)
+    data = make_transitions(offset=offset)
+    scale, loc = torch.std_mean(data["observation"].double(), dim=0, correction=0)
+    found = observation_statistics(data)
+    torch.testing.assert_close(found, (loc.float(), scale.float()), rtol=1e-7, atol=0)
+
+
+def test_observations_of_a_large_set_are_sampled(make_transitions):
+    data = make_transitions()
+    assert sampled_observations(data).equal(data["observation"])
+    some = sampled_observations(data, 9)
+    assert len(some) == 9
+    assert all((data["observation"] == row).all(1).any() for row in some)

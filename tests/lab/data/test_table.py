@@ -1,0 +1,299 @@
+"""Logs of your own: files, columns by name, order by step."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pyarrow
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from property_settings import tried
+from pyarrow import parquet
+from recorded_logs import make_columns, save
+
+from torchrl_osr.lab.data import load_dataset, transitions_from_columns
+from torchrl_osr.lab.data.table import find_columns
+
+NAMED = {"observation": ["x", "theta", "v"], "action": ["u", "w"], "episode": "run"}
+WANTED = NAMED | {"reward": "cost", "terminated": "fell"}
+
+
+def flat(columns):
+    """Return a frame with one column for each number."""
+    frame = {}
+    for name, column in columns.items():
+        wide = column.reshape(len(column), -1)
+        names = (
+            [f"{name}_{i}" for i in range(wide.shape[1])] if column.ndim > 1 else [name]
+        )
+        frame |= dict(zip(names, wide.T, strict=True))
+    return pd.DataFrame(frame)
+
+
+def robot(**changes):
+    """Return a robot's log, whose columns are called as its driver calls them."""
+    columns = make_columns(120)
+    entries = [*columns["observation"].T, *columns["action"].T]
+    frame = pd.DataFrame(dict(zip(["x", "theta", "v", "u", "w"], entries, strict=True)))
+    frame["cost"] = columns["reward"]
+    frame["fell"] = columns["terminated"].astype(int)
+    frame["run"] = [f"monday {number}" for number in np.arange(120) // 40]
+    frame["tick"] = np.arange(120) % 40
+    return frame.assign(**changes)
+
+
+@pytest.fixture(params=[".csv", ".parquet"])
+def write(request, tmp_path):
+    def write(frame):
+        path = tmp_path / f"log{request.param}"
+        if path.suffix == ".parquet":
+            frame.to_parquet(path)
+        else:
+            frame.to_csv(path, index=False)
+        return path
+
+    return write
+
+
+@pytest.mark.parametrize("ending", ["npz", "hdf5", "parquet"])
+def test_all_kinds_of_files_hold_the_same(tmp_path, ending):
+    expected, about = transitions_from_columns(make_columns())
+    path = save(tmp_path / f"log.{ending}", make_columns())
+    data, manifest = load_dataset(path=path)
+    assert (data == expected).all()
+    assert about.items() <= (manifest | {"data_sha256": None}).items()
+    for damaged in (b"", b"nothing", path.read_bytes()[:2000]):
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match=r"log\.\w+ (cannot be read|is no)"):
+            load_dataset(path=path)
+    path.unlink()
+    with pytest.raises(FileNotFoundError, match="there is no file"):
+        load_dataset(path=path)
+
+
+def test_usual_names_need_no_word(write):
+    data, manifest = load_dataset(path=write(flat(make_columns())))
+    assert (data == transitions_from_columns(make_columns())[0]).all()
+    names = ["observation_0", "observation_1", "observation_2"]
+    assert manifest["columns"]["observation"] == names
+
+
+@pytest.mark.parametrize(
+    ("options", "encoding"),
+    [
+        ({"sep": ";"}, "utf-8"),
+        ({"sep": ";", "decimal": ","}, "utf-8"),
+        ({"sep": "\t", "decimal": ","}, "utf-16"),
+        ({}, "cp1252"),
+        ({}, "utf-8-sig"),
+    ],
+)
+@pytest.mark.parametrize("ending", ["csv", "csv.gz"])
+def test_separators_decimals_and_encodings_are_detected(
+    tmp_path, options, encoding, ending
+):
+    frame = robot().rename(columns={"theta": "Größe"})
+    path = tmp_path / f"log.{ending}"
+    frame.to_csv(path, index=False, encoding=encoding, **options)
+    names = WANTED | {"observation": ["x", "Größe", "v"]}
+    data, manifest = load_dataset(path=path, columns=names)
+    robot().to_csv(tmp_path / "plain.csv", index=False)
+    expected, plain = load_dataset(path=tmp_path / "plain.csv", columns=WANTED)
+    assert (data == expected).all()
+    assert plain["notes"] == []
+    assert bool(manifest["notes"]) == (encoding != "utf-8-sig")
+
+
+def test_columns_are_taken_by_their_names(write):
+    frame = robot()
+    columns = {
+        "observation": frame[["theta", "x", "v"]].to_numpy(),
+        "action": frame[["u", "w"]].to_numpy(),
+        "reward": frame["cost"].to_numpy(),
+        "terminated": frame["fell"].to_numpy(),
+        "episode": np.arange(120) // 40,
+    }
+    wanted = WANTED | {"observation": ["theta", "x", "v"]}
+    data, manifest = load_dataset(path=write(frame), columns=wanted)
+    assert (data == transitions_from_columns(columns)[0]).all()
+    assert manifest["unused_columns"] == ["tick"]
+
+
+def stamps(ticks):
+    times = pd.Timestamp("2026-03-29T01:59:59+01:00") + pd.to_timedelta(ticks / 50, "s")
+    return [time.isoformat() for time in times]
+
+
+@pytest.mark.parametrize("clock", [lambda ticks: ticks, lambda t: t / 50, stamps])
+def test_steps_bring_the_rows_of_an_episode_into_order(write, clock):
+    expected, _ = load_dataset(path=write(robot()), columns=WANTED)
+    ordered = robot().assign(tick=clock(robot()["tick"]))
+    shuffled = ordered.sample(frac=1, random_state=0)
+    wanted = WANTED | {"step": "tick"}
+    data, manifest = load_dataset(path=write(shuffled), columns=wanted)
+    # Episodes in the order in which they come up in the file.
+    order = {name: i for i, name in enumerate(shuffled["run"].unique())}
+    parts = np.argsort([order[f"monday {number}"] for number in range(3)])
+    ends = expected["next", "done"][:, 0].nonzero()[:, 0] + 1
+    episodes = expected.split(np.diff(ends.numpy(), prepend=0).tolist())
+    assert (data == torch.cat([episodes[part] for part in parts])).all()
+    if clock is stamps:
+        assert "0.02 s (50 Hz)" in manifest["notes"][0]
+    with pytest.raises(ValueError, match="where steps are .* a next state is missing"):
+        load_dataset(path=write(ordered.drop(index=17)), columns=wanted)
+    with pytest.raises(ValueError, match="the rows in another order"):
+        load_dataset(path=write(shuffled), columns=WANTED)
+    ordered.loc[17, "tick"] = ordered.loc[16, "tick"]
+    with pytest.raises(ValueError, match="where steps are"):
+        load_dataset(path=write(ordered), columns=wanted)
+
+
+def test_several_files_are_one_log(tmp_path):
+    columns = make_columns(120)
+    halves = [
+        {n: c[part] for n, c in columns.items()} for part in (slice(60), slice(60, 120))
+    ]
+    paths = [str(save(tmp_path / f"{i}.npz", half)) for i, half in enumerate(halves)]
+    parts = [transitions_from_columns(half)[0] for half in halves]
+    for path in (paths, str(tmp_path / "*.npz")):
+        data, manifest = load_dataset(path=path)
+        assert (data == torch.cat(parts)).all()
+        assert manifest["path"] == paths
+    # Episodes are numbered anew in each file.
+    numbered = [half | {"episode": np.arange(60) // 40} for half in halves]
+    for path, half in zip(paths, numbered, strict=True):
+        del half["truncated"]
+        save(tmp_path / path, half | {"terminated": np.zeros(60)})
+    _, manifest = load_dataset(path=paths)
+    lengths = manifest["episode_lengths"] + manifest["incomplete_lengths"]
+    assert sorted(lengths) == [20, 20, 40, 40]
+
+
+def test_a_task_that_never_ends(write):
+    frame = robot().drop(columns="fell")
+    with pytest.raises(ValueError, match="lack terminated; .*terminated=false if noth"):
+        load_dataset(path=write(frame), columns=NAMED | {"reward": "cost"})
+    wanted = WANTED | {"terminated": False}
+    data, manifest = load_dataset(path=write(frame), columns=wanted)
+    assert not data["next", "terminated"].any()
+    assert (manifest["unmarked_ends"], manifest["dropped_rows"]) == (3, 3)
+
+
+def test_rows_with_missing_values_can_be_left_out(write):
+    frame = robot(theta=[np.nan, *robot()["theta"][1:]], fell=[None] + [0] * 119)
+    with pytest.raises(ValueError, match="'observation' has no value in row 0"):
+        load_dataset(path=write(frame), columns=WANTED)
+    data, manifest = load_dataset(path=write(frame), columns=WANTED, missing="row")
+    assert (len(data), manifest["missing_rows"]) == (120 - 3 - 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "columns", "message"),
+    [
+        ({"u": "fast"}, {}, "'u' holds 'fast' in row 0 of 120; expected numbers"),
+        ({"run": ["a"] * 60 + [None] * 60}, {}, "'episode' has no value in row 60"),
+        ({"fell": [0.0] * 119 + [0.5]}, {}, "'terminated' holds 0.5 in row 119"),
+        ({"w": 7.0}, {}, r"'action' leaves its bounds in 120 .*data\.action_bounds"),
+        ({}, {"action": "force"}, r"columns\.action=force names no column; expected"),
+        ({}, {"action": "x"}, "column 'x' is read twice"),
+        ({}, {"reward": "*"}, r"columns.reward=\* names x, .*expected one of"),
+        ({}, {"speed": "v"}, "data.columns has no speed"),
+        ({}, {"episode": None}, "the data lack truncated or episode; the file"),
+        ({}, {"episode": None, "step": "tick"}, "lack episode"),
+        ({"done": 0}, {"terminated": None}, "data.columns.terminated=done if the task"),
+    ],
+)
+def test_a_wrong_log_is_one_sentence(write, changes, columns, message):
+    wanted = WANTED | columns
+    with pytest.raises(ValueError, match=message):
+        load_dataset(path=write(robot(**changes)), columns=wanted)
+
+
+def test_unknown_columns_are_refused_unless_some_are_named(write):
+    with pytest.raises(ValueError, match="unknown columns note"):
+        load_dataset(path=write(flat(make_columns()).assign(note=1)))
+
+
+@tried(50)
+@given(st.permutations([f"q{number}" for number in range(12)]), st.booleans())
+def test_entries_are_in_the_order_of_their_numbers(names, named):
+    others = ["action_x", "reward", "terminated", "episode"]
+    others += [] if named else ["tail_1", "tail_0"]
+    columns = find_columns([*others, *names], {"observation": "q*"})
+    assert columns["observation"] == [f"q{number}" for number in range(12)]
+    asked = {"observation": list(names)}
+    assert find_columns([*names, *others], asked)["observation"] == names
+
+
+def test_a_missing_entry_of_a_vector_is_named():
+    names = ["act", "reward", "terminal", "timeout", "obs_1", f"obs_{10**18}"]
+    with pytest.raises(ValueError, match="but none with the number 2:"):
+        find_columns(names, {})
+    names = [
+        "obs_pos_1",
+        "obs_vel_1",
+        "obs_pos_0",
+        "act",
+        "reward",
+        "terminal",
+        "timeout",
+    ]
+    assert find_columns(names, {})["observation"] == names[:3], "no common numbering"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "expected the names of at least two columns"),
+        (b",obs_0,action\n0,1,2\n", "expected the names of at least two columns"),
+        (b"0.1,0.2,0.3\n1,2,3\n", "the file has 0.1, 0.2, 0.3"),
+        (b"obs_0,action,reward,reward\n1,2,3,4\n", "two columns have one name"),
+        (b"obs_0,action,reward,terminated,episode\n", "the data hold no rows"),
+        (b"obs_0,action,reward,terminated,episode\n1,.2,3,0,0,9\n", "cannot be read"),
+        (b"obs_0,action,reward,terminated,episode\n1,.2,3\n", "no value in row 0"),
+    ],
+)
+def test_wrong_csv_files_are_refused(tmp_path, content, message):
+    (tmp_path / "log.csv").write_bytes(content)
+    with pytest.raises(ValueError, match=message):
+        load_dataset(path=tmp_path / "log.csv")
+
+
+def test_episodes_with_names_are_told_apart(tmp_path):
+    frame = flat(make_columns(24)).drop(columns="truncated")
+    frame["episode"] = ["007"] * 10 + ["0"] * 4 + ["a"] * 10
+    frame.to_csv(tmp_path / "log.csv", index=False)
+    _, manifest = load_dataset(path=tmp_path / "log.csv")
+    lengths = manifest["episode_lengths"] + manifest["incomplete_lengths"]
+    assert sorted(lengths) == [4, 10, 10]
+
+
+@pytest.mark.parametrize(
+    ("name", "column", "message"),
+    [
+        ("action", [[0.1], [0.2, 0.3]] * 30, "holds lists of the lengths"),
+        (
+            "action",
+            [[0.1, 0.2]] * 59 + [[0.1, None]],
+            "'action' has no value in row 59",
+        ),
+        ("reward", [1.0] * 59 + [None], "'reward' has no value in row 59"),
+    ],
+)
+def test_lists_in_parquet_have_one_length(tmp_path, name, column, message):
+    path = tmp_path / "log.parquet"
+    columns = {k: list(v) if v.ndim > 1 else v for k, v in make_columns(60).items()}
+    parquet.write_table(pyarrow.table(columns | {name: column}), path)
+    with pytest.raises(ValueError, match=message):
+        load_dataset(path=path)
+
+
+def test_arrays_of_episodes_are_refused(tmp_path):
+    columns = {name: np.stack([c] * 2) for name, c in make_columns(60).items()}
+    with pytest.raises(ValueError, match=r"'observation' has shape \[2, 60, 3\]"):
+        load_dataset(path=save(tmp_path / "log.npz", columns))
+    columns = make_columns(60) | {"action": make_columns(50)["action"]}
+    with pytest.raises(ValueError, match="expected equally many"):
+        load_dataset(path=save(tmp_path / "log.npz", columns))

@@ -1,0 +1,155 @@
+"""Replay buffers of offline data.
+
+Shapes: ``N`` rows of the data set, ``B`` batch.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import ImmutableDatasetWriter, LazyTensorStorage, ReplayBuffer
+from torchrl.data.replay_buffers.storages import Storage
+from torchrl.envs.transforms import Transform
+
+from torchrl_osr.lab.data.store import is_memory_mapped
+
+Reader = Callable[[TensorDictBase, Tensor], TensorDictBase]
+
+
+class MemmapStorage(Storage):
+    """Rows of a memory-mapped set as the storage of a replay buffer, read-only.
+
+    Args:
+        data: memory-mapped transitions ``[N]``.
+
+    Keyword Args:
+        left_out: sorted numbers of rows that are not drawn. Default: none.
+        device: of the batches. The draws are made there too, so that they are those of
+            a buffer that holds the rows on that device. Default: CPU.
+        read: returns rows of ``data`` by their numbers. Default: as they are.
+    """
+
+    def __init__(
+        self,
+        data: TensorDictBase,
+        *,
+        left_out: Tensor | None = None,
+        device: torch.device | str = "cpu",
+        read: Reader = operator.getitem,
+    ) -> None:
+        left_out = torch.empty(0, dtype=torch.long) if left_out is None else left_out
+        super().__init__(len(data) - len(left_out))
+        self.data, self.device, self.read = data, torch.device(device), read
+        # Before row i of the rest lie as many of the left-out ones as have no more than
+        # i rows of the rest before them.
+        self._shifts = left_out - torch.arange(len(left_out))
+
+    def __len__(self) -> int:
+        return int(self.max_size)
+
+    def get(self, index: Tensor) -> TensorDictBase:
+        """Rows ``[B]``."""
+        index = index.cpu()
+        rows = index + torch.searchsorted(self._shifts, index, right=True)
+        batch = self.read(self.data, rows)
+        return batch if self.device.type == "cpu" else batch.to(self.device)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing: the rows are in their files."""
+        return {}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Do nothing."""
+
+
+def make_replay_buffer(
+    data: TensorDictBase,
+    *,
+    batch_size: int,
+    seed: int,
+    left_out: Tensor | None = None,
+    transform: Transform | None = None,
+    device: torch.device | str | None = None,
+    read: Reader | None = None,
+) -> ReplayBuffer:
+    """Replay buffer that samples a data set uniformly, with replacement.
+
+    The batches depend on ``seed`` alone: the buffer has a generator of its own, and
+    does not prefetch, because threads would make the order of the draws depend on time.
+
+    Args:
+        data: transitions ``[N]``. Memory-mapped ones (:func:`load_memmap`) stay on
+            disk, and the same seed draws the same rows.
+
+    Keyword Args:
+        batch_size: rows per ``sample()``.
+        seed: of the sampling.
+        left_out: sorted numbers of memory-mapped rows that are not drawn, see
+            :func:`~torchrl_osr.lab.data.rows.held_out_rows`. Default: none.
+        transform: applied to each sampled batch. Default: none.
+        device: of the rows and the sampling, or, of a memory-mapped set, of the
+            batches. Default: the device of ``data``, or CPU if it has none.
+        read: returns rows of memory-mapped data by their numbers. Default: as they are.
+
+    Raises:
+        ValueError: ``data`` is not flat or has no rows, or an option is for
+            memory-mapped data alone.
+        MemoryError: the data do not fit into the GPU.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_osr.lab.data import make_replay_buffer
+        >>> data = TensorDict({"observation": torch.rand(100, 3)}, batch_size=[100])
+        >>> buffer = make_replay_buffer(data, batch_size=8, seed=0)
+        >>> buffer.sample()["observation"].shape
+        torch.Size([8, 3])
+    """
+    if data.ndim != 1 or data.shape[0] == 0:
+        raise ValueError(
+            f"data has batch size {list(data.shape)}; "
+            "expected a flat [N] with at least one row."
+        )
+    device = torch.device(device or data.device or "cpu")
+    options: dict[str, Any] = {
+        "batch_size": batch_size,
+        "transform": transform,
+        "generator": torch.Generator(device).manual_seed(seed),
+    }
+    if is_memory_mapped(data):
+        read = operator.getitem if read is None else read
+        return ReplayBuffer(
+            storage=MemmapStorage(data, left_out=left_out, device=device, read=read),
+            writer=ImmutableDatasetWriter(),
+            collate_fn=lambda batch: batch,
+            **options,
+        )
+    if left_out is not None or read is not None:
+        raise ValueError("left_out and read are for memory-mapped data.")
+    check_memory(data, device)
+    buffer = ReplayBuffer(
+        storage=LazyTensorStorage(data.shape[0], device=device), **options
+    )
+    buffer.extend(data.to(device))
+    return buffer
+
+
+def check_memory(data: TensorDictBase, device: torch.device) -> None:
+    """Raise a MemoryError unless a data set fits into a GPU, with a copy to it."""
+    if device.type != "cuda":
+        return
+    there = data.device is not None and data.device.type == "cuda"
+    needed = data.bytes() * (1 if there else 2)
+    free = torch.cuda.mem_get_info(device)[0]
+    # Memory that torch keeps is free to us.
+    free += torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    if needed > free:
+        raise MemoryError(
+            f"The data set needs {needed:,} bytes on {device}, which has {free:,} "
+            f"free: take fewer than {data.shape[0]:,} rows, or keep it on the CPU."
+        )

@@ -1,0 +1,322 @@
+"""Gymnasium tasks, as data are collected on them and policies are played in them.
+
+Those of gymnasium-robotics too (``torchrl-osr[mazes]``), which are registered when one
+is asked for.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import warnings
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, redirect_stderr
+from functools import reduce
+from operator import getitem
+from pathlib import Path
+from typing import Any, NamedTuple, TypeGuard
+
+import numpy as np
+
+from torchrl_osr._extras import needed_by
+from torchrl_osr.lab.data.behavior import load_behavior_card
+
+with needed_by("MuJoCo tasks need", "train"):
+    import gymnasium
+    import mujoco
+    from gymnasium import spaces
+
+# v4 of the ant, although there is v5: Minari's sets are of v4, whose observations lack
+# the 78 contact forces of v5, as D4RL's do.
+MAZE_IDS = {
+    "pointmaze-umaze": "PointMaze_UMaze-v3",
+    "pointmaze-medium": "PointMaze_Medium-v3",
+    "pointmaze-large": "PointMaze_Large-v3",
+    "antmaze-umaze": "AntMaze_UMaze-v4",
+    "antmaze-medium": "AntMaze_Medium-v4",
+    "antmaze-large": "AntMaze_Large-v4",
+}
+"""Gymnasium ids of the mazes, by short name."""
+
+MAX_EPISODE = 100_000
+"""Largest number of steps of an episode; an episode that never ends is an error."""
+
+Leaves = dict[tuple[str | int, ...], "spaces.Space[Any]"]
+
+
+def environment_id(env_name: str) -> str:
+    """Gymnasium id of a maze, or of a task with behaviour policies, by short name."""
+    known = _known_ids()
+    if env_name not in known:
+        raise ValueError(
+            f"unknown environment {env_name!r}; there are: {', '.join(known)}."
+        )
+    return known[env_name]
+
+
+def environment_name(env_id: str) -> str:
+    """Short name of a task, which its behaviour policies and reference returns have.
+
+    Of another task it is the id, without the module that registers it and with ``-``
+    for what has no place in a folder's name.
+
+    Examples:
+        >>> from torchrl_osr.lab.data.environment import environment_name
+        >>> environment_name("Hopper-v5"), environment_name("robots:ns/Arm-v0")
+        ('hopper', 'ns-Arm-v0')
+    """
+    names = {known: name for name, known in _known_ids().items()}
+    return names.get(env_id) or re.sub(r"[^\w.-]", "-", env_id.split(":")[-1])
+
+
+def _known_ids() -> dict[str, str]:
+    return {name: str(e["env"]) for name, e in load_behavior_card().items()} | MAZE_IDS
+
+
+class EnvironmentSpec(NamedTuple):
+    """Sizes and action bounds that data and networks of a task must fit.
+
+    Attributes:
+        observation_size: numbers of an observation, ``S``.
+        action_size: numbers of an action, or the number of discrete actions, ``A``.
+        action_low: lowest action in the task's own units, ``A`` numbers; ``None`` if
+            actions are discrete.
+        action_high: highest action, likewise.
+        simulated: whether it can be played: an environment without ``step`` only
+            describes a machine.
+    """
+
+    observation_size: int
+    action_size: int
+    action_low: list[float] | None
+    action_high: list[float] | None
+    simulated: bool
+
+    @property
+    def discrete(self) -> bool:
+        """Whether an action is one of ``A``, not ``A`` numbers."""
+        return self.action_low is None
+
+
+def environment_spec(env_id: str) -> EnvironmentSpec:
+    """Sizes and action bounds of a task, see :func:`open_environment`.
+
+    Examples:
+        >>> from torchrl_osr.lab.data import environment_spec
+        >>> environment_spec("Pendulum-v1")[:4]
+        (3, 1, [-2.0], [2.0])
+    """
+    with closing(open_environment(env_id)) as env:
+        size = spaces.flatdim(env.observation_space)
+        actions: Any = env.action_space
+        if isinstance(actions, spaces.Discrete):
+            return EnvironmentSpec(size, int(actions.n), None, None, is_simulated(env))
+        low, high = actions.low.tolist(), actions.high.tolist()
+        return EnvironmentSpec(size, len(low), low, high, is_simulated(env))
+
+
+def is_simulated(env: gymnasium.Env[Any, Any]) -> bool:
+    """Whether an environment can be played, see :class:`EnvironmentSpec`."""
+    return type(env.unwrapped).step is not gymnasium.Env.step
+
+
+def check_simulated(env: gymnasium.Env[Any, Any], env_id: str) -> None:
+    """Raise a RuntimeError unless an environment can be played."""
+    if not is_simulated(env):
+        raise RuntimeError(
+            f"{env_id} has no simulator (its class has no step) and cannot be played: "
+            "train and export do without."
+        )
+
+
+def make_environment(env_id: str) -> gymnasium.Env[Any, Any]:
+    """Make a Gymnasium task with the actions that the losses and the data have.
+
+    Real actions are rescaled to -1 and 1, unless these are their bounds already.
+
+    Args:
+        env_id: see :func:`open_environment`, also for the errors.
+
+    Examples:
+        >>> from torchrl_osr.lab.data import make_environment
+        >>> make_environment("HalfCheetah-v5").action_space.shape
+        (6,)
+    """
+    env = open_environment(env_id)
+    actions: Any = env.action_space
+    if (
+        isinstance(actions, spaces.Box)
+        and ((actions.low != -1) | (actions.high != 1)).any()
+    ):
+        env = gymnasium.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
+    return env
+
+
+def open_environment(env_id: str) -> gymnasium.Env[Any, Any]:
+    """Make a Gymnasium task with actions in its own units.
+
+    Observations that are dictionaries or tuples become one vector, in the order of
+    :func:`observation_leaves`. Mazes end (``terminated``) at their goal.
+
+    Args:
+        env_id: Gymnasium id, such as ``"Hopper-v5"``, or ``"my_package:MyRobot-v0"``,
+            which imports ``my_package`` first.
+
+    Raises:
+        ValueError: there is no such task, its observations are no real vectors, or its
+            actions neither real vectors with finite bounds nor numbered from 0.
+        ImportError: a package that the task needs is not installed.
+        RuntimeError: in a step, if the task has no time limit and the episode has more
+            than 100,000 steps.
+    """
+    env = _found(env_id)
+    if isinstance(env.observation_space, (spaces.Dict, spaces.Tuple)):
+        leaves = observation_leaves(env.observation_space)
+        parts = spaces.Tuple([*leaves.values()])
+
+        def flatten(state: Any) -> Any:
+            entries = (reduce(getitem, name, state) for name in leaves)
+            return spaces.flatten(parts, tuple(entries))
+
+        flat = spaces.flatten_space(parts)
+        env = gymnasium.wrappers.TransformObservation(env, flatten, flat)
+    actions: Any = env.action_space
+    bounded = _is_real_vector(actions) and actions.is_bounded()
+    numbered = isinstance(actions, spaces.Discrete) and actions.start == 0
+    if not _is_real_vector(env.observation_space):
+        flaw = (
+            f"observations {env.observation_space}; expected a vector of real numbers"
+        )
+    elif not bounded and not numbered:
+        flaw = f"actions {actions}; expected bounded real numbers, or Discrete from 0"
+    else:
+        limited = env.spec is not None and env.spec.max_episode_steps is not None
+        return env if limited else _Ending(env)
+    raise ValueError(
+        f"{env_id} has {flaw}: change it in a wrapper, such as Gymnasium's ClipAction "
+        "or TransformAction, and register the wrapped environment."
+    )
+
+
+def observation_leaves(space: spaces.Space[Any]) -> Leaves:
+    """Entries of an observation in the order in which they make up its vector.
+
+    Environments, data and policies all have this order: the keys of a dictionary
+    alphabetically on every level, the parts of a tuple as they are.
+
+    Returns:
+        The space of each entry, by its path of keys.
+
+    Raises:
+        ValueError: an entry is an image, or cannot be flattened.
+
+    Examples:
+        >>> from gymnasium.spaces import Box, Dict
+        >>> from torchrl_osr.lab.data.environment import observation_leaves
+        >>> [*observation_leaves(Dict(speed=Box(0, 1, (2,)), angle=Box(0, 1, (1,))))]
+        [('angle',), ('speed',)]
+    """
+    if isinstance(space, (spaces.Dict, spaces.Tuple)):
+        inner: Any = space
+        keys = sorted(inner) if isinstance(space, spaces.Dict) else range(len(inner))
+        parts = {key: observation_leaves(inner[key]) for key in keys}
+        return {
+            (k, *name): leaf for k, part in parts.items() for name, leaf in part.items()
+        }
+    if not space.is_np_flattenable or (
+        space.dtype == np.uint8 and len(space.shape or ()) > 1
+    ):
+        raise ValueError(f"an observation is {space}; expected real vectors.")
+    return {(): space}
+
+
+class _Ending(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """An environment without a time limit, which may or may not end by itself."""
+
+    _steps = 0
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        self._steps = 0
+        return super().reset(**options)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        self._steps += 1
+        if self._steps > MAX_EPISODE:
+            raise RuntimeError(
+                f"an episode of {self.env} has not ended after {MAX_EPISODE:,} steps: "
+                "register the environment with max_episode_steps."
+            )
+        return super().step(action)
+
+
+def _is_real_vector(space: gymnasium.Space[Any]) -> TypeGuard[spaces.Box]:
+    return (
+        isinstance(space, spaces.Box)
+        and len(space.shape) == 1
+        and np.issubdtype(space.dtype, np.floating)
+    )
+
+
+def _found(env_id: str) -> gymnasium.Env[Any, Any]:
+    """Make the task as it is registered, with clear errors."""
+    try:
+        try:
+            return _make(env_id)
+        except gymnasium.error.NameNotFound as error:
+            _register_robotics(env_id, error)
+            return _make(env_id)
+    except gymnasium.error.DependencyNotInstalled as error:
+        needs = " ".join(map(str, error.args))
+        raise ImportError(f"{env_id} needs another package: {needs}") from error
+    except gymnasium.error.Error as error:
+        raise ValueError(
+            f"env.id={env_id} is no environment that Gymnasium knows: {error} An "
+            "environment of a package of your own is env.id=<package>:<name>."
+        ) from error
+    except ModuleNotFoundError as error:
+        raise ImportError(
+            f"env.id={env_id} imports {env_id.partition(':')[0]!r} first, and that "
+            f"failed: {error.__cause__ or error}. Install the package, or run the "
+            "command in the folder that it is in."
+        ) from error
+
+
+def _make(env_id: str) -> gymnasium.Env[Any, Any]:
+    spec = gymnasium.registry.get(env_id)
+    # Without it an episode never ends at the goal, and the return is no success.
+    options = {"continuing_task": False} if spec and "maze_map" in spec.kwargs else {}
+    with _silent_model_loading(), warnings.catch_warnings():
+        # On purpose, see MAZE_IDS.
+        warnings.filterwarnings(
+            "ignore", r".*AntMaze_\w+-v4 is out of date", DeprecationWarning
+        )
+        env: gymnasium.Env[Any, Any] = gymnasium.make(env_id, **options)
+    if env_id in MAZE_IDS.values():
+        # The model's file, which is loaded now and would be left for ever.
+        Path(env.get_wrapper_attr("tmp_xml_file_path")).unlink(missing_ok=True)
+    return env
+
+
+def _register_robotics(env_id: str, unknown: Exception) -> None:
+    try:
+        # Importing it prints a note on hands that were changed, to standard error.
+        with redirect_stderr(io.StringIO()):
+            import gymnasium_robotics
+    except ImportError as error:
+        raise ImportError(
+            f"Gymnasium itself has no {env_id!r} ({unknown}); those of "
+            f"gymnasium-robotics need {error.name!r}: pip install torchrl-osr[mazes]"
+        ) from error
+    gymnasium.register_envs(gymnasium_robotics)
+
+
+@contextmanager
+def _silent_model_loading() -> Iterator[None]:
+    # Without a handler MuJoCo appends its notes on deprecated model attributes to
+    # MUJOCO_LOG.TXT in the working folder. Warnings while stepping are left alone.
+    previous = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(previous)

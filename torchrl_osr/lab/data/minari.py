@@ -1,0 +1,171 @@
+"""Minari data sets, HDF5 or Arrow, read through the ``minari`` library.
+
+TorchRL 0.11 to 0.14.1 has a reader whose every field is zero
+(``MinariExperienceReplay``). Minari stores ``T + 1`` observations of an episode, so
+that every row has its true next observation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import reduce
+from operator import getitem
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from tqdm.auto import tqdm
+
+from torchrl_osr._extras import needed_by
+from torchrl_osr._files import read_json
+from torchrl_osr.lab.data.environment import Leaves, observation_leaves
+from torchrl_osr.lab.data.recording import Recording
+from torchrl_osr.lab.data.transitions import Array, Reading
+
+with needed_by("Minari data sets need", "minari"):
+    import minari
+    from minari.storage import get_dataset_path, hosting
+
+
+def open_minari(
+    path: Any,
+    options: Reading,
+    entries: Sequence[str] | None = None,
+    *,
+    download: bool = False,
+    progress: bool = True,
+) -> Recording:
+    """Open a Minari data set; no episode is read yet.
+
+    Args:
+        path: id, such as ``"mujoco/hopper/medium-v0"``, or the folder of a set, which
+            goes first.
+        options: for the conversion; bounds of ``None`` are the set's own.
+        entries: of a dictionary, the observations to take, in this order; nested ones
+            as ``"outer/inner"``. Default: all, see
+            :func:`~torchrl_osr.lab.data.environment.observation_leaves`.
+
+    Keyword Args:
+        download: fetch a set that is not on this machine. Default: ``False``.
+        progress: show a progress bar when on a terminal. Default: ``True``.
+    """
+    opened = _open(str(path), download)
+    actions: Any = opened.action_space
+    if isinstance(actions, spaces.Discrete):
+        options = replace(options, num_actions=int(actions.n), action_bounds=(-1, 1))
+    elif not isinstance(actions, spaces.Box):
+        raise ValueError(f"{path} has actions {actions}; expected a Box or Discrete.")
+    elif options.action_bounds is None:
+        bounds = actions.low.ravel(), actions.high.ravel()
+        options = replace(options, action_bounds=bounds)
+    leaves = observation_leaves(opened.observation_space)
+    names = {"/".join(map(str, name)): name for name in leaves}
+    if entries is not None:
+        if isinstance(entries, str) or not entries or {*entries} - {*names}:
+            raise ValueError(
+                f"data.columns.observation={entries}; expected a list of some of "
+                f"{', '.join(names)}."
+            )
+        names = {entry: names[entry] for entry in entries}
+        leaves = {name: leaves[name] for name in names.values()}
+    sizes = [spaces.flatdim(leaf) for leaf in leaves.values()]
+    about = {
+        "source": "minari",
+        "path": str(path),
+        "dataset_id": opened.id,
+        "env_id": opened.env_spec and opened.env_spec.id,
+        "minari_version": opened.minari_version,
+        "observation_layout": [[*each] for each in zip(names, sizes, strict=True)],
+    }
+
+    def parts(rows: int | None) -> Iterator[dict[str, Array]]:
+        waiting: list[dict[str, Array]] = []
+        for episode in _read(opened, leaves, progress):
+            waiting.append(episode)
+            if rows and sum(len(each["reward"]) for each in waiting) >= rows:
+                yield _together(waiting)
+                waiting = []
+        if waiting:
+            yield _together(waiting)
+
+    files = sorted(Path(opened.storage.data_path).rglob("*"))
+    files = [file for file in files if file.is_file()]
+    return Recording(parts, options, about, files, total=int(opened.total_steps))
+
+
+def _open(dataset: str, download: bool) -> minari.MinariDataset:
+    path = Path(dataset).expanduser()
+    here = get_dataset_path(dataset) / "data"
+    for folder in (path / "data", path):
+        if (folder / "metadata.json").is_file():
+            here = folder
+            break
+    else:
+        if download and not here.exists():
+            hosting.download_dataset(dataset)
+    if not (here / "metadata.json").is_file():
+        raise FileNotFoundError(
+            f"Minari set {dataset!r} is not on this machine: fetch it with "
+            "data.download=true, or give its folder."
+        )
+    # Without its spaces Minari makes the environment of the metadata to ask for them,
+    # which can be any function of any package.
+    metadata = read_json(here / "metadata.json")
+    if not {"observation_space", "action_space"} <= metadata.keys():
+        raise ValueError(f"{here / 'metadata.json'} names no spaces.")
+    return minari.MinariDataset(here)
+
+
+def _read(
+    opened: minari.MinariDataset, leaves: Leaves, progress: bool
+) -> Iterator[dict[str, Array]]:
+    """Columns of each episode; raise if some of what the set announces is missing."""
+    steps, first = 0, getattr(opened.action_space, "start", 0)
+    total, bar = opened.total_episodes, None if progress else True
+    episodes = tqdm(
+        opened.iterate_episodes(), "read", total, unit="episode", disable=bar
+    )
+    for number, episode in enumerate(episodes):
+        count = len(episode.rewards)
+        if not count:
+            continue
+        steps += count
+        states = [
+            _leaf(episode.observations, name, box) for name, box in leaves.items()
+        ]
+        observation = np.concatenate(states, axis=1)
+        if len(observation) != count + 1:
+            raise ValueError(
+                f"episode {number} has {count} rewards and {len(observation)} "
+                "observations; expected one more observation."
+            )
+        yield {
+            "observation": observation[:-1],
+            "next_observation": observation[1:],
+            "action": np.asarray(episode.actions).reshape(count, -1) - first,
+            "reward": np.asarray(episode.rewards),
+            "terminated": np.asarray(episode.terminations),
+            "truncated": np.asarray(episode.truncations),
+            "episode": np.full(count, number),
+        }
+    if steps != opened.total_steps:
+        raise ValueError(
+            f"{opened.id} holds {steps} steps where its metadata say "
+            f"{opened.total_steps}: the set is damaged, or has an episode of more than "
+            "32,767 steps in Arrow or Parquet, which Minari 0.5.4 reads in part."
+        )
+
+
+def _leaf(observations: Any, name: tuple[Any, ...], space: spaces.Space[Any]) -> Any:
+    """Rows ``[T + 1, D]`` of an entry of the observations."""
+    array = np.asarray(reduce(getitem, name, observations))
+    if isinstance(space, spaces.Box):
+        return array.reshape(len(array), -1)
+    rows: list[Any] = [spaces.flatten(space, each) for each in array]
+    return np.stack(rows)
+
+
+def _together(episodes: list[dict[str, Array]]) -> dict[str, Array]:
+    return {name: np.concatenate([e[name] for e in episodes]) for name in episodes[0]}

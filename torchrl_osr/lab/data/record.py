@@ -1,0 +1,173 @@
+"""Record episodes of any policy in any environment as a log.
+
+Shapes: ``N`` steps, ``S`` observation, ``A`` action.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import ArrayLike, NDArray
+from tqdm.auto import tqdm
+
+from torchrl_osr._extras import needed_by
+from torchrl_osr._files import whole_file
+
+Act = Callable[[NDArray[Any]], ArrayLike]
+"""Action in the environment's own units, ``[A]`` or a number, for a state ``[S]``."""
+
+WRITERS = {".npz": "numpy", ".hdf5": "h5py", ".h5": "h5py", ".parquet": "pyarrow"}
+"""The package that writes each kind of file, by its suffix."""
+
+
+def record_episodes(
+    env: gymnasium.Env[Any, Any],
+    act: Act | None,
+    num_episodes: int,
+    *,
+    noise: float = 0.0,
+    seed: int = 0,
+    progress: bool = True,
+) -> dict[str, NDArray[Any]]:
+    """Play whole episodes and keep every step.
+
+    Args:
+        env: the environment, in its own units.
+        act: the policy; ``None`` draws actions uniformly.
+        num_episodes: number of episodes, at least 1.
+
+    Keyword Args:
+        noise: standard deviation of Gaussian noise on actions, in half-widths of their
+            bounds, which they are clipped to; of discrete actions the share that is
+            drawn uniformly instead. Default 0.
+        seed: the episodes are seeded ``seed, seed + 1, ...``, and the draws by it.
+            Default 0.
+        progress: show a progress bar when on a terminal. Default ``True``.
+
+    Returns:
+        ``observation`` and ``next_observation`` ``[N, S]``, ``action`` ``[N, A]``, or
+        ``[N]`` if discrete, as the environment was given them, and ``reward``,
+        ``terminated``, ``truncated`` and ``episode`` ``[N]``: the columns that
+        :func:`~torchrl_osr.lab.data.load_dataset` reads.
+
+    Raises:
+        ValueError: ``num_episodes`` or ``noise`` is out of its range, an action of the
+            policy is none of the environment's, or a step gives no finite numbers.
+    """
+    most = 1 if isinstance(env.action_space, spaces.Discrete) else np.finfo(float).max
+    if num_episodes < 1 or not 0 <= noise <= most:
+        raise ValueError(
+            f"episodes={num_episodes} and noise={noise}; expected at least 1 episode "
+            f"and noise from 0 to {most:g}."
+        )
+    rng = np.random.default_rng([seed, 1])  # not the environment's own numbers
+    env.action_space.seed(int(rng.integers(2**31)))
+    steps: list[dict[str, Any]] = []
+    hidden = None if progress else True  # None: no bar off a terminal
+    for episode in tqdm(range(num_episodes), "collect", unit="episode", disable=hidden):
+        # Copies: the environment and the policy may write into their arrays.
+        observation, ended = np.array(env.reset(seed=seed + episode)[0]), False
+        while not ended:
+            action = _action(env.action_space, act, observation.copy(), noise, rng)
+            state, reward, terminated, truncated, _ = env.step(action)
+            step = {
+                "observation": observation,
+                "action": np.array(action),
+                "reward": reward,
+                "terminated": terminated,
+                "truncated": truncated,
+                "next_observation": np.array(state),
+                "episode": episode,
+            }
+            steps.append(step)
+            for name in ("observation", "next_observation", "reward"):
+                shape = () if name == "reward" else env.observation_space.shape
+                if np.shape(step[name]) != shape or not np.isfinite(step[name]).all():
+                    raise ValueError(
+                        f"step {len(steps)} of {env} has {name} {step[name]}; expected "
+                        f"finite numbers of shape {shape}."
+                    )
+            observation, ended = step["next_observation"], terminated or truncated
+    columns = {name: np.array([step[name] for step in steps]) for name in steps[0]}
+    real = [name for name, each in columns.items() if each.dtype.kind == "f"]
+    return columns | {name: columns[name].astype(np.float32) for name in real}
+
+
+def _action(
+    space: gymnasium.Space[Any],
+    act: Act | None,
+    observation: NDArray[Any],
+    noise: float,
+    rng: np.random.Generator,
+) -> Any:
+    if act is None:
+        return space.sample()
+    action = np.asarray(act(observation))
+    if isinstance(space, spaces.Discrete):
+        if rng.random() < noise:
+            return space.sample()
+        action = action[()] if action.ndim == 0 else action
+    else:
+        assert isinstance(space, spaces.Box)
+        half = (space.high - space.low) / 2
+        if action.shape == space.shape and noise:
+            noisy = action + noise * half * rng.standard_normal(space.shape)
+            action = np.clip(noisy, space.low, space.high)
+        action = action.astype(space.dtype)
+    if not space.contains(action):
+        raise ValueError(
+            f"the policy's action {np.asarray(action).tolist()} of shape "
+            f"{np.shape(action)} is not in the environment's {space}."
+        )
+    return action
+
+
+def check_log_path(path: Path) -> None:
+    """Raise unless a log can be written there.
+
+    Raises:
+        ImportError: the format's package is not installed.
+        ValueError: the suffix is none of :data:`WRITERS`.
+        FileExistsError: something is there.
+    """
+    if path.suffix not in WRITERS:
+        raise ValueError(f"path={path} must end in one of {', '.join(WRITERS)}.")
+    if path.exists():
+        raise FileExistsError(
+            f"path={path} exists and is not replaced: choose another."
+        )
+    with needed_by(f"{path.suffix} files need", "minari"):
+        import_module(WRITERS[path.suffix])
+
+
+def write_log(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
+    """Write columns to a file that :func:`~torchrl_osr.lab.data.load_dataset` reads.
+
+    The file appears whole or not at all.
+
+    Args:
+        path: see :func:`check_log_path`; missing folders are made.
+        columns: of one length, see :func:`record_episodes`.
+    """
+    check_log_path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(path) as file:
+        if path.suffix == ".npz":
+            np.savez(file, allow_pickle=False, **columns)
+        elif path.suffix == ".parquet":
+            from pyarrow import parquet, table
+
+            lists = {name: list(each) for name, each in columns.items()}
+            parquet.write_table(table(lists), file)
+        else:
+            import h5py
+
+            with h5py.File(file, "w") as archive:
+                for name, each in columns.items():
+                    archive[name] = each

@@ -1,0 +1,207 @@
+"""Named data sets, rolled out from the behaviour policies of the package.
+
+``random`` draws uniform actions; ``medium-replay`` stands for the replay buffer of a
+training run by eight snapshots on the way to the medium policy; the mixtures are made
+of equal shares. The mazes have sources of their own, see
+:mod:`~torchrl_osr.lab.data.mazes`.
+
+Gymnasium and a NumPy policy, one environment, one process: on one core that was faster
+than vectorised environments and than a torch policy.
+
+Shapes: ``N`` transitions, ``E`` complete episodes, ``S`` observation, ``A`` action.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from contextlib import closing
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+from tensordict import TensorDict
+from tqdm.auto import tqdm
+
+from torchrl_osr._files import sha256_of
+from torchrl_osr.lab.data.behavior import behavior_policy_path, load_behavior_policy
+from torchrl_osr.lab.data.environment import (
+    MAZE_IDS,
+    environment_id,
+    make_environment,
+)
+from torchrl_osr.lab.data.mazes import ActionSampler, maze_behavior, maze_players
+from torchrl_osr.lab.data.transitions import ACTION_LIMIT, as_transitions
+
+BEHAVIORS: dict[str, tuple[str, ...]] = {
+    "random": (),
+    "medium": ("medium",),
+    "medium-replay": tuple(f"replay_{number}" for number in range(1, 9)),
+    "medium-expert": ("medium", "expert"),
+    "expert": ("expert",),
+}
+"""Behaviour policies of each source, in equal shares; ``random`` needs none."""
+
+
+class Collection(NamedTuple):
+    """Transitions, and the statistics of the complete episodes.
+
+    Attributes:
+        data: transitions ``[N]``.
+        episode_returns: undiscounted returns ``[E]``, float64.
+        episode_lengths: steps ``[E]``.
+    """
+
+    data: TensorDict
+    episode_returns: NDArray[np.float64]
+    episode_lengths: NDArray[np.int64]
+
+
+def behavior_of(env_name: str, source: str) -> dict[str, Any]:
+    """Entries of the manifest that determine the rows, beside the seed."""
+    if env_name in MAZE_IDS:
+        return {"behavior": maze_behavior(env_name, source)}
+    if source not in BEHAVIORS:
+        raise ValueError(f"unknown data={source!r}; there are: {', '.join(BEHAVIORS)}.")
+    paths = {name: behavior_policy_path(env_name, name) for name in BEHAVIORS[source]}
+    return {"behavior_sha256": {name: sha256_of(path) for name, path in paths.items()}}
+
+
+def collect_source(
+    env_name: str,
+    source: str,
+    num_transitions: int,
+    *,
+    seed: int = 0,
+    progress: bool = True,
+) -> Collection:
+    """Roll out one of the named data sets.
+
+    Args:
+        env_name: ``"hopper"``, ``"walker2d"``, ``"halfcheetah"``, or
+            ``"pointmaze-umaze"``, ``-medium`` or ``-large``.
+        source: a key of ``BEHAVIORS``; of a maze ``"diverse"`` or ``"play"``.
+        num_transitions: exact number of transitions ``N``.
+
+    Keyword Args:
+        seed: non-negative seed. Default: 0. The source enters too, so that a medium and
+            a medium-expert set of one seed share no episode.
+        progress: show a progress bar when on a terminal. Default: ``True``.
+    """
+    behavior_of(env_name, source)  # an unknown source stops here
+    entropy = (seed, zlib.crc32(f"{env_name}-{source}".encode()))
+    with closing(make_environment(environment_id(env_name))) as env:
+        if env_name in MAZE_IDS:
+            env, samplers = maze_players(env, env_name, source)
+        else:
+            policies = [
+                load_behavior_policy(env_name, name) for name in BEHAVIORS[source]
+            ]
+            samplers = [policy.sample for policy in policies] or [uniform_sampler(env)]
+        return collect_transitions(
+            env, samplers, num_transitions, seed=entropy, progress=progress
+        )
+
+
+def uniform_sampler(env: gymnasium.Env[Any, Any]) -> ActionSampler:
+    """Sampler of uniform actions in ``[-ACTION_LIMIT, ACTION_LIMIT]``."""
+    action_size = gymnasium.spaces.flatdim(env.action_space)
+
+    def sample(_: NDArray[Any], rng: np.random.Generator) -> NDArray[np.float32]:
+        draws = rng.uniform(-ACTION_LIMIT, ACTION_LIMIT, action_size)
+        return draws.astype(np.float32)
+
+    return sample
+
+
+def collect_transitions(
+    env: gymnasium.Env[Any, Any],
+    samplers: Sequence[ActionSampler],
+    num_transitions: int,
+    *,
+    seed: int | Sequence[int] = 0,
+    progress: bool = True,
+) -> Collection:
+    """Roll out an exact number of transitions, in equal shares of several policies.
+
+    Each policy plays episode after episode until its share is full; the last row of
+    a share that is cut within an episode is marked truncated. The stored actions are
+    the executed ones, clipped to ``ACTION_LIMIT``.
+
+    Args:
+        env: task as :func:`~torchrl_osr.lab.data.make_environment` returns it.
+        samplers: draw actions ``[A]`` in -1 to 1 for an observation ``[S]``, given a
+            NumPy generator; one for each policy.
+        num_transitions: ``N``, at least one for each policy. Shares differ by one at
+            most.
+
+    Keyword Args:
+        seed: non-negative seed or seeds; global generators are not used. Default: 0.
+        progress: show a progress bar when on a terminal. Default: ``True``.
+
+    Returns:
+        The transitions, ordered by policy and time, and the episode statistics.
+    """
+    if not 0 < len(samplers) <= num_transitions:
+        raise ValueError(
+            f"num_transitions={num_transitions} for {len(samplers)} policies; "
+            "expected at least one transition each."
+        )
+    state = num_transitions, gymnasium.spaces.flatdim(env.observation_space)
+    action = num_transitions, gymnasium.spaces.flatdim(env.action_space)
+    columns: dict[str, NDArray[Any]] = {
+        "observation": np.empty(state, np.float32),
+        "action": np.empty(action, np.float32),
+        "next_observation": np.empty(state, np.float32),
+        "reward": np.empty(num_transitions, np.float32),
+        "terminated": np.zeros(num_transitions, np.bool_),
+        "truncated": np.zeros(num_transitions, np.bool_),
+    }
+    bounds = [num_transitions * i // len(samplers) for i in range(len(samplers) + 1)]
+    seeds = np.random.SeedSequence(seed).spawn(len(samplers))
+    episodes: list[tuple[float, int]] = []
+    hidden = None if progress else True  # None: no bar where there is no terminal
+    with tqdm(
+        total=num_transitions, desc="collect", unit="step", disable=hidden
+    ) as bar:
+        for sampler, child, (start, stop) in zip(
+            samplers, seeds, pairwise(bounds), strict=True
+        ):
+            rng = np.random.default_rng(child)
+            while start < stop:
+                rows = {name: column[start:stop] for name, column in columns.items()}
+                length, episode_return = _play_episode(env, sampler, rng, rows)
+                if episode_return is not None:
+                    episodes.append((episode_return, length))
+                start += length
+                bar.update(length)
+    returns, lengths = np.array(episodes, np.float64).reshape(-1, 2).T
+    return Collection(as_transitions(columns), returns, lengths.astype(np.int64))
+
+
+def _play_episode(
+    env: gymnasium.Env[Any, Any],
+    sampler: ActionSampler,
+    rng: np.random.Generator,
+    rows: dict[str, NDArray[Any]],
+) -> tuple[int, float | None]:
+    """Fill ``rows`` from their start; return the length, and the return if complete."""
+    observation, _ = env.reset(seed=int(rng.integers(2**31)))
+    episode_return = 0.0
+    capacity = len(rows["reward"])
+    for step in range(capacity):
+        rows["observation"][step] = observation
+        action = np.clip(sampler(observation, rng), -ACTION_LIMIT, ACTION_LIMIT)
+        observation, reward, terminated, truncated, _ = env.step(action)
+        rows["action"][step] = action
+        rows["next_observation"][step] = observation
+        rows["reward"][step] = reward
+        episode_return += float(reward)
+        if terminated or truncated:
+            rows["terminated"][step] = terminated
+            rows["truncated"][step] = truncated
+            return step + 1, episode_return
+    rows["truncated"][capacity - 1] = True
+    return capacity, None

@@ -1,0 +1,220 @@
+"""Rows of a data set: held out, mixed, consecutive, and several steps together.
+
+Shapes: ``N`` transitions, ``B`` rows of them, ``A`` action.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_osr.lab.data.transitions import ROWS_AT_A_TIME, SAME_STATE
+
+
+def held_out_rows(rows: int, held_out: int | float, *, seed: int) -> Tensor:
+    """Numbers of randomly chosen rows, in random order.
+
+    Args:
+        rows: number of rows ``N``.
+        held_out: number of held-out rows (``int``), or their share (``float`` between
+            0 and 1, rounded to whole rows).
+
+    Keyword Args:
+        seed: of the choice, which has a generator of its own.
+
+    Raises:
+        ValueError: none would be held out, or all.
+    """
+    count = round(held_out * rows) if isinstance(held_out, float) else held_out
+    if not 0 < count < rows:
+        raise ValueError(
+            f"held_out={held_out!r} would hold out {count} of {rows} rows; "
+            "expected at least one row on each side."
+        )
+    order = torch.randperm(rows, generator=torch.Generator().manual_seed(seed))
+    return order[:count].clone()  # not the rest of the memory with it
+
+
+def split_held_out(
+    data: TensorDict, held_out: int | float, *, seed: int
+) -> tuple[TensorDict, TensorDict]:
+    """Training and held-out rows, see :func:`held_out_rows`, in their original order.
+
+    A memory-mapped set would be copied into memory: see ``left_out`` of
+    :func:`~torchrl_osr.lab.data.make_replay_buffer`.
+    """
+    mask = torch.zeros(len(data), dtype=torch.bool)
+    mask[held_out_rows(len(data), held_out, seed=seed)] = True
+    mask = mask.to(data.device or "cpu")
+    return data[~mask], data[mask]
+
+
+def mix_datasets(
+    valuable: TensorDict, random: TensorDict, *, random_share: float, seed: int
+) -> TensorDict:
+    """Replace a share of the rows by rows of another data set; the number stays.
+
+    Limited valuable data, section 5.3 of the paper. The rows of each set are drawn
+    without replacement.
+
+    Args:
+        valuable: ``N`` transitions.
+        random: at least as many as are needed of it.
+
+    Keyword Args:
+        random_share: of the ``N`` rows, rounded to whole ones.
+        seed: of the choice, which has a generator of its own.
+
+    Returns:
+        ``N`` transitions: those kept of ``valuable``, then those of ``random``.
+    """
+    number = round(random_share * len(valuable))
+    if not 0 <= random_share <= 1 or number > len(random):
+        raise ValueError(
+            f"random_share={random_share} of {len(valuable)} rows, with {len(random)} "
+            "random rows; expected a share from 0 to 1 and enough random rows."
+        )
+    generator = torch.Generator().manual_seed(seed)
+    kept = torch.randperm(len(valuable), generator=generator)[number:].sort().values
+    taken = torch.randperm(len(random), generator=generator)[:number].sort().values
+    mixed: TensorDict = torch.cat([valuable[kept], random[taken]])
+    return mixed
+
+
+def is_followed(data: TensorDictBase, rows: Tensor | None = None) -> Tensor:
+    """Whether each row is followed by the row that came next in time, bool ``[B]``.
+
+    Then it ends no episode, and its next state is the state of the following row.
+
+    Args:
+        data: all transitions ``[N]``.
+        rows: numbers of rows ``[B]``. Default: all.
+    """
+    rows = torch.arange(len(data)) if rows is None else rows
+    after = (rows + 1).clamp(max=len(data) - 1)
+    reached = data["next", "observation"][rows]
+    state = data["observation"][after]
+    slack = SAME_STATE * state.abs().clamp_min(1)
+    apart = ((reached - state).abs() > slack).any(-1)
+    ends = data["next", "done"][rows].squeeze(-1) | (rows + 1 == len(data))
+    followed: Tensor = ~(apart | ends)
+    return followed
+
+
+def next_action(data: TensorDictBase, rows: Tensor | None = None) -> Tensor:
+    """Action ``[B, A]`` of the following row, 0 where an episode ends.
+
+    Args:
+        data: all transitions ``[N]`` in order of time, see :func:`check_order`.
+        rows: numbers of rows ``[B]``. Default: all.
+    """
+    rows = torch.arange(len(data)) if rows is None else rows
+    following: Tensor = data["action"][(rows + 1).clamp(max=len(data) - 1)]
+    return following.masked_fill(data["next", "done"][rows], 0.0)
+
+
+def check_order(data: TensorDictBase) -> None:
+    """Raise unless every row that does not end an episode is followed by its next.
+
+    Args:
+        data: transitions ``[N]``; read in chunks.
+    """
+    wrong = []
+    every: Any = torch.arange(len(data))
+    for rows in every.split(ROWS_AT_A_TIME):
+        done = data["next", "done"][rows].squeeze(-1)
+        wrong += rows[~(done | is_followed(data, rows))].tolist()
+    if wrong:
+        raise ValueError(
+            f"{len(wrong):,} of the {len(data):,} rows, row {wrong[0]} the first, end "
+            "no episode and are not followed by the row that came next in time. Give "
+            "the rows in order, and mark the last one of each episode as truncated."
+        )
+
+
+def consecutive_rows(data: TensorDictBase, starts: Tensor, length: int) -> TensorDict:
+    """Pieces of trajectories: each row is followed by the one that came after it.
+
+    Args:
+        data: transitions ``[N]`` in the order in which they were recorded.
+        starts: numbers of the first rows. Those that are not followed by enough rows
+            of the same trajectory are left out.
+        length: rows of a piece, ``L``.
+
+    Returns:
+        Transitions ``[n, L]``; of ``starts``, ``n`` are left.
+    """
+    starts = starts[starts + length <= len(data)]
+    rows = starts.unsqueeze(-1) + torch.arange(length, device=starts.device)
+    followed = is_followed(data, rows[:, :-1].flatten())
+    rows = rows[followed.view(len(starts), length - 1).all(1)]
+    pieces: TensorDict = data[rows.flatten()].view(len(rows), length)
+    return pieces
+
+
+def multi_step(
+    data: TensorDictBase,
+    rows: Tensor | None = None,
+    *,
+    n_steps: int,
+    gamma: float,
+    reward_scale: float = 1.0,
+    reward_shift: float = 0.0,
+    with_next_action: bool = False,
+) -> TensorDict:
+    r"""What each row leads to in at most ``n_steps`` steps of the data.
+
+    The reward is :math:`\sum_{k<m} \gamma^k (a\,r_k + b)`; state and flags are those
+    after the last of the m steps. m is less than ``n_steps`` where an episode ends, or
+    where the row after is not the one that came next in time.
+
+    TorchRL 0.14.1's ``MultiStep`` keeps the flags of the first step, so that returns
+    that have reached a terminal state are bootstrapped from it.
+
+    Args:
+        data: all transitions ``[N]``.
+        rows: numbers of rows ``[B]``. Default: all.
+
+    Keyword Args:
+        n_steps: the largest m.
+        gamma: discount factor.
+        reward_scale: a.
+        reward_shift: b.
+        with_next_action: add the data's ``"action"`` at the state that the steps lead
+            to, see :func:`next_action`.
+
+    Returns:
+        The entries of ``"next"``, and ``"steps"``, m, ``[B, 1]``.
+    """
+
+    def reward_of(rows: Tensor) -> Tensor:
+        reward: Tensor = data["next", "reward"][rows]
+        return reward_scale * reward + reward_shift
+
+    last = torch.arange(len(data)) if rows is None else rows
+    whole = is_followed(data) if rows is None else None
+    steps, reward = torch.ones_like(last), reward_of(last)
+    for step in range(1, n_steps):
+        goes_on = is_followed(data, last) if whole is None else whole[last]
+        last = last + goes_on
+        reward += goes_on.unsqueeze(-1) * gamma**step * reward_of(last)
+        steps += goes_on
+    found: TensorDict = data["next"].exclude("action")[last].set("reward", reward)
+    if with_next_action:
+        found["action"] = next_action(data, last)
+    return found.set("steps", steps.unsqueeze(-1))
+
+
+def take_multi_step(batch: TensorDictBase) -> TensorDictBase:
+    """A batch whose ``"next"`` is :func:`multi_step`, which was in ``"multi_step"``.
+
+    The transition of one step is then in ``"one_step"``, for the losses that ask which
+    action leads to the next state; ``"steps_to_next_obs"`` is TorchRL's name for m.
+    """
+    after = batch["multi_step"]
+    batch = batch.exclude("multi_step").set("one_step", batch["next"])
+    batch["steps_to_next_obs"] = after["steps"]
+    return batch.set("next", after.exclude("steps"))

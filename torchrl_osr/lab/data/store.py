@@ -1,0 +1,308 @@
+"""Transitions on disk, memory-mapped, and the cache folder of such data sets.
+
+A data set is a folder with ``rows``, which ``TensorDict.load_memmap`` reads, and
+``manifest.json``, which says what they were made from and holds their checksum. Rows
+are read when they are drawn; the system takes their pages back when memory is short.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import torch
+from filelock import FileLock
+from tensordict import MemoryMappedTensor, NestedKey, TensorDict, TensorDictBase
+from torchrl import torchrl_logger
+from tqdm.auto import tqdm
+
+from torchrl_osr._extras import needed_by
+from torchrl_osr._files import check_disk_space, read_json, sha256_of, write_json
+from torchrl_osr.lab.data.transitions import (
+    DATASET_KEYS,
+    FLAG_KEYS,
+    check_filled,
+    check_rows,
+)
+
+CACHE_VARIABLE = "TORCHRL_OSR_CACHE"
+"""Environment variable that moves the cache folder."""
+
+CHUNK_ROWS = 200_000
+"""Rows that are converted and written at a time: some ten megabytes of hopper."""
+
+MANIFEST, ROWS = "manifest.json", "rows"
+
+# Raise the number whenever the files or the required entries of the manifest change.
+FORMAT = "torchrl-osr transitions 2"
+
+FILES: dict[NestedKey, str] = {
+    key: f"{key if isinstance(key, str) else '/'.join(key)}.memmap"
+    for key in DATASET_KEYS
+}
+"""Files of the columns, below ``rows``, as tensordict names them."""
+
+
+def cache_root(cache_dir: Path | str | None = None) -> Path:
+    """Folder of all cached data sets. Default: the user's, or ``TORCHRL_OSR_CACHE``."""
+    root = cache_dir or os.environ.get(CACHE_VARIABLE)
+    if root is None:
+        with needed_by("the cache needs", "train"):
+            import platformdirs
+        root = platformdirs.user_cache_dir("torchrl-osr")
+    return Path(root).expanduser()
+
+
+def is_memory_mapped(data: TensorDictBase) -> bool:
+    """Whether a data set's rows are read from disk when they are drawn."""
+    return isinstance(data.get("observation", None), MemoryMappedTensor)
+
+
+def is_memmap_folder(folder: Path | str) -> bool:
+    """Whether :func:`load_memmap` is the reader of a path."""
+    return (Path(folder).expanduser() / MANIFEST).is_file()
+
+
+def write_memmap(
+    chunks: Iterable[TensorDict],
+    folder: Path | str,
+    *,
+    describe: Callable[[], Mapping[str, Any]] = dict,
+    total: int | None = None,
+    progress: bool = True,
+) -> tuple[TensorDict, dict[str, Any]]:
+    """Write transitions to a folder, chunk by chunk, and open them.
+
+    They are written to a hidden folder, ``.<name>.partial``, which is renamed at the
+    end: an interrupted call leaves no data set.
+
+    Args:
+        chunks: transitions ``[n]`` each, float32. Only one is in memory at a time.
+        folder: of the data set, which is made, or replaced.
+
+    Keyword Args:
+        describe: called when all chunks are written; returns JSON-compatible entries of
+            the manifest. Default: none.
+        total: number of rows, or more, for the bar and to check the free space before
+            the work. Default: unknown.
+        progress: show a progress bar when on a terminal. Default: ``True``.
+
+    Returns:
+        Like :func:`load_memmap`.
+
+    Raises:
+        FileExistsError: the folder holds something else, which is not touched.
+        ValueError: :func:`~torchrl_osr.lab.data.check_dataset` refuses the rows.
+        OSError: the disk is full, or cannot be written.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_osr.lab.data import load_dataset, write_memmap
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     rows, _ = load_dataset("hopper", "random", num_transitions=500)
+        ...     data, manifest = write_memmap(rows.split(200), f"{folder}/set")
+        >>> bool((data == rows).all()), manifest["num_transitions"]
+        (True, 500)
+    """
+    folder = Path(folder).expanduser()
+    if os.path.lexists(folder) and not _is_ours(folder):
+        raise FileExistsError(
+            f"{folder} is not replaced: it is no data set, or holds other files. "
+            "Choose another folder, or remove it."
+        )
+    partial = folder.with_name(f".{folder.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    bar = tqdm(
+        total=total,
+        desc=f"write {folder.name}",
+        unit="row",
+        unit_scale=True,
+        disable=None if progress else True,
+    )
+    try:
+        with explained_write_errors(folder):
+            (partial / ROWS / "next").mkdir(parents=True)
+        with bar:
+            rows = _write_rows(chunks, partial / ROWS, folder, total, bar)
+        manifest = dict(describe()) | {"format": FORMAT, "num_transitions": rows}
+        with explained_write_errors(folder):
+            manifest["rows_sha256"] = _checksum(partial / ROWS)
+            write_json(partial / MANIFEST, manifest)
+            if folder.exists():
+                shutil.rmtree(folder)
+            os.replace(partial, folder)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+    return load_memmap(folder)
+
+
+def _write_rows(
+    chunks: Iterable[TensorDict],
+    rows_folder: Path,
+    folder: Path,
+    total: int | None,
+    bar: Any,
+) -> int:
+    """Append the columns to their files and describe these as tensordict does."""
+    sizes: dict[NestedKey, int] = {}
+    rows = 0
+    with ExitStack() as stack:
+        files = {
+            key: stack.enter_context((rows_folder / name).open("wb"))
+            for key, name in FILES.items()
+        }
+        for chunk in chunks:
+            check_rows(chunk)
+            found = {key: chunk.get(key).shape[-1] for key in FILES}
+            if found != (sizes or found):
+                raise ValueError(f"rows from {rows:,} on have other sizes than before.")
+            if not sizes and total is not None:
+                needed = total * chunk.bytes() // len(chunk)
+                check_disk_space(folder, needed, "the data set")
+            sizes = found
+            with explained_write_errors(folder):
+                for key, file in files.items():
+                    file.write(chunk.get(key).numpy(force=True).tobytes())
+                    file.flush()
+            rows += len(chunk)
+            bar.update(len(chunk))
+        if not rows:
+            raise ValueError("there is no row to write; expected at least one.")
+    data = TensorDict({"next": TensorDict({}, [rows])}, [rows])
+    for key, name in FILES.items():
+        dtype = torch.bool if key in FLAG_KEYS else torch.float32
+        shape = torch.Size([rows, sizes[key]])
+        data[key] = MemoryMappedTensor.from_filename(rows_folder / name, dtype, shape)
+    check_filled(data)
+    data.memmap(rows_folder, existsok=True)
+    return rows
+
+
+def load_memmap(folder: Path | str) -> tuple[TensorDict, dict[str, Any]]:
+    """Open a data set that :func:`write_memmap` has written.
+
+    Its files are read once, to compare their checksum; rows are read when asked for.
+
+    Args:
+        folder: of the data set; it may have been copied from another machine.
+
+    Returns:
+        The transitions ``[N]``, memory-mapped, and the manifest. What is written into
+        these tensors is written into the files: change a ``clone()``.
+
+    Raises:
+        FileNotFoundError: there is no such data set.
+        ValueError: it is damaged, or of another version.
+    """
+    folder = Path(folder).expanduser()
+    if not is_memmap_folder(folder):
+        raise FileNotFoundError(
+            f"{folder} has no {MANIFEST}; expected a folder that write_memmap wrote."
+        )
+    try:
+        manifest = read_json(folder / MANIFEST)
+        if manifest.get("format") != FORMAT:
+            raise ValueError(
+                f"its format is {manifest.get('format')!r}, not {FORMAT!r}"
+            )
+        if manifest.get("rows_sha256") != _checksum(folder / ROWS):
+            raise ValueError("its checksum is wrong")
+    except ValueError as error:
+        raise ValueError(f"{folder} is damaged: {error}. Write it again.") from error
+    return TensorDict.load_memmap(folder / ROWS), manifest
+
+
+def load_or_write(
+    folder: Path,
+    request: Mapping[str, Any],
+    chunks: Callable[[], Iterable[TensorDict]],
+    *,
+    describe: Callable[[], Mapping[str, Any]] = dict,
+    total: int | None = None,
+    progress: bool = True,
+) -> tuple[TensorDict, dict[str, Any]]:
+    """Open a cached data set, or write it first, see :func:`write_memmap`.
+
+    Processes that ask for the same data set at once wait for one of them to write it.
+
+    Args:
+        folder: of the data set.
+        request: JSON-compatible entries of the manifest that determine the rows. A data
+            set with others is written anew.
+        chunks: makes the transitions.
+    """
+    wanted = json.loads(json.dumps(request))  # like the manifest's: without tuples
+
+    def load() -> tuple[TensorDict, dict[str, Any]]:
+        data, manifest = load_memmap(folder)
+        for key in wanted:
+            if manifest.get(key) != wanted[key]:
+                raise ValueError(
+                    f"its {key} is {manifest.get(key)!r}, wanted {wanted[key]!r}."
+                )
+        return data, manifest
+
+    # Without the lock first: a data set can be read from a read-only folder.
+    with suppress(OSError, ValueError):
+        return load()
+    with explained_write_errors(folder):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(f"{folder}.lock")
+        lock.acquire()
+    try:
+        return load()  # another process may have written it in the meantime
+    except (OSError, ValueError) as flaw:
+        if folder.exists():
+            torchrl_logger.warning(f"Making {folder} anew: {flaw}")
+        return write_memmap(
+            chunks(),
+            folder,
+            describe=lambda: wanted | dict(describe()),
+            total=total,
+            progress=progress,
+        )
+    finally:
+        lock.release()
+
+
+@contextmanager
+def explained_write_errors(folder: Path) -> Iterator[None]:
+    """Add the folder and a cure to an error of the file system."""
+    try:
+        yield
+    except OSError as error:
+        # errno picks the subclass, so that PermissionError stays one.
+        raise OSError(
+            error.errno,
+            f"cannot write the data set ({error.strerror}); free space, or choose "
+            f"another folder ({CACHE_VARIABLE}=/path moves the cache)",
+            str(folder),
+        ) from error
+
+
+def _is_ours(folder: Path) -> bool:
+    """Whether a folder holds nothing but a data set, perhaps a damaged one."""
+    if not folder.is_dir() or folder.is_symlink():
+        return False
+    return {path.name for path in folder.iterdir()} <= {MANIFEST, ROWS}
+
+
+def _checksum(folder: Path) -> str:
+    """SHA-256 of the files of a data set.
+
+    Raises:
+        ValueError: they are others; tensordict would unpickle some kinds.
+    """
+    paths = sorted(path for path in folder.rglob("*") if path.is_file())
+    names = {path.relative_to(folder).as_posix() for path in paths}
+    if names != {*FILES.values(), "meta.json", "next/meta.json"}:
+        raise ValueError(f"it has the files {', '.join(sorted(names))}")
+    digests = [sha256_of(path) for path in paths]
+    return hashlib.sha256("".join(digests).encode()).hexdigest()

@@ -1,0 +1,424 @@
+"""Logs of your own as tables: CSV, Parquet, HDF5 or NumPy archives.
+
+The parts of a log (observation, action, reward, ...) are columns that you name, or
+those with the usual names. A vector is a column of rows ``[N, D]``, or several columns.
+"""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import gzip
+import re
+import warnings
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from fnmatch import fnmatchcase
+from glob import glob
+from itertools import chain, pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from torchrl_osr._extras import needed_by
+from torchrl_osr._files import check_unpacked_size, read_arrays
+from torchrl_osr.lab.data.recording import Recording, whole_trajectories
+from torchrl_osr.lab.data.transitions import Array, Reading
+
+with needed_by("tables need", "train"):
+    import pandas as pd
+
+Arrays = dict[str, Array]
+
+ENDINGS = (".csv", ".csv.gz", ".parquet", ".hdf5", ".h5", ".npz")
+
+USUAL_NAMES = {
+    "observation": ("observation", "observations", "obs", "state", "states"),
+    "action": ("action", "actions", "act"),
+    "reward": ("reward", "rewards"),
+    "terminated": ("terminated", "terminal", "terminals"),
+    "truncated": ("truncated", "timeout", "timeouts"),
+    "episode": ("episode", "episode_id"),
+    "step": (),
+    "next_observation": (
+        *("next_observation", "next_observations", "next_obs"),
+        *("next_state", "next_states"),
+    ),
+}
+"""Parts of a log, and what their columns are called unless you name them."""
+
+VECTORS = ("observation", "action", "next_observation")
+
+ColumnNames = Mapping[str, str | Sequence[str] | bool | None]
+"""Names or patterns (``obs_*``) of columns, by the keys of ``USUAL_NAMES``.
+
+``None`` stands for the usual names; ``terminated=False`` for a task that never ends.
+"""
+
+
+class Table(NamedTuple):
+    """A file with named columns.
+
+    Attributes:
+        names: of all columns, in the file's order.
+        read: yields some columns, about so many rows at a time or all at once.
+        notes: what was detected.
+    """
+
+    names: list[str]
+    read: Callable[[list[str], int | None], Iterator[Arrays]]
+    notes: tuple[str, ...] = ()
+
+
+def open_log(
+    path: str | Path | Sequence[str], columns: ColumnNames | None, options: Reading
+) -> Recording:
+    """Open a log, see :func:`~torchrl_osr.lab.data.load_dataset`; no row is read yet.
+
+    Args:
+        path: of a file; or several that make one log, as a list or a pattern.
+        columns: names of the parts. Default: the usual names; then a column that is
+            not known is an error, otherwise it is left out.
+        options: for the conversion.
+    """
+    tables = {file: _table(file) for file in _files(path)}
+    first = next(iter(tables.values()))
+    layout = find_columns(first.names, columns or {})
+    names = [*chain(*layout.values())]
+    notes = [f"{file.name}: {n}" for file, table in tables.items() for n in table.notes]
+
+    def parts(rows: int | None) -> Iterator[Mapping[str, Array]]:
+        codes: dict[Any, int] = {}
+        step = layout.get("step")
+        for file, table in tables.items():
+            if lacking := {*names} - {*table.names}:
+                raise ValueError(f"{file} lacks {', '.join(lacking)}.")
+            # To sort them, all rows are needed.
+            chunks: Iterable[Arrays] = (
+                assemble(layout, arrays, codes, file if len(tables) > 1 else None)
+                for arrays in table.read(names, None if step else rows)
+            )
+            if step:
+                chunks = (_sorted(each, step[0], notes) for each in chunks)
+            yield from chunks if step or not rows else whole_trajectories(chunks)
+
+    files = [str(file) for file in tables]
+    about = {
+        "source": "file",
+        "path": files[0] if len(files) == 1 else files,
+        "columns": layout,
+        "unused_columns": [name for name in first.names if name not in names],
+    }
+    return Recording(parts, options, about, [*tables], notes)
+
+
+def _files(path: str | Path | Sequence[str]) -> list[Path]:
+    files: list[Path] = []
+    for each in [path] if isinstance(path, (str, Path)) else path:
+        whole = Path(each).expanduser().absolute()
+        # A name that looks like a pattern is a name.
+        found = [whole] if whole.is_file() else map(Path, sorted(glob(str(whole))))
+        files += found
+        if not files:
+            raise FileNotFoundError(f"there is no file {whole}: give a log's path.")
+    if wrong := [file for file in files if not file.name.endswith(ENDINGS)]:
+        raise ValueError(f"{wrong[0]} must end in one of {', '.join(ENDINGS)}.")
+    return files
+
+
+def _table(path: Path) -> Table:
+    kinds = {".parquet": _parquet, ".hdf5": _hdf5, ".h5": _hdf5, ".npz": _npz}
+    with _explained(path):
+        table = kinds.get(path.suffix, _csv)(path)
+        if len({*table.names}) < len(table.names):
+            raise ValueError(f"two columns have one name: {_listed(table.names)}")
+    return table
+
+
+@contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    """Name the file and the kind of error when a library cannot read it."""
+    try:
+        yield
+    except (EOFError, OSError, RuntimeError, ValueError, Warning, zlib.error) as error:
+        kind = f"{type(error).__name__}: {error}"
+        raise ValueError(f"{path} cannot be read ({kind}); is it whole?") from error
+
+
+def _npz(path: Path) -> Table:
+    arrays = read_arrays(path)
+    return Table([*arrays], lambda names, _: iter([{n: arrays[n] for n in names}]))
+
+
+def _csv(path: Path) -> Table:
+    with (gzip.open if path.suffix == ".gz" else open)(path, "rb") as file:
+        head = file.read(2**16)
+    wide = head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    encoding = "utf-16" if wide else "utf-8-sig"
+    try:
+        text = codecs.getincrementaldecoder(encoding)().decode(head)
+    except UnicodeDecodeError:
+        encoding = "cp1252"
+        text = head.decode(encoding, errors="replace")
+    lines = text.splitlines() or [""]
+    separator = max(",;\t", key=lines[0].count)
+    names = [n.strip() for n in next(csv.reader(lines[:1], delimiter=separator), [])]
+    if len(names) < 2 or not all(names):
+        raise ValueError(
+            f"its first line holds {names}; expected the names of at least two columns"
+        )
+    comma = separator != "," and any(re.search(r"\d,\d", line) for line in lines[1:])
+    form = {"sep": separator, "decimal": "," if comma else ".", "encoding": encoding}
+    usual = {"sep": ",", "decimal": ".", "encoding": "utf-8-sig"}
+
+    def read(chosen: list[str], _: int | None) -> Iterator[Arrays]:
+        with _explained(path), warnings.catch_warnings():
+            # pandas drops what a line has beyond the header, with a warning.
+            warnings.simplefilter("error", pd.errors.ParserWarning)
+            options: Any = {"header": 0, "names": names, "index_col": False, **form}
+            frame = pd.read_csv(path, low_memory=False, **options)
+        yield {name: frame[name].to_numpy() for name in chosen}
+
+    return Table(names, read, (f"read as {form}",) if form != usual else ())
+
+
+def _parquet(path: Path) -> Table:
+    with needed_by("Parquet files need", "minari"):
+        from pyarrow import parquet
+    file = parquet.ParquetFile(path)
+
+    def read(chosen: list[str], rows: int | None) -> Iterator[Arrays]:
+        with _explained(path):
+            size = rows or max(file.metadata.num_rows, 1)
+            for batch in file.iter_batches(size, columns=chosen):
+                yield {name: _from_arrow(name, batch[name]) for name in chosen}
+
+    return Table(file.schema_arrow.names, read)
+
+
+def _from_arrow(name: str, column: Any) -> Array:
+    """Column ``[N]``, or ``[N, D]`` if it holds lists."""
+    if not hasattr(column, "value_lengths"):
+        return np.asarray(column.to_pandas().to_numpy())
+    lengths = {*column.value_lengths().to_pylist()}
+    if len(lengths) > 1 or None in lengths:
+        raise ValueError(f"{name!r} holds lists of the lengths {lengths}; expected one")
+    return np.asarray(column.flatten().to_numpy(False)).reshape(len(column), -1)
+
+
+def _hdf5(path: Path) -> Table:
+    with needed_by("HDF5 files need", "minari"):
+        import h5py
+    with h5py.File(path, "r") as file:
+        sizes = {n: a.nbytes for n, a in file.items() if isinstance(a, h5py.Dataset)}
+
+    def read(chosen: list[str], _: int | None) -> Iterator[Arrays]:
+        with _explained(path), h5py.File(path, "r") as file:
+            check_unpacked_size(path, sum(sizes[name] for name in chosen))
+            arrays = {name: np.asarray(file[name]) for name in chosen}
+        yield arrays
+
+    return Table([*sizes], read)
+
+
+def find_columns(names: Sequence[str], wanted: ColumnNames) -> dict[str, list[str]]:
+    """Names of the columns of each part of a log.
+
+    Args:
+        names: of the file's columns.
+        wanted: names by part. Without any, all columns must be known.
+
+    Raises:
+        ValueError: a named column is not there, or is read twice; a part or an entry of
+            a vector is missing, or a column is not known.
+    """
+    if unknown := wanted.keys() - USUAL_NAMES.keys():
+        raise ValueError(
+            f"data.columns has no {', '.join(unknown)}, only {', '.join(USUAL_NAMES)}."
+        )
+    wanted = {part: each for part, each in wanted.items() if each is not None}
+    endless = wanted.get("terminated") is False
+    found = {part: _named(part, each, names) for part, each in wanted.items() if each}
+    free = [name for name in names if name not in {*chain(*found.values())}]
+    found |= {part: _usual(part, free) for part in USUAL_NAMES if part not in wanted}
+    columns = {part: found[part] for part in USUAL_NAMES if found.get(part)}
+    used = [*chain(*columns.values())]
+    if twice := [name for name in used if used.count(name) > 1]:
+        raise ValueError(f"column {twice[0]!r} is read twice: {columns}.")
+    unused = [name for name in names if name not in used]
+    required = ["observation", "action", "reward"] + ["terminated"] * (not endless)
+    missing = [part for part in required if part not in columns]
+    if "episode" not in columns and ("step" in columns or "truncated" not in columns):
+        missing.append("episode" if "step" in columns else "truncated or episode")
+    if missing:
+        part = missing[0].split()[0]
+        cure = f"name it as in data.columns.{part}=<name>"
+        if done := [name for name in unused if name.lower() in ("done", "dones")]:
+            cure = (
+                f"data.columns.terminated={done[0]} if the task ended there, or "
+                f"data.columns.truncated={done[0]} data.columns.terminated=false if "
+                "only the recording did"
+            )
+        elif part == "terminated":
+            cure += ", or data.columns.terminated=false if nothing ends the task"
+        lack, there = ", ".join(missing), _listed(names)
+        raise ValueError(f"the data lack {lack}; the file has {there}: {cure}.")
+    if unused and not wanted:
+        # A misspelt next_observation would otherwise cost rows.
+        raise ValueError(
+            f"unknown columns {', '.join(unused)}: rename or remove them, or name "
+            "those to read (data.columns.observation=...): the others are left out."
+        )
+    return columns
+
+
+def _named(part: str, patterns: Any, names: Sequence[str]) -> list[str]:
+    """Columns that the user has named, in that order."""
+    found: list[str] = []
+    for pattern in patterns if isinstance(patterns, (list, tuple)) else [str(patterns)]:
+        # A name that looks like a pattern is a name.
+        exact = [pattern] * (pattern in names)
+        matching = exact or [name for name in names if fnmatchcase(name, pattern)]
+        found += exact or _in_order(part, matching)
+        if not matching or (part not in VECTORS and len(found) > 1):
+            raise ValueError(
+                f"data.columns.{part}={pattern} names {_listed(matching)}; expected "
+                f"{'some' if part in VECTORS else 'one'} of {_listed(names)}."
+            )
+    return found
+
+
+def _usual(part: str, names: Sequence[str]) -> list[str]:
+    """Columns that have a usual name, or begin with one: ``obs_0``, ``obs_x``."""
+    for usual in USUAL_NAMES[part]:
+        if usual in names:
+            return [usual]
+    for usual in USUAL_NAMES[part] if part in VECTORS else ():
+        if found := [name for name in names if name.startswith(f"{usual}_")]:
+            return _in_order(part, found)
+    return []
+
+
+def _in_order(part: str, names: list[str]) -> list[str]:
+    """Entries of a vector by their numbers if all have one, else as in the file."""
+    ends = {name: re.search(r"\d+\D?$", name) for name in names}
+    stems = {name[: end.start()] if end else None for name, end in ends.items()}
+    if None in stems or len(stems) != 1:
+        return names
+    numbers = {name: int(re.findall(r"\d+", name)[-1]) for name in names}
+    there = sorted(numbers.values())
+    for before, number in pairwise([min(there[0] - 1, 0), *there]):  # from 0 or 1 on
+        if number > before + 1:
+            raise ValueError(
+                f"{part} has the columns {_listed(names)}, but none with the number "
+                f"{before + 1}: name all (data.columns.{part}=[...]) if that is right."
+            )
+    return sorted(names, key=numbers.__getitem__)
+
+
+def _listed(names: Sequence[str], most: int = 20) -> str:
+    rest = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + rest if names else "no column"
+
+
+def assemble(
+    layout: Mapping[str, list[str]],
+    arrays: Mapping[str, Array],
+    codes: dict[Any, int],
+    file: Path | None = None,
+) -> Arrays:
+    """Columns of a log, from those of a file.
+
+    Args:
+        layout: of the file.
+        arrays: all columns of the layout, by their names in the file.
+        codes: numbers of episodes that have names, or are in several files; new ones
+            are added.
+        file: if there are several.
+    """
+    lengths = {name: len(array) if array.ndim else 0 for name, array in arrays.items()}
+    if len({*lengths.values()}) > 1:
+        raise ValueError(f"the columns have {lengths} rows; expected equally many.")
+    columns: Arrays = {}
+    for part, names in layout.items():
+        first = arrays[names[0]]
+        if part == "episode":
+            columns[part] = _episodes(first, codes, file)
+        elif part == "step":
+            columns[part] = first.reshape(-1)
+        else:
+            found = [_numbers(name, arrays[name]) for name in names]
+            vector = len(found) > 1 or (part in VECTORS and first.ndim == 1)
+            columns[part] = np.column_stack(found) if vector else found[0]
+            if first.ndim > 2:
+                raise ValueError(
+                    f"{names[0]!r} has shape {[*first.shape]}; expected [N] or [N, D], "
+                    "the steps of all episodes below each other."
+                )
+    columns.setdefault("terminated", np.zeros(len(columns["reward"]), np.bool_))
+    return columns
+
+
+def _numbers(name: str, array: Array) -> Array:
+    """Column of numbers, with NaN for missing values."""
+    if array.dtype.kind in "biuf":
+        return array
+    values = pd.Series([*array], dtype=object)
+    numbers = pd.to_numeric(values, errors="coerce")
+    if (wrong := (numbers.isna() & values.notna()).to_numpy()).any():
+        row = int(wrong.argmax())
+        raise ValueError(
+            f"{name!r} holds {values[row]!r} in row {row} of {len(array)}; expected "
+            "numbers."
+        )
+    return np.asarray(numbers, np.float64)
+
+
+def _episodes(array: Array, codes: dict[Any, int], file: Path | None) -> Array:
+    """Numbers of episodes, in order of appearance if they have names."""
+    if array.dtype.kind in "biuf" and file is None:
+        return array.reshape(-1)
+    places, names = pd.factorize(array.reshape(-1))
+    found = [float(codes.setdefault((file, name), len(codes))) for name in names]
+    # -1 stands for a missing name
+    return np.asarray(np.array([*found, np.nan])[places])
+
+
+def _sorted(columns: Arrays, name: str, notes: list[str]) -> Arrays:
+    """Rows of all episodes, each in order of its steps or time stamps.
+
+    Raises:
+        ValueError: an episode has a step twice, or lacks one that its next state would
+            be read from.
+    """
+    given, episode = columns.pop("step"), columns["episode"]
+    step = given
+    if clock := given.dtype.kind not in "biuf":
+        times = pd.to_datetime(given, format="ISO8601", utc=True)
+        step = np.asarray((times - times[0]).total_seconds())
+    if not np.isfinite(step).all():
+        row = int((~np.isfinite(step)).argmax())
+        raise ValueError(f"{name!r} has no value in row {row} of {len(step)}.")
+    order = np.lexsort((step, episode))
+    rows = {key: each[order] for key, each in columns.items()}
+    same, gaps = np.diff(episode[order]) == 0, np.diff(step[order])
+    if not same.any():
+        return rows
+    usual = np.sort(gaps[same])[same.sum() // 2]
+    counted = step.dtype.kind in "iu"
+    uneven = gaps != usual if counted else abs(gaps - usual) > usual / 2
+    wrong = same & ((gaps == 0) | (uneven & ("next_observation" not in columns)))
+    if wrong.any():
+        row = int(wrong.argmax())
+        raise ValueError(
+            f"episode {rows['episode'][row]:g} goes from {name!r} {given[order[row]]} "
+            f"to {given[order[row + 1]]}, where steps are {usual:g} apart, as in "
+            f"{wrong.sum()} places: a next state is missing. Give next_observation, or "
+            "another episode to what follows."
+        )
+    if not counted:
+        rate = f"{usual:g} s ({1 / usual:g} Hz)" if clock else f"{usual:g}"
+        notes.append(f"{name!r} has a row every {rate}")
+    return rows
