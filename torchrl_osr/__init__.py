@@ -5,6 +5,7 @@ Learning" (Jiang et al., NeurIPS 2023), https://openreview.net/forum?id=4gLWjSaw
 """
 
 from torchrl_osr.objectives import (
+    CQLLoss,
     DiscreteOSRLoss,
     InverseDynamicsLoss,
     OSRLoss,
@@ -17,6 +18,7 @@ from torchrl_osr.transforms import StatePerturbation
 __version__ = "0.1.0"
 
 __all__ = [
+    "CQLLoss",
     "DiscreteOSRLoss",
     "InverseDynamicsLoss",
     "OSRLoss",

@@ -35,7 +35,7 @@ from torchrl_osr.modules import (
     tanh_gaussian_actor,
     tanh_gaussian_inverse_dynamics,
 )
-from torchrl_osr.objectives import BaseLoss
+from torchrl_osr.objectives import ActorCriticLoss
 from torchrl_osr.trainers import ReplayBufferCollector
 
 OPTIONS: dict[tuple[str, str], Callable[..., Any]] = {
@@ -94,7 +94,7 @@ def option(part: Callable[..., Any]) -> dict[str, Any]:
     """
     parameters = dict(inspect.signature(part).parameters)
     if parameters.pop("options", None):
-        base = inspect.signature(BaseLoss).parameters
+        base = inspect.signature(ActorCriticLoss).parameters
         parameters |= {name: base[name] for name in base if name not in parameters}
     defaults = {name: _default(name, each) for name, each in parameters.items()}
     path = f"{part.__module__}.{part.__qualname__}"

@@ -8,7 +8,13 @@ import pytest
 import torch
 from torchrl.objectives import SoftUpdate
 
-from torchrl_osr import InverseDynamicsLoss, OSRLoss, OSRVLoss, StateRecoveryLoss
+from torchrl_osr import (
+    CQLLoss,
+    InverseDynamicsLoss,
+    OSRLoss,
+    OSRVLoss,
+    StateRecoveryLoss,
+)
 from torchrl_osr.fast.traced_update import LossGradients
 from torchrl_osr.lab.losses import (
     BCLoss,
@@ -26,7 +32,7 @@ from torchrl_osr.modules import (
     tanh_gaussian_actor,
     tanh_gaussian_inverse_dynamics,
 )
-from torchrl_osr.objectives.with_recovery import WithRecovery
+from torchrl_osr.objectives import WithRecovery
 
 SIZES = (3, 2)
 CELLS = {"num_cells": [8, 8]}
@@ -47,9 +53,7 @@ def with_recovery(loss, recovery):
 
 LOSSES = {
     "osr": lambda: OSRLoss(*networks(layer_norm=True), model(), num_random=2),
-    "cql": lambda: OSRLoss(
-        *networks(), recovery_weight=0, actor_states="clean", with_lagrange=True
-    ),
+    "cql": lambda: CQLLoss(*networks(), target_action_gap=0.0),
     "osr_v": lambda: OSRVLoss(*networks(), model(), num_random=2),
     "edac": lambda: EDACLoss(*networks()),
     "td3_bc": lambda: TD3BCLoss(*networks(deterministic_actor)),
@@ -60,7 +64,7 @@ LOSSES = {
     ),
     "iql": lambda: IQLLoss(*networks(gaussian_actor), state_value(SIZES[0], **CELLS)),
     "rorl": lambda: RORLLoss(*networks(), num_samples=2),
-    "bc": lambda: BCLoss(networks()[0], states="both"),
+    "bc": lambda: BCLoss(networks()[0]),
     "inverse_dynamics": lambda: InverseDynamicsLoss(model()),
 }
 
@@ -145,13 +149,13 @@ def test_another_kind_of_batch_or_option_runs_the_loss_itself(make_batch):
 
 
 def test_a_loss_that_decides_by_numbers_is_run_as_it_is(make_batch, caplog):
-    class Deciding(OSRLoss):
+    class Deciding(CQLLoss):
         def forward(self, tensordict):
             if (tensordict["action"] > 0).any():
                 return super().forward(tensordict)
             raise AssertionError
 
-    loss = Deciding(*networks(), recovery_weight=0, actor_states="clean").double()
+    loss = Deciding(*networks()).double()
     SoftUpdate(loss, tau=0.1)
     batch = make_batch(6)
     for gradients in (LossGradients(loss, record=True, warm_up=0), LossGradients(loss)):

@@ -9,7 +9,6 @@ import torch
 from torchrl.data.postprocs import MultiStep
 from torchrl.objectives import ValueEstimators
 from torchrl.objectives.value import TD0Estimator
-
 from torchrl_osr.objectives.step import Step
 
 

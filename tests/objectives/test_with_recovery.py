@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 from torchrl.objectives import SoftUpdate
+from torchrl_osr.objectives.with_recovery import WithRecovery
 
 from torchrl_osr import StateRecoveryLoss
 from torchrl_osr.lab.losses import ReBRACLoss
-from torchrl_osr.objectives.with_recovery import WithRecovery
 
 
 @pytest.fixture

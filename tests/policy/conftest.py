@@ -8,7 +8,7 @@ import pytest
 import torch
 from torchrl.envs import ObservationNorm
 
-from torchrl_osr import DiscreteOSRLoss, OSRLoss
+from torchrl_osr import CQLLoss, DiscreteOSRLoss
 from torchrl_osr.lab.losses import TD3BCLoss
 from torchrl_osr.modules import (
     categorical_actor,
@@ -39,7 +39,7 @@ def make_loss() -> Callable[..., torch.nn.Module]:
         if kind == "td3_bc":
             return TD3BCLoss(deterministic_actor(STATE, ACTION, **cells), critics)
         actor = tanh_gaussian_actor(STATE, ACTION, **cells)
-        return OSRLoss(actor, critics, recovery_weight=0)
+        return CQLLoss(actor, critics)
 
     return make
 

@@ -20,7 +20,7 @@ from torchrl.envs import ObservationNorm
 from torchrl.modules import MLP, NormalParamExtractor, ValueOperator
 from untrained_run import make_run
 
-from torchrl_osr import OSRLoss, load_policy
+from torchrl_osr import CQLLoss, load_policy
 from torchrl_osr.lab.envs import critics_of
 from torchrl_osr.lab.losses import TD3BCLoss
 from torchrl_osr.lab.run.policy_of_run import load_run_policy
@@ -233,7 +233,7 @@ def test_networks_that_a_policy_would_not_copy_whole():
         return actor
 
     critics = critic_ensemble(3, 2)
-    policy_from_loss(OSRLoss(actor(), critics, recovery_weight=0))
+    policy_from_loss(CQLLoss(actor(), critics))
     swapped = ValueOperator(MLP(5, 1), in_keys=["action", "observation"])
     for networks, message in [
         ((actor(nn.LayerNorm(3)), critics), "compute something else"),
@@ -242,7 +242,7 @@ def test_networks_that_a_policy_would_not_copy_whole():
         ((actor(), swapped), "compute something else"),
         ((actor(MLP(3, 3)), critics), "one torchrl.modules.MLP.* has 2"),
     ]:
-        loss = OSRLoss(*networks, recovery_weight=0)
+        loss = CQLLoss(*networks)
         with pytest.raises(ValueError, match=message):
             policy_from_loss(loss)
     plain = TensorDictModule(MLP(3, 2), ["observation"], ["action"])

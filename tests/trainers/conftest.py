@@ -12,7 +12,13 @@ from tensordict import TensorDict
 from torch.utils._pytree import tree_leaves
 from torchrl.objectives import SoftUpdate
 
-from torchrl_osr import InverseDynamicsLoss, OSRLoss, OSRVLoss, StatePerturbation
+from torchrl_osr import (
+    CQLLoss,
+    InverseDynamicsLoss,
+    OSRLoss,
+    OSRVLoss,
+    StatePerturbation,
+)
 from torchrl_osr.lab.data import make_replay_buffer
 from torchrl_osr.lab.losses import EDACLoss
 from torchrl_osr.modules import (
@@ -22,11 +28,10 @@ from torchrl_osr.modules import (
 )
 from torchrl_osr.trainers import OfflineTrainer
 
-# chunk_size=None: the path that a GPU takes.
 LOSSES = {
-    "OSR": {"num_random": 2, "chunk_size": None},
+    "OSR": {"num_random": 2},
     "OSR-v": {},
-    "CQL": {"recovery_weight": 0, "with_lagrange": True, "chunk_size": None},
+    "CQL": {"target_action_gap": 0.0},
     "OSR-10": {"min_q_weight": 0, "deterministic_backup": False},
     "EDAC": {},
 }
@@ -65,11 +70,11 @@ def build_loss(name: str, *, layer_norm=False, cells=8, device="cpu", **options)
     )
     actor = tanh_gaussian_actor(3, 2, num_cells=[cells]).to(device)
     options = LOSSES[name] | options
-    if options.get("recovery_weight") == 0:
-        inverse_dynamics = None
     critics = [each.to(device) for each in critics]
     if name == "EDAC":
         return EDACLoss(actor, critics, **options)
+    if name == "CQL":
+        return CQLLoss(actor, critics, **options)
     kind = OSRVLoss if name == "OSR-v" else OSRLoss
     return kind(actor, critics, inverse_dynamics, **options)
 

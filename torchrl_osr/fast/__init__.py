@@ -1,10 +1,9 @@
 """Faster updates of small networks on a CPU, with the same numbers.
 
-:mod:`~torchrl_osr.fast.critics` scores many sampled actions with plain MLP critics; the
-losses call it as ``critics.qvalue``, ``critics.soft_maximum``, ``critics.plain_mlp``
-and ``critics.applicable``.
+:func:`fuse_critics` lets a loss score its sampled actions with fewer, larger products.
 """
 
+from torchrl_osr.fast.critics import fuse_critics
 from torchrl_osr.fast.soft_update import SoftUpdate
 
-__all__ = ["SoftUpdate"]
+__all__ = ["SoftUpdate", "fuse_critics"]

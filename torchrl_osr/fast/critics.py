@@ -15,6 +15,7 @@ sampled actions of a state, ``N`` critics, ``H`` cells of a hidden layer.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -24,6 +25,60 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torch.nn.functional import layer_norm
 from torchrl.modules import MLP, ValueOperator
+
+from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Critics
+from torchrl_osr.objectives.transitions import Transitions
+
+
+class FusedCritics(Critics):
+    """Evaluate plain MLP critics without their modules, and CQL(H)'s actions in chunks.
+
+    Other critics, and those on a GPU, are evaluated as usual.
+    """
+
+    chunk_size = 64  # states that go through the critics at a time
+
+    def values(
+        self, states: TensorDictBase, action: Tensor, params: TensorDictBase
+    ) -> Tensor:
+        mlp = self._mlp()
+        if mlp is None:
+            return super().values(states, action, params)
+        return qvalue(params, mlp, self._joined(states), action)
+
+    def values_and_soft_maximum(
+        self, batch: Transitions, action: Tensor, log_prob: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        loss, mlp = self.loss, self._mlp()
+        if mlp is None or not applicable(batch.s, action):
+            return super().values_and_soft_maximum(batch, action, log_prob)
+        alike = loss.clip_diff_min == -math.inf and loss.rows_weigh_alike(batch)
+        return self.values(batch.s, batch.a, loss.qvalue_network_params), soft_maximum(
+            loss.qvalue_network_params,
+            mlp,
+            self._joined(batch.s),
+            action,
+            log_prob,
+            temperature=loss.temperature,
+            chunk_size=self.chunk_size,
+            equal_rows=alike,
+        )
+
+    def _mlp(self) -> PlainMLP | None:
+        keys = self.loss.tensor_keys
+        network = self.loss.qvalue_network
+        return plain_mlp(network, keys.action, keys.state_action_value)
+
+    def _joined(self, states: TensorDictBase) -> Tensor:
+        keys = self.loss.qvalue_network.in_keys[:-1]
+        return torch.cat([states.get(key) for key in keys], -1)
+
+
+def fuse_critics(loss: nn.Module) -> None:
+    """Let a loss, and the losses in it, evaluate their critics by this module."""
+    for each in loss.modules():
+        if isinstance(each, ActorCriticLoss):
+            each.critics = FusedCritics(each)
 
 
 class Layer(NamedTuple):
@@ -132,21 +187,18 @@ def _has_hook(module: nn.Module) -> bool:
     )
 
 
-def applicable(loss: Any, state: TensorDictBase, action: Tensor) -> PlainMLP | None:
-    """The layers of a loss's critics if :func:`soft_maximum` may run them, or ``None``.
+def applicable(state: TensorDictBase, action: Tensor) -> bool:
+    """Return whether :func:`soft_maximum` may run.
 
-    It may on a CPU, outside of :func:`torch.compile`, for plain MLPs, where nobody
-    wants a gradient by the states.
+    It may on a CPU, outside of :func:`torch.compile`, where no gradient by the states
+    is wanted.
     """
-    if (
-        action.device.type != "cpu"
-        or not torch.is_grad_enabled()
-        or torch.compiler.is_compiling()
-        or any(value.requires_grad for value in state.values(True, True))
-    ):
-        return None
-    keys = loss.tensor_keys
-    return plain_mlp(loss.qvalue_network, keys.action, keys.state_action_value)
+    return (
+        action.device.type == "cpu"
+        and torch.is_grad_enabled()
+        and not torch.compiler.is_compiling()
+        and not any(value.requires_grad for value in state.values(True, True))
+    )
 
 
 def qvalue(
@@ -245,7 +297,7 @@ class _SoftMaximum(torch.autograd.Function):
                 "second derivatives."
             )
         weight = upstream.flatten()[0]
-        equal = (upstream == weight).all()
+        equal = (upstream == weight).all() | weight.isnan()  # NaN is no equal
         if ctx.equal_rows:
             torch._assert_async(
                 equal, "Rows of one weight were promised, see equal_rows."

@@ -82,6 +82,8 @@ class LossGradients:
     def _try_to_record(self, batch: TensorDictBase) -> bool:
         generator = torch.get_rng_state()
         try:
+            self._losses(batch.copy())  # a loss may look at its first batch
+            torch.set_rng_state(generator)
             self._recording = _Recording(
                 self._losses, self.loss_module, batch, self.parameters
             )

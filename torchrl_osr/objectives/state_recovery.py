@@ -1,49 +1,41 @@
 r"""The state-recovery term by itself, to be added to any loss that trains an actor.
 
-Shapes: ``B`` batch (any leading dimensions), ``A`` action, ``D`` sets of states
-(2 for D_tot, 1 for either half).
+Shapes: ``R`` rows, ``A`` action, ``D`` sets of states (2 for D_tot, 1 for either half).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal, cast
+import copy
+from typing import Any, Literal, Self, cast
 
+import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import (
-    ProbabilisticTensorDictSequential,
-    TensorDictModuleBase,
-)
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
-from torchrl.modules import IndependentNormal, TanhNormal
+from torchrl.modules import Delta, IndependentNormal, TanhDelta
 from torchrl.modules.distributions.utils import safeatanh_noeps
+from torchrl.objectives import LossModule
 
-from torchrl_osr import functional
-from torchrl_osr._checks import check_literals, check_weight
-from torchrl_osr._entries import column, entry, nested, state_keys
-from torchrl_osr.objectives.base import BaseLoss, Terms
-from torchrl_osr.objectives.cloning import (
-    cloning_distance,
-    is_deterministic,
-    policy_at,
-)
-from torchrl_osr.objectives.distributions import (
+from torchrl_osr import functional as F
+from torchrl_osr._entries import nested, state_keys
+from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses
+from torchrl_osr.objectives.networks import (
+    CATEGORICAL,
+    ONE_HOT,
     action_bounds,
     bounds_of,
+    check_action,
     check_num_actions,
     check_same_bounds,
+    distribution,
     head_of,
+    is_deterministic,
+    written_action,
 )
-from torchrl_osr.objectives.mixed_states import (
-    States,
-    first_step,
-    of_data,
-    transitions,
-)
-from torchrl_osr.objectives.step import frozen_distribution
+from torchrl_osr.objectives.transitions import States, Transitions
 
 
-class StateRecoveryLoss(BaseLoss):
+class StateRecoveryLoss(ActorCriticLoss):
     r"""The state-recovery term :math:`L_{sr}`, for the actor of another loss.
 
     .. math::
@@ -51,19 +43,17 @@ class StateRecoveryLoss(BaseLoss):
             KL(I(a \mid \tilde s, s') \,\|\, \pi(a \mid \tilde s))
 
     Give it the actor of an IQLLoss, SACLoss, TD3BCLoss or another TorchRL loss and add
-    ``"loss_recovery"`` to that loss's entries. Its parameters are the very tensors of
-    that loss, whose optimizer is enough; its gradient reaches nothing but the actor.
-    Rows that are ``done`` do not count. "Recovering from Out-of-sample States via
-    Inverse Dynamics in Offline Reinforcement Learning", equations (11) and (12),
-    https://openreview.net/forum?id=4gLWjSaw4o.
+    ``"loss_recovery"`` to that loss's entries, or join both by :class:`WithRecovery`.
+    Its parameters are the very tensors of that loss, whose optimizer is enough; its
+    gradient reaches nothing but the actor. Rows that are ``done`` do not count.
+    "Recovering from Out-of-sample States via Inverse Dynamics in Offline Reinforcement
+    Learning", equations (11) and (12), https://openreview.net/forum?id=4gLWjSaw4o.
 
     A deterministic actor (a :class:`~torchrl.modules.TanhDelta`, or a module that
     writes the action) is pulled to the model's mean, by
     :func:`~torchrl_osr.functional.deterministic_recovery`: an addition, not in the
     paper. So is the mean of an :class:`~torchrl.modules.IndependentNormal`. A module
-    should squash its action itself, with a tanh at its end: beyond the bounds the
-    gradient is finite, but huge. Where that tanh has saturated there is no gradient;
-    with a ``TanhDelta`` there is.
+    should end in a tanh; beyond the bounds its gradient is finite, but huge.
 
     With ``recovery_target="data"`` it is noisy behaviour cloning, which needs no model:
     :math:`-\log\pi(a \mid \tilde s)`, and the squared distance
@@ -71,11 +61,10 @@ class StateRecoveryLoss(BaseLoss):
 
     Args:
         actor_network: ends in a :class:`~torchrl.modules.TanhNormal` or an
-            :class:`~torchrl.modules.IndependentNormal`, or deterministic.
+            :class:`~torchrl.modules.IndependentNormal`, or is deterministic.
         inverse_dynamics_network: a *trained* model of ``I(a | s, s')`` with the
-            actor's bounds (see :class:`~torchrl_osr.InverseDynamicsLoss`). Frozen here:
-            in the state dict, moved by ``.to()``, without gradient. Needed unless
-            ``recovery_target="data"``, which leaves it out.
+            actor's bounds (see :class:`~torchrl_osr.InverseDynamicsLoss`), frozen here.
+            Not needed with ``recovery_target="data"``.
 
     Keyword Args:
         recovery_weight: :math:`\lambda`. Default 0.5. May be assigned later.
@@ -87,15 +76,14 @@ class StateRecoveryLoss(BaseLoss):
         action_reduction: ``"sum"`` (default) over action dimensions, or ``"mean"``.
         recovery_states: ``"both"`` (default) for D_tot, ``"perturbed"``, or
             ``"clean"``, which needs no perturbed entry.
-        reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``, without the metric.
-        use_prioritized_weights: weigh rows by ``"priority_weight"``; ``"auto"``
-            (default) does when the entry is there.
+        options: of every loss, of which ``reduction`` and ``use_prioritized_weights``
+            matter here, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
     Raises:
         TypeError: if a distribution is another one.
-        ValueError: if bounds differ, the weight is negative, an option is unknown, the
-            model is missing, or an actor has no forward direction; in the call, if the
-            batch is empty or holds several steps a row.
+        ValueError: if bounds differ, the weight is negative, the model is missing, or
+            an actor has no forward direction; in the call, if the batch is empty or
+            holds several steps a row.
         KeyError: in the call, if the batch has no perturbed entry.
 
     Examples:
@@ -116,27 +104,6 @@ class StateRecoveryLoss(BaseLoss):
         True
     """
 
-    @dataclass
-    class _AcceptedKeys:
-        """The tensordict entries that :meth:`set_keys` can rename.
-
-        Attributes:
-            action: the data's action, and what an actor writes. Defaults to
-                ``"action"``.
-            done: end of a trajectory, below ``"next"``. Defaults to ``"done"``.
-            priority_weight: importance weight of a row. Defaults to
-                ``"priority_weight"``.
-            perturbed: where the perturbed states are. Defaults to ``"perturbed"``.
-        """
-
-        action: NestedKey = "action"
-        done: NestedKey = "done"
-        priority_weight: NestedKey = "priority_weight"
-        perturbed: NestedKey = "perturbed"
-
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
-
     _schedulable_buffers = frozenset({"recovery_weight"})
 
     def __init__(
@@ -149,131 +116,100 @@ class StateRecoveryLoss(BaseLoss):
         recovery_direction: Literal["forward", "reverse"] | None = None,
         recovery_states: States = "both",
         action_reduction: Literal["sum", "mean"] = "sum",
-        reduction: Literal["none", "mean", "sum"] | None = None,
-        use_prioritized_weights: bool | Literal["auto"] = "auto",
+        **options: Any,
     ) -> None:
-        check_literals(StateRecoveryLoss.__init__, locals())
-        check_weight("recovery_weight", recovery_weight)
-        super().__init__(
-            reduction=reduction,
-            use_prioritized_weights=use_prioritized_weights,
-            scalar_output_mode="exclude",
-        )
-        self.recovery_target = recovery_target
-        self.recovery_states = recovery_states
-        self.action_reduction = action_reduction
-        self._note_head(actor_network, recovery_direction)
-        if recovery_target == "inverse_dynamics":
-            self._check_and_hold(actor_network, inverse_dynamics_network)
-        self.convert_to_functional(actor_network, "actor_network")
-        self.register_coeff_buffer("recovery_weight", float(recovery_weight))
-
-    def _note_head(self, network: TensorDictModuleBase, direction: str | None) -> None:
-        """Note what the actor ends in, and the direction of the divergence."""
-        head, _ = head_of(network)
+        super().__init__(**({"scalar_output_mode": "exclude"} | options))
+        self.recovery_target, self.recovery_states = recovery_target, recovery_states
+        self.action_reduction: Literal["sum", "mean"] = action_reduction
+        head, settings = head_of(actor_network)
         self.is_normal = head is IndependentNormal
-        self.is_deterministic = is_deterministic(network)
-        self.has_distribution = head is not None
+        self.is_deterministic = is_deterministic(actor_network)
         by_mean = self.is_deterministic or self.is_normal
-        self.recovery_direction: Any = direction or (
-            "reverse" if by_mean else "forward"
-        )
-        if by_mean and self.recovery_direction == "forward":
+        if by_mean and recovery_direction == "forward":
             raise ValueError(
                 "actor_network is deterministic, or a Gaussian without a tanh: the "
-                "divergence in the forward direction is infinite, or has no closed "
-                "form. Pass recovery_direction='reverse', or none: it pulls the action "
-                "to the mean of the inverse dynamics model."
+                "forward divergence is infinite, or has no closed form. Pass "
+                "recovery_direction='reverse', or none: it pulls the action to the "
+                "mean of the inverse dynamics model."
             )
-        if not by_mean:
-            action_bounds(network, "actor_network")
-
-    def _check_and_hold(
-        self,
-        network: TensorDictModuleBase,
-        model: ProbabilisticTensorDictSequential | None,
-    ) -> None:
-        """Hold the model; raise unless it goes with the actor."""
-        if model is None:
+        default: Any = "reverse" if by_mean else "forward"
+        self.recovery_direction = recovery_direction or default
+        metric = "recovery_kl"
+        if recovery_target == "data":
+            metric = "recovery_error" if self.is_deterministic else "recovery_nll"
+            if not by_mean:
+                action_bounds(actor_network, "actor_network")
+        elif inverse_dynamics_network is None:
             raise ValueError(
-                "recovery_target='inverse_dynamics' needs an inverse_dynamics_network; "
-                "pass one, or recovery_target='data' for noisy behaviour cloning."
+                f"recovery_target={recovery_target!r} needs an "
+                "inverse_dynamics_network: pass one, or recovery_target='data' for "
+                "noisy behaviour cloning."
             )
-        low, high = bounds = action_bounds(model, "inverse_dynamics_network")
-        self.register_buffer("action_low", low, persistent=False)
-        self.register_buffer("action_high", high, persistent=False)
-        if not (self.is_deterministic or self.is_normal):
-            check_same_bounds(action_bounds(network, "actor_network"), bounds)
-        elif self.has_distribution and not self.is_normal:
-            check_same_bounds(bounds_of(head_of(network)[1]), bounds)
-        self._hold_inverse_dynamics(model)
+        else:
+            name = "inverse_dynamics_network"
+            low, high = bounds = action_bounds(inverse_dynamics_network, name)
+            self.register_buffer("action_low", low, persistent=False)
+            self.register_buffer("action_high", high, persistent=False)
+            if not by_mean:
+                check_same_bounds(action_bounds(actor_network, "actor_network"), bounds)
+            elif head is TanhDelta:
+                check_same_bounds(bounds_of(settings), bounds)
+            self.register_frozen(name, inverse_dynamics_network)
+        self.convert_to_functional(actor_network, "actor_network")
+        self.register_coefficient("recovery_weight", recovery_weight)
+        self.declare(["loss_recovery"], [metric])
 
-    def _input_keys(self) -> list[NestedKey]:
+    def input_keys(self) -> list[NestedKey]:
         states = state_keys(self.actor_network.in_keys)
-        network_keys = [self.tensor_keys.action]
-        if self.recovery_target == "inverse_dynamics":
-            network_keys = self.inverse_dynamics_network.in_keys
-        keys = [*states, *network_keys, nested("next", self.tensor_keys.done)]
+        read: list[NestedKey] = [self.tensor_keys.action]
+        if self.recovery_target != "data":
+            read = self.inverse_dynamics_network.in_keys
+        keys = [*states, *read, nested("next", self.tensor_keys.done)]
         if self.recovery_states != "clean":
-            states += state_keys(network_keys, self.tensor_keys.action)
+            states += state_keys(read, self.tensor_keys.action)
             keys += [nested(self.tensor_keys.perturbed, key) for key in states]
         return keys
 
-    def _output_keys(self) -> tuple[list[NestedKey], list[NestedKey]]:
-        return ["loss_recovery"], [self._metric]
-
-    @property
-    def _metric(self) -> str:
-        if self.recovery_target == "inverse_dynamics":
-            return "recovery_kl"
-        return "recovery_error" if self.is_deterministic else "recovery_nll"
-
-    def _terms(self, tensordict: TensorDictBase) -> Terms:
-        tensordict = first_step(tensordict)
-        done = column(tensordict, nested("next", self.tensor_keys.done)).bool()
-        states = self.recovery_states
-        mixed = transitions(
-            tensordict,
-            state_keys(self.actor_network.in_keys),
-            done=done,
-            perturbed=self.tensor_keys.perturbed,
-            states=states,
+    def losses(self, batch: Transitions) -> Losses:
+        states = state_keys(self.actor_network.in_keys)
+        mixed = batch.states_of(states, self.recovery_states)
+        pi = policy_at(
+            self.actor_network,
+            self.actor_network_params,
+            mixed,
+            self.tensor_keys.action,
         )
         if self.recovery_target == "data":
-            action = entry(tensordict, self.tensor_keys.action)
-            pi = self._policy(mixed)
-            divergence = cloning_distance(pi, action, self.tensor_keys.action).mean(0)
+            recovery = cloning_distance(pi, batch.a, self.tensor_keys.action).mean(0)
             if self.action_reduction == "mean":
-                divergence = divergence / action.shape[-1]
+                recovery = recovery / batch.a.shape[-1]
         else:
-            model: TanhNormal = frozen_distribution(
-                self, tensordict, done=done, states=states
-            )
-            divergence = self._divergence(mixed, model).mean(0)
-        valid, data = ~done, of_data(tensordict)
-        if data is not None:
-            valid = valid & data
-        loss = self.recovery_weight * self._reduce(divergence, tensordict, valid)
-        mean = self._mean(divergence, tensordict, valid)
-        return {"loss_recovery": loss}, {self._metric: mean}
+            model = self.inverse_dynamics(batch, self.recovery_states)
+            recovery = self.divergence(pi, model).mean(0)
+        term = self.recovery_weight * self.reduce(recovery, batch, batch.has_next)
+        metric = {
+            name: self.mean(recovery, batch, batch.has_next)
+            for name in self.out_keys
+            if name != "loss_recovery"
+        }
+        return {"loss_recovery": term}, metric
 
-    def _divergence(self, states: TensorDictBase, model: TanhNormal) -> Tensor:
-        """The recovery term (11) at ``states``, ``[D, B]``."""
-        pi = self._policy(states)
-        if not self.has_distribution:
-            loc = self._pre_tanh(pi)
+    def divergence(self, pi: Any, model: Any) -> Tensor:
+        """Return the recovery term (11) of a policy and a model, ``[D, R]``."""
+        if isinstance(pi, Tensor):
+            loc = self.pre_tanh(pi)
         elif self.is_normal:
-            loc = self._pre_tanh(pi.mean)
+            loc = self.pre_tanh(pi.mean)
         else:
             # Not TanhDelta's action, which may have saturated.
             loc = pi.base_dist.param if self.is_deterministic else pi.loc
         sizes = model.loc.shape[-1], loc.shape[-1]
         check_num_actions("inverse_dynamics_network", *sizes)
         if self.is_deterministic or self.is_normal:
-            return functional.deterministic_recovery(
+            return F.deterministic_recovery(
                 loc, model.loc, model.scale, action_reduction=self.action_reduction
             )
-        return functional.state_recovery(
+        return F.state_recovery(
             loc,
             pi.scale,
             model.loc,
@@ -282,14 +218,148 @@ class StateRecoveryLoss(BaseLoss):
             action_reduction=self.action_reduction,
         )
 
-    def _policy(self, states: TensorDictBase) -> Any:
-        """The policy's distribution at ``states``, or the action that it writes."""
-        params, key = self.actor_network_params, self.tensor_keys.action
-        return policy_at(self.actor_network, params, states, key)
-
-    def _pre_tanh(self, action: Tensor) -> Tensor:
-        """An action before the tanh, ``[D, B, A]``."""
+    def pre_tanh(self, action: Tensor) -> Tensor:
+        """Return an action before the tanh, ``[D, R, A]``."""
         width = self.action_high - self.action_low
         squashed = 2 * (action - self.action_low) / width - 1
         # Clamped a little inside the bounds, where the slope is finite.
         return cast(Tensor, safeatanh_noeps(squashed))
+
+
+class WithRecovery(LossModule):
+    """A loss and a term of its actor, as one loss.
+
+    What trains, checkpoints or logs a loss does so with both. Parameters that the two
+    share count once. Reduction, masks and weights are each one's own.
+
+    Args:
+        loss: trains an actor, such as TorchRL's ``IQLLoss``.
+        recovery: of that very actor.
+
+    Raises:
+        ValueError: if ``recovery`` is of another actor.
+
+    Examples:
+        >>> from torchrl_osr import CQLLoss, StateRecoveryLoss
+        >>> from torchrl_osr.modules import (
+        ...     critic_ensemble, tanh_gaussian_actor, tanh_gaussian_inverse_dynamics)
+        >>> from torchrl_osr.objectives import WithRecovery
+        >>> actor = tanh_gaussian_actor(11, 3)
+        >>> cql = CQLLoss(actor, critic_ensemble(11, 3))
+        >>> recovery = StateRecoveryLoss(actor, tanh_gaussian_inverse_dynamics(11, 3))
+        >>> loss = WithRecovery(cql, recovery)
+        >>> [key for key in loss.out_keys if key.startswith("loss_")]
+        ['loss_actor', 'loss_alpha', 'loss_qvalue', 'loss_cql', 'loss_recovery']
+    """
+
+    def __init__(self, loss: LossModule, recovery: LossModule) -> None:
+        super().__init__()
+        pair = loss.actor_network_params, recovery.actor_network_params
+        ours, theirs = (set(map(id, each.parameters())) for each in pair)
+        if ours != theirs:
+            raise ValueError(
+                "the recovery term is of another actor than the loss's: build both "
+                "with the same actor_network."
+            )
+        self.loss, self.recovery = loss, recovery
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        # tensordict 0.14.3's TensorDictParams copies without the memo: both parts would
+        # have an actor of their own.
+        new = copy.copy(self)
+        new._modules = {}
+        new.loss = copy.deepcopy(self.loss, memo)
+        new.recovery = copy.deepcopy(self.recovery, memo)
+        new.recovery.actor_network_params = new.loss.actor_network_params
+        return new
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """The entries that one of the two reads."""
+        return list(dict.fromkeys([*self.loss.in_keys, *self.recovery.in_keys]))
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """The entries that the two write."""
+        return [*self.loss.out_keys, *self.recovery.out_keys]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return losses and metrics of both, see ``out_keys``."""
+        losses: TensorDictBase = self.loss(tensordict)
+        return losses.update(self.recovery(tensordict))
+
+
+def policy_at(
+    network: TensorDictModuleBase,
+    params: TensorDictBase,
+    states: TensorDictBase,
+    key: NestedKey,
+) -> Any:
+    """Return an actor's distribution at states ``[D, R]``, or the action it writes."""
+    if head_of(network)[0] is None:
+        return written_action(network, params, states, key)
+    return distribution(network, params, states)
+
+
+def cloning_distance(policy: Any, data_action: Tensor, key: NestedKey) -> Tensor:
+    r"""Return what behaviour cloning minimises, ``[D, R]``.
+
+    :math:`-\log\pi(a \mid s)`; for a policy without a density the squared distance
+    :math:`\|\pi(s) - a\|^2`.
+
+    Args:
+        policy: what :func:`policy_at` returns.
+        data_action: ``[R, A]``; of a discrete policy one-hot or indices.
+        key: name of the data's action in an error.
+
+    Raises:
+        ValueError: if the actions have another shape than the policy's.
+    """
+    if isinstance(policy, (Tensor, TanhDelta, Delta)):
+        action = policy if isinstance(policy, Tensor) else policy.deterministic_sample
+        check_action(data_action, action.shape[1:], key)
+        return F.action_distance(action, data_action)
+    if isinstance(policy, CATEGORICAL):
+        sets, rows = policy.logits.shape[:2]
+        index = action_index(data_action, policy, rows, key)
+        index = index.expand(sets, rows).unsqueeze(-1)
+        log_prob: Tensor = policy.logits.gather(-1, index).squeeze(-1)
+        return -log_prob
+    shape = policy.batch_shape + policy.event_shape
+    check_action(data_action, shape[1:], key)
+    log_prob = policy.log_prob(data_action.expand(shape))
+    # torch's Normal has a density for each dimension.
+    return -(log_prob if policy.event_shape else log_prob.sum(-1))
+
+
+def action_index(
+    action: Tensor, distribution: Any, rows: int, key: NestedKey
+) -> Tensor:
+    """Return a batch's discrete actions as indices, int64 ``[R]``.
+
+    Args:
+        action: one-hot ``[R, n]`` of any type if ``distribution`` is of one-hot
+            actions, or else integer indices ``[R]`` or ``[R, 1]``.
+        distribution: of the network that acts; its ``logits`` end in ``n``.
+        rows: ``R``.
+        key: name of the entry in an error.
+
+    Raises:
+        ValueError: naming the entry, its shape and what was expected.
+    """
+    if isinstance(distribution, ONE_HOT):
+        expected: Any = [(rows, distribution.logits.shape[-1])]
+        fits = action.shape in expected
+    else:
+        expected = [(rows,), (rows, 1)]
+        fits = action.shape in expected and not action.is_floating_point()
+    if not fits:
+        raise ValueError(
+            f"{key!r} has shape {tuple(action.shape)} and type {action.dtype}; the "
+            f"actions of a {type(distribution).__name__} have one of {expected}, and "
+            "indices are integers."
+        )
+    if isinstance(distribution, ONE_HOT):
+        # In floating point: torch has no argmax of booleans.
+        return action.to(torch.float32).argmax(-1)
+    return action.long().reshape(rows)

@@ -51,10 +51,10 @@ def policy_from_loss(
 
     Examples:
         >>> import numpy as np
-        >>> from torchrl_osr import OSRLoss
+        >>> from torchrl_osr import CQLLoss
         >>> from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
         >>> networks = tanh_gaussian_actor(3, 1), critic_ensemble(3, 1)
-        >>> loss = OSRLoss(*networks, recovery_weight=0)
+        >>> loss = CQLLoss(*networks)
         >>> policy = policy_from_loss(loss, low=-2.0, high=2.0)
         >>> policy.act(np.zeros((4, 3))).shape, policy.value(np.zeros((4, 3))).shape
         ((4, 1), (4,))

@@ -23,11 +23,11 @@ def load_policy(path: Path | str) -> Policy:
     Examples:
         >>> import tempfile
         >>> import numpy as np
-        >>> from torchrl_osr import OSRLoss, load_policy
+        >>> from torchrl_osr import CQLLoss, load_policy
         >>> from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
         >>> from torchrl_osr.policy import policy_from_loss
         >>> networks = tanh_gaussian_actor(3, 1), critic_ensemble(3, 1)
-        >>> loss = OSRLoss(*networks, recovery_weight=0)
+        >>> loss = CQLLoss(*networks)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     policy_from_loss(loss).save(f"{folder}/policy.safetensors")
         ...     policy = load_policy(f"{folder}/policy.safetensors")

@@ -28,6 +28,7 @@ from torchrl.trainers import OptimizationStepper, Trainer
 
 from torchrl_osr._checks import check_choice, check_positive
 from torchrl_osr._files import finite_or_none
+from torchrl_osr.fast import fuse_critics
 from torchrl_osr.fast.traced_update import LossGradients
 from torchrl_osr.trainers.checkpoints import Checkpoints, GeneratorState
 from torchrl_osr.trainers.csv_rows import cut_back
@@ -244,6 +245,8 @@ class OfflineTrainer(Trainer):
             check_capturable(optimizer)
         if compile:
             loss_module.compile()
+        elif device.type == "cpu":
+            fuse_critics(loss_module)
 
         # Not handed to Trainer: it would put the whole data set into checkpoints.
         generator = torch.Generator(device).manual_seed(seed)

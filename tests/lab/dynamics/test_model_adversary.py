@@ -15,11 +15,11 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.objectives import SoftUpdate
 from uneven_dynamics import uneven_dynamics
 
-from torchrl_osr import OSRLoss
+from torchrl_osr import CQLLoss
 from torchrl_osr.lab.dynamics import DynamicsEnsemble, DynamicsOptions, ModelAdversary
 
 GAMMA = 0.875
-SAC = {"recovery_weight": 0.0, "min_q_weight": 0.0, "actor_states": "clean"}
+SAC = {"min_q_weight": 0.0}
 
 
 def falls(state: Tensor) -> Tensor:
@@ -27,7 +27,7 @@ def falls(state: Tensor) -> Tensor:
 
 
 def make_adversary(networks, make_batch, **options) -> ModelAdversary:
-    loss = OSRLoss(networks.actor, networks.critics, **SAC).double()
+    loss = CQLLoss(networks.actor, networks.critics, **SAC).double()
     SoftUpdate(loss, tau=0.1)
     real = ReplayBuffer(storage=LazyTensorStorage(50))
     real.extend(make_batch(50, twin=False))

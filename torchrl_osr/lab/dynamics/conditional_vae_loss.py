@@ -5,22 +5,22 @@ Shapes: ``B`` batch (any leading dimensions), ``T`` target, ``Z`` latent.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase, TensorDictParams, unravel_key
+from tensordict import NestedKey, TensorDictParams, unravel_key
 
 from torchrl_osr._checks import check_weight
 from torchrl_osr._entries import entry, is_next, nested
 from torchrl_osr.functional import gaussian_kl
 from torchrl_osr.lab.dynamics.conditional_vae import ConditionalVAE
 from torchrl_osr.lab.dynamics.ensemble import has_next_state
-from torchrl_osr.objectives.base import BaseLoss, Terms
-from torchrl_osr.objectives.mixed_states import check_single_steps, first_step
+from torchrl_osr.objectives import ActorCriticLoss
+from torchrl_osr.objectives.actor_critic import Losses
+from torchrl_osr.objectives.transitions import Transitions, check_single_steps
 
 
-class ConditionalVAELoss(BaseLoss):
+class ConditionalVAELoss(ActorCriticLoss):
     r"""Squared error of the target, and the latent's divergence from its prior.
 
     .. math::
@@ -37,13 +37,6 @@ class ConditionalVAELoss(BaseLoss):
         latent_weight: ``w``. Default 0.5, BCQ's.
         reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
     """
-
-    @dataclass
-    class _AcceptedKeys:
-        """There is nothing to rename: the network names what it reads."""
-
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
 
     vae_network: ConditionalVAE
     vae_network_params: TensorDictParams
@@ -64,6 +57,7 @@ class ConditionalVAELoss(BaseLoss):
         )
         self.convert_to_functional(vae_network, "vae_network")
         self.latent_weight = latent_weight
+        self.declare(["loss_vae"], [])
 
     @property
     def _state(self) -> NestedKey:
@@ -72,18 +66,14 @@ class ConditionalVAELoss(BaseLoss):
         after = (unravel_key(key[1:]) for key in keys if is_next(key))
         return next(after, keys[0])
 
-    def _input_keys(self) -> list[NestedKey]:
+    def input_keys(self) -> list[NestedKey]:
         model, state = self.vae_network, self._state
         rows = [state, nested("next", state), ("next", "terminated")]
         return [*model.in_keys, *model.out_keys, *rows]
 
-    def _output_keys(self) -> tuple[list[NestedKey], list[NestedKey]]:
-        return ["loss_vae"], []
-
-    def _terms(self, tensordict: TensorDictBase) -> Terms:
-        tensordict = first_step(tensordict)
-        check_single_steps(tensordict, "the autoencoder")
-        model = self.vae_network
+    def losses(self, batch: Transitions) -> Losses:
+        check_single_steps(batch, "the autoencoder")
+        tensordict, model = batch.one_step, self.vae_network
         condition, target = (
             entry(tensordict, key) for key in (*model.in_keys, *model.out_keys)
         )
@@ -94,5 +84,5 @@ class ConditionalVAELoss(BaseLoss):
         prior = torch.zeros_like(loc), torch.ones_like(scale)
         divergence = gaussian_kl(loc, scale, *prior).mean(-1)
         value = (output - target).square().mean(-1) + self.latent_weight * divergence
-        loss = self._reduce(value, tensordict, has_next_state(tensordict, self._state))
+        loss = self.reduce(value, batch, has_next_state(tensordict, self._state))
         return {"loss_vae": loss}, {}

@@ -5,17 +5,17 @@ Shapes: ``B`` batch (any leading dimensions), ``E`` networks, ``D`` predicted en
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
-from tensordict import NestedKey, TensorDictBase, TensorDictParams
+from tensordict import NestedKey, TensorDictParams
 from torch import Tensor
 
 from torchrl_osr._checks import check_weight
 from torchrl_osr._entries import nested
 from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble, has_next_state
-from torchrl_osr.objectives.base import BaseLoss, Terms
-from torchrl_osr.objectives.mixed_states import check_single_steps, first_step
+from torchrl_osr.objectives import ActorCriticLoss
+from torchrl_osr.objectives.actor_critic import Losses
+from torchrl_osr.objectives.transitions import Transitions, check_single_steps
 
 
 def gaussian_error(mean: Tensor, log_variance: Tensor, target: Tensor) -> Tensor:
@@ -26,7 +26,7 @@ def gaussian_error(mean: Tensor, log_variance: Tensor, target: Tensor) -> Tensor
     return ((mean - target).square() * (-log_variance).exp() + log_variance).mean(-1)
 
 
-class DynamicsLoss(BaseLoss):
+class DynamicsLoss(ActorCriticLoss):
     r"""Negative log-likelihood of next state and reward, and bounds of the variance.
 
     .. math::
@@ -61,13 +61,6 @@ class DynamicsLoss(BaseLoss):
         ['loss_bounds', 'loss_dynamics']
     """
 
-    @dataclass
-    class _AcceptedKeys:
-        """There is nothing to rename: the network names what it reads."""
-
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
-
     dynamics_network: DynamicsEnsemble
     dynamics_network_params: TensorDictParams
     target_dynamics_network_params: TensorDictParams
@@ -87,19 +80,17 @@ class DynamicsLoss(BaseLoss):
         )
         self.convert_to_functional(dynamics_network, "dynamics_network")
         self.bound_weight = bound_weight
+        self.declare(["loss_dynamics", "loss_bounds"], [])
 
-    def _input_keys(self) -> list[NestedKey]:
+    def input_keys(self) -> list[NestedKey]:
         key, action = self.dynamics_network.in_keys
         following = [nested("next", each) for each in (key, "reward", "terminated")]
         return [key, action, *following]
 
-    def _output_keys(self) -> tuple[list[NestedKey], list[NestedKey]]:
-        return ["loss_dynamics", "loss_bounds"], []
-
-    def _terms(self, tensordict: TensorDictBase) -> Terms:
-        tensordict = first_step(tensordict)
-        check_single_steps(tensordict, "the model of the dynamics")
-        model, rows = self.dynamics_network, tensordict.batch_size.numel()
+    def losses(self, batch: Transitions) -> Losses:
+        check_single_steps(batch, "the model of the dynamics")
+        tensordict, model = batch.one_step, self.dynamics_network
+        rows = tensordict.batch_size.numel()
         if rows % model.num_networks:
             raise ValueError(
                 f"The batch has {rows} rows for {model.num_networks} networks, each of "
@@ -121,8 +112,8 @@ class DynamicsLoss(BaseLoss):
             model.num_networks if self.reduction == "mean" else 1
         )
         valid = has_next_state(tensordict, model.in_keys[0])
-        loss = self._reduce(value, tensordict, valid)
+        loss = self.reduce(value, batch, valid)
         if self.reduction == "none":
-            bounds = bounds.expand(tensordict.batch_size) / rows
+            bounds = bounds.expand(batch.tensordict.batch_size) / rows
         losses = {"loss_dynamics": loss, "loss_bounds": bounds}
         return losses, {}

@@ -25,8 +25,7 @@ from torchrl_osr.lab.dynamics.dynamics_loss import DynamicsLoss
 from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
 from torchrl_osr.lab.dynamics.options import DynamicsOptions
 from torchrl_osr.lab.dynamics.rollouts import Termination, never
-from torchrl_osr.objectives import BaseLoss
-from torchrl_osr.objectives.step import qvalue
+from torchrl_osr.objectives import ActorCriticLoss
 
 SEED = 2**40
 """Added to a seed, so that roll-outs with the same one draw other numbers."""
@@ -65,7 +64,7 @@ class ModelAdversary:
         self,
         options: DynamicsOptions,
         model: DynamicsEnsemble,
-        loss: BaseLoss,
+        loss: ActorCriticLoss,
         actor: ProbabilisticTensorDictSequential,
         real: ReplayBuffer,
         optimizer: torch.optim.Optimizer,
@@ -142,7 +141,7 @@ class ModelAdversary:
     def _value(self, state: Tensor, action: Tensor) -> Tensor:
         batch = TensorDict({self.model.in_keys[0]: state}, state.shape[:-1])
         params = self.loss.qvalue_network_params
-        return qvalue(self.loss, batch, action, params).amin(0)
+        return self.loss.q(batch, action, params).amin(0)
 
     def state_dict(self) -> dict[str, Any]:
         """Return what a continued run needs."""

@@ -146,7 +146,7 @@ class RolloutReplayBuffer(OfflineToOnlineReplayBuffer):
         batch = self.batch_transform(batch)
         if self.options.reverse_policy is None:  # own actions are no labels
             number = torch.arange(len(batch), device=batch.device).unsqueeze(-1)
-            batch["imagined"] = number >= round(self.options.real_ratio * len(batch))
+            batch["is_synthetic"] = number >= round(self.options.real_ratio * len(batch))
         return take_multi_step(batch) if self.n_steps > 1 else batch
 
     def roll_out(self, copied: nn.Module) -> Rollout:

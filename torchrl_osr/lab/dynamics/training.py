@@ -12,7 +12,7 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 from filelock import FileLock
@@ -31,7 +31,7 @@ from torchrl_osr.lab.dynamics.fit import describe_dynamics, dynamics_report
 from torchrl_osr.lab.dynamics.model_adversary import ModelAdversary
 from torchrl_osr.lab.dynamics.options import DynamicsOptions
 from torchrl_osr.lab.dynamics.rollout_buffer import RolloutReplayBuffer
-from torchrl_osr.objectives import BaseLoss
+from torchrl_osr.objectives import ActorCriticLoss
 from torchrl_osr.policy.tensor_file import read_tensors, write_tensors
 from torchrl_osr.trainers import OfflineTrainer
 from torchrl_osr.trainers.checkpoints import safe_checkpoint
@@ -75,7 +75,8 @@ def train_dynamics(
     Args:
         options: of models and roll-outs.
         data: for models.
-        loss, actor: of the policy.
+        loss: what is trained, with the terms that are added to it.
+        actor: the policy.
         phase: trains a model.
 
     Keyword Args:
@@ -89,11 +90,13 @@ def train_dynamics(
     reverse = options.reverse_policy is not None
     model = dynamics_model(options, data.reverse() if reverse else data, phase)
     sizes = model.observation_dim, model.action_dim
-    if hasattr(loss, "dynamics_network"):
-        cast(BaseLoss, loss).load_network("dynamics_network", model)
-    if hasattr(loss, "transition_network"):
-        vae = train_vae(options.transition_vae(sizes[0]), options, data, phase)
-        cast(BaseLoss, loss).load_network("transition_network", vae)
+    parts = [each for each in loss.modules() if isinstance(each, ActorCriticLoss)]
+    for each in parts:
+        if hasattr(each, "dynamics_network"):
+            each.load_frozen("dynamics_network", model)
+        if hasattr(each, "transition_network"):
+            vae = train_vae(options.transition_vae(sizes[0]), options, data, phase)
+            each.load_frozen("transition_network", vae)
     if options.real_ratio == 1:
         return None, None
     policy: nn.Module = actor
@@ -104,7 +107,7 @@ def train_dynamics(
         adversary = ModelAdversary(
             options,
             model,
-            cast(BaseLoss, loss),
+            parts[0],
             actor,
             data.buffer(),
             phase.adam(model.parameter_groups(), lr=options.adversarial_lr),

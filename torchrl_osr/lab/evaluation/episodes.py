@@ -21,7 +21,7 @@ from torchrl_osr._checks import check_positive
 from torchrl_osr.lab.data import ReferenceReturns
 from torchrl_osr.lab.data.environment import check_simulated, make_environment
 from torchrl_osr.lab.evaluation.statistics import mean_interval, wilson_interval
-from torchrl_osr.objectives.distributions import ONE_HOT
+from torchrl_osr.objectives.networks import ONE_HOT
 
 if TYPE_CHECKING:
     import gymnasium

@@ -16,7 +16,7 @@ from tensordict.nn import (
     set_interaction_type,
 )
 
-from torchrl_osr.objectives.distributions import ONE_HOT
+from torchrl_osr.objectives.networks import ONE_HOT
 
 NORMAL_QUANTILE_95 = 1.6448536269514722
 """A normal variable is within this many standard deviations with probability 0.9."""

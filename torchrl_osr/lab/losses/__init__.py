@@ -7,7 +7,7 @@ from torchrl_osr.lab.losses.iql import IQLLoss
 from torchrl_osr.lab.losses.rebrac import ReBRACLoss
 from torchrl_osr.lab.losses.rorl import RORLLoss
 from torchrl_osr.lab.losses.scas import SCASLoss
-from torchrl_osr.lab.losses.sdc import SDCLoss
+from torchrl_osr.lab.losses.sdc import StateDeviationLoss
 from torchrl_osr.lab.losses.td3_bc import TD3BCLoss
 
 __all__ = [
@@ -18,6 +18,6 @@ __all__ = [
     "RORLLoss",
     "ReBRACLoss",
     "SCASLoss",
-    "SDCLoss",
+    "StateDeviationLoss",
     "TD3BCLoss",
 ]

@@ -22,9 +22,9 @@ from torchrl.modules import TanhNormal
 
 from torchrl_osr._checks import check_choice, check_positive, check_weight
 from torchrl_osr._entries import entry, nested, select
-from torchrl_osr.functional import jeffreys_divergence
-from torchrl_osr.objectives.base import BaseLoss
-from torchrl_osr.objectives.step import distribution, observation_keys, qvalue
+from torchrl_osr.lab.losses.rorl import jeffreys_divergence
+from torchrl_osr.objectives.actor_critic import ActorCriticLoss
+from torchrl_osr.objectives.networks import distribution
 
 TanhNormalPolicy = Callable[[TensorDictBase], TanhNormal]
 """Maps states ``[M, B]`` (or ``[B]``) to the policy's distribution there."""
@@ -108,7 +108,9 @@ class Adversary:
         check_positive("num_steps", self.num_steps, minimum=1)
         check_positive("step_size", self.step_size)
 
-    def __call__(self, loss: BaseLoss, tensordict: TensorDictBase) -> TensorDictBase:
+    def __call__(
+        self, loss: ActorCriticLoss, tensordict: TensorDictBase
+    ) -> TensorDictBase:
         """A batch whose perturbed states are the worst for a loss's networks.
 
         It stands in the place of :class:`~torchrl_osr.StatePerturbation`: in a plain
@@ -120,7 +122,7 @@ class Adversary:
                 :class:`~torchrl_osr.OSRLoss`.
             tensordict: a batch ``[B]``, left as it is.
         """
-        keys = observation_keys(loss)
+        keys = loss.observation_keys
         critics = loss.qvalue_network_params.detach()
 
         def policy(states: TensorDictBase) -> TanhNormal:
@@ -130,7 +132,7 @@ class Adversary:
             select(tensordict, keys),
             keys,
             policy,
-            lambda states, action: qvalue(loss, states, action, critics),
+            lambda states, action: loss.q(states, action, critics),
         )
         tensordict = tensordict.copy()
         for key in keys:

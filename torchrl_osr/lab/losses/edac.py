@@ -1,7 +1,6 @@
-r"""EDAC: an ensemble of critics whose action gradients are kept apart.
+r"""EDAC: an ensemble of critics that differ in how values change with the action.
 
-Shapes: ``B`` batch (any leading dimensions), ``A`` action, ``N`` critics. The equations
-are in :mod:`torchrl_osr.functional`.
+Shapes: ``R`` rows, ``A`` action, ``N`` critics.
 """
 
 from __future__ import annotations
@@ -10,21 +9,41 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import (
-    ProbabilisticTensorDictSequential,
-    TensorDictModule,
-)
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor
+from torch.nn.functional import normalize
 from torchrl.objectives.utils import _vmap_func
 
-from torchrl_osr import functional
-from torchrl_osr._checks import check_literals, check_weight
-from torchrl_osr.objectives.base import BaseLoss, Terms, TransitionKeys
-from torchrl_osr.objectives.step import Step, actor_critic_in_keys, critic_inputs
+from torchrl_osr._checks import check_positive
+from torchrl_osr._entries import state_keys
+from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses
+from torchrl_osr.objectives.transitions import Transitions
 
 
-class EDACLoss(BaseLoss):
+def gradient_diversity(action_gradients: Tensor) -> Tensor:
+    r"""EDAC similarity of the critics' action gradients, to be minimised.
+
+    .. math::
+        \frac{1}{N - 1} \sum_{i \ne j} \Big\langle
+            \frac{\nabla_a Q_i(s, a)}{\|\nabla_a Q_i(s, a)\|},
+            \frac{\nabla_a Q_j(s, a)}{\|\nabla_a Q_j(s, a)\|} \Big\rangle
+
+    Args:
+        action_gradients: of each critic at the data's action, ``[N, R, A]``,
+            ``N >= 2``.
+
+    Returns:
+        ``[R]``, between -N / (N - 1) and N.
+    """
+    number = action_gradients.shape[0]
+    # Without eps: a dead critic's zero gradient would be 0 / 0.
+    unit = normalize(action_gradients, dim=-1, eps=1e-10)
+    # All pairs at once: |sum_i g_i|^2 - sum_i |g_i|^2, with |g_i| = 1.
+    pairs = unit.sum(0).square().sum(-1) - unit.square().sum((0, -1))
+    return pairs / (number - 1)
+
+
+class EDACLoss(ActorCriticLoss):
     r"""Ensemble-Diversified Actor-Critic (EDAC).
 
     .. math::
@@ -37,50 +56,36 @@ class EDACLoss(BaseLoss):
         T &= r + \gamma\,(1 - \text{terminated})
             [\min_i \bar Q_i(s', a') - \alpha_e \log\pi(a' \mid s')]
 
-    Presented in "Uncertainty-Based Offline Reinforcement Learning with Diversified
-    Q-Ensemble", https://arxiv.org/abs/2110.01548. With ``diversity_weight=0`` it is
-    SAC-N. ``loss_qvalue`` holds both terms of :math:`L_Q`.
+    "Uncertainty-Based Offline Reinforcement Learning with Diversified Q-Ensemble",
+    https://arxiv.org/abs/2110.01548. Without the diversity it is SAC-N, see
+    :class:`~torchrl_osr.CQLLoss`. ``loss_qvalue`` holds both terms of :math:`L_Q`.
 
     Args:
         actor_network: ends in a :class:`~torchrl.modules.TanhNormal`.
-        qvalue_network: one critic, copied by TorchRL, or a list of critics that keep
-            their own weights (:func:`~torchrl_osr.modules.critic_ensemble`).
+        qvalue_network: one critic, copied by TorchRL, or a list of critics.
 
     Keyword Args:
         diversity_weight: :math:`\eta`. Default 1.0. May be assigned later.
         alpha_init: initial entropy temperature :math:`\alpha_e`. Default 1.0.
         fixed_alpha: keep the temperature. Default ``False``.
         target_entropy: in nats; ``"auto"`` (default) is minus the action's size.
-        options: of every loss, see :class:`~torchrl_osr.objectives.BaseLoss`.
+        options: of every loss, see
+            :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
     Raises:
         TypeError: if the actor's distribution is not a ``TanhNormal``.
-        ValueError: if an option is out of its range or there is a single critic; in the
-            call, if the batch is empty.
+        ValueError: if a number is out of its range or there is a single critic.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl.objectives import SoftUpdate
         >>> from torchrl_osr.lab.losses import EDACLoss
         >>> from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
         >>> critics = critic_ensemble(11, 3, num_qvalue_nets=4)
         >>> loss = EDACLoss(tanh_gaussian_actor(11, 3), critics)
-        >>> updater = SoftUpdate(loss, tau=5e-3)
-        >>> no = torch.zeros(4, 1, dtype=torch.bool)
-        >>> batch = TensorDict({
-        ...     "observation": torch.randn(4, 11), "action": torch.rand(4, 3),
-        ...     "next": {"observation": torch.randn(4, 11), "reward": torch.ones(4, 1),
-        ...              "done": no, "terminated": no}}, [4])
-        >>> sorted(key for key in loss(batch).keys() if key.startswith("loss_"))
+        >>> loss.out_keys[:3]
         ['loss_actor', 'loss_alpha', 'loss_qvalue']
     """
 
     _schedulable_buffers = frozenset({"diversity_weight"})
-
-    _AcceptedKeys = TransitionKeys
-    default_keys = TransitionKeys
-    tensor_keys: TransitionKeys
 
     def __init__(
         self,
@@ -93,69 +98,47 @@ class EDACLoss(BaseLoss):
         target_entropy: float | Literal["auto"] = "auto",
         **options: Any,
     ) -> None:
-        check_literals(EDACLoss.__init__, locals())
-        check_weight("diversity_weight", diversity_weight)
         super().__init__(**options)
-        self._hold_action_bounds(actor_network)
-        self._hold_actor_critic(actor_network, qvalue_network)
-        if self.num_qvalue_nets < 2:
-            raise ValueError(
-                "EDACLoss compares critics with each other: it needs num_qvalue_nets "
-                "of at least 2."
-            )
-        self._hold_temperature(alpha_init, fixed_alpha, target_entropy)
-        self.register_coeff_buffer("diversity_weight", float(diversity_weight))
+        self.register_action_bounds(actor_network)
+        self.register_actor_critic(actor_network, qvalue_network)
+        check_positive("num_qvalue_nets", self.num_qvalue_nets, minimum=2)
+        self.register_temperature(alpha_init, fixed_alpha, target_entropy)
+        self.register_coefficient("diversity_weight", diversity_weight)
+        self.declare_soft_actor_critic("diversity")
         self.make_value_estimator()
 
-    def _make_vmap(self) -> None:
-        super()._make_vmap()
-        # Each critic at actions of its own, for its own gradient.
-        self._vmap_qvalue_each = _vmap_func(
-            self.qvalue_network,
-            (0, 0),
-            randomness=self.vmap_randomness,
-            pseudo_vmap=self.deactivate_vmap,
-        )
-
-    def _input_keys(self) -> list[NestedKey]:
-        return actor_critic_in_keys(self, perturbed=False)
-
-    def _output_keys(self) -> tuple[list[NestedKey], list[NestedKey]]:
-        metrics = ["alpha", "entropy", "pred_value", "target_value", "diversity"]
-        return ["loss_actor", "loss_alpha", "loss_qvalue"], metrics
-
-    def _terms(self, tensordict: TensorDictBase) -> Terms:
-        step = Step(self, tensordict, perturbed=False)
-        objective, log_prob = step.soft_objective("clean")
-        actor, alpha = step.reduce(objective), step.temperature_loss(log_prob)
-        params = self.qvalue_network_params
-        pred_value = step.qvalue(step.states[0], step.data_action, params)
-        diversity = functional.gradient_diversity(self._action_gradients(step))
-        target_value = step.soft_target()
-        distance = step.td_distance(pred_value, target_value)
-        qvalue = step.reduce(distance + self.diversity_weight * diversity)
-        step.write_priority(pred_value, target_value)
-        losses = {"loss_actor": actor, "loss_alpha": alpha, "loss_qvalue": qvalue}
-        metrics = {
-            "alpha": self._alpha,
-            "entropy": -step.mean(log_prob),
-            "pred_value": step.mean(pred_value),
-            "target_value": step.mean(target_value),
-            "diversity": step.mean(diversity),
+    def losses(self, batch: Transitions) -> Losses:
+        policy = self.policy(batch)
+        objective, log_prob = self.soft_policy_objective(batch, policy, "clean")
+        q_data = self.q(batch.s, batch.a)
+        diversity = gradient_diversity(self.action_gradients(batch))
+        error, metrics = self.td_error(batch, q_data, self.soft_target(batch, policy))
+        qvalue = error + self.diversity_weight * diversity
+        losses = {
+            "loss_actor": self.reduce(objective, batch),
+            "loss_alpha": self.temperature_loss(batch, log_prob),
+            "loss_qvalue": self.reduce(qvalue, batch),
         }
-        return losses, metrics
+        return losses, metrics | {
+            "alpha": self.alpha,
+            "entropy": -self.mean(log_prob, batch),
+            "diversity": self.mean(diversity, batch),
+        }
 
-    def _action_gradients(self, step: Step) -> Tensor:
-        """Gradient of each critic by the data's action, ``[N, B, A]``."""
-        number, action = self.num_qvalue_nets, step.data_action
-        states = critic_inputs(self, step.states[0])
+    def action_gradients(self, batch: Transitions) -> Tensor:
+        """Return each critic's gradient by the data's action, ``[N, R, A]``."""
+        number, action, keys = self.num_qvalue_nets, batch.a, self.tensor_keys
+        states = batch.s.select(*state_keys(self.qvalue_network.in_keys), strict=False)
         states = states.expand(number, *states.batch_size)
         params = self.qvalue_network_params
+        # Each critic at actions of its own, for its own gradient.
+        critics = _vmap_func(
+            self.qvalue_network, (0, 0), pseudo_vmap=self.deactivate_vmap
+        )
 
         def total(action: Tensor) -> Tensor:
-            batch = states.copy().set(self.tensor_keys.action, action)
-            batch = self._vmap_qvalue_each(batch, params)
-            value: Tensor = batch.get(self.tensor_keys.state_action_value)
+            rows = critics(states.copy().set(keys.action, action), params)
+            value: Tensor = rows.get(keys.state_action_value)
             return value.sum()
 
         # torch.func, unlike torch.autograd.grad, can be compiled; both can be

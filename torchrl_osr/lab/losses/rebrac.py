@@ -1,7 +1,6 @@
 r"""ReBRAC: TD3+BC with a second penalty, in the critics' target.
 
-Shapes: ``B`` batch (any leading dimensions), ``A`` action, ``N`` critics. The equations
-are in :mod:`torchrl_osr.functional`.
+Shapes: ``R`` rows, ``A`` action, ``N`` critics.
 """
 
 from __future__ import annotations
@@ -10,20 +9,52 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_osr import functional
-from torchrl_osr._checks import check_literals, check_weight
-from torchrl_osr._entries import column, entry
-from torchrl_osr.lab.losses.td3_bc import check_smoothing, smoothed_action_and_value
-from torchrl_osr.objectives.base import BaseLoss, Terms, TransitionKeys
-from torchrl_osr.objectives.distributions import check_action
-from torchrl_osr.objectives.step import Step, actor_critic_in_keys
+from torchrl_osr import functional as F
+from torchrl_osr._checks import check_weight
+from torchrl_osr._entries import column, entry, nested
+from torchrl_osr.lab.losses.td3 import (
+    TargetPolicySmoothing,
+    magnitude,
+    register_td3,
+)
+from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses
+from torchrl_osr.objectives.networks import check_action
+from torchrl_osr.objectives.transitions import Transitions
 
 
-class ReBRACLoss(BaseLoss):
+def rebrac_objective(
+    qvalue: Tensor, distance: Tensor, magnitude: Tensor, weight: float
+) -> Tensor:
+    r"""ReBRAC objective of the policy, to be minimised.
+
+    .. math::
+        \beta_1 \|\pi(s) - a\|^2
+        - \frac{\min_i Q_i(s, \pi(s))}{\mathbb E_D |\min_i Q_i(s, \pi(s))|}
+
+    As its released code has it: the paper prints no normaliser.
+
+    Args:
+        qvalue: the critics' smallest value of the policy's action, ``[R]``.
+        distance: of that action from the data's, squared, ``[R]``.
+        magnitude: the normaliser, a scalar without gradient.
+        weight: :math:`\beta_1`.
+
+    Returns:
+        ``[R]``.
+
+    Examples:
+        >>> one = torch.ones(1)
+        >>> rebrac_objective(4 * one, 3 * one, magnitude=2 * one, weight=0.5)
+        tensor([-0.5000])
+    """
+    return weight * distance - qvalue / magnitude
+
+
+class ReBRACLoss(ActorCriticLoss):
     r"""Revisited behaviour-regularised actor-critic (ReBRAC).
 
     .. math::
@@ -35,20 +66,18 @@ class ReBRACLoss(BaseLoss):
             - \beta_2 \|\tilde a' - a'\|^2 \Big], \quad
         \tilde a' = \bar\pi(s') + \epsilon
 
-    Presented in "Revisiting the Minimalist Approach to Offline Reinforcement Learning",
-    https://arxiv.org/abs/2305.09836. The critics shall have layer normalisation
-    (:func:`~torchrl_osr.modules.critic_ensemble`). The authors update policy and
-    targets every second step, which is the training loop's to do.
+    "Revisiting the Minimalist Approach to Offline Reinforcement Learning",
+    https://arxiv.org/abs/2305.09836. The critics should have layer normalisation. The
+    authors update policy and targets every second step; that is the training loop's
+    part.
 
     :math:`a'` is what the data did at :math:`s'`, the entry ``("next", "action")``.
-    Where an episode was cut (``done`` and not ``terminated``) nobody knows it: there
-    the penalty does not count, and whatever stands in the entry is not read.
+    Where an episode was cut it is unknown: there the penalty does not count.
 
     Args:
         actor_network: writes the action; see
             :func:`~torchrl_osr.modules.deterministic_actor`.
-        qvalue_network: one critic, copied by TorchRL, or a list of critics that keep
-            their own weights (:func:`~torchrl_osr.modules.critic_ensemble`).
+        qvalue_network: one critic, copied by TorchRL, or a list of critics.
 
     Keyword Args:
         actor_bc_coef: :math:`\beta_1`, weight of the policy's distance from the data's
@@ -58,38 +87,23 @@ class ReBRACLoss(BaseLoss):
         policy_noise: standard deviation of :math:`\epsilon`, in units of the action.
             Default 0.2.
         noise_clip: largest magnitude of :math:`\epsilon`. Default 0.5.
-        low, high: action bounds, between which the target's action is kept; those of
-            the actor's :class:`~torchrl.modules.TanhDelta`, if it ends in one. Default
-            -1 and 1.
-        options: of every loss, see :class:`~torchrl_osr.objectives.BaseLoss`.
+        low, high: action bounds, numbers or ``[A]``; needed unless the actor ends in a
+            :class:`~torchrl.modules.TanhDelta`, which has them.
+        options: of every loss, see
+            :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
     Raises:
-        ValueError: if an option is out of its range; in the call, if the batch is
-            empty.
+        ValueError: if bounds are missing, or a number is out of its range.
         KeyError: in the call, if the batch has no next action.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl.objectives import SoftUpdate
-        >>> from torchrl_osr.modules import critic_ensemble, deterministic_actor
         >>> from torchrl_osr.lab.losses import ReBRACLoss
+        >>> from torchrl_osr.modules import critic_ensemble, deterministic_actor
         >>> critics = critic_ensemble(11, 3, layer_norm=True)
         >>> loss = ReBRACLoss(deterministic_actor(11, 3), critics)
-        >>> updater = SoftUpdate(loss, tau=5e-3)
-        >>> no = torch.zeros(4, 1, dtype=torch.bool)
-        >>> batch = TensorDict({
-        ...     "observation": torch.randn(4, 11), "action": torch.rand(4, 3),
-        ...     "next": {"observation": torch.randn(4, 11), "reward": torch.ones(4, 1),
-        ...              "done": no, "terminated": no, "action": torch.rand(4, 3)}
-        ... }, [4])
-        >>> sorted(loss(batch).keys())
-        ['cloning_error', 'loss_actor', 'loss_qvalue', 'pred_value', 'target_value']
+        >>> ("next", "action") in loss.in_keys
+        True
     """
-
-    _AcceptedKeys = TransitionKeys
-    default_keys = TransitionKeys
-    tensor_keys: TransitionKeys
 
     def __init__(
         self,
@@ -100,74 +114,51 @@ class ReBRACLoss(BaseLoss):
         critic_bc_coef: float = 0.01,
         policy_noise: float = 0.2,
         noise_clip: float = 0.5,
-        low: float = -1.0,
-        high: float = 1.0,
+        low: Any = None,
+        high: Any = None,
         **options: Any,
     ) -> None:
-        check_literals(ReBRACLoss.__init__, locals())
         check_weight("actor_bc_coef", actor_bc_coef)
         check_weight("critic_bc_coef", critic_bc_coef)
-        check_smoothing(policy_noise, noise_clip, low, high, actor_network)
         super().__init__(**options)
-        self._hold_actor_critic(
-            actor_network,
-            qvalue_network,
-            delay_actor=self.delay_qvalue,
-        )
+        self.smoothing = TargetPolicySmoothing(policy_noise, noise_clip)
+        register_td3(self, actor_network, qvalue_network, low, high)
         self.actor_bc_coef, self.critic_bc_coef = actor_bc_coef, critic_bc_coef
-        self.has_penalty = critic_bc_coef > 0
-        self.policy_noise, self.noise_clip = policy_noise, noise_clip
-        self.low, self.high = low, high
-        self.make_value_estimator()
-
-    def _input_keys(self) -> list[NestedKey]:
-        keys = actor_critic_in_keys(self, perturbed=False)
-        return keys + (self._next_keys("action") if self.has_penalty else [])
-
-    def _output_keys(self) -> tuple[list[NestedKey], list[NestedKey]]:
         metrics = ["cloning_error", "pred_value", "target_value"]
-        return ["loss_actor", "loss_qvalue"], metrics
+        self.declare(["loss_actor", "loss_qvalue"], metrics)
 
-    def _terms(self, tensordict: TensorDictBase) -> Terms:
-        step = Step(self, tensordict, perturbed=False)
-        actor, cloning_error = self.actor_loss(step)
-        params = self.qvalue_network_params
-        pred_value = step.qvalue(step.states[0], step.data_action, params)
-        target_value = self._target_value(step)
-        distance = step.td_distance(pred_value, target_value)
-        step.write_priority(pred_value, target_value)
-        metrics = {
-            "cloning_error": self._mean(cloning_error, tensordict, step.of_data),
-            "pred_value": step.mean(pred_value),
-            "target_value": step.mean(target_value),
-        }
-        losses = {"loss_actor": actor, "loss_qvalue": step.reduce(distance)}
-        return losses, metrics
+    def input_keys(self) -> list[NestedKey]:
+        keys = super().input_keys()
+        if self.critic_bc_coef:
+            keys.append(nested("next", self.tensor_keys.action))
+        return keys
 
-    def actor_loss(self, step: Step) -> tuple[Tensor, Tensor]:
-        r""":math:`L_\pi`, and the squared distance to the data's action, ``[B]``."""
-        action = step.action(step.states[0], self.actor_network_params)
-        check_action(step.data_action, action.shape[-1], self.tensor_keys.action)
-        # Detached: the policy's objective shall not train the critics.
+    def losses(self, batch: Transitions) -> Losses:
+        action = self.act(batch.s, self.actor_network_params)
+        self.check_actions(batch, action.shape)
+        # Detached: the policy's objective must not train the critics.
         params = self.qvalue_network_params.detach()
-        qvalue = step.qvalue(step.states[0], action, params).min(0).values
-        distance = step.cloned(functional.action_distance(action, step.data_action))
-        magnitude = step.magnitude(qvalue)
-        objective = functional.rebrac_objective(
-            qvalue, distance, magnitude, self.actor_bc_coef
-        )
-        return step.reduce(objective), distance
+        qvalue = self.q(batch.s, action, params).min(0).values
+        distance = batch.of_data(F.action_distance(action, batch.a))
+        scale = magnitude(self, batch, qvalue)
+        objective = rebrac_objective(qvalue, distance, scale, self.actor_bc_coef)
+        target = self.penalised_target(batch)
+        error, metrics = self.td_error(batch, self.q(batch.s, batch.a), target)
+        metrics["cloning_error"] = self.mean(distance, batch, batch.is_data)
+        return {
+            "loss_actor": self.reduce(objective, batch),
+            "loss_qvalue": self.reduce(error, batch),
+        }, metrics
 
     @torch.no_grad()
-    def _target_value(self, step: Step) -> Tensor:
-        """The TD target, ``[B]``: smoothed, and less the penalty."""
-        action, next_value = smoothed_action_and_value(self, step)
-        if self.has_penalty:
-            key, done = self._next_keys("action", "done")
-            data_action = entry(step.tensordict, key)
-            check_action(data_action, action.shape[-1], key)
-            penalty = functional.action_distance(action, data_action)
-            ended = column(step.tensordict, done).bool()
-            penalty = penalty.masked_fill(ended, 0.0)
+    def penalised_target(self, batch: Transitions) -> Tensor:
+        """Return the TD target less the penalty of its action, ``[R]``."""
+        action, next_value = self.smoothing(self, batch)
+        if self.critic_bc_coef:
+            key = nested("next", self.tensor_keys.action)
+            data_action = entry(batch.rows, key)
+            check_action(data_action, action.shape, key)
+            done = column(batch.rows, nested("next", self.tensor_keys.done))
+            penalty = F.action_distance(action, data_action).masked_fill(done, 0.0)
             next_value = next_value - self.critic_bc_coef * penalty
-        return step.td_target(next_value)
+        return self.td_target(batch, next_value)

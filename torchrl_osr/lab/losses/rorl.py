@@ -1,7 +1,6 @@
 r"""RORL: an ensemble of critics, and a policy and values that are smooth around states.
 
-Shapes: ``B`` batch (any leading dimensions), ``A`` action, ``N`` critics, ``M``
-perturbed states of one state. The equations are in :mod:`torchrl_osr.functional`.
+Shapes: ``R`` rows, ``A`` action, ``N`` critics, ``M`` perturbed states of one state.
 """
 
 from __future__ import annotations
@@ -10,23 +9,95 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 
-from torchrl_osr import functional
-from torchrl_osr._checks import check_literals, check_positive, check_weight
-from torchrl_osr.objectives.base import BaseLoss, Terms, TransitionKeys
-from torchrl_osr.objectives.step import (
-    Step,
-    actor_critic_in_keys,
-    distribution,
-    observation_keys,
-)
+from torchrl_osr._checks import check_positive, check_weight
+from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses, StatePolicy
+from torchrl_osr.objectives.networks import distribution
+from torchrl_osr.objectives.transitions import Transitions
 
 
-class RORLLoss(BaseLoss):
+def jeffreys_divergence(
+    loc_p: Tensor, scale_p: Tensor, loc_q: Tensor, scale_q: Tensor
+) -> Tensor:
+    r"""Jeffreys divergence :math:`KL(p \,\|\, q) + KL(q \,\|\, p)` of Gaussians.
+
+    .. math::
+        \frac12 \sum_i \Big(\frac{\sigma_p}{\sigma_q} - \frac{\sigma_q}{\sigma_p}\Big)^2
+        + (\mu_p - \mu_q)^2 \Big(\frac1{\sigma_p^2} + \frac1{\sigma_q^2}\Big)
+
+    It is the sum of both :func:`gaussian_kl`, whose logarithms cancel. A sum of squares
+    keeps its digits where ``p`` and ``q`` are close, and there it is used: for a policy
+    at two neighbouring states.
+
+    Args:
+        loc_p, scale_p: mean and standard deviation of ``p``, ``[R, A]``.
+        loc_q, scale_q: mean and standard deviation of ``q``, ``[R, A]``.
+
+    Returns:
+        ``[R]``, each entry at least 0.
+
+    Examples:
+        >>> p, q = torch.tensor([0.4]), torch.tensor([-0.2])
+        >>> both = jeffreys_divergence(p, torch.tensor([0.3]), q, torch.tensor([0.5]))
+        >>> round(both.item(), 6)
+        3.288889
+    """
+    gap = loc_p - loc_q
+    means = (gap / scale_p).square() + (gap / scale_q).square()
+    scales = (scale_p / scale_q - scale_q / scale_p).square()
+    return 0.5 * (means + scales).sum(-1)
+
+
+def value_smoothness(difference: Tensor, tau: float = 0.2) -> Tensor:
+    r"""RORL penalty of a change of the values around a state, to be minimised.
+
+    .. math::
+        \max_j \frac1N \sum_i (1 - \tau) \max(d_{ij}, 0)^2 + \tau \min(d_{ij}, 0)^2,
+        \quad d_{ij} = Q_i(\hat s_j, a) - Q_i(s, a)
+
+    "RORL: Robust Offline Reinforcement Learning via Conservative Smoothing" (Yang et
+    al. 2022), https://arxiv.org/abs/2206.02829, as its released code has it.
+
+    Args:
+        difference: :math:`d_{ij}` of ``M`` perturbed states, ``[N, M, R]``.
+        tau: weight of values that fall, against those that rise.
+
+    Returns:
+        ``[R]``.
+
+    Examples:
+        >>> value_smoothness(torch.tensor([[[1.0], [-1.0]]])).tolist()
+        [0.800000011920929]
+    """
+    rise, fall = difference.clamp(min=0).square(), difference.clamp(max=0).square()
+    return ((1 - tau) * rise + tau * fall).mean(0).amax(0)
+
+
+def uncertainty_penalty(qvalue: Tensor, weight: Tensor | float) -> Tensor:
+    r"""RORL penalty of actions that the critics do not agree on, to be minimised.
+
+    .. math::
+        \frac1N \sum_i \big( Q_i - [Q_i - \lambda\, \text{std}_i Q_i] \big)^2
+
+    The bracket is a target without gradient: the more the critics disagree, the further
+    each is pulled down. Source: see :func:`value_smoothness`.
+
+    Args:
+        qvalue: ``[N, R]``, ``N >= 2``.
+        weight: :math:`\lambda`.
+
+    Returns:
+        ``[R]``.
+    """
+    target = (qvalue - weight * qvalue.std(0)).detach()
+    return (qvalue - target).square().mean(0)
+
+
+class RORLLoss(ActorCriticLoss):
     r"""Robust Offline Reinforcement Learning (RORL).
 
     SAC-N, and around each state draws :math:`\hat s_j = s + \delta_j` from a box:
@@ -38,8 +109,8 @@ class RORLLoss(BaseLoss):
             + \beta_Q\, \mathbb E_D\, \mathcal L_{smooth}
             + \beta_{ood}\, \mathbb E_{D, j}\, \mathcal L_{ood}(\hat s_j, \hat a_j)
 
-    with :func:`~torchrl_osr.functional.value_smoothness` and
-    :func:`~torchrl_osr.functional.uncertainty_penalty` of the policy's actions. "RORL:
+    with :func:`~torchrl_osr.value_smoothness` and
+    :func:`~torchrl_osr.uncertainty_penalty` of the policy's actions. "RORL:
     Robust Offline Reinforcement Learning via Conservative Smoothing",
     https://arxiv.org/abs/2206.02829, and its released code, whose names the options
     have. As there, the ``M`` draws of a term are shared by all rows of the batch. A
@@ -69,7 +140,8 @@ class RORLLoss(BaseLoss):
         alpha_init: initial entropy temperature :math:`\alpha_e`. Default 1.0.
         fixed_alpha: keep the temperature. Default ``False``.
         target_entropy: in nats; ``"auto"`` (default) is minus the action's size.
-        options: of every loss, see :class:`~torchrl_osr.objectives.BaseLoss`.
+        options: of every loss, see
+            :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
     Raises:
         TypeError: if the actor's distribution is not a ``TanhNormal``.
@@ -77,27 +149,14 @@ class RORLLoss(BaseLoss):
             deviation; in the call, if the batch is empty.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl.objectives import SoftUpdate
         >>> from torchrl_osr.lab.losses import RORLLoss
         >>> from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
         >>> critics = critic_ensemble(11, 3, num_qvalue_nets=4)
         >>> loss = RORLLoss(tanh_gaussian_actor(11, 3), critics)
-        >>> updater = SoftUpdate(loss, tau=5e-3)
-        >>> no = torch.zeros(4, 1, dtype=torch.bool)
-        >>> batch = TensorDict({
-        ...     "observation": torch.randn(4, 11), "action": torch.rand(4, 3),
-        ...     "next": {"observation": torch.randn(4, 11), "reward": torch.ones(4, 1),
-        ...              "done": no, "terminated": no}}, [4])
-        >>> sorted(key for key in loss(batch).keys() if key.startswith("loss_"))
-        ['loss_actor', 'loss_alpha', 'loss_qvalue']
         >>> loss.decay_uncertainty()
+        >>> loss.uncertainty_weight
+        tensor(0.1000)
     """
-
-    _AcceptedKeys = TransitionKeys
-    default_keys = TransitionKeys
-    tensor_keys: TransitionKeys
 
     def __init__(
         self,
@@ -125,7 +184,6 @@ class RORLLoss(BaseLoss):
             for name, value in locals().items()
             if name.endswith(("_reg", "_eps", "_min", "_decay"))
         }
-        check_literals(RORLLoss.__init__, locals())
         for name, value in given.items():
             check_weight(name, value)
         check_positive("num_samples", num_samples, minimum=1)
@@ -138,19 +196,25 @@ class RORLLoss(BaseLoss):
         if not 0 <= q_smooth_tau <= 1:
             raise ValueError(f"q_smooth_tau must be in [0, 1], got {q_smooth_tau}.")
         super().__init__(**options)
-        self._hold_action_bounds(actor_network)
-        self._hold_actor_critic(actor_network, qvalue_network)
+        self.register_action_bounds(actor_network)
+        self.register_actor_critic(actor_network, qvalue_network)
         if self.num_qvalue_nets < 2 and q_ood_reg:
             raise ValueError(
                 "one critic has no deviation: take num_qvalue_nets of at least 2, or "
                 "q_ood_reg=0."
             )
-        self._hold_temperature(alpha_init, fixed_alpha, target_entropy)
+        self.register_temperature(alpha_init, fixed_alpha, target_entropy)
         for name, value in given.items():
             setattr(self, name, value)
         self.num_samples, self.q_smooth_tau = num_samples, q_smooth_tau
         self.register_buffer("uncertainty_weight", torch.tensor(q_ood_uncertainty_reg))
         self.register_buffer("num_updates", torch.tensor(0.0))
+        terms = {
+            "policy_smoothness": policy_smooth_reg,
+            "value_smoothness": q_smooth_reg,
+            "uncertainty_penalty": q_ood_reg,
+        }
+        self.declare_soft_actor_critic(*(name for name in terms if terms[name]))
         self.make_value_estimator()
 
     @torch.no_grad()
@@ -165,89 +229,62 @@ class RORLLoss(BaseLoss):
         # Into the same tensor: a recording or a CUDA graph reads it there.
         self.uncertainty_weight.copy_(weight)
 
-    def _input_keys(self) -> list[NestedKey]:
-        return actor_critic_in_keys(self, perturbed=False)
-
-    def _output_keys(self) -> tuple[list[NestedKey], list[NestedKey]]:
-        metrics: list[NestedKey] = ["alpha", "entropy", "pred_value", "target_value"]
-        metrics += ["policy_smoothness"] * (self.policy_smooth_reg > 0)
-        metrics += ["value_smoothness"] * (self.q_smooth_reg > 0)
-        metrics += ["uncertainty_penalty"] * (self.q_ood_reg > 0)
-        return ["loss_actor", "loss_alpha", "loss_qvalue"], metrics
-
-    def _terms(self, tensordict: TensorDictBase) -> Terms:
-        step = Step(self, tensordict, perturbed=False)
-        actor, log_prob, smooth = self.actor_loss(step)
-        alpha = step.temperature_loss(log_prob)
-        params = self.qvalue_network_params
-        pred_value = step.qvalue(step.states[0], step.data_action, params)
-        target_value = step.soft_target()
-        distance = step.td_distance(pred_value, target_value)
-        terms = self._value_terms(step, pred_value)
-        weights = {
-            "value_smoothness": self.q_smooth_reg,
-            "uncertainty_penalty": self.q_ood_reg,
-        }
-        for name, term in terms.items():
-            distance = distance + weights[name] * term
-        step.write_priority(pred_value, target_value)
+    def losses(self, batch: Transitions) -> Losses:
+        policy = self.policy(batch)
+        objective, log_prob = self.soft_policy_objective(batch, policy, "clean")
+        terms: dict[str, Tensor] = {}
+        if self.policy_smooth_reg:
+            terms["policy_smoothness"] = self.policy_smoothness(batch, policy)
+            smoothness = self.policy_smooth_reg * terms["policy_smoothness"]
+            objective = objective + smoothness
+        temperature = self.temperature_loss(batch, log_prob)
+        q_data = self.q(batch.s, batch.a)
+        error, metrics = self.td_error(batch, q_data, self.soft_target(batch, policy))
+        if self.q_smooth_reg:
+            terms["value_smoothness"] = self.value_smoothness(batch, q_data)
+            error = error + self.q_smooth_reg * terms["value_smoothness"]
+        if self.q_ood_reg:
+            terms["uncertainty_penalty"] = self.uncertainty_penalty(batch)
+            error = error + self.q_ood_reg * terms["uncertainty_penalty"]
         losses = {
-            "loss_actor": actor,
-            "loss_alpha": alpha,
-            "loss_qvalue": step.reduce(distance),
+            "loss_actor": self.reduce(objective, batch),
+            "loss_alpha": temperature,
+            "loss_qvalue": self.reduce(error, batch),
         }
-        metrics = {
-            "alpha": self._alpha,
-            "entropy": -step.mean(log_prob),
-            "pred_value": step.mean(pred_value),
-            "target_value": step.mean(target_value),
-            **{name: step.mean(term) for name, term in (smooth | terms).items()},
-        }
+        metrics |= {name: self.mean(term, batch) for name, term in terms.items()}
+        metrics |= {"alpha": self.alpha, "entropy": -self.mean(log_prob, batch)}
         return losses, metrics
 
-    def actor_loss(self, step: Step) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-        r""":math:`L_\pi`, the log-density of the policy's actions, its smoothness."""
-        objective, log_prob = step.soft_objective("clean")
-        if not self.policy_smooth_reg:
-            return step.reduce(objective), log_prob, {}
-        pi = step.policy("clean")
-        around = self._policy(self._around(step.states[0], self.policy_smooth_eps))
-        divergence = functional.jeffreys_divergence(
-            pi.loc, pi.scale, around.loc, around.scale
-        )
-        smoothness = divergence.amax(0)
-        objective = objective + self.policy_smooth_reg * smoothness
-        return step.reduce(objective), log_prob, {"policy_smoothness": smoothness}
+    def policy_smoothness(self, batch: Transitions, policy: StatePolicy) -> Tensor:
+        """Return the largest divergence of the policy around a state, ``[R]``."""
+        pi, around = policy["clean"], self.around(batch, self.policy_smooth_eps)
+        other = distribution(self.actor_network, self.actor_network_params, around)
+        return jeffreys_divergence(pi.loc, pi.scale, other.loc, other.scale).amax(0)
 
-    def _value_terms(self, step: Step, pred_value: Tensor) -> dict[str, Tensor]:
-        """What is added to the TD distance, unweighted, ``[B]`` each."""
-        terms, params, state = {}, self.qvalue_network_params, step.states[0]
-        if self.q_smooth_reg:
-            around = self._around(state, self.q_smooth_eps)
-            action = step.data_action.expand(self.num_samples, *step.data_action.shape)
-            difference = step.qvalue(around, action, params) - pred_value.unsqueeze(1)
-            terms["value_smoothness"] = functional.value_smoothness(
-                difference, self.q_smooth_tau
-            )
-        if self.q_ood_reg:
-            around = self._around(state, self.q_ood_eps)
-            with torch.no_grad():
-                action, _ = rsample_and_log_prob(self._policy(around))
-            qvalue = step.qvalue(around, action, params)
-            penalty = functional.uncertainty_penalty(qvalue, self.uncertainty_weight)
-            terms["uncertainty_penalty"] = penalty.mean(0)
-        return terms
+    def value_smoothness(self, batch: Transitions, q_data: Tensor) -> Tensor:
+        """Return the change of the values around a state, ``[R]``."""
+        around = self.around(batch, self.q_smooth_eps)
+        action = batch.a.expand(self.num_samples, *batch.a.shape)
+        difference = self.q(around, action) - q_data.unsqueeze(1)
+        return value_smoothness(difference, self.q_smooth_tau)
 
-    def _around(self, states: TensorDictBase, epsilon: float) -> TensorDictBase:
-        """Perturbed states ``[M, B]``; the draws are the same for all rows."""
-        number = self.num_samples
+    def uncertainty_penalty(self, batch: Transitions) -> Tensor:
+        """Return the penalty of the policy's actions around a state, ``[R]``."""
+        around = self.around(batch, self.q_ood_eps)
+        with torch.no_grad():
+            params = self.actor_network_params
+            pi = distribution(self.actor_network, params, around)
+            action, _ = rsample_and_log_prob(pi)
+        qvalue = self.q(around, action)
+        return uncertainty_penalty(qvalue, self.uncertainty_weight).mean(0)
+
+    def around(self, batch: Transitions, epsilon: float) -> TensorDictBase:
+        """Return perturbed states ``[M, R]``; the draws are the same for all rows."""
+        states, number = batch.s, self.num_samples
         around = states.expand(number, *states.batch_size).copy()
-        for key in observation_keys(self):
+        for key in self.observation_keys:
             state: Tensor = states.get(key)
-            size = state.shape[states.ndim :]
-            draws = state.new_empty((number, *size)).uniform_(-epsilon, epsilon)
-            around.set(key, state + draws.reshape(number, *[1] * states.ndim, *size))
+            size = state.shape[1:]
+            draws = state.new_empty((number, 1, *size)).uniform_(-epsilon, epsilon)
+            around.set(key, state + draws)
         return around
-
-    def _policy(self, states: TensorDictBase) -> Any:
-        return distribution(self.actor_network, self.actor_network_params, states)

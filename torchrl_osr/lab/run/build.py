@@ -19,9 +19,8 @@ from torchrl_osr.lab.dynamics import DynamicsOptions
 from torchrl_osr.lab.losses import IQLLoss
 from torchrl_osr.lab.run.limits import check_networks
 from torchrl_osr.modules import state_value
-from torchrl_osr.objectives import BaseLoss
-from torchrl_osr.objectives.distributions import head_of, is_categorical
-from torchrl_osr.objectives.with_recovery import WithRecovery
+from torchrl_osr.objectives import ActorCriticLoss, WithRecovery
+from torchrl_osr.objectives.networks import head_of, is_categorical
 
 
 def read_environment(cfg: DictConfig) -> None:
@@ -184,7 +183,8 @@ def make_learner(
         loss: LossModule = instantiate(part, _partial_=True)(**given).to(device)
         return loss
 
-    loss = objective = built(cfg.loss)
+    objective = built(cfg.loss)
+    loss = objective.loss if isinstance(objective, WithRecovery) else objective
     if hasattr(loss, "qvalue_network"):
         loss.make_value_estimator(gamma=cfg.optim.gamma)
     parts = [loss]
@@ -203,7 +203,7 @@ def make_learner(
 def _check_adversary(objective: str, learner: Learner) -> None:
     """Raise a ValueError unless an adversary can ask a loss's networks."""
     loss, head = learner.loss, head_of(learner.actor)[0]
-    if not (isinstance(loss, BaseLoss) and hasattr(loss, "qvalue_network")):
+    if not (isinstance(loss, ActorCriticLoss) and hasattr(loss, "qvalue_network")):
         raise ValueError(
             f"perturbation=adversarial asks a loss with critics and perturbed states, "
             f"and {type(loss).__name__} has none: take perturbation=gaussian."
@@ -236,7 +236,7 @@ def _check_model_adversary(cfg: DictConfig, loss: LossModule) -> None:
             "is: set it to 0, or take dynamics=ensemble and dynamics.real_ratio below "
             "1."
         )
-    if not (isinstance(loss, BaseLoss) and hasattr(loss, "qvalue_network")):
+    if not (isinstance(loss, ActorCriticLoss) and hasattr(loss, "qvalue_network")):
         raise ValueError(
             f"{steps} asks for the values of critics, and {type(loss).__name__} has "
             "none: set it to 0."

@@ -134,7 +134,7 @@ def train_dynamics(
     return training.train_dynamics(
         dynamics_options(cfg),
         model_data(cfg, data),
-        learner.loss,
+        learner.objective,
         learner.actor,
         phase,
         batch_size=cfg.trainer.batch_size,

@@ -32,7 +32,7 @@ CHOSEN = {
     name: getattr(package, name)
     for package in (objectives, losses)
     for name in package.__all__
-    if name != "BaseLoss"
+    if name != "ActorCriticLoss"
 }
 """Losses that a configuration can name, and the adversary."""
 

@@ -24,7 +24,7 @@ from torchrl.modules import TanhNormal
 from torchrl_osr.lab.envs import attacked_policy, critics_of
 from torchrl_osr.lab.evaluation import Disturbance
 from torchrl_osr.lab.run.trained_run import TrainedRun
-from torchrl_osr.objectives.distributions import CATEGORICAL
+from torchrl_osr.objectives.networks import CATEGORICAL
 
 DATA_UNIT = "data"
 """As a wrapper's ``unit``: the data's standard deviations."""

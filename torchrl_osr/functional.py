@@ -1,0 +1,408 @@
+"""The paper's equations as pure tensor functions.
+
+"Recovering from Out-of-sample States via Inverse Dynamics in Offline Reinforcement
+Learning" (Jiang et al., NeurIPS 2023), https://openreview.net/forum?id=4gLWjSaw4o
+
+Shapes: ``B`` batch (any leading dimensions), ``A`` action, ``N`` critics, ``M``
+sampled actions of one state, ``n`` discrete actions. Every function returns one number
+a sample; the loss modules weigh and reduce. Where the printed paper and these
+files differ, the line says so and why.
+
+Symbols: ``pi`` policy, ``I`` inverse dynamics model, ``s`` clean state, ``s^``
+perturbed state, ``s~`` a state of the mixed data set (clean and perturbed).
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+
+def gaussian_kl(
+    loc_p: Tensor, scale_p: Tensor, loc_q: Tensor, scale_q: Tensor
+) -> Tensor:
+    r""":math:`KL(p \,\|\, q)` of diagonal Gaussians, one number a dimension.
+
+    .. math::
+        \log\frac{\sigma_q}{\sigma_p}
+        + \frac{\sigma_p^2 + (\mu_p - \mu_q)^2}{2\sigma_q^2} - \frac12
+
+    It is also the divergence of the two *tanh*-Gaussians with these pre-tanh
+    parameters and equal bounds, because a bijection leaves the KL unchanged.
+
+    Args:
+        loc_p, scale_p: mean and standard deviation of ``p``, ``[B, A]``.
+        loc_q, scale_q: mean and standard deviation of ``q``, ``[B, A]``.
+
+    Returns:
+        ``[B, A]``, each entry at least 0.
+
+    Examples:
+        >>> p, q = torch.tensor([0.4]), torch.tensor([-0.2])
+        >>> kl = gaussian_kl(p, torch.tensor([0.3]), q, torch.tensor([0.5]))
+        >>> round(kl.item(), 6)
+        0.910826
+    """
+    variance_ratio = (scale_p / scale_q).square()
+    # log(x) / 2 of the squared ratio: one logarithm, and exactly 0 for p == q.
+    return 0.5 * (
+        variance_ratio + ((loc_p - loc_q) / scale_q).square() - 1 - variance_ratio.log()
+    )
+
+
+def categorical_kl(log_prob_p: Tensor, log_prob_q: Tensor) -> Tensor:
+    r""":math:`KL(p \,\|\, q)` of categorical distributions.
+
+    .. math::
+        \sum_a p(a) \, [\log p(a) - \log q(a)]
+
+    An action that ``p`` never takes counts for nothing, whatever ``q`` says of it; one
+    that only ``q`` never takes makes the divergence infinite.
+
+    Args:
+        log_prob_p: normalised log-probabilities of ``p``, ``[B, n]``.
+        log_prob_q: normalised log-probabilities of ``q``, ``[B, n]``.
+
+    Returns:
+        ``[B]``, each entry at least 0.
+
+    Examples:
+        >>> p, q = torch.tensor([0.5, 0.5, 0.0]), torch.tensor([0.25, 0.5, 0.25])
+        >>> round(categorical_kl(p.log(), q.log()).item(), 6)
+        0.346574
+    """
+    prob = log_prob_p.exp()
+    # Selected before the product, not after: the gradient of 0 * inf would be nan.
+    log_prob_p = torch.where(prob > 0, log_prob_p, 0.0)
+    log_prob_q = torch.where(prob > 0, log_prob_q, 0.0)
+    return (prob * (log_prob_p - log_prob_q)).sum(-1)
+
+
+def state_recovery(
+    policy_loc: Tensor,
+    policy_scale: Tensor,
+    inverse_dynamics_loc: Tensor,
+    inverse_dynamics_scale: Tensor,
+    *,
+    direction: Literal["forward", "reverse"] = "forward",
+    action_reduction: Literal["sum", "mean"] = "sum",
+) -> Tensor:
+    r"""State-recovery term :math:`L_{sr}`, equations (11) and (12).
+
+    .. math::
+        KL\big(I(a \mid \tilde s, s') \,\|\, \pi(a \mid \tilde s)\big)
+
+    The paper prints (12) with :math:`\log(\sigma_I / \sigma_\pi)`, which falls
+    without bound as :math:`\sigma_\pi` grows, and without the constant -1/2.
+    Implemented is the divergence of (11), with :math:`\log(\sigma_\pi / \sigma_I)`.
+
+    Args:
+        policy_loc, policy_scale: pre-tanh policy at ``s~``, ``[B, A]``.
+        inverse_dynamics_loc, inverse_dynamics_scale: pre-tanh inverse dynamics
+            model at ``(s~, s')``, ``[B, A]``.
+        direction: ``"forward"`` is the paper's ``KL(I || pi)``, ``"reverse"`` the
+            ``KL(pi || I)`` of the authors' released code.
+        action_reduction: ``"sum"`` over action dimensions as in (12), ``"mean"`` as
+            in the released code.
+
+    Returns:
+        ``[B]``.
+    """
+    policy = (policy_loc, policy_scale)
+    inverse_dynamics = (inverse_dynamics_loc, inverse_dynamics_scale)
+    if direction == "forward":
+        divergence = gaussian_kl(*inverse_dynamics, *policy)
+    elif direction == "reverse":
+        divergence = gaussian_kl(*policy, *inverse_dynamics)
+    else:
+        raise ValueError(
+            f"direction must be 'forward' or 'reverse', got {direction!r}."
+        )
+    if action_reduction == "sum":
+        return divergence.sum(-1)
+    if action_reduction == "mean":
+        return divergence.mean(-1)
+    raise ValueError(
+        f"action_reduction must be 'sum' or 'mean', got {action_reduction!r}."
+    )
+
+
+def deterministic_recovery(
+    policy_loc: Tensor,
+    inverse_dynamics_loc: Tensor,
+    inverse_dynamics_scale: Tensor,
+    *,
+    action_reduction: Literal["sum", "mean"] = "sum",
+) -> Tensor:
+    r"""State-recovery term of a policy without a density.
+
+    .. math::
+        \sum_d \frac{(x_d - \mu_{I,d})^2}{2\sigma_{I,d}^2}
+
+    with :math:`x` the policy's action before the tanh. An addition, not in the paper,
+    whose divergence needs two densities: towards a point :math:`KL(I \,\|\, \pi)` is
+    infinite. This is the part of the reverse :math:`KL(\pi \,\|\, I)` that depends on
+    the mean of a Gaussian policy of fixed width.
+
+    Args:
+        policy_loc: pre-tanh action at ``s~``, ``[B, A]``.
+        inverse_dynamics_loc, inverse_dynamics_scale: pre-tanh inverse dynamics
+            model at ``(s~, s')``, ``[B, A]``.
+        action_reduction: ``"sum"`` or ``"mean"`` over action dimensions.
+
+    Returns:
+        ``[B]``, each entry at least 0; 0 where the action is the model's mean.
+
+    Examples:
+        >>> action, loc = torch.tensor([0.4, 1.0]), torch.tensor([-0.2, 0.0])
+        >>> round(deterministic_recovery(action, loc, torch.tensor(0.5)).item(), 6)
+        2.72
+    """
+    # Of equal widths, only the means are left in the divergence.
+    return state_recovery(
+        policy_loc,
+        inverse_dynamics_scale,
+        inverse_dynamics_loc,
+        inverse_dynamics_scale,
+        direction="reverse",
+        action_reduction=action_reduction,
+    )
+
+
+def soft_policy_value(
+    log_prob: Tensor, qvalue: Tensor, alpha: Tensor | float
+) -> Tensor:
+    r"""SAC objective of the policy, to be minimised, section 4.4.
+
+    .. math::
+        \alpha_e \log\pi(\hat a \mid \tilde s) - \min_i Q_i(\tilde s, \hat a)
+
+    The paper prints :math:`+Q` in an objective to be minimised, which would seek
+    the worst action; the entropy term is not printed but is in the authors' code
+    (and in CQL, on which the method stands).
+
+    Args:
+        log_prob: log-density of the sampled action, ``[B]``.
+        qvalue: values of that action, ``[N, B]``.
+        alpha: entropy temperature, a scalar.
+
+    Returns:
+        ``[B]``.
+    """
+    return alpha * log_prob - qvalue.min(0).values
+
+
+def bootstrap_value(
+    qvalue: Tensor, log_prob: Tensor | None = None, alpha: Tensor | float = 0.0
+) -> Tensor:
+    r"""Pessimistic value of the next state, :math:`V(s')` of the target (2).
+
+    .. math::
+        \min_i \bar Q_i(s', a') - \alpha_e \log\pi(a' \mid s'),
+        \quad a' \sim \pi(s')
+
+    The target itself, :math:`r + \gamma\,(1 - \text{terminated})\,V(s')`, is that of
+    TorchRL's value estimator.
+
+    Args:
+        qvalue: target critics' values of the action, ``[N, B]``.
+        log_prob: log-density of the action, ``[B]``, for SAC's target with its
+            entropy. Default ``None``, the paper's.
+        alpha: entropy temperature, a scalar.
+
+    Returns:
+        ``[B]``.
+
+    Examples:
+        >>> bootstrap_value(torch.tensor([[1.0, 4.0], [2.0, 3.0]]))
+        tensor([1., 3.])
+    """
+    value = qvalue.min(0).values
+    return value if log_prob is None else value - alpha * log_prob
+
+
+def discrete_policy_value(
+    log_prob: Tensor, qvalue: Tensor, alpha: Tensor | float
+) -> Tensor:
+    r""":func:`soft_policy_value` in expectation over all ``n`` actions.
+
+    .. math::
+        \sum_{a=1}^{n} \pi(a \mid \tilde s)
+        \, [\alpha_e \log\pi(a \mid \tilde s) - \min_i Q_i(\tilde s, a)]
+
+    "Soft Actor-Critic for Discrete Action Settings", https://arxiv.org/abs/1910.07207:
+    nothing is sampled. With ``alpha=0`` it is minus the value of the state.
+
+    Args:
+        log_prob: normalised log-probabilities of the policy, ``[B, n]``.
+        qvalue: values of every action, ``[N, B, n]``.
+        alpha: entropy temperature, a scalar.
+
+    Returns:
+        ``[B]``.
+
+    Examples:
+        >>> qvalue = torch.tensor([[[2.0, 1.0]], [[3.0, 0.0]]])
+        >>> discrete_policy_value(torch.tensor([[0.25, 0.75]]).log(), qvalue, 0.0)
+        tensor([-0.5000])
+    """
+    prob = log_prob.exp()
+    # 0 log 0 = 0, as in categorical_kl.
+    log_prob = torch.where(prob > 0, log_prob, 0.0)
+    return (prob * (alpha * log_prob - qvalue.min(0).values)).sum(-1)
+
+
+def temperature_objective(
+    log_alpha: Tensor, log_prob: Tensor, target_entropy: float
+) -> Tensor:
+    r"""SAC objective of the entropy temperature, linear in its logarithm.
+
+    .. math::
+        -\log\alpha_e \, \big(\log\pi(\hat a \mid \tilde s) + \bar{\mathcal H}\big)
+
+    Args:
+        log_alpha: logarithm of the temperature, a scalar.
+        log_prob: log-density of the policy's own action, ``[B]``; treated as constant.
+        target_entropy: the entropy the policy should keep, in nats.
+
+    Returns:
+        ``[B]``.
+    """
+    return -log_alpha * (log_prob.detach() + target_entropy)
+
+
+def action_distance(action: Tensor, data_action: Tensor) -> Tensor:
+    r"""Squared distance of an action from the data's, in squared action units.
+
+    .. math::
+        \|a - a_D\|^2 = \sum_d (a_d - a_{D,d})^2
+
+    Args:
+        action: ``[B, A]``.
+        data_action: ``[B, A]``.
+
+    Returns:
+        ``[B]``.
+    """
+    return (action - data_action).square().sum(-1)
+
+
+def soft_maximum(
+    qvalue: Tensor, log_prob: Tensor, *, temperature: float = 1.0
+) -> Tensor:
+    r"""Log-sum-exp of the values of sampled actions, weighted by their densities.
+
+    .. math::
+        \tau \log \sum_{j=1}^{M} \exp\big(Q(s, a_j) / \tau\big) / p(a_j)
+
+    Each weight :math:`1/p` makes a term an unbiased estimate of
+    :math:`\int e^{Q(s, a) / \tau} da`. Other codes divide the log-density by
+    :math:`\tau` too, which for :math:`\tau \ne 1` is the weight
+    :math:`p^{-1/\tau}`; with the default both are the same.
+
+    Args:
+        qvalue: values of the sampled actions, ``[B, M]``.
+        log_prob: log-density of each action under what drew it, ``[B, M]``.
+        temperature: :math:`\tau`, in units of the value.
+
+    Returns:
+        ``[B]``.
+
+    Examples:
+        >>> two_uniform_actions = torch.tensor([1.0, 3.0])
+        >>> density = torch.tensor([0.5, 0.5]).log()
+        >>> round(soft_maximum(two_uniform_actions, density).item(), 4)
+        3.8201
+    """
+    return temperature * torch.logsumexp(qvalue / temperature - log_prob, -1)
+
+
+def conservative_gap(soft_maximum: Tensor, data_qvalue: Tensor) -> Tensor:
+    r"""CQL(H) penalty: by how much sampled actions are valued above the data's.
+
+    .. math::
+        \tau \log \sum_{j=1}^{M} \exp\big(Q(s, a_j) / \tau\big) / p(a_j) - Q(s, a)
+
+    with ``M = 3K`` actions: uniform, from ``pi(s)`` and from ``pi(s')``, *all scored
+    at* ``s`` and all in one log-sum-exp ("Conservative Q-Learning", Kumar et al.
+    2020, appendix F, https://arxiv.org/abs/2006.04779). The paper prints the simpler
+    (3); its authors' code, like the reference CQL code, computes this. As there, the
+    sum is not divided by ``M``: a constant, without effect on the gradient.
+
+    TorchRL 0.14.1 ``CQLLoss`` differs: it takes the log-sum-exp over three actions at
+    a time and scores the actions of ``pi(s')`` at ``s'``.
+
+    Args:
+        soft_maximum: the first term, see :func:`soft_maximum`, ``[B]``.
+        data_qvalue: value of the data's action, ``[B]``.
+
+    Returns:
+        ``[B]``.
+    """
+    return soft_maximum - data_qvalue
+
+
+def lagrange_terms(
+    gap: Tensor, log_multiplier: Tensor, threshold: float
+) -> tuple[Tensor, Tensor]:
+    r"""Both sides of CQL's Lagrangian, each to be minimised.
+
+    .. math::
+        \max_{\alpha' \ge 0} \min_Q \; \alpha' \, (\text{gap}(Q) - \tau)
+
+    CQL's appendix F (https://arxiv.org/abs/2006.04779). The multiplier is constant in
+    the critics' term and the gap is constant in the multiplier's, so that one backward
+    over the sum of both moves each the right way. TorchRL 0.14.1 ``CQLLoss`` detaches
+    neither: there the multiplier's loss raises the gap.
+
+    Args:
+        gap: the conservative gap, ``[B]``.
+        log_multiplier: :math:`\log\alpha'`, a scalar.
+        threshold: :math:`\tau`, the gap that is tolerated, in units of the value.
+
+    Returns:
+        The critics' term and the multiplier's, each ``[B]``.
+    """
+    # The bound is that of the reference code: a gap that cannot be closed would let
+    # the multiplier overflow.
+    multiplier = log_multiplier.exp().clamp(max=1e6)
+    excess = gap - threshold
+    return multiplier.detach() * excess, -multiplier * excess.detach()
+
+
+def value_constraint(
+    policy_qvalue: Tensor,
+    inverse_dynamics_qvalue: Tensor,
+    *,
+    log_prob: Tensor | None = None,
+    temperature: float = 1.0,
+) -> Tensor:
+    r"""OSR-v constraint on the values, equation (8).
+
+    .. math::
+        \mathbb E_{\hat a \sim \pi(\tilde s)} Q(\tilde s, \hat a)
+        - \mathbb E_{a \sim I(\tilde s, s')} Q(\tilde s, a)
+
+    Minimised over Q, it lowers actions with unknown consequences and raises those that
+    lead to ``s'``. With ``log_prob`` the first expectation is a log-sum-exp over
+    importance-weighted actions instead (:func:`soft_maximum`): our addition, which
+    puts the weight on the actions that Q overrates. The paper's difference is linear
+    in Q, so that it has no minimum. Ours estimates, up to the constant :math:`\log M`,
+    :math:`\log\int e^{Q} da - \mathbb E_I Q`, which is never below the model's entropy.
+
+    Args:
+        policy_qvalue: values of the sampled actions at ``s~``, ``[B, M]``.
+        inverse_dynamics_qvalue: values of the model's actions at ``s~``, ``[B, K]``.
+        log_prob: log-density of each sampled action under what drew it, ``[B, M]``.
+            Default ``None``, the paper's plain mean.
+        temperature: of the log-sum-exp, in units of the value.
+
+    Returns:
+        ``[B]``.
+    """
+    target = inverse_dynamics_qvalue.mean(-1)
+    if log_prob is None:
+        return policy_qvalue.mean(-1) - target
+    return soft_maximum(policy_qvalue, log_prob, temperature=temperature) - target

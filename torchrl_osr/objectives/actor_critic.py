@@ -1,0 +1,813 @@
+r"""The base of the losses: keys, networks, the unpacked batch, targets, reduction.
+
+Shapes: ``B`` batch (any leading dimensions), ``R`` rows (all of ``B`` in one), ``A``
+action, ``N`` critics, ``K`` sampled actions of a kind, ``D`` sets of states: 2 for
+D_tot (clean and perturbed), 1 for either alone.
+
+Networks are called as TorchRL's own losses call them, with one batch dimension: ``D``
+sets of ``R`` rows are ``D * R`` rows. Batch normalisation sees all sets together.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from abc import abstractmethod
+from collections.abc import Iterable, Sequence
+from typing import Any, Literal, Self
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from tensordict.nn import (
+    InteractionType,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+    TensorDictParams,
+    dispatch,
+    set_interaction_type,
+)
+from torch import Tensor, nn
+from torchrl.modules.distributions.utils import rsample_and_log_prob
+from torchrl.objectives import LossModule, ValueEstimators, distance_loss
+from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
+from torchrl.objectives.value import TD0Estimator
+
+from torchrl_osr import functional as F
+from torchrl_osr._checks import check_positive, check_weight
+from torchrl_osr._entries import column, is_next, nested, state_keys
+from torchrl_osr.objectives.networks import (
+    action_bounds,
+    check_action,
+    check_networks,
+    check_same_bounds,
+    distribution,
+    distribution_params,
+    full_precision,
+    written_action,
+)
+from torchrl_osr.objectives.transitions import (
+    SETS,
+    States,
+    TransitionKeys,
+    Transitions,
+    check_single_steps,
+    next_states,
+)
+
+Losses = tuple[dict[str, Tensor], dict[str, Tensor]]
+"""The losses and the metrics of a batch, by name."""
+
+
+class StatePolicy:
+    """The policy at all states of a batch: ``policy["both"]`` is a distribution.
+
+    Args:
+        network: the actor.
+        params: the parameters of its distribution at the stack of states.
+    """
+
+    def __init__(
+        self, network: ProbabilisticTensorDictSequential, params: TensorDictBase
+    ) -> None:
+        self._network, self._params = network, params
+        self._built: dict[str, Any] = {}
+
+    def __getitem__(self, states: str) -> Any:
+        """Return the distribution at a set of states in :data:`SETS`, ``[D, R]``."""
+        if states not in self._built:
+            params = self._params[SETS[states]]
+            self._built[states] = self._network.build_dist_from_params(params)
+        return self._built[states]
+
+
+class Critics:
+    """Evaluate the critics of a loss; :mod:`torchrl_osr.fast` has a faster one."""
+
+    def __init__(self, loss: ActorCriticLoss) -> None:
+        self.loss = loss
+
+    def values(
+        self, states: TensorDictBase, action: Tensor, params: TensorDictBase
+    ) -> Tensor:
+        """Return the values of all critics, ``[N, ..., R]``, of actions at states."""
+        keys = self.loss.tensor_keys
+        rows = states.select(
+            *state_keys(self.loss.qvalue_network.in_keys), strict=False
+        )
+        rows = rows.reshape(-1).set(keys.action, action.flatten(0, -2))
+        value = self.loss.critic_output(rows, params, keys.state_action_value)
+        return value.reshape(-1, *action.shape[:-1])
+
+    def values_and_soft_maximum(
+        self, batch: Transitions, action: Tensor, log_prob: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return both terms of CQL(H) at ``s``, ``[N, R]`` each, in one pass.
+
+        Args:
+            batch: the batch.
+            action: sampled ones, ``[M, R, A]``.
+            log_prob: their log-densities, ``[M, R]``.
+        """
+        action = torch.cat([batch.a.unsqueeze(0), action])
+        params = self.loss.qvalue_network_params
+        qvalue = self.values(batch.s.expand(action.shape[:-1]), action, params)
+        return qvalue[:, 0], F.soft_maximum(
+            qvalue[:, 1:].movedim(1, -1),
+            log_prob.movedim(0, -1),
+            temperature=self.loss.temperature,
+        )
+
+
+class ActorCriticLoss(LossModule):
+    """Abstract base of the losses.
+
+    A loss registers its networks in its constructor, calls :meth:`declare`, and
+    computes :meth:`losses`. TorchRL 0.14.1 builds ``in_keys`` from sets, so that their
+    order, and with it the meaning of positional arguments, changes from one process to
+    the next; here the order is fixed.
+
+    Coefficients (``min_q_weight``, ``recovery_weight``, ``gamma``) are options, not
+    state: :meth:`load_state_dict` keeps those of the loss that it loads into.
+
+    Keyword Args:
+        num_qvalue_nets: number of critics ``N`` where a loss is given a single one,
+            which TorchRL copies; a list has its own length. Default 2.
+        loss_function: distance of the TD error: ``"l2"`` (default), ``"l1"`` or
+            ``"smooth_l1"``.
+        delay_qvalue: use target networks, to be moved by
+            :class:`~torchrl.objectives.SoftUpdate`. Default ``True``.
+        deactivate_vmap: run the critics one by one. Default ``False``.
+        reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
+        use_prioritized_weights: weigh rows by ``"priority_weight"``; ``"auto"``
+            (default) does when the entry is there.
+        scalar_output_mode: with ``reduction="none"``, ``"exclude"`` (with a warning by
+            default) or ``"non_tensor"`` for the scalar metrics.
+    """
+
+    default_value_estimator = ValueEstimators.TD0
+    _AcceptedKeys = TransitionKeys
+    default_keys = TransitionKeys
+    tensor_keys: TransitionKeys
+
+    # convert_to_functional wants every network that a loss may hold annotated.
+    actor_network: ProbabilisticTensorDictSequential
+    actor_network_params: TensorDictParams
+    target_actor_network_params: TensorDictParams
+    qvalue_network: TensorDictModule
+    qvalue_network_params: TensorDictParams
+    target_qvalue_network_params: TensorDictParams
+    inverse_dynamics_network: ProbabilisticTensorDictSequential
+    inverse_dynamics_network_params: TensorDictParams
+    target_inverse_dynamics_network_params: TensorDictParams
+
+    # Losses without CQL's term.
+    has_cql = max_q_backup = deterministic_backup = False
+    target_action_gap: float | None = None
+    delay_actor = False
+    reads_perturbed = False
+
+    def __init__(
+        self,
+        *,
+        num_qvalue_nets: int = 2,
+        loss_function: Literal["l2", "l1", "smooth_l1"] = "l2",
+        delay_qvalue: bool = True,
+        deactivate_vmap: bool = False,
+        reduction: Literal["none", "mean", "sum"] | None = None,
+        use_prioritized_weights: bool | Literal["auto"] = "auto",
+        scalar_output_mode: Literal["exclude", "non_tensor"] | None = None,
+    ) -> None:
+        super().__init__()
+        self._in_keys: list[NestedKey] | None = None
+        self.num_qvalue_nets = num_qvalue_nets
+        self.loss_function = loss_function
+        self.delay_qvalue = delay_qvalue
+        self.deactivate_vmap = deactivate_vmap
+        self.use_prioritized_weights = use_prioritized_weights
+        self.reduction = reduction or "mean"
+        if self.reduction == "none" and scalar_output_mode is None:
+            warnings.warn(
+                f"{type(self).__name__} with reduction='none' leaves its scalar "
+                "metrics out; pass scalar_output_mode='exclude' to say so, or "
+                "'non_tensor' to keep them.",
+                stacklevel=3,
+            )
+            scalar_output_mode = "exclude"
+        self.scalar_output_mode = scalar_output_mode
+        self.critics = Critics(self)
+        self._bounds_are_checked = False
+
+    @abstractmethod
+    def losses(self, batch: Transitions) -> Losses:
+        """Return the losses, which train their own parameters only, and the metrics."""
+
+    # -- networks ---------------------------------------------------------------------
+
+    def register_actor_critic(
+        self,
+        actor_network: TensorDictModuleBase,
+        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+        inverse_dynamics_network: TensorDictModuleBase | None = None,
+        *,
+        delay_actor: bool = False,
+    ) -> None:
+        """Register an actor, critics (one to be copied, or a list), a frozen model."""
+        check_networks(
+            actor_network=actor_network,
+            qvalue_network=qvalue_network,
+            inverse_dynamics_network=inverse_dynamics_network,
+        )
+        self.delay_actor = delay_actor
+        self.convert_to_functional(
+            actor_network, "actor_network", create_target_params=delay_actor
+        )
+        if isinstance(qvalue_network, Sequence):
+            self.num_qvalue_nets = len(qvalue_network)
+        check_positive("num_qvalue_nets", self.num_qvalue_nets, minimum=1)
+        self.convert_to_functional(
+            qvalue_network,
+            "qvalue_network",
+            self.num_qvalue_nets,
+            create_target_params=self.delay_qvalue,
+        )
+        if isinstance(qvalue_network, Sequence) and self.num_qvalue_nets == 1:
+            # TorchRL 0.14.1 keeps a list of one as expanded views of its parameters,
+            # which no optimizer finds in loss.parameters().
+            own = self.qvalue_network_params.apply(
+                lambda tensor: (
+                    nn.Parameter(tensor.detach().clone())
+                    if tensor.requires_grad
+                    else tensor.clone()
+                ),
+                filter_empty=False,
+            )
+            self.qvalue_network_params = TensorDictParams(own, no_convert=True)
+        if inverse_dynamics_network is not None:
+            self.register_frozen("inverse_dynamics_network", inverse_dynamics_network)
+        self._make_vmap()
+
+    def register_frozen(self, name: str, network: nn.Module) -> None:
+        """Register a trained network frozen: in the state dict, moved by ``.to()``.
+
+        Its parameters become buffers, so that no optimizer that takes
+        ``loss.parameters()`` can move them; they share the network's memory.
+        """
+        self.convert_to_functional(network, name)
+        frozen = getattr(self, f"{name}_params").apply(
+            lambda tensor: tensor.data, filter_empty=False
+        )
+        setattr(self, f"{name}_params", TensorDictParams(frozen, no_convert=True))
+
+    def load_frozen(self, name: str, network: nn.Module) -> None:
+        """Load the weights of a trained network into a frozen one of the same sizes."""
+        held = getattr(self, f"{name}_params")
+        given = TensorDict.from_module(network).detach()
+        held.apply(lambda ours, theirs: ours.copy_(theirs), given, filter_empty=False)
+
+    def register_action_bounds(
+        self,
+        actor_network: TensorDictModuleBase,
+        inverse_dynamics_network: TensorDictModuleBase | None = None,
+    ) -> None:
+        """Register the bounds of a tanh-Gaussian actor; a model must share them."""
+        low, high = bounds = action_bounds(actor_network, "actor_network")
+        self.register_buffer("action_low", low, persistent=False)
+        self.register_buffer("action_high", high, persistent=False)
+        if inverse_dynamics_network is not None:
+            name = "inverse_dynamics_network"
+            check_same_bounds(bounds, action_bounds(inverse_dynamics_network, name))
+
+    def register_coefficient(self, name: str, value: float) -> None:
+        """Register the weight of a term, which may be assigned later."""
+        check_weight(name, value)
+        self.register_buffer(name, torch.tensor(float(value)), persistent=False)
+
+    def register_temperature(
+        self,
+        alpha_init: float,
+        fixed_alpha: bool,
+        target_entropy: float | Literal["auto"],
+    ) -> None:
+        """Register the logarithm of SAC's entropy temperature, ``log_alpha``."""
+        check_positive("alpha_init", alpha_init)
+        self.target_entropy = target_entropy
+        log_alpha = torch.tensor(math.log(alpha_init))
+        if fixed_alpha:
+            self.register_buffer("log_alpha", log_alpha)
+        else:
+            self.log_alpha = nn.Parameter(log_alpha)
+
+    def register_conservative_penalty(
+        self,
+        min_q_weight: float,
+        num_random: int,
+        temperature: float,
+        target_action_gap: float | None,
+        clip_diff_min: float,
+        max_q_backup: bool,
+        deterministic_backup: bool,
+    ) -> None:
+        """Register the options of CQL(H), see :class:`~torchrl_osr.CQLLoss`."""
+        check_positive("num_random", num_random, minimum=1)
+        check_positive("temperature", temperature)
+        self.register_coefficient("min_q_weight", min_q_weight)
+        self.has_cql = min_q_weight > 0
+        if target_action_gap is not None and not self.has_cql:
+            raise ValueError("target_action_gap needs min_q_weight above 0.")
+        if max_q_backup and not deterministic_backup:
+            raise ValueError(
+                "max_q_backup=True takes the best action's value without entropy, as "
+                "CQL does: leave deterministic_backup=True."
+            )
+        if target_action_gap is not None:
+            self.log_alpha_prime = nn.Parameter(torch.zeros(()))
+        self.num_random, self.temperature = num_random, temperature
+        self.target_action_gap, self.clip_diff_min = target_action_gap, clip_diff_min
+        self.max_q_backup = max_q_backup
+        self.deterministic_backup = deterministic_backup
+
+    def _make_vmap(self) -> None:
+        if "qvalue_network" in self.__dict__:
+            self._vmap_qvalue = _vmap_func(
+                self.qvalue_network, (None, 0), randomness=self.vmap_randomness
+            )
+
+    def make_value_estimator(
+        self, value_type: ValueEstimators | str | None = None, **hyperparams: Any
+    ) -> Self:
+        """Choose the TD target: TD(0) with ``gamma=0.99`` unless told otherwise."""
+        value_type, options = self._prepare_value_estimator_kwargs(
+            value_type, **hyperparams
+        )
+        if value_type is not None:
+            names = ("value", "reward", "done", "terminated", "steps_to_next_obs")
+            dispatch_value_estimator(
+                self,
+                value_type,
+                supported=(
+                    ValueEstimators.TD0,
+                    ValueEstimators.TD1,
+                    ValueEstimators.TDLambda,
+                ),
+                tensor_keys={name: getattr(self.tensor_keys, name) for name in names},
+                value_network=None,
+                deactivate_vmap=self.deactivate_vmap,
+                **options,
+            )
+        for name, buffer in list(self.value_estimator.named_buffers(recurse=False)):
+            self.value_estimator.register_buffer(name, buffer, persistent=False)
+        return self
+
+    # -- keys -------------------------------------------------------------------------
+
+    def declare(self, losses: Iterable[str], metrics: Iterable[str]) -> None:
+        """Name what the loss writes, in this order."""
+        losses, metrics = list(losses), list(metrics)
+        kept = self.reduction != "none" or self.scalar_output_mode == "non_tensor"
+        self.out_keys = losses + metrics if kept else losses
+
+    def declare_soft_actor_critic(self, *metrics: str) -> None:
+        """Name what the losses with SAC's actor write, and further metrics."""
+        losses = ["loss_actor", "loss_alpha", "loss_qvalue"]
+        shared = ["alpha", "entropy", "pred_value", "target_value"]
+        if self.has_cql:
+            losses.append("loss_cql")
+        if self.target_action_gap is not None:
+            losses.append("loss_alpha_prime")
+            shared.append("alpha_prime")
+        self.declare(losses, [*shared, *metrics])
+
+    @property
+    def observation_keys(self) -> list[NestedKey]:
+        """The state entries that actor and critics read."""
+        keys = [*self.actor_network.in_keys, *self.qvalue_network.in_keys]
+        return state_keys(keys, self.tensor_keys.action)
+
+    def input_keys(self) -> list[NestedKey]:
+        """Return the entries that actor, critics and model read, in order."""
+        keys, states = self.tensor_keys, self.observation_keys
+        found = [*states, keys.action, *(nested("next", key) for key in states)]
+        flags = keys.reward, keys.done, keys.terminated
+        found += [nested("next", key) for key in flags]
+        model: list[NestedKey] = []
+        if "inverse_dynamics_network" in self.__dict__:
+            model = list(self.inverse_dynamics_network.in_keys)
+        found += model
+        if self.reads_perturbed:
+            below = [*states, *state_keys(model)]
+            found += [nested(keys.perturbed, key) for key in below]
+        return found
+
+    def _set_in_keys(self) -> None:
+        """Forget the keys: TorchRL calls this when one was renamed."""
+        self._in_keys = None
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """The entries that the loss reads."""
+        if self._in_keys is None:
+            keys = list(dict.fromkeys(self.input_keys()))
+            if torch.compiler.is_compiling():
+                # Kept, they would make torch.compile trace the second call anew.
+                return keys
+            self._in_keys = keys
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, values: list[NestedKey]) -> None:
+        self._in_keys = values
+
+    # -- the call ---------------------------------------------------------------------
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return the losses and metrics of a batch, see ``out_keys``.
+
+        A loss with critics writes the largest absolute TD error of them under the
+        ``priority`` key, ``[B]``; nothing else is written into ``tensordict``.
+
+        Args:
+            tensordict: a batch ``[B]`` with the entries of ``in_keys``.
+
+        Raises:
+            ValueError: if the batch is empty.
+        """
+        # Not tensordict.numel(), which is at least 1.
+        if not tensordict.batch_size.numel():
+            raise ValueError(
+                f"The batch is empty (batch_size {tuple(tensordict.batch_size)}): the "
+                f"mean of {type(self).__name__} needs at least one transition."
+            )
+        losses, metrics = self.losses(self.unpack(tensordict))
+        scalar = losses | metrics
+        if self.reduction == "none":
+            out = TensorDict(losses, batch_size=tensordict.batch_size)
+            for name in self.out_keys:
+                if name not in losses:
+                    out.set_non_tensor(name, metrics[name])
+        else:
+            out = TensorDict({name: scalar[name] for name in self.out_keys}, [])
+        params = [name for name in self._modules if name.endswith("_params")]
+        self._clear_weakrefs(tensordict, out, *params)
+        return out
+
+    def unpack(self, tensordict: TensorDictBase) -> Transitions:
+        """Return the batch as named tensors, see :class:`Transitions`."""
+        name = next(name for name in self._modules if name.endswith("_params"))
+        dtype = next(iter(getattr(self, name).values(True, True))).dtype
+        masks = self._loss_mask_keys()
+        batch = Transitions(tensordict, self.in_keys, self.tensor_keys, masks, dtype)
+        if "qvalue_network" in self.__dict__:
+            keys = self.observation_keys
+            if taken := set(keys) & set(self.actor_network.out_keys):
+                key = taken.pop()
+                raise KeyError(
+                    f"{key!r} is what the actor writes, and would be read as a state: "
+                    f"call set_keys(action={key!r})."
+                )
+            batch.stack_states(keys, perturbed=self.reads_perturbed)
+        return batch
+
+    # -- networks at states -----------------------------------------------------------
+
+    def policy(self, batch: Transitions) -> StatePolicy:
+        """Return the policy at all states of a batch, in one call of the actor."""
+        network, params = self.actor_network, self.actor_network_params
+        return StatePolicy(network, distribution_params(network, params, batch.states))
+
+    def target_policy(self, batch: Transitions, policy: StatePolicy) -> Any:
+        """Return the policy at the next states of the TD target, ``[1, R]``."""
+        if not self.delay_actor:
+            return policy["next"]
+        params = self.target_actor_network_params
+        return distribution(self.actor_network, params, batch.states[SETS["next"]])
+
+    def act(self, states: TensorDictBase, params: TensorDictParams) -> Tensor:
+        """Return the actions that a deterministic policy writes, ``[..., R, A]``."""
+        key = self.tensor_keys.action
+        return written_action(self.actor_network, params, states, key)
+
+    def inverse_dynamics(self, batch: Transitions, states: States) -> Any:
+        """Return the frozen model ``I(a | s~, s')``, ``[D, R]``, without gradient.
+
+        A latent variable stays at its mean, so that the label does not jitter from one
+        call to the next.
+        """
+        network = self.inverse_dynamics_network
+        inputs = self.model_inputs(batch, network.in_keys, states)
+        with torch.no_grad(), set_interaction_type(InteractionType.DETERMINISTIC):
+            params = self.inverse_dynamics_network_params
+            return distribution(network, params, inputs)
+
+    def model_inputs(
+        self, batch: Transitions, in_keys: Sequence[NestedKey], states: States
+    ) -> TensorDictBase:
+        """Return what an inverse dynamics model reads, ``[D, R]``.
+
+        The next state is never perturbed: it is the state to return to.
+
+        Raises:
+            ValueError: if next states are several steps ahead.
+        """
+        inputs = batch.states_of(state_keys(in_keys), states)
+        after = [unravel_key(key[1:]) for key in in_keys if is_next(key)]
+        if after:
+            check_single_steps(batch, "the inverse dynamics model")
+            following = next_states(batch.one_step, after, batch.done)
+            for key in after:
+                value = following.get(key)
+                inputs.set(nested("next", key), value.expand(len(inputs), *value.shape))
+        return inputs
+
+    def q(
+        self,
+        states: TensorDictBase,
+        action: Tensor,
+        params: TensorDictBase | None = None,
+    ) -> Tensor:
+        """Return the values of all critics, ``[N, ..., R]``.
+
+        Args:
+            states: ``[..., R]``.
+            action: ``[..., R, A]``.
+            params: of the critics. Default: those that are trained;
+                ``qvalue_network_params.detach()`` for the policy's own objective.
+        """
+        if params is None:
+            params = self.qvalue_network_params
+        return self.critics.values(states, action, params)
+
+    def critic_output(
+        self, rows: TensorDictBase, params: TensorDictBase, key: NestedKey
+    ) -> Tensor:
+        """Return the entry ``key`` that all critics write at rows, ``[N, R, ...]``."""
+        network = self.qvalue_network
+        if key not in network.out_keys:
+            raise KeyError(
+                f"The critics write {network.out_keys}, not {key!r}: give them that "
+                "out_key, or name theirs with set_keys()."
+            )
+        if not self.deactivate_vmap:
+            value: Tensor = full_precision(self._vmap_qvalue(rows, params)).get(key)
+            return value
+        values = []
+        # Not TorchRL 0.14.1's loop, which torch.compile traces anew at every call.
+        for each in params.unbind(0):
+            with each.to_module(network, preserve_module_state=False):
+                values.append(full_precision(network(rows.copy())).get(key))
+        return torch.stack(values)
+
+    # -- terms ------------------------------------------------------------------------
+
+    @property
+    def alpha(self) -> Tensor:
+        """SAC's entropy temperature, detached."""
+        return self.log_alpha.detach().exp()
+
+    def soft_policy_objective(
+        self, batch: Transitions, policy: StatePolicy, states: States
+    ) -> tuple[Tensor, Tensor]:
+        """Return SAC's objective of the policy on a set of states.
+
+        Returns:
+            The objective, to be minimised, ``[R]``; the log-density of the policy's own
+            actions, ``[D, R]``.
+        """
+        action, log_prob = rsample_and_log_prob(policy[states])
+        self.check_actions(batch, action.shape[1:])
+        # Detached: the policy's objective must not train the critics.
+        params = self.qvalue_network_params.detach()
+        qvalue = self.q(batch.states[SETS[states]], action, params)
+        objective = F.soft_policy_value(log_prob, qvalue, self.alpha)
+        return objective.mean(0), log_prob
+
+    def temperature_loss(
+        self, batch: Transitions, log_prob: Tensor, auto: float | None = None
+    ) -> Tensor:
+        """Return SAC's objective of the entropy temperature, reduced.
+
+        Args:
+            batch: the batch.
+            log_prob: log-density of the policy's own actions, ``[D, R]``.
+            auto: target of ``target_entropy="auto"``, in nats. Default: minus the
+                number of the action's dimensions.
+        """
+        wanted = self.target_entropy
+        if wanted == "auto":
+            wanted = -batch.a.shape[-1] if auto is None else auto
+        objective = F.temperature_objective(self.log_alpha, log_prob, wanted)
+        return self.reduce(objective.mean(0), batch)
+
+    def critic_losses(self, batch: Transitions, policy: StatePolicy) -> Losses:
+        """Return the TD error and CQL(H)'s penalty, weighted, and their metrics."""
+        losses: dict[str, Tensor] = {}
+        metrics: dict[str, Tensor] = {"alpha": self.alpha}
+        if self.has_cql:
+            q_data, gap = self.conservative_gap(batch, policy)
+            if self.target_action_gap is not None:
+                gap, multiplier = F.lagrange_terms(
+                    gap, self.log_alpha_prime, self.target_action_gap
+                )
+                reduced = self.reduce(multiplier.mean(0), batch)
+                losses["loss_alpha_prime"] = self.min_q_weight * reduced
+                metrics["alpha_prime"] = self.log_alpha_prime.detach().exp()
+            losses["loss_cql"] = self.min_q_weight * self.reduce(gap.sum(0), batch)
+        else:
+            q_data = self.q(batch.s, batch.a)
+        error, values = self.td_error(batch, q_data, self.soft_target(batch, policy))
+        losses["loss_qvalue"] = self.reduce(error, batch)
+        return losses, metrics | values
+
+    def conservative_gap(
+        self, batch: Transitions, policy: StatePolicy
+    ) -> tuple[Tensor, Tensor]:
+        """Return :math:`Q_i(s, a)` and CQL(H)'s gap, ``[N, R]`` each."""
+        action, log_prob = self.proposals(batch, policy)
+        q_data, soft_maximum = self.critics.values_and_soft_maximum(
+            batch, action, log_prob
+        )
+        gap = F.conservative_gap(soft_maximum, q_data)
+        if self.clip_diff_min > -math.inf:
+            gap = gap.clamp(min=self.clip_diff_min)
+        return q_data, gap
+
+    @torch.no_grad()
+    def proposals(
+        self, batch: Transitions, policy: StatePolicy
+    ) -> tuple[Tensor, Tensor]:
+        """Draw ``K`` actions each: uniform, from ``pi(s)`` and from ``pi(s')``.
+
+        Returns:
+            Actions ``[3K, R, A]`` and their log-densities ``[3K, R]``.
+        """
+        uniform, log_density = self.uniform_actions(batch.a)
+        # rsample also without gradient: torch's sample reads the scale back to the host
+        # to check its sign.
+        number = (self.num_random,)
+        action, log_prob = rsample_and_log_prob(policy["recorded"], number)
+        return (
+            torch.cat([uniform, action.flatten(0, 1)]),
+            torch.cat([log_density, log_prob.flatten(0, 1)]),
+        )
+
+    def uniform_actions(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Draw ``K`` uniform actions ``[K, ..., A]``, with their log-densities."""
+        low, high = self.action_low, self.action_high
+        width = (high - low).expand(like.shape[-1])
+        shape = (self.num_random, *like.shape)
+        action = torch.rand(shape, dtype=like.dtype, device=like.device)
+        log_density = -width.log().sum().expand(action.shape[:-1])
+        return action * width + low, log_density
+
+    def soft_target(self, batch: Transitions, policy: StatePolicy) -> Tensor:
+        """Return the TD target of an action of the policy at ``s'``, ``[R]``."""
+        with torch.no_grad():  # as a decorator here, torch.compile cannot trace it
+            states, pi = batch.states[SETS["next"]], self.target_policy(batch, policy)
+            number = (self.num_random,) if self.max_q_backup else ()
+            action, log_prob = rsample_and_log_prob(pi, number)
+            params = self.target_qvalue_network_params
+            qvalue = self.q(states.expand(action.shape[:-1]), action, params)
+            entropy = () if self.deterministic_backup else (log_prob, self.alpha)
+            next_value = F.bootstrap_value(qvalue, *entropy)
+            if self.max_q_backup:
+                next_value = next_value.amax(0)
+            return self.td_target(batch, next_value.squeeze(0))
+
+    def td_target(self, batch: Transitions, next_value: Tensor) -> Tensor:
+        r"""Return :math:`r + \gamma (1 - \text{terminated}) V(s')`, ``[R]``.
+
+        Computed by the value estimator that :meth:`make_value_estimator` chose; this is
+        TD(0), the default. The others need trajectories, ``[B, T]``. ``terminated``,
+        not ``done``: a time-out cuts the recording, not the task.
+
+        Args:
+            batch: the batch.
+            next_value: :math:`V(s')`, ``[R]``.
+        """
+        size, estimator = batch.tensordict.batch_size, self.value_estimator
+        if len(size) < 2 and not isinstance(estimator, TD0Estimator):
+            raise ValueError(
+                f"{type(estimator).__name__} reads the rows of a batch as one "
+                f"trajectory: expected a batch [B, T] of trajectories, got {[*size]}; "
+                "use the default, TD(0)."
+            )
+        column(batch.rows, nested("next", self.tensor_keys.reward))
+        key = nested("next", estimator.tensor_keys.value)
+        own = batch.rows.copy().set(key, next_value.unsqueeze(-1))
+        if len(size) != 1:
+            own = own.reshape(size or (1,))
+        target: Tensor = estimator.value_estimate(own)
+        return target.reshape(-1)
+
+    def td_error(
+        self, batch: Transitions, pred_value: Tensor, target: Tensor
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the critics' summed distance from the TD target, ``[R]``; metrics.
+
+        Squared with the default ``loss_function="l2"``. Writes the largest absolute
+        error of the critics into the batch, as priority.
+
+        Args:
+            batch: the batch.
+            pred_value: :math:`Q_i(s, a)`, ``[N, R]``.
+            target: ``[R]``.
+        """
+        error = (pred_value.detach() - target).abs().amax(0)
+        given = batch.tensordict
+        given.set(self.tensor_keys.priority, error.reshape(given.batch_size))
+        distance: Tensor = distance_loss(
+            pred_value, target.expand_as(pred_value), self.loss_function
+        )
+        values = {"pred_value": pred_value, "target_value": target}
+        return distance.sum(0), {
+            name: self.mean(value, batch) for name, value in values.items()
+        }
+
+    def check_actions(self, batch: Transitions, shape: torch.Size) -> None:
+        """Raise unless the data's actions fit; warn once if they leave the bounds."""
+        check_action(batch.a, shape, self.tensor_keys.action)
+        if self._bounds_are_checked or torch.compiler.is_compiling():
+            return
+        self._bounds_are_checked = True
+        low, high = self.action_low, self.action_high
+        margin = 1e-4 * (high - low)
+        if bool(((batch.a < low - margin) | (batch.a > high + margin)).any()):
+            warnings.warn(
+                f"The data's actions leave the bounds of the networks, {low.tolist()} "
+                f"and {high.tolist()}, where the policy has no density: build actor "
+                "and inverse dynamics model with low= and high= of the environment.",
+                stacklevel=2,
+            )
+
+    # -- reduction --------------------------------------------------------------------
+
+    def reduce(
+        self, value: Tensor, batch: Transitions, valid: Tensor | None = None
+    ) -> Tensor:
+        """Return a loss reduced as asked, with the batch's masks and weights.
+
+        Args:
+            value: one number a row, ``[R]``.
+            batch: the batch.
+            valid: rows that count, bool ``[R]``; the others are 0 under ``"none"``.
+                Default: all. A mean over no row, or over weights of 0, is 0.
+        """
+        given = batch.tensordict
+        value = value.reshape(given.batch_size)
+        weights = self._weights(given)
+        if valid is not None:
+            valid = valid.reshape(given.batch_size)
+            # Selected, not multiplied: 0 * nan is nan in the backward pass, too.
+            value = torch.where(valid, value, torch.zeros_like(value))
+        if weights is None or self.reduction != "mean":
+            # A mask under "none" would compact the result, and a sum needs none.
+            mask = valid if self.reduction == "mean" else None
+            reduced: Tensor = self._reduce_loss(
+                value, given, mask=mask, weights=weights
+            )
+            return reduced
+        # Not TorchRL 0.14.1's weighted mean, which is 0 / 0 where no weight counts.
+        weights = weights.to(value.dtype)
+        if valid is not None:
+            weights = weights * valid
+        total: Tensor = self._reduce_loss(value * weights, given, reduction="sum")
+        weight: Tensor = self._reduce_loss(weights, given, reduction="sum")
+        return total / torch.where(weight == 0, torch.ones_like(weight), weight)
+
+    def mean(
+        self, value: Tensor, batch: Transitions, valid: Tensor | None = None
+    ) -> Tensor:
+        """Return the detached mean of a metric ``[..., R]`` over rows that count."""
+        size = batch.tensordict.batch_size
+        value = value.detach().reshape(-1, *size).mean(0)
+        if valid is not None:
+            valid = valid.reshape(size)
+            value = torch.where(valid, value, torch.zeros_like(value))
+        mean: Tensor = self._reduce_loss(
+            value, batch.tensordict, mask=valid, reduction="mean"
+        )
+        return mean
+
+    def _weights(self, tensordict: TensorDictBase) -> Tensor | None:
+        """Return the rows' importance weights ``[B]``, if there and to be used."""
+        if self.use_prioritized_weights is False:
+            return None
+        # Not TorchRL's _maybe_get_priority_weight, which fails with a nested key.
+        key = self.tensor_keys.priority_weight
+        weights: Tensor | None = tensordict.get(key, None)
+        if weights is None or weights.shape == tensordict.batch_size:
+            return weights
+        if weights.shape == (*tensordict.batch_size, 1):
+            return weights.squeeze(-1)
+        raise ValueError(
+            f"{key!r} has shape {tuple(weights.shape)}, expected one weight a row: "
+            f"{tuple(tensordict.batch_size)}."
+        )
+
+    def rows_weigh_alike(self, batch: Transitions) -> bool:
+        """Return whether every row's term has the same weight in a reduced loss."""
+        given = batch.tensordict
+        masked = any(key in given for key in self._loss_mask_keys())
+        weighted = self._weights(given) is not None
+        return self.reduction != "none" and not (masked or weighted)

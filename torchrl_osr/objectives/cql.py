@@ -1,0 +1,134 @@
+r"""CQL(H) as published: conservative Q-learning with a soft actor-critic.
+
+Shapes: ``R`` rows, ``A`` action, ``N`` critics, ``K`` sampled actions of a kind. The
+equations are in :mod:`torchrl_osr.functional`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Literal
+
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+
+from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses
+from torchrl_osr.objectives.transitions import States, Transitions
+
+
+class CQLLoss(ActorCriticLoss):
+    r"""Conservative Q-learning, CQL(H).
+
+    .. math::
+        L_\pi &= \mathbb E_D [\alpha_e \log\pi(\hat a \mid s) - \min_i Q_i(s, \hat a)]
+            \\
+        L_Q &= \sum_i \mathbb E_D (Q_i - T)^2 + \alpha \sum_i \mathbb E_D \Big[
+            \log \sum_{j=1}^{3K} e^{Q_i(s, a_j)} / p(a_j) - Q_i(s, a) \Big]
+
+    "Conservative Q-Learning for Offline Reinforcement Learning", appendix F,
+    https://arxiv.org/abs/2006.04779. TorchRL 0.14.1's ``CQLLoss`` differs, see
+    :func:`~torchrl_osr.functional.conservative_gap`: this one is untrained about
+    ``N log K`` below it. With ``min_q_weight=0, deterministic_backup=False`` and ten
+    critics it is SAC-N (https://arxiv.org/abs/2110.01548).
+
+    Each entry is weighted already and sends gradient to its own parameters only.
+
+    Args:
+        actor_network: ends in a :class:`~torchrl.modules.TanhNormal`.
+        qvalue_network: one critic, copied by TorchRL, or a list of critics that keep
+            their own weights (:func:`~torchrl_osr.modules.critic_ensemble`).
+
+    Keyword Args:
+        actor_states: where the policy seeks values: ``"clean"`` (default) states, or
+            ``"both"`` for D_tot, which needs perturbed entries.
+        min_q_weight: :math:`\alpha`, weight of the conservative term. Default 5.0. May
+            be assigned later; 0 *here* leaves the term out.
+        num_random: ``K``, actions drawn of each kind (uniform, at ``s``, at ``s'``).
+            Default 10.
+        temperature: :math:`\tau` of the log-sum-exp, in units of the value. Default
+            1.0.
+        target_action_gap: learn a multiplier of the conservative term that holds the
+            gap at this value; adds ``loss_alpha_prime``. Default: none.
+        clip_diff_min: lower bound of the gap, per critic and row, in units of the
+            value. Default: none.
+        max_q_backup: the target takes the best of ``num_random`` actions. Default
+            ``False``.
+        deterministic_backup: leave the entropy out of the target. Default ``True``.
+        alpha_init: initial entropy temperature :math:`\alpha_e`. Default 1.0.
+        fixed_alpha: keep the temperature. Default ``False``.
+        target_entropy: in nats; ``"auto"`` (default) is minus the action's size.
+        delay_actor: the action in the TD target is that of a target actor. Default
+            ``False``.
+        options: of every loss, see
+            :class:`~torchrl_osr.objectives.ActorCriticLoss`.
+
+    Raises:
+        TypeError: if the actor's distribution is not a ``TanhNormal``.
+        ValueError: if a number is out of its range; in the call, if the batch is empty.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.objectives import SoftUpdate
+        >>> from torchrl_osr import CQLLoss
+        >>> from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
+        >>> loss = CQLLoss(tanh_gaussian_actor(11, 3), critic_ensemble(11, 3))
+        >>> updater = SoftUpdate(loss, tau=5e-3)
+        >>> no = torch.zeros(4, 1, dtype=torch.bool)
+        >>> batch = TensorDict({
+        ...     "observation": torch.randn(4, 11), "action": torch.rand(4, 3),
+        ...     "next": {"observation": torch.randn(4, 11), "reward": torch.ones(4, 1),
+        ...              "done": no, "terminated": no}}, [4])
+        >>> sorted(key for key in loss(batch).keys() if key.startswith("loss_"))
+        ['loss_actor', 'loss_alpha', 'loss_cql', 'loss_qvalue']
+    """
+
+    _schedulable_buffers = frozenset({"min_q_weight"})
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+        *,
+        actor_states: States = "clean",
+        min_q_weight: float = 5.0,
+        num_random: int = 10,
+        temperature: float = 1.0,
+        target_action_gap: float | None = None,
+        clip_diff_min: float = -math.inf,
+        max_q_backup: bool = False,
+        deterministic_backup: bool = True,
+        alpha_init: float = 1.0,
+        fixed_alpha: bool = False,
+        target_entropy: float | Literal["auto"] = "auto",
+        delay_actor: bool = False,
+        **options: Any,
+    ) -> None:
+        super().__init__(**options)
+        self.actor_states: States = actor_states
+        self.reads_perturbed = actor_states != "clean"
+        self.register_action_bounds(actor_network)
+        self.register_actor_critic(
+            actor_network, qvalue_network, delay_actor=delay_actor
+        )
+        self.register_temperature(alpha_init, fixed_alpha, target_entropy)
+        self.register_conservative_penalty(
+            min_q_weight,
+            num_random,
+            temperature,
+            target_action_gap,
+            clip_diff_min,
+            max_q_backup,
+            deterministic_backup,
+        )
+        self.declare_soft_actor_critic()
+        self.make_value_estimator()
+
+    def losses(self, batch: Transitions) -> Losses:
+        policy, states = self.policy(batch), self.actor_states
+        objective, log_prob = self.soft_policy_objective(batch, policy, states)
+        losses, metrics = self.critic_losses(batch, policy)
+        losses["loss_actor"] = self.reduce(objective, batch)
+        losses["loss_alpha"] = self.temperature_loss(batch, log_prob)
+        metrics["entropy"] = -self.mean(log_prob, batch)
+        return losses, metrics

@@ -1,0 +1,254 @@
+"""A batch as the losses see it: named tensors, unpacked once.
+
+Shapes: ``B`` batch (any leading dimensions), ``R`` rows (all of ``B`` in one), ``A``
+action, ``D`` sets of states: 2 for D_tot (clean and perturbed), 1 for either alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_osr._entries import column, entry, nested
+
+States = Literal["both", "clean", "perturbed"]
+"""The states of D_tot on which a term is taken."""
+
+SETS = {
+    "both": slice(0, None, 2),
+    "clean": slice(0, 1),
+    "perturbed": slice(2, 3),
+    "next": slice(1, 2),
+    "recorded": slice(0, 2),
+}
+"""Sets of states in the stack ``[s, s', s^]``; ``"recorded"`` is ``s`` and ``s'``."""
+
+
+@dataclass
+class TransitionKeys:
+    """The entries of a batch that a loss reads or writes.
+
+    Attributes:
+        action: the data's action. Default ``"action"``.
+        value: what the value estimator reads. Default ``"state_value"``.
+        reward, done, terminated: below ``"next"``. Default: their own names.
+        priority: written to the batch, ``[B]``. Default ``"td_error"``.
+        priority_weight: importance weight of a row. Default ``"priority_weight"``.
+        perturbed: where the perturbed states are. Default ``"perturbed"``.
+        state_action_value: what a critic writes. Default ``"state_action_value"``.
+        is_synthetic: marks rows whose action is not the data's, ``[B, 1]``; read if
+            present. Default ``"is_synthetic"``.
+        one_step: the single step of an n-step row, as ``"next"``; read if present.
+            Default ``"one_step"``.
+        steps_to_next_obs: number of steps of an n-step row; read if present. Default
+            ``"steps_to_next_obs"``.
+    """
+
+    action: NestedKey = "action"
+    value: NestedKey = "state_value"
+    reward: NestedKey = "reward"
+    done: NestedKey = "done"
+    terminated: NestedKey = "terminated"
+    priority: NestedKey = "td_error"
+    priority_weight: NestedKey = "priority_weight"
+    perturbed: NestedKey = "perturbed"
+    state_action_value: NestedKey = "state_action_value"
+    is_synthetic: NestedKey = "is_synthetic"
+    one_step: NestedKey = "one_step"
+    steps_to_next_obs: NestedKey = "steps_to_next_obs"
+
+
+class Transitions:
+    """A batch, unpacked once for everything downstream.
+
+    Rows are flattened. Flags are bool, whatever they were. Floating-point entries have
+    the networks' type. Masked rows are zeros, for they may hold NaN.
+
+    Args:
+        tensordict: the batch ``[B]``.
+        read: the entries that the loss reads.
+        keys: names of the entries.
+        masks: entries that mark the rows that count, bool ``[B]`` or ``[B, 1]``.
+        dtype: of the networks.
+
+    Attributes:
+        tensordict: the batch as it was given.
+        rows: what the loss reads of it, ``[R]``.
+        one_step: the same rows with the single step as ``"next"``, see
+            :class:`TransitionKeys`.
+        states: ``[s, s']`` or ``[s, s', s^]``, ``[2 or 3, R]``, of a loss with critics.
+    """
+
+    states: TensorDictBase
+
+    def __init__(
+        self,
+        tensordict: TensorDictBase,
+        read: Sequence[NestedKey],
+        keys: TransitionKeys,
+        masks: Sequence[NestedKey],
+        dtype: torch.dtype,
+    ) -> None:
+        self.tensordict, self.keys = tensordict, keys
+        optional = {keys.is_synthetic, keys.one_step, keys.steps_to_next_obs, *masks}
+        rows = tensordict.select(*read, *optional, strict=False)
+        if rows.ndim != 1:
+            rows = rows.reshape(-1)
+        rows = _in_dtype(rows, dtype)
+        for mask in (rows.get(key, None) for key in masks):
+            if mask is not None:
+                rows = _zeros_where_not(rows, mask.reshape(-1).bool())
+        self.rows = self.one_step = rows
+        if keys.one_step in rows.keys(include_nested=True):
+            own = rows.exclude(keys.steps_to_next_obs)
+            self.one_step = own.set("next", rows.get(keys.one_step))
+        for each in (self.rows, self.one_step):
+            for key in (nested("next", keys.done), nested("next", keys.terminated)):
+                if each.get(key, None) is not None:
+                    each.set(key, column(each, key).bool().unsqueeze(-1))
+
+    def stack_states(self, keys: Sequence[NestedKey], *, perturbed: bool) -> None:
+        """Stack the states that actor and critics read, see ``states``."""
+        ended = column(self.rows, nested("next", self.keys.terminated))
+        clean = self.states_of(keys, "clean")[0]
+        stack = [clean, next_states(self.rows, keys, ended)]
+        if perturbed:
+            stack.append(self.states_of(keys, "perturbed")[0])
+        self.states = torch.stack(stack)
+
+    def states_of(self, keys: Sequence[NestedKey], states: States) -> TensorDictBase:
+        """Return the entries ``keys`` of D_tot or a half of it, ``[D, R]``.
+
+        The perturbed state is the entry ``("perturbed", key)`` of the same row, as the
+        next state is ``("next", key)``; section 4.1 stacks the two.
+
+        Raises:
+            KeyError: if no entry has a perturbed one.
+            ValueError: if a perturbed entry has another shape than its clean one.
+        """
+        clean = TensorDict(
+            {key: entry(self.rows, key) for key in keys}, self.rows.batch_size
+        )
+        if states == "clean":
+            return clean.unsqueeze(0)
+        prefix = self.keys.perturbed
+        found = {key: self.rows.get(nested(prefix, key), None) for key in keys}
+        if all(value is None for value in found.values()):
+            there = sorted(map(str, self.tensordict.keys(True, True)))
+            raise KeyError(
+                f"No perturbed state in the batch: expected one of "
+                f"{[nested(prefix, key) for key in keys]}, the batch has {there}. "
+                "Append StatePerturbation(std=...) to the replay buffer."
+            )
+        perturbed = clean.copy()
+        for key, value in found.items():
+            if value is not None:
+                perturbed.set(key, _same_shape(clean, key, nested(prefix, key), value))
+        return torch.stack([clean, perturbed][states == "perturbed" :])
+
+    @property
+    def s(self) -> TensorDictBase:
+        """The clean states, ``[R]``."""
+        return self.states[0]
+
+    @property
+    def s_next(self) -> TensorDictBase:
+        """The next states, ``[R]``; after a termination the state stands in."""
+        return self.states[1]
+
+    @property
+    def a(self) -> Tensor:
+        """The data's actions, ``[R, A]``."""
+        return entry(self.rows, self.keys.action)
+
+    @property
+    def done(self) -> Tensor:
+        """Ends of trajectories after a single step, bool ``[R]``."""
+        return column(self.one_step, nested("next", self.keys.done))
+
+    @property
+    def is_data(self) -> Tensor | None:
+        """Rows with an action of the data, bool ``[R]``; ``None`` if all have."""
+        if self.rows.get(self.keys.is_synthetic, None) is None:
+            return None
+        return ~column(self.rows, self.keys.is_synthetic).bool()
+
+    def of_data(self, value: Tensor) -> Tensor:
+        """Return ``value``, ``[R]``, with 0 where the action is not the data's."""
+        data = self.is_data
+        return value if data is None else torch.where(data, value, 0.0 * value.detach())
+
+    @property
+    def has_next(self) -> Tensor:
+        """Rows of the data whose next state is one, bool ``[R]``."""
+        data = self.is_data
+        return ~self.done if data is None else ~self.done & data
+
+
+def next_states(
+    rows: TensorDictBase, keys: Sequence[NestedKey], absent: Tensor
+) -> TensorDictBase:
+    """Return ``("next", key)`` for each key, the current state where ``absent``.
+
+    What a loader left as the next state of an ended trajectory may be zeros, the first
+    state of the next episode or NaN. Selecting before the networks run keeps such
+    values out of the gradient, too (``0 * nan`` is ``nan``).
+
+    Args:
+        rows: ``[R]``.
+        keys: state entries.
+        absent: rows without a true next state, bool ``[R]``.
+    """
+    found = {}
+    for key in keys:
+        state, name = entry(rows, key), nested("next", key)
+        after = _same_shape(rows, key, name, entry(rows, name))
+        where = absent.reshape(absent.shape + (1,) * (state.ndim - absent.ndim))
+        found[key] = torch.where(where, state, after)
+    return TensorDict(found, rows.batch_size)
+
+
+def check_single_steps(batch: Transitions, reader: str) -> None:
+    """Raise a ValueError where a next state is not the one that an action led to."""
+    steps = batch.one_step.get(batch.keys.steps_to_next_obs, None)
+    # Tracing cannot branch on a number; the first, eager call has looked.
+    if steps is not None and not torch.compiler.is_compiling() and (steps > 1).any():
+        raise ValueError(
+            f"The batch holds multi-step transitions ({int(steps.max())} steps), but "
+            f"{reader} reads the state one step ahead: leave MultiStep out of the "
+            "buffer, or keep the single step in the entry 'one_step'."
+        )
+
+
+def _same_shape(
+    rows: TensorDictBase, key: NestedKey, name: NestedKey, value: Tensor
+) -> Tensor:
+    if value.shape != rows.get(key).shape:
+        raise ValueError(
+            f"{name!r} has shape {tuple(value.shape)}, but {key!r} has "
+            f"{tuple(rows.get(key).shape)}."
+        )
+    return value
+
+
+def _in_dtype(rows: TensorDictBase, dtype: torch.dtype) -> TensorDictBase:
+    other = [
+        value.is_floating_point() and value.dtype != dtype
+        for value in rows.values(True, True)
+    ]
+    if not any(other):
+        return rows
+    return rows.apply(lambda each: each.to(dtype) if each.is_floating_point() else each)
+
+
+def _zeros_where_not(rows: TensorDictBase, mask: Tensor) -> TensorDictBase:
+    def selected(value: Tensor) -> Tensor:
+        where = mask.reshape(-1, *[1] * (value.ndim - 1))
+        return torch.where(where, value, torch.zeros_like(value))
+
+    return rows.apply(selected)
