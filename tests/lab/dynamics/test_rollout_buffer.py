@@ -158,7 +158,7 @@ def test_synthetic_rows_are_marked_and_may_have_noise(data, noise, n_steps) -> N
         storage.set(range(540), rows)
         data = replace(data, storage=storage)
     _, batch, _, actor = buffer_of(data, options, n_steps=n_steps)
-    assert batch["imagined"].flatten().tolist() == [False] * 2 + [True] * 6
+    assert batch["is_synthetic"].flatten().tolist() == [False] * 2 + [True] * 6
     rows = batch[2:]
     apart = (rows["action"] - actor(rows.select("observation"))["action"]).abs()
     assert (0.01 < apart.max() < 2) if noise else (apart.max() < 1e-6)
