@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from untrained_run import make_run
@@ -101,15 +100,3 @@ def test_what_cannot_be_switched_is_named(folders, tmp_path) -> None:
     refused("clone has discrete actions or no critics", tmp_path / "clone")
     refused(r"optim.gamma: \[0.9, 0.99\]", folders[0], tmp_path / "hasty")
     refused("these differ: direction of time", tmp_path / "reverse")
-
-
-def test_a_robots_loop_may_give_one_observation_or_many(folders) -> None:
-    policy = load_switching_policy(folders, steps=1)
-    rows = np.random.default_rng(0).normal(size=(3, 11))
-    wanted = policy(torch.as_tensor(rows, dtype=torch.float32)).numpy()
-    policy.reset()
-    np.testing.assert_array_equal(policy.act(rows), wanted)
-    policy.reset()
-    one = policy.act(rows[0])
-    assert one.shape == (3,)
-    np.testing.assert_allclose(one, wanted[0], rtol=1e-5)

@@ -11,7 +11,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import InteractionType, set_interaction_type
 from torch import Tensor, nn
-from torchrl.data import OfflineToOnlineReplayBuffer
 
 from torchrl_osr.lab.data.rows import take_multi_step
 from torchrl_osr.lab.data.transitions import DATASET_KEYS
@@ -29,26 +28,7 @@ from torchrl_osr.lab.dynamics.rollouts import (
 )
 
 
-class _Rows:
-    """Rows to sample from; TorchRL 0.14.1's ReplayBuffer is freed late, by a cycle."""
-
-    def __init__(self, rows: TensorDictBase, rng: torch.Generator | None) -> None:
-        self.rows, self.rng = rows, rng
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    def set_rng(self, generator: torch.Generator) -> None:
-        self.rng = generator
-
-    def sample(self, batch_size: int) -> TensorDictBase:
-        device = None if self.rng is None else self.rng.device
-        size = (batch_size,)
-        index = torch.randint(len(self.rows), size, generator=self.rng, device=device)
-        return self.rows[index]
-
-
-class RolloutReplayBuffer(OfflineToOnlineReplayBuffer):
+class RolloutReplayBuffer:
     """Mix recorded rows with roll-outs of the policy's newest copies.
 
     Before the first batch, and after every ``options.rollout_interval`` batches, a copy
@@ -69,6 +49,9 @@ class RolloutReplayBuffer(OfflineToOnlineReplayBuffer):
         gamma: discount factor.
         n_steps: of the recorded rows; synthetic ones are single steps.
         seed: of the first roll-out; the next one has the next seed.
+
+    Attributes:
+        synthetic: rows of the newest roll-outs, oldest first, ``[n]``.
     """
 
     def __init__(
@@ -85,22 +68,17 @@ class RolloutReplayBuffer(OfflineToOnlineReplayBuffer):
         seed: int,
         transform: Callable[[TensorDictBase], TensorDictBase],
     ) -> None:
-        super().__init__(
-            data.buffer(),
-            online_capacity=1,
-            offline_fraction=options.real_ratio,
-            batch_size=batch_size,
-            transform=self._finished,
-        )
         self.options, self.data, self.model = options, data, model
         self.adversary, self.seed, self.n_steps = adversary, seed, n_steps
-        self.batch_transform = transform
+        self.batch_size, self.transform = batch_size, transform
+        self.real = data.buffer()
         # The adversary's model is copied too: a roll-out must be repeatable.
         self.policy = policy if adversary is None else nn.ModuleList([policy, model])
         terminated = options.termination(data.env_id, data.loc, data.scale)
         self.bounds: dict[str, Any] = {"terminated": terminated}
         self.bounds |= self._bounds_of_unknown(gamma)
         self.num_batches = 0
+        self.synthetic: TensorDictBase = TensorDict({}, [0])
         self._rng: torch.Generator | None = None
         self._copy = deepcopy(self.policy).requires_grad_(False)
         self._policies: list[dict[str, Any]] = []
@@ -124,29 +102,35 @@ class RolloutReplayBuffer(OfflineToOnlineReplayBuffer):
     def set_rng(self, generator: torch.Generator) -> None:
         """Sample both kinds of rows with this generator."""
         self._rng = generator
-        for buffer in (self._offline_buffer, self._online_buffer):
-            buffer.set_rng(generator)
+        self.real.set_rng(generator)
 
-    def sample(self, batch_size: int | None = None) -> TensorDictBase:
+    def sample(self) -> TensorDictBase:
         """Return a batch; roll the policy out before, if that is due."""
-        if self.num_batches % self.options.rollout_interval == 0:
-            number = self.num_batches // self.options.rollout_interval
+        options = self.options
+        if self.num_batches % options.rollout_interval == 0:
+            number = self.num_batches // options.rollout_interval
             if number and self.adversary is not None:
                 self.adversary(number)
             state = self.policy.state_dict()
             weights = {key: value.cpu().clone() for key, value in state.items()}
-            newest = slice(-self.options.generations, None)
+            newest = slice(-options.generations, None)
             self._policies = [*self._policies, weights][newest]
             latest = self._repeatable(weights, number)
             self._keep([*self._rollouts, latest][newest])
         self.num_batches += 1
-        return super().sample(batch_size)
-
-    def _finished(self, batch: TensorDictBase) -> TensorDictBase:
-        batch = self.batch_transform(batch)
-        if self.options.reverse_policy is None:  # own actions are no labels
-            number = torch.arange(len(batch), device=batch.device).unsqueeze(-1)
-            batch["is_synthetic"] = number >= round(self.options.real_ratio * len(batch))
+        num_real = round(options.real_ratio * self.batch_size)
+        num_synthetic, generator = self.batch_size - num_real, self._rng
+        real = self.real.sample(num_real)
+        index = torch.randint(
+            len(self.synthetic),
+            (num_synthetic,),
+            generator=generator,
+            device=None if generator is None else generator.device,
+        )
+        batch = self.transform(torch.cat([real, self.synthetic[index]]))
+        if options.reverse_policy is None:  # own actions are no labels
+            order = torch.arange(len(batch), device=batch.device)
+            batch["is_synthetic"] = order.unsqueeze(-1) >= num_real
         return take_multi_step(batch) if self.n_steps > 1 else batch
 
     def roll_out(self, copied: nn.Module) -> Rollout:
@@ -202,19 +186,14 @@ class RolloutReplayBuffer(OfflineToOnlineReplayBuffer):
         return found
 
     def _keep(self, rollouts: list[Rollout]) -> None:
-        """Sample from these rows, in their order."""
+        """Sample from these rows."""
         rows = torch.cat([each.rows for each in rollouts])
         ends = [0, *accumulate(len(each.rows) for each in rollouts)]
         self._rollouts = [  # of slices, so that rows are in memory once
             Rollout(rows[start:end], each.num_rejected)
             for (start, end), each in zip(pairwise(ends), rollouts, strict=True)
         ]
-        self._online_buffer = _Rows(rows, self._rng)
-
-    @property
-    def synthetic(self) -> TensorDictBase:
-        """All rows of the roll-outs, oldest first, ``[n]``."""
-        return self._online_buffer.rows
+        self.synthetic = rows
 
     def metrics(self) -> dict[str, float]:
         """Return the share of rejected rows, and of the others that end the task."""

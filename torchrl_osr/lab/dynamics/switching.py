@@ -9,9 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import copy
 
-import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from torchrl_osr._checks import check_positive
@@ -144,13 +142,6 @@ class SwitchingPolicy:
         """Choose anew at the next call."""
         self.chosen: Tensor | None = None
         self._calls = 0
-
-    def act(self, observation: ArrayLike) -> NDArray[np.float32]:
-        """Return actions ``[A]`` or ``[B, A]`` for ``[S]`` or ``[B, S]``."""
-        rows = torch.as_tensor(np.asarray(observation, np.float32))
-        action = self(rows.view(-1, rows.shape[-1]))
-        found: NDArray[np.float32] = action.view(*rows.shape[:-1], -1).numpy()
-        return found
 
     @torch.no_grad()
     def __call__(self, observation: Tensor) -> Tensor:
