@@ -1,7 +1,6 @@
 """Dynamics models: training, roll-outs, and policies and losses that use them."""
 
-from torchrl_osr.lab.dynamics.conditional_vae import ConditionalVAE
-from torchrl_osr.lab.dynamics.conditional_vae_loss import ConditionalVAELoss
+from torchrl_osr.lab.dynamics.conditional_vae import ConditionalVAE, ConditionalVAELoss
 from torchrl_osr.lab.dynamics.data import ModelData
 from torchrl_osr.lab.dynamics.dynamics_loss import DynamicsLoss
 from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble

@@ -22,8 +22,7 @@ from torch import nn
 from torchrl_osr import __version__
 from torchrl_osr._files import write_json
 from torchrl_osr.lab.data.store import cache_root
-from torchrl_osr.lab.dynamics.conditional_vae import ConditionalVAE
-from torchrl_osr.lab.dynamics.conditional_vae_loss import ConditionalVAELoss
+from torchrl_osr.lab.dynamics.conditional_vae import ConditionalVAE, ConditionalVAELoss
 from torchrl_osr.lab.dynamics.data import ModelData
 from torchrl_osr.lab.dynamics.dynamics_loss import DynamicsLoss
 from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble

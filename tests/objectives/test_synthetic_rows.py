@@ -1,4 +1,4 @@
-"""Where the policy itself has acted in a model, nothing of the data is cloned."""
+"""Rows of a model, in which the policy itself acts, are not cloned."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TERMS = {
 
 
 @pytest.mark.parametrize(("name", "key"), TERMS.items())
-def test_what_happened_in_imagined_rows_is_not_imitated(
+def test_synthetic_rows_are_not_imitated(
     family, family_batch, seeded, name, key
 ) -> None:
     loss, batch = family(name), family_batch(name, 10)
