@@ -9,11 +9,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
+from torch.distributions import Normal, kl_divergence
 from torchrl.envs import ObservationNorm
 from torchrl.modules import MLP, ValueOperator
 from torchrl.objectives import SACLoss
 
-from torchrl_osr.functional import jeffreys_divergence
 from torchrl_osr.lab.envs import attacked_policy, critics_of
 from torchrl_osr.lab.evaluation import deterministic_policy
 from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
@@ -56,7 +56,8 @@ def shown(trained, observation, **arguments):
 
 def divergence(trained, clean, observation):
     p, q = (trained.policy(states_of(each)) for each in (clean, observation))
-    return jeffreys_divergence(p.loc, p.scale, q.loc, q.scale).detach()
+    p, q = (Normal(each.loc, each.scale) for each in (p, q))
+    return (kl_divergence(p, q) + kl_divergence(q, p)).sum(-1).detach()
 
 
 def value(trained, clean, observation):

@@ -19,7 +19,6 @@ import sys
 from pathlib import Path
 
 from torchrl_osr.lab.report import comparison_notes, pack_runs, read_runs, write_report
-from torchrl_osr.lab.report.scores import counted
 
 EXAMPLES = """\
   torchrl-osr report outputs
@@ -56,7 +55,7 @@ def main() -> None:
         if files := [str(each) for each in options.runs if each.is_file()]:
             parser.error(f"--pack takes folders of runs, got {', '.join(files)}.")
         number = pack_runs(options.runs, options.pack)
-        print(f"{counted(number, 'run')} in {options.pack}")
+        print(f"{number} runs in {options.pack}")
         return
     tables = read_runs(options.runs)
     for path, reason in tables.left_out:
@@ -66,7 +65,7 @@ def main() -> None:
     page = write_report(
         tables, options.output, reference=options.reference, command=command
     )
-    print(f"{counted(len(tables.runs), 'run')} in {page}")
+    print(f"{len(tables.runs)} runs in {page}")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,14 @@
 """One page about any number of runs: verdict, tables, figures, differences."""
 
 from torchrl_osr.lab.report.comparisons import compare, quantities
-from torchrl_osr.lab.report.methods import RunTables, comparison_notes, read_runs
 from torchrl_osr.lab.report.page import write_report
-from torchrl_osr.lab.report.runs import pack_runs, read_records
+from torchrl_osr.lab.report.runs import (
+    RunTables,
+    comparison_notes,
+    pack_runs,
+    read_records,
+    read_runs,
+)
 
 __all__ = [
     "RunTables",

@@ -1,8 +1,7 @@
-"""Is one method better than another? Differences of the same episodes, and a verdict.
+"""Differences between methods, in the same episodes, and the verdict.
 
-Two runs are compared if they have the same data set and seed, and episode by episode
-if these have the same checkpoint and start state. Intervals resample seeds, then
-episodes.
+Two runs are compared if they have the same data set and seed, episode by episode at the
+same checkpoint and from the same start state. Intervals resample seeds, then episodes.
 """
 
 from __future__ import annotations
@@ -10,15 +9,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
-from torchrl_osr.lab.evaluation.statistics import nested_resamples, percentile_interval
-from torchrl_osr.lab.report.methods import RunTables
-from torchrl_osr.lab.report.scores import Estimate, counted, decimal, over_what, recent
-
-Array = NDArray[np.float64]
+from torchrl_osr.lab.evaluation.statistics import (
+    Array,
+    Estimate,
+    decimal,
+    mean_difference,
+)
+from torchrl_osr.lab.report.runs import RunTables
+from torchrl_osr.lab.report.tables import recent
 
 ALL_DATA = "all data sets"
 
@@ -29,18 +29,21 @@ A bootstrap over three seeds holds the true mean in about 76 of 100 cases, over 
 83, over ten in 89: with fewer, an interval without 0 says next to nothing.
 """
 
+EPISODE = ["data", "method", "seed", "step", "episode"]
+
 
 class Quantity(NamedTuple):
     """A number of an episode in which methods are compared.
 
     Attributes:
         name: in words.
-        values: by ``data``, ``method``, ``seed``, ``step`` and ``episode``.
+        rows: ``data``, ``method``, ``seed``, ``step``, ``episode``, ``disturbance``,
+            ``value``, and whether the disturbance was ``met``.
         sign: 1 where more is better, -1 where less is.
     """
 
     name: str
-    values: pd.Series
+    rows: pd.DataFrame
     sign: int = 1
 
 
@@ -49,60 +52,49 @@ class Difference(NamedTuple):
 
     Attributes:
         data: a data set, or :data:`ALL_DATA`.
-        method: which is compared.
-        quantity: in what.
-        estimate: method less reference; ``None`` if they cannot be paired.
+        method: that is compared.
+        quantity: in which.
+        estimate: method less reference; ``None`` if they cannot be compared.
         seeds: pairs of runs, the fewest that a data set has.
-        note: why they cannot, or that seeds are left out.
+        note: why they cannot be compared, or what is left out.
     """
 
     data: str
     method: str
     quantity: Quantity
     estimate: Estimate | None
-    seeds: int
+    seeds: int = 0
     note: str = ""
 
     @property
     def verdict(self) -> str:
-        """Either "better", "worse", "not told apart" or why it cannot be told."""
+        """Better, worse, no significant difference, or why there is no verdict."""
         if self.estimate is None:
-            return "not paired"
+            return "not compared"
         if self.seeds < MIN_SEEDS:
-            return f"cannot be told: {counted(self.seeds, 'seed')}"
+            return f"too few seeds ({self.seeds} of {MIN_SEEDS})"
         if self.estimate.low <= 0 <= self.estimate.high:
-            return "not told apart"
+            return "no significant difference"
         return "better" if self.estimate.mean * self.quantity.sign > 0 else "worse"
-
-    @property
-    def told(self) -> bool:
-        """Whether one of the two is better."""
-        return self.verdict in ("better", "worse")
 
 
 def quantities(tables: RunTables) -> list[Quantity]:
-    """What methods are compared in: the score or return, and two of each suite."""
+    """The undisturbed score or return, and two quantities of each suite."""
     measure = "score" if tables.measure == "normalised score" else "return"
-    found = [Quantity(f"undisturbed {measure}", _values(recent(tables.episodes)))]
+    rows = recent(tables.episodes).rename(columns={"score": "value"}).assign(met=True)
+    found = [Quantity(f"undisturbed {measure}", rows)]
     for suite in tables.suites:
         rows = tables.episodes[tables.episodes["suite"] == suite]
-        none = rows["disturbance"] == ""
-        clean, under = _values(rows[none]), _values(rows[~none])
+        clean = rows[rows["disturbance"] == ""].groupby(EPISODE)["score"].mean()
+        rows = rows[rows["disturbance"] != ""].rename(columns={"score": "value"})
+        rows = rows.assign(met=rows["disturbed_at"].notna())
+        lost = rows.join(clean.rename("clean"), on=EPISODE)
+        lost["value"] = lost["clean"] - lost["value"]
         found += [
-            Quantity(f"{measure} under {suite}", under),
-            Quantity(f"{measure} lost to {suite}", clean - under, sign=-1),
+            Quantity(f"{measure} under {suite}", rows),
+            Quantity(f"{measure} lost to {suite}", lost, sign=-1),
         ]
     return found
-
-
-def suite_quantities(tables: RunTables, suite: str) -> list[Quantity]:
-    """The score under each disturbance of a suite."""
-    rows = tables.episodes[tables.episodes["suite"] == suite]
-    return [
-        Quantity(name, _values(group))
-        for name, group in rows.groupby("disturbance", sort=False)
-        if name
-    ]
 
 
 def compare(
@@ -116,28 +108,59 @@ def compare(
     """
     found, paired = [], []
     for data in tables.data:
-        values = quantity.values[quantity.values.index.get_level_values("data") == data]
-        if not {method, reference} <= set(values.index.unique("method")):
+        rows = quantity.rows[quantity.rows["data"] == data]
+        if not {method, reference} <= set(rows["method"]):
             continue
-        pairs, note = pair(values.droplevel("data"), method, reference)
+        pairs, note = pair(rows, method, reference)
         estimate = mean_difference([pairs]) if pairs else None
         found.append(Difference(data, method, quantity, estimate, len(pairs), note))
         if pairs:
             paired.append(pairs)
-    if len(paired) > 1:
-        notes = [each.note for each in found if each.estimate]
-        if len(paired) < len(tables.data):
-            notes.insert(0, f"of {len(paired)} data sets")
-        note = "; ".join(dict.fromkeys(filter(None, notes)))
+    if len(found) > 1 and paired:
+        note = f"{len(paired)} of {len(tables.data)} data sets"
+        note = "" if len(paired) == len(tables.data) else note
         together, fewest = mean_difference(paired), min(map(len, paired))
         found.append(Difference(ALL_DATA, method, quantity, together, fewest, note))
     return found
 
 
-def compare_all(
-    tables: RunTables, reference: str, wanted: Sequence[Quantity]
-) -> list[Difference]:
-    """Compare every method with the reference."""
+def pair(rows: pd.DataFrame, method: str, reference: str) -> tuple[list[Array], str]:
+    """Differences of the same episodes of two methods on one data set.
+
+    Args:
+        rows: of a :class:`Quantity`.
+        method, reference: their names.
+
+    Returns:
+        Method less reference of each seed that both have, averaged over disturbances
+        and checkpoints, ``[E]``, and what is left out; or nothing, and the reason.
+    """
+    rows = rows[rows["method"].isin([method, reference])]
+    met = rows.groupby(["disturbance", "method"])["met"].any().unstack(fill_value=False)
+    unmet = [name for name in met.index if not met.loc[name].all()]
+    if len(unmet) == len(met):
+        return [], "no disturbance was met by both: their episodes ended before"
+    notes = [f"without {', '.join(unmet)}, not met by both"] if unmet else []
+    rows = rows[~rows["disturbance"].isin(unmet)]
+    both = rows.groupby(EPISODE[1:])["value"].mean().unstack("method")
+    seeds = (both.groupby("seed").count() > 0).all(axis=1)
+    if not seeds.any():
+        return [], "they have no seed in common"
+    both = both[both.index.get_level_values("seed").isin(seeds.index[seeds])]
+    if alone := int(both.isna().any(axis=1).sum()):
+        return (
+            [],
+            f"{alone} episodes of one have no partner: other checkpoints or seeds",
+        )
+    if not seeds.all():
+        notes.append("only seeds that both have")
+    less = (both[method] - both[reference]).groupby(["seed", "episode"]).mean()
+    return [each.to_numpy() for _, each in less.groupby("seed")], "; ".join(notes)
+
+
+def compare_all(tables: RunTables, reference: str) -> list[Difference]:
+    """Compare every method with the reference in all quantities."""
+    wanted = quantities(tables)
     return [
         each
         for method in tables.methods
@@ -147,59 +170,11 @@ def compare_all(
     ]
 
 
-def pair(values: pd.Series, method: str, reference: str) -> tuple[list[Array], str]:
-    """Differences of the same episodes of two methods on one data set.
-
-    Args:
-        values: by ``method``, ``seed``, ``step`` and ``episode``.
-        method: its name.
-        reference: the other's name.
-
-    Returns:
-        Method less reference of each seed that both have, averaged over checkpoints,
-        ``[E]``; a note if seeds are left out. Or nothing, and why it cannot be paired.
-    """
-    both = values.unstack("method")[[method, reference]].dropna(how="all")
-    seeds = both.groupby("seed").count()
-    common = seeds.index[(seeds > 0).all(axis=1)]
-    if common.empty:
-        return [], "they have no seed in common"
-    both = both[both.index.get_level_values("seed").isin(common)]
-    alone = both.index[both.isna().any(axis=1)]
-    if len(alone):
-        seed, step, episode = alone[0]
-        return [], (
-            f"{counted(len(alone), 'episode')} without a partner, the first of seed "
-            f"{seed} at step {step:,} with episode seed {episode}"
-        )
-    less = (both[method] - both[reference]).groupby(["seed", "episode"]).mean()
-    note = "only seeds that both have" if len(common) < len(seeds) else ""
-    return [each.to_numpy() for _, each in less.groupby("seed")], note
-
-
-def mean_difference(data_sets: Sequence[Sequence[Array]]) -> Estimate:
-    """Mean difference, every data set and every seed with equal weight.
-
-    Args:
-        data_sets: differences of each seed's episodes, ``[E]``, data set by data set.
-    """
-    point = np.mean([np.mean([run.mean() for run in each]) for each in data_sets])
-    # A seed for each data set: with one, they would be drawn alike.
-    resamples = [
-        nested_resamples([run[:, None] for run in each], seed=index)
-        for index, each in enumerate(data_sets)
-    ]
-    low, high = percentile_interval(np.mean(resamples, axis=0).ravel())
-    return Estimate(float(point), float(low), float(high), over_what(data_sets))
-
-
 def verdict(differences: Sequence[Difference], reference: str) -> list[str]:
-    """Which method is better than the reference in what, in plain sentences.
+    """Sentences: which methods differ significantly from the reference, and in what.
 
-    Returns:
-        First the verdicts, then what is not told apart, then what cannot be told. A
-        method with several data sets is judged over all of them, any other on its only
-        one.
+    A method with several data sets is judged over all of them, any other on its only
+    one.
     """
     everywhere = {each.method for each in differences if each.data == ALL_DATA}
     found = [
@@ -207,30 +182,18 @@ def verdict(differences: Sequence[Difference], reference: str) -> list[str]:
         for each in differences
         if each.data == ALL_DATA or each.method not in everywhere
     ]
-    sentences = [
-        f"{each.method} is {each.verdict} than {reference} in {each.quantity.name} on "
-        f"{each.data}: {decimal(each.estimate.mean, '+')} "
-        f"{each.estimate.interval('+')}, {each.seeds} pairs of runs a data set."
-        for each in found
-        if each.told and each.estimate
-    ]
-    rest = pd.DataFrame(
-        [(e.verdict, e.method, e.quantity.name) for e in found if not e.told],
-        columns=["why", "method", "quantity"],
-    ).drop_duplicates()
-    rest = rest.sort_values("why", key=lambda why: why == "not paired", kind="stable")
-    by_method = rest.groupby(["why", "method"], sort=False)["quantity"].agg(", ".join)
-    alike = by_method.reset_index().groupby(["why", "quantity"], sort=False)["method"]
-    for (why, names), methods in alike:
-        sentences.append(f"{', '.join(methods)} against {reference} in {names}: {why}.")
-    if rest["why"].str.startswith("cannot").any():
-        sentences.append(
-            f"A verdict needs {MIN_SEEDS} pairs of runs on every data set: over fewer "
-            "seeds an interval is too narrow to rank anything."
-        )
+    sentences, rest = [], dict[tuple[str, str], list[str]]()
+    for each in found:
+        if each.estimate and each.verdict in ("better", "worse"):
+            sentences.append(
+                f"{each.method} is {each.verdict} than {reference} in "
+                f"{each.quantity.name} on {each.data}: "
+                f"{decimal(each.estimate.mean, '+')} {each.estimate.interval('+')}, "
+                f"{each.seeds} pairs of runs a data set."
+            )
+        else:
+            rest.setdefault((each.quantity.name, each.verdict), []).append(each.method)
+    for (name, why), methods in rest.items():
+        who = ", ".join(dict.fromkeys(methods))
+        sentences.append(f"{name.capitalize()}, {why}: {who} against {reference}.")
     return sentences or [f"There is nothing to compare with {reference}."]
-
-
-def _values(rows: pd.DataFrame) -> pd.Series:
-    """Mean score of each episode over the disturbances in the rows."""
-    return rows.groupby(["data", "method", "seed", "step", "episode"])["score"].mean()

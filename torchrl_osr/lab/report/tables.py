@@ -1,0 +1,257 @@
+"""Tables of scores, robustness, recoverable states and differences.
+
+A cell is an :class:`~torchrl_osr.lab.evaluation.statistics.Estimate`, a text or a
+number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from torchrl_osr.lab.evaluation.recoverable import GROUPS, disturbances_of
+from torchrl_osr.lab.evaluation.recovery import STEPS_AFTER
+from torchrl_osr.lab.evaluation.statistics import (
+    Array,
+    Estimate,
+    decimal,
+    estimate,
+    iqm,
+    nested_resamples,
+    over_what,
+    percentile_interval,
+    recovered_share,
+    saved_share,
+    scores_and_decreases,
+)
+from torchrl_osr.lab.evaluation.training_summary import NUM_RECENT
+from torchrl_osr.lab.report.runs import RunTables
+
+if TYPE_CHECKING:
+    from torchrl_osr.lab.report.comparisons import Difference
+
+MARKS = {"better": "▲ ", "worse": "▼ ", "no significant difference": "= "}
+
+
+def undisturbed(episodes: pd.DataFrame) -> pd.DataFrame:
+    """The episodes of the training's own evaluations."""
+    return episodes[episodes["suite"] == ""]
+
+
+def recent(episodes: pd.DataFrame, number: int = NUM_RECENT) -> pd.DataFrame:
+    """The undisturbed episodes of each run's last evaluations, by default five.
+
+    The evaluation of the untrained policy, at step 0, is not among them.
+    """
+    found = undisturbed(episodes)
+    found = found[found["step"] > 0]
+    rank = found.groupby("run")["step"].rank("dense", ascending=False)
+    return found[rank <= number]
+
+
+def by_run(episodes: pd.DataFrame) -> list[Array]:
+    """Scores of each run's start states, ``[E]`` each.
+
+    Evaluations that start in the same state are averaged: they are no new episodes.
+    """
+    means = episodes.groupby(["run", "episode"], sort=False)["score"].mean()
+    return [run.to_numpy() for _, run in means.groupby("run", sort=False)]
+
+
+def score_table(tables: RunTables) -> pd.DataFrame:
+    """Undisturbed scores, by data set and method."""
+    rows = {}
+    for key, group in tables.episodes.groupby(["data", "method"], sort=False):
+        of = tables.runs.loc[group["run"].unique()]
+        rows[key] = {
+            "seeds": f"{len(of)} ({', '.join(map(str, sorted(of['seed'])))})",
+            "updates": f"{of['steps'].iloc[0]:,}",
+            "last": estimate(by_run(recent(group, 1))),
+            f"mean of the last {NUM_RECENT}": estimate(by_run(recent(group))),
+            "data mean": of["data_score"].iloc[0],
+        }
+    return _frame(rows, "data", "method")
+
+
+def mean_table(tables: RunTables) -> pd.DataFrame:
+    """Interquartile means over all data sets, by method; empty for a single one."""
+    rows: dict[str, dict[str, Any]] = {}
+    if len(tables.data) == 1:
+        return _frame(rows, "method")
+    for method, group in recent(tables.episodes).groupby("method", sort=False):
+        groups = [by_run(each) for _, each in group.groupby("data", sort=False)]
+        rows[method] = {
+            "data sets": f"{len(groups)} of {len(tables.data)}",
+            "runs": sum(map(len, groups)),
+            "interquartile mean": iqm(groups),
+        }
+    return _frame(rows, "method")
+
+
+def robustness_table(tables: RunTables, suite: str) -> pd.DataFrame:
+    """Scores and recovery under a suite, by data set, disturbance and method.
+
+    Scores are over all episodes. The shares after ``met`` are over the episodes that
+    met the disturbance; those of a disturbance that no episode met are left out.
+    """
+    rows: dict[tuple[str, str], dict[str, Any]] = {}
+    episodes = tables.episodes[tables.episodes["suite"] == suite]
+    for (data, method), group in episodes.groupby(["data", "method"], sort=False):
+        names = list(group["disturbance"].unique())
+        runs = [
+            run.pivot_table(values="score", index="episode", columns="disturbance")[
+                names
+            ]
+            for _, run in group.groupby("run", sort=False)
+        ]
+        for name, (score, lost) in zip(names, scores_and_decreases(runs), strict=True):
+            if name == "":
+                clean = score
+                continue
+            row = {"seeds": len(runs), "clean": clean, "disturbed": score}
+            level = group[group["disturbance"] == name]
+            there = level[level["disturbed_at"].notna()]
+            row |= {"lost %": lost if len(there) else None}
+            row |= {"met %": 100 * len(there) / len(level)}
+            rows.setdefault((data, name), {})[method] = row | _recovery(there)
+    flat = {
+        (*key, method): row for key, of in rows.items() for method, row in of.items()
+    }
+    return _frame(flat, "data", "disturbance", "method")
+
+
+def _recovery(there: pd.DataFrame) -> dict[str, Any]:
+    """Percentages and steps of the episodes that met a disturbance that ends."""
+    if not there["stood"].notna().any():
+        return {}
+    columns = ["stood", "alive_after", "undisturbed_alive"]
+    shares = there.groupby("run")[columns].mean().mean()  # a run, a vote
+    mean, low, high = (100 * float(line[-1]) for line in recovery_curve(there)[1:])
+    over = over_what([there["run"].unique()])
+    median = there["recovery_steps"].fillna(np.inf).median()
+    return {
+        "stood %": 100 * shares["stood"],
+        f"stood +{STEPS_AFTER} %": 100 * shares["alive_after"],
+        "(undisturbed) %": 100 * shares["undisturbed_alive"],
+        "recovered %": Estimate(mean, low, high, over),
+        "median steps": median if np.isfinite(median) else "most never",
+    }
+
+
+def recovery_curve(there: pd.DataFrame) -> tuple[Array, Array, Array, Array]:
+    """Share of disturbed episodes that have been back in the data, by steps after it.
+
+    Returns:
+        Steps, share and its 95 % band over runs and episodes, ``[T]`` each.
+    """
+    steps = np.arange(STEPS_AFTER + 1.0)
+    within = [
+        run["recovery_steps"].to_numpy()[:, None] <= steps
+        for _, run in there.groupby("run", sort=False)
+    ]
+    share = np.mean([each.mean(0) for each in within], axis=0)
+    return (steps, share, *percentile_interval(nested_resamples(within)))
+
+
+def came_back(
+    tables: RunTables,
+) -> Iterator[tuple[str, str, pd.DataFrame, pd.DataFrame]]:
+    """Which states each run comes back from, data set by data set.
+
+    Yields:
+        The data set; half and digest of its states; ``group``, ``disturbance`` and
+        ``walk`` of each, ``M`` rows; and how often each was come back from, ``M``
+        columns and a row for each ``method`` and ``seed``, in the order of the runs.
+    """
+    for (data, states), rows in tables.saved.groupby(["data", "states"], sort=False):
+        rows = rows.assign(state=rows.groupby("run").cumcount())
+        of_each = rows.drop_duplicates("state").set_index("state")
+        keys = ["method", "seed"]
+        back = rows.pivot(index=keys, columns="state", values="back").astype(float)
+        order = pd.MultiIndex.from_frame(rows[keys].drop_duplicates())
+        yield data, states, of_each, back.loc[order]
+
+
+def saved_table(tables: RunTables, reference: str) -> pd.DataFrame:
+    """Percentage of the recoverable states that each method comes back from.
+
+    By group, for the recoverable ones also by disturbance; and R against the reference,
+    with the seeds of both.
+    """
+    rows = {}
+    for data, states, of_each, back in came_back(tables):
+        group, disturbance, walk = (
+            of_each[name].to_numpy() for name in ("group", "disturbance", "walk")
+        )
+        hard = group == GROUPS[-1]
+        chosen = {f"{name} %": group == name for name in GROUPS if name in group}
+        chosen |= {
+            f"{name} %": hard & (disturbance == name)
+            for name in disturbances_of(disturbance[hard])
+        }
+        methods = back.index.unique("method")
+        for method in methods:
+            table = back.loc[method]
+            row: dict[str, Any] = {"seeds": len(table)}
+            if reference in methods and method != reference and hard.any():
+                theirs = back.loc[reference]
+                both = table.index.intersection(theirs.index)
+                ours, theirs = (each.loc[both, hard] for each in (table, theirs))
+                row["R %"] = _recovered(ours, theirs, walk[hard])
+            for name, which in chosen.items():
+                share = saved_share(table.loc[:, which], walk[which])
+                row[name] = _percent(share, len(table))
+            rows[f"{data}, {states}", method] = row
+    return _frame(rows, "data", "method")
+
+
+def _recovered(ours: pd.DataFrame, theirs: pd.DataFrame, walk: Any) -> Estimate | None:
+    """R of a method; ``None`` without a common seed or a state to save."""
+    try:
+        return (
+            _percent(recovered_share(ours, theirs, walk), len(ours))
+            if len(ours)
+            else None
+        )
+    except ValueError:
+        return None
+
+
+def _percent(found: tuple[float, float, float], seeds: int) -> Estimate:
+    mean, low, high = (100 * each for each in found)
+    return Estimate(mean, low, high, over_what([range(seeds)], alone="walks"))
+
+
+def difference_table(differences: Sequence[Difference]) -> pd.DataFrame:
+    """Differences to the reference, by data set and method, with their verdicts."""
+    rows: dict[Any, dict[str, Any]] = {}
+    for each in differences:
+        row = rows.setdefault((each.data, each.method), {})
+        mark = MARKS.get(each.verdict, "")
+        name = each.quantity.name
+        if each.estimate is None:
+            row[name] = f"not compared: {each.note}"
+        else:
+            text = f"{decimal(each.estimate.mean, '+')} {each.estimate.interval('+')}"
+            row[name] = f"{mark}{text}"
+        if each.estimate is not None and each.note:
+            row["note"] = each.note
+    return _frame(rows, "data", "method")
+
+
+def text(cell: Any) -> str:
+    """A cell as text; nothing is a dash."""
+    if cell is None or (isinstance(cell, float) and np.isnan(cell)):
+        return "-"
+    return decimal(cell) if isinstance(cell, float) else str(cell)
+
+
+def _frame(rows: Mapping[Any, Mapping[str, Any]], *names: str) -> pd.DataFrame:
+    """Table with a row for each key, whose parts have names."""
+    frame = pd.DataFrame(list(rows.values()), dtype=object)
+    if not rows or len(names) == 1:
+        return frame.set_axis(pd.Index(list(rows), name=names[0]))
+    return frame.set_index(pd.MultiIndex.from_tuples(rows, names=names))
