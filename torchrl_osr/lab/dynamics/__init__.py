@@ -2,8 +2,7 @@
 
 from torchrl_osr.lab.dynamics.conditional_vae import ConditionalVAE, ConditionalVAELoss
 from torchrl_osr.lab.dynamics.data import ModelData
-from torchrl_osr.lab.dynamics.dynamics_loss import DynamicsLoss
-from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
+from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble, DynamicsLoss
 from torchrl_osr.lab.dynamics.fit import describe_dynamics, dynamics_report
 from torchrl_osr.lab.dynamics.model_adversary import ModelAdversary
 from torchrl_osr.lab.dynamics.options import DynamicsOptions

@@ -12,8 +12,11 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from torchrl_osr.lab.dynamics.dynamics_loss import gaussian_error
-from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble, has_next_state
+from torchrl_osr.lab.dynamics.ensemble import (
+    DynamicsEnsemble,
+    gaussian_error,
+    has_next_state,
+)
 
 HORIZONS = (1, 2, 5, 10, 20)
 """Steps after which a roll-out is compared with the recording."""

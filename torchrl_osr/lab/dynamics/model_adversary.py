@@ -21,8 +21,7 @@ from torch.distributions import Normal
 from torchrl.data import ReplayBuffer
 
 from torchrl_osr._entries import entry
-from torchrl_osr.lab.dynamics.dynamics_loss import DynamicsLoss
-from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
+from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble, DynamicsLoss
 from torchrl_osr.lab.dynamics.options import DynamicsOptions
 from torchrl_osr.lab.dynamics.rollouts import Termination, never
 from torchrl_osr.objectives import ActorCriticLoss

@@ -165,14 +165,10 @@ def perturbed_starts(
 
     Args:
         model: of the dynamics.
-        starts: ``[B, S]``.
+        starts: ``[B, S]``; as many states are returned.
 
     Keyword Args:
-        steps: see above.
-        options: others of :func:`rollout`.
-
-    Returns:
-        ``[B, S]``, drawn with replacement.
+        options: of :func:`rollout`.
     """
     policy = uniform_policy(model.action_dim)
     rows, _ = rollout(model, policy, starts, steps=steps, **options)
@@ -204,9 +200,6 @@ def reverse_rollout(
 
     Keyword Args:
         options: of :func:`rollout`.
-
-    Returns:
-        Rows in the direction of time, none of them terminated.
     """
     rows, rejected = rollout(model, policy, ends, **options)
     acted = ~rows["next", "terminated"].squeeze(-1)
