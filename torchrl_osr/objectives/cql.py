@@ -112,15 +112,9 @@ class CQLLoss(ActorCriticLoss):
             actor_network, qvalue_network, delay_actor=delay_actor
         )
         self.register_temperature(alpha_init, fixed_alpha, target_entropy)
-        self.register_conservative_penalty(
-            min_q_weight,
-            num_random,
-            temperature,
-            target_action_gap,
-            clip_diff_min,
-            max_q_backup,
-            deterministic_backup,
-        )
+        gap = temperature, target_action_gap, clip_diff_min
+        backup = max_q_backup, deterministic_backup
+        self.register_conservative_penalty(min_q_weight, num_random, *gap, *backup)
         self.declare_soft_actor_critic()
         self.make_value_estimator()
 

@@ -127,15 +127,9 @@ class OSRLoss(ActorCriticLoss):
         self.register_actor_critic(*networks, delay_actor=delay_actor)
         self.register_temperature(alpha_init, fixed_alpha, target_entropy)
         self.register_coefficient("recovery_weight", recovery_weight)
-        self.register_conservative_penalty(
-            min_q_weight,
-            num_random,
-            temperature,
-            target_action_gap,
-            clip_diff_min,
-            max_q_backup,
-            deterministic_backup,
-        )
+        gap = temperature, target_action_gap, clip_diff_min
+        backup = max_q_backup, deterministic_backup
+        self.register_conservative_penalty(min_q_weight, num_random, *gap, *backup)
         self.declare_soft_actor_critic("recovery_kl")
         self.make_value_estimator()
 

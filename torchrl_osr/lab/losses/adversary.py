@@ -47,21 +47,15 @@ class Adversary:
       :math:`a = \tanh(\mu(\hat s))`, within its bounds. The critics see the true
       state: what counts is where the misled action leads from there.
 
-    The methods, with the names of the RORL attacks:
+    The methods:
 
     * ``"sample"`` (RORL's zero order): the best of ``num_samples`` uniform draws, for
-      ``"min_Q"`` also of no perturbation at all, where ``"action_diff"`` is smallest;
-    * ``"gradient"``: ``num_steps`` steps along the sign of the gradient, from each of
-      ``num_samples`` uniform draws and back into the box after each step; then the
-      best of the ends. One start is RORL's first order, 20 are its mixed order. Its
-      code makes a new Adam for every step, and Adam's first step is the sign. A start
-      moves at most ``num_steps * step_size`` half-widths: by default half the box.
-      Whether ``"min_Q"`` ends below the value without perturbation is not checked.
+      ``"min_Q"`` also of no perturbation;
+    * ``"gradient"``: ``num_steps`` steps along the sign of the gradient from each of
+      ``num_samples`` draws, kept in the box; then the best of the ends. One start is
+      RORL's first order, 20 are its mixed order.
 
-    Here each row draws for itself; RORL's code draws once for the whole batch. All
-    candidates go through the networks together: as one batch in ``"sample"``, as one
-    forward and one backward pass for each step in ``"gradient"``. Both run whole under
-    :func:`torch.compile` (without a ``generator``) and within :func:`torch.no_grad`.
+    Here each row draws for itself; RORL's code draws once for the whole batch.
 
     Args:
         objective: ``"action_diff"`` (default) or ``"min_Q"``.
@@ -72,25 +66,10 @@ class Adversary:
         num_steps: gradient steps. Default 10.
         step_size: length of a gradient step in units of ``epsilon``. Default 0.1.
 
-    Raises:
-        ValueError: if an argument is out of its range.
-
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
-        >>> from torchrl_osr.lab.losses.adversary import Adversary
-        >>> actor = tanh_gaussian_actor(3, 2, num_cells=[8])
-        >>> critics = critic_ensemble(3, 2, num_cells=[8])
-        >>> def qvalue(states, action):
-        ...     batch = states.copy().set("action", action)
-        ...     values = [critic(batch)["state_action_value"] for critic in critics]
-        ...     return torch.stack(values).squeeze(-1)
-        >>> states = TensorDict({"observation": torch.zeros(5, 3)}, [5])
-        >>> adversary = Adversary("min_Q", epsilon=0.1)
-        >>> worst = adversary.perturb(states, ["observation"], actor.get_dist, qvalue)
-        >>> bool((worst["observation"].abs() <= 0.1).all())
-        True
+        >>> from torchrl_osr.lab.losses import Adversary
+        >>> adversary = Adversary("min_Q", method="gradient", epsilon=0.1)
+        >>> # batch = adversary(loss, buffer.sample())
     """
 
     objective: Literal["action_diff", "min_Q"] = "action_diff"
