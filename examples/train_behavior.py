@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 from contextlib import closing, suppress
+from dataclasses import fields
 from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,6 +32,7 @@ from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 from tqdm.auto import tqdm
 
+from torchrl_osr._files import whole_file, write_json
 from torchrl_osr.lab.data import (
     collect_transitions,
     make_environment,
@@ -41,8 +43,7 @@ from torchrl_osr.lab.data.behavior import (
     LOG_STD_MIN,
     Affine,
     BehaviorPolicy,
-    save_behavior_policy,
-    update_behavior_card,
+    load_behavior_card,
 )
 
 WIDTH = 256
@@ -198,6 +199,18 @@ def choose(snapshots: list[Snapshot], medium_share: float) -> dict[str, Snapshot
     return chosen
 
 
+def save(path: Path, policy: BehaviorPolicy, *, half: bool) -> None:
+    """Write a policy as plain arrays, in float16 or float32; whole or not at all."""
+    arrays = {
+        f"{layer.name}.{part}": array.astype(np.float16 if half else np.float32)
+        for layer in fields(policy)
+        for part, array in getattr(policy, layer.name)._asdict().items()
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(path) as file:
+        np.savez_compressed(file, **arrays)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Train, choose, measure anew and write."""
     args = parse_arguments(arguments)
@@ -212,7 +225,7 @@ def main(arguments: list[str] | None = None) -> None:
         # Half precision is enough for the eight that only add variety.
         half = name.startswith("replay")
         file = args.out / args.name / f"{name}.npz"
-        save_behavior_policy(file, kept.actor, half=half)
+        save(file, kept.actor, half=half)
         # Fresh episodes: those that a snapshot was chosen by flatter it.
         entry = measure(env, kept.actor, args.card_steps, args.seed + 1)
         if references := reference_returns(args.name):
@@ -221,7 +234,9 @@ def main(arguments: list[str] | None = None) -> None:
         entry |= {"steps": kept.step, "dtype": "float16" if half else "float32"}
         entries[name] = entry
         torchrl_logger.info(f"{args.name} {name}: {entry}")
-    update_behavior_card(args.out, args.name, args.env, entries)
+    path = args.out / "card.json"
+    card = load_behavior_card(args.out) if path.exists() else {}
+    write_json(path, card | {args.name: {"env": args.env, "policies": entries}})
 
 
 if __name__ == "__main__":

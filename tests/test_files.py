@@ -183,14 +183,9 @@ def test_no_loading_touches_the_network(tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     recipe = {"random_share": 0.0, "num_transitions": 50, "progress": False}
     load_dataset("hopper", "random", **recipe)
-    for quality, path in (
-        ("d4rl", "hopper-medium-v2"),
-        ("minari", "mujoco/a/medium-v0"),
-    ):
+    for quality, path in (("minari", "mujoco/a/medium-v0"),):
         with pytest.raises(FileNotFoundError, match="download"):
             load_dataset("hopper", quality, path=path)
-    with pytest.raises(AssertionError, match="the network was asked for"):
-        load_dataset("hopper", "d4rl", path="hopper-medium-v2", download=True)
 
 
 def test_nobody_waits_for_the_other_end_of_a_pipe(tmp_path):

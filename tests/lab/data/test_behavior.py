@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from contextlib import closing
 
 import numpy as np
@@ -14,8 +15,6 @@ from torchrl_osr.lab.data import (
 from torchrl_osr.lab.data.behavior import (
     BehaviorPolicy,
     load_behavior_card,
-    save_behavior_policy,
-    update_behavior_card,
 )
 
 CARD = load_behavior_card()
@@ -81,24 +80,10 @@ def test_unknown_names_list_what_exists() -> None:
         load_behavior_policy("hopper", "simple")
 
 
-@pytest.mark.parametrize("half", [False, True])
-def test_saved_policy_loads_from_a_folder(tmp_path, half: bool) -> None:
-    policy = load_behavior_policy("hopper", "medium")
-    save_behavior_policy(tmp_path / "toy" / "medium.npz", policy, half=half)
-    update_behavior_card(tmp_path, "other", "Other-v0", {})
-    update_behavior_card(tmp_path, "toy", "Toy-v0", {"medium": {"steps": 1}})
-    assert list(load_behavior_card(tmp_path)) == ["other", "toy"]
-    loaded = load_behavior_policy("toy", "medium", folder=tmp_path)
-    for ours, theirs in zip(
-        (policy.hidden0, policy.log_std), (loaded.hidden0, loaded.log_std), strict=True
-    ):
-        np.testing.assert_allclose(ours.weight, theirs.weight, rtol=1e-3, atol=1e-4)
-    assert [path.name for path in (tmp_path / "toy").iterdir()] == ["medium.npz"]
-
-
 def test_file_without_an_array_is_named(tmp_path) -> None:
     (tmp_path / "toy").mkdir()
     np.savez(tmp_path / "toy" / "medium.npz", **{"hidden0.weight": np.ones((2, 2))})
-    update_behavior_card(tmp_path, "toy", "Toy-v0", {"medium": {}})
+    card = {"toy": {"env": "Toy-v0", "policies": {"medium": {}}}}
+    (tmp_path / "card.json").write_text(json.dumps(card))
     with pytest.raises(ValueError, match=r"has no array .hidden0\.bias"):
         load_behavior_policy("toy", "medium", folder=tmp_path)

@@ -110,10 +110,10 @@ def test_a_set_is_cached_and_says_what_it_is_made_of(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("env_name", "source", "message"),
     [
-        ("pointmaze-umaze", "play", "'play' of pointmaze-umaze; there are: diverse"),
-        ("pointmaze-large", "medium", "'medium' .* there are: diverse, play"),
-        ("antmaze-umaze", "diverse", "data=minari.*D4RL/antmaze/umaze-v1"),
-        ("antmaze-large", "play", "data=minari.*D4RL/antmaze/large-play-v1"),
+        ("pointmaze-umaze", "play", "data=play of pointmaze-umaze; there are: diverse"),
+        ("pointmaze-large", "medium", "data=medium .* there are: diverse, play"),
+        ("antmaze-umaze", "diverse", "there are: minari"),
+        ("antmaze-large", "play", "there are: minari"),
         ("hopper", "diverse", "unknown data='diverse'; there are: random, medium"),
         ("ant", "medium", "'ant'; there are policies for hopper"),
     ],

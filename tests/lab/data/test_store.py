@@ -199,5 +199,5 @@ def test_a_whole_set_is_read_without_writing(load, monkeypatch):
 
     monkeypatch.setattr(store, "FileLock", refuse)
     load()
-    with pytest.raises(PermissionError, match=r"free space.*TORCHRL_OSR_CACHE="):
+    with pytest.raises(PermissionError):
         load(another="request")

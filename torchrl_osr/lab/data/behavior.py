@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_osr._files import read_arrays, read_json, whole_file, write_json
+from torchrl_osr._files import read_arrays, read_json
 
 FloatArray = NDArray[np.float32]
 
@@ -156,44 +156,3 @@ def load_behavior_policy(
     except KeyError as error:
         raise ValueError(f"{path} has no array {error}.") from error
     return BehaviorPolicy(**layers)
-
-
-def save_behavior_policy(
-    path: Path | str, policy: BehaviorPolicy, *, half: bool = False
-) -> None:
-    """Write a policy as plain arrays; the file appears whole or not at all.
-
-    Args:
-        path: ``<folder>/<env_name>/<policy_name>.npz``; missing folders are made.
-        policy: the policy.
-
-    Keyword Args:
-        half: store float16 instead of float32. Default: ``False``.
-    """
-    arrays = {
-        f"{field.name}.{part}": array.astype(np.float16 if half else np.float32)
-        for field in fields(policy)
-        for part, array in getattr(policy, field.name)._asdict().items()
-    }
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with whole_file(path) as file:
-        np.savez_compressed(file, **arrays)
-
-
-def update_behavior_card(
-    folder: Path | str, env_name: str, env_id: str, policies: dict[str, Any]
-) -> None:
-    """Put the entry of one environment into a folder's ``card.json``.
-
-    Args:
-        folder: of the card; made if there is none.
-        env_name: short name of the task; an entry of that name is replaced.
-        env_id: Gymnasium id.
-        policies: ``{policy_name: {...}}``, facts about each saved policy.
-    """
-    path = Path(folder) / "card.json"
-    card = load_behavior_card(folder) if path.exists() else {}
-    card[env_name] = {"env": env_id, "policies": policies}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, card)

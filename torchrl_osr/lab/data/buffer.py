@@ -24,27 +24,20 @@ Reader = Callable[[TensorDictBase, Tensor], TensorDictBase]
 class MemmapStorage(Storage):
     """Rows of a memory-mapped set as the storage of a replay buffer, read-only.
 
-    Args:
-        data: memory-mapped transitions ``[N]``.
-
-    Keyword Args:
-        left_out: sorted numbers of rows that are not drawn. Default: none.
-        device: of the batches. The draws are made there too, so that they are those of
-            a buffer that holds the rows on that device. Default: CPU.
-        read: returns rows of ``data`` by their numbers. Default: as they are.
+    The draws are made on the device of the batches, so that they are those of a buffer
+    that holds the rows there. See :func:`make_replay_buffer` for the arguments.
     """
 
     def __init__(
         self,
         data: TensorDictBase,
-        *,
-        left_out: Tensor | None = None,
-        device: torch.device | str = "cpu",
-        read: Reader = operator.getitem,
+        left_out: Tensor | None,
+        device: torch.device,
+        read: Reader | None,
     ) -> None:
         left_out = torch.empty(0, dtype=torch.long) if left_out is None else left_out
         super().__init__(len(data) - len(left_out))
-        self.data, self.device, self.read = data, torch.device(device), read
+        self.data, self.device, self.read = data, device, read or operator.getitem
         # Before row i of the rest lie as many of the left-out ones as have no more than
         # i rows of the rest before them.
         self._shifts = left_out - torch.arange(len(left_out))
@@ -96,11 +89,6 @@ def make_replay_buffer(
             batches. Default: the device of ``data``, or CPU if it has none.
         read: returns rows of memory-mapped data by their numbers. Default: as they are.
 
-    Raises:
-        ValueError: ``data`` is not flat or has no rows, or an option is for
-            memory-mapped data alone.
-        MemoryError: the data do not fit into the GPU.
-
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
@@ -122,34 +110,16 @@ def make_replay_buffer(
         "generator": torch.Generator(device).manual_seed(seed),
     }
     if is_memory_mapped(data):
-        read = operator.getitem if read is None else read
         return ReplayBuffer(
-            storage=MemmapStorage(data, left_out=left_out, device=device, read=read),
+            storage=MemmapStorage(data, left_out, device, read),
             writer=ImmutableDatasetWriter(),
             collate_fn=lambda batch: batch,
             **options,
         )
     if left_out is not None or read is not None:
         raise ValueError("left_out and read are for memory-mapped data.")
-    check_memory(data, device)
     buffer = ReplayBuffer(
         storage=LazyTensorStorage(data.shape[0], device=device), **options
     )
     buffer.extend(data.to(device))
     return buffer
-
-
-def check_memory(data: TensorDictBase, device: torch.device) -> None:
-    """Raise a MemoryError unless a data set fits into a GPU, with a copy to it."""
-    if device.type != "cuda":
-        return
-    there = data.device is not None and data.device.type == "cuda"
-    needed = data.bytes() * (1 if there else 2)
-    free = torch.cuda.mem_get_info(device)[0]
-    # Memory that torch keeps is free to us.
-    free += torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    if needed > free:
-        raise MemoryError(
-            f"The data set needs {needed:,} bytes on {device}, which has {free:,} "
-            f"free: take fewer than {data.shape[0]:,} rows, or keep it on the CPU."
-        )

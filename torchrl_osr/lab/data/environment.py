@@ -39,7 +39,7 @@ MAZE_IDS = {
 """Gymnasium ids of the mazes, by short name."""
 
 MAX_EPISODE = 100_000
-"""Largest number of steps of an episode; an episode that never ends is an error."""
+"""Time limit of tasks that have none, in steps."""
 
 Leaves = dict[tuple[str | int, ...], "spaces.Space[Any]"]
 
@@ -59,11 +59,6 @@ def environment_name(env_id: str) -> str:
 
     Of another task it is the id, without the module that registers it and with ``-``
     for what has no place in a folder's name.
-
-    Examples:
-        >>> from torchrl_osr.lab.data.environment import environment_name
-        >>> environment_name("Hopper-v5"), environment_name("robots:ns/Arm-v0")
-        ('hopper', 'ns-Arm-v0')
     """
     names = {known: name for name, known in _known_ids().items()}
     return names.get(env_id) or re.sub(r"[^\w.-]", "-", env_id.split(":")[-1])
@@ -74,16 +69,14 @@ def _known_ids() -> dict[str, str]:
 
 
 class EnvironmentSpec(NamedTuple):
-    """Sizes and action bounds that data and networks of a task must fit.
+    """Sizes and action bounds of a task, which data and networks must fit.
 
     Attributes:
         observation_size: numbers of an observation, ``S``.
         action_size: numbers of an action, or the number of discrete actions, ``A``.
-        action_low: lowest action in the task's own units, ``A`` numbers; ``None`` if
-            actions are discrete.
-        action_high: highest action, likewise.
-        simulated: whether it can be played: an environment without ``step`` only
-            describes a machine.
+        action_low, action_high: bounds in the task's own units, ``A`` numbers; ``None``
+            if actions are discrete.
+        simulated: whether it can be played; an environment without ``step`` cannot.
     """
 
     observation_size: int
@@ -136,11 +129,6 @@ def make_environment(env_id: str) -> gymnasium.Env[Any, Any]:
 
     Args:
         env_id: see :func:`open_environment`, also for the errors.
-
-    Examples:
-        >>> from torchrl_osr.lab.data import make_environment
-        >>> make_environment("HalfCheetah-v5").action_space.shape
-        (6,)
     """
     env = open_environment(env_id)
     actions: Any = env.action_space
@@ -166,8 +154,6 @@ def open_environment(env_id: str) -> gymnasium.Env[Any, Any]:
         ValueError: there is no such task, its observations are no real vectors, or its
             actions neither real vectors with finite bounds nor numbered from 0.
         ImportError: a package that the task needs is not installed.
-        RuntimeError: in a step, if the task has no time limit and the episode has more
-            than 100,000 steps.
     """
     env = _found(env_id)
     if isinstance(env.observation_space, (spaces.Dict, spaces.Tuple)):
@@ -191,7 +177,7 @@ def open_environment(env_id: str) -> gymnasium.Env[Any, Any]:
         flaw = f"actions {actions}; expected bounded real numbers, or Discrete from 0"
     else:
         limited = env.spec is not None and env.spec.max_episode_steps is not None
-        return env if limited else _Ending(env)
+        return env if limited else gymnasium.wrappers.TimeLimit(env, MAX_EPISODE)
     raise ValueError(
         f"{env_id} has {flaw}: change it in a wrapper, such as Gymnasium's ClipAction "
         "or TransformAction, and register the wrapped environment."
@@ -230,25 +216,6 @@ def observation_leaves(space: spaces.Space[Any]) -> Leaves:
     return {(): space}
 
 
-class _Ending(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """An environment without a time limit, which may or may not end by itself."""
-
-    _steps = 0
-
-    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
-        self._steps = 0
-        return super().reset(**options)
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        self._steps += 1
-        if self._steps > MAX_EPISODE:
-            raise RuntimeError(
-                f"an episode of {self.env} has not ended after {MAX_EPISODE:,} steps: "
-                "register the environment with max_episode_steps."
-            )
-        return super().step(action)
-
-
 def _is_real_vector(space: gymnasium.Space[Any]) -> TypeGuard[spaces.Box]:
     return (
         isinstance(space, spaces.Box)
@@ -265,19 +232,12 @@ def _found(env_id: str) -> gymnasium.Env[Any, Any]:
         except gymnasium.error.NameNotFound as error:
             _register_robotics(env_id, error)
             return _make(env_id)
-    except gymnasium.error.DependencyNotInstalled as error:
-        needs = " ".join(map(str, error.args))
-        raise ImportError(f"{env_id} needs another package: {needs}") from error
-    except gymnasium.error.Error as error:
-        raise ValueError(
-            f"env.id={env_id} is no environment that Gymnasium knows: {error} An "
-            "environment of a package of your own is env.id=<package>:<name>."
-        ) from error
-    except ModuleNotFoundError as error:
-        raise ImportError(
-            f"env.id={env_id} imports {env_id.partition(':')[0]!r} first, and that "
-            f"failed: {error.__cause__ or error}. Install the package, or run the "
-            "command in the folder that it is in."
+    except (gymnasium.error.Error, ModuleNotFoundError) as error:
+        missing = gymnasium.error.DependencyNotInstalled, ModuleNotFoundError
+        kind = ImportError if isinstance(error, missing) else ValueError
+        raise kind(
+            f"env.id={env_id} cannot be made: {error.__cause__ or error} A task of "
+            "your own is env.id=<package>:<name>, where that can be imported."
         ) from error
 
 
@@ -298,15 +258,10 @@ def _make(env_id: str) -> gymnasium.Env[Any, Any]:
 
 
 def _register_robotics(env_id: str, unknown: Exception) -> None:
-    try:
-        # Importing it prints a note on hands that were changed, to standard error.
-        with redirect_stderr(io.StringIO()):
-            import gymnasium_robotics
-    except ImportError as error:
-        raise ImportError(
-            f"Gymnasium itself has no {env_id!r} ({unknown}); those of "
-            f"gymnasium-robotics need {error.name!r}: pip install torchrl-osr[mazes]"
-        ) from error
+    what = f"Gymnasium itself has no {env_id!r} ({unknown}); gymnasium-robotics needs"
+    # Importing it prints a note on hands that were changed, to standard error.
+    with needed_by(what, "mazes"), redirect_stderr(io.StringIO()):
+        import gymnasium_robotics
     gymnasium.register_envs(gymnasium_robotics)
 
 

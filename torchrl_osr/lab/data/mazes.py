@@ -29,18 +29,12 @@ MAZE_SOURCES = ("diverse", "play")
 # Row and column of start and goal, picked by hand: long ways, from and to all corners.
 PLAY_CELLS: dict[str, list[tuple[Cell, Cell]]] = {
     "pointmaze-medium": [
-        ((1, 1), (6, 6)),
-        ((6, 1), (1, 6)),
-        ((2, 6), (6, 5)),
-        ((4, 6), (2, 1)),
-        ((6, 6), (6, 1)),
+        *(((1, 1), (6, 6)), ((6, 1), (1, 6)), ((2, 6), (6, 5))),
+        *(((4, 6), (2, 1)), ((6, 6), (6, 1))),
     ],
     "pointmaze-large": [
-        ((1, 1), (7, 9)),
-        ((7, 1), (1, 10)),
-        ((1, 6), (7, 4)),
-        ((7, 10), (3, 1)),
-        ((5, 4), (1, 9)),
+        *(((1, 1), (7, 9)), ((7, 1), (1, 10)), ((1, 6), (7, 4))),
+        *(((7, 10), (3, 1)), ((5, 4), (1, 9))),
     ],
 }
 """Pairs of start and goal of source ``play``; the umaze has too few cells for it."""
@@ -55,49 +49,28 @@ ACTION_NOISE = 0.5
 
 
 def maze_behavior(env_name: str, source: str) -> dict[str, Any]:
-    """Entries of the manifest that decide how a maze set comes about.
+    """Entries of the manifest that determine a maze set.
 
-    Raises:
-        ValueError: there is no such source, or it is a maze of the ant.
+    Args:
+        env_name: short name of the maze.
+        source: ``"diverse"``: start and goal are two different free cells, as the
+            environment itself draws them; ``"play"``: a pair of :data:`PLAY_CELLS`. The
+            environment moves both within their cells.
     """
-    if env_name.startswith("antmaze"):
-        size = env_name.removeprefix("antmaze-")
-        recorded = size if size == "umaze" else f"{size}-play"
-        raise ValueError(
-            f"{env_name} has no sources that are rolled out, because no policy that "
-            "walks ships with the package: data=minari, for instance with "
-            f"data.path=D4RL/antmaze/{recorded}-v1 data.download=true."
-        )
     known = MAZE_SOURCES if env_name in PLAY_CELLS else ("diverse",)
+    if env_name.startswith("antmaze"):
+        known = ("minari",)  # no policy that walks ships with the package
     if source not in known:
         raise ValueError(
-            f"unknown source {source!r} of {env_name}; there are: {', '.join(known)}."
+            f"unknown data={source} of {env_name}; there are: {', '.join(known)}."
         )
     pairs = PLAY_CELLS[env_name] if source == "play" else None
     return {
         "stiffness": STIFFNESS,
         "damping": DAMPING,
         "action_noise": ACTION_NOISE,
-        # Lists, as JSON gives them back.
-        "cells": pairs and [[list(start), list(goal)] for start, goal in pairs],
+        "cells": pairs,
     }
-
-
-def maze_players(
-    env: gymnasium.Env[Any, Any], env_name: str, source: str
-) -> tuple[gymnasium.Env[Any, Any], list[ActionSampler]]:
-    """Maze with a source's starts and goals, and the controller that plays it.
-
-    Args:
-        env: the maze.
-        env_name: its short name.
-        source: ``"diverse"``: start and goal are two different free cells, as the
-            environment itself draws them; ``"play"``: a pair of :data:`PLAY_CELLS`. The
-            environment moves both within their cells.
-    """
-    pairs = maze_behavior(env_name, source)["cells"]
-    sampler = waypoint_sampler(env.get_wrapper_attr("maze"))
-    return StartsAndGoals(env, pairs) if pairs else env, [sampler]
 
 
 def waypoint_sampler(maze: Any) -> ActionSampler:
@@ -109,15 +82,10 @@ def waypoint_sampler(maze: Any) -> ActionSampler:
     with the middle :math:`w` of the next cell on a shortest way, or the goal itself
     once it is in this cell or the next.
 
-    Args:
-        maze: of the environment, gymnasium-robotics' ``Maze``.
+    ``maze`` is gymnasium-robotics' ``Maze`` of the environment.
     """
-    free = {
-        (i, j)
-        for i, row in enumerate(maze.maze_map)
-        for j, cell in enumerate(row)
-        if cell != 1
-    }
+    rows = enumerate(maze.maze_map)
+    free = {(i, j) for i, row in rows for j, cell in enumerate(row) if cell != 1}
 
     @cache
     def middle_of_next(start: Cell, goal: Cell) -> NDArray[np.float64] | None:
@@ -147,17 +115,9 @@ def waypoint_sampler(maze: Any) -> ActionSampler:
 
 
 def shortest_path(free: set[Cell], start: Cell, goal: Cell) -> list[Cell]:
-    """Cells of a shortest way from ``start`` to ``goal``, both included.
+    """Free cells of a shortest way from ``start`` to ``goal``, both included.
 
     Of several it is always the same one: up goes before down, left and right.
-
-    Args:
-        free: cells that can be entered.
-        start: one of them.
-        goal: another, or the same.
-
-    Raises:
-        ValueError: there is no way.
     """
     # From the goal, so that each cell that is reached knows the next one on its way.
     next_cell: dict[Cell, Cell] = {goal: goal}
@@ -178,12 +138,7 @@ def shortest_path(free: set[Cell], start: Cell, goal: Cell) -> list[Cell]:
 
 
 class StartsAndGoals(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Draws start and goal of each episode from pairs of cells.
-
-    Args:
-        env: a maze of gymnasium-robotics, whose ``reset`` has options for it.
-        pairs: rows and columns of start and goal.
-    """
+    """A maze that draws start and goal of each episode from pairs of cells."""
 
     def __init__(
         self, env: gymnasium.Env[Any, Any], pairs: Sequence[Sequence[Sequence[int]]]

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -21,15 +20,11 @@ from torchrl_osr.lab.data.transitions import ACTION_LIMIT
 PARTS = ("observation", "action", "reward")
 """Parts that are described entry by entry."""
 
-FEW_ROWS = 1000
-SOME = 0.1
-MOST = 0.5
+FEW_ROWS, MOST_ROWS = 1000, 20_000
+SOME, MOST = 0.1, 0.5
 
+# A jump is so many times the change that nine in ten rows stay below.
 JUMP = 20
-"""A jump is so many times the change that nine in ten rows stay below."""
-
-MOST_ROWS = 20_000
-"""Rows that actions are compared on."""
 
 
 class Entry(NamedTuple):
@@ -61,37 +56,20 @@ def describe_entries(
             and ``reward`` ``[n]``, as they were recorded.
         columns: names of the file's columns, by part. Default names are numbered.
     """
-    sums: dict[str, NDArray[np.float64]] = {}
-    first: dict[str, NDArray[np.float64]] = {}
-    for some, part in ((some, part) for some in rows for part in PARTS):
-        if not len(some[part]):
-            continue
-        array = np.asarray(some[part], np.float64).reshape(len(some[part]), -1)
-        known = np.isfinite(array)
-        # From the first row on: sums of squares of large numbers lose digits.
-        start = first.setdefault(part, np.where(known[0], array[0], 0.0))
-        moved = np.where(known, array - start, 0.0)
-        low = np.where(known, array, np.inf).min(0)
-        high = np.where(known, array, -np.inf).max(0)
-        found = [(~known).sum(0), known.sum(0), moved.sum(0), (moved**2).sum(0)]
-        before = sums.get(part, np.array([*np.zeros((4, len(low))), low, high]))
-        added = before[:4] + found
-        sums[part] = np.array(
-            [*added, np.minimum(before[4], low), np.maximum(before[5], high)]
-        )
-    entries = []
-    for part, (missing, count, moved, squares, low, high) in sums.items():
-        count = np.maximum(count, 1)
-        deviation = np.sqrt(np.maximum(squares / count - (moved / count) ** 2, 0))
-        table = np.c_[missing, low, high, first[part] + moved / count, deviation]
-        names = list(columns.get(part, ()))
+    entries, chunks = [], [some for some in rows if len(some["reward"])]
+    for part in PARTS:
+        arrays = [np.reshape(some[part], (len(some[part]), -1)) for some in chunks]
+        table: Any = np.concatenate(arrays).T if arrays else []
+        names = columns.get(part, ())
         if len(names) != len(table):
             numbered = [f"{part}[{entry}]" for entry in range(len(table))]
             names = [part] if part == "reward" else numbered
-        entries += [
-            Entry(name, part, int(row[0]), *row[1:])
-            for name, row in zip(names, table.tolist(), strict=True)
-        ]
+        for name, column in zip(names, table, strict=True):
+            known = column[np.isfinite(column)].astype(np.float64)
+            known = known if len(known) else np.full(1, np.nan)
+            facts = known.min(), known.max(), known.mean(), known.std()
+            missing = int((~np.isfinite(column)).sum())
+            entries.append(Entry(name, part, missing, *map(float, facts)))
     return entries
 
 

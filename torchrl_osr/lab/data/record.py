@@ -51,14 +51,12 @@ def record_episodes(
         progress: show a progress bar when on a terminal. Default ``True``.
 
     Returns:
-        ``observation`` and ``next_observation`` ``[N, S]``, ``action`` ``[N, A]``, or
-        ``[N]`` if discrete, as the environment was given them, and ``reward``,
-        ``terminated``, ``truncated`` and ``episode`` ``[N]``: the columns that
-        :func:`~torchrl_osr.lab.data.load_dataset` reads.
+        The columns of :func:`~torchrl_osr.lab.data.transitions_from_columns`, with
+        actions as the environment was given them.
 
     Raises:
-        ValueError: ``num_episodes`` or ``noise`` is out of its range, an action of the
-            policy is none of the environment's, or a step gives no finite numbers.
+        ValueError: an action of the policy is none of the environment's, or a step
+            gives no finite numbers.
     """
     most = 1 if isinstance(env.action_space, spaces.Discrete) else np.finfo(float).max
     if num_episodes < 1 or not 0 <= noise <= most:
@@ -129,13 +127,7 @@ def _action(
 
 
 def check_log_path(path: Path) -> None:
-    """Raise unless a log can be written there.
-
-    Raises:
-        ImportError: the format's package is not installed.
-        ValueError: the suffix is none of :data:`WRITERS`.
-        FileExistsError: something is there.
-    """
+    """Raise unless a log can be written there."""
     if path.suffix not in WRITERS:
         raise ValueError(f"path={path} must end in one of {', '.join(WRITERS)}.")
     if path.exists():
@@ -147,14 +139,7 @@ def check_log_path(path: Path) -> None:
 
 
 def write_log(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
-    """Write columns to a file that :func:`~torchrl_osr.lab.data.load_dataset` reads.
-
-    The file appears whole or not at all.
-
-    Args:
-        path: see :func:`check_log_path`; missing folders are made.
-        columns: of one length, see :func:`record_episodes`.
-    """
+    """Write columns to a file, whole or not at all; missing folders are made."""
     check_log_path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as file:

@@ -73,13 +73,7 @@ class Recording:
     def load(
         self, *, on_disk: bool = False, progress: bool = True
     ) -> tuple[TensorDict, dict[str, Any]]:
-        """Transitions ``[N]`` and their manifest.
-
-        Keyword Args:
-            on_disk: convert in parts into the cache folder, unless they are there, and
-                leave them memory-mapped. Default: ``False``.
-            progress: show a bar while writing. Default: ``True``.
-        """
+        """Transitions ``[N]`` and their manifest; on disk, converted in parts."""
         source = str(self.about.get("path", ""))
         try:
             if on_disk:
@@ -133,8 +127,10 @@ class Recording:
             except ValueError as error:
                 where = f"in the rows from {read:,} on: " if read else ""
                 raise ValueError(f"{where}{error}") from error
+            flags = [columns.get(n, [0])[-1] for n in ("terminated", "truncated")]
             if "next_observation" in columns:
-                before = np.asarray(columns["next_observation"])[-1]
+                reached = np.asarray(columns["next_observation"])[-1]
+                before = reached if np.any(flags) else np.nan
             read += np.size(columns["reward"])
             kept += len(part.data)
             self._parts.append(part._replace(data=TensorDict()))  # not the rows
@@ -156,7 +152,7 @@ class Recording:
         returns, lengths = episodes[:, 0], episodes[:, 1].astype(int)
         return {
             **self.about,
-            "data_sha256": checksum(self.files),
+            "data_sha256": [sha256_of(file) for file in self.files],
             **counts,
             "num_actions": self.options.num_actions,
             "action_limit": ACTION_LIMIT,
@@ -170,7 +166,8 @@ class Recording:
 
     def _warnings(self, counts: Mapping[str, int]) -> Iterator[str]:
         for name in ("observation", "reward"):
-            moved, lost = np.sum([part.changes[name] for part in self._parts], axis=0)
+            total: Any = sum(part.changes[name] for part in self._parts)
+            moved, lost = total
             for entry in np.flatnonzero(lost > VANISHED_SHARE * moved):
                 which = f"entry {entry} of {name!r}" if len(moved) > 1 else repr(name)
                 yield (
@@ -194,14 +191,6 @@ def _check_together(episode: Any, seen: set[float]) -> None:
                 "together and in order of time. data.columns.step sorts them."
             )
         seen.add(number)
-
-
-def checksum(files: Iterable[Path]) -> str | None:
-    """SHA-256 of a file, or of the checksums of several; ``None`` without files."""
-    digests = [sha256_of(file) for file in files]
-    if len(digests) < 2:
-        return digests[0] if digests else None
-    return hashlib.sha256("".join(digests).encode()).hexdigest()
 
 
 def whole_trajectories(
@@ -268,14 +257,12 @@ def transitions_from_columns(
             ``"error"`` raises. Default: ``"error"``.
 
     Returns:
-        The transitions in float32, see :func:`~torchrl_osr.lab.data.check_dataset`,
-        and a manifest: counts of rows and ends, returns and lengths of the complete
-        and the incomplete episodes, and ``warnings``, which are logged, too.
+        The transitions in float32, and a manifest: counts of rows and ends, returns and
+        lengths of the complete and the incomplete episodes, and ``warnings``.
 
     Raises:
         ValueError: the columns are not as above or contradict one another, hold a NaN
-            or an infinity, or a field is zero everywhere; the actions look like numbers
-            of discrete ones. The message names the column and the row.
+            or an infinity, or actions look discrete; names the column and the row.
 
     Examples:
         >>> import numpy as np

@@ -32,7 +32,12 @@ from torchrl_osr.lab.data.environment import (
     environment_id,
     make_environment,
 )
-from torchrl_osr.lab.data.mazes import ActionSampler, maze_behavior, maze_players
+from torchrl_osr.lab.data.mazes import (
+    ActionSampler,
+    StartsAndGoals,
+    maze_behavior,
+    waypoint_sampler,
+)
 from torchrl_osr.lab.data.transitions import ACTION_LIMIT, as_transitions
 
 BEHAVIORS: dict[str, tuple[str, ...]] = {
@@ -77,24 +82,18 @@ def collect_source(
     seed: int = 0,
     progress: bool = True,
 ) -> Collection:
-    """Roll out one of the named data sets.
+    """Roll out a named data set, see :func:`~torchrl_osr.lab.data.load_dataset`.
 
-    Args:
-        env_name: ``"hopper"``, ``"walker2d"``, ``"halfcheetah"``, or
-            ``"pointmaze-umaze"``, ``-medium`` or ``-large``.
-        source: a key of ``BEHAVIORS``; of a maze ``"diverse"`` or ``"play"``.
-        num_transitions: exact number of transitions ``N``.
-
-    Keyword Args:
-        seed: non-negative seed. Default: 0. The source enters too, so that a medium and
-            a medium-expert set of one seed share no episode.
-        progress: show a progress bar when on a terminal. Default: ``True``.
+    The source enters the seed, so that a medium and a medium-expert set of one seed
+    share no episode.
     """
     behavior_of(env_name, source)  # an unknown source stops here
     entropy = (seed, zlib.crc32(f"{env_name}-{source}".encode()))
     with closing(make_environment(environment_id(env_name))) as env:
         if env_name in MAZE_IDS:
-            env, samplers = maze_players(env, env_name, source)
+            samplers = [waypoint_sampler(env.get_wrapper_attr("maze"))]
+            if pairs := maze_behavior(env_name, source)["cells"]:
+                env = StartsAndGoals(env, pairs)
         else:
             policies = [
                 load_behavior_policy(env_name, name) for name in BEHAVIORS[source]
@@ -127,22 +126,17 @@ def collect_transitions(
     """Roll out an exact number of transitions, in equal shares of several policies.
 
     Each policy plays episode after episode until its share is full; the last row of
-    a share that is cut within an episode is marked truncated. The stored actions are
-    the executed ones, clipped to ``ACTION_LIMIT``.
+    a share is then marked truncated. Rows are ordered by policy and time. The stored
+    actions are the executed ones, clipped to ``ACTION_LIMIT``.
 
     Args:
         env: task as :func:`~torchrl_osr.lab.data.make_environment` returns it.
-        samplers: draw actions ``[A]`` in -1 to 1 for an observation ``[S]``, given a
-            NumPy generator; one for each policy.
-        num_transitions: ``N``, at least one for each policy. Shares differ by one at
-            most.
+        samplers: one for each policy.
+        num_transitions: ``N``, at least one for each policy.
 
     Keyword Args:
         seed: non-negative seed or seeds; global generators are not used. Default: 0.
         progress: show a progress bar when on a terminal. Default: ``True``.
-
-    Returns:
-        The transitions, ordered by policy and time, and the episode statistics.
     """
     if not 0 < len(samplers) <= num_transitions:
         raise ValueError(

@@ -19,14 +19,10 @@ def held_out_rows(rows: int, held_out: int | float, *, seed: int) -> Tensor:
 
     Args:
         rows: number of rows ``N``.
-        held_out: number of held-out rows (``int``), or their share (``float`` between
-            0 and 1, rounded to whole rows).
+        held_out: number of held-out rows (``int``), or their share (``float``).
 
     Keyword Args:
         seed: of the choice, which has a generator of its own.
-
-    Raises:
-        ValueError: none would be held out, or all.
     """
     count = round(held_out * rows) if isinstance(held_out, float) else held_out
     if not 0 < count < rows:
@@ -41,11 +37,7 @@ def held_out_rows(rows: int, held_out: int | float, *, seed: int) -> Tensor:
 def split_held_out(
     data: TensorDict, held_out: int | float, *, seed: int
 ) -> tuple[TensorDict, TensorDict]:
-    """Training and held-out rows, see :func:`held_out_rows`, in their original order.
-
-    A memory-mapped set would be copied into memory: see ``left_out`` of
-    :func:`~torchrl_osr.lab.data.make_replay_buffer`.
-    """
+    """Training and held-out rows, see :func:`held_out_rows`, copied, in order."""
     mask = torch.zeros(len(data), dtype=torch.bool)
     mask[held_out_rows(len(data), held_out, seed=seed)] = True
     mask = mask.to(data.device or "cpu")
@@ -58,18 +50,7 @@ def mix_datasets(
     """Replace a share of the rows by rows of another data set; the number stays.
 
     Limited valuable data, section 5.3 of the paper. The rows of each set are drawn
-    without replacement.
-
-    Args:
-        valuable: ``N`` transitions.
-        random: at least as many as are needed of it.
-
-    Keyword Args:
-        random_share: of the ``N`` rows, rounded to whole ones.
-        seed: of the choice, which has a generator of its own.
-
-    Returns:
-        ``N`` transitions: those kept of ``valuable``, then those of ``random``.
+    without replacement; those kept of ``valuable`` come first.
     """
     number = round(random_share * len(valuable))
     if not 0 <= random_share <= 1 or number > len(random):
@@ -117,11 +98,7 @@ def next_action(data: TensorDictBase, rows: Tensor | None = None) -> Tensor:
 
 
 def check_order(data: TensorDictBase) -> None:
-    """Raise unless every row that does not end an episode is followed by its next.
-
-    Args:
-        data: transitions ``[N]``; read in chunks.
-    """
+    """Raise unless every row that does not end an episode is followed by its next."""
     wrong = []
     every: Any = torch.arange(len(data))
     for rows in every.split(ROWS_AT_A_TIME):

@@ -84,12 +84,12 @@ def load_dataset(
         env_id: Gymnasium id of the task. The actions of a ``"file"`` are then in its
             units, and data that do not fit it are refused. Default: actions within -1
             and 1, not compared.
-        references: scale of the scores. Default: D4RL's of the name, if there are any.
+        references: scale of the scores. Default: D4RL's, if there are any.
         path: of recorded data. ``"file"``: CSV, Parquet, HDF5 or NumPy archive, a list
             or a pattern (``"logs/*.csv"``) of files that make one log, or a folder that
-            :func:`~torchrl_osr.lab.data.write_memmap` has written. ``"minari"`` and
-            ``"d4rl"``: a name, such as ``"mujoco/hopper/medium-v0"`` or
-            ``"hopper-medium-v2"``, or a path.
+            :func:`~torchrl_osr.lab.data.write_memmap` has written. ``"minari"``: a
+            name, such as ``"mujoco/hopper/medium-v0"``, or a folder. ``"d4rl"``: an
+            HDF5 file of D4RL.
         columns: of a ``"file"``, names of columns by their part: ``observation``,
             ``action``, ``reward``, ``terminated``, ``truncated``, ``episode``,
             ``next_observation``, as in
@@ -102,7 +102,7 @@ def load_dataset(
             ``"minari"`` its action space; otherwise the task's own bounds.
         clip_actions, missing: see
             :func:`~torchrl_osr.lab.data.transitions_from_columns`.
-        download: fetch a set that is known by its name. Default: ``False``.
+        download: fetch the Minari set of that name. Default: ``False``.
         num_transitions: exact number of rolled-out transitions. Default: 200,000.
         random_share: share of the rolled-out rows that are random instead: limited
             valuable data, section 5.3 of the paper. Default: 0.
@@ -120,23 +120,12 @@ def load_dataset(
     Raises:
         ValueError: an option is missing or has no effect, a task or a source is
             unknown, or the data do not fit the task.
-        FileNotFoundError: there is no such file or set, and ``download`` is false.
 
     Examples:
-        >>> import tempfile, numpy as np
         >>> from torchrl_osr.lab.data import load_dataset
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     np.savez(
-        ...         f"{folder}/log.npz",
-        ...         observation=np.random.rand(6, 3),
-        ...         action=np.random.uniform(-1, 1, (6, 2)),
-        ...         reward=np.ones(6),
-        ...         terminated=np.array([0, 0, 1, 0, 0, 0]),
-        ...         episode=np.array([0, 0, 0, 1, 1, 1]),
-        ...     )
-        ...     data, manifest = load_dataset(path=f"{folder}/log.npz")
-        >>> len(data), manifest["dropped_rows"]
-        (5, 1)
+        >>> data, manifest = load_dataset("hopper", "random", num_transitions=500)
+        >>> data["observation"].shape, manifest["env_id"]
+        (torch.Size([500, 11]), 'Hopper-v5')
     """
     columns = {part: name for part, name in (columns or {}).items() if name is not None}
     reading: dict[str, Any] = {
@@ -193,9 +182,11 @@ def open_recorded(
 ) -> Recording:
     """Open recorded data, no row of which is read yet; see :func:`load_dataset`."""
     columns = {part: name for part, name in (columns or {}).items() if name is not None}
-    known = {"minari": {"observation"}, "d4rl": set(columns) and set()}
-    for part in columns.keys() - known.get(source, columns.keys()):
-        _refuse({f"columns.{part}": columns[part]}, f"data={source}")
+    if source != "file":
+        given = {f"columns.{part}": name for part, name in columns.items()}
+        if source == "minari":
+            given.pop("columns.observation", None)
+        _refuse(given, f"data={source}")
     number = spec.action_size if spec is not None and spec.discrete else None
     if number is not None:
         _refuse({"action_bounds": action_bounds}, "discrete actions")
@@ -213,13 +204,11 @@ def open_recorded(
 
         entries = columns.get("observation")
         return open_minari(path, options, entries, download=download, progress=progress)
-    if source == "d4rl":
-        from torchrl_osr.lab.data.d4rl import open_d4rl
+    from torchrl_osr.lab.data.table import D4RL_NAMES, open_log
 
-        return open_d4rl(path, options, download=download, progress=progress)
-    from torchrl_osr.lab.data.table import open_log
-
-    return open_log(path, columns, options)
+    _refuse({"download": download}, f"data={source}")
+    names = D4RL_NAMES if source == "d4rl" else columns
+    return open_log(path, names, options, source)
 
 
 def _check_rolled_out(env_name: str | None, env_id: str | None, source: str) -> None:

@@ -60,12 +60,10 @@ def observation_statistics(data: TensorDictBase) -> tuple[Tensor, Tensor]:
         count = total
     scale = variance.sqrt()
     if small := (scale < MIN_OBSERVATION_SCALE).nonzero()[:, 0].tolist():
-        named = [f"{entry} ({scale[entry]:.2g})" for entry in small[:5]]
-        rest = f" and {len(small) - 5} more" if len(small) > 5 else ""
         torchrl_logger.warning(
-            f"Observation entries have a standard deviation below "
-            f"{MIN_OBSERVATION_SCALE} and are divided by {MIN_OBSERVATION_SCALE} when "
-            f"standardised: {', '.join(named)}{rest}."
+            f"{len(small)} observation entries have a standard deviation below "
+            f"{MIN_OBSERVATION_SCALE} and are divided by that when standardised, the "
+            f"first of them {small[:5]}."
         )
     scale = scale.clamp_min(MIN_OBSERVATION_SCALE)
     return loc.to(observation.dtype), scale.to(observation.dtype)

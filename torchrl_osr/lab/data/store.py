@@ -11,8 +11,8 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -99,16 +99,6 @@ def write_memmap(
     Raises:
         FileExistsError: the folder holds something else, which is not touched.
         ValueError: :func:`~torchrl_osr.lab.data.check_dataset` refuses the rows.
-        OSError: the disk is full, or cannot be written.
-
-    Examples:
-        >>> import tempfile
-        >>> from torchrl_osr.lab.data import load_dataset, write_memmap
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     rows, _ = load_dataset("hopper", "random", num_transitions=500)
-        ...     data, manifest = write_memmap(rows.split(200), f"{folder}/set")
-        >>> bool((data == rows).all()), manifest["num_transitions"]
-        (True, 500)
     """
     folder = Path(folder).expanduser()
     if os.path.lexists(folder) and not _is_ours(folder):
@@ -126,17 +116,15 @@ def write_memmap(
         disable=None if progress else True,
     )
     try:
-        with explained_write_errors(folder):
-            (partial / ROWS / "next").mkdir(parents=True)
+        (partial / ROWS / "next").mkdir(parents=True)
         with bar:
-            rows = _write_rows(chunks, partial / ROWS, folder, total, bar)
+            rows = _write_rows(chunks, partial / ROWS, total, bar)
         manifest = dict(describe()) | {"format": FORMAT, "num_transitions": rows}
-        with explained_write_errors(folder):
-            manifest["rows_sha256"] = _checksum(partial / ROWS)
-            write_json(partial / MANIFEST, manifest)
-            if folder.exists():
-                shutil.rmtree(folder)
-            os.replace(partial, folder)
+        manifest["rows_sha256"] = _checksum(partial / ROWS)
+        write_json(partial / MANIFEST, manifest)
+        if folder.exists():
+            shutil.rmtree(folder)
+        os.replace(partial, folder)
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         raise
@@ -144,18 +132,14 @@ def write_memmap(
 
 
 def _write_rows(
-    chunks: Iterable[TensorDict],
-    rows_folder: Path,
-    folder: Path,
-    total: int | None,
-    bar: Any,
+    chunks: Iterable[TensorDict], folder: Path, total: int | None, bar: Any
 ) -> int:
     """Append the columns to their files and describe these as tensordict does."""
     sizes: dict[NestedKey, int] = {}
     rows = 0
     with ExitStack() as stack:
         files = {
-            key: stack.enter_context((rows_folder / name).open("wb"))
+            key: stack.enter_context((folder / name).open("wb"))
             for key, name in FILES.items()
         }
         for chunk in chunks:
@@ -167,10 +151,8 @@ def _write_rows(
                 needed = total * chunk.bytes() // len(chunk)
                 check_disk_space(folder, needed, "the data set")
             sizes = found
-            with explained_write_errors(folder):
-                for key, file in files.items():
-                    file.write(chunk.get(key).numpy(force=True).tobytes())
-                    file.flush()
+            for key, file in files.items():
+                file.write(chunk.get(key).numpy(force=True).tobytes())
             rows += len(chunk)
             bar.update(len(chunk))
         if not rows:
@@ -179,9 +161,9 @@ def _write_rows(
     for key, name in FILES.items():
         dtype = torch.bool if key in FLAG_KEYS else torch.float32
         shape = torch.Size([rows, sizes[key]])
-        data[key] = MemoryMappedTensor.from_filename(rows_folder / name, dtype, shape)
+        data[key] = MemoryMappedTensor.from_filename(folder / name, dtype, shape)
     check_filled(data)
-    data.memmap(rows_folder, existsok=True)
+    data.memmap(folder, existsok=True)
     return rows
 
 
@@ -190,22 +172,14 @@ def load_memmap(folder: Path | str) -> tuple[TensorDict, dict[str, Any]]:
 
     Its files are read once, to compare their checksum; rows are read when asked for.
 
-    Args:
-        folder: of the data set; it may have been copied from another machine.
-
     Returns:
         The transitions ``[N]``, memory-mapped, and the manifest. What is written into
         these tensors is written into the files: change a ``clone()``.
 
     Raises:
-        FileNotFoundError: there is no such data set.
         ValueError: it is damaged, or of another version.
     """
     folder = Path(folder).expanduser()
-    if not is_memmap_folder(folder):
-        raise FileNotFoundError(
-            f"{folder} has no {MANIFEST}; expected a folder that write_memmap wrote."
-        )
     try:
         manifest = read_json(folder / MANIFEST)
         if manifest.get("format") != FORMAT:
@@ -252,15 +226,13 @@ def load_or_write(
     # Without the lock first: a data set can be read from a read-only folder.
     with suppress(OSError, ValueError):
         return load()
-    with explained_write_errors(folder):
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(f"{folder}.lock")
-        lock.acquire()
-    try:
-        return load()  # another process may have written it in the meantime
-    except (OSError, ValueError) as flaw:
-        if folder.exists():
-            torchrl_logger.warning(f"Making {folder} anew: {flaw}")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(f"{folder}.lock"):
+        try:
+            return load()  # another process may have written it in the meantime
+        except (OSError, ValueError) as flaw:
+            if folder.exists():
+                torchrl_logger.warning(f"Making {folder} anew: {flaw}")
         return write_memmap(
             chunks(),
             folder,
@@ -268,23 +240,6 @@ def load_or_write(
             total=total,
             progress=progress,
         )
-    finally:
-        lock.release()
-
-
-@contextmanager
-def explained_write_errors(folder: Path) -> Iterator[None]:
-    """Add the folder and a cure to an error of the file system."""
-    try:
-        yield
-    except OSError as error:
-        # errno picks the subclass, so that PermissionError stays one.
-        raise OSError(
-            error.errno,
-            f"cannot write the data set ({error.strerror}); free space, or choose "
-            f"another folder ({CACHE_VARIABLE}=/path moves the cache)",
-            str(folder),
-        ) from error
 
 
 def _is_ours(folder: Path) -> bool:

@@ -49,6 +49,19 @@ USUAL_NAMES = {
 }
 """Parts of a log, and what their columns are called unless you name them."""
 
+D4RL_NAMES = {
+    "observation": "observations",
+    "action": "actions",
+    "reward": "rewards",
+    "terminated": "terminals",
+    "truncated": "timeouts",
+}
+"""Names of D4RL's HDF5 files, which have ``next_observations`` in v2 alone.
+
+TorchRL's ``D4RLExperienceReplay`` zeroes the next observation of every row that is
+done; ``d4rl.qlearning_dataset`` puts the next episode's first observation there.
+"""
+
 VECTORS = ("observation", "action", "next_observation")
 
 ColumnNames = Mapping[str, str | Sequence[str] | bool | None]
@@ -73,19 +86,23 @@ class Table(NamedTuple):
 
 
 def open_log(
-    path: str | Path | Sequence[str], columns: ColumnNames | None, options: Reading
+    path: str | Path | Sequence[str],
+    columns: ColumnNames,
+    options: Reading,
+    source: str = "file",
 ) -> Recording:
     """Open a log, see :func:`~torchrl_osr.lab.data.load_dataset`; no row is read yet.
 
     Args:
         path: of a file; or several that make one log, as a list or a pattern.
-        columns: names of the parts. Default: the usual names; then a column that is
-            not known is an error, otherwise it is left out.
+        columns: names of the parts. Without any, they have the usual names, and a
+            column that is not known is an error, otherwise it is left out.
         options: for the conversion.
+        source: for the manifest.
     """
     tables = {file: _table(file) for file in _files(path)}
     first = next(iter(tables.values()))
-    layout = find_columns(first.names, columns or {})
+    layout = find_columns(first.names, columns)
     names = [*chain(*layout.values())]
     notes = [f"{file.name}: {n}" for file, table in tables.items() for n in table.notes]
 
@@ -106,7 +123,7 @@ def open_log(
 
     files = [str(file) for file in tables]
     about = {
-        "source": "file",
+        "source": source,
         "path": files[0] if len(files) == 1 else files,
         "columns": layout,
         "unused_columns": [name for name in first.names if name not in names],

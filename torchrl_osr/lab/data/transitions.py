@@ -47,12 +47,7 @@ OPTIONAL = ("truncated", "episode", "next_observation")
 
 
 def as_transitions(columns: Mapping[str, Array]) -> TensorDict:
-    """Transitions ``[N]`` from arrays, which are not copied.
-
-    Args:
-        columns: ``observation`` and ``next_observation`` ``[N, S]``, ``action``
-            ``[N, A]``, ``reward``, ``terminated`` and ``truncated`` ``[N]``.
-    """
+    """Transitions ``[N]`` from arrays by name, which are not copied."""
     size = [len(columns["reward"])]
     tensors = {name: torch.from_numpy(array) for name, array in columns.items()}
     after = {n: tensors[n][:, None] for n in ("reward", "terminated", "truncated")}
@@ -65,8 +60,6 @@ def as_transitions(columns: Mapping[str, Array]) -> TensorDict:
 def check_dataset(data: TensorDictBase) -> None:
     """Raise if a transition data set cannot be trained on.
 
-    A broken data set does not crash a training run, it only spoils it.
-
     Args:
         data: transitions ``[N]`` with ``observation`` ``[N, S]``, ``action``
             ``[N, A]`` and, under ``next``, ``observation`` ``[N, S]``, ``reward``
@@ -76,7 +69,6 @@ def check_dataset(data: TensorDictBase) -> None:
     Raises:
         ValueError: a key has another shape or type, holds a NaN or an infinity, or an
             observation, next observation or action is zero everywhere.
-        KeyError: a key is missing.
     """
     check_rows(data)
     check_filled(data)
@@ -165,7 +157,9 @@ def trajectories(
     ends[:-1] |= lost[1:]
     keep = ~(lost | resets)
     if not keep.any():
-        raise ValueError("every row lacks a value, or its episode does.")
+        counts = {"missing_rows": int(lost.sum()), "reset_rows": int(resets.sum())}
+        none = {n: np.zeros((2, 1), int) for n in ("observation", "reward")}
+        return Trajectories(TensorDict({}, [0]), counts, np.empty((0, 3)), none)
     if not keep.all():
         columns = {name: array[keep] for name, array in columns.items()}
         flagged, ends, broken = flagged[keep], ends[keep], broken[keep]
