@@ -111,22 +111,10 @@ def state_recovery(
         ``[B]``.
     """
     policy = (policy_loc, policy_scale)
-    inverse_dynamics = (inverse_dynamics_loc, inverse_dynamics_scale)
-    if direction == "forward":
-        divergence = gaussian_kl(*inverse_dynamics, *policy)
-    elif direction == "reverse":
-        divergence = gaussian_kl(*policy, *inverse_dynamics)
-    else:
-        raise ValueError(
-            f"direction must be 'forward' or 'reverse', got {direction!r}."
-        )
-    if action_reduction == "sum":
-        return divergence.sum(-1)
-    if action_reduction == "mean":
-        return divergence.mean(-1)
-    raise ValueError(
-        f"action_reduction must be 'sum' or 'mean', got {action_reduction!r}."
-    )
+    model = (inverse_dynamics_loc, inverse_dynamics_scale)
+    pair = {"forward": (*model, *policy), "reverse": (*policy, *model)}[direction]
+    divergence = gaussian_kl(*pair)
+    return {"sum": torch.sum, "mean": torch.mean}[action_reduction](divergence, -1)
 
 
 def deterministic_recovery(
@@ -161,14 +149,9 @@ def deterministic_recovery(
         2.72
     """
     # Of equal widths, only the means are left in the divergence.
-    return state_recovery(
-        policy_loc,
-        inverse_dynamics_scale,
-        inverse_dynamics_loc,
-        inverse_dynamics_scale,
-        direction="reverse",
-        action_reduction=action_reduction,
-    )
+    scale = inverse_dynamics_scale
+    pair = policy_loc, scale, inverse_dynamics_loc, scale
+    return state_recovery(*pair, action_reduction=action_reduction)
 
 
 def soft_policy_value(

@@ -62,25 +62,12 @@ class CQLLoss(ActorCriticLoss):
         options: of every loss, see
             :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
-    Raises:
-        TypeError: if the actor's distribution is not a ``TanhNormal``.
-        ValueError: if a number is out of its range; in the call, if the batch is empty.
-
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl.objectives import SoftUpdate
         >>> from torchrl_osr import CQLLoss
         >>> from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
         >>> loss = CQLLoss(tanh_gaussian_actor(11, 3), critic_ensemble(11, 3))
-        >>> updater = SoftUpdate(loss, tau=5e-3)
-        >>> no = torch.zeros(4, 1, dtype=torch.bool)
-        >>> batch = TensorDict({
-        ...     "observation": torch.randn(4, 11), "action": torch.rand(4, 3),
-        ...     "next": {"observation": torch.randn(4, 11), "reward": torch.ones(4, 1),
-        ...              "done": no, "terminated": no}}, [4])
-        >>> sorted(key for key in loss(batch).keys() if key.startswith("loss_"))
-        ['loss_actor', 'loss_alpha', 'loss_cql', 'loss_qvalue']
+        >>> [key for key in loss.out_keys if key.startswith("loss_")]
+        ['loss_actor', 'loss_alpha', 'loss_qvalue', 'loss_cql']
     """
 
     _schedulable_buffers = frozenset({"min_q_weight"})

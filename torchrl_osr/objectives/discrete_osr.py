@@ -80,25 +80,15 @@ class DiscreteOSRLoss(ActorCriticLoss):
         KeyError: in the call, if the batch has no perturbed entry.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl.objectives import SoftUpdate
-        >>> from torchrl_osr import DiscreteOSRLoss, StatePerturbation
+        >>> from torchrl_osr import DiscreteOSRLoss
         >>> from torchrl_osr.modules import (
         ...     categorical_actor, categorical_inverse_dynamics,
         ...     discrete_critic_ensemble)
         >>> loss = DiscreteOSRLoss(categorical_actor(4, 2),
         ...                        discrete_critic_ensemble(4, 2),
         ...                        categorical_inverse_dynamics(4, 2))
-        >>> updater = SoftUpdate(loss, tau=5e-3)
-        >>> no = torch.zeros(3, 1, dtype=torch.bool)
-        >>> batch = TensorDict({
-        ...     "observation": torch.randn(3, 4), "action": torch.eye(2)[[0, 1, 0]],
-        ...     "next": {"observation": torch.randn(3, 4), "reward": torch.ones(3, 1),
-        ...              "done": no, "terminated": no}}, [3])
-        >>> losses = loss(StatePerturbation(std=1e-3)(batch))
-        >>> sorted(key for key in losses.keys() if key.startswith("loss_"))
-        ['loss_actor', 'loss_alpha', 'loss_cql', 'loss_qvalue']
+        >>> [key for key in loss.out_keys if key.startswith("loss_")]
+        ['loss_actor', 'loss_alpha', 'loss_qvalue', 'loss_cql']
     """
 
     _schedulable_buffers = frozenset({"recovery_weight", "min_q_weight"})

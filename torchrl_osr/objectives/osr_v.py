@@ -72,22 +72,12 @@ class OSRVLoss(ActorCriticLoss):
         KeyError: in the call, if the batch has no perturbed entry.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl.objectives import SoftUpdate
-        >>> from torchrl_osr import OSRVLoss, StatePerturbation
+        >>> from torchrl_osr import OSRVLoss
         >>> from torchrl_osr.modules import (
         ...     critic_ensemble, tanh_gaussian_actor, tanh_gaussian_inverse_dynamics)
         >>> loss = OSRVLoss(tanh_gaussian_actor(11, 3), critic_ensemble(11, 3),
         ...                 tanh_gaussian_inverse_dynamics(11, 3))
-        >>> updater = SoftUpdate(loss, tau=5e-3)
-        >>> no = torch.zeros(4, 1, dtype=torch.bool)
-        >>> batch = TensorDict({
-        ...     "observation": torch.randn(4, 11), "action": torch.rand(4, 3),
-        ...     "next": {"observation": torch.randn(4, 11), "reward": torch.ones(4, 1),
-        ...              "done": no, "terminated": no}}, [4])
-        >>> losses = loss(StatePerturbation(std=1e-3)(batch))
-        >>> sorted(key for key in losses.keys() if key.startswith("loss_"))
+        >>> [key for key in loss.out_keys if key.startswith("loss_")]
         ['loss_actor', 'loss_alpha', 'loss_qvalue']
     """
 

@@ -81,10 +81,8 @@ class StateRecoveryLoss(ActorCriticLoss):
 
     Raises:
         TypeError: if a distribution is another one.
-        ValueError: if bounds differ, the weight is negative, the model is missing, or
-            an actor has no forward direction; in the call, if the batch is empty or
-            holds several steps a row.
-        KeyError: in the call, if the batch has no perturbed entry.
+        ValueError: if bounds differ, the model is missing, or an actor has no forward
+            direction; in the call, if the batch holds several steps a row.
 
     Examples:
         >>> import torch
