@@ -25,8 +25,7 @@ from torchrl.modules import (
 from torchrl.objectives import CQLLoss, LossModule, SoftUpdate, group_optimizers
 
 from torchrl_osr import OSRLoss, OSRVLoss, StatePerturbation
-from torchrl_osr.fast import SoftUpdate as FastSoftUpdate
-from torchrl_osr.fast.traced_update import LossGradients
+from torchrl_osr.fast import fast_update
 from torchrl_osr.modules import (
     critic_ensemble,
     tanh_gaussian_actor,
@@ -39,13 +38,19 @@ from plain_osr import Batch, PlainOSR
 Update = Callable[[Any], Any]
 
 GAMMA, TAU, RATE, ROWS = 0.99, 5e-3, 3e-4, 100_000
-PLAIN, TORCHRL, EAGER, COMPILED = (
+PLAIN, TIGHT, TORCHRL, EAGER, COMPILED, LOOP, FAST_LOOP = (
     "plain PyTorch, OSR",
+    "plain PyTorch, OSR, tight",
     "TorchRL's CQLLoss",
     "OSR, eager",
     "OSR, compiled",
+    "drop-in loss",
+    "drop-in loss + fast_update",
 )
-CONTENDERS = ("OSR", EAGER, "CQL(H)", "OSR-v", "OSR-10", TORCHRL, PLAIN)
+CONTENDERS = (
+    *("OSR", EAGER, LOOP, FAST_LOOP, "CQL(H)", "OSR-v", "OSR-10"),
+    *(TORCHRL, PLAIN, TIGHT),
+)
 DIMENSIONS = {"hopper": (11, 3), "walker2d": (17, 6), "halfcheetah": (17, 6)}
 
 
@@ -127,15 +132,52 @@ def our_loss(name: str, size: Size, device: torch.device) -> LossModule:
 
 def our_update(loss: LossModule, *, traced: bool) -> Update:
     """Return the trainer's update: one backward, one optimizer, traced on a CPU."""
-    updater = FastSoftUpdate(loss, tau=TAU)
+    updater = SoftUpdate(loss, tau=TAU)
     optimizer = torch.optim.Adam(loss.parameters(), lr=RATE, fused=True)
-    gradients = LossGradients(loss, None, record=traced, warm_up=2)
+    update = fast_update(loss, optimizer, updater, trace=traced, warm_up=2)
+    return lambda batch: update(batch.copy())
 
-    def update(batch: TensorDictBase) -> None:
-        gradients(batch.copy())
+
+def loop_update(loss: LossModule, *, fast: bool) -> Update:
+    """Return the update of a plain TorchRL loop, with PyTorch's default Adam."""
+    updater = SoftUpdate(loss, tau=TAU)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=RATE)
+    fast_step = fast_update(loss, optimizer, updater, trace=fast, warm_up=2)
+
+    def step(batch: TensorDictBase) -> None:
+        losses = loss(batch)
+        sum(value for name, value in losses.items() if "loss_" in name).backward()
         optimizer.step()
-        optimizer.zero_grad(set_to_none=True)
+        optimizer.zero_grad()
         updater.step()
+
+    return lambda batch: (fast_step if fast else step)(batch.copy())
+
+
+def tight_update(plain: PlainOSR) -> Update:
+    """Return the plain update with one backward, one fused Adam and fused targets."""
+    critics, targets = (
+        [weight for each in networks for weight in each.parameters()]
+        for networks in (plain.critics, plain.targets)
+    )
+    trained = [*plain.actor.parameters(), plain.log_alpha, *critics]
+    optimizer = torch.optim.Adam(trained, lr=RATE, fused=True)
+
+    def update(batch: Batch) -> None:
+        noise, ended = plain.draw(batch.action), batch.terminated.unsqueeze(-1)
+        next_state = torch.where(ended, batch.state, batch.next_state)
+        batch = batch._replace(next_state=next_state)
+        for each in critics:  # the actor's loss must not train them
+            each.requires_grad_(False)
+        losses = plain.actor_losses(batch, noise)
+        for each in critics:
+            each.requires_grad_(True)
+        losses |= plain.critic_losses(batch, noise)
+        sum(losses.values()).backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        with torch.no_grad():
+            torch._foreach_lerp_(targets, critics, TAU)
 
     return update
 
@@ -210,10 +252,11 @@ def make_contender(
 ) -> tuple[Update, list[Any]]:
     """Return an update and the batches that it reads, the same for every name."""
     batches = make_batches(size, device)
-    if name == PLAIN:
+    if name in (PLAIN, TIGHT):
         options = {"num_random": size.num_random, "layer_norm": size.layer_norm}
         plain = PlainOSR(size.observations, size.actions, list(size.cells), **options)
-        return plain.update, [unpack(batch) for batch in batches]
+        rows = [unpack(batch) for batch in batches]
+        return plain.update if name == PLAIN else tight_update(plain), rows
     if name == TORCHRL:
         update = torchrl_update(size, device)
         return update, [batch.exclude("perturbed") for batch in batches]
@@ -222,4 +265,6 @@ def make_contender(
         loss.compile()
     if ("perturbed", "observation") not in loss.in_keys:
         batches = [batch.exclude("perturbed") for batch in batches]
+    if name in (LOOP, FAST_LOOP):
+        return loop_update(loss, fast=name == FAST_LOOP), batches
     return our_update(loss, traced=name not in (EAGER, COMPILED)), batches

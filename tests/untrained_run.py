@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
 from pathlib import Path
 
 import torch
 from composed import composed
 from omegaconf import OmegaConf
+from torch.optim.swa_utils import AveragedModel
 from torchrl.checkpoint import CheckpointRotation
 from torchrl.envs import ObservationNorm
 
@@ -33,7 +33,7 @@ def make_run(folder: Path, *overrides: str, sizes: tuple[int, int] = (11, 3)):
     checkpoint = safe_checkpoint(
         loss_module=objective,
         observation_norm=norm,
-        policy_average=deepcopy(actor),
+        policy_average=AveragedModel(actor),
         history=[],
     )
     rotation = CheckpointRotation(folder / CHECKPOINTS, keep_last=2)

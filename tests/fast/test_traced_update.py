@@ -1,12 +1,22 @@
-"""A recording of losses and gradients against the losses themselves."""
+"""A trace of losses and gradients against the losses themselves."""
 
 from __future__ import annotations
 
 import gc
+from collections.abc import Callable
+from unittest import mock
 
 import pytest
 import torch
-from torchrl.objectives import SoftUpdate
+from tensordict import TensorDict
+from tensordict.nn import (
+    InteractionType,
+    TensorDictModule,
+    TensorDictParams,
+    set_interaction_type,
+)
+from torch import nn
+from torchrl.objectives import LossModule, SoftUpdate
 
 from torchrl_osr import (
     CQLLoss,
@@ -15,6 +25,7 @@ from torchrl_osr import (
     OSRVLoss,
     StateRecoveryLoss,
 )
+from torchrl_osr.fast import fuse_critics, traced_update
 from torchrl_osr.fast.traced_update import LossGradients
 from torchrl_osr.lab.losses import (
     BCLoss,
@@ -83,13 +94,14 @@ def make_batch(make_batch):
 
 def make(name):
     loss = LOSSES[name]().double()
+    fuse_critics(loss)
     if hasattr(loss, "qvalue_network"):
         SoftUpdate(loss, tau=0.1)  # TorchRL warns of losses without one
     return loss
 
 
 def results(gradients, loss, batch):
-    """Losses, gradients and what the loss has written, for one state of the noise."""
+    """Losses, gradients, what the loss has written, and the next random number."""
     batch = batch.clone()
     torch.manual_seed(3)
     losses = gradients(batch)
@@ -98,57 +110,236 @@ def results(gradients, loss, batch):
     return losses, found, batch, torch.rand(())
 
 
-@pytest.mark.parametrize("name", LOSSES)
-def test_a_recording_has_the_bits_of_what_was_recorded(name, make_batch):
-    loss = make(name)
-    eager, recorded = LossGradients(loss), LossGradients(loss, record=True, warm_up=0)
-    recorded(make_batch(6, twin=True))
-    gc.collect()  # the recording owns what it needs
+def assert_same_bits(given, expected) -> None:
+    torch.testing.assert_close(given[0], expected[0], rtol=0, atol=0)
+    for ours, theirs in zip(given[1], expected[1], strict=True):
+        assert (ours is None) == (theirs is None)
+        assert ours is None or torch.equal(ours, theirs)
+        # A fused optimizer goes through parameter and gradient by address.
+        assert ours is None or ours.is_contiguous()
+    assert (given[2] == expected[2]).all()
+    assert given[3] == expected[3]  # the generator moved on alike
+
+
+def single(batch: TensorDict) -> TensorDict:
+    """The batch in float32."""
+    return batch.apply(lambda each: each.float() if each.is_floating_point() else each)
+
+
+def pair(loss, batch) -> tuple[LossGradients, LossGradients]:
+    """The loss as it is and traced."""
+    traced = LossGradients(loss, warm_up=1)
+    for _ in range(4):
+        traced(batch.clone())
     loss.zero_grad()
-    assert isinstance(recorded._recording.run, torch.jit.ScriptModule)
-    calls = []
-    loss.register_forward_pre_hook(lambda *_: calls.append(1))
+    return LossGradients(loss, trace=False), traced
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_a_trace_has_the_bits_of_the_loss(name, make_batch):
+    loss = make(name)
+    eager, traced = pair(loss, make_batch(6))
+    gc.collect()  # the trace owns what it needs
+    assert isinstance(traced._trace.run, torch.jit.ScriptModule)
     for seed in (1, 2):
         torch.manual_seed(seed)
-        batch = make_batch(6, twin=True)
+        batch = make_batch(6)
         with torch.no_grad():
             for each in loss.parameters():
                 each.mul_(1.01)
         expected = results(eager, loss, batch)
-        calls.clear()
-        given = results(recorded, loss, batch)
-        assert not calls  # the loss's own code was not run
-        torch.testing.assert_close(given[0], expected[0], rtol=0, atol=0)
-        for ours, theirs in zip(given[1], expected[1], strict=True):
-            assert (ours is None) == (theirs is None)
-            assert ours is None or torch.equal(ours, theirs)
-            # A fused optimizer goes through parameter and gradient by address.
-            assert ours is None or ours.is_contiguous()
-        assert (given[2] == expected[2]).all()
-        assert given[3] == expected[3]  # the generator moved on alike
-    assert all(each is not None for each in given[1])
+        with mock.patch.object(type(loss), "forward", side_effect=AssertionError):
+            given = results(traced, loss, batch)
+        assert_same_bits(given, expected)
 
 
-def test_another_kind_of_batch_or_option_runs_the_loss_itself(make_batch):
+def test_without_torchscript_the_graph_runs_from_python(make_batch, monkeypatch):
+    monkeypatch.delattr(torch.jit, "trace")
     loss = make("osr")
-    recorded = LossGradients(loss, record=True, warm_up=0)
-    recorded(make_batch(6, twin=True))
-    calls = []
-    loss.register_forward_pre_hook(lambda *_: calls.append(1))
-    recorded(make_batch(6, twin=True))
-    assert not calls
-    recorded(make_batch(5, twin=True))
-    assert calls == [1]
-    weighted = make_batch(6, twin=True)
+    eager, traced = pair(loss, make_batch(6))
+    assert isinstance(traced._trace.run, torch.fx.GraphModule)
+    batch = make_batch(6)
+    assert_same_bits(results(traced, loss, batch), results(eager, loss, batch))
+
+
+def test_another_kind_of_batch_runs_the_loss_itself(make_batch):
+    loss = make("osr")
+    eager, traced = pair(loss, make_batch(6))
+    weighted = make_batch(6)
     weighted["priority_weight"] = torch.rand(6, dtype=torch.float64)
-    recorded(weighted)
-    assert calls == [1, 1]
-    loss.num_random = 3
-    recorded(make_batch(6, twin=True))
-    assert calls == [1, 1, 1]
+    for batch in (make_batch(5), weighted, make_batch(6)):
+        assert_same_bits(results(traced, loss, batch), results(eager, loss, batch))
+    assert traced.is_traced
 
 
-def test_a_loss_that_decides_by_numbers_is_run_as_it_is(make_batch, caplog):
+# -- state that changes outside of the traced operations ------------------------------
+
+
+def set_attribute(name: str, value) -> Callable:
+    return lambda loss: setattr(loss, name, value)
+
+
+def freeze(loss) -> None:
+    next(loss.actor_network_params.parameters()).requires_grad_(False)
+
+
+def move(loss) -> None:
+    """Give a parameter other memory."""
+    parameter = next(loss.actor_network_params.parameters())
+    parameter.data = 2 * parameter.data
+
+
+CHANGES = {
+    "weight": set_attribute("min_q_weight", 0.1),
+    "count": set_attribute("num_random", 3),
+    "key": lambda loss: loss.set_keys(reward="other"),
+    "gamma": lambda loss: loss.make_value_estimator(gamma=0.5),
+    "gamma in place": lambda loss: loss.value_estimator.gamma.fill_(0.5),
+    "estimator": lambda loss: loss.make_value_estimator("td0", gamma=0.3),
+    "requires_grad": freeze,
+    "memory": move,
+    "dtype": lambda loss: loss.float().double(),
+    "forward": lambda loss: setattr(
+        loss, "forward", lambda batch, old=loss.forward: old(batch) * 2
+    ),
+    "hook": lambda loss: loss.register_forward_hook(lambda *each: each[2] * 2),
+    "hook of a network": lambda loss: loss.actor_network.register_forward_hook(
+        lambda *_: None
+    ),
+    "eval": lambda loss: loss.eval(),
+    "log_alpha": lambda loss: loss.log_alpha.data.fill_(1.0),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_what_is_changed_later_counts_at_once(change, make_batch):
+    loss = make("osr")
+    batch = make_batch(6)
+    batch["next", "other"] = 3 * batch["next", "reward"]
+    eager, traced = pair(loss, batch)
+    assert traced.is_traced
+    CHANGES[change](loss)
+    retrace = change == "weight"
+    traced.warm_up = 1 if retrace else 100
+    for _ in range(5):
+        assert_same_bits(results(traced, loss, batch), results(eager, loss, batch))
+    in_place = change in ("gamma in place", "log_alpha")  # a trace reads tensors anew
+    assert traced.is_traced == (retrace or in_place)
+
+
+@pytest.mark.parametrize("mode", ["interaction", "autocast"])
+def test_modes_of_the_caller_count(mode, make_batch):
+    loss = make("osr").float()
+    batch = single(make_batch(6))
+    eager, traced = pair(loss, batch)
+    context = {
+        "interaction": set_interaction_type(InteractionType.DETERMINISTIC),
+        "autocast": torch.autocast("cpu", torch.bfloat16),
+    }[mode]
+    with context:
+        assert_same_bits(results(traced, loss, batch), results(eager, loss, batch))
+
+
+class Regression(LossModule):
+    """A loss of the user's own, with a state that its forward may change."""
+
+    network: TensorDictModule
+    network_params: TensorDictParams
+    target_network_params: TensorDictParams
+
+    def __init__(self, kind: str) -> None:
+        super().__init__()
+        self.kind, self.calls, self.weights = kind, 0, [1.0]
+        torch.manual_seed(0)
+        between = {"batch norm": nn.BatchNorm1d(4), "dropout": nn.Dropout(0.5)}
+        layers = nn.Linear(3, 4), between.get(kind, nn.Tanh()), nn.Linear(4, 1)
+        network = nn.Sequential(*layers).double()
+        module = TensorDictModule(network, ["observation"], ["value"])
+        self.convert_to_functional(module, "network", create_target_params=False)
+        self.register_buffer("mean", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("share", torch.ones((), dtype=torch.float64))
+
+    in_keys, out_keys = ["observation"], ["loss"]
+
+    def forward(self, batch):
+        with self.network_params.to_module(self.network):
+            value = self.network(batch)["value"]
+        weight = self.weights[0]
+        if self.kind == "assigned":
+            self.mean = 0.9 * self.mean + value.detach().mean()
+        elif self.kind == "in place":
+            self.mean.mul_(0.9).add_(value.detach().mean())
+        elif self.kind == "schedule":
+            self.calls += 1
+            weight = 1 / self.calls
+        elif self.kind == "elsewhere":
+            weight = ELSEWHERE[0]
+        distance = weight * self.share * (value - 1 + self.mean).square().mean()
+        return TensorDict({"loss_value": distance})
+
+
+ELSEWHERE = [1.0]
+
+
+@pytest.mark.parametrize(
+    ("kind", "is_traced"),
+    [
+        ("plain", True),
+        ("dropout", True),
+        ("assigned", False),
+        ("in place", False),
+        ("schedule", False),
+        ("batch norm", False),
+    ],
+)
+def test_a_loss_with_a_state_of_its_own_is_not_frozen(
+    kind, is_traced, make_batch, caplog
+):
+    losses = Regression(kind), Regression(kind)
+    plain, traced = (
+        LossGradients(each, trace=trace, warm_up=3)
+        for each, trace in zip(losses, (False, True), strict=True)
+    )
+    for _ in range(30):
+        batch = make_batch(6)
+        found = [
+            results(gradients, loss, batch)
+            for gradients, loss in zip((traced, plain), losses[::-1], strict=True)
+        ]
+        assert_same_bits(*found)
+    assert traced.is_traced == is_traced
+    assert ("runs without a trace" in caplog.text) != is_traced
+
+
+@pytest.mark.parametrize("change", ["list", "assigned", "in place", "eval"])
+def test_a_users_own_loss_is_followed(change, make_batch):
+    loss, batch = Regression("dropout"), make_batch(6)
+    eager, traced = pair(loss, batch)
+    assert traced.is_traced
+    {
+        "list": lambda: loss.weights.__setitem__(0, 2.0),
+        "assigned": lambda: setattr(loss, "share", 3 * loss.share),
+        "in place": lambda: loss.share.mul_(3),
+        "eval": lambda: loss.network.eval(),
+    }[change]()
+    for _ in range(5):
+        assert_same_bits(results(traced, loss, batch), results(eager, loss, batch))
+
+
+def test_numbers_from_elsewhere_are_found_by_comparison(
+    make_batch, caplog, monkeypatch
+):
+    monkeypatch.setattr(traced_update, "CHECK_INTERVAL", 10)
+    loss, batch = Regression("elsewhere"), make_batch(6)
+    eager, traced = pair(loss, batch)
+    monkeypatch.setitem(globals(), "ELSEWHERE", [2.0])
+    for _ in range(10):
+        last = results(traced, loss, batch)
+    assert_same_bits(last, results(eager, loss, batch))
+    assert "it reads numbers from outside of its attributes" in caplog.text
+
+
+def test_a_loss_that_decides_by_numbers_runs_as_it_is(make_batch, caplog):
     class Deciding(CQLLoss):
         def forward(self, tensordict):
             if (tensordict["action"] > 0).any():
@@ -157,24 +348,7 @@ def test_a_loss_that_decides_by_numbers_is_run_as_it_is(make_batch, caplog):
 
     loss = Deciding(*networks()).double()
     SoftUpdate(loss, tau=0.1)
+    eager, traced = pair(loss, make_batch(6))
     batch = make_batch(6)
-    for gradients in (LossGradients(loss, record=True, warm_up=0), LossGradients(loss)):
-        losses, found, *_ = results(gradients, loss, batch)
-    assert "Deciding runs without a recording" in caplog.text
-    assert all(value.isfinite() for value in losses.values())
-    assert sum(each is not None for each in found) > 4
-
-
-def test_the_same_weights_are_trained_by_a_fused_optimizer(make_batch):
-    batch, trained = make_batch(6, twin=True), []
-    for record in (False, True):
-        torch.manual_seed(0)
-        loss = make("osr")
-        gradients = LossGradients(loss, record=record, warm_up=0)
-        optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2, fused=True)
-        for _ in range(3):
-            gradients(batch.clone())
-            optimizer.step()
-            optimizer.zero_grad()
-        trained.append(loss.state_dict().values())
-    assert all(torch.equal(*pair) for pair in zip(*trained, strict=True))
+    assert_same_bits(results(traced, loss, batch), results(eager, loss, batch))
+    assert "Deciding runs without a trace" in caplog.text

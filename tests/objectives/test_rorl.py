@@ -173,8 +173,8 @@ def test_the_weight_of_the_uncertainty_falls_to_its_floor(make_networks) -> None
 
 def test_a_recording_sees_the_weight_fall(make_networks, make_batch) -> None:
     loss, batch = make_loss(make_networks()), make_batch(10)
-    recorded = LossGradients(loss, record=True, warm_up=0)
-    plain = LossGradients(loss)
+    recorded = LossGradients(loss, warm_up=0)
+    plain = LossGradients(loss, trace=False)
     found = []
     for gradients in (plain, recorded, recorded):
         torch.manual_seed(5)

@@ -19,6 +19,7 @@ from torchrl_osr import (
     OSRVLoss,
     StatePerturbation,
 )
+from torchrl_osr.fast import fast_update
 from torchrl_osr.lab.data import make_replay_buffer
 from torchrl_osr.lab.losses import EDACLoss
 from torchrl_osr.modules import (
@@ -26,7 +27,7 @@ from torchrl_osr.modules import (
     tanh_gaussian_actor,
     tanh_gaussian_inverse_dynamics,
 )
-from torchrl_osr.trainers import OfflineTrainer
+from torchrl_osr.trainers import Evaluation, OfflineTrainer
 
 LOSSES = {
     "OSR": {"num_random": 2},
@@ -34,6 +35,14 @@ LOSSES = {
     "CQL": {"target_action_gap": 0.0},
     "OSR-10": {"min_q_weight": 0, "deterministic_backup": False},
     "EDAC": {},
+}
+UPDATE = {
+    "target_updater",
+    "policy_delay",
+    "policy_params",
+    "autocast_dtype",
+    "trace",
+    "warm_up",
 }
 CRITICS = {"OSR-10": 10, "EDAC": 3}
 
@@ -90,23 +99,30 @@ def build_run(folder, name="OSR", *, device="cpu", loss_options=(), **options):
     loss = build_loss(name, **dict(loss_options)).to(device)
     targets = name != "inverse dynamics"
     perturbation = StatePerturbation(0.1, seed=0)
+    update = {
+        "target_updater": SoftUpdate(loss, tau=0.1) if targets else None,
+        "policy_params": policy_params(loss),
+        "trace": False,
+    }
+    update |= {name: options.pop(name) for name in UPDATE & options.keys()}
     options = {
         "total_steps": 12,
-        "target_net_updater": SoftUpdate(loss, tau=0.1) if targets else None,
-        "policy_params": policy_params(loss),
         "components": {"perturbation": perturbation},
         "log_interval": 4,
-        "eval_interval": 6,
+        "checkpoint_interval": 6,
         "progress": False,
     } | options
+    if evaluate := options.pop("evaluate", None):
+        interval = options.pop("eval_interval", 6)
+        options["evaluation"] = Evaluation(
+            evaluate, interval, *options.pop("metric", ())
+        )
     buffer = make_replay_buffer(
         make_data(device), batch_size=8, seed=0, transform=perturbation
     )
-    capturable = options.get("cudagraph", False)
-    optimizer = torch.optim.Adam(
-        loss.parameters(), lr=1e-2, fused=True, capturable=capturable
-    )
-    return OfflineTrainer(loss, optimizer, buffer, folder=folder, **options)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2, fused=True)
+    update = fast_update(loss, optimizer, **update)
+    return OfflineTrainer(update, buffer, folder=folder, **options)
 
 
 def state_of_run(trainer: OfflineTrainer) -> list[torch.Tensor]:

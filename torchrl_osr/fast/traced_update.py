@@ -1,18 +1,24 @@
-"""Losses and gradients as a recorded list of tensor operations.
+"""Losses and gradients as a traced list of tensor operations.
 
 An update of small networks is some hundreds of short operations, and around each of
-them Python, TorchRL and autograd take longer than the operation itself. Which
-operations there are does not change from one batch to the next. So they are recorded
-once, by :func:`torch.fx.experimental.proxy_tensor.make_fx`, forward and backward, and
-repeated with the next batches: the same operations on the same numbers in the same
-order, hence the same bits, without a compiler. TorchScript's interpreter repeats them,
-where it can: without Python in between they take two thirds of the time.
+them Python, TorchRL and autograd take longer than the operation itself. The operations
+are the same for each batch. So they are traced once, by
+:func:`torch.fx.experimental.proxy_tensor.make_fx`, forward and backward, and repeated
+with the next batches: the same operations on the same numbers in the same order, hence
+the same bits, without a compiler.
+
+TorchScript's interpreter repeats them: without Python in between they take two thirds
+of the time. It is deprecated in PyTorch 2.13, in which nothing else repeats operations
+from C++ without a compiler. Where it is missing, the same graph runs from Python, as
+the ``torch.fx.GraphModule`` that the tracer returns.
 """
 
 from __future__ import annotations
 
+import enum
 import logging
 import operator
+import types
 import warnings
 from collections.abc import Callable, Sequence
 from functools import cache
@@ -20,14 +26,21 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 from torch.fx import GraphModule, Node, map_arg
 from torch.fx.experimental.proxy_tensor import make_fx
+from torch.utils.hooks import RemovableHandle
+from torchrl.data import TensorSpec
 from torchrl.objectives import LossModule
 
 log = logging.getLogger(__name__)
 
-Run = Callable[..., Sequence[Tensor]]
+MAX_CHANGES = 20
+"""Changes of a loss's attributes after which it is no longer traced."""
+
+CHECK_INTERVAL = 1000
+"""Updates between two comparisons of a trace with the loss itself."""
 
 
 class LossGradients:
@@ -36,13 +49,10 @@ class LossGradients:
     Args:
         loss_module: whose entries ``loss_*`` are summed.
         autocast_dtype: of the matrix products. Default: that of the parameters.
-        parameters: that are given a gradient; losses and metrics stay the same.
-            Default: all of the loss module.
-        record: repeat a recording, on a CPU. Python code in the losses is not run again
-            then: hooks, counters or prints in them stay silent. A loss that decides by
-            numbers cannot be recorded and runs as it is.
-        warm_up: batches before the recording, which takes as long as some hundreds of
-            updates save: short runs do without. Default 100.
+        parameters: that get a gradient; losses and metrics stay the same. Default: all
+            of the loss module.
+        trace: repeat a trace, on a CPU, unless the loss is compiled.
+        warm_up: updates before the trace, at least 1.
     """
 
     def __init__(
@@ -51,24 +61,32 @@ class LossGradients:
         autocast_dtype: torch.dtype | None = None,
         *,
         parameters: Sequence[nn.Parameter] | None = None,
-        record: bool = False,
+        trace: bool = True,
         warm_up: int = 100,
     ) -> None:
         self.loss_module, self.autocast_dtype = loss_module, autocast_dtype
-        self.parameters = parameters
+        self.parameters, self.warm_up = parameters, max(warm_up, 1)
         self.device = next(loss_module.parameters()).device
-        self.record = record and self.device.type == "cpu"
-        self._countdown = warm_up
-        self._recording: _Recording | None = None
+        self.may_trace = trace and self.device.type == "cpu"
+        self._countdown, self._changes, self._replays = self.warm_up, -1, 0
+        self._state: _State | None = None
+        self._trace: _Trace | None = None
+
+    @property
+    def is_traced(self) -> bool:
+        """Whether there is a trace to repeat."""
+        return self._trace is not None
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
         """Detached losses and metrics of a batch; adds to the parameters' ``grad``."""
-        if self._recording is not None and self._recording.fits(batch):
-            return self._recording(batch)
-        if self.record and self._recording is None:
-            self._countdown -= 1
-            if self._countdown < 0:
-                self.record = self._try_to_record(batch)
+        if self.may_trace:
+            self._look_for_changes()
+            if self._trace is None:
+                self._countdown -= 1
+                if self._countdown < 0:
+                    self._try_to_trace(batch)
+            elif self._trace.fits(batch):
+                return self._replay(self._trace, batch)
         losses = self._losses(batch)
         _total(losses).backward(inputs=self.parameters)
         return losses.detach()
@@ -79,106 +97,226 @@ class LossGradients:
             losses: TensorDictBase = self.loss_module(batch)
         return losses
 
-    def _try_to_record(self, batch: TensorDictBase) -> bool:
+    def _look_for_changes(self) -> None:
+        """Forget the trace, and wait again, if the loss is not what it was."""
+        if self._state is not None and self._state.holds():
+            return
+        self._state, self._trace = _State(self.loss_module), None
+        self._countdown, self._changes = self.warm_up, self._changes + 1
+        if self.loss_module._compiled_call_impl is not None:
+            self.may_trace = False
+        elif self._changes >= MAX_CHANGES:
+            self._give_up("its attributes keep changing")
+
+    def _try_to_trace(self, batch: TensorDictBase) -> None:
+        assert self._state is not None
         generator = torch.get_rng_state()
+        before = [each.detach().clone() for each in self._state.tensors]
         try:
-            self._losses(batch.copy())  # a loss may look at its first batch
-            torch.set_rng_state(generator)
-            self._recording = _Recording(
-                self._losses, self.loss_module, batch, self.parameters
-            )
-        except Exception as error:  # whatever a loss does that cannot be recorded
-            log.warning(
-                f"{type(self.loss_module).__name__} runs without a recording, slower: "
-                f"{type(error).__name__}: {str(error).splitlines()[0]}"
-            )
+            trace = _Trace(self._losses, self.loss_module, batch, self.parameters)
+            after = self._state.tensors
+            if all(map(torch.equal, after, before)) and self._state.holds():
+                self._trace = trace
+            else:
+                self._give_up("it writes into its own tensors")
+        except Exception as error:  # whatever a loss does that cannot be traced
+            self._give_up(f"{type(error).__name__}: {str(error).splitlines()[0]}")
         finally:
             torch.set_rng_state(generator)
-        return self._recording is not None
+            if self._trace is None:
+                for tensor, value in zip(self._state.tensors, before, strict=True):
+                    tensor.data.copy_(value)
+
+    def _replay(self, trace: _Trace, batch: TensorDictBase) -> TensorDictBase:
+        """Repeat the trace; at first and now and then, compare it with the loss."""
+        check = self._replays % CHECK_INTERVAL == 0
+        self._replays += 1
+        start = torch.get_rng_state() if check else None
+        with torch.no_grad():
+            outputs = trace.run(*trace.tensors(batch))
+        if start is not None:
+            end = torch.get_rng_state()
+            torch.set_rng_state(start)
+            wanted = trace.update(*trace.tensors(batch))
+            wanted, found = [*wanted, torch.get_rng_state()], [*outputs, end]
+            if not all(map(torch.equal, found, wanted)):
+                outputs = wanted
+                self._give_up("it reads numbers from outside of its attributes")
+        return trace.spread(outputs, batch)
+
+    def _give_up(self, why: str) -> None:
+        self.may_trace, self._trace = False, None
+        name = type(self.loss_module).__name__
+        log.warning(f"{name} runs without a trace, slower: {why}")
+
+
+Run = Callable[..., Sequence[Tensor]]
 
 
 def _total(losses: TensorDictBase) -> Any:
     return sum(value for key, value in losses.items() if key.startswith("loss_"))
 
 
-class _Recording:
+_OPAQUE = (
+    *(type, types.FunctionType, types.MethodType, types.ModuleType),
+    *(enum.Enum, TensorSpec),
+)
+_INERT = (nn.Linear, nn.ReLU)
+"""Modules without a state of their own but for tensors and hooks, of which a network
+has most."""
+
+
+_USUAL = {key for key, value in vars(nn.Module()).items() if value in ({}, set())}
+
+
+class _State:
+    """All that a loss may decide by: attributes of it and its parts, and torch's modes.
+
+    Its parts are the modules and other objects that it refers to. Numbers in the
+    tensors do not count: a trace reads them anew.
+    """
+
+    def __init__(self, loss_module: LossModule) -> None:
+        self.tensors: list[Tensor] = []
+        owners: list[dict[str, Any]] = []
+        seen: set[int] = set()
+        stack: list[Any] = [loss_module]
+        while stack:
+            each = stack.pop()
+            if id(each) in seen:
+                continue
+            seen.add(id(each))
+            if isinstance(each, Tensor):
+                self.tensors.append(each)
+            elif isinstance(each, TensorDictBase):
+                stack += each.values(True, True)
+            elif isinstance(each, dict):
+                stack += each.values()
+            elif isinstance(each, (list, tuple, set)):
+                stack += each
+            elif hasattr(each, "__dict__") and not isinstance(each, _OPAQUE):
+                stack += vars(each).values()
+                if type(each) not in _INERT:
+                    owners.append(vars(each))
+        self._traits = self._traits_now()
+        self._attributes = []
+        for attributes in owners:
+            # Most of what a module has are empty dictionaries. What comes into them
+            # also changes the length, or the number of the next hook.
+            names = [key for key in attributes if attributes[key] or key not in _USUAL]
+            if len(names) > 1:
+                get = operator.itemgetter(*names)
+                row = attributes, len(attributes), get, _copied(get(attributes))
+                self._attributes.append(row)
+
+    def holds(self) -> bool:
+        """Whether everything is as it was."""
+        try:
+            return self._traits == self._traits_now() and all(
+                len(attributes) == length and get(attributes) == before
+                for attributes, length, get, before in self._attributes
+            )
+        except (KeyError, RuntimeError, ValueError):  # for arrays == has no answer
+            return False
+
+    def _traits_now(self) -> list[Any]:
+        modes = (
+            torch.is_grad_enabled(),
+            torch.is_autocast_enabled("cpu") and torch.get_autocast_dtype("cpu"),
+            torch.get_default_dtype(),
+            interaction_type(),
+            RemovableHandle.next_id,
+        )
+        traits = [(each.data_ptr(), each.requires_grad) for each in self.tensors]
+        return [modes, traits]
+
+
+def _copied(value: Any) -> Any:
+    """The containers in a value as they are now; everything else by reference."""
+    if isinstance(value, dict):
+        return {key: _copied(each) for key, each in value.items()}
+    if type(value) in (list, tuple):
+        return type(value)(map(_copied, value))
+    return set(value) if isinstance(value, set) else value
+
+
+class _Trace:
     """The operations of one update.
 
     Args:
         losses: of a batch, with their graph.
-        loss_module: its parameters, buffers and options are part of the recording.
+        loss_module: its parameters, buffers and options are part of the trace.
         batch: of the kind that is to come; a loss may write into it.
-        parameters: that are given a gradient; ``None`` for all.
+        parameters: that get a gradient; ``None`` for all.
     """
 
     def __init__(
         self,
-        losses: Any,
+        losses: Callable[[TensorDictBase], TensorDictBase],
         loss_module: LossModule,
         batch: TensorDictBase,
         parameters: Sequence[nn.Parameter] | None,
     ) -> None:
-        self.loss_module = loss_module
         given = loss_module.parameters() if parameters is None else parameters
-        self.parameters = [each for each in given if each.requires_grad]
-        self.keys: list[NestedKey] = list(batch.keys(True, True))
-        self.names: list[str] = []
-        self.written: list[NestedKey] = []
-        self.kind, self.options = self._kind(batch), _options(loss_module)
-        self.trained: list[nn.Parameter] = []
+        self._losses = losses
+        self._parameters = [each for each in given if each.requires_grad]
+        self._trained: list[nn.Parameter] = []
+        self._keys: list[NestedKey] = list(batch.keys(True, True))
+        self._names: list[str] = []
+        self._written: list[NestedKey] = []
+        self._kind = self._kind_of(batch)
+        self._empty = TensorDict({}, batch.batch_size, device=batch.device)
+        tensors = self.tensors(batch)
+        self.run = _without_python(_simplified(make_fx(self.update)(*tensors)), tensors)
 
-        def update(*tensors: Tensor) -> list[Tensor]:
-            inputs = dict(zip(self.keys, tensors, strict=True))
-            own = TensorDict({}, batch.batch_size, device=batch.device)
-            for key, value in inputs.items():
-                own.set(key, value)
-            result = losses(own)
-            found = torch.autograd.grad(
-                _total(result), self.parameters, allow_unused=True
-            )
-            pairs = zip(self.parameters, found, strict=True)
-            given = [(each, value) for each, value in pairs if value is not None]
-            self.trained = [each for each, _ in given]
-            self.names = list(result.keys())
-            self.written = [
-                key for key, value in own.items(True, True)
-                if inputs.get(key) is not value
-            ]  # fmt: skip
-            return [
-                *(value.detach() for value in result.values()),
-                *(own.get(key) for key in self.written),
-                *(_laid_out(value, like=each) for each, value in given),
-            ]
-
-        tensors = self._tensors(batch)
-        self.run = _without_python(_simplified(make_fx(update)(*tensors)), tensors)
-
-    def fits(self, batch: TensorDictBase) -> bool:
-        """Whether batch and options are of the kind that was recorded."""
-        return (
-            self._kind(batch) == self.kind
-            and _options(self.loss_module) == self.options
-        )
+    def update(self, *tensors: Tensor) -> list[Tensor]:
+        """Return losses, entries written to the batch, and gradients."""
+        inputs = dict(zip(self._keys, tensors, strict=True))
+        batch = self._empty.copy()
+        for key, value in inputs.items():
+            batch.set(key, value)
+        losses = self._losses(batch)
+        found = torch.autograd.grad(_total(losses), self._parameters, allow_unused=True)
+        pairs = zip(self._parameters, found, strict=True)
+        given = [(each, value) for each, value in pairs if value is not None]
+        self._trained, self._names = [each for each, _ in given], list(losses.keys())
+        self._written = [
+            key for key, value in batch.items(True, True)
+            if inputs.get(key) is not value
+        ]  # fmt: skip
+        return [
+            *(value.detach() for value in losses.values()),
+            *(batch.get(key) for key in self._written),
+            *(_laid_out(value, like=each) for each, value in given),
+        ]
 
     @torch.no_grad()
-    def __call__(self, batch: TensorDictBase) -> TensorDictBase:
-        outputs = iter(self.run(*self._tensors(batch)))
-        losses = TensorDict({name: next(outputs) for name in self.names}, [])
-        for key in self.written:
-            batch.set(key, next(outputs))
-        for parameter, gradient in zip(self.trained, outputs, strict=True):
+    def spread(
+        self, outputs: Sequence[Tensor], batch: TensorDictBase
+    ) -> TensorDictBase:
+        """Put written entries into the batch, add gradients, and return the losses."""
+        remaining = iter(outputs)
+        losses = TensorDict({name: next(remaining) for name in self._names}, [])
+        for key in self._written:
+            batch.set(key, next(remaining))
+        for parameter, gradient in zip(self._trained, remaining, strict=False):
             grad = parameter.grad
             parameter.grad = gradient if grad is None else grad + gradient
         return losses
 
-    def _tensors(self, batch: TensorDictBase) -> list[Tensor]:
-        return [batch.get(key) for key in self.keys]
+    def fits(self, batch: TensorDictBase) -> bool:
+        """Return whether a batch is of the kind that was traced."""
+        return bool(self._kind_of(batch) == self._kind)
 
-    def _kind(self, batch: TensorDictBase) -> Any:
+    def tensors(self, batch: TensorDictBase) -> list[Tensor]:
+        """Return the entries of a batch in the order of the trace."""
+        return [batch.get(key) for key in self._keys]
+
+    def _kind_of(self, batch: TensorDictBase) -> Any:
         entries = {
             key: (value.shape, value.dtype, value.requires_grad)
             for key, value in batch.items(True, True)
-            if key in self.keys or key not in self.written
+            if key in self._keys or key not in self._written
         }
         return batch.batch_size, entries
 
@@ -191,18 +329,6 @@ def _laid_out(gradient: Tensor, like: Tensor) -> Tensor:
     if gradient.stride() == like.stride():
         return gradient
     return torch.empty_like(like).copy_(gradient)
-
-
-def _options(loss_module: LossModule) -> list[dict[str, Any]]:
-    """Numbers, words and flags of a loss and its parts: what Python may decide by."""
-    plain = (bool, int, float, str, type(None))
-    parts = [each for each in loss_module.children() if isinstance(each, LossModule)]
-    return [
-        {
-            name: value for name, value in vars(each).items()
-            if isinstance(value, plain) and not name.startswith("_")
-        } for each in (loss_module, *parts)
-    ]  # fmt: skip
 
 
 _VIEWS = {

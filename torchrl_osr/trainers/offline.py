@@ -1,8 +1,7 @@
-"""TorchRL's :class:`~torchrl.trainers.Trainer`, driven by a data set.
+"""Offline version of TorchRL's :class:`~torchrl.trainers.Trainer`.
 
-TorchRL 0.14.1 has no offline trainer: every trainer asks a collector for frames. Here
-the collector is a clock, so that frames count gradient steps, and the trainer's own
-loop, hooks and optimization stepper are used as they are.
+Every trainer of TorchRL 0.14.1 asks a collector for frames. Here the collector counts
+gradient steps, and TorchRL's own loop and hooks are used as they are.
 """
 
 from __future__ import annotations
@@ -12,314 +11,195 @@ import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from functools import partial
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import nn
 from torchrl.checkpoint import GlobalRNGState
-from torchrl.data import ReplayBuffer
-from torchrl.objectives import LossModule, TargetNetUpdater
+from torchrl.data import PrioritizedSampler, ReplayBuffer
 from torchrl.record.loggers import CSVLogger, Logger
 from torchrl.trainers import OptimizationStepper, Trainer
 
-from torchrl_osr._checks import check_choice, check_positive
-from torchrl_osr._files import finite_or_none
-from torchrl_osr.fast import fuse_critics
-from torchrl_osr.fast.traced_update import LossGradients
-from torchrl_osr.trainers.checkpoints import Checkpoints, GeneratorState
-from torchrl_osr.trainers.csv_rows import cut_back
-from torchrl_osr.trainers.cudagraph import captured, check_capturable
-from torchrl_osr.trainers.hardware import check_cudagraph
+from torchrl_osr._files import finite_or_none, whole_file
+from torchrl_osr.fast import NonfiniteError, Update
+from torchrl_osr.trainers.checkpoints import Checkpoints, SamplerState
 from torchrl_osr.trainers.interruption import (
     EXIT_CODES,
     Interrupted,
     StopRequest,
     signals_noted,
 )
-from torchrl_osr.trainers.nonfinite import NonfiniteCheck
 from torchrl_osr.trainers.progress import Progress
 
 log = logging.getLogger(__name__)
 
 
-class StepClock:
-    """Stands in for a collector: an empty batch of n rows is n gradient steps.
+@dataclass(frozen=True)
+class Evaluation:
+    """How and how often a run is evaluated.
 
-    A batch ends wherever something is due: a log entry, an evaluation, a checkpoint.
-
-    Raises:
-        ValueError: if one of them is not at least 1.
+    Attributes:
+        run: returns JSON-compatible results by name; its numbers are logged.
+        interval: steps between two evaluations. Default 5000.
+        metric: the result that decides the best checkpoint. Default ``"score"``.
+        best: whether the ``"max"`` (default) or the ``"min"`` is best.
     """
 
-    init_random_frames = 0
-
-    def __init__(self, total: int, intervals: Sequence[int]) -> None:
-        if total < 1 or min(intervals) < 1:
-            raise ValueError(
-                "steps and intervals must be at least 1, got "
-                f"total_steps={total} and log, eval and checkpoint intervals "
-                f"{intervals}."
-            )
-        self.total = total
-        self.intervals = intervals
-        self.step = 0
-
-    def __iter__(self) -> Iterator[TensorDictBase]:
-        while self.step < self.total:
-            due = min(
-                (self.step // interval + 1) * interval for interval in self.intervals
-            )
-            steps = min(due, self.total) - self.step
-            self.step += steps
-            yield TensorDict({}, [steps])
-
-    def shutdown(self) -> None:
-        """Do nothing: the trainer calls this on its collector."""
-
-
-class SumOfLosses(OptimizationStepper):
-    """One backward and one step on the sum of the ``loss_*`` entries, if it is finite.
-
-    TorchRL 0.14.1's default stepper hands back losses with their graph attached and
-    reads the gradient norm back to the host at every step; this one does neither.
-
-    Args:
-        check: steps the optimizer, unless a loss or a gradient is not finite.
-        gradients: maps a batch to its detached losses, and puts the gradients of their
-            sum where the optimizer looks.
-        between: the same for the updates between those of ``gradients``. Default: those
-            are all.
-        delay: every how many updates ``gradients`` has its turn. Default 1.
-    """
-
-    def __init__(
-        self,
-        check: NonfiniteCheck,
-        gradients: LossGradients,
-        between: LossGradients | None = None,
-        delay: int = 1,
-    ) -> None:
-        self.check, self.gradients = check, gradients
-        self.between, self.delay = between, delay
-        self.run: Callable[[TensorDictBase], TensorDictBase] = self.update
-
-    def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
-        """Run one update and return the detached losses and metrics."""
-        if self.between is None or self.is_whole(trainer):
-            return self.run(sub_batch)
-        return self.update(sub_batch, self.between)
-
-    def is_whole(self, trainer: Trainer) -> bool:
-        """Whether the running update is one of ``gradients``."""
-        count: int = trainer._optim_count
-        return count % self.delay == 0
-
-    def update(
-        self, batch: TensorDictBase, gradients: LossGradients | None = None
-    ) -> TensorDictBase:
-        """Losses of a batch, their gradients, and the optimizer's step."""
-        try:
-            losses = (gradients or self.gradients)(batch)
-            self.check.step(batch, losses)
-            return losses
-        finally:
-            # Also after an error: the next backward must not add to these gradients.
-            self.check.optimizer.zero_grad(set_to_none=True)
-
-    def capture(self) -> None:
-        """Let updates be replayed as a CUDA graph from now on."""
-        self.run = captured(self.update, self.check.loss_module)
+    run: Callable[[], dict[str, Any]]
+    interval: int = 5000
+    metric: str = "score"
+    best: Literal["max", "min"] = "max"
 
 
 class OfflineTrainer(Trainer):
-    """Train a loss module on a replay buffer, with evaluation, checkpoints and resume.
+    """Train on a replay buffer, with evaluation, checkpoints and resume.
 
-    It knows no algorithm: any :class:`~torchrl.objectives.LossModule` whose ``loss_*``
-    entries may be summed. One step is: sample a batch, compute the losses, backward on
-    their sum, optimizer, target networks; TorchRL's hooks (:meth:`register_op`) come in
-    between.
-
-    A killed run continues from its newest whole checkpoint and ends with the same bits
-    as one that was never killed (on the same machine and libraries, on a CPU):
-    networks, optimizer, targets, random generators and ``components`` are restored.
+    It knows no algorithm: one step is a batch and one ``update`` on it. A killed run
+    continues from its newest whole checkpoint and ends with the same bits as one that
+    was never killed (on the same machine and libraries, on a CPU): networks, optimizer,
+    targets, random generators, the order or priorities of the buffer's sampler, and
+    ``components`` are restored.
 
     Args:
-        loss_module: what to train.
-        optimizer: over the loss module's parameters.
+        update: one gradient step; :func:`~torchrl_osr.fast.fast_update` returns it from
+            a loss module, an optimizer and a target updater.
         replay_buffer: sampled once a step, with a generator that the trainer puts in.
+            The priorities of a prioritised buffer are updated after each step.
         total_steps: gradient steps of the whole run.
-        folder: where checkpoints go; made if need be.
+        folder: where checkpoints go; created if needed.
 
     Keyword Args:
         seed: of the sampling. Default 0.
-        target_net_updater: stepped after each update. Default: none.
-        policy_delay: ``policy_params`` and the target networks move only at every
-            ``policy_delay``-th update, as in TD3. At the other updates they and their
-            optimizer's state stay as they are. Default 1.
-        policy_params: see there; needed with a ``policy_delay`` above 1.
-        evaluate: returns JSON-compatible results, of which numbers are logged and all
-            are kept in ``history``, with their ``"step"``. Called before the first step
-            of a new run, every ``eval_interval`` steps and at the end. Default: none.
-        metric: which result decides the best checkpoint, and whether ``"max"`` or
-            ``"min"`` is best. Default ``("score", "max")``.
-        components: more state to checkpoint, by name: a transform with a generator,
-            observation statistics, a sampler without replacement.
+        hooks: pairs of a place in TorchRL's loop and a function, see
+            :meth:`~torchrl.trainers.Trainer.register_op`. Default: none.
+        components: more state to checkpoint, by name: a transform with a generator, a
+            learning rate schedule, an average of the weights.
+        evaluation: run before the first step, at its interval and at the end, after the
+            checkpoint of the step. The results are in ``history``. One that fails is
+            logged and counted in ``failed_evaluations``; the run goes on. Default:
+            none.
+        checkpoint_interval: steps between checkpoints. Default: that of the evaluation,
+            or 5000.
+        checkpoints_kept: number of regular checkpoints that stay, beside the newest
+            and the best. Default 2.
         loggers: TorchRL loggers; all get every number. Default: none.
         log_interval: steps between log entries, which are means over them. Default 200.
-        eval_interval: steps between evaluations. Default 5000.
-        checkpoint_interval: steps between checkpoints. Default: ``eval_interval``.
-        checkpoints_kept: how many of the newest regular ones stay, beside the newest of
-            all and the best. Default 2.
-        description: names the phase in the progress bar and the logs. Default "train".
-        progress: show a progress bar when on a terminal. Without one, a line is logged
-            every half minute. Default ``True``.
-        autocast_dtype: compute the losses' matrix products in this precision
-            (``torch.bfloat16``). Default: that of the parameters.
-        record: repeat a recording of the losses' tensor operations, and of their
-            gradients', from the 101st update on: the same bits in less time, on a CPU.
-            Python code in the losses, such as a hook, is not run again. Default
-            ``False``.
-        compile: call the loss module through :func:`torch.compile`, in place. It draws
-            other random numbers then. Default ``False``.
-        cudagraph: replay each update, from the batch to the optimizer's step, as one
-            CUDA graph. Default ``False``.
-        value_limits: largest plausible magnitude of a logged mean, by its name; warns
-            once for each that is exceeded. Default: none.
+        value_limits: largest plausible magnitude of a logged mean, by name; a larger
+            one is warned of once. Default: none.
+        description: name of the phase in the progress bar and the logs. Default
+            "train".
+        progress: show a progress bar on a terminal; elsewhere a line is logged every
+            half minute. Default ``True``.
 
     Raises:
-        ValueError: if an option is unknown or needs another device or optimizer; while
-            training, if the folder's checkpoint is beyond ``total_steps``, or the
-            results of ``evaluate`` lack the metric.
+        ValueError: while training, if the folder's checkpoint is beyond
+            ``total_steps``, or the results of the evaluation lack the metric.
         FloatingPointError: while training, if a loss or a gradient is not finite; the
-            batch that caused it is saved beside the checkpoints.
+            batch is saved beside the checkpoints.
         Interrupted: while training, after SIGTERM, SIGHUP or Ctrl-C, when a checkpoint
             is written.
-        CheckpointError: if a checkpoint in ``folder`` does not fit.
-        OSError: if there is no room for the checkpoints, or their folder is removed.
+        CheckpointError: while training, if a checkpoint in ``folder`` does not fit.
+        OSError: while training, if there is no room for the checkpoints, or their
+            folder is removed.
     """
 
     def __init__(
         self,
-        loss_module: LossModule,
-        optimizer: torch.optim.Optimizer,
+        update: Update,
         replay_buffer: ReplayBuffer,
         total_steps: int,
         folder: Path | str,
         *,
         seed: int = 0,
-        target_net_updater: TargetNetUpdater | None = None,
-        policy_delay: int = 1,
-        policy_params: Sequence[nn.Parameter] = (),
-        evaluate: Callable[[], dict[str, Any]] | None = None,
-        metric: tuple[str, Literal["min", "max"]] = ("score", "max"),
+        hooks: Sequence[tuple[str, Callable[..., Any]]] = (),
         components: Mapping[str, Any] | None = None,
-        loggers: Sequence[Logger] = (),
-        log_interval: int = 200,
-        eval_interval: int = 5000,
+        evaluation: Evaluation | None = None,
         checkpoint_interval: int | None = None,
         checkpoints_kept: int = 2,
+        loggers: Sequence[Logger] = (),
+        log_interval: int = 200,
+        value_limits: Mapping[str, float] | None = None,
         description: str = "train",
         progress: bool = True,
-        autocast_dtype: torch.dtype | None = None,
-        record: bool = False,
-        compile: bool = False,
-        cudagraph: bool = False,
-        value_limits: Mapping[str, float] | None = None,
     ) -> None:
-        device = next(loss_module.parameters()).device
         if checkpoint_interval is None:
-            checkpoint_interval = eval_interval
-        clock = StepClock(
-            total_steps, (log_interval, eval_interval, checkpoint_interval)
+            checkpoint_interval = evaluation.interval if evaluation else 5000
+        intervals = [log_interval, checkpoint_interval]
+        if evaluation is not None:
+            intervals.append(evaluation.interval)
+        super().__init__(
+            collector=_StepCounter(total_steps, intervals),
+            total_frames=total_steps,
+            frame_skip=1,
+            optim_steps_per_batch=1,
+            loss_module=update.loss_module,
+            optimizer=update.optimizer,
+            optimization_stepper=_Stepper(),
+            progress_bar=False,
+            auto_log_optim_steps=False,
         )
-        self._metric, best_is = metric
-        check_choice("metric[1]", best_is, ("max", "min"))
-        self._choose = max if best_is == "max" else min
-        check_positive("policy_delay", policy_delay, minimum=1)
-        if cudagraph:
-            check_cudagraph(device, policy_delay)
-            check_capturable(optimizer)
-        if compile:
-            loss_module.compile()
-        elif device.type == "cpu":
-            fuse_critics(loss_module)
-
-        # Not handed to Trainer: it would put the whole data set into checkpoints.
+        device = next(update.loss_module.parameters()).device
         generator = torch.Generator(device).manual_seed(seed)
         replay_buffer.set_rng(generator)
-        components = components or {}
+        # The buffer is not handed to TorchRL's trainer, which would put the whole data
+        # set into checkpoints.
+        self.update, self.buffer, self.evaluation = update, replay_buffer, evaluation
+        self.loggers, self.description = loggers, description
         self.history: list[dict[str, Any]] = []
+        self.failed_evaluations: list[dict[str, Any]] = []
         self._saved = {"step": 0}
-        self._model_components = ("loss_module", *components)
+        self._limits = dict(value_limits or {})
+        self._progress = Progress(description, total_steps, progress)
+        self._stop_request = StopRequest()
+        components = dict(components or {})
+        self._model_components = ["loss_module", *components]
         own = {
-            "loss_module": loss_module,
-            "optimizer": optimizer,
-            "sampler": GeneratorState(generator),
+            "loss_module": update.loss_module,
+            "optimizer": update.optimizer,
+            "sampler": SamplerState(replay_buffer, generator),
             "global_rng": GlobalRNGState(),
             "history": self.history,
+            "failed_evaluations": self.failed_evaluations,
             "progress": self._saved,
         }
         if taken := sorted(own.keys() & components):
             raise ValueError(f"components have names of the trainer's own: {taken}.")
         self.checkpoints = Checkpoints(
             folder,
-            own | dict(components),
+            own | components,
             interval=checkpoint_interval,
             kept=checkpoints_kept,
         )
-        self.nonfinite_check = NonfiniteCheck(
-            loss_module, optimizer, self.checkpoints, description
-        )
-        record = record and not (compile or cudagraph)
-        new_gradients = partial(
-            LossGradients, loss_module, autocast_dtype, record=record
-        )
-        between = None
-        if policy_delay > 1:
-            delayed = set(policy_params)
-            rest = [each for each in loss_module.parameters() if each not in delayed]
-            if not delayed:
-                raise ValueError(
-                    f"policy_delay={policy_delay} needs the parameters that it delays: "
-                    "give policy_params."
-                )
-            if not rest:
-                raise ValueError(
-                    f"policy_delay={policy_delay} leaves nothing to train in between, "
-                    "without critics: use policy_delay=1 (optim.policy_delay=1)."
-                )
-            between = new_gradients(parameters=rest)
-        self._stepper = SumOfLosses(
-            self.nonfinite_check, new_gradients(), between, policy_delay
-        )
-        super().__init__(
-            collector=clock,
-            total_frames=total_steps,
-            frame_skip=1,
-            optim_steps_per_batch=1,
-            loss_module=loss_module,
-            optimizer=optimizer,
-            optimization_stepper=self._stepper,
-            progress_bar=False,
-            auto_log_optim_steps=False,
-        )
-        self.buffer, self.cudagraph = replay_buffer, cudagraph
-        self.evaluate, self.eval_interval = evaluate, eval_interval
-        self.loggers, self.description = loggers, description
-        self._limits = dict(value_limits or {})
-        self._progress = Progress(description, total_steps, progress)
-        self._stop_request = StopRequest()
+        self._register(hooks)
 
+    def _register(self, hooks: Sequence[tuple[str, Callable[..., Any]]]) -> None:
+        """Register all hooks; they run in this order.
+
+        For each gradient step:
+
+        1. ``process_optim_batch``: draw a batch, then the caller's hooks on it.
+        2. The update: losses, gradients, optimizer, target networks.
+        3. ``post_optim``: the caller's, such as schedules and averages of weights.
+        4. ``post_optim_log``: the buffer's priorities.
+
+        Whenever something is due:
+
+        5. ``post_optim_complete_log``: log the means of the losses.
+        6. ``post_steps``: the caller's, then the checkpoint.
+        7. ``post_steps_log``: the evaluation, after the checkpoint: if it ends the
+           process, no step is lost.
+        """
         self.register_op("process_optim_batch", self._sample)
-        if target_net_updater is not None:
-            self.register_op(
-                "post_optim", self._move_targets, updater=target_net_updater
-            )
         self.register_op("post_optim_complete_log", self._log_losses)
+        for place, hook in hooks:
+            self.register_op(place, hook)
+        sampler = getattr(self.buffer, "sampler", None)
+        if isinstance(sampler, PrioritizedSampler):
+            self.register_op("post_optim_log", self.buffer.update_tensordict_priority)
+        self.register_op("post_steps", self._save_if_due)
         self.register_op("post_steps_log", self._evaluate_if_due)
 
     @property
@@ -328,11 +208,19 @@ class OfflineTrainer(Trainer):
         return int(self._optim_count)
 
     def best(self) -> dict[str, Any] | None:
-        """Best evaluation so far, the first of equals; one without a value is none."""
-        rows = [row for row in self.history if row[self._metric] is not None]
-        if not rows:
+        """Best evaluation so far, the first of equals.
+
+        Evaluations without a value do not count, and that of the untrained networks
+        only if it is the only one.
+        """
+        if self.evaluation is None:
             return None
-        return self._choose(rows, key=lambda row: row[self._metric])
+        name, choose = self.evaluation.metric, {"max": max, "min": min}
+        rows = [row for row in self.history if row[name] is not None]
+        rows = [row for row in rows if row["step"]] or rows
+        return choose[self.evaluation.best](
+            rows, key=lambda row: row[name], default=None
+        )
 
     def train(self) -> None:
         """Run, or continue, to the last step; a finished run returns at once."""
@@ -340,32 +228,26 @@ class OfflineTrainer(Trainer):
         if self.step == self.total_frames and self._is_evaluated():
             return
         self.checkpoints.check_room(self.loss_module, self.optimizer)
-        if self.cudagraph:  # only now: resuming has replaced the optimizer's tensors
-            self._stepper.capture()
         # tensordict 0.14.3 searches the disk for pandas in every module call until that
         # is imported: 0.3 ms each, a tenth of a small update.
         with suppress(ImportError):
             import_module("pandas")
         shown = self._progress.shown(self.step)
         with shown, signals_noted() as self._stop_request:
-            if not self.history:
-                self._evaluate()
+            self._evaluate_if_due()  # a kill may have come between both
             super().train()
-            if not self._is_evaluated():  # the last checkpoint is of a longer run
-                self._evaluate()
-                self._save(self.step)
         if self._stop_request.signal is not None:  # in the last evaluation
             raise self._interrupted(self.step)
-
-    def _is_evaluated(self) -> bool:
-        """Whether there is, or need be, no evaluation at this step any more."""
-        steps = [row["step"] for row in self.history]
-        return self.evaluate is None or self.step in steps
+        for row in self.failed_evaluations:
+            log.error(
+                f"{self.description}: no evaluation of step {row['step']}: "
+                f"{row['error']}"
+            )
 
     def resume(self) -> Path | None:
         """Restore the newest whole checkpoint of the folder, if there is one.
 
-        What a CSV logger wrote after it is cut off: these steps are done once more.
+        Rows that a CSV logger wrote after it are cut off: these steps are repeated.
         """
         path = self.checkpoints.restore()
         step = self._saved["step"]
@@ -381,18 +263,20 @@ class OfflineTrainer(Trainer):
         if path and step < self.total_frames:
             log.info(f"{self.description}: goes on from {path}")
         self.collected_frames = self._optim_count = self.collector.step = step
-        self.nonfinite_check.restart(step)
+        self.update.count = step
         return path
 
     def optim_steps(self, batch: TensorDictBase) -> None:
-        """Do as many updates as the clock's batch has rows, and log their means."""
+        """Do as many updates as the counter's batch has rows."""
         self.optim_steps_per_batch = batch.numel()
         super().optim_steps(batch)
 
     def save_trainer(self, force_save: bool = False) -> None:
-        """Write a checkpoint where one is due, and at the end."""
+        """Do nothing: TorchRL's loop would save after the evaluation."""
+
+    def _save_if_due(self) -> None:
         step = self.collected_frames
-        if force_save or step % self.checkpoints.interval == 0:
+        if step % self.checkpoints.interval == 0 or step == self.total_frames:
             self._save(step)
 
     def _save(self, step: int) -> None:
@@ -406,10 +290,6 @@ class OfflineTrainer(Trainer):
         batch: TensorDictBase = self.buffer.sample()
         return batch
 
-    def _move_targets(self, updater: TargetNetUpdater) -> None:
-        if self._stepper.is_whole(self):
-            updater.step()
-
     def _interrupted(self, step: int) -> Interrupted:
         """Save a run that was asked to end after a step; return what to raise.
 
@@ -418,7 +298,6 @@ class OfflineTrainer(Trainer):
         number = self._stop_request.signal
         assert number is not None
         self._optim_count = self.collected_frames = step
-        self.nonfinite_check.settle()
         if step != self._saved["step"]:
             self._save(step)
         reason = (
@@ -430,58 +309,72 @@ class OfflineTrainer(Trainer):
 
     def _log_losses(self, _: int, losses: TensorDictBase) -> None:
         """Log the means over a log interval; one copy to the host for all of them."""
-        self.nonfinite_check.settle()
-        names = list(losses.keys())
-        values = torch.stack([losses[name].float() for name in names]).tolist()
-        means = dict(zip(names, values, strict=True))
-        self._warn_of_divergence(means)
-        self._send(means)
-        self._progress.update(self.collected_frames)
-
-    def _warn_of_divergence(self, means: Mapping[str, float]) -> None:
-        """Warn once of each mean that exceeds its limit."""
-        for name in [each for each in self._limits if each in means]:
+        values = torch.stack([each.float() for each in losses.values()]).tolist()
+        means = dict(zip(losses.keys(), values, strict=True))
+        for name in self._limits.keys() & means:
             if abs(means[name]) > self._limits[name]:
                 log.warning(
                     f"{self.description}, step {self.collected_frames}: the mean "
                     f"{name} is {means[name]:.4g}; a magnitude above "
                     f"{self._limits.pop(name):.4g} means that the values diverge. "
-                    "Lower the critics' learning rate (optim.qvalue_lr), or check the "
-                    "rewards and the discount. The run continues."
+                    "Lower the critics' learning rate, or check the rewards and the "
+                    "discount. The run continues."
                 )
+        self._send(means)
+        self._progress.update(self.collected_frames)
 
-    def _evaluate_if_due(self, _: TensorDictBase) -> None:
+    def _is_evaluated(self) -> bool:
+        steps = [row["step"] for row in self.history]
+        return self.evaluation is None or self.collected_frames in steps
+
+    def _evaluate_if_due(self, _: TensorDictBase | None = None) -> None:
+        """Evaluate at the interval and at the end, once; keep the best model."""
         step = self.collected_frames
-        if step % self.eval_interval == 0 or step == self.total_frames:
-            self._evaluate()
-
-    def _evaluate(self) -> None:
-        """Evaluate, log the numbers, and save the best model so far."""
-        if self.evaluate is None:
+        if self.evaluation is None or self._is_evaluated():
             return
-        step, name = self.collected_frames, self._metric
-        results = {"step": step, **self.evaluate()}
-        if name not in results:
+        if step % self.evaluation.interval and step != self.total_frames:
+            return
+        failed = [row for row in self.failed_evaluations if row["step"] != step]
+        try:
+            results = self._results(self.evaluation)
+        except Exception as error:
+            if not self.history:  # no work is lost yet, and the next would fail alike
+                raise
+            failed.append({"step": step, "error": f"{type(error).__name__}: {error}"})
+            log.exception(f"{self.description}: the evaluation of step {step} failed")
+        else:
+            self._keep(results, self.evaluation.metric)
+        self.failed_evaluations[:] = failed
+        if step and step == self._saved["step"]:
+            self.checkpoints.save(step)  # once more, with the result
+
+    def _results(self, evaluation: Evaluation) -> dict[str, Any]:
+        results = {"step": self.collected_frames, **evaluation.run()}
+        if evaluation.metric not in results:
             raise ValueError(
-                f"evaluate() returned {', '.join(results.keys() - {'step'})}, without "
-                f"the {name!r} that decides the best checkpoint: name one of its "
-                "results, as in metric=('score', 'max')."
+                f"the evaluation returned {', '.join(results.keys() - {'step'})}, "
+                f"without the metric {evaluation.metric!r} that decides the best "
+                "checkpoint."
             )
         # As a checkpoint restores them: sorted, lists for tuples.
-        results = json.loads(json.dumps(finite_or_none(results), sort_keys=True))
+        text = json.dumps(finite_or_none(results), sort_keys=True)
+        restored: dict[str, Any] = json.loads(text)
+        return restored
+
+    def _keep(self, results: dict[str, Any], name: str) -> None:
+        """Log an evaluation, and save the model if it is the best so far."""
+        step, metric = self.collected_frames, results[name]
         self.history.append(results)
+        text = "-" if metric is None else f"{metric:.4g}"
+        self._progress.result(step, f"{name} {text}")
+        if self.best() is results:
+            metadata = {"step": step, name: metric}
+            self.checkpoints.save_best(self._model_components, metadata)
         numbers = {
             key: value for key, value in results.items()
             if isinstance(value, (int, float)) and key != "step"
         }  # fmt: skip
         self._send(numbers)
-        metric = results[name]
-        self._progress.result(
-            step, f"{name} {'-' if metric is None else f'{metric:.4g}'}"
-        )
-        if self.best() is results:
-            metadata = {"step": step, name: metric}
-            self.checkpoints.save_best(self._model_components, metadata)
 
     def _send(self, numbers: Mapping[str, float]) -> None:
         step = self.collected_frames
@@ -490,6 +383,89 @@ class OfflineTrainer(Trainer):
             for logger in self.loggers:
                 for name, value in numbers.items():
                     logger.log_scalar(f"{self.description}/{name}", value, step=step)
+
+    def do_update(self, batch: TensorDictBase) -> TensorDictBase:
+        """Do one update; a batch that gives NaN or infinity is saved."""
+        try:
+            return self.update(batch)
+        except NonfiniteError as error:
+            path = self.checkpoints.folder / "nonfinite" / f"step-{self.step:012d}.pt"
+            record = {
+                "step": self.step,
+                "batch": batch.cpu().to_dict(),
+                "losses": error.losses,
+                "gradients": error.gradients,
+                "loss_module": self.loss_module.state_dict(),
+            }
+            saved = f"are in {path}: torch.load('{path}', weights_only=True)"
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with whole_file(path) as file:
+                    torch.save(record, file)
+            except OSError as full:  # a full disk must not hide why the run stops
+                saved = f"could not be written: {full}"
+            raise FloatingPointError(
+                f"{self.description}: step {self.step}: {error}. The batch, the losses "
+                f"and the parameters before {saved}. Look at the batch, and lower the "
+                f"learning rates. The last checkpoint is {self.checkpoints.latest()}."
+            ) from error
+
+
+class _StepCounter:
+    """Dummy collector. A batch of length n stands for n gradient steps.
+
+    A batch ends wherever something is due: a log entry, an evaluation, a checkpoint.
+    """
+
+    init_random_frames = 0
+
+    def __init__(self, total: int, intervals: Sequence[int]) -> None:
+        if total < 1 or min(intervals) < 1:
+            raise ValueError(
+                "total_steps and all intervals must be at least 1, got "
+                f"total_steps={total} and log, evaluation and checkpoint intervals "
+                f"{intervals}."
+            )
+        self.total, self.intervals, self.step = total, intervals, 0
+
+    def __iter__(self) -> Iterator[TensorDictBase]:
+        while self.step < self.total:
+            due = [(self.step // each + 1) * each for each in self.intervals]
+            steps = min(*due, self.total) - self.step
+            self.step += steps
+            yield TensorDict({}, [steps])
+
+    def shutdown(self) -> None:
+        """Do nothing: the trainer calls this on its collector."""
+
+
+class _Stepper(OptimizationStepper):
+    """Pass a batch to the trainer's update."""
+
+    def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
+        losses: TensorDictBase = trainer.do_update(sub_batch)
+        return losses
+
+
+def cut_back(folder: Path, step: int) -> None:
+    """Cut off the rows that a ``CSVLogger`` wrote after a step.
+
+    A last line that a kill left unfinished goes, too.
+
+    Args:
+        folder: of CSV files with rows ``step,value``, steps in ascending order.
+        step: the last one that stays.
+    """
+    for path in folder.glob("*.csv"):
+        with path.open("r+b") as file:
+            kept = 0
+            for line in file:
+                number = line.split(b",")[0]
+                whole = line.endswith(b"\n") and number.isdigit()
+                if not whole or int(number) > step:
+                    break
+                kept += len(line)
+            file.truncate(kept)
 
 
 def largest_value(largest_reward: float, gamma: float) -> float:

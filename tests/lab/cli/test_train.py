@@ -64,7 +64,6 @@ def test_log_has_a_line_for_each_evaluation(finished):
     ("overrides", "named"),
     [
         (["loss=rebrac", "env.id=Walker2d-v5"], "is walker2d: give env=walker2d."),
-        (["trainer.cudagraph=true"], "cudagraph=True needs a CUDA device"),
         (["dynamics=ensemble", "dynamics.path=typo"], "typo"),
         (["data.held_out=0"], "data.held_out=0.0 must be above 0"),
         (

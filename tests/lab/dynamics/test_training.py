@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from torchrl_osr.fast import fast_update
 from torchrl_osr.lab.__main__ import main
 from torchrl_osr.lab.dynamics import DynamicsOptions, ModelData, reverse_transitions
 from torchrl_osr.lab.dynamics.training import (
@@ -31,8 +32,9 @@ def modelled(folder: Path, data: ModelData, options: DynamicsOptions, seed: int 
     folder.mkdir(exist_ok=True)
     trainers = []
 
-    def new_trainer(*arguments, **keywords) -> OfflineTrainer:
-        trainers.append(OfflineTrainer(*arguments, progress=False, **keywords))
+    def new_trainer(loss, optimizer, **keywords) -> OfflineTrainer:
+        update = fast_update(loss, optimizer)
+        trainers.append(OfflineTrainer(update, progress=False, **keywords))
         return trainers[0]
 
     phase = Phase(folder, new_trainer, torch.optim.Adam, seed, "hopper", {})
@@ -45,7 +47,7 @@ def test_a_model_is_trained_once_and_anew_if_its_file_is_damaged(
     monkeypatch.setenv("TORCHRL_OSR_CACHE", str(tmp_path))
     options = replace(TINY, lr=0.3)
     first, trainer = modelled(tmp_path / "a", data, options)
-    errors = [row["mse"] for row in trainer.history]
+    errors = [row["mse"] for row in trainer.history[1:]]
     assert min(errors) < errors[-1]
     targets = data.held_out["next", "observation"] - data.held_out["observation"]
     targets = torch.cat([targets, data.held_out["next", "reward"]], -1)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import zipfile
-from copy import deepcopy
 
 import pytest
 import torch
 from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
 from tensordict import TensorDict
+from torch.optim.swa_utils import AveragedModel
 from torchrl.checkpoint import CheckpointError, CheckpointRotation
 from torchrl.envs import ObservationNorm
 from untrained_run import make_run
@@ -86,7 +86,7 @@ def test_runs_without_standardisation_come_back(tmp_path, rows):
     checkpoint = safe_checkpoint(
         loss_module=loss,
         observation_norm=norm,
-        policy_average=deepcopy(actor),
+        policy_average=AveragedModel(actor),
     )
     CheckpointRotation(folder / CHECKPOINTS, keep_last=2).save(checkpoint, step=1000)
     trained = load_trained(folder)
@@ -157,7 +157,7 @@ def test_the_policy_is_the_average_of_its_weights(tmp_path):
     make_run(tmp_path / "run")
     folder = tmp_path / "run"
     actor, _, loss, _ = make_learner(OmegaConf.load(folder / "config.yaml"), 11, 3)
-    average = deepcopy(actor)
+    average = AveragedModel(actor)
     for parameter in average.parameters():
         parameter.data.add_(1.0)
     checkpoint = safe_checkpoint(

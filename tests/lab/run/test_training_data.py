@@ -124,10 +124,6 @@ def test_distances_are_those_of_memory():
     ("overrides", "message"),
     [
         (["data.storage=tape"], "data.storage must be one of"),
-        (
-            ["data.storage=disk", "trainer.cudagraph=true"],
-            "trainer.cudagraph=true cannot be combined with data.storage=disk",
-        ),
     ],
 )
 def test_what_cannot_be_had_is_refused_before_the_data(overrides, message, monkeypatch):

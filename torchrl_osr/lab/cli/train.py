@@ -53,7 +53,7 @@ from torchrl_osr.lab.run.phases import (
 from torchrl_osr.lab.run.published import check_published
 from torchrl_osr.lab.run.run_config import check_run, module_of, read_yaml
 from torchrl_osr.lab.run.training_data import load_training_data
-from torchrl_osr.trainers import OfflineTrainer, check_hardware
+from torchrl_osr.trainers import OfflineTrainer
 
 log = logging.getLogger(__name__)
 
@@ -120,7 +120,7 @@ def run(cfg: DictConfig, folder: Path) -> float:
         "observation_norm": data.norm,
         "settings": run_folder.Settings(cfg),
     }
-    new_trainer = trainer_maker(cfg, data, components, loggers, autocast)
+    new_trainer = trainer_maker(cfg, folder, data, components, loggers, autocast)
     if learner.model is not None:
         train_inverse_dynamics(cfg, folder, data, learner.model, new_trainer)
     imagined = adversary = None
@@ -132,7 +132,13 @@ def run(cfg: DictConfig, folder: Path) -> float:
         cfg, folder, data, learner, imagined, adversary, new_trainer,
         played=spec.simulated,
     )  # fmt: skip
-    return report(cfg, folder, data.mean, trainer, loggers)
+    score = report(cfg, folder, data.mean, trainer, loggers)
+    if failed := trainer.failed_evaluations:
+        raise RuntimeError(
+            f"The run is finished, but {len(failed)} of its evaluations failed, the "
+            f"last at step {failed[-1]['step']}: {failed[-1]['error']}"
+        )
+    return score
 
 
 def prepare_machine(
@@ -145,12 +151,8 @@ def prepare_machine(
     log.info(versions)
     torch.set_num_threads(cfg.trainer.num_threads)
     torch.set_float32_matmul_precision(cfg.trainer.matmul_precision)
-    return check_hardware(
-        cfg.trainer.device,
-        cfg.trainer.precision,
-        cudagraph=cfg.trainer.cudagraph,
-        policy_delay=cfg.optim.policy_delay,
-    )
+    precisions = {"float32": None, "bfloat16": torch.bfloat16}
+    return torch.device(cfg.trainer.device), precisions[cfg.trainer.precision]
 
 
 def code_versions() -> dict[str, str]:

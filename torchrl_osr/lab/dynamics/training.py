@@ -31,7 +31,7 @@ from torchrl_osr.lab.dynamics.options import DynamicsOptions
 from torchrl_osr.lab.dynamics.rollout_buffer import RolloutReplayBuffer
 from torchrl_osr.objectives import ActorCriticLoss
 from torchrl_osr.policy.tensor_file import read_tensors, write_tensors
-from torchrl_osr.trainers import OfflineTrainer
+from torchrl_osr.trainers import Evaluation, OfflineTrainer
 from torchrl_osr.trainers.checkpoints import safe_checkpoint
 
 log = logging.getLogger(__name__)
@@ -182,9 +182,7 @@ def _trained(
         total_steps=options.steps,
         folder=phase.folder / "checkpoint" / "dynamics",
         seed=phase.seed,
-        evaluate=evaluate,
-        metric=("mse", "min"),
-        eval_interval=max(1, options.steps // 10),
+        evaluation=Evaluation(evaluate, max(1, options.steps // 10), "mse", "min"),
         description="dynamics",
     )
     trainer.train()
@@ -214,9 +212,7 @@ def train_vae(
         total_steps=options.vae_steps,
         folder=phase.folder / "checkpoint" / "vae",
         seed=phase.seed,
-        evaluate=evaluate,
-        metric=("vae_error", "min"),
-        eval_interval=options.vae_steps,
+        evaluation=Evaluation(evaluate, options.vae_steps, "vae_error", "min"),
         description="vae",
     ).train()
     return model.requires_grad_(False)

@@ -102,11 +102,6 @@ def check_storage(cfg: DictConfig) -> str:
     """
     storage = str(cfg.data.storage)
     check_choice("data.storage", storage, ("memory", "disk"))
-    if storage == "disk" and cfg.trainer.cudagraph:
-        raise ValueError(
-            "trainer.cudagraph=true cannot be combined with data.storage=disk: a CUDA "
-            "graph reads no files. Take data.storage=memory or trainer.cudagraph=false."
-        )
     return storage
 
 
@@ -256,16 +251,6 @@ def check_parts(
             into the memory.
     """
     sizes = observation_size, action_size
-    falling = [
-        name for name in ("actor_schedule", "qvalue_schedule")
-        if cfg.optim[name] != "constant"
-    ]  # fmt: skip
-    if cfg.trainer.cudagraph and falling:
-        raise ValueError(
-            f"optim.{falling[0]}={cfg.optim[falling[0]]} cannot be combined with "
-            "trainer.cudagraph=true: a CUDA graph repeats the learning rate that it "
-            "was captured with. Take constant, or trainer.cudagraph=false."
-        )
     check_networks(cfg, *sizes, cfg.trainer.device, training=True)
     learner = make_learner(cfg, *sizes)
     if cfg.data.held_out in (0, 1):

@@ -17,7 +17,6 @@ import torch
 from omegaconf import DictConfig
 
 from torchrl_osr._checks import check_choice
-from torchrl_osr.trainers.schedule import SCHEDULES
 
 LARGEST = 10**9
 """Largest magnitude of a number for which :data:`RANGES` has no other."""
@@ -99,8 +98,8 @@ CHOICES: dict[str, tuple[str | None, ...]] = {
     "inverse_dynamics.loss.reduction": _REDUCTIONS,
     "loss.reduction": _REDUCTIONS,
     "recovery.reduction": _REDUCTIONS,
-    "optim.actor_schedule": SCHEDULES,
-    "optim.qvalue_schedule": SCHEDULES,
+    "optim.actor_schedule": ("constant", "cosine"),
+    "optim.qvalue_schedule": ("constant", "cosine"),
     "trainer.precision": ("float32", "bfloat16"),
     "trainer.matmul_precision": ("highest", "high", "medium"),
     "logger.kind": ("csv", "tensorboard", "wandb"),

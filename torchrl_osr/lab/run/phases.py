@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from functools import partial
@@ -13,14 +14,17 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from tensordict import TensorDict
 from tensordict.nn import ProbabilisticTensorDictSequential
+from torch import Tensor
 from torch.nn import Parameter
 from torch.optim.lr_scheduler import LambdaLR
+from torch.optim.swa_utils import AveragedModel
 from torchrl.envs import ObservationNorm
+from torchrl.objectives import LossModule, SoftUpdate, TargetNetUpdater
 from torchrl.record.loggers import Logger
-from torchrl.trainers import LRSchedulerHook
 
 from torchrl_osr import StatePerturbation
 from torchrl_osr._files import write_json
+from torchrl_osr.fast import fast_update
 from torchrl_osr.lab.data.rows import take_multi_step
 from torchrl_osr.lab.dynamics import ModelAdversary, RolloutReplayBuffer, training
 from torchrl_osr.lab.evaluation import (
@@ -34,52 +38,71 @@ from torchrl_osr.lab.evaluation import (
 from torchrl_osr.lab.run import run_folder
 from torchrl_osr.lab.run.build import Learner, dynamics_options, references_of
 from torchrl_osr.lab.run.training_data import TrainingData, model_data
-from torchrl_osr.trainers import (
-    OfflineTrainer,
-    SoftUpdate,
-    WeightAverage,
-    largest_value,
-    learning_rates,
-)
+from torchrl_osr.trainers import Evaluation, OfflineTrainer, largest_value
 
 EVALUATION_SEED = 10_000  # far from the seeds of the data's episodes
 
-NewTrainer = partial[OfflineTrainer]
+NewTrainer = Callable[..., OfflineTrainer]
 """Makes a phase's trainer of a loss, an optimizer and what is the phase's own."""
 
 
 def trainer_maker(
     cfg: DictConfig,
+    folder: Path,
     data: TrainingData,
     components: Mapping[str, Any],
     loggers: Sequence[Logger],
     autocast: torch.dtype | None,
 ) -> NewTrainer:
-    """What all phases have in common, as the function that makes their trainers.
+    """Return the function that makes the trainers of all phases.
 
     One step of a trainer: sample a batch, compute the losses, go backward on their sum,
-    step the optimizer, move the target networks; log, evaluate and write a checkpoint
+    step the optimizer, move the target networks; log, write a checkpoint and evaluate
     at their intervals.
     """
-    return partial(
-        OfflineTrainer,
-        replay_buffer=data.buffer,
-        components=components,
-        loggers=loggers,
-        log_interval=cfg.trainer.log_interval,
-        checkpoint_interval=cfg.trainer.checkpoint_interval,
-        checkpoints_kept=cfg.trainer.checkpoints_kept,
-        progress=cfg.trainer.progress,
-        autocast_dtype=autocast,
-        record=cfg.trainer.record,
-        compile=cfg.trainer.compile,
-        cudagraph=cfg.trainer.cudagraph,
-    )
+
+    def new_trainer(
+        loss: LossModule,
+        optimizer: torch.optim.Optimizer,
+        target_updater: TargetNetUpdater | None = None,
+        *,
+        policy_delay: int = 1,
+        policy_params: Sequence[Parameter] = (),
+        **options: Any,
+    ) -> OfflineTrainer:
+        if cfg.trainer.compile:
+            loss.compile()
+        update = fast_update(
+            loss,
+            optimizer,
+            target_updater,
+            policy_delay=policy_delay,
+            policy_params=policy_params,
+            autocast_dtype=autocast,
+            trace=cfg.trainer.record,
+        )
+        # In a folder that was removed, nothing would be kept.
+        removed = ("post_steps", partial(run_folder.check_ours, folder))
+        shared = {
+            "replay_buffer": data.buffer,
+            "loggers": loggers,
+            "log_interval": cfg.trainer.log_interval,
+            "checkpoint_interval": cfg.trainer.checkpoint_interval,
+            "checkpoints_kept": cfg.trainer.checkpoints_kept,
+            "progress": cfg.trainer.progress,
+        }
+        own = {
+            "components": {**components, **options.pop("components", {})},
+            "hooks": [removed, *options.pop("hooks", [])],
+        }
+        return OfflineTrainer(update, **(shared | own | options))
+
+    return new_trainer
 
 
 def adam_of(cfg: DictConfig) -> Callable[..., torch.optim.Optimizer]:
     """The optimizer of all phases, as a function of parameters."""
-    return partial(torch.optim.Adam, fused=True, capturable=cfg.trainer.cudagraph)
+    return partial(torch.optim.Adam, fused=True)
 
 
 def train_inverse_dynamics(
@@ -100,14 +123,16 @@ def train_inverse_dynamics(
         total_steps=cfg.trainer.inverse_dynamics_steps,
         folder=folder / "checkpoint" / "inverse_dynamics",
         seed=cfg.seed,
-        evaluate=lambda: inverse_dynamics_report(model, data.held_out),
-        metric=("nll", "min"),
-        eval_interval=cfg.trainer.inverse_dynamics_steps,
+        evaluation=Evaluation(
+            lambda: inverse_dynamics_report(model, data.held_out),
+            cfg.trainer.inverse_dynamics_steps,
+            "nll",
+            "min",
+        ),
         description="inverse_dynamics",
+        hooks=[("process_optim_batch", _shuffle_next)]
+        * cfg.inverse_dynamics.shuffle_next,
     )
-    _stop_if_removed(trainer, folder)
-    if cfg.inverse_dynamics.shuffle_next:
-        trainer.register_op("process_optim_batch", _shuffle_next)
     trainer.train()
     write_json(folder / "inverse_dynamics.json", trainer.history[-1])
     print(describe_inverse_dynamics(trainer.history[-1]))
@@ -167,17 +192,32 @@ def train_policy(
     if critics and loss.delay_qvalue:  # cloning has no critics
         targets = SoftUpdate(loss, tau=cfg.optim.tau)
     # What is played, now and by all other commands.
-    average = WeightAverage(actor, cfg.optim.policy_average)
+    average = AveragedModel(
+        actor, multi_avg_fn=partial(_average, share=cfg.optim.policy_average)
+    )
     limit = largest_value(data.largest_reward, cfg.optim.gamma)
-    components = {"schedule": schedule, "policy_average": average.network}
+    components = {"schedule": schedule, "policy_average": average}
     if adversary is not None:  # before the roll-outs, which are of a copy of it
         components["adversary"] = adversary
     if imagined is not None:
         components["imagined"] = imagined
     if imagined is None and cfg.optim.n_steps > 1:
         data.buffer.append_transform(take_multi_step)
+    hooks: list[tuple[str, Callable[..., Any]]] = [
+        ("post_optim", schedule.step),
+        ("post_optim", partial(average.update_parameters, actor)),
+    ]
+    if imagined is not None:
+        hooks.append(
+            ("post_steps", lambda: _log_imagined(trainer, imagined, adversary))
+        )
+    if hasattr(loss, "decay_uncertainty"):
+        hooks.append(("post_optim", loss.decay_uncertainty))
+    if cfg.perturbation.adversary is not None:
+        attack = instantiate(cfg.perturbation.adversary)
+        hooks.append(("process_optim_batch", partial(attack, loss)))
     with ExitStack() as opened:
-        evaluate = None
+        evaluation = None
         if played:
             episodes = EpisodeEvaluator(
                 cfg.env.id,
@@ -186,44 +226,41 @@ def train_policy(
                 device=cfg.trainer.device,
             )
             opened.enter_context(closing(episodes))
-            evaluate = partial(
-                _evaluation, cfg, episodes, average.network, actor, data.norm
+            evaluation = Evaluation(
+                partial(_evaluation, cfg, episodes, average.module, actor, data.norm),
+                cfg.trainer.eval_interval,
+                "return" if references_of(cfg) is None else "score",
             )
         trainer = new_trainer(
             objective,
             optimizer,
+            targets,
             replay_buffer=data.buffer if imagined is None else imagined,
-            components=new_trainer.keywords["components"] | components,
+            hooks=hooks,
+            components=components,
             total_steps=cfg.trainer.steps,
             folder=folder / "checkpoint" / "policy",
             seed=cfg.seed + 1,
-            target_net_updater=targets,
             policy_delay=cfg.optim.policy_delay,
             policy_params=policy,
-            evaluate=evaluate,
-            metric=("return" if references_of(cfg) is None else "score", "max"),
-            eval_interval=cfg.trainer.eval_interval,
+            evaluation=evaluation,
             description="policy",
             value_limits={"pred_value": limit, "target_value": limit},
         )
-        _stop_if_removed(trainer, folder)
-        if imagined is not None:
-            log_both = partial(_log_imagined, trainer, imagined, adversary)
-            trainer.register_op("post_steps", log_both)
-        LRSchedulerHook(schedule, interval="optim").register(trainer)
-        trainer.register_op("post_optim", lambda: average.update(trainer.step))
-        if hasattr(loss, "decay_uncertainty"):
-            trainer.register_op("post_optim", loss.decay_uncertainty)
-        if cfg.perturbation.adversary is not None:
-            attack = instantiate(cfg.perturbation.adversary)
-            trainer.register_op("process_optim_batch", partial(attack, loss))
         trainer.train()
     return trainer
 
 
-def _stop_if_removed(trainer: OfflineTrainer, folder: Path) -> None:
-    """Look at each log entry for the folder: in a removed one nothing would be kept."""
-    trainer.register_op("post_steps", partial(run_folder.check_ours, folder))
+@torch.no_grad()
+def _average(
+    average: list[Tensor], weights: list[Tensor], count: Tensor, share: float
+) -> None:
+    """Move an exponential average of weights, which forgets its first ones.
+
+    They would stay in it for longer than a short run lasts: until update number
+    ``10 / share`` it is of about the last tenth of all updates.
+    """
+    torch._foreach_lerp_(average, weights, max(share, 10 / (int(count) + 10)))
 
 
 def _parameters_of(learner: Learner) -> tuple[list[Parameter], list[Parameter]]:
@@ -247,8 +284,12 @@ def _optimizer_of(
     trained = [each for each in trained if each[0]]
     groups = [{"params": params, "lr": rate} for params, rate, _ in trained]
     optimizer = adam_of(cfg)(groups)
-    kinds = [kind for *_, kind in trained]
-    return optimizer, learning_rates(optimizer, kinds, cfg.trainer.steps)
+
+    def cosine(step: int) -> float:
+        return 0.5 * (1 + math.cos(math.pi * min(step / cfg.trainer.steps, 1.0)))
+
+    factors = {"cosine": cosine, "constant": lambda _: 1.0}
+    return optimizer, LambdaLR(optimizer, [factors[kind] for *_, kind in trained])
 
 
 def _evaluation(

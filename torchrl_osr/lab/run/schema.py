@@ -243,7 +243,6 @@ class TrainerConfig:
         record: repeat a recording of the losses' operations: the same bits in less
             time, on a CPU.
         compile: run the losses through ``torch.compile``.
-        cudagraph: run updates as a CUDA graph; needs ``device=cuda``.
         progress: show progress bars when on a terminal.
     """
 
@@ -261,7 +260,6 @@ class TrainerConfig:
     matmul_precision: str = MISSING
     record: bool = MISSING
     compile: bool = MISSING
-    cudagraph: bool = MISSING
     progress: bool = MISSING
 
 

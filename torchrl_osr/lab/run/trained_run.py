@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from copy import deepcopy
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from omegaconf import DictConfig
 from tensordict.nn import ProbabilisticTensorDictSequential
+from torch.optim.swa_utils import AveragedModel
 from torchrl.checkpoint import CheckpointError
 from torchrl.envs import ObservationNorm
 from torchrl.objectives import LossModule
@@ -124,7 +124,7 @@ def load_trained(
         torch.zeros(shape), torch.ones(shape), in_keys=["observation"],
         standard_normal=True,
     )  # fmt: skip
-    average = deepcopy(actor)
+    average = AveragedModel(actor)
     checkpoint = safe_checkpoint(
         loss_module=objective, observation_norm=norm, policy_average=average
     )
@@ -135,7 +135,7 @@ def load_trained(
             f"{path} does not fit {folder / CONFIG}: {error} Take both from one run.",
             error.result,
         ) from error
-    actor.load_state_dict(average.state_dict())
+    actor.load_state_dict(average.module.state_dict())
     numbered = re.fullmatch(r"checkpoint-(\d+)\.torchrl", path.name)
     step = int(numbered[1]) if numbered else int(manifest["metadata"]["step"])
     # The objective's parameters of actor and model are their own tensors.

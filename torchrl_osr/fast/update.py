@@ -1,0 +1,201 @@
+"""One update of a loss: gradients, optimizer, target networks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import torch
+from tensordict import TensorDictBase
+from torch import nn
+from torchrl.objectives import LossModule, SoftUpdate, TargetNetUpdater
+
+from torchrl_osr.fast.critics import fuse_critics
+from torchrl_osr.fast.traced_update import LossGradients
+
+
+class NonfiniteError(FloatingPointError):
+    """A loss or a gradient is NaN or infinite; the weights are those before the update.
+
+    Attributes:
+        losses: values of the losses and metrics, by name.
+        gradients: names of the parameters whose gradient is not finite.
+    """
+
+    def __init__(self, losses: dict[str, float], gradients: list[str]) -> None:
+        bad = [name for name, value in losses.items() if not math.isfinite(value)]
+        super().__init__(
+            f"not finite: losses {_listed(bad)}; gradients {_listed(gradients)}"
+        )
+        self.losses, self.gradients = losses, gradients
+
+
+def _listed(names: list[str], most: int = 5) -> str:
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return (", ".join(names[:most]) or "none") + more
+
+
+def fast_update(
+    loss_module: LossModule,
+    optimizer: torch.optim.Optimizer,
+    target_updater: TargetNetUpdater | None = None,
+    *,
+    policy_delay: int = 1,
+    policy_params: Sequence[nn.Parameter] = (),
+    autocast_dtype: torch.dtype | None = None,
+    trace: bool = True,
+    warm_up: int = 100,
+) -> Update:
+    """Return a function that does one gradient step on a batch.
+
+    It sums the ``loss_*`` entries, goes backward once, steps the optimizer, clears the
+    gradients and moves the target networks. On a CPU it is up to twice as fast as these
+    lines of a training loop for small networks, with the same numbers. It lets the
+    losses of this package evaluate plain MLP critics in fewer, larger products
+    (:mod:`torchrl_osr.fast.critics`). From update number ``warm_up`` on, it repeats a
+    trace of the tensor operations (:mod:`torchrl_osr.fast.traced_update`).
+
+    The trace follows everything that the loss keeps in attributes. When you change a
+    weight, ``gamma``, ``requires_grad`` or a hook, or call ``eval()``, the loss itself
+    runs and is traced again later. A loss that cannot be traced runs as it is, and a
+    warning says so. Use ``trace=False`` for a loss that reads numbers from elsewhere,
+    such as a global variable.
+
+    Args:
+        loss_module: any loss module whose ``loss_*`` entries may be summed.
+        optimizer: over its parameters. ``torch.optim.Adam(..., fused=True)`` is the
+            fastest.
+        target_updater: moves the target networks after each update. Default: none.
+
+    Keyword Args:
+        policy_delay: ``policy_params`` and target networks move only at every
+            ``policy_delay``-th update, as in TD3. Default 1.
+        policy_params: needed with a ``policy_delay`` above 1.
+        autocast_dtype: precision of the losses' matrix products, for instance
+            ``torch.bfloat16``. Default: that of the parameters.
+        trace: on a CPU, unless the loss is compiled. Default ``True``.
+        warm_up: updates before the trace, which costs as much as some hundred updates.
+            Default 100.
+
+    Returns:
+        ``update(batch)``, which returns the detached losses and metrics and raises
+        :class:`NonfiniteError` instead of a step with NaN or infinite gradients.
+
+    Raises:
+        ValueError: if ``policy_delay`` lacks the parameters to delay, or leaves none.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_osr import InverseDynamicsLoss
+        >>> from torchrl_osr.fast import fast_update
+        >>> from torchrl_osr.modules import tanh_gaussian_inverse_dynamics
+        >>> loss = InverseDynamicsLoss(tanh_gaussian_inverse_dynamics(11, 3))
+        >>> optimizer = torch.optim.Adam(loss.parameters(), fused=True)
+        >>> update = fast_update(loss, optimizer)
+        >>> s, a = torch.randn(2, 64, 11), torch.rand(64, 3)
+        >>> batch = TensorDict({
+        ...     "observation": s[0], "action": a, "perturbed": {"observation": s[0]},
+        ...     "next": {"observation": s[1], "done": torch.zeros(64, 1).bool()}}, [64])
+        >>> for _ in range(3):
+        ...     losses = update(batch)
+    """
+    compiled = loss_module._compiled_call_impl is not None
+    if not compiled and next(loss_module.parameters()).device.type == "cpu":
+        fuse_critics(loss_module)
+    gradients = partial(
+        LossGradients, loss_module, autocast_dtype, trace=trace, warm_up=warm_up
+    )
+    between = None
+    if policy_delay > 1:
+        delayed = set(policy_params)
+        rest = [each for each in loss_module.parameters() if each not in delayed]
+        if not delayed or not rest:
+            raise ValueError(
+                f"policy_delay={policy_delay} needs policy_params to delay, and other "
+                f"parameters to train in between; there are {len(delayed)} and "
+                f"{len(rest)}."
+            )
+        between = gradients(parameters=rest)
+    return Update(gradients(), optimizer, _mover(target_updater), policy_delay, between)
+
+
+class Update:
+    """One gradient step a call; made by :func:`fast_update`.
+
+    Attributes:
+        loss_module, optimizer: what is trained, and what trains it.
+        count: updates so far, of which every ``policy_delay``-th moves the policy; set
+            it when a run is resumed.
+    """
+
+    def __init__(
+        self,
+        gradients: LossGradients,
+        optimizer: torch.optim.Optimizer,
+        move_targets: Callable[[], None],
+        delay: int,
+        between: LossGradients | None,
+    ) -> None:
+        self.loss_module, self.optimizer, self.count = (
+            gradients.loss_module,
+            optimizer,
+            0,
+        )
+        self._gradients, self._between = gradients, between or gradients
+        self._move_targets, self._delay = move_targets, delay
+
+    def __call__(self, batch: TensorDictBase) -> TensorDictBase:
+        """Do one update; return the detached losses and metrics."""
+        self.count += 1
+        whole = self.count % self._delay == 0
+        try:
+            losses = (self._gradients if whole else self._between)(batch)
+            self._check_finite(losses)
+            self.optimizer.step()
+        finally:
+            # Also after an error: the next backward must not add to these gradients.
+            self.optimizer.zero_grad(set_to_none=True)
+        if whole:
+            self._move_targets()
+        return losses
+
+    def _check_finite(self, losses: TensorDictBase) -> None:
+        groups = self.optimizer.param_groups
+        trained = [p for each in groups for p in each["params"] if p.grad is not None]
+        # An eighth of the time of the largest magnitudes. A square that overflows is as
+        # bad: it would be one of Adam's second moments.
+        norms = torch._foreach_norm([each.grad for each in trained])
+        values = torch.stack([*losses.values(), *norms]).tolist()
+        if all(map(math.isfinite, values)):
+            return
+        names = {each: name for name, each in self.loss_module.named_parameters()}
+        found = dict(zip(map(str, losses.keys()), values, strict=False))
+        pairs = zip(trained, values[len(found) :], strict=True)
+        bad = [names.get(p, "unnamed") for p, norm in pairs if not math.isfinite(norm)]
+        raise NonfiniteError(found, bad)
+
+
+def _mover(updater: TargetNetUpdater | None) -> Callable[[], None]:
+    """Return a function that moves the targets as the updater does, with the same bits.
+
+    TorchRL 0.14.1 goes through nested tensordicts at every step, which takes 20 times
+    as long as the arithmetic of small networks.
+    """
+    if updater is None:
+        return lambda: None
+    if type(updater) is not SoftUpdate:
+        move: Callable[[], None] = updater.step
+        return move
+    pairs = [
+        (updater._targets[f"target_{name}", *rest], source)
+        for (name, *rest), source in updater._sources.items(True, True)
+    ]
+    targets, sources = map(list, zip(*pairs, strict=True))
+
+    @torch.no_grad()
+    def move_all() -> None:
+        torch._foreach_lerp_(targets, sources, 1 - updater.eps)
+
+    return move_all
