@@ -36,12 +36,3 @@ def test_what_cannot_be_reported_is_one_line(tmp_path, monkeypatch):
     with pytest.raises(SystemExit) as stopped:
         main(["report", "nowhere"])
     assert stopped.value.code == "nowhere does not exist."  # printed, and code 1
-
-
-def test_a_table_replaces_no_other_file(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
-    (tmp_path / "log.csv").write_text("mine")
-    with pytest.raises(SystemExit):
-        main(["report", "nowhere", "--pack", "log.csv"])
-    assert (tmp_path / "log.csv").read_text() == "mine"

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from contextlib import closing
 
 import mujoco
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -106,17 +104,6 @@ def test_counted_modes_replace_the_agents_actions(mode, play, recorder):
     assert bare.actions[5].dtype == bare.action_space.dtype
 
 
-def test_paper_actions_are_normal_with_std_1e_3(play, recorder):
-    bare = recorder(size=4)
-    play(ActionKnock(bare, 2500, mode="paper", at=0), 2500)
-    actions = torch.from_numpy(np.array(bare.actions)).double().flatten().sort().values
-    steps = torch.arange(1, 10001) / 10000
-    cdf = torch.special.ndtr(actions / 1e-3)
-    distance = torch.maximum(steps - cdf, cdf - steps + 1e-4).max()
-    # Kolmogorov-Smirnov at the level 0.01.
-    assert distance < 1.63 / math.sqrt(10000)
-
-
 def test_torque_is_full_strength_of_either_sign(play, recorder):
     bare = recorder(size=4, low=-2.0, high=3.0)
     play(ActionKnock(bare, 2500, mode="torque", at=0), 2500)
@@ -167,17 +154,6 @@ def test_force_is_applied_and_removed(play):
         expected[torso, 0] = 25 * env.sign * (2 <= number < 5)
         assert (applied == expected).all()
     assert not env.unwrapped.data.xfrc_applied.any()
-
-
-def test_both_directions_occur_and_the_seed_decides():
-    env = ExternalPush(make_environment("Hopper-v5"), 1.0, duration=1, at=0)
-    signs = []
-    for seed in [*range(40), *range(40)]:
-        env.reset(seed=seed)
-        signs.append(env.sign)
-    assert signs[:40] == signs[40:]
-    # 40 fair coins, 4 standard errors of 3.2.
-    assert abs(signs[:40].count(1.0) - 20) < 13
 
 
 def test_what_is_pushed_is_the_torso_or_the_heaviest_body():

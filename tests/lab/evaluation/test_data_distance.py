@@ -57,16 +57,6 @@ def test_threshold_is_the_quantile_of_states_that_were_left_out():
     assert len(kept) == len(kept & set(standard)) == 2000
 
 
-def test_the_subset_depends_on_the_seed_alone():
-    rows = torch.randn(500, 2)
-    before = torch.get_rng_state()
-    one, same, other = (DataDistance(dataset(rows), seed=seed) for seed in (3, 3, 4))
-    assert torch.equal(before, torch.get_rng_state())
-    asked = torch.randn(50, 2)
-    assert torch.equal(one(asked), same(asked))
-    assert one.threshold != other.threshold
-
-
 def test_too_few_rows_are_named():
     with pytest.raises(ValueError, match="10 rows.* too few for 10 neighbours"):
         DataDistance(dataset(torch.randn(10, 2)))

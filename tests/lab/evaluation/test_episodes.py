@@ -51,14 +51,6 @@ def test_each_episode_is_what_it_would_be_alone():
     np.testing.assert_array_equal(results.returns, again.returns)
 
 
-def test_global_generators_are_left_alone():
-    before, state = np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
-    EpisodeEvaluator("Hopper-v5", num_episodes=2)(linear_policy)
-    assert torch.equal(state, torch.get_rng_state())
-    after = np.random.get_state()  # noqa: NPY002
-    assert all(map(np.array_equal, before, after))
-
-
 def test_policy_sees_standardised_observations():
     actor = tanh_gaussian_actor(2, 1, num_cells=[4])
     loc, scale = torch.tensor([1.0, 2.0]), torch.tensor([3.0, 4.0])

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from torchrl_osr.lab.evaluation.recovery import (
-    STEPS_AFTER,
     STEPS_BEFORE,
     Recorder,
     Trajectory,
@@ -90,19 +89,6 @@ def test_the_undisturbed_episode_is_measured_at_the_same_step(
     there = ~np.isnan(recovery.clean_distance)
     assert there[STEPS_BEFORE]
     assert there[STEPS_BEFORE + 60] == there_later
-
-
-def test_distances_are_around_the_end_of_the_disturbance():
-    size, nan = STEPS_BEFORE + 1 + STEPS_AFTER, np.nan
-    around = slice(STEPS_BEFORE - 3, STEPS_BEFORE + 3)
-    # In units of the threshold, 2.
-    long = measure(trajectory([1.0] * 20 + [6.0] + [2.0] * 200, {20})).distance
-    np.testing.assert_array_equal(long[around], [0.5, 0.5, 0.5, 3.0, 1.0, 1.0])
-    assert len(long) == (~np.isnan(long)).sum() == size
-    short = measure(trajectory([1.0, 1.0, 4.0, 3.0], {2}, fell=True)).distance
-    np.testing.assert_array_equal(short[around], [nan, 0.5, 0.5, 2.0, 1.5, nan])
-    assert len(short) == size
-    assert (~np.isnan(short)).sum() == 4
 
 
 def test_recorder_copies_observations():

@@ -111,13 +111,9 @@ def wilson_interval(count: int, total: int) -> tuple[float, float]:
 
 
 def stratified_resamples(strata: Sequence[ArrayLike]) -> Array:
-    """Bootstrap resamples that keep the number of runs of every stratum.
+    """Bootstrap resamples of the runs of all strata, side by side, ``[R, N]``.
 
-    Args:
-        strata: a number of each run, a sequence for each data set.
-
-    Returns:
-        The runs of all strata side by side, ``[R, N]``.
+    Each stratum, a data set for instance, keeps its number of runs.
     """
     rng = np.random.default_rng(0)
     samples = [np.asarray(stratum, dtype=np.float64) for stratum in strata]
@@ -165,11 +161,7 @@ def nested_resamples(runs: Sequence[ArrayLike], *, seed: int = 0) -> Array:
 
 
 def estimate(runs: Sequence[Array]) -> Estimate:
-    """Mean over runs, and its interval over their means; of one run over its episodes.
-
-    Args:
-        runs: scores of each run's episodes, ``[E]``.
-    """
+    """Mean over runs ``[E]`` and its interval; a single run's is over its episodes."""
     over = over_what([runs])
     values = runs[0] if over == "episodes" else [run.mean() for run in runs]
     return Estimate(*mean_interval(values), over)
@@ -192,13 +184,10 @@ def interquartile_mean(values: ArrayLike) -> Array:
 
 
 def iqm(groups: Sequence[Sequence[Array]]) -> Estimate:
-    """Interquartile mean of the runs of all data sets.
+    """Interquartile mean of the runs of all data sets, which are given one by one.
 
-    Runs are resampled within their data sets. If one of these has a single run, the
-    interval is over the runs' episodes instead.
-
-    Args:
-        groups: scores of each run's episodes, ``[E]``, data set by data set.
+    Runs ``[E]`` are resampled within their data sets. If one of these has a single run,
+    the interval is over the runs' episodes instead.
     """
     scores = [[run.mean() for run in group] for group in groups]
     over = over_what(groups)
@@ -213,11 +202,7 @@ def iqm(groups: Sequence[Sequence[Array]]) -> Estimate:
 
 
 def mean_difference(data_sets: Sequence[Sequence[Array]]) -> Estimate:
-    """Mean difference, every data set and every seed with equal weight.
-
-    Args:
-        data_sets: differences of each seed's episodes, ``[E]``, data set by data set.
-    """
+    """Mean difference; data sets have equal weight, and so have the seeds of each."""
     point = np.mean([np.mean([run.mean() for run in each]) for each in data_sets])
     # A seed for each data set: with one, they would be drawn alike.
     resamples = [
@@ -307,42 +292,21 @@ def saved_share(back: ArrayLike, walk: ArrayLike) -> tuple[float, float, float]:
     for share, whole in ((0.0, 0.0 * sizes), (1.0, sizes)):
         if (table == whole).all():
             return (share, *wilson_interval(round(share * len(sizes)), len(sizes)))
-    return _share(table, sizes)
-
-
-def saved_difference(
-    method: ArrayLike, baseline: ArrayLike, walk: ArrayLike
-) -> tuple[float, float, float]:
-    """Share that a method saves less the share that a baseline saves.
-
-    Args:
-        method, baseline: as in :func:`saved_share`; row by row of the same seeds.
-        walk: of each state, ``[M]``.
-
-    Examples:
-        >>> saved_difference([[1, 0, 1, 1]], [[0, 0, 0, 1]], walk=[0, 0, 1, 1])
-        (0.5, 0.5, 0.5)
-    """
-    ours, sizes = _by_walk(method, walk)
-    return _share(ours - _by_walk(baseline, walk)[0], sizes)
+    seeds, walks = _weights(len(table), len(sizes))
+    shares = ((seeds @ table) * walks).sum(-1) / len(table) / (walks @ sizes)
+    return interval(shares[0], shares[1:])[:3]
 
 
 def recovered_share(
-    method: ArrayLike, baseline: ArrayLike, walk: ArrayLike, *, paired: bool = True
+    method: ArrayLike, baseline: ArrayLike, walk: ArrayLike
 ) -> tuple[float, float, float]:
     r"""R: share of the states that a baseline loses that a method saves.
 
     .. math::
         R = \frac{p_{method} - p_{baseline}}{1 - p_{baseline}}
 
-    with :math:`p` the share of states that each comes back from.
-
-    Args:
-        method, baseline, walk: see :func:`saved_difference`.
-
-    Keyword Args:
-        paired: whether row by row the seeds are the same, and resampled together.
-            Otherwise the numbers of seeds may differ. Default ``True``.
+    with :math:`p` the share of states that each comes back from, see
+    :func:`saved_share`; row by row method and baseline have the same seed.
 
     Raises:
         ValueError: if the baseline saves all states, in the data or in a resample.
@@ -353,9 +317,8 @@ def recovered_share(
     """
     ours, sizes = _by_walk(method, walk)
     theirs, _ = _by_walk(baseline, walk)
-    seeds, walks, others = _weights(len(ours), len(sizes), len(theirs))
-    saved = ((seeds @ ours) * walks).sum(-1) / len(ours)
-    before = (((seeds if paired else others) @ theirs) * walks).sum(-1) / len(theirs)
+    seeds, walks = _weights(len(ours), len(sizes))
+    saved, before = (((seeds @ of) * walks).sum(-1) / len(of) for of in (ours, theirs))
     lost = walks @ sizes - before
     if (lost <= 0).any():
         raise ValueError("The baseline saves all states: R is not defined.")
@@ -368,14 +331,6 @@ def _by_walk(table: ArrayLike, walk: ArrayLike) -> tuple[Array, Array]:
     walks, number = np.unique(np.asarray(walk), return_inverse=True)
     member = np.eye(len(walks))[number]
     return np.asarray(table, np.float64) @ member, member.sum(0)
-
-
-def _share(table: Array, sizes: Array) -> tuple[float, float, float]:
-    """Sums by seed and walk over the number of states, with their interval."""
-    seeds, walks = _weights(len(table), len(sizes))
-    saved = ((seeds @ table) * walks).sum(-1) / len(table)
-    shares = saved / (walks @ sizes)
-    return interval(shares[0], shares[1:])[:3]
 
 
 def _weights(*sizes: int) -> list[Array]:

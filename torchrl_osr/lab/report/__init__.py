@@ -5,8 +5,6 @@ from torchrl_osr.lab.report.page import write_report
 from torchrl_osr.lab.report.runs import (
     RunTables,
     comparison_notes,
-    pack_runs,
-    read_records,
     read_runs,
 )
 
@@ -14,9 +12,7 @@ __all__ = [
     "RunTables",
     "compare",
     "comparison_notes",
-    "pack_runs",
     "quantities",
-    "read_records",
     "read_runs",
     "write_report",
 ]
