@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 from contextlib import closing
 
 import numpy as np
@@ -78,12 +77,3 @@ def test_unknown_names_list_what_exists() -> None:
         load_behavior_policy("ant", "medium")
     with pytest.raises(ValueError, match=r"'simple'.*medium, expert, replay_1"):
         load_behavior_policy("hopper", "simple")
-
-
-def test_file_without_an_array_is_named(tmp_path) -> None:
-    (tmp_path / "toy").mkdir()
-    np.savez(tmp_path / "toy" / "medium.npz", **{"hidden0.weight": np.ones((2, 2))})
-    card = {"toy": {"env": "Toy-v0", "policies": {"medium": {}}}}
-    (tmp_path / "card.json").write_text(json.dumps(card))
-    with pytest.raises(ValueError, match=r"has no array .hidden0\.bias"):
-        load_behavior_policy("toy", "medium", folder=tmp_path)

@@ -139,11 +139,6 @@ def test_what_cannot_be_acted_in_is_refused_in_a_sentence(env_id, error, message
         make_environment(env_id)
 
 
-def test_unknown_names_list_the_known_ones():
-    with pytest.raises(ValueError, match=r"'ant'.*hopper.*pointmaze-umaze"):
-        environment_id("ant")
-
-
 def test_other_action_bounds_are_rescaled():
     with closing(make_environment("InvertedPendulum-v5")) as env:
         assert (env.action_space.low, env.action_space.high) == (-1, 1)
@@ -184,9 +179,3 @@ def test_an_episode_that_never_ends_is_cut(monkeypatch):
         env.reset(seed=0)
         cut = [env.step(np.int64(0))[3] for _ in range(50)]
     assert cut == [False] * 49 + [True]
-
-
-def test_nothing_is_left_in_the_working_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    make_environment("HalfCheetah-v5").close()
-    assert list(tmp_path.iterdir()) == []

@@ -10,7 +10,7 @@ import pytest
 
 from torchrl_osr.lab.cli.data import overview
 from torchrl_osr.lab.data import transitions_from_columns
-from torchrl_osr.lab.data.overview import describe_entries, findings, out_of_space
+from torchrl_osr.lab.data.overview import describe_entries, findings
 from torchrl_osr.lab.evaluation.figures import data_figure
 
 
@@ -106,13 +106,6 @@ def test_ranges_are_those_that_pandas_finds():
     found = np.array([[e.low, e.high, e.mean, e.deviation] for e in entries])
     np.testing.assert_allclose(found, expected, rtol=1e-3)
     np.testing.assert_allclose(found[:, :2], expected[:, :2], rtol=1e-12)
-
-
-def test_observations_outside_of_the_tasks_space_are_said():
-    entries = describe_entries([make_log()], {})
-    assert [*out_of_space(entries, [-np.inf, -9.0], [np.inf, 9.0])] == []
-    (sentence,) = out_of_space(entries, [-9.0, -1.0], [9.0, 1.0])
-    assert "where the environment's observation has -1 to 1" in sentence
 
 
 def test_discrete_actions_are_not_measured_by_bounds(tmp_path):

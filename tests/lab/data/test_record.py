@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from contextlib import closing
 
 import gymnasium
@@ -12,11 +11,10 @@ from recorded_logs import columns_of
 
 from torchrl_osr.lab.data import (
     load_dataset,
-    transitions_from_columns,
     write_memmap,
 )
 from torchrl_osr.lab.data.environment import open_environment
-from torchrl_osr.lab.data.record import check_log_path, record_episodes, write_log
+from torchrl_osr.lab.data.record import record_episodes, write_log
 
 
 def record(env_id, act=None, episodes=2, **options):
@@ -81,24 +79,6 @@ def test_discrete_actions_are_numbers_in_the_log_and_one_hot_in_the_data(tmp_pat
         load_dataset("x", "file", env_id="CartPole-v1", path=str(tmp_path / "set"))
 
 
-@pytest.mark.parametrize("suffix", ["parquet", "h5"])
-def test_a_missing_package_is_named_before_an_episode(tmp_path, monkeypatch, suffix):
-    for name in ("pyarrow", "h5py"):
-        monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(ImportError, match=rf"\.{suffix} files need .*\[minari\]"):
-        check_log_path(tmp_path / f"log.{suffix}")
-    check_log_path(tmp_path / "log.npz")
-
-
-@pytest.mark.parametrize("wrong", [2, -1, 0.5])
-def test_a_number_of_no_action_is_named_with_its_row(wrong):
-    columns = record("CartPole-v1")
-    columns["action"] = columns["action"].astype(np.float64)
-    columns["action"][3] = wrong
-    with pytest.raises(ValueError, match=f"{float(wrong)} in row 3 .*actions, 0 to 1"):
-        transitions_from_columns(columns, num_actions=2)
-
-
 def test_noise_stays_within_the_bounds_and_zero_is_none():
     clean = record("Pendulum-v1", forwards, noise=0.0)
     noisy = record("Pendulum-v1", forwards, noise=0.25)["action"]
@@ -112,13 +92,6 @@ def test_noise_stays_within_the_bounds_and_zero_is_none():
     assert np.mean(noisy == 2) == pytest.approx(0.1587, abs=0.08)
     again = record("Pendulum-v1", forwards, noise=0.25)["action"]
     np.testing.assert_array_equal(noisy, again)
-
-
-def test_noise_on_discrete_actions_is_their_random_share():
-    actions = record("CartPole-v1", lambda _: 1, episodes=60, noise=0.5)["action"]
-    # Half of the actions are drawn, and half of these are 0.
-    assert np.mean(actions == 0) == pytest.approx(0.25, abs=0.08)
-    assert set(record("CartPole-v1", lambda _: 1)["action"]) == {1}
 
 
 @pytest.mark.parametrize(

@@ -73,11 +73,6 @@ def test_shares_are_equal_and_cut_apart() -> None:
     assert truncated.nonzero().flatten().tolist() == [2, 5]
 
 
-def test_fewer_transitions_than_policies_are_refused() -> None:
-    with pytest.raises(ValueError, match="num_transitions=1 for 2 policies"):
-        collect_transitions(CountingEnv(), [saturated] * 2, 1)
-
-
 @pytest.mark.parametrize("env_name", load_behavior_card())
 @pytest.mark.parametrize("source", BEHAVIORS)
 def test_named_sets_are_sound(env_name: str, source: str) -> None:

@@ -141,18 +141,11 @@ def load_behavior_policy(
     Raises:
         ValueError: unknown name (the message lists the known ones), or a damaged file.
     """
-    path = behavior_policy_path(env_name, policy_name, folder)
-    arrays = read_arrays(path)
-    try:
-        layers = {
-            field.name: Affine(
-                *(
-                    arrays[f"{field.name}.{part}"].astype(np.float32)
-                    for part in Affine._fields
-                )
-            )
-            for field in fields(BehaviorPolicy)
-        }
-    except KeyError as error:
-        raise ValueError(f"{path} has no array {error}.") from error
-    return BehaviorPolicy(**layers)
+    arrays = read_arrays(behavior_policy_path(env_name, policy_name, folder))
+
+    def layer(name: str) -> Affine:
+        parts = (arrays[f"{name}.{part}"] for part in Affine._fields)
+        return Affine(*(part.astype(np.float32) for part in parts))
+
+    names = [each.name for each in fields(BehaviorPolicy)]
+    return BehaviorPolicy(**{name: layer(name) for name in names})

@@ -46,12 +46,7 @@ Leaves = dict[tuple[str | int, ...], "spaces.Space[Any]"]
 
 def environment_id(env_name: str) -> str:
     """Gymnasium id of a maze, or of a task with behaviour policies, by short name."""
-    known = _known_ids()
-    if env_name not in known:
-        raise ValueError(
-            f"unknown environment {env_name!r}; there are: {', '.join(known)}."
-        )
-    return known[env_name]
+    return _known_ids()[env_name]
 
 
 def environment_name(env_id: str) -> str:

@@ -68,14 +68,11 @@ def reference_returns(
     low, high = random_return, expert_return
     if low is None and high is None:
         return REFERENCE_RETURNS.get(env_name)
-    if env_name in REFERENCE_RETURNS:
+    known = env_name in REFERENCE_RETURNS
+    if known or low is None or high is None or not 0 < high - low < math.inf:
         raise ValueError(
-            f"{env_name} is scored by D4RL's references: leave out env.random_return "
-            "and env.expert_return, or give another env.name."
-        )
-    if low is None or high is None or not 0 < high - low < math.inf:
-        raise ValueError(
-            f"env.random_return={low} and env.expert_return={high}: expected two "
-            "finite numbers, the expert's above the random policy's, or neither."
+            f"env.random_return={low} and env.expert_return={high} of {env_name}: "
+            "expected two finite numbers, the expert's above the random policy's, and "
+            "none for a task with D4RL's references."
         )
     return ReferenceReturns(low, high)

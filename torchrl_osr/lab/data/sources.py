@@ -214,17 +214,12 @@ def open_recorded(
 def _check_rolled_out(env_name: str | None, env_id: str | None, source: str) -> None:
     name = env_name if env_id is None else environment_name(env_id)
     known = [*load_behavior_card(), *MAZE_IDS]
-    if name not in known:
+    if name not in known or name != env_name:
         raise ValueError(
-            f"there are no built-in data of {env_id or env_name}, only of "
-            f"{', '.join(known)}: record some with 'torchrl-osr collect "
-            f"env.id={env_id} path={name}.npz', then add data=file "
+            f"data={source} is rolled out for env.name={', '.join(known)}, not for "
+            f"{env_id or env_name} as {env_name}: record data with 'torchrl-osr "
+            f"collect env.id={env_id} path={name}.npz', then add data=file "
             f"data.path={name}.npz."
-        )
-    if name != env_name:
-        raise ValueError(
-            f"data={source} is rolled out for the task {name}: leave out "
-            f"env.name={env_name}, or bring data of your own with data=file."
         )
 
 
@@ -236,23 +231,16 @@ def _check_fit(
     parts = data["action"].split(CHUNK_ROWS)
     hot = all(bool((p.sum(1) == 1).all() and (p * (1 - p) == 0).all()) for p in parts)
     if ours != [spec.observation_size, spec.action_size] or spec.discrete > hot:
-        cure = "choose the env that the data are of."
-        if environment_name(env_id).startswith("antmaze"):
-            cure += (
-                " Its observations hold the goal; D4RL's own files of the ant do not, "
-                "and are of a mirrored maze: take data=minari, see docs/mazes.md."
-            )
         kind = "discrete" if spec.discrete else "real"
         raise ValueError(
             f"the data have {ours[0]} observation and {ours[1]} action entries, "
             f"{env_id} has {spec.observation_size} and {spec.action_size} ({kind}): "
-            f"{cure}"
+            "choose the env that the data are of."
         )
     if manifest.get("source") == "minari" and not spec.discrete:
-        bounds, task = manifest["action_bounds"], [spec.action_low, spec.action_high]
-        if not np.allclose(
-            [np.broadcast_to(b, ours[1]) for b in bounds], np.array(task)
-        ):
+        bounds = manifest["action_bounds"]
+        task: Any = [spec.action_low, spec.action_high]
+        if not all(map(np.allclose, bounds, task)):
             torchrl_logger.warning(
                 f"The actions of the Minari set have the bounds {bounds}, those of "
                 f"{env_id} {task}: actions are rescaled. If the environment clipped "
@@ -274,7 +262,7 @@ def _rolled_out(
     if not random_share:
         return data if on_disk else data.clone(), manifest
     if source == "random":
-        raise ValueError("data.random_share mixes random rows into data=random.")
+        _refuse({"random_share": random_share}, "data=random")
     other, random = _collected(root, env_name, "random", recipe, progress)
     number = round(random_share * len(data))
     rows = {source: len(data) - number, "random": number}
@@ -296,12 +284,9 @@ def _rolled_out(
 
     if not on_disk:
         return mixed(), mixture
-    folder = (
-        root / "collected" / f"{_name(env_name, source, recipe)}-random{random_share}"
-    )
-    return load_or_write(
-        folder, mixture, lambda: mixed().split(CHUNK_ROWS), progress=False
-    )
+    name = f"{_name(env_name, source, recipe)}-random{random_share}"
+    folder = root / "collected" / name
+    return load_or_write(folder, mixture, lambda: mixed().split(CHUNK_ROWS))
 
 
 def _collected(
@@ -346,7 +331,6 @@ def _collected(
         request,
         collect,
         describe=lambda: {"torchrl_osr_version": __version__, **episodes},
-        progress=False,
     )
 
 

@@ -182,12 +182,9 @@ def load_memmap(folder: Path | str) -> tuple[TensorDict, dict[str, Any]]:
     folder = Path(folder).expanduser()
     try:
         manifest = read_json(folder / MANIFEST)
-        if manifest.get("format") != FORMAT:
-            raise ValueError(
-                f"its format is {manifest.get('format')!r}, not {FORMAT!r}"
-            )
-        if manifest.get("rows_sha256") != _checksum(folder / ROWS):
-            raise ValueError("its checksum is wrong")
+        found = [manifest.get(key) for key in ("format", "rows_sha256")]
+        if found != [FORMAT, _checksum(folder / ROWS)]:
+            raise ValueError("its format or its checksum is wrong")
     except ValueError as error:
         raise ValueError(f"{folder} is damaged: {error}. Write it again.") from error
     return TensorDict.load_memmap(folder / ROWS), manifest
@@ -200,7 +197,7 @@ def load_or_write(
     *,
     describe: Callable[[], Mapping[str, Any]] = dict,
     total: int | None = None,
-    progress: bool = True,
+    progress: bool = False,
 ) -> tuple[TensorDict, dict[str, Any]]:
     """Open a cached data set, or write it first, see :func:`write_memmap`.
 
