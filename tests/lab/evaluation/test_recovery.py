@@ -53,10 +53,10 @@ def measure(disturbed: Trajectory, clean: Trajectory | None = None):
 def test_one_episode(after, fell, survived, alive, steps):
     before = [1.0, 1.0, 4.0]
     recovery = measure(trajectory([*before, *after], {2, 3}, fell=fell))
-    assert recovery.ended_at == 2
-    assert recovery.survived == survived
-    assert recovery.alive_after == alive
-    assert recovery.steps == steps
+    assert recovery["ended_at"] == 2
+    assert recovery["survived_knock"] == survived
+    assert recovery["alive_after"] == alive
+    assert recovery["recovery_steps"] == steps
 
 
 def test_episodes_without_the_disturbance_have_no_recovery():
@@ -72,8 +72,8 @@ def test_first_and_last_entry_of_a_disturbance(disturbed, block):
 
 def test_the_first_of_two_disturbances_counts():
     recovery = measure(trajectory([1, 1, 4, 3, 1, 1, 8, 8], {2, 6}))
-    assert recovery.ended_at == 1
-    assert recovery.steps == 2
+    assert recovery["ended_at"] == 1
+    assert recovery["recovery_steps"] == 2
 
 
 @pytest.mark.parametrize(
@@ -85,8 +85,8 @@ def test_the_undisturbed_episode_is_measured_at_the_same_step(
 ):
     clean = trajectory([1.0] * entries, fell=fell)
     recovery = measure(trajectory([1.0, 4.0, 1.0, 1.0], {1}), clean)
-    assert recovery.clean_alive_after == alive
-    there = ~np.isnan(recovery.clean_distance)
+    assert recovery["clean_alive_after"] == alive
+    there = ~np.isnan(recovery["clean_distance"])
     assert there[STEPS_BEFORE]
     assert there[STEPS_BEFORE + 60] == there_later
 

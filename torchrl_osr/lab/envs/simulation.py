@@ -78,10 +78,8 @@ class DynamicsChange(DisturbanceWrapper):
 class StartStateNoise(DisturbanceWrapper):
     """Add Gaussian noise to the start state of an episode.
 
-    It comes on top of the environment's own noise (uniform, half-width 5e-3 for hopper
-    and walker2d). Orientations of free bodies are rotated. After strong noise an
-    episode may start fallen, or with a foot in the ground, which MuJoCo pushes out.
-    Put this around the bare task, and observation noise around this.
+    Orientations of free bodies are rotated. After strong noise an episode may start
+    fallen, or with a foot in the ground. Put this around the bare task.
 
     Args:
         env: one of Gymnasium's MuJoCo tasks.

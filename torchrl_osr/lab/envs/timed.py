@@ -41,11 +41,10 @@ class ActionKnock(DisturbanceWrapper):
       anew in every step with probability 1/2. The steps count as in ``"paper"``.
       Discrete actions are drawn uniformly.
 
-    The official knock is inside the agent's last step before it. That step returns the
-    observation after the knock with the reward, end and info of the agent's own action;
-    a fall in the knock ends the episode only after the agent's next step. Neither the
-    time limit nor other wrappers see the extra steps. Put this around the bare task,
-    and observation noise around this.
+    The agent's last step before the official knock returns the observation after the
+    knock, with the reward and end of the agent's own action; a fall in the knock ends
+    the episode only after the agent's next step. Neither the time limit nor other
+    wrappers see the extra steps. Put this around the bare task.
 
     Args:
         env: the environment, with real actions, or in ``"torque"`` mode discrete ones.

@@ -45,24 +45,20 @@ class RecoverableStates:
 
     Attributes:
         env_name: short name of the task, ``"walker2d"`` for instance.
-        qpos: positions of the simulation, ``[M, Q]``.
-        qvel: velocities, ``[M, V]``.
+        qpos, qvel: positions ``[M, Q]`` and velocities ``[M, V]`` of the simulation.
         goal: in a maze, metres, ``[M, 2]``; elsewhere ``[M, 0]``.
         group: of :data:`GROUPS`.
         walk: number of the undisturbed walk a state comes from; states of one walk are
             alike.
         moment: step of the walk at which it was disturbed.
-        kind: of disturbance.
-        strength: of the disturbance, in the kind's unit.
+        kind, strength: of the disturbance.
         distance: to the expert's data, in units of the threshold of
             :class:`~torchrl_osr.lab.evaluation.DataDistance`.
-        offsets: the planner's solution, ``[M, K, A]``, each held for ``hold`` steps:
-            added to the actions of the expert, who then goes on alone. 0 if not
+        offsets: the planner's solution, ``[M, K, A]``, added to the actions of the
+            expert, who then goes on alone, for ``hold`` steps each. 0 if not
             recoverable.
-        hold: steps, a scalar.
-        steps: for which a policy is played from each state, a scalar.
-        least_speed: that HalfCheetah must regain, m/s, a scalar; elsewhere minus
-            infinity.
+        hold, steps: scalars; a policy is played for ``steps`` from each state.
+        least_speed: that HalfCheetah must regain, m/s; elsewhere minus infinity.
     """
 
     env_name: str

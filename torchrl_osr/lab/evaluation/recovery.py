@@ -73,42 +73,26 @@ class Recorder:
         trajectory.terminated = bool(terminated) and not info.get("success", False)
 
 
-@dataclass(frozen=True)
-class Recovery:
-    """Survival and recovery of one episode after a disturbance that ends.
-
-    Attributes:
-        ended_at: last step in which the disturbance acted.
-        survived: had not fallen by then.
-        alive_after: had not fallen :data:`STEPS_AFTER` steps later; ``None`` if the
-            time limit came first.
-        clean_alive_after: the same for the undisturbed episode of the pair.
-        steps: from its end until the distance to the data is within the threshold;
-            ``None`` if the episode ended before.
-        distance: in units of the threshold, from :data:`STEPS_BEFORE` steps before the
-            end of the disturbance to :data:`STEPS_AFTER` after it; NaN at steps that
-            the episode does not have.
-        clean_distance: of the undisturbed episode, at the same steps.
-    """
-
-    ended_at: int
-    survived: bool
-    alive_after: bool | None
-    clean_alive_after: bool | None
-    steps: int | None
-    distance: NDArray[np.float64]
-    clean_distance: NDArray[np.float64]
-
-
 def measure_recovery(
     disturbed: Trajectory, clean: Trajectory, distance: DataDistance
-) -> Recovery | None:
-    """Survival and recovery of one pair; ``None`` if the disturbance never acted."""
+) -> dict[str, Any] | None:
+    """Survival and recovery of one pair of episodes.
+
+    Returns:
+        ``None`` if the disturbance never acted. Else the last step in which it acted,
+        ``"ended_at"``; whether the episode had not fallen by then,
+        ``"survived_knock"``, nor :data:`STEPS_AFTER` steps later, ``"alive_after"``
+        (``None``: the time limit came first), and the same for the undisturbed episode,
+        ``"clean_alive_after"``; the steps from the end of the disturbance until the
+        distance to the data is within the threshold, ``"recovery_steps"`` (``None``:
+        the episode ended before); and distances in units of the threshold from
+        :data:`STEPS_BEFORE` steps before that end to :data:`STEPS_AFTER` after it,
+        ``"distance"`` and ``"clean_distance"`` (NaN: the episode has no such step).
+    """
     block = disturbed.disturbance()
     if block is None:
         return None
-    end = block[1]
-    last = len(disturbed.disturbed) - 1
+    end, last = block[1], len(disturbed.disturbed) - 1
     curve = _around(disturbed, end, distance)
     steps = _first_within(curve[STEPS_BEFORE:])
     if steps is None:
@@ -117,15 +101,15 @@ def measure_recovery(
     # The state of the fall itself does not count as recovered.
     if disturbed.terminated and steps == last - end:
         steps = None
-    return Recovery(
-        ended_at=max(end - 1, 0),
-        survived=not (disturbed.terminated and last == end),
-        alive_after=disturbed.alive_after(end),
-        clean_alive_after=clean.alive_after(end),
-        steps=steps,
-        distance=curve,
-        clean_distance=_around(clean, end, distance),
-    )
+    return {
+        "ended_at": max(end - 1, 0),
+        "survived_knock": not (disturbed.terminated and last == end),
+        "alive_after": disturbed.alive_after(end),
+        "clean_alive_after": clean.alive_after(end),
+        "recovery_steps": steps,
+        "distance": curve,
+        "clean_distance": _around(clean, end, distance),
+    }
 
 
 def _around(

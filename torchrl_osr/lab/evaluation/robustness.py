@@ -27,13 +27,18 @@ from torchrl_osr.lab.evaluation.recovery import (
     STEPS_AFTER,
     STEPS_BEFORE,
     Recorder,
-    Recovery,
     measure_recovery,
 )
 from torchrl_osr.lab.evaluation.statistics import decrease_interval, mean_interval
 
 TRANSIENT = ("knock", "push", "start")
 """Kinds of disturbance that end, so that there is something to recover from."""
+
+ENTRIES = (
+    *("ended_at", "survived_knock", "alive_after", "clean_alive_after"),
+    "recovery_steps",
+)
+"""What is known of each episode after a disturbance that ends."""
 
 
 @dataclass(frozen=True)
@@ -88,9 +93,9 @@ def evaluate_paired(
         JSON-compatible. ``"clean"``: lists ``"returns"``, ``"lengths"``, ``"seeds"``
         and, with references, ``"scores"``, one entry an episode. ``"levels"``: the same
         for each disturbance, with ``"name"``, ``"kind"``, ``"strength"``, the step at
-        which each episode was ``"disturbed_at"`` (``None``: it ended before), and, if
-        the disturbance ends, the entries of
-        :class:`~torchrl_osr.lab.evaluation.recovery.Recovery`; else these are ``None``.
+        which each episode was ``"disturbed_at"`` (``None``: it ended before), and the
+        entries of :func:`~torchrl_osr.lab.evaluation.recovery.measure_recovery`, which
+        are ``None`` if the disturbance does not end.
     """
 
     def play(policy: Policy, wrap: Wrap | None) -> tuple[EpisodeResults, Recorder]:
@@ -162,28 +167,20 @@ def _episodes_json(
     return raw | {"scores": references.score(results.returns).tolist()}
 
 
-def _recovery_json(recovery: Sequence[Recovery | None] | None) -> dict[str, Any]:
-    """Lists of the entries of each episode's recovery, and mean distances."""
-    entries = {
-        "ended_at": "ended_at",
-        "survived_knock": "survived",
-        "alive_after": "alive_after",
-        "clean_alive_after": "clean_alive_after",
-        "recovery_steps": "steps",
-    }
+def _recovery_json(
+    recovery: Sequence[Mapping[str, Any] | None] | None,
+) -> dict[str, Any]:
+    """Entries of :func:`measure_recovery`, a list each, and mean distances."""
     if recovery is None:
-        return dict.fromkeys([*entries, "distance"])
+        return dict.fromkeys([*ENTRIES, "distance"])
+    lists = {key: [each and each[key] for each in recovery] for key in ENTRIES}
     nowhere = np.full(STEPS_BEFORE + 1 + STEPS_AFTER, np.nan)
     curves: dict[str, Any] = {"offset": list(range(-STEPS_BEFORE, STEPS_AFTER + 1))}
     for prefix in ("", "clean_"):
-        rows = [getattr(each, f"{prefix}distance", nowhere) for each in recovery]
+        rows = [each[f"{prefix}distance"] if each else nowhere for each in recovery]
         known = np.ma.masked_invalid(rows)
         curves[f"{prefix}mean"] = known.mean(0).tolist()  # None without a step
         curves[f"{prefix}count"] = known.count(0).tolist()
-    lists = {
-        key: [getattr(each, name, None) for each in recovery]
-        for key, name in entries.items()
-    }
     return lists | {"distance": curves}
 
 

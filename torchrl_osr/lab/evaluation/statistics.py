@@ -28,12 +28,8 @@ TAIL = 50 * (1 - 0.95)
 class Estimate(NamedTuple):
     """A mean with its 95 % interval.
 
-    Attributes:
-        mean: the mean.
-        low: lower end.
-        high: upper end.
-        over: what was resampled: ``"seeds"``; ``"two seeds"``, whose interval is hardly
-            more than the two of them; ``"episodes"`` or ``"walks"`` of a single seed.
+    ``over`` says what was resampled: ``"seeds"``; ``"two seeds"``, whose interval is
+    hardly more than the two of them; ``"episodes"`` or ``"walks"`` of a single seed.
     """
 
     mean: float
@@ -140,11 +136,6 @@ def nested_resamples(runs: Sequence[ArrayLike], *, seed: int = 0) -> Array:
 
     Returns:
         Means, every run with equal weight, ``[R, K]``.
-
-    Examples:
-        >>> resamples = nested_resamples([[[1.0, 5.0]] * 3, [[1.0, 5.0]] * 4])
-        >>> resamples.shape, resamples[0].tolist()
-        ((2000, 2), [1.0, 5.0])
     """
     tables = [np.asarray(run, dtype=np.float64) for run in runs]
     rng = np.random.default_rng(seed)
@@ -248,14 +239,12 @@ def scores_and_decreases(
 ) -> list[tuple[Estimate, Estimate | None]]:
     """Scores of several runs, and their decreases in percent of the clean score.
 
-    Seeds are resampled, then episodes with all of their scores.
-
     Args:
-        runs: scores of each run's episodes, ``[E, K]``: first the clean one, then one
-            for each disturbance.
+        runs: scores of each run's episodes, ``[E, K]``, the clean one first. Seeds are
+            resampled, then episodes with all of their scores.
 
     Returns:
-        ``K`` pairs. A decrease is ``None`` where a clean mean is not above 0.
+        ``K`` pairs; a decrease is ``None`` where a clean mean is not above 0.
     """
     over = over_what([runs])
     means = np.mean([np.mean(np.asarray(run, float), axis=0) for run in runs], axis=0)

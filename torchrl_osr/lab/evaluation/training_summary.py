@@ -39,41 +39,27 @@ def score_table(
     """
     measure, last = measure_of(best), history[-1]
 
-    def with_interval(row: Mapping[str, Any], name: str, factor: float = 1) -> str:
-        mean, low, high = (
-            factor * row[f"{name}{end}"] for end in ("", "_low", "_high")
-        )
+    def text(mean: float, low: float, high: float) -> str:
         return f"{mean:6.1f}  [{low:.1f}, {high:.1f}]"
 
-    known = "unknown" if data_mean is None else f"{data_mean:6.1f}"
+    ends = (measure, f"{measure}_low", f"{measure}_high")
     trained = [row[measure] for row in history if row["step"]]
     recent = (trained or [last[measure]])[-NUM_RECENT:]
-    rows = [
-        ("data, mean episode", known),
-        ("policy, last", with_interval(last, measure)),
-    ]
+    rows = {
+        "data, mean episode": "unknown" if data_mean is None else f"{data_mean:6.1f}",
+        "policy, last": text(*(last[key] for key in ends)),
+    }
     if "success_rate" in last:
-        rate = {f"rate{end}": last[f"success{old}"] for end, old in RATES.items()}
-        episodes = f"  % of {len(last['successes'])} episodes, Wilson interval"
-        rows.append(
-            ("policy, last, success", with_interval(rate, "rate", 100) + episodes)
-        )
-    rows += [
-        (f"policy, mean of last {len(recent)}", f"{np.mean(recent):6.1f}"),
-        (
-            "policy, best evaluation",
-            f"{with_interval(best, measure)}  at step {best['step']}",
-        ),
-    ]
-    scale = (
-        "normalised score, 0 random and 100 expert" if measure == "score" else measure
-    )
-    lines = [f"{title}: {scale} [95 % interval]"]
-    lines += [f"  {label:<25}{value}" for label, value in rows]
+        rate = (100 * last[f"success_{end}"] for end in ("rate", "low", "high"))
+        number = f"  % of {len(last['successes'])} episodes, Wilson interval"
+        rows["policy, last, success"] = text(*rate) + number
+    rows[f"policy, mean of last {len(recent)}"] = f"{np.mean(recent):6.1f}"
+    found = f"{text(*(best[key] for key in ends))}  at step {best['step']}"
+    rows["policy, best evaluation"] = found
+    scale = "normalised score, 0 random and 100 expert"
+    lines = [f"{title}: {scale if measure == 'score' else measure} [95 % interval]"]
+    lines += [f"  {label:<25}{value}" for label, value in rows.items()]
     return "\n".join([*lines, f"  {'files':<26}{folder}"])
-
-
-RATES = {"": "_rate", "_low": "_low", "_high": "_high"}
 
 
 def read_scalars(folder: Path | str) -> dict[str, list[tuple[int, float]]]:

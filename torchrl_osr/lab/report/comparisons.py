@@ -7,7 +7,7 @@ same checkpoint and from the same start state. Intervals resample seeds, then ep
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pandas as pd
 
@@ -18,9 +18,11 @@ from torchrl_osr.lab.evaluation.statistics import (
     mean_difference,
 )
 from torchrl_osr.lab.report.runs import RunTables
-from torchrl_osr.lab.report.tables import recent
+from torchrl_osr.lab.report.tables import frame_of, recent
 
 ALL_DATA = "all data sets"
+
+MARKS = {"better": "▲ ", "worse": "▼ ", "no significant difference": "= "}
 
 MIN_SEEDS = 5
 """Pairs of runs on each data set below which there is no verdict.
@@ -197,3 +199,20 @@ def verdict(differences: Sequence[Difference], reference: str) -> list[str]:
         who = ", ".join(dict.fromkeys(methods))
         sentences.append(f"{name.capitalize()}, {why}: {who} against {reference}.")
     return sentences or [f"There is nothing to compare with {reference}."]
+
+
+def difference_table(differences: Sequence[Difference]) -> pd.DataFrame:
+    """Differences to the reference, by data set and method, with their verdicts."""
+    rows: dict[Any, dict[str, Any]] = {}
+    for each in differences:
+        row = rows.setdefault((each.data, each.method), {})
+        mark = MARKS.get(each.verdict, "")
+        name = each.quantity.name
+        if each.estimate is None:
+            row[name] = f"not compared: {each.note}"
+        else:
+            text = f"{decimal(each.estimate.mean, '+')} {each.estimate.interval('+')}"
+            row[name] = f"{mark}{text}"
+        if each.estimate is not None and each.note:
+            row["note"] = each.note
+    return frame_of(rows, "data", "method")

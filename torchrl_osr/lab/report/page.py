@@ -14,10 +14,14 @@ from torchrl_osr._files import write_atomically
 from torchrl_osr.lab.evaluation.figures import save_figure
 from torchrl_osr.lab.evaluation.statistics import NUM_RESAMPLES, Estimate
 from torchrl_osr.lab.report import figures
-from torchrl_osr.lab.report.comparisons import MIN_SEEDS, compare_all, verdict
+from torchrl_osr.lab.report.comparisons import (
+    MIN_SEEDS,
+    compare_all,
+    difference_table,
+    verdict,
+)
 from torchrl_osr.lab.report.runs import RunTables, comparison_notes
 from torchrl_osr.lab.report.tables import (
-    difference_table,
     mean_table,
     robustness_table,
     saved_table,

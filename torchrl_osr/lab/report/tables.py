@@ -6,8 +6,8 @@ number.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -29,11 +29,6 @@ from torchrl_osr.lab.evaluation.statistics import (
 )
 from torchrl_osr.lab.evaluation.training_summary import NUM_RECENT
 from torchrl_osr.lab.report.runs import RunTables
-
-if TYPE_CHECKING:
-    from torchrl_osr.lab.report.comparisons import Difference
-
-MARKS = {"better": "▲ ", "worse": "▼ ", "no significant difference": "= "}
 
 
 def undisturbed(episodes: pd.DataFrame) -> pd.DataFrame:
@@ -73,14 +68,14 @@ def score_table(tables: RunTables) -> pd.DataFrame:
             f"mean of the last {NUM_RECENT}": estimate(by_run(recent(group))),
             "data mean": of["data_score"].iloc[0],
         }
-    return _frame(rows, "data", "method")
+    return frame_of(rows, "data", "method")
 
 
 def mean_table(tables: RunTables) -> pd.DataFrame:
     """Interquartile means over all data sets, by method; empty for a single one."""
     rows: dict[str, dict[str, Any]] = {}
     if len(tables.data) == 1:
-        return _frame(rows, "method")
+        return frame_of(rows, "method")
     for method, group in recent(tables.episodes).groupby("method", sort=False):
         groups = [by_run(each) for _, each in group.groupby("data", sort=False)]
         rows[method] = {
@@ -88,7 +83,7 @@ def mean_table(tables: RunTables) -> pd.DataFrame:
             "runs": sum(map(len, groups)),
             "interquartile mean": iqm(groups),
         }
-    return _frame(rows, "method")
+    return frame_of(rows, "method")
 
 
 def robustness_table(tables: RunTables, suite: str) -> pd.DataFrame:
@@ -120,7 +115,7 @@ def robustness_table(tables: RunTables, suite: str) -> pd.DataFrame:
     flat = {
         (*key, method): row for key, of in rows.items() for method, row in of.items()
     }
-    return _frame(flat, "data", "disturbance", "method")
+    return frame_of(flat, "data", "disturbance", "method")
 
 
 def _recovery(there: pd.DataFrame) -> dict[str, Any]:
@@ -205,7 +200,7 @@ def saved_table(tables: RunTables, reference: str) -> pd.DataFrame:
                 share = saved_share(table.loc[:, which], walk[which])
                 row[name] = _percent(share, len(table))
             rows[f"{data}, {states}", method] = row
-    return _frame(rows, "data", "method")
+    return frame_of(rows, "data", "method")
 
 
 def _recovered(ours: pd.DataFrame, theirs: pd.DataFrame, walk: Any) -> Estimate | None:
@@ -225,23 +220,6 @@ def _percent(found: tuple[float, float, float], seeds: int) -> Estimate:
     return Estimate(mean, low, high, over_what([range(seeds)], alone="walks"))
 
 
-def difference_table(differences: Sequence[Difference]) -> pd.DataFrame:
-    """Differences to the reference, by data set and method, with their verdicts."""
-    rows: dict[Any, dict[str, Any]] = {}
-    for each in differences:
-        row = rows.setdefault((each.data, each.method), {})
-        mark = MARKS.get(each.verdict, "")
-        name = each.quantity.name
-        if each.estimate is None:
-            row[name] = f"not compared: {each.note}"
-        else:
-            text = f"{decimal(each.estimate.mean, '+')} {each.estimate.interval('+')}"
-            row[name] = f"{mark}{text}"
-        if each.estimate is not None and each.note:
-            row["note"] = each.note
-    return _frame(rows, "data", "method")
-
-
 def text(cell: Any) -> str:
     """A cell as text; nothing is a dash."""
     if cell is None or (isinstance(cell, float) and np.isnan(cell)):
@@ -249,7 +227,7 @@ def text(cell: Any) -> str:
     return decimal(cell) if isinstance(cell, float) else str(cell)
 
 
-def _frame(rows: Mapping[Any, Mapping[str, Any]], *names: str) -> pd.DataFrame:
+def frame_of(rows: Mapping[Any, Mapping[str, Any]], *names: str) -> pd.DataFrame:
     """Table with a row for each key, whose parts have names."""
     frame = pd.DataFrame(list(rows.values()), dtype=object)
     if not rows or len(names) == 1:
