@@ -100,7 +100,8 @@ def main(arguments=None):
         return mode(trained.actor, observation=state_of(observation))
 
     def episode(controller, push):
-        env = gymnasium.make(task.id, render_mode="rgb_array", width=240, height=240)
+        view = {"camera_name": "track", "width": 240, "height": 240}
+        env = gymnasium.make(task.id, render_mode="rgb_array", **view)
         if given.video and push:
             env = RecordVideo(env, given.video, name_prefix=controller.__name__)
         options = {"duration": DURATION, "unit": "body_weight", "at": BEGIN}

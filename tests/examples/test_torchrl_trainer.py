@@ -54,7 +54,7 @@ def test_an_option_has_every_argument_with_its_default(composed, group, name) ->
     part = configs.OPTIONS[group, name]
     for key, each in inspect.signature(part).parameters.items():
         if each.kind is each.VAR_KEYWORD:
-            assert {"loss_function", "gamma", "reduction"} <= found.keys()
+            assert {"loss_function", "reduction"} <= found.keys()
         elif key in configs.GIVEN_IN_THE_CALL:
             assert found[key] is None
         elif each.default is each.empty:
