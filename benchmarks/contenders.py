@@ -22,9 +22,10 @@ from torchrl.modules import (
     TanhNormal,
     ValueOperator,
 )
-from torchrl.objectives import CQLLoss, LossModule, SoftUpdate, group_optimizers
+from torchrl.objectives import CQLLoss as TorchRLCQLLoss
+from torchrl.objectives import LossModule, SoftUpdate, group_optimizers
 
-from torchrl_osr import OSRLoss, OSRVLoss, StatePerturbation
+from torchrl_osr import CQLLoss, OSRLoss, OSRVLoss, StatePerturbation
 from torchrl_osr.fast import fast_update
 from torchrl_osr.modules import (
     critic_ensemble,
@@ -119,8 +120,7 @@ def our_loss(name: str, size: Size, device: torch.device) -> LossModule:
     if name == "OSR-v":
         loss = OSRVLoss(actor, critics, inverse_dynamics)
     elif name == "CQL(H)":
-        options = {"recovery_weight": 0, "actor_states": "clean"}
-        loss = OSRLoss(actor, critics, num_random=size.num_random, **options)
+        loss = CQLLoss(actor, critics, num_random=size.num_random)
     elif name == "OSR-10":
         options = {"min_q_weight": 0, "deterministic_backup": False}
         loss = OSRLoss(actor, critics, inverse_dynamics, **options)
@@ -203,7 +203,7 @@ def torchrl_update(size: Size, device: torch.device) -> Update:
         default_interaction_type=ExplorationType.RANDOM,
     )
     critic = MLP(observations + actions, 1, **like)
-    loss = CQLLoss(
+    loss = TorchRLCQLLoss(
         actor,
         ValueOperator(critic, ["observation", "action"]),
         loss_function="l2",
