@@ -11,36 +11,43 @@ import math
 
 import torch
 from torch import Tensor
-from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.data import LazyTensorStorage
 from torchrl.objectives import SoftUpdate
 from uneven_dynamics import uneven_dynamics
 
 from torchrl_osr import CQLLoss
-from torchrl_osr.lab.dynamics import DynamicsEnsemble, DynamicsOptions, ModelAdversary
+from torchrl_osr.lab.dynamics import (
+    DynamicsEnsemble,
+    DynamicsOptions,
+    ModelAdversary,
+    ModelData,
+)
 
 GAMMA = 0.875
-SAC = {"min_q_weight": 0.0}
 
 
 def falls(state: Tensor) -> Tensor:
     return state[..., 0] > 0.5
 
 
-def make_adversary(networks, make_batch, **options) -> ModelAdversary:
-    loss = CQLLoss(networks.actor, networks.critics, **SAC).double()
+def make_adversary(networks, make_batch) -> ModelAdversary:
+    loss = CQLLoss(networks.actor, networks.critics, min_q_weight=0.0).double()
     SoftUpdate(loss, tau=0.1)
-    real = ReplayBuffer(storage=LazyTensorStorage(50))
-    real.extend(make_batch(50, twin=False))
+    rows, storage = make_batch(50, twin=False), LazyTensorStorage(50)
+    storage.set(range(50), rows)
+    data = ModelData(
+        storage, rows, None, torch.zeros(3), torch.ones(3), 1.0, 0.0, "Hopper-v5"
+    )
     model = uneven_dynamics()
     optimizer = torch.optim.Adam(model.parameters(), lr=1e-2)
-    given = {
-        "adversarial_steps": 5, "adversarial_weight": 0.5, "rollout_steps": 2,
-        "batch_size": 8,
-    }  # fmt: skip
-    return ModelAdversary(
-        DynamicsOptions(**(given | options)), model, loss, networks.actor, real,
-        optimizer, gamma=GAMMA, terminated=falls,
-    )  # fmt: skip
+    options = DynamicsOptions(
+        adversarial_steps=5, adversarial_weight=0.5, rollout_steps=2, batch_size=8
+    )
+    adversary = ModelAdversary(
+        options, data, model, loss, networks.actor, optimizer, GAMMA, seed=0
+    )
+    adversary.terminated = falls
+    return adversary
 
 
 def restated(networks, model: DynamicsEnsemble, states: Tensor) -> Tensor:
@@ -78,9 +85,7 @@ def restated(networks, model: DynamicsEnsemble, states: Tensor) -> Tensor:
         mean, scale = gaussians[drawn[row]]
         sample = (mean + scale * noise[row]).detach()
         following, reward = state + sample[:3], sample[3]
-        after = (
-            0.0 if falls(following) else value(following, policy(following)[0].tanh())
-        )
+        after = value(following, policy(following)[0].tanh()) * ~falls(following)
         advantage.append(reward + GAMMA * after - value(state, action))
         densities = [
             torch.exp(-(((sample - mean) / scale) ** 2) / 2)
@@ -105,17 +110,11 @@ def test_objective_and_gradients_equal_the_restatement(
     got, _ = adversary.objective(states)
     torch.manual_seed(6)
     wanted = restated(plain, model, states)
-    gradients = (
-        torch.autograd.grad(value.mean(), list(each.parameters()))
+    mine, theirs = (
+        [value.detach(), *torch.autograd.grad(value.mean(), list(each.parameters()))]
         for value, each in ((got, adversary.model), (wanted, model))
     )
-    mine, theirs = gradients
-    check(
-        "RAMBO",
-        [got.detach(), *mine],
-        [wanted.detach(), *theirs],
-        tolerance=1e-10,
-    )
+    check("RAMBO", mine, theirs, tolerance=1e-10)
     assert not any(each.grad is not None for each in adversary.loss.parameters())
 
 

@@ -44,7 +44,7 @@ def test_it_is_the_runs_policies_models_and_critics(folders) -> None:
             seen, half = (state - own.loc) / own.scale, (own.high - own.low) / 2
             unit = (action - (own.low + own.high) / 2) / half
             plain = load_dynamics(folder / FILE)
-            mean = plain.predict(seen, unit).mean[plain.elites[0]]
+            mean = plain.predict(seen, unit)[0][plain.elites[0]]
             after = state + mean[:, :-1] * own.scale
             values = [
                 critic.smallest_value(after, policy(after)) for critic in policies
@@ -63,7 +63,7 @@ def test_others_may_judge_and_critics_may_judge_alone(folders, tmp_path) -> None
     make_run(tmp_path / "bc", "loss=bc", "env.action_low=[-1,-1,-1]")
     state = torch.zeros(1, 11)
     judged = load_switching_policy([tmp_path / "bc"], judges=folders[:1])
-    assert (len(judged.policies), judged.networks.num_networks) == (1, 1)
+    assert (len(judged.policies), len(judged.networks.weights[0])) == (1, 1)
     assert torch.equal(judged(state), load_run_policy(tmp_path / "bc")(state))
     alone = load_switching_policy(folders, critics_only=True)
     policies = [load_run_policy(folder) for folder in folders]

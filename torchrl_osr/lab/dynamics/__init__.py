@@ -3,20 +3,10 @@
 from torchrl_osr.lab.dynamics.conditional_vae import ConditionalVAE, ConditionalVAELoss
 from torchrl_osr.lab.dynamics.data import ModelData
 from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble, DynamicsLoss
-from torchrl_osr.lab.dynamics.fit import describe_dynamics, dynamics_report
 from torchrl_osr.lab.dynamics.model_adversary import ModelAdversary
 from torchrl_osr.lab.dynamics.options import DynamicsOptions
 from torchrl_osr.lab.dynamics.rollout_buffer import RolloutReplayBuffer
-from torchrl_osr.lab.dynamics.rollouts import (
-    Rollout,
-    never,
-    perturbed_starts,
-    reverse_rollout,
-    reverse_transitions,
-    rollout,
-    termination,
-    uniform_policy,
-)
+from torchrl_osr.lab.dynamics.rollouts import rollout, termination
 from torchrl_osr.lab.dynamics.switching import EliteNetworks, SwitchingPolicy
 
 __all__ = [
@@ -28,16 +18,8 @@ __all__ = [
     "EliteNetworks",
     "ModelAdversary",
     "ModelData",
-    "Rollout",
     "RolloutReplayBuffer",
     "SwitchingPolicy",
-    "describe_dynamics",
-    "dynamics_report",
-    "never",
-    "perturbed_starts",
-    "reverse_rollout",
-    "reverse_transitions",
     "rollout",
     "termination",
-    "uniform_policy",
 ]

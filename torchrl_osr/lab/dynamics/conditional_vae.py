@@ -8,17 +8,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase, TensorDictParams, unravel_key
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from torchrl_osr._checks import check_weight
 from torchrl_osr._entries import entry, is_next, nested
 from torchrl_osr.functional import gaussian_kl
-from torchrl_osr.lab.dynamics.ensemble import has_next_state, loc_and_scale
+from torchrl_osr.lab.dynamics.ensemble import (
+    UNWEIGHTED,
+    copy_statistics,
+    has_next_state,
+)
 from torchrl_osr.modules.cvae_inverse_dynamics import LATENT_LOG_SCALE_BOUNDS
 from torchrl_osr.objectives import ActorCriticLoss
 from torchrl_osr.objectives.actor_critic import Losses
@@ -41,19 +44,9 @@ class ConditionalVAE(nn.Module):
 
     Keyword Args:
         condition_key, target_key: entries of a batch.
-        change: see above.
         num_cells: width of each hidden layer. Default: BCQ's.
         latent_dim: ``Z``. Default ``2 * T``, BCQ's.
         latent_bound: largest magnitude of a sampled latent; BCQ's is 0.5.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_osr.lab.dynamics import ConditionalVAE
-        >>> model = ConditionalVAE(
-        ...     11, 3, condition_key=("next", "observation"), target_key="action",
-        ...     num_cells=[32])
-        >>> model.sample(torch.zeros(4, 11)).shape
-        torch.Size([4, 3])
     """
 
     target_loc: Tensor
@@ -81,28 +74,17 @@ class ConditionalVAE(nn.Module):
         self.register_buffer("target_loc", torch.zeros(target_dim))
         self.register_buffer("target_scale", torch.ones(target_dim))
 
-    def encode(self, condition: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and scale ``[B, Z]`` of the latent, for a standardised target."""
-        loc, log_scale = self.encoder(condition, target).chunk(2, -1)
-        return loc, log_scale.clamp(*LATENT_LOG_SCALE_BOUNDS).exp()
-
     def decode(self, condition: Tensor, latent: Tensor) -> Tensor:
         """Return the predicted standardised target, ``[B, T]``."""
         output: Tensor = self.decoder(condition, latent)
         return output if self.change else output.tanh()
 
-    def standardized(self, condition: Tensor, target: Tensor) -> Tensor:
-        """Return the target as :meth:`decode` predicts it, ``[B, T]``."""
-        if not self.change:
-            return target
-        return (target - condition - self.target_loc) / self.target_scale
-
     def sample(self, condition: Tensor) -> Tensor:
         """Draw a target for each condition, ``[B, T]``."""
         size = *condition.shape[:-1], self.latent_dim
         latent = torch.randn(size, dtype=condition.dtype, device=condition.device)
-        bound = self.latent_bound
-        output = self.decode(condition, latent.clamp(-bound, bound))
+        latent = latent.clamp(-self.latent_bound, self.latent_bound)
+        output = self.decode(condition, latent)
         if not self.change:
             return output
         return condition + self.target_loc + self.target_scale * output
@@ -111,11 +93,8 @@ class ConditionalVAE(nn.Module):
     def standardize_(self, data: TensorDictBase) -> None:
         """Take mean and standard deviation of the change from rows ``[N]``."""
         rows = data[has_next_state(data, self.in_keys[0])]
-        loc, scale = loc_and_scale(
-            entry(rows, self.out_keys[0]) - entry(rows, self.in_keys[0])
-        )
-        self.target_loc.copy_(loc)
-        self.target_scale.copy_(scale)
+        change = entry(rows, self.out_keys[0]) - entry(rows, self.in_keys[0])
+        copy_statistics(change, self.target_loc, self.target_scale)
 
 
 class ConditionalVAELoss(ActorCriticLoss):
@@ -128,12 +107,9 @@ class ConditionalVAELoss(ActorCriticLoss):
 
     as in BCQ's code. Rows without a next state do not count.
 
-    Args:
-        vae_network: to be trained.
-
     Keyword Args:
         latent_weight: ``w``. Default 0.5, BCQ's.
-        reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
+        options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
     """
 
     vae_network: ConditionalVAE
@@ -145,42 +121,34 @@ class ConditionalVAELoss(ActorCriticLoss):
         vae_network: ConditionalVAE,
         *,
         latent_weight: float = 0.5,
-        reduction: Literal["none", "mean", "sum"] | None = None,
+        **options: Any,
     ) -> None:
-        check_weight("latent_weight", latent_weight)
-        super().__init__(
-            reduction=reduction,
-            use_prioritized_weights=False,
-            scalar_output_mode="exclude",
-        )
+        super().__init__(**(UNWEIGHTED | options))
         self.convert_to_functional(vae_network, "vae_network")
         self.latent_weight = latent_weight
+        # The entry whose next one is read or written, or else the condition.
+        keys = [*vae_network.in_keys, *vae_network.out_keys]
+        after = (unravel_key(key[1:]) for key in keys if is_next(key))
+        self.state_key = next(after, keys[0])
         self.declare(["loss_vae"], [])
 
-    @property
-    def _state(self) -> NestedKey:
-        """The entry whose next one is read or written, or else the condition."""
-        keys = [*self.vae_network.in_keys, *self.vae_network.out_keys]
-        after = (unravel_key(key[1:]) for key in keys if is_next(key))
-        return next(after, keys[0])
-
     def input_keys(self) -> list[NestedKey]:
-        model, state = self.vae_network, self._state
-        rows = [state, nested("next", state), ("next", "terminated")]
-        return [*model.in_keys, *model.out_keys, *rows]
+        rows = [self.state_key, nested("next", self.state_key), ("next", "terminated")]
+        return [*self.vae_network.in_keys, *self.vae_network.out_keys, *rows]
 
     def losses(self, batch: Transitions) -> Losses:
         check_single_steps(batch, "the autoencoder")
         tensordict, model = batch.one_step, self.vae_network
-        condition, target = (
-            entry(tensordict, key) for key in (*model.in_keys, *model.out_keys)
-        )
+        condition = entry(tensordict, model.in_keys[0])
+        target = entry(tensordict, model.out_keys[0])
         with self.vae_network_params.to_module(model):
-            target = model.standardized(condition, target)
-            loc, scale = model.encode(condition, target)
+            if model.change:
+                target = (target - condition - model.target_loc) / model.target_scale
+            loc, log_scale = model.encoder(condition, target).chunk(2, -1)
+            scale = log_scale.clamp(*LATENT_LOG_SCALE_BOUNDS).exp()
             output = model.decode(condition, loc + scale * torch.randn_like(scale))
         prior = torch.zeros_like(loc), torch.ones_like(scale)
         divergence = gaussian_kl(loc, scale, *prior).mean(-1)
         value = (output - target).square().mean(-1) + self.latent_weight * divergence
-        loss = self.reduce(value, batch, has_next_state(tensordict, self._state))
-        return {"loss_vae": loss}, {}
+        valid = has_next_state(tensordict, self.state_key)
+        return {"loss_vae": self.reduce(value, batch, valid)}, {}

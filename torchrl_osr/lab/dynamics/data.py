@@ -41,15 +41,13 @@ class ModelData:
 
     def buffer(self, batch_size: int | None = None) -> ReplayBuffer:
         """Return a buffer of the rows to train on, without other transforms."""
-        buffer = ReplayBuffer(
+        return ReplayBuffer(
             storage=self.storage,
             writer=ImmutableDatasetWriter(),
             collate_fn=lambda batch: batch,
             batch_size=batch_size,
+            transform=reverse_transitions if self.backward else None,
         )
-        if self.backward:
-            buffer.append_transform(reverse_transitions)
-        return buffer
 
     def reverse(self) -> ModelData:
         """Return the same transitions against the direction of time."""

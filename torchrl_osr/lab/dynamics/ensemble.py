@@ -8,15 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase, TensorDictParams
 from torch import Tensor, nn
-from torch.linalg import vector_norm
 from torch.nn.functional import softplus
 
-from torchrl_osr._checks import check_weight
 from torchrl_osr._entries import column, entry, nested
 from torchrl_osr.objectives import ActorCriticLoss
 from torchrl_osr.objectives.actor_critic import Losses
@@ -29,16 +27,15 @@ WEIGHT_DECAY = (2.5e-5, 5e-5, 7.5e-5, 7.5e-5)
 OUTPUT_WEIGHT_DECAY = 1e-4
 """Of MOPO's four hidden layers and its last one; further layers use the fourth's."""
 
-
-class Prediction(NamedTuple):
-    """Gaussians of all networks, in the units of the data, ``[E, B, D]``."""
-
-    mean: Tensor
-    scale: Tensor
+UNWEIGHTED: dict[str, Any] = {
+    "use_prioritized_weights": False,
+    "scalar_output_mode": "exclude",
+}
+"""Options of the models' losses, which learn from all rows alike."""
 
 
 class DynamicsEnsemble(nn.Module):
-    r"""Predict Gaussians of the state's change and the reward with several networks.
+    r"""Networks that predict Gaussians of the state's change and the reward.
 
     .. math::
         \big(s' - s,\, r\big) \sim
@@ -46,16 +43,15 @@ class DynamicsEnsemble(nn.Module):
         \quad i = 1 \dots E
 
     as in PETS (https://arxiv.org/abs/1805.12114) and MOPO
-    (https://arxiv.org/abs/2005.13239), which sets the defaults. Unlike there, targets
-    are standardised as well as inputs, so that the entries' units do not matter.
+    (https://arxiv.org/abs/2005.13239), which sets the defaults. Targets are
+    standardised as well as inputs, so that the entries' units do not matter.
 
     Args:
-        observation_dim: ``S``.
-        action_dim: ``A``; the number of discrete actions.
+        observation_dim, action_dim: ``S`` and ``A``.
 
     Keyword Args:
-        num_networks: ``E``.
-        num_elites: networks that roll-outs use, see :meth:`calibrate_`.
+        num_networks, num_elites: ``E``; roll-outs use the elites, see
+            :meth:`calibrate_`.
         num_cells: width of each hidden layer.
         observation_key, action_key: entries to read.
 
@@ -73,6 +69,7 @@ class DynamicsEnsemble(nn.Module):
     target_loc: Tensor
     target_scale: Tensor
     elites: Tensor
+    layers: Any
 
     def __init__(
         self,
@@ -87,10 +84,8 @@ class DynamicsEnsemble(nn.Module):
     ) -> None:
         super().__init__()
         if not 1 <= num_elites <= num_networks:
-            raise ValueError(
-                f"num_elites must be between 1 and num_networks={num_networks}, got "
-                f"{num_elites}."
-            )
+            limits = f"between 1 and num_networks={num_networks}"
+            raise ValueError(f"num_elites must be {limits}, got {num_elites}.")
         self.observation_dim, self.action_dim = observation_dim, action_dim
         self.num_networks, self.num_elites = num_networks, num_elites
         self.num_cells = list(num_cells)
@@ -108,16 +103,10 @@ class DynamicsEnsemble(nn.Module):
             self.register_buffer(f"{name}_scale", torch.ones(size))
         self.register_buffer("elites", torch.arange(num_elites))
 
-    @property
-    def linear_layers(self) -> list[_StackedLinear]:
-        """The layers, with their type."""
-        return [cast(_StackedLinear, layer) for layer in self.layers]
-
     def standardized(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and log-variance ``[E, B, D]`` of the standardised targets.
 
-        Args:
-            inputs: states and actions, ``[B, S + A]`` or ``[E, B, S + A]``.
+        ``inputs`` are states and actions, ``[B, S + A]`` or ``[E, B, S + A]``.
         """
         hidden = (inputs - self.input_loc) / self.input_scale
         if hidden.ndim == 2:
@@ -131,22 +120,22 @@ class DynamicsEnsemble(nn.Module):
         below = highest - softplus(highest - free)
         return mean, lowest + softplus(below - lowest)
 
-    def predict(self, observation: Tensor, action: Tensor) -> Prediction:
-        """Return the Gaussians of all networks at ``[B, S]`` and ``[B, A]``."""
+    def predict(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and scale of all networks, in the data's units, ``[E, B, D]``."""
         batch = observation.shape[:-1]
         inputs = torch.cat([observation, action], -1).flatten(0, -2)
         mean, log_variance = self.standardized(inputs)
         mean = mean * self.target_scale + self.target_loc
         scale = log_variance.mul(0.5).exp() * self.target_scale
         shape = self.num_networks, *batch, -1
-        return Prediction(mean.view(shape), scale.view(shape))
+        return mean.view(shape), scale.view(shape)
 
-    def sample(self, prediction: Prediction) -> Tensor:
+    def sample(self, mean: Tensor, scale: Tensor) -> Tensor:
         """Draw an elite for each row, and from its Gaussian, ``[B, D]``."""
-        batch = prediction.mean.shape[1:-1]
-        drawn = torch.randint(len(self.elites), batch, device=self.elites.device)
-        chosen = self.elites[drawn].unsqueeze(-1).expand_as(prediction.mean[:1])
-        mean, scale = (each.gather(0, chosen).squeeze(0) for each in prediction)
+        batch, device = mean.shape[1:-1], self.elites.device
+        drawn = self.elites[torch.randint(len(self.elites), batch, device=device)]
+        drawn = drawn.unsqueeze(-1).expand_as(mean[:1])
+        mean, scale = (each.gather(0, drawn).squeeze(0) for each in (mean, scale))
         return mean + scale * torch.randn_like(mean)
 
     def disagreement(self, mean: Tensor) -> Tensor:
@@ -156,7 +145,7 @@ class DynamicsEnsemble(nn.Module):
         takes the largest distance of two networks.
         """
         mean = mean[self.elites] / self.target_scale
-        distance: Tensor = vector_norm(mean - mean.mean(0), dim=-1)
+        distance: Tensor = (mean - mean.mean(0)).norm(dim=-1)
         return distance.amax(0)
 
     def inputs_and_targets(self, data: TensorDictBase) -> tuple[Tensor, Tensor]:
@@ -172,11 +161,9 @@ class DynamicsEnsemble(nn.Module):
     def standardize_(self, data: TensorDictBase) -> None:
         """Take mean and standard deviation of inputs and targets from rows ``[N]``."""
         rows = data[has_next_state(data, self.in_keys[0])]
-        names = ("input", "target")
-        for name, values in zip(names, self.inputs_and_targets(rows), strict=True):
-            loc, scale = loc_and_scale(values)
-            getattr(self, f"{name}_loc").copy_(loc)
-            getattr(self, f"{name}_scale").copy_(scale)
+        inputs, targets = self.inputs_and_targets(rows)
+        copy_statistics(inputs, self.input_loc, self.input_scale)
+        copy_statistics(targets, self.target_loc, self.target_scale)
 
     @torch.no_grad()
     def calibrate_(self, held_out: TensorDictBase) -> None:
@@ -190,14 +177,13 @@ class DynamicsEnsemble(nn.Module):
 
     def parameter_groups(self) -> Iterator[dict[str, Any]]:
         """Yield groups for :class:`torch.optim.Adam`, with MOPO's weight decay."""
-        *hidden, last = self.linear_layers
-        for number, layer in enumerate(hidden):
+        *hidden, last = (layer.weight for layer in self.layers)
+        for number, weight in enumerate(hidden):
             decay = WEIGHT_DECAY[min(number, len(WEIGHT_DECAY) - 1)]
-            yield {"params": [layer.weight], "weight_decay": decay}
-        yield {"params": [last.weight], "weight_decay": OUTPUT_WEIGHT_DECAY}
-        weights = {id(layer.weight) for layer in (*hidden, last)}
-        rest = [each for each in self.parameters() if id(each) not in weights]
-        yield {"params": rest}
+            yield {"params": [weight], "weight_decay": decay}
+        yield {"params": [last], "weight_decay": OUTPUT_WEIGHT_DECAY}
+        weights = {*hidden, last}
+        yield {"params": [each for each in self.parameters() if each not in weights]}
 
 
 class _StackedLinear(nn.Module):
@@ -215,10 +201,11 @@ class _StackedLinear(nn.Module):
         return torch.baddbmm(self.bias, value, self.weight)
 
 
-def loc_and_scale(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Return mean and standard deviation of ``[N, D]``; 1 for constant entries."""
-    scale, loc = torch.std_mean(values.double(), 0, correction=0)
-    return loc, torch.where(scale > 1e-8, scale, torch.ones_like(scale))
+def copy_statistics(values: Tensor, loc: Tensor, scale: Tensor) -> None:
+    """Copy mean and standard deviation of ``[N, D]``; 1 for constant entries."""
+    std, mean = torch.std_mean(values.double(), 0, correction=0)
+    loc.copy_(mean)
+    scale.copy_(torch.where(std > 1e-8, std, torch.ones_like(std)))
 
 
 def has_next_state(data: TensorDictBase, key: NestedKey = "observation") -> Tensor:
@@ -231,10 +218,7 @@ def has_next_state(data: TensorDictBase, key: NestedKey = "observation") -> Tens
 
 
 def gaussian_error(mean: Tensor, log_variance: Tensor, target: Tensor) -> Tensor:
-    r"""Return :math:`\frac1D \sum_d (\mu_d - y_d)^2 / \sigma_d^2 + \log \sigma_d^2`.
-
-    This is twice the negative log-likelihood without its constant, ``[B]``.
-    """
+    """Return twice the negative log-likelihood, a mean without constant, ``[B]``."""
     return ((mean - target).square() * (-log_variance).exp() + log_variance).mean(-1)
 
 
@@ -247,30 +231,17 @@ class DynamicsLoss(ActorCriticLoss):
             + w \sum_d \big( v^{max}_d - v^{min}_d \big)
 
     with the standardised targets :math:`y = (s' - s, r)` and the learned bounds
-    :math:`v` of the log-variance, as in MOPO's code (https://arxiv.org/abs/2005.13239,
-    tianheyu927/mopo). MOPO's weight decay is in
-    :meth:`~torchrl_osr.lab.dynamics.DynamicsEnsemble.parameter_groups`. The batch is
-    divided among the networks, where MOPO draws bootstrap samples. Rows without a next
-    state do not count.
+    :math:`v` of the log-variance, as in MOPO's code (tianheyu927/mopo), whose weight
+    decay is in :meth:`DynamicsEnsemble.parameter_groups`. The batch is divided among
+    the networks, where MOPO draws bootstrap samples. Rows without a next state do not
+    count.
 
     Args:
         dynamics_network: to be trained, standardised already.
 
     Keyword Args:
         bound_weight: ``w``. Default 0.01, MOPO's.
-        reduction: of the likelihood, ``"mean"`` (default), ``"sum"`` or ``"none"``.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_osr.lab.dynamics import DynamicsEnsemble, DynamicsLoss
-        >>> loss = DynamicsLoss(DynamicsEnsemble(11, 3, num_networks=2, num_elites=1))
-        >>> batch = TensorDict({
-        ...     "observation": torch.randn(6, 11), "action": torch.rand(6, 3),
-        ...     "next": {"observation": torch.randn(6, 11), "reward": torch.ones(6, 1),
-        ...              "terminated": torch.zeros(6, 1, dtype=torch.bool)}}, [6])
-        >>> sorted(loss(batch).keys())
-        ['loss_bounds', 'loss_dynamics']
+        options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
     """
 
     dynamics_network: DynamicsEnsemble
@@ -282,14 +253,9 @@ class DynamicsLoss(ActorCriticLoss):
         dynamics_network: DynamicsEnsemble,
         *,
         bound_weight: float = 0.01,
-        reduction: Literal["none", "mean", "sum"] | None = None,
+        **options: Any,
     ) -> None:
-        check_weight("bound_weight", bound_weight)
-        super().__init__(
-            reduction=reduction,
-            use_prioritized_weights=False,
-            scalar_output_mode="exclude",
-        )
+        super().__init__(**(UNWEIGHTED | options))
         self.convert_to_functional(dynamics_network, "dynamics_network")
         self.bound_weight = bound_weight
         self.declare(["loss_dynamics", "loss_bounds"], [])
@@ -304,17 +270,13 @@ class DynamicsLoss(ActorCriticLoss):
         tensordict, model = batch.one_step, self.dynamics_network
         rows = tensordict.batch_size.numel()
         if rows % model.num_networks:
-            raise ValueError(
-                f"The batch has {rows} rows for {model.num_networks} networks, each of "
-                "which needs its own rows: expected a multiple."
-            )
+            number = model.num_networks
+            raise ValueError(f"{rows} rows cannot be divided among {number} networks.")
         with self.dynamics_network_params.to_module(model):
             inputs, targets = model.inputs_and_targets(tensordict)
             targets = (targets - model.target_loc) / model.target_scale
-            inputs, targets = (
-                each.reshape(model.num_networks, -1, each.shape[-1])
-                for each in (inputs, targets)
-            )
+            inputs = inputs.reshape(model.num_networks, -1, inputs.shape[-1])
+            targets = targets.reshape(model.num_networks, -1, targets.shape[-1])
             mean, log_variance = model.standardized(inputs)
             width = model.highest_log_variance - model.lowest_log_variance
             bounds = self.bound_weight * width.sum()
@@ -327,5 +289,4 @@ class DynamicsLoss(ActorCriticLoss):
         loss = self.reduce(value, batch, valid)
         if self.reduction == "none":
             bounds = bounds.expand(batch.tensordict.batch_size) / rows
-        losses = {"loss_dynamics": loss, "loss_bounds": bounds}
-        return losses, {}
+        return {"loss_dynamics": loss, "loss_bounds": bounds}, {}

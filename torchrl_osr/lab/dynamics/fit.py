@@ -28,23 +28,17 @@ def dynamics_report(
     held_out: TensorDictBase,
     pieces: TensorDictBase | None = None,
 ) -> dict[str, Any]:
-    """Measure an ensemble's errors, and how well it predicts them.
-
-    Args:
-        model: the ensemble.
-        held_out: transitions ``[N]``.
-        pieces: of :func:`rollout_errors`. Default: none.
+    """Measure an ensemble's errors on rows ``[N]``, and how well it predicts them.
 
     Returns:
         ``"nll"`` of the elites in nats, summed over entries; ``"mse"`` of standardised
         targets, of all networks; ``"r2"`` of the elites' mean for each entry, the last
         of the reward; ``"within_1_sigma"`` and ``"within_2_sigma"``, shares of errors
         (0.683 and 0.954 are calibrated); ``"disagreement_rank"``, Spearman's
-        correlation of disagreement and error; ``"rollout"``.
+        correlation of disagreement and error; ``"rollout"``, see
+        :func:`rollout_errors`.
     """
     rows = held_out[has_next_state(held_out, model.in_keys[0])]
-    if not len(rows):
-        raise ValueError("No held-out row has a next state.")
     _, targets = model.inputs_and_targets(rows)
     mean, scale = model.predict(*(rows[key] for key in model.in_keys))
     unit = model.target_scale
@@ -78,12 +72,7 @@ def rollout_errors(
     pieces: TensorDictBase,
     horizons: Sequence[int] = HORIZONS,
 ) -> list[dict[str, float]]:
-    """Measure errors of the elites' mean, rolled out with the recorded actions.
-
-    Args:
-        model: the ensemble.
-        pieces: consecutive transitions ``[n, L]``.
-        horizons: numbers of steps.
+    """Measure errors of the elites' mean, rolled out with the actions of ``[n, L]``.
 
     Returns:
         The ``"steps"`` of each horizon up to ``L``, the ``"rmse"`` in standard
@@ -102,20 +91,17 @@ def rollout_errors(
                 ((guess - truth) / unit).square().mean(-1).mean().sqrt().item()
                 for guess in (state, first)
             )
-            row = {"steps": step + 1, "rmse": rolled, "standing_still": still}
-            found.append(row)
+            found.append({"steps": step + 1, "rmse": rolled, "standing_still": still})
     return found
 
 
 def describe_dynamics(report: Mapping[str, Any]) -> str:
     """Return one line of text with the numbers of a report."""
     line = (
-        f"dynamics, {report['rows']} held-out rows: NLL {report['nll']:.2f}, "
-        f"R2 {report['r2_mean']:.2f}, within 1 and 2 sigma "
-        f"{100 * report['within_1_sigma']:.0f} and "
-        f"{100 * report['within_2_sigma']:.0f} %, disagreement and error "
-        f"{report['disagreement_rank']:.2f}"
-    )
+        "dynamics, {rows} held-out rows: NLL {nll:.2f}, R2 {r2_mean:.2f}, within 1 and "
+        "2 sigma {within_1_sigma:.0%} and {within_2_sigma:.0%}, disagreement and error "
+        "{disagreement_rank:.2f}"
+    ).format(**report)
     if report.get("rollout"):
         errors = [f"{each['rmse']:.2f} ({each['steps']})" for each in report["rollout"]]
         line += f", error after steps {', '.join(errors)}"

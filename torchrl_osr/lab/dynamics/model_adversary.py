@@ -18,12 +18,10 @@ from tensordict.nn import (
 )
 from torch import Tensor
 from torch.distributions import Normal
-from torchrl.data import ReplayBuffer
 
-from torchrl_osr._entries import entry
+from torchrl_osr.lab.dynamics.data import ModelData
 from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble, DynamicsLoss
 from torchrl_osr.lab.dynamics.options import DynamicsOptions
-from torchrl_osr.lab.dynamics.rollouts import Termination, never
 from torchrl_osr.objectives import ActorCriticLoss
 
 SEED = 2**40
@@ -46,36 +44,27 @@ class ModelAdversary:
     marc-rigter/rambo).
 
     Args:
-        options: of the training; ``adversarial_weight`` is :math:`\lambda`.
-        model: trained already.
+        options: ``adversarial_weight`` is :math:`\lambda`.
+        model: trained already; ``optimizer`` has its parameters.
         loss: has the critics.
-        actor: the policy.
-        real: the data, sampled with the buffer's own generator, if it has one.
-        optimizer: of the model's parameters.
-
-    Keyword Args:
-        gamma: discount factor.
-        terminated: of next states. Default: never.
-        seed: of the draws.
     """
 
     def __init__(
         self,
         options: DynamicsOptions,
+        data: ModelData,
         model: DynamicsEnsemble,
         loss: ActorCriticLoss,
         actor: ProbabilisticTensorDictSequential,
-        real: ReplayBuffer,
         optimizer: torch.optim.Optimizer,
-        *,
         gamma: float,
-        terminated: Termination = never,
-        seed: int = 0,
+        seed: int,
     ) -> None:
         self.options, self.model = options, model.requires_grad_(True)
-        self.loss, self.actor, self.real, self.optimizer = loss, actor, real, optimizer
-        self.likelihood = DynamicsLoss(model)
-        self.gamma, self.terminated, self.seed = gamma, terminated, seed
+        self.loss, self.actor, self.optimizer = loss, actor, optimizer
+        self.gamma, self.seed = gamma, seed
+        self.terminated = options.termination(data.env_id, data.loc, data.scale)
+        self.real, self.likelihood = data.buffer(), DynamicsLoss(model)
         self.metrics: dict[str, float] = {}
 
     def __call__(self, number: int) -> None:
@@ -88,43 +77,33 @@ class ModelAdversary:
             for step in range(steps):
                 if step % length == 0:
                     rows = self.real.sample(options.batch_size)
-                    state = entry(rows, self.model.in_keys[0])
-                likelihood, objective, state = self._update(state)
-                totals += torch.stack([likelihood, objective])
+                    state = rows[self.model.in_keys[0]]
+                rows = self.real.sample(self.model.num_networks * options.batch_size)
+                likelihood = sum(self.likelihood(rows).values())
+                objectives, state = self.objective(state)
+                objective = objectives.mean()
+                (likelihood + options.adversarial_weight * objective).backward()
+                self.optimizer.step()
+                self.optimizer.zero_grad()
+                totals += torch.stack([likelihood, objective]).detach()
         names = ("adversary_likelihood", "adversary_objective")
         self.metrics = dict(zip(names, (totals / steps).tolist(), strict=True))
 
-    def _update(self, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Take a gradient step; return both terms and the next states."""
-        rows = self.model.num_networks * self.options.batch_size
-        likelihood = sum(self.likelihood(self.real.sample(rows)).values())
-        objectives, following = self.objective(state)
-        objective = objectives.mean()
-        (likelihood + self.options.adversarial_weight * objective).backward()
-        self.optimizer.step()
-        self.optimizer.zero_grad()
-        return likelihood.detach(), objective.detach(), following
-
     def objective(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        r"""Return the term with :math:`\lambda`, ``[B]``, and next states, ``[B, S]``.
-
-        Args:
-            state: ``[B, S]``.
-        """
+        r"""Return the term with :math:`\lambda`, ``[B]``, and next states."""
         model = self.model
         with torch.no_grad():
             action = self._action(state, InteractionType.RANDOM)
-        prediction = model.predict(state, action)
+        mean, scale = model.predict(state, action)
         with torch.no_grad():
-            sample = model.sample(prediction)
+            sample = model.sample(mean, scale)
             following, reward = state + sample[..., :-1], sample[..., -1]
             goes_on = ~self.terminated(following)
             after = self._action(following, InteractionType.DETERMINISTIC)
             value = self._value(following, after)
             advantage = reward + self.gamma * goes_on * value
             advantage = advantage - self._value(state, action)
-        mean, scale = (each[model.elites] for each in prediction)
-        density = Normal(mean, scale)
+        density = Normal(mean[model.elites], scale[model.elites])
         log_prob = density.log_prob(sample).sum(-1)  # type: ignore[no-untyped-call]
         log_density = log_prob.logsumexp(0) - math.log(len(log_prob))
         # Equation (9), standardised as in the code.
@@ -139,16 +118,12 @@ class ModelAdversary:
 
     def _value(self, state: Tensor, action: Tensor) -> Tensor:
         batch = TensorDict({self.model.in_keys[0]: state}, state.shape[:-1])
-        params = self.loss.qvalue_network_params
-        return self.loss.q(batch, action, params).amin(0)
+        return self.loss.q(batch, action).amin(0)
 
     def state_dict(self) -> dict[str, Any]:
         """Return what a continued run needs."""
-        return {
-            "model": self.model.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "metrics": self.metrics,
-        }
+        model, optimizer = self.model.state_dict(), self.optimizer.state_dict()
+        return {"model": model, "optimizer": optimizer, "metrics": self.metrics}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Continue from a state."""

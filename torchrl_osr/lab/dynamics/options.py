@@ -57,13 +57,9 @@ class DynamicsOptions:
 
     def ensemble(self, observation_size: int, action_size: int) -> DynamicsEnsemble:
         """Build an untrained ensemble."""
-        return DynamicsEnsemble(
-            observation_size,
-            action_size,
-            num_networks=self.num_networks,
-            num_elites=self.num_elites,
-            num_cells=self.num_cells,
-        )
+        names = "num_networks", "num_elites", "num_cells"
+        options = {name: getattr(self, name) for name in names}
+        return DynamicsEnsemble(observation_size, action_size, **options)
 
     def transition_vae(self, observation_size: int) -> ConditionalVAE:
         """Build an untrained model of the states that follow a state in the data."""
@@ -90,11 +86,7 @@ class DynamicsOptions:
     def termination(
         self, env_id: str, loc: Tensor | float = 0.0, scale: Tensor | float = 1.0
     ) -> Termination:
-        """Return the rule that ends roll-outs, for observations ``(s - loc) / scale``.
-
-        Raises:
-            ValueError: no rule is known for the task.
-        """
+        """Return the rule that ends roll-outs, for states ``(s - loc) / scale``."""
         rule = never if self.terminations == "never" else termination(env_id)
         return lambda state: rule(state * scale + loc)
 
@@ -106,19 +98,12 @@ class DynamicsOptions:
         if self.real_ratio == 1:
             return
         self.termination(env_id)
-        real = round(self.real_ratio * batch_size)
-        forward = self.perturbed_start_steps > 0 or self.unknown == "halt"
+        real, halts = round(self.real_ratio * batch_size), self.unknown == "halt"
         if not 0 < real < batch_size:
-            why = (
-                f"real_ratio={self.real_ratio}: {real} of {batch_size} rows would be "
-                "real, and a batch needs real and synthetic rows"
-            )
-        elif self.reverse_policy and forward:
-            why = (
-                "perturbed_start_steps and unknown=halt need a forward model: choose "
-                "dynamics=ensemble"
-            )
-        elif self.unknown == "halt" and gamma == 1:
+            why = f"real_ratio={self.real_ratio}: {real} of {batch_size} rows are real"
+        elif self.reverse_policy and (self.perturbed_start_steps or halts):
+            why = "perturbed_start_steps and unknown=halt need a forward model"
+        elif halts and gamma == 1:
             why = "unknown=halt needs optim.gamma below 1"
         elif self.adversarial_steps and self.batch_size < 2:
             why = "batch_size must be at least 2: advantages are standardised"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from copy import deepcopy
-from itertools import accumulate, pairwise
 from typing import Any, cast
 
 import torch
@@ -37,16 +36,12 @@ class RolloutReplayBuffer:
     state dict holds policies instead of rows; loading it repeats the roll-outs.
 
     Args:
-        options: of the roll-outs.
         data: the recorded rows, which come first in a batch.
         model: of the dynamics, a reverse one with ``options.reverse_policy``.
-        policy: an actor, or for a reverse model a
-            :class:`~torchrl_osr.lab.dynamics.ConditionalVAE`.
-        adversary: trains the model before each further roll-out. Default: none.
+        policy: an actor, or for a reverse model a :class:`ConditionalVAE`.
+        adversary: trains the model before each further roll-out.
 
     Keyword Args:
-        batch_size, transform: of all rows.
-        gamma: discount factor.
         n_steps: of the recorded rows; synthetic ones are single steps.
         seed: of the first roll-out; the next one has the next seed.
 
@@ -74,9 +69,7 @@ class RolloutReplayBuffer:
         self.real = data.buffer()
         # The adversary's model is copied too: a roll-out must be repeatable.
         self.policy = policy if adversary is None else nn.ModuleList([policy, model])
-        terminated = options.termination(data.env_id, data.loc, data.scale)
-        self.bounds: dict[str, Any] = {"terminated": terminated}
-        self.bounds |= self._bounds_of_unknown(gamma)
+        self.bounds = self._bounds(gamma)
         self.num_batches = 0
         self.synthetic: TensorDictBase = TensorDict({}, [0])
         self._rng: torch.Generator | None = None
@@ -85,14 +78,16 @@ class RolloutReplayBuffer:
         self._rollouts: list[Rollout] = []
 
     @torch.no_grad()
-    def _bounds_of_unknown(self, gamma: float) -> dict[str, float]:
-        """Return options of :func:`rollout` for rows on which the networks disagree."""
-        options, held_out = self.options, self.data.held_out
+    def _bounds(self, gamma: float) -> dict[str, Any]:
+        """Return options of :func:`rollout` for ends and for unknown rows."""
+        options, data, held_out = self.options, self.data, self.data.held_out
+        terminated = options.termination(data.env_id, data.loc, data.scale)
+        bounds: dict[str, Any] = {"terminated": terminated}
         if options.unknown == "take":
-            return {}
+            return bounds
         mean, _ = self.model.predict(held_out["observation"], held_out["action"])
         known = self.model.disagreement(mean).quantile(options.known_share)
-        bounds = {"max_disagreement": known.item()}
+        bounds["max_disagreement"] = known.item()
         if options.unknown == "halt":
             # An end must not be better than the data's worst rewards for ever.
             worst = held_out["next", "reward"].quantile(0.01).clamp(max=0)
@@ -119,14 +114,9 @@ class RolloutReplayBuffer:
             self._keep([*self._rollouts, latest][newest])
         self.num_batches += 1
         num_real = round(options.real_ratio * self.batch_size)
-        num_synthetic, generator = self.batch_size - num_real, self._rng
-        real = self.real.sample(num_real)
-        index = torch.randint(
-            len(self.synthetic),
-            (num_synthetic,),
-            generator=generator,
-            device=None if generator is None else generator.device,
-        )
+        size, rng = (self.batch_size - num_real,), self._rng
+        real, device = self.real.sample(num_real), None if rng is None else rng.device
+        index = torch.randint(len(self.synthetic), size, generator=rng, device=device)
         batch = self.transform(torch.cat([real, self.synthetic[index]]))
         if options.reverse_policy is None:  # own actions are no labels
             order = torch.arange(len(batch), device=batch.device)
@@ -134,15 +124,12 @@ class RolloutReplayBuffer:
         return take_multi_step(batch) if self.n_steps > 1 else batch
 
     def roll_out(self, copied: nn.Module) -> Rollout:
-        """Return rows of a copy of the policy, by torch's global generator alone."""
+        """Roll out a copy of the policy, by torch's global generator alone."""
         options, data, policy, model = self.options, self.data, copied, self.model
         if self.adversary is not None:
             policy, model = cast(tuple[nn.Module, DynamicsEnsemble], copied.children())
-        uniform = uniform_policy(self.model.action_dim)
 
         def act(state: Tensor) -> Tensor:
-            if options.reverse_policy == "uniform":
-                return uniform(state)
             if isinstance(policy, ConditionalVAE):
                 return policy.sample(state)
             batch = TensorDict({"observation": state}, state.shape[:-1])
@@ -159,9 +146,15 @@ class RolloutReplayBuffer:
             starts = perturbed_starts(model, starts, steps=steps, **self.bounds)
         sizes = data.scale.expand(model.observation_dim)
         units = torch.cat([sizes, sizes.new_tensor([1 / data.reward_scale])])
+        uniform = options.reverse_policy == "uniform"
         roll_out = rollout if options.reverse_policy is None else reverse_rollout
         rows, rejected = roll_out(
-            model, act, starts, steps=options.rollout_steps, units=units, **self.bounds
+            model,
+            uniform_policy(model.action_dim) if uniform else act,
+            starts,
+            steps=options.rollout_steps,
+            units=units,
+            **self.bounds,
         )
         penalty = options.penalty * data.reward_scale
         rows["next", "reward"] -= penalty * rows["uncertainty"]
@@ -169,7 +162,7 @@ class RolloutReplayBuffer:
         if self.n_steps > 1:
             ones = torch.ones_like(rows["next", "done"], dtype=torch.long)
             rows["multi_step"] = rows["next"].copy().set("steps", ones)
-        return Rollout(rows, rejected)
+        return rows, rejected
 
     def _repeatable(self, weights: Mapping[str, Any], number: int) -> Rollout:
         """Roll out a policy with these weights, with the seed of this number."""
@@ -177,27 +170,25 @@ class RolloutReplayBuffer:
         device = next(self._copy.parameters()).device
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
             torch.manual_seed(self.seed + number)
-            found = self.roll_out(self._copy)
-        if not len(found.rows):
+            rows, rejected = self.roll_out(self._copy)
+        if not len(rows):
             raise ValueError(
                 "The model rejects all rows of a roll-out. Train it longer "
                 "(dynamics.steps), or keep them (dynamics.unknown=take)."
             )
-        return found
+        return rows, rejected
 
     def _keep(self, rollouts: list[Rollout]) -> None:
         """Sample from these rows."""
-        rows = torch.cat([each.rows for each in rollouts])
-        ends = [0, *accumulate(len(each.rows) for each in rollouts)]
-        self._rollouts = [  # of slices, so that rows are in memory once
-            Rollout(rows[start:end], each.num_rejected)
-            for (start, end), each in zip(pairwise(ends), rollouts, strict=True)
-        ]
-        self.synthetic = rows
+        rows, rejected = zip(*rollouts, strict=True)
+        self.synthetic = torch.cat(rows)
+        # Slices, so that rows are in memory once.
+        slices = self.synthetic.split([len(each) for each in rows])
+        self._rollouts = list(zip(slices, rejected, strict=True))
 
     def metrics(self) -> dict[str, float]:
         """Return the share of rejected rows, and of the others that end the task."""
-        rejected = sum(each.num_rejected for each in self._rollouts)
+        rejected = sum(number for _, number in self._rollouts)
         following = self.synthetic["next"]
         return {
             "rollout_rejected": rejected / (rejected + len(following)),

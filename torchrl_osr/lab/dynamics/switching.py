@@ -1,7 +1,6 @@
 """Policy selection by predicted return.
 
-Shapes: ``B`` states, ``S`` observation, ``A`` action, ``N`` policies, ``E`` networks of
-the dynamics, ``T`` steps of a roll-out.
+Shapes: ``B`` states, ``S`` observation, ``A`` action, ``N`` policies, ``E`` networks.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ from copy import copy
 import torch
 from torch import Tensor
 
-from torchrl_osr._checks import check_positive
 from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
 from torchrl_osr.lab.dynamics.rollouts import Termination, never
 
@@ -25,7 +23,7 @@ class EliteNetworks:
 
     Args:
         model: is copied.
-        loc, scale: were subtracted from the environment's states, and divided them.
+        loc, scale: the model's states are ``(s - loc) / scale``.
         low, high: the environment's actions for the data's -1 and 1.
     """
 
@@ -42,9 +40,8 @@ class EliteNetworks:
         states, actions = ones(model.observation_dim), ones(model.action_dim)
         center = torch.cat([loc * states, (low + high) / 2 * actions]).double()
         unit = torch.cat([scale * states, (high - low) / 2 * actions]).double()
-        layers = model.linear_layers
-        weights = [each.weight[model.elites].double() for each in layers]
-        biases = [each.bias[model.elites].double() for each in layers]
+        weights = [each.weight[model.elites].double() for each in model.layers]
+        biases = [each.bias[model.elites].double() for each in model.layers]
         weights[0] /= (unit * model.input_scale).unsqueeze(-1)
         shift = (center + unit * model.input_loc) @ weights[0]
         biases[0] -= shift.unsqueeze(1)
@@ -56,11 +53,6 @@ class EliteNetworks:
         self.weights = [each.float() for each in weights]
         self.biases = [each.float() for each in biases]
         self.activation = model.activation
-
-    @property
-    def num_networks(self) -> int:
-        """``E``."""
-        return len(self.weights[0])
 
     @classmethod
     def join(cls, parts: Sequence[EliteNetworks]) -> EliteNetworks:
@@ -100,24 +92,20 @@ class SwitchingPolicy:
         value: of observations and actions, ``[n]``.
 
     Keyword Args:
-        terminated: of next observations. Default: never.
-        steps: ``T``.
-        gamma: discount factor.
+        terminated: of next observations.
+        steps: :math:`T`.
         hold: calls for which the chosen policy acts.
 
     Attributes:
         chosen: number of the acting policy in each state, ``[B]``; ``None`` at first.
 
     Examples:
-        >>> import torch
-        >>> from torchrl_osr.lab.dynamics import SwitchingPolicy
-        >>> rest = lambda state: torch.zeros(len(state), 3)
-        >>> push = lambda state: torch.ones(len(state), 3)
+        >>> rest, push = torch.zeros_like, torch.ones_like
         >>> policy = SwitchingPolicy(
-        ...     [rest, push], None, lambda state, action: action.sum(-1) * state[:, 0])
+        ...     [rest, push], None, lambda state, action: (state * action)[:, 0])
         >>> policy(torch.tensor([[0.5], [-0.5]]))
-        tensor([[1., 1., 1.],
-                [0., 0., 0.]])
+        tensor([[1.],
+                [0.]])
     """
 
     def __init__(
@@ -131,8 +119,6 @@ class SwitchingPolicy:
         gamma: float = 0.99,
         hold: int = 4,
     ) -> None:
-        check_positive("steps", steps, minimum=1)
-        check_positive("hold", hold, minimum=1)
         self.policies, self.value, self.terminated = list(policies), value, terminated
         self.networks = networks
         self.steps, self.gamma, self.hold = steps, gamma, hold
@@ -157,24 +143,18 @@ class SwitchingPolicy:
     def returns(self, observation: Tensor) -> Tensor:
         """Return each policy's predicted return, ``[B, N]``, for ``[B, S]``."""
         starts = observation.repeat_interleave(len(self.policies), 0)
-        if self.networks is None:
-            found = self.value(starts, self._actions(starts))
-        else:
-            found = self._rolled_out(self.networks, starts).mean(0)
-        return found.view(-1, len(self.policies))
-
-    def _rolled_out(self, networks: EliteNetworks, starts: Tensor) -> Tensor:
-        """Return the return predicted by each network, ``[E, B N]``, for ``[B N, S]``.
-
-        A prediction that is not finite ends the task without a reward.
-        """
-        rows = networks.num_networks, len(starts), -1
-        state = starts.repeat(networks.num_networks, 1)
+        networks = self.networks
+        if networks is None:
+            value = self.value(starts, self._actions(starts))
+            return value.view(-1, len(self.policies))
+        number = len(networks.weights[0])
+        rows, state = (number, len(starts), -1), starts.repeat(number, 1)
         going = torch.ones_like(state[:, 0], dtype=torch.bool)
         reward = torch.zeros(self.steps, len(going), device=starts.device)
         for step in range(self.steps):
             action = self._actions(state).reshape(rows)
             change = networks(state.view(rows), action).flatten(0, 1)
+            # A prediction that is not finite ends the task without a reward.
             going = going & change.isfinite().all(-1)
             reward[step] = change[:, -1].where(going, 0.0)
             following = state + change[:, :-1]
@@ -186,7 +166,7 @@ class SwitchingPolicy:
         discount = self.gamma ** torch.arange(self.steps, device=starts.device)
         value = self.value(state, self._actions(state)).where(going, 0.0)
         found = discount @ reward + self.gamma**self.steps * value
-        return found.view(-1, len(starts))
+        return found.view(number, len(starts)).mean(0).view(-1, len(self.policies))
 
     def _actions(self, state: Tensor) -> Tensor:
         """Return actions for ``[n N, S]``, by each policy in turn."""

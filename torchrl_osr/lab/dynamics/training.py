@@ -10,7 +10,7 @@ import hashlib
 import json
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +39,7 @@ log = logging.getLogger(__name__)
 FILE, REPORT = "dynamics.safetensors", "dynamics.json"
 """The model and its errors, in the folder of a run."""
 
-ROWS_FOR_STATISTICS = 50_000
-"""Rows from which a model's inputs and targets are standardised."""
+ROWS_FOR_STATISTICS = 50_000  # a model's inputs and targets are standardised by them
 
 FITTED = ("num_networks", "num_elites", "num_cells", "lr", "batch_size", "steps")
 """Options that decide what a trained model is."""
@@ -68,18 +67,9 @@ def train_dynamics(
     gamma: float,
     **batches: Any,
 ) -> tuple[RolloutReplayBuffer | None, ModelAdversary | None]:
-    """Train a run's dynamics models, and give them to its loss.
+    """Train a run's dynamics models, and load them into the parts of its loss.
 
-    Args:
-        options: of models and roll-outs.
-        data: for models.
-        loss: what is trained, with the terms that are added to it.
-        actor: the policy.
-        phase: trains a model.
-
-    Keyword Args:
-        gamma: discount factor.
-        batches: other options of :class:`RolloutReplayBuffer`.
+    ``batches`` are other options of :class:`RolloutReplayBuffer`.
 
     Returns:
         The policy's buffer with roll-outs, and the adversary that trains the model
@@ -102,39 +92,28 @@ def train_dynamics(
         policy = train_vae(options.reverse_vae(*sizes), options, data, phase)
     adversary = None
     if options.adversarial_steps and options.adversarial_weight:
+        adam = phase.adam(model.parameter_groups(), lr=options.adversarial_lr)
         adversary = ModelAdversary(
-            options,
-            model,
-            parts[0],
-            actor,
-            data.buffer(),
-            phase.adam(model.parameter_groups(), lr=options.adversarial_lr),
-            gamma=gamma,
-            terminated=options.termination(data.env_id, data.loc, data.scale),
-            seed=phase.seed,
+            options, data, model, parts[0], actor, adam, gamma, phase.seed
         )
-    buffer = RolloutReplayBuffer(
-        options, data, model, policy, adversary, gamma=gamma, seed=phase.seed, **batches
+    batches |= {"gamma": gamma, "seed": phase.seed}
+    return (
+        RolloutReplayBuffer(options, data, model, policy, adversary, **batches),
+        adversary,
     )
-    return buffer, adversary
 
 
 def dynamics_model(
     options: DynamicsOptions, data: ModelData, phase: Phase
 ) -> DynamicsEnsemble:
-    """Train a run's ensemble, or take it from a file; with a report in its folder.
-
-    Raises:
-        ValueError: ``options.path`` is no model, or one of other data.
-    """
+    """Train a run's ensemble or load it; write file and report to the run's folder."""
     facts, here = data.facts(), phase.folder / FILE
     if not here.exists() and options.path is not None:
         write_dynamics(here, load_dynamics(options.path, facts), facts)
     elif not here.exists():
-        chosen = {key: asdict(options)[key] for key in FITTED}
-        stamp = {"version": __version__, "seed": phase.seed} | chosen
-        everything = {"data": facts, "settings": stamp | dict(phase.arithmetic)}
-        text = json.dumps(everything, sort_keys=True).encode()
+        stamp = {"version": __version__, "seed": phase.seed} | dict(phase.arithmetic)
+        stamp |= {key: getattr(options, key) for key in FITTED}
+        text = json.dumps({"data": facts, "settings": stamp}, sort_keys=True).encode()
         name = f"{phase.name}-{hashlib.sha256(text).hexdigest()[:16]}"
         cached = cache_root() / "dynamics" / f"{name}.safetensors"
         cached.parent.mkdir(parents=True, exist_ok=True)
@@ -165,9 +144,8 @@ def _trained(
     """Train a model; return the weights of its best evaluation."""
     held_out = data.held_out
     torch.manual_seed(phase.seed)
-    model = options.ensemble(
-        held_out["observation"].shape[-1], held_out["action"].shape[-1]
-    )
+    sizes = (held_out[key].shape[-1] for key in ("observation", "action"))
+    model = options.ensemble(*sizes)
     _standardize(model, data, phase)
     loss = DynamicsLoss(model)
 
@@ -186,8 +164,8 @@ def _trained(
         description="dynamics",
     )
     trainer.train()
-    best = safe_checkpoint(loss_module=loss)
-    best.load(trainer.checkpoints.best_path, map_location="cpu")
+    path = trainer.checkpoints.best_path
+    safe_checkpoint(loss_module=loss).load(path, map_location="cpu")
     model.calibrate_(held_out)
     return model
 
@@ -230,7 +208,7 @@ def _standardize(
 def write_dynamics(
     path: Path, model: DynamicsEnsemble, facts: Mapping[str, Any]
 ) -> None:
-    """Write a model and :meth:`ModelData.facts` to one file of tensors."""
+    """Write a model and the facts on its data to one file of tensors."""
     names = "observation_dim", "action_dim", "num_networks", "num_elites", "num_cells"
     sizes = {name: getattr(model, name) for name in names}
     write_tensors(path, model.state_dict(), {"sizes": sizes, "data": dict(facts)})
@@ -239,11 +217,9 @@ def write_dynamics(
 def load_dynamics(
     path: Path | str, facts: Mapping[str, Any] | None = None
 ) -> DynamicsEnsemble:
-    """Load a model that a run has trained; torch's global generator stays.
+    """Load ``dynamics.safetensors`` of a run; raise unless these facts agree.
 
-    Args:
-        path: of ``dynamics.safetensors`` in the folder of a run.
-        facts: those of :meth:`ModelData.facts` that have to agree. Default: none.
+    Torch's global generator stays.
     """
     try:
         tensors, record = read_tensors(Path(path))
@@ -252,10 +228,8 @@ def load_dynamics(
         model.load_state_dict(tensors)
         there = record["data"]
     except (KeyError, TypeError, RuntimeError, ValueError) as error:
-        raise ValueError(
-            f"{path} holds no dynamics model: {error}. Take {FILE} from the folder of "
-            "a run."
-        ) from error
+        what = f"{path} holds no dynamics model: {error}"
+        raise ValueError(f"{what}. Take {FILE} from the folder of a run.") from error
     wanted = json.loads(json.dumps(facts or {}))
     others = [name for name, value in wanted.items() if there.get(name) != value]
     if others:

@@ -174,7 +174,7 @@ class StateDeviationLoss(ActorCriticLoss):
         start = batch.states_of([key], "perturbed")[0].get(key)
         start = start.expand(number, -1, -1)
         with self.dynamics_network_params.to_module(model, preserve_module_state=False):
-            change = model.sample(model.predict(start, action))[..., :-1]
+            change = model.sample(*model.predict(start, action))[..., :-1]
         held = self.transition_network_params
         with torch.no_grad(), held.to_module(aims, preserve_module_state=False):
             aim = aims.sample(clean)
