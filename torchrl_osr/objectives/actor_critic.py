@@ -458,6 +458,9 @@ class ActorCriticLoss(LossModule):
         dtype = next(iter(getattr(self, name).values(True, True))).dtype
         masks = self._loss_mask_keys()
         batch = Transitions(tensordict, self.in_keys, self.tensor_keys, masks, dtype)
+        action = batch.rows.get(self.tensor_keys.action, None)
+        if action is not None and "action_low" in self._buffers:  # real, if integers
+            batch.rows.set(self.tensor_keys.action, action.to(dtype))
         if "qvalue_network" in self.__dict__:
             keys = self.observation_keys
             if taken := set(keys) & set(self.actor_network.out_keys):
