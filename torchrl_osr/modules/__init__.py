@@ -1,18 +1,21 @@
 """Networks: actors, critics and inverse dynamics models."""
 
 from torchrl_osr.modules.actor import (
+    categorical_actor,
     deterministic_actor,
     gaussian_actor,
     tanh_gaussian_actor,
 )
-from torchrl_osr.modules.critic import critic_ensemble, state_value
-from torchrl_osr.modules.cvae_inverse_dynamics import cvae_inverse_dynamics
-from torchrl_osr.modules.discrete import (
-    categorical_actor,
-    categorical_inverse_dynamics,
+from torchrl_osr.modules.critic import (
+    critic_ensemble,
     discrete_critic_ensemble,
+    state_value,
 )
-from torchrl_osr.modules.inverse_dynamics import tanh_gaussian_inverse_dynamics
+from torchrl_osr.modules.inverse_dynamics import (
+    categorical_inverse_dynamics,
+    cvae_inverse_dynamics,
+    tanh_gaussian_inverse_dynamics,
+)
 
 __all__ = [
     "categorical_actor",

@@ -1,13 +1,15 @@
-"""The critics: an ensemble of Q networks, and a value network of states alone."""
+"""Critics: ensembles of Q networks, and a value network of states alone."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from tensordict import NestedKey
+from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.modules import MLP, ValueOperator
+from torchrl.modules import ValueOperator
+
+from torchrl_osr.modules.actor import mlp
 
 
 def critic_ensemble(
@@ -51,19 +53,41 @@ def critic_ensemble(
         >>> critic(TensorDict(batch, [4]))["state_action_value"].shape
         torch.Size([4, 1])
     """
-    norm = layer_norm_options(num_cells) if layer_norm else {}
+    sizes = observation_dim + action_dim, 1
     return [
         ValueOperator(
-            MLP(
-                in_features=observation_dim + action_dim,
-                out_features=1,
-                num_cells=list(num_cells),
-                activation_class=activation_class,
-                **norm,
-            ),
+            mlp(*sizes, num_cells, activation_class, layer_norm=layer_norm),
             in_keys=[observation_key, action_key],
             # ValueOperator knows an action by the name "action" alone.
             out_keys=["state_action_value"],
+        )
+        for _ in range(num_qvalue_nets)
+    ]
+
+
+def discrete_critic_ensemble(
+    observation_dim: int,
+    num_actions: int,
+    *,
+    num_qvalue_nets: int = 2,
+    num_cells: Sequence[int] = (256, 256),
+    activation_class: type[nn.Module] = nn.ReLU,
+    observation_key: NestedKey = "observation",
+    layer_norm: bool = False,
+) -> list[TensorDictModule]:
+    """Return Q networks that value all ``n`` discrete actions of a state at once.
+
+    A list, and with the arguments, of :func:`critic_ensemble`.
+
+    Returns:
+        ``N`` modules that write ``"action_value"``, ``[B, n]``.
+    """
+    sizes = observation_dim, num_actions
+    return [
+        TensorDictModule(
+            mlp(*sizes, num_cells, activation_class, layer_norm=layer_norm),
+            [observation_key],
+            ["action_value"],
         )
         for _ in range(num_qvalue_nets)
     ]
@@ -79,34 +103,9 @@ def state_value(
 ) -> ValueOperator:
     """Return a value network of one observation, without an action.
 
-    Args:
-        observation_dim: size of the observation, ``S``.
-        num_cells: width of each hidden layer.
-        activation_class: activation between the layers.
-        layer_norm: as in :func:`critic_ensemble`. Default ``False``.
-        observation_key: the state it reads. Default ``"observation"``.
-
-    Returns:
-        A module that writes ``"state_value"``, ``[B, 1]``.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> value, batch = state_value(11), {"observation": torch.zeros(4, 11)}
-        >>> value(TensorDict(batch, [4]))["state_value"].shape
-        torch.Size([4, 1])
+    Arguments as of :func:`critic_ensemble`; it writes ``"state_value"``, ``[B, 1]``.
     """
-    network = MLP(
-        in_features=observation_dim,
-        out_features=1,
-        num_cells=list(num_cells),
-        activation_class=activation_class,
-        **(layer_norm_options(num_cells) if layer_norm else {}),
+    network = mlp(
+        observation_dim, 1, num_cells, activation_class, layer_norm=layer_norm
     )
     return ValueOperator(network, in_keys=[observation_key])
-
-
-def layer_norm_options(num_cells: Sequence[int]) -> dict[str, Any]:
-    """Options of :class:`~torchrl.modules.MLP` that normalise each hidden layer."""
-    widths = [{"normalized_shape": width} for width in num_cells]
-    return {"norm_class": nn.LayerNorm, "norm_kwargs": widths}

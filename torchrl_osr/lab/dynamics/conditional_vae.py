@@ -22,7 +22,7 @@ from torchrl_osr.lab.dynamics.ensemble import (
     copy_statistics,
     has_next_state,
 )
-from torchrl_osr.modules.cvae_inverse_dynamics import LATENT_LOG_SCALE_BOUNDS
+from torchrl_osr.modules.inverse_dynamics import LATENT_LOG_SCALE_BOUNDS
 from torchrl_osr.objectives import ActorCriticLoss
 from torchrl_osr.objectives.actor_critic import Losses
 from torchrl_osr.objectives.transitions import Transitions, check_single_steps

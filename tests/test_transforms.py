@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import pickle
 
 import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
-from torchrl.envs import GymEnv, TransformedEnv
+from torchrl.envs import GymEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_osr import StatePerturbation
@@ -56,55 +57,91 @@ def test_zero_noise_gives_identical_values() -> None:
     assert perturbed is not batch["observation"]
 
 
-def test_seed_decides_the_noise() -> None:
-    first, same, other = (StatePerturbation(0.1, seed=seed) for seed in (5, 5, 6))
-    drawn = noise(first, 8)
-    assert torch.equal(drawn, noise(same, 8))
-    assert not torch.equal(drawn, noise(other, 8))
-    assert not torch.equal(drawn, noise(first, 8))
+# -- streams --------------------------------------------------------------------------
 
 
-def test_without_a_seed_torchs_initial_seed_decides() -> None:
+def test_a_seed_decides_the_noise() -> None:
+    drawn = [noise(StatePerturbation(1.0, seed=seed), 8) for seed in (5, 5, 6)]
+    assert torch.equal(drawn[0], drawn[1])
+    assert not torch.equal(drawn[0], drawn[2])
+    wanted = torch.randn(
+        8, 11, generator=torch.Generator().manual_seed(5), dtype=torch.float64
+    )
+    assert torch.equal(drawn[0], wanted)
+
+
+def of_serial_environments() -> list[torch.Tensor]:
+    env = SerialEnv(
+        3, lambda: TransformedEnv(GymEnv("Pendulum-v1"), StatePerturbation(1.0))
+    )
+    rows = env.reset()
+    gaps = rows[PERTURBED] - rows["observation"]
+    env.close()
+    return list(gaps)
+
+
+class Rows(torch.utils.data.Dataset):
+    def __init__(self) -> None:
+        self.transform = StatePerturbation(1.0, seed=3)
+
+    def __len__(self) -> int:
+        return 4
+
+    def __getitem__(self, _: int) -> torch.Tensor:
+        return noise(self.transform)
+
+
+def of_workers() -> list[torch.Tensor]:
+    rows = Rows()
+    loader = torch.utils.data.DataLoader(rows, num_workers=2)
+    return [*[each[0] for each in loader], noise(rows.transform)]
+
+
+def of_instances() -> list[torch.Tensor]:
     torch.manual_seed(12)
-    first = StatePerturbation(0.1)
-    torch.randn(3)
-    second = StatePerturbation(0.1)
-    torch.manual_seed(13)
-    third = StatePerturbation(0.1)
-    drawn = noise(first, 8)
-    assert torch.equal(drawn, noise(second, 8))
-    assert not torch.equal(drawn, noise(third, 8))
+    drawn = [noise(StatePerturbation(1.0), 8) for _ in range(2)]
+    return [*drawn, torch.randn(8, 11, dtype=torch.float64)]
+
+
+def of_copies() -> list[torch.Tensor]:
+    first = StatePerturbation(1.0, seed=3)
+    noise(first, 2)
+    second = copy.deepcopy(first)
+    third, fourth = (pickle.loads(pickle.dumps(first)) for _ in range(2))
+    every = first, second, copy.deepcopy(first), copy.deepcopy(second), third, fourth
+    return [noise(each, 8) for each in every]
+
+
+@pytest.mark.parametrize(
+    "draws", [of_instances, of_copies, of_serial_environments, of_workers]
+)
+def test_no_two_have_the_same_noise(draws) -> None:
+    for one, other in itertools.combinations(draws(), 2):
+        assert not (one == other).any()
 
 
 @pytest.mark.parametrize("kind", ["gaussian", "uniform"])
 def test_global_generator_is_neither_read_nor_moved(kind) -> None:
-    first, second = (StatePerturbation(0.1, seed=1, noise=kind) for _ in range(2))
     before = torch.get_rng_state()
+    first = StatePerturbation(0.1, noise=kind)
+    second = StatePerturbation(0.1, seed=first.seed, noise=kind)
     drawn = noise(first, 8)
     assert torch.equal(torch.get_rng_state(), before)
     torch.manual_seed(99)
     assert torch.equal(noise(second, 8), drawn)
 
 
-def restored(transform: StatePerturbation) -> StatePerturbation:
-    fresh = StatePerturbation(0.5, seed=77)
-    fresh.load_state_dict(transform.state_dict())
-    return fresh
-
-
 @pytest.mark.parametrize("used", [True, False])
-@pytest.mark.parametrize(
-    "copied",
-    [restored, copy.deepcopy, lambda transform: pickle.loads(pickle.dumps(transform))],
-    ids=["state_dict", "deepcopy", "pickle"],
-)
-def test_copies_continue_the_noise_to_the_bit(copied, used) -> None:
-    transform = StatePerturbation(0.1, seed=4)
+def test_a_restored_one_continues_the_noise_to_the_bit(used) -> None:
+    transform, other = StatePerturbation(0.1, seed=4), StatePerturbation(0.5)
     if used:
         noise(transform, 5)
-    other = copied(transform)
+    other.load_state_dict(transform.state_dict())
     wanted = [noise(transform, 8) for _ in range(2)]
     assert all(torch.equal(noise(other, 8), each) for each in wanted)
+
+
+# -- where it is used -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", [ReplayBuffer, TensorDictReplayBuffer])
@@ -116,52 +153,55 @@ def test_buffers_sample_perturbed_states_and_keep_their_storage(kind) -> None:
     assert first[PERTURBED].shape == (6, 11)
     assert (first["observation"] == 1).all()
     assert not torch.equal(first[PERTURBED], second[PERTURBED])
-    head = buffer[:5]  # a view of the storage
-    assert ((head[PERTURBED] - 1).abs() > 0).any()
     stored = buffer.storage[:]
     assert (stored["observation"] == 1).all()
     assert "perturbed" not in stored.keys()  # noqa: SIM118
 
 
-def test_nested_and_several_keys_draw_apart() -> None:
-    keys = ["observation", ("agent", "pixels")]
+@pytest.mark.parametrize(
+    ("in_keys", "expected"),
+    [
+        ("observation", ["observation"]),
+        (["observation", ("agent", "pixels")], ["observation", ("agent", "pixels")]),
+        (("agent", "pixels"), [("agent", "pixels")]),
+        ([("agent", "pixels")], [("agent", "pixels")]),
+    ],
+)
+def test_nested_and_several_keys_draw_apart(in_keys, expected) -> None:
     batch = TensorDict(
         {"observation": torch.ones(4, 3), "agent": {"pixels": torch.ones(4, 3)}}, [4]
     )
-    transform = StatePerturbation(1.0, in_keys=keys, perturbed=("noisy", "states"))
+    transform = StatePerturbation(1.0, in_keys=in_keys, perturbed=("noisy", "states"))
     out = transform(batch)
-    assert transform.out_keys == [
-        ("noisy", "states", "observation"),
-        ("noisy", "states", "agent", "pixels"),
-    ]
-    one, other = (out[key] for key in transform.out_keys)
-    assert not (one == 1).any()
-    assert not (one == other).any()
+    assert transform.in_keys == expected
+    drawn = [out["noisy", "states"][key] for key in expected]
+    assert not any((each == 1).any() for each in drawn)
+    assert torch.cat(drawn).unique().numel() == 12 * len(drawn)
 
 
-def test_every_row_of_any_batch_shape_has_its_own_noise() -> None:
-    drawn = noise(StatePerturbation(0.1), 2, 3)
-    assert drawn.shape == (2, 3, 11)
-    assert drawn.unique().numel() == drawn.numel()
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_dtype_is_kept(dtype) -> None:
-    batch = observations(4).to(dtype)
-    assert StatePerturbation(0.1)(batch)[PERTURBED].dtype == dtype
+@pytest.mark.parametrize(
+    ("dtype", "expected"),
+    [
+        (torch.float32, torch.float32),
+        (torch.float64, torch.float64),
+        (torch.uint8, torch.float32),
+        (torch.int64, torch.float32),
+    ],
+)
+def test_floats_keep_their_type_and_integers_become_floats(dtype, expected) -> None:
+    batch = TensorDict({"observation": torch.ones(4, 3).to(dtype)}, [4])
+    found = StatePerturbation(0.1)(batch)[PERTURBED]
+    assert found.dtype == expected
+    assert 0 < (found - 1).abs().max() < 1
 
 
 def test_environment_specs_hold_the_perturbed_state() -> None:
     env = TransformedEnv(GymEnv("Pendulum-v1"), StatePerturbation(0.1))
     env.set_seed(0)
     check_env_specs(env)
-    assert (
-        env.observation_spec[PERTURBED].shape
-        == env.observation_spec["observation"].shape
-    )
     rollout = env.rollout(3)
-    for entry in (rollout, rollout["next"]):
-        gap = entry[PERTURBED] - entry["observation"]
+    for each in (rollout, rollout["next"]):
+        gap = each[PERTURBED] - each["observation"]
         assert (gap != 0).all()
         assert gap.abs().max() < 1
     # Pendulum's observation is bounded; its perturbed state may leave the bounds.
@@ -170,29 +210,13 @@ def test_environment_specs_hold_the_perturbed_state() -> None:
     assert env.observation_spec[PERTURBED].is_in(far)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"std": -0.1}, "std must be at least 0, got -0.1"),
-        ({"std": float("nan")}, "std must be at least 0, got nan"),
-        ({"std": 0.1, "noise": "laplace"}, "got 'laplace'"),
-        ({"std": float("inf")}, "std must be at least 0, got inf"),
-    ],
-)
-def test_wrong_arguments_are_named(arguments, message) -> None:
-    with pytest.raises(ValueError, match=message):
-        StatePerturbation(**arguments)
-
-
-def test_missing_state_is_named_together_with_what_is_there() -> None:
+def test_wrong_arguments_and_missing_states_are_named() -> None:
+    with pytest.raises(ValueError, match="std must be at least 0, got nan"):
+        StatePerturbation(float("nan"))
+    with pytest.raises(ValueError, match="got 'laplace'"):
+        StatePerturbation(0.1, noise="laplace")
     with pytest.raises(KeyError, match="'state'.*observation"):
         StatePerturbation(0.1, in_keys=["state"])(observations(4))
-
-
-def test_integer_states_are_refused() -> None:
-    batch = TensorDict({"observation": torch.zeros(4, 3, dtype=torch.uint8)}, [4])
-    with pytest.raises(TypeError, match=r"'observation' must be floating point.*uint8"):
-        StatePerturbation(0.1)(batch)
 
 
 def test_compiled_transform_draws_the_same_noise() -> None:

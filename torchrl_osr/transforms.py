@@ -2,8 +2,12 @@ r"""The noise of equation (5): :math:`\hat s = s + \beta\,\epsilon`."""
 
 from __future__ import annotations
 
+import hashlib
+import itertools
+import multiprocessing
+import os
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -12,7 +16,12 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from torchrl_osr._checks import check_choice, check_weight
-from torchrl_osr._entries import nested
+from torchrl_osr._entries import entry, nested
+
+_number = itertools.count()
+_process = [os.getpid()]  # torch.compile cannot trace the call
+if hasattr(os, "register_at_fork"):  # Windows has no forks
+    os.register_at_fork(after_in_child=lambda: _process.__setitem__(0, os.getpid()))
 
 
 class StatePerturbation(Transform):
@@ -24,21 +33,26 @@ class StatePerturbation(Transform):
     generator of its own, so that the rest of a run stays the same bits with and without
     it. In an environment it adds the same entry to observations and specs.
 
+    Each transform has noise of its own: one without a ``seed``, a copy, and what a
+    worker process of a ``DataLoader`` inherits. ``load_state_dict`` continues the noise
+    of the transform that was saved.
+
     Args:
         std: :math:`\beta`, the noise's standard deviation per dimension, in units of
             the observation.
 
     Keyword Args:
-        in_keys: the states to perturb. Default ``["observation"]``.
+        in_keys: the states to perturb, a list; a string or a tuple of strings is one
+            key. Integers become floats. Default ``["observation"]``.
         noise: ``"gaussian"`` (default), or ``"uniform"`` with the same standard
             deviation (half-width :math:`\sqrt 3\,\beta`).
         perturbed: where to write the perturbed states. Default ``"perturbed"``.
-        seed: of the generator. Default: torch's initial seed.
+        seed: of the generator. Default: derived from torch's initial seed, the process
+            and the number of transforms before this one.
 
     Raises:
         ValueError: if ``std`` is negative or infinite, or ``noise`` unknown.
         KeyError: in the call, if a state is missing.
-        TypeError: in the call, if a state is not floating point.
 
     Examples:
         >>> import torch
@@ -65,18 +79,33 @@ class StatePerturbation(Transform):
     ) -> None:
         check_weight("std", std)
         check_choice("noise", noise, ("gaussian", "uniform"))
-        in_keys = [in_keys] if isinstance(in_keys, str) else list(in_keys)
+        is_one = isinstance(in_keys, str) or (
+            isinstance(in_keys, tuple) and all(isinstance(key, str) for key in in_keys)
+        )
+        keys: list[Any] = [in_keys] if is_one else list(in_keys)
+        keys = [key[0] if len(key) == 1 else key for key in keys]
         super().__init__(
-            in_keys=in_keys, out_keys=[nested(perturbed, key) for key in in_keys]
+            in_keys=keys, out_keys=[nested(perturbed, key) for key in keys]
         )
         self.register_buffer("std", torch.tensor(std, dtype=torch.float64))
         self.noise = noise
-        self.seed = torch.initial_seed() if seed is None else seed
+        self.seed = _derived("new", next(_number)) if seed is None else seed
+        self._copies, self._process = 0, _process[0]
         self._generator: torch.Generator | None = None
         self._loaded: Tensor | None = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy starts with: a seed of its own, and no draws."""
+        self._copies += 1
+        state: dict[str, Any] = super().__getstate__()
+        own = {"seed": _derived("copy", self.seed, self._copies), "_copies": 0}
+        return state | own | {"_generator": None, "_loaded": None}
+
     def _generator_on(self, device: torch.device) -> torch.Generator:
         """Return the noise's generator, made on the device of the first batch."""
+        if self._process != _process[0]:  # inherited by another process
+            self.seed, self._process = _derived("process", self.seed), _process[0]
+            self._generator = self._loaded = None
         if self._generator is None or self._generator.device != device:
             self._generator = torch.Generator(device).manual_seed(self.seed)
             self._continue(self._generator)
@@ -90,38 +119,24 @@ class StatePerturbation(Transform):
             generator.set_state(loaded)
             self._loaded = None
 
-    def _perturb(self, state: Tensor, key: NestedKey) -> Tensor:
-        if not state.is_floating_point():
-            raise TypeError(
-                f"{key!r} must be floating point to be perturbed, got {state.dtype}; "
-                "append DoubleToFloat or ToTensorImage first."
-            )
+    def _perturb(self, state: Tensor) -> Tensor:
         generator = self._generator_on(state.device)
-        if self.noise == "gaussian":
-            noise = torch.randn(
-                state.shape, generator=generator, dtype=state.dtype, device=state.device
-            )
-        else:
-            noise = torch.rand(
-                state.shape, generator=generator, dtype=state.dtype, device=state.device
-            )
+        draw = torch.randn if self.noise == "gaussian" else torch.rand
+        noise = draw(
+            state.shape, generator=generator, dtype=state.dtype, device=state.device
+        )
+        if self.noise == "uniform":
             noise = (2 * noise - 1) * 3**0.5
         return torch.addcmul(state, noise, self.std.to(state))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Add the perturbed states to a batch of any shape."""
         for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
-            state = tensordict.get(key, None)
-            if state is None:
-                raise KeyError(
-                    f"StatePerturbation reads {key!r}, but the batch has "
-                    f"{sorted(map(str, tensordict.keys(True, True)))}."
-                )
+            state = entry(tensordict, key)
+            state = state.to(_floating(state.dtype))
             if self.std.device != state.device:
-                # Once: a copy from the host at each draw keeps a GPU waiting, and
-                # cannot be captured in a CUDA graph.
-                self.to(state.device)
-            tensordict.set(out_key, self._perturb(state, key))
+                self.to(state.device)  # once: a copy at each draw keeps a GPU waiting
+            tensordict.set(out_key, self._perturb(state))
         return tensordict
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -133,15 +148,12 @@ class StatePerturbation(Transform):
         return self.forward(tensordict_reset)
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add the perturbed entries: unbounded, of the states' shape and dtype."""
-        if not isinstance(observation_spec, Composite):
-            raise TypeError(
-                f"StatePerturbation needs a Composite spec, got {observation_spec}."
-            )
+        """Add the perturbed entries: unbounded, of the states' shape."""
+        assert isinstance(observation_spec, Composite)
         for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
             spec = observation_spec[key]
             observation_spec[out_key] = Unbounded(
-                shape=spec.shape, dtype=spec.dtype, device=spec.device
+                shape=spec.shape, dtype=_floating(spec.dtype), device=spec.device
             )
         return observation_spec
 
@@ -154,7 +166,17 @@ class StatePerturbation(Transform):
 
     def set_extra_state(self, state: Tensor) -> None:
         """Continue the noise from a saved state; on another device it starts anew."""
-        self._loaded = state.cpu()
+        self._loaded, self._process = state.cpu(), _process[0]
         if self._generator is not None:
-            # Into the generator that is there, which a CUDA graph may hold.
             self._continue(self._generator)
+
+
+def _floating(dtype: torch.dtype) -> torch.dtype:
+    return dtype if dtype.is_floating_point else torch.get_default_dtype()
+
+
+def _derived(*parts: str | int) -> int:
+    """Seed of a stream that belongs to these parts, in this process."""
+    here = torch.initial_seed(), multiprocessing.current_process().name
+    digest = hashlib.sha256(repr((*parts, *here)).encode()).digest()
+    return int.from_bytes(digest[:7], "big")

@@ -1,0 +1,111 @@
+"""Actors: shapes, bounds, and scales that have a floor."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import InteractionType, set_interaction_type
+from torchrl.envs import GymEnv
+
+from torchrl_osr.modules import (
+    categorical_actor,
+    categorical_inverse_dynamics,
+    critic_ensemble,
+    deterministic_actor,
+    gaussian_actor,
+    tanh_gaussian_actor,
+    tanh_gaussian_inverse_dynamics,
+)
+
+BOUNDED = [tanh_gaussian_actor, tanh_gaussian_inverse_dynamics]
+CATEGORICAL = [categorical_actor, categorical_inverse_dynamics]
+BOUNDS = [
+    (-0.4, 0.4),
+    (torch.tensor([-1.0, 0.0]), torch.tensor([2.0, 3.0])),
+]
+
+
+def states(*size: int, scale: float = 1.0) -> TensorDict:
+    observation, next_observation = scale * torch.randn(2, *size, 5)
+    next_states = {"observation": next_observation}
+    return TensorDict({"observation": observation, "next": next_states}, size)
+
+
+@pytest.mark.parametrize("build", [*BOUNDED, *CATEGORICAL, gaussian_actor])
+@pytest.mark.parametrize("size", [(7,), (2, 3)])
+def test_outputs_have_one_entry_an_action_dimension(build, size) -> None:
+    network = build(5, 2, num_cells=[8])
+    out = network(states(*size))
+    assert out["action"].shape == (*size, 2)
+    if build in CATEGORICAL:
+        assert (out["action"].sum(-1) == 1).all()
+    if build is not gaussian_actor:
+        log_prob = network.get_dist(out).log_prob(out["action"])
+        assert log_prob.shape == size
+        torch.testing.assert_close(out["action_log_prob"], log_prob)
+
+
+@pytest.mark.parametrize("build", [*BOUNDED, deterministic_actor])
+@pytest.mark.parametrize(("low", "high"), BOUNDS)
+def test_actions_fill_their_bounds_and_never_leave_them(build, low, high) -> None:
+    # Inputs of this size saturate the tanh at both ends.
+    out = build(5, 2, num_cells=[8], low=low, high=high)(states(500, scale=300))
+    action, low, high = out["action"], torch.as_tensor(low), torch.as_tensor(high)
+    assert (action >= low).all()
+    assert (action <= high).all()
+    width = high - low
+    assert (action.amin(0) < low + 0.1 * width).all()
+    assert (action.amax(0) > high - 0.1 * width).all()
+
+
+@pytest.mark.parametrize(("low", "high"), BOUNDS)
+def test_deterministic_action_is_the_squashed_output(low, high) -> None:
+    actor = deterministic_actor(5, 2, num_cells=[8], low=low, high=high)
+    batch = states(2, 3)
+    # By hand: the network's output, moved by the interval's center as TorchRL's
+    # TanhDelta does, a tanh, and the interval.
+    param = actor.module[0].module(batch["observation"])
+    low, high = torch.as_tensor(low), torch.as_tensor(high)
+    center, half = (low + high) / 2, (high - low) / 2
+    wanted = center + half * (param + center).tanh()
+    with set_interaction_type(InteractionType.RANDOM):  # nothing is drawn
+        torch.testing.assert_close(actor(batch)["action"], wanted)
+
+
+def test_deterministic_action_passes_the_gradient_of_its_tanh() -> None:
+    out = deterministic_actor(5, 2, num_cells=[8])(states(4))
+    (slope,) = torch.autograd.grad(out["action"].sum(), out["param"])
+    torch.testing.assert_close(slope, 1 - out["param"].tanh().square())
+
+
+@pytest.mark.parametrize("build", BOUNDED)
+def test_scale_has_a_floor(build) -> None:
+    # The KL divides by the variance: 1e-2 is as sure as a network can get.
+    scale = build(5, 2, num_cells=[8]).get_dist(states(500, scale=1e4)).scale
+    assert scale.min().item() == pytest.approx(1e-2)
+
+
+@pytest.mark.parametrize(("scale", "trained"), [(None, True), (0.5, False)])
+def test_scale_of_a_gaussian_is_learned_or_fixed(scale, trained) -> None:
+    actor = gaussian_actor(5, 2, num_cells=[8], scale=scale)
+    out = actor(states(4, scale=100))
+    assert (out["loc"].abs() <= 1).all()
+    assert (out["scale"] == (scale or 1.0)).all()
+    assert out["scale"].requires_grad == trained
+
+
+@pytest.mark.parametrize("build", [*BOUNDED, *CATEGORICAL, critic_ensemble])
+def test_width_depth_and_activation_are_as_asked(build) -> None:
+    network = build(5, 2, num_cells=[6, 4], activation_class=torch.nn.Tanh)
+    network = network[0] if isinstance(network, list) else network
+    layers = [m for m in network.modules() if isinstance(m, torch.nn.Linear)]
+    assert [layer.out_features for layer in layers[:2]] == [6, 4]
+    assert sum(isinstance(m, torch.nn.Tanh) for m in network.modules()) == 2
+
+
+def test_categorical_actor_plays_a_gymnasium_task_as_torchrl_gives_it() -> None:
+    env = GymEnv("CartPole-v1")
+    rollout = env.rollout(5, categorical_actor(4, 2, num_cells=[8]))
+    assert env.action_spec.is_in(rollout["action"][0].to(env.action_spec.dtype))
+    env.close()

@@ -1,0 +1,146 @@
+"""Inverse dynamics models: what they read, and the latent of the conditional VAE."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import InteractionType, set_interaction_type
+
+from torchrl_osr import InverseDynamicsLoss
+from torchrl_osr.functional import gaussian_kl
+from torchrl_osr.modules import (
+    categorical_actor,
+    categorical_inverse_dynamics,
+    cvae_inverse_dynamics,
+    tanh_gaussian_actor,
+    tanh_gaussian_inverse_dynamics,
+)
+
+LATENT_KEYS = ["latent_loc", "latent_scale"]
+RANDOM = InteractionType.RANDOM
+
+
+def make_model(**options):
+    return cvae_inverse_dynamics(3, 2, **{"latent_dim": 4, "num_cells": [8]} | options)
+
+
+def states(*size: int, scale: float = 1.0) -> TensorDict:
+    observation, next_observation = scale * torch.randn(2, *size, 3)
+    next_states = {"observation": next_observation}
+    return TensorDict({"observation": observation, "next": next_states}, size)
+
+
+def correlation(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    """Pearson's correlation of each column, ``[A]``."""
+    x, y = x - x.mean(0), y - y.mean(0)
+    return (x * y).sum(0) / (x.norm(dim=0) * y.norm(dim=0))
+
+
+@pytest.mark.parametrize(
+    ("build", "reads_next"),
+    [
+        (tanh_gaussian_actor, False),
+        (tanh_gaussian_inverse_dynamics, True),
+        (categorical_actor, False),
+        (categorical_inverse_dynamics, True),
+    ],
+)
+def test_models_read_both_states_and_policies_only_the_first(build, reads_next) -> None:
+    network, before = build(3, 2, num_cells=[8]), states(4)
+    after = before.clone()
+    after["next", "observation"] += 1
+    found = [network(each).get("logits", each.get("loc")) for each in (before, after)]
+    assert torch.equal(*found) != reads_next
+
+
+@pytest.mark.parametrize("size", [(7,), (2, 5, 3), ()])
+def test_the_conditional_vae_stands_in_for_the_tanh_gaussian(size) -> None:
+    bounds = {"low": torch.tensor([-1.0, -2.0]), "high": torch.tensor([2.0, 1.0])}
+    model = make_model(**bounds)
+    plain = tanh_gaussian_inverse_dynamics(3, 2, num_cells=[8], **bounds)
+    ours, theirs = (network(states(*size)) for network in (model, plain))
+    assert model.in_keys == plain.in_keys
+    for key in ("loc", "scale", "action", "action_log_prob"):
+        assert ours[key].shape == theirs[key].shape
+    assert all(ours[key].shape == (*size, 4) for key in LATENT_KEYS)
+    assert torch.equal(model.get_dist(ours).high, bounds["high"])
+
+
+def test_layers_are_the_authors_by_default() -> None:
+    # Encoder 3 x 256 to 2 x 32 outputs, decoder 2 x 256; two states of 11, z of 32.
+    model = cvae_inverse_dynamics(11, 3)
+    layers = [m for m in model.modules() if isinstance(m, torch.nn.Linear)]
+    sizes = [(layer.in_features, layer.out_features) for layer in layers]
+    assert sizes[:4] == [(22, 256), (256, 256), (256, 256), (256, 64)]
+    assert sizes[4:] == [(54, 256), (256, 256), (256, 6)]
+
+
+def test_extreme_states_give_finite_scales_and_divergence() -> None:
+    out = make_model()(states(500, scale=1e4))
+    assert out["scale"].min().item() == pytest.approx(1e-2)
+    latent_scale = out["latent_scale"].log()
+    assert latent_scale.min().item() == pytest.approx(-4)
+    assert latent_scale.max().item() == pytest.approx(15)
+    loc, scale = (out[key] for key in LATENT_KEYS)
+    prior = torch.zeros_like(loc), torch.ones_like(scale)
+    assert gaussian_kl(loc, scale, *prior).isfinite().all()
+
+
+@pytest.mark.parametrize("kind", [InteractionType.DETERMINISTIC, None])
+def test_the_latent_is_its_mean_unless_draws_are_asked_for(kind) -> None:
+    model, batch = make_model(), states(7)
+    core = model.module[0].module
+    pair = batch["observation"], batch["next", "observation"]
+    state = torch.get_rng_state()
+    with set_interaction_type(kind):
+        params = model.get_dist_params(batch)
+    assert torch.equal(torch.get_rng_state(), state)
+    decoded = core.decoder(*pair, params["latent_loc"])[..., :2]
+    torch.testing.assert_close(params["loc"], decoded)
+    with set_interaction_type(RANDOM):
+        assert not torch.equal(model.get_dist_params(batch)["loc"], decoded)
+
+
+@pytest.mark.filterwarnings("ignore:.*autograd.function.Function:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore:.*inline_inbuilt_nn_modules:FutureWarning")
+def test_compiled_model_equals_eager_for_each_interaction_type() -> None:
+    model, batch = make_model(), states(2, 7)
+    torch.compiler.reset()
+    compiled = torch.compile(model, backend="eager", fullgraph=True)
+
+    def call(network, kind: InteractionType) -> TensorDict:
+        torch.manual_seed(3)
+        with set_interaction_type(kind):
+            return network(batch.clone())
+
+    # Random twice: the graph of the other type must not be taken for it.
+    for kind in (RANDOM, InteractionType.DETERMINISTIC, RANDOM):
+        found, wanted = call(compiled, kind), call(model, kind)
+        for key in model.out_keys:
+            torch.testing.assert_close(found[key], wanted[key])
+
+
+def test_the_scale_learns_what_the_mean_does_not_know() -> None:
+    # The mean depends on s', the spread on s alone: they are independent.
+    batch = states(2048)
+    loc = 0.5 * batch["next", "observation"][:, :2]
+    log_scale = 0.5 * batch["observation"][:, :2] - 1.5
+    batch["action"] = torch.tanh(loc + log_scale.exp() * torch.randn_like(loc))
+    batch["next", "done"] = torch.zeros(2048, 1, dtype=torch.bool)
+    model = make_model(num_cells=[32])
+    loss = InverseDynamicsLoss(model, states="clean")
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
+    for _ in range(300):
+        optimizer.zero_grad()
+        loss(batch)["loss_inverse_dynamics"].backward()
+        optimizer.step()
+    with torch.no_grad():
+        out = model.get_dist_params(batch.clone())
+    assert (correlation(out["loc"], loc) > 0.95).all()
+    assert (correlation(out["scale"].log(), log_scale) > 0.9).all()
+    assert (correlation(out["scale"].log(), out["loc"]).abs() < 0.3).all()
+    # The documented limit: the latent has collapsed to its prior.
+    prior = torch.tensor(0.0), torch.tensor(1.0)
+    kl = gaussian_kl(out["latent_loc"], out["latent_scale"], *prior)
+    assert kl.mean().item() < 0.05

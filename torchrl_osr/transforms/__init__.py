@@ -1,5 +1,0 @@
-"""Transforms for replay buffers and environments."""
-
-from torchrl_osr.transforms.state_perturbation import StatePerturbation
-
-__all__ = ["StatePerturbation"]
