@@ -149,7 +149,7 @@ def test_without_a_simulator_a_log_still_makes_a_policy(tmp_path, capsys):
         (["env.id=Pendulum-v1", "loss=discrete_osr"], "real actions.*take loss=osr"),
         (["env.id=Pendulum-v1", "env.action_low=[-1.0]"], "read from Pendulum-v1"),
         (["env.id=Pendulum-v1", "env.random_return=0"], "expert_return=None"),
-        (["env.id=Pendulums-v1"], "env.id=Pendulums-v1 is no environment"),
+        (["env.id=Pendulums-v1"], "env.id=Pendulums-v1 cannot be made"),
         (["env=hopper", "env.random_return=0", "env.expert_return=1"], "D4RL's"),
     ],
 )

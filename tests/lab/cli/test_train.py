@@ -72,7 +72,7 @@ def test_log_has_a_line_for_each_evaluation(finished):
         ),
         (
             ["env=pointmaze-umaze", "data=diverse", "data.random_share=0.5"],
-            "unknown quality 'random'",
+            "unknown data=random of pointmaze-umaze",
         ),
     ],
 )
