@@ -74,13 +74,6 @@ class StickyAction(DisturbanceWrapper):
     Args:
         env: the environment.
         probability: of a repetition, from 0 (off) to below 1.
-
-    Examples:
-        >>> from torchrl_osr.lab.data import make_environment
-        >>> env = StickyAction(make_environment("Hopper-v5"), 0.999)
-        >>> _ = env.reset(seed=0)
-        >>> [int(env.step(env.action_space.high)[-1]["disturbed"]) for _ in range(3)]
-        [0, 1, 1]
     """
 
     def __init__(self, env: gymnasium.Env[Vector, Vector], probability: float) -> None:

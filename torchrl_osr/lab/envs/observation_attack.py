@@ -25,10 +25,7 @@ def critics_of(loss: LossModule) -> Values:
     """Return the values of a loss's critics as a function of states and actions.
 
     ``N`` critics, ``M`` perturbations and ``E`` episodes give ``[N, M, E]``. The
-    critics are not the target networks and have the loss's current parameters.
-
-    Args:
-        loss: a loss module with a ``qvalue_network``.
+    critics, not their targets, have the loss's current parameters.
     """
 
     def values(states: TensorDictBase, action: Tensor) -> Tensor:
@@ -54,7 +51,7 @@ def attacked_policy(
     num_samples: int = 50,
     seed: int = 0,
 ) -> Callable[[Tensor], Tensor]:
-    r"""Return a deterministic policy that sees perturbed observations.
+    r"""Return a deterministic policy ``[E, S]`` -> ``[E, A]`` that is attacked.
 
     Each number of an observation is off by at most :math:`\epsilon` standard
     deviations: uniformly (``"random"``), or as
@@ -64,8 +61,7 @@ def attacked_policy(
     Args:
         policy_distribution: the actor's ``get_dist``, for instance.
         qvalue: the critics, see :func:`critics_of`; only ``"min_Q"`` calls them.
-        observation_norm: how the training data were standardised
-            (``standard_normal=True``). Default: not at all.
+        observation_norm: standardisation of the training data. Default: none.
 
     Keyword Args:
         kind: see above.
@@ -74,9 +70,6 @@ def attacked_policy(
             start, its mixed order with 20.
         num_samples: draws, or starts of the gradient steps. Default 50.
         seed: of the draws, which continue from call to call. Default 0.
-
-    Returns:
-        A function from raw observations ``[E, S]`` to actions ``[E, A]``, on the CPU.
 
     Examples:
         >>> import torch

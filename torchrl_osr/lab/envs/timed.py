@@ -137,9 +137,8 @@ class ExternalPush(DisturbanceWrapper):
         duration: in steps of the agent: 0.008 s each for hopper and walker2d, 0.05 s
             for halfcheetah.
         at, window: moment, as in :class:`ActionKnock`. Default ``"random"``.
-        unit: ``"newton"`` (default) or ``"body_weight"``, the weight of all bodies when
-            the model is wrapped, at 9.81 m/s² where the model has no gravity. Hopper
-            weighs 155 N, walker2d 232 N, halfcheetah 137 N.
+        unit: ``"newton"`` (default) or ``"body_weight"``, the weight of all bodies:
+            155 N for hopper, 232 N for walker2d, 137 N for halfcheetah.
     """
 
     def __init__(

@@ -64,11 +64,8 @@ def deterministic_policy(
 ) -> Policy:
     """Return the actor's deterministic action as a function of raw observations.
 
-    Args:
-        actor_network: reads ``"observation"``. Of discrete actions the function returns
-            the number of the likeliest.
-        observation_norm: how the training data were standardised
-            (``standard_normal=True``). Default: not at all.
+    Of discrete actions that is the number of the likeliest. ``observation_norm`` has
+    the standardisation of the training data. Default: none.
     """
 
     @torch.no_grad()
@@ -133,13 +130,7 @@ class EpisodeEvaluator:
     def __call__(
         self, policy: Policy, watch: Watch = lambda *_: None
     ) -> EpisodeResults:
-        """Play one episode for each seed.
-
-        Args:
-            policy: the same for all episodes; its ``reset`` is called before, if it
-                has one.
-            watch: called at each reset and step. Default: nothing.
-        """
+        """Play an episode for each seed, after the policy's own ``reset``, if any."""
         getattr(policy, "reset", lambda: None)()
         episodes = len(self.environments)
         returns, lengths = np.zeros(episodes), np.zeros(episodes, dtype=np.int64)
@@ -187,10 +178,7 @@ def summarize(
 ) -> dict[str, Any]:
     """Mean score or return, its interval and the raw results, JSON-compatible.
 
-    Args:
-        results: of ``E`` episodes.
-        references: what returns are normalised by, see
-            :func:`~torchrl_osr.lab.data.reference_returns`; ``None`` for raw returns.
+    Returns are normalised by the references, unless these are ``None``.
 
     Returns:
         ``"score"`` with its 95 % bootstrap interval ``"score_low"``, ``"score_high"``

@@ -68,14 +68,8 @@ def data_figure(
 ) -> None:
     """Draw histograms of the episodes' returns and lengths and of every entry.
 
-    Args:
-        data: transitions ``[N]``.
-        manifest: of the readers.
-        names: of the entries of ``"observation"`` and ``"action"``.
-        path: of the PNG file.
-
-    Keyword Args:
-        title: above the figure.
+    ``manifest`` is that of the readers; ``names`` has those of the entries of
+    ``"observation"`` and ``"action"``.
     """
     low, high = (np.asarray(each) for each in manifest.get("action_bounds", (-1, 1)))
     actions: NDArray[Any] = low + (data["action"].numpy() + 1) / 2 * (high - low)
@@ -118,15 +112,9 @@ def learning_curve(
 ) -> None:
     """Draw the score, or return, with its interval, and the losses.
 
-    Args:
-        history: evaluations with their ``"step"``, see
-            :func:`~torchrl_osr.lab.evaluation.summarize`; may be empty.
-        scalars: see :func:`~torchrl_osr.lab.evaluation.training_summary.read_scalars`.
-        path: of the PNG file.
-
-    Keyword Args:
-        title: above the figure.
-        data_mean: mean score, or return, of the data's episodes, if known.
+    ``history`` has evaluations with their ``"step"`` and may be empty; ``data_mean`` is
+    that of the data's episodes, if known. ``scalars`` are those of
+    :func:`~torchrl_osr.lab.evaluation.training_summary.read_scalars`.
     """
     panels = [name for name in PANELS if scalars.get(name)]
     ratios = (2, 1) if history else (1,)
@@ -167,13 +155,8 @@ def robustness_figure(
 ) -> None:
     """Draw scores under disturbances and, after those that end, distances to the data.
 
-    Args:
-        summary: see :func:`~torchrl_osr.lab.evaluation.summarize_disturbances`.
-        evaluations: that it is of.
-        path: of the PNG file.
-
-    Keyword Args:
-        title: above the figure.
+    ``summary`` is that of the ``evaluations``, see
+    :func:`~torchrl_osr.lab.evaluation.summarize_disturbances`.
     """
     curves = distance_curves(evaluations)
     figure = new_figure(11 if curves else 6.5, 4.6)

@@ -29,13 +29,9 @@ def score_table(
 
     The evaluation of the untrained policy, at step 0, is in no mean.
 
-    Args:
-        title: name of the run.
-        history: all evaluations with their ``"step"``, see
-            :func:`~torchrl_osr.lab.evaluation.summarize`.
-        best: the best of them; chosen by its own episodes, hence optimistic.
-        data_mean: mean score, or return, of the data's episodes, if known.
-        folder: where the run's files are.
+    ``history`` has all evaluations with their ``"step"``. The ``best`` of them is
+    chosen by its own episodes, hence optimistic. ``data_mean`` is that of the data's
+    episodes, if known.
     """
     measure, last = measure_of(best), history[-1]
 
@@ -63,12 +59,9 @@ def score_table(
 
 
 def read_scalars(folder: Path | str) -> dict[str, list[tuple[int, float]]]:
-    """Step and value pairs that a TorchRL ``CSVLogger`` wrote, by name.
+    """Step and value pairs in a ``scalars`` folder of TorchRL's ``CSVLogger``, by name.
 
     A resumed run logs the steps since its checkpoint once more; the later row counts.
-
-    Args:
-        folder: the logger's ``scalars`` folder of one phase.
     """
     scalars = {}
     for path in sorted(Path(folder).glob("*.csv")):

@@ -54,8 +54,7 @@ class Difference(NamedTuple):
 
     Attributes:
         data: a data set, or :data:`ALL_DATA`.
-        method: that is compared.
-        quantity: in which.
+        method, quantity: what is compared.
         estimate: method less reference; ``None`` if they cannot be compared.
         seeds: pairs of runs, the fewest that a data set has.
         note: why they cannot be compared, or what is left out.
@@ -129,10 +128,6 @@ def compare(
 def pair(rows: pd.DataFrame, method: str, reference: str) -> tuple[list[Array], str]:
     """Differences of the same episodes of two methods on one data set.
 
-    Args:
-        rows: of a :class:`Quantity`.
-        method, reference: their names.
-
     Returns:
         Method less reference of each seed that both have, averaged over disturbances
         and checkpoints, ``[E]``, and what is left out; or nothing, and the reason.
@@ -203,16 +198,16 @@ def verdict(differences: Sequence[Difference], reference: str) -> list[str]:
 
 def difference_table(differences: Sequence[Difference]) -> pd.DataFrame:
     """Differences to the reference, by data set and method, with their verdicts."""
-    rows: dict[Any, dict[str, Any]] = {}
+    rows: dict[Any, dict[str, str]] = {}
+    notes: dict[Any, list[str]] = {}
     for each in differences:
-        row = rows.setdefault((each.data, each.method), {})
-        mark = MARKS.get(each.verdict, "")
-        name = each.quantity.name
-        if each.estimate is None:
-            row[name] = f"not compared: {each.note}"
-        else:
-            text = f"{decimal(each.estimate.mean, '+')} {each.estimate.interval('+')}"
-            row[name] = f"{mark}{text}"
-        if each.estimate is not None and each.note:
-            row["note"] = each.note
+        text = "not compared"
+        if each.estimate is not None:
+            text = MARKS.get(each.verdict, "") + decimal(each.estimate.mean, "+")
+            text += f" {each.estimate.interval('+')}"
+        key = each.data, each.method
+        rows.setdefault(key, {})[each.quantity.name] = text
+        notes.setdefault(key, []).append(each.note)
+    for key, row in rows.items():
+        row["note"] = "; ".join(filter(None, dict.fromkeys(notes[key])))
     return frame_of(rows, "data", "method")

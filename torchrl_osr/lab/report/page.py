@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import re
 from pathlib import Path
 from typing import Any
 
@@ -34,24 +35,6 @@ with needed_by("the report needs", "train"):
 
 PAGE = "report.html"
 
-CAPTIONS = {
-    "scores": "Undisturbed {measure}: mean over seeds. Neighbouring evaluations swing, "
-    "so the mean of the last ones says more than the last one.",
-    "means": "Interquartile mean of the runs of all data sets (Agarwal et al., 2021). "
-    "Means over different data sets cannot be compared.",
-    "robustness": "Mean {measure} without and with each disturbance, and its decrease. "
-    "Met: episodes in which the disturbance came; others had ended before. The columns "
-    "after it are of these episodes: stood at its end and 100 steps later, in brackets "
-    "the undisturbed episodes; back in the data until then.",
-    "recoverable": "Percentage of the states from which a policy comes back. Easy: no "
-    "reference policy failed. Contested: some did. Recoverable: all did, and a planner "
-    "in the simulator did not; then by disturbance. R: share of the states that "
-    "{reference} does not save that the method saves.",
-    "differences": "Method less {reference}, in the same episodes. ▲ better, ▼ worse, "
-    "= no significant difference; without a mark too few seeds.",
-    "runs": "Every run, and the command that trained it.",
-}
-
 
 def write_report(
     tables: RunTables,
@@ -62,13 +45,8 @@ def write_report(
 ) -> Path:
     """Write ``report.html``, ``report.md``, and each table and figure by itself.
 
-    Args:
-        tables: see :func:`~torchrl_osr.lab.report.read_runs`.
-        folder: of the files; it is made if needed.
-
-    Keyword Args:
-        reference: method that the others are compared with. Default: the first.
-        command: to be named on the page.
+    The others are compared with the method ``reference``. Default: the first. The page
+    names the ``command``.
 
     Returns:
         The page's path.
@@ -108,14 +86,12 @@ def write_report(
                 (folder / f"{name}.png").read_bytes()
             ).decode()
     for name, frame in frames.items():
-        write_atomically(folder / f"{name}.csv", numbers(frame).to_csv())
-    names = {"reference": reference, "measure": tables.measure}
+        file = re.sub(r"[^\w.-]+", "-", name)  # suites have any name
+        write_atomically(folder / f"{file}.csv", numbers(frame).to_csv())
     content = {
         "tables": tables,
         "frames": {name: frame.map(text) for name, frame in frames.items()},
-        "captions": {
-            name: CAPTIONS[name.partition("-")[0]].format(**names) for name in frames
-        },
+        "reference": reference,
         "pictures": pictures,
         "verdict": verdict(found, reference),
         "notes": comparison_notes(tables),
@@ -160,7 +136,7 @@ def markdown(content: dict[str, Any]) -> str:
         print("\n".join(f"- {each}" for each in content[title]), end="\n\n", file=file)
     for name, frame in content["frames"].items():
         rows = frame.reset_index()
-        print(f"## {name}\n\n{content['captions'][name]}\n", file=file)
+        print(f"## {name}\n", file=file)
         lines = [list(rows), ["---"] * len(list(rows)), *rows.values.tolist()]
         for line in lines:
             cells = (str(cell).replace("|", "\\|") for cell in line)
