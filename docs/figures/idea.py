@@ -1,4 +1,4 @@
-"""Draw ``idea.png``: a state knocked off the data, and the way back.
+"""Draw ``idea.png``: a perturbed state, and the action that leads back.
 
 python docs/figures/idea.py
 """
@@ -26,7 +26,7 @@ def main() -> None:
     rng = np.random.default_rng(3)
     x = rng.uniform(0.0, 6.4, 260)
     y = path(x) + 0.10 * rng.standard_normal(x.size)
-    figure, axes = plt.subplots(figsize=(8, 3.1), layout="constrained")
+    figure, axes = plt.subplots(figsize=(7, 3.1), layout="constrained")
     axes.scatter(x, y, s=14, color=DATA, linewidths=0)
     state, following = np.array([2.6, path(2.6)]), np.array([4.0, path(4.0)])
     perturbed = state + np.array([0.1, 1.15])
@@ -44,18 +44,19 @@ def main() -> None:
     texts = (
         (state, (-10, -22), r"state $s$", INK, "right"),
         (following, (12, -18), r"next state $s'$", INK, "left"),
-        (perturbed, (-12, 2), r"knocked off the data: $\hat s = s + \beta\epsilon$",
+        (perturbed, (-12, 4), "perturbed state\n" r"$\hat s = s + \beta\epsilon$",
          OFF, "right"),
-        ((3.75, 1.25), (22, 0), "the way back: the action that the inverse dynamics\n"
-         r"model $I(a \mid \hat s, s')$ gives is taught to the policy", BACK, "left"),
-        ((0.9, path(0.9)), (0, 30), "data", "#5b7fae", "center"),
+        ((3.75, 1.25), (-4, 0), "inverse dynamics model:\n"
+         r"$I(a \mid \hat s, s')$ predicts the action" "\nthat the policy learns",
+         BACK, "left"),
+        ((0.9, path(0.9)), (0, 34), "data", "#5b7fae", "center"),
     )  # fmt: skip
     for point, offset, text, color, side in texts:
         axes.annotate(
             text, point, offset, textcoords="offset points", color=color, ha=side,
-            fontsize=11, va="center",
+            fontsize=13, va="center",
         )  # fmt: skip
-    axes.set(xlim=(-0.4, 7.6), ylim=(-0.8, 1.9))
+    axes.set(xlim=(-0.2, 6.8), ylim=(-0.8, 1.9))
     axes.axis("off")
     figure.savefig(Path(__file__).with_name("idea.png"), dpi=150)
 
