@@ -7,6 +7,7 @@ import re
 import sys
 from pathlib import Path
 
+from docutils import nodes
 from sphinx.util.inspect import stringify_signature
 from torchrl.objectives import LossModule
 
@@ -92,9 +93,15 @@ def rooms():
 def write_pages(app):
     """Write the settings and the reference, a page for each room, before the build."""
     GENERATED.mkdir(exist_ok=True)
-    lines = ["# Reference\n", "Exported by `torchrl_osr`:\n"]
-    exported = [name for name in torchrl_osr.__all__ if not name.startswith("_")]
-    lines += [f"- {{py:obj}}`~torchrl_osr.{name}`" for name in exported]
+    lines = ["# API reference\n", "*What does each name do?*\n"]
+    lines += ["```python", "from torchrl_osr import OSRLoss, load_policy", "```\n"]
+    lines += ["`torchrl_osr` exports these names:\n", "| name | |", "|---|---|"]
+    for name in torchrl_osr.__all__:
+        if not name.startswith("_"):
+            summary = inspect.getdoc(getattr(torchrl_osr, name)).partition("\n")[0]
+            summary = re.sub(r":math:`(.*?)`", r"$\1$", summary)
+            lines.append(f"| {{py:obj}}`~torchrl_osr.{name}` | {summary} |")
+    lines += ["\n## Modules\n", "`torchrl_osr.lab` needs the extra `train`."]
     lines += ["\n```{toctree}\n:maxdepth: 1\n", *rooms(), "```\n"]
     pages = {"settings": settings.page(), "reference": "\n".join(lines)}
     for page, directives in rooms().items():
@@ -121,6 +128,22 @@ def resolve_exported_name(app, env, node, contnode):
     )
 
 
+def label_cells(app, doctree, docname):
+    """Name the columns in the cells of wide tables: on a phone a row is a block."""
+    for table in doctree.findall(nodes.table):
+        head, *rows = [[*row.findall(nodes.entry)] for row in table.findall(nodes.row)]
+        columns = zip(head, *rows, strict=True)
+        if sum(max(len(each.astext()) for each in cells) for cells in columns) < 70:
+            continue
+        table["classes"].append("wide")
+        for row in rows:
+            for title, cell in zip(head[1:], row[1:], strict=True):
+                label = nodes.inline(text=f"{title.astext()}: ", classes=["label"])
+                paragraph = cell.next_node(nodes.paragraph)
+                if cell.astext() and title.astext():
+                    paragraph.insert(0, label)
+
+
 def constructor_signature(app, what, name, obj, options, signature, returns):
     """Show a loss's own arguments; TorchRL's metaclass has them as ``*args``."""
     if what == "class" and issubclass(obj, LossModule):
@@ -145,6 +168,7 @@ def one_field_each(app, what, name, obj, options, lines):
 
 def setup(app):
     app.connect("builder-inited", write_pages)
+    app.connect("doctree-resolved", label_cells)
     app.connect("missing-reference", resolve_exported_name)
     app.connect("autodoc-process-signature", constructor_signature)
     # After Napoleon, whose priority is 500.

@@ -30,9 +30,15 @@ COMMON = (
 )
 HEAD = """# Settings
 
-Every key of `torchrl-osr train` with its value in two presets. The options of a
-loss are those of its class, here those of {py:class}`~torchrl_osr.OSRLoss`;
-`torchrl-osr train loss=osr_v --cfg job` prints those of another.
+*Which settings are there, and what do they mean?*
+
+```bash
+torchrl-osr train trainer.steps=100_000 --cfg job
+```
+
+The tables have every key of `torchrl-osr train`, with its value in two presets. The
+keys `loss.*` are the options of {py:class}`~torchrl_osr.OSRLoss`. To print those of
+another loss, add `loss=osr_v --cfg job`.
 """
 
 

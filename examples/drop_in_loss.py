@@ -39,7 +39,7 @@ actor = ProbabilisticActor(
     return_log_prob=True,
 )
 qvalue = ValueOperator(MLP(in_features=6, out_features=1), ["observation", "action"])
-inverse_dynamics = tanh_gaussian_inverse_dynamics(3, 3, num_cells=[64, 64])
+inverse_dynamics = tanh_gaussian_inverse_dynamics(3, 3, low=-1.0, high=1.0)
 inverse_dynamics_loss = InverseDynamicsLoss(inverse_dynamics)
 optimizer = torch.optim.Adam(inverse_dynamics_loss.parameters(), lr=3e-3)
 for _ in range(200):

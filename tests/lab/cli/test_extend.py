@@ -28,8 +28,8 @@ def save_files(folder: Path) -> None:
 
 
 def typed(command: str) -> list[str]:
-    """Arguments of the page's line that begins with this command."""
-    block = "\n".join(grab_code_blocks(PAGE, lang="bash"))
+    """Arguments of the line that begins with this command, in the page's last block."""
+    block = grab_code_blocks(PAGE, lang="bash")[-1]
     (line,) = (line for line in block.splitlines() if line.startswith(command))
     return shlex.split(line)[1:]
 
