@@ -27,9 +27,10 @@ class CQLLoss(ActorCriticLoss):
 
     "Conservative Q-Learning for Offline Reinforcement Learning", appendix F,
     https://arxiv.org/abs/2006.04779. TorchRL 0.14.1's ``CQLLoss`` differs, see
-    :func:`~torchrl_osr.functional.conservative_gap`: this one is untrained about
-    ``N log K`` below it. With ``min_q_weight=0, deterministic_backup=False`` and ten
-    critics it is SAC-N (https://arxiv.org/abs/2110.01548).
+    :func:`~torchrl_osr.functional.conservative_gap`: before training, ``loss_cql`` here
+    is larger by about ``min_q_weight * N * log(K)``. With ``min_q_weight=0,
+    deterministic_backup=False`` and ten critics it is SAC-N
+    (https://arxiv.org/abs/2110.01548).
 
     Each entry is weighted already and sends gradient to its own parameters only.
 
