@@ -4,6 +4,7 @@ import inspect
 import os
 import pkgutil
 import re
+import shutil
 import sys
 from pathlib import Path
 
@@ -108,9 +109,12 @@ def write_pages(app):
         body = "\n".join(directives)
         pages[page] = REFERENCE.format(title=f"torchrl_osr.{page}", body=body)
     for page, text in pages.items():
-        path = GENERATED / f"{page}.md"
-        if not path.exists() or path.read_text(encoding="utf-8") != text:
-            path.write_text(text, encoding="utf-8")
+        (GENERATED / f"{page}.md").write_text(text, encoding="utf-8")
+
+
+def remove_pages(app, exception):
+    """Leave nothing of a build outside of its output."""
+    shutil.rmtree(GENERATED)
 
 
 def resolve_exported_name(app, env, node, contnode):
@@ -169,6 +173,7 @@ def one_field_each(app, what, name, obj, options, lines):
 def setup(app):
     app.connect("builder-inited", write_pages)
     app.connect("doctree-resolved", label_cells)
+    app.connect("build-finished", remove_pages)
     app.connect("missing-reference", resolve_exported_name)
     app.connect("autodoc-process-signature", constructor_signature)
     # After Napoleon, whose priority is 500.

@@ -1,4 +1,4 @@
-"""OSR in plain PyTorch: one page to read beside the paper.
+"""OSR in plain PyTorch: one page to read with the paper.
 
 The page follows the paper: perturbed states, the inverse dynamics model (4.2), state
 recovery (11), the actor and the critics (4.4), one update. It computes the losses and
