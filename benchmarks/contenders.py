@@ -253,6 +253,7 @@ def make_contender(
     """Return an update and the batches that it reads, the same for every name."""
     batches = make_batches(size, device)
     if name in (PLAIN, TIGHT):
+        torch.set_default_device(device)  # each contender has its own process
         options = {"num_random": size.num_random, "layer_norm": size.layer_norm}
         plain = PlainOSR(size.observations, size.actions, list(size.cells), **options)
         rows = [unpack(batch) for batch in batches]
