@@ -1,4 +1,4 @@
-"""What an optional package is for, said where its import fails."""
+"""Clear ImportErrors for optional dependencies."""
 
 from __future__ import annotations
 
@@ -8,14 +8,9 @@ from contextlib import contextmanager
 
 @contextmanager
 def needed_by(what: str, extra: str) -> Iterator[None]:
-    """Add to a failed import who needs the package and how to install it.
+    """Add to an ImportError who needs the package, with a verb, and which extra has it.
 
-    Args:
-        what: with its verb, as in ``"CSV files need"``.
-        extra: of this package, which brings it.
-
-    Raises:
-        ImportError: naming the missing package and the extra.
+    ``with needed_by("CSV files need", "train"): import pandas``
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""Files: written whole or not at all, read within bounds, told apart by checksums."""
+"""Files that are written whole or not at all; JSON, arrays, tensors and checksums."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ import json
 import math
 import os
 import shutil
-import stat
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.lib.format import MAGIC_PREFIX
 from numpy.typing import NDArray
+from torch import Tensor
+
+from torchrl_osr._extras import needed_by
 
 # Results of 10,000 pairs of episodes at ten levels have 40 MB.
 MAX_JSON_BYTES = 256 * 2**20
@@ -28,6 +29,9 @@ MAX_UNPACKED_BYTES = 4 * 2**30
 
 CHECKSUM = "checksum"
 """Where a record has the SHA-256 of everything else in it."""
+
+RECORD = "torchrl_osr"
+"""Where a file of tensors, or a graph, has its record."""
 
 
 @contextmanager
@@ -84,15 +88,8 @@ def finite_or_none(value: Any) -> Any:
 
 
 def read_text(path: Path, *, max_bytes: int = MAX_JSON_BYTES) -> str:
-    """Text of a small file, of at most ``max_bytes``.
-
-    Raises:
-        OSError: it cannot be read.
-        ValueError: it is too large, not UTF-8, or no file.
-    """
-    refuse_other_than_files(path)
+    """Return the text of a file; a ValueError names one that is none, or too large."""
     with path.open("rb") as file:
-        # Not its size: a file may grow.
         content = file.read(max_bytes + 1)
     if len(content) > max_bytes:
         raise ValueError(f"{path.name} has more than {max_bytes:,} bytes")
@@ -102,62 +99,31 @@ def read_text(path: Path, *, max_bytes: int = MAX_JSON_BYTES) -> str:
         raise ValueError(f"{path.name} is no text: {error}") from error
 
 
-def refuse_other_than_files(path: Path) -> None:
-    """Raise a ValueError if a path is a folder, a named pipe or a device.
-
-    To open a pipe waits for its other end, perhaps for ever.
-    """
-    if path.exists() and not path.is_file():
-        raise ValueError(f"{path} is a folder, a pipe or a device; a file was expected")
-
-
 def read_json(path: Path, *, max_bytes: int = MAX_JSON_BYTES) -> dict[str, Any]:
-    """JSON object that a file holds, see :func:`read_text`.
-
-    Raises:
-        OSError: it cannot be read.
-        ValueError: it holds something else or is too large, naming the file.
-    """
-    return parse_json(read_text(path, max_bytes=max_bytes), path.name)
-
-
-def parse_json(text: str, name: str) -> dict[str, Any]:
-    """JSON object in a text; a ValueError names the file if it is something else."""
+    """Return the JSON object of a file; a ValueError names one that holds another."""
     try:
-        value = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{name} is no JSON: {error}") from error
+        value = json.loads(read_text(path, max_bytes=max_bytes))
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise ValueError(f"{path.name} is no JSON: {error}") from error
     if not isinstance(value, dict):
-        raise ValueError(f"{name} holds no object")
+        raise ValueError(f"{path.name} holds no object")
     return value
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Plain arrays of a NumPy archive (``.npz``), by name; nothing is unpickled.
+    """Return the arrays of a NumPy archive (``.npz``) by name; nothing is unpickled.
 
     Raises:
         OSError: it cannot be read.
-        ValueError: it is no archive, damaged, holds objects, two arrays of one name, or
-            would unpack to more than :func:`check_unpacked_size` allows; the message
-            names the file.
+        ValueError: it is no archive of arrays, damaged, or would unpack to more than
+            :func:`check_unpacked_size` allows.
     """
     try:
-        refuse_other_than_files(path)
-        with path.open("rb") as file:
-            if file.read(len(MAGIC_PREFIX)) == MAGIC_PREFIX:
-                raise ValueError("it is a single array")
         with zipfile.ZipFile(path) as archive:
             sizes = [member.file_size for member in archive.infolist()]
-            names = [name.removesuffix(".npy") for name in archive.namelist()]
-        if twice := [name for name in names if names.count(name) > 1]:
-            raise ValueError(f"two arrays in it are called {twice[0]!r}")
         check_unpacked_size(path, sum(sizes))
         with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive}
-        # What is no array comes back as bytes.
-        if others := [name for name in arrays if isinstance(arrays[name], bytes)]:
-            raise ValueError(f"{others[0]!r} in it is no array")
-        return arrays
+            return {name: np.asarray(archive[name]) for name in archive}
     except (
         *(EOFError, MemoryError, NotImplementedError, OverflowError),
         *(ValueError, zipfile.BadZipFile, zlib.error),
@@ -178,21 +144,50 @@ def check_unpacked_size(path: Path, unpacked: int) -> None:
         )
 
 
-def refuse_archive(archive: zipfile.ZipFile) -> None:
-    """Raise unless a ZIP archive unpacks to its own place and its own size.
+def write_tensors(
+    path: Path, tensors: Mapping[str, Tensor], record: Mapping[str, Any]
+) -> None:
+    """Write tensors and a JSON-compatible record to a safetensors file."""
+    with needed_by("files of tensors need", "export"):
+        from safetensors.torch import save
+    there = {name: each.detach().cpu().contiguous() for name, each in tensors.items()}
+    record = dict(record) | {CHECKSUM: _digest(there)}
+    write_atomically(path, save(there, {RECORD: json.dumps(record)}))
+
+
+def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Return tensors and record of a file; nothing is unpickled.
 
     Raises:
-        ValueError: naming the member: its path leads out, it is a symbolic link, or it
-            is compressed, so that a small file may unpack to anything.
+        ImportError: safetensors is not installed.
+        OSError: the file cannot be read.
+        ValueError: it is something else, or damaged.
     """
-    for member in archive.infolist():
-        names = PurePosixPath(member.filename), PureWindowsPath(member.filename)
-        if any(".." in name.parts or name.anchor for name in names):
-            raise ValueError(f"the path {member.filename!r} leads out of the archive")
-        if stat.S_ISLNK(member.external_attr >> 16):
-            raise ValueError(f"{member.filename!r} is a symbolic link")
-        if member.compress_type != zipfile.ZIP_STORED:
-            raise ValueError(f"{member.filename!r} is compressed")
+    with needed_by("files of tensors need", "export"):
+        from safetensors import SafetensorError, safe_open
+    try:
+        with safe_open(path, "pt") as file:
+            # Copies: what is mapped changes with the file.
+            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
+            record = json.loads((file.metadata() or {})[RECORD])
+        damaged = record.pop(CHECKSUM) != _digest(tensors)
+    except (SafetensorError, KeyError, ValueError, AttributeError) as error:
+        raise ValueError(
+            f"{path} is no file of tensors of torchrl-osr, or damaged: {error!r}"
+        ) from error
+    if damaged:
+        raise ValueError(
+            f"{path} is damaged: its checksum is wrong. Take a whole copy."
+        )
+    return tensors, record
+
+
+def _digest(tensors: Mapping[str, Tensor]) -> str:
+    digest = hashlib.sha256()
+    for name, tensor in sorted(tensors.items()):
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
+        digest.update(tensor.numpy().tobytes())
+    return digest.hexdigest()
 
 
 def sha256_of(path: Path) -> str:
@@ -202,25 +197,14 @@ def sha256_of(path: Path) -> str:
 
 
 def checksummed(record: Mapping[str, Any]) -> dict[str, Any]:
-    """JSON-compatible record with the checksum of its contents in it.
-
-    Examples:
-        >>> from torchrl_osr._files import check_checksum, checksummed
-        >>> record = checksummed({"rows": 7})
-        >>> check_checksum(record, "card.json")
-        >>> check_checksum(record | {"rows": 8}, "card.json")
-        Traceback (most recent call last):
-            ...
-        ValueError: the checksum of card.json is wrong
-    """
+    """JSON-compatible record with the checksum of its contents in it."""
     return dict(record) | {CHECKSUM: _checksum(record)}
 
 
 def check_checksum(record: Mapping[str, Any], name: str) -> None:
     """Raise a ValueError that names the file unless :func:`checksummed` made it so."""
     if record.get(CHECKSUM) != _checksum(record):
-        flaw = "wrong" if CHECKSUM in record else "missing"
-        raise ValueError(f"the checksum of {name} is {flaw}")
+        raise ValueError(f"the checksum of {name} is wrong or missing")
 
 
 def _checksum(record: Mapping[str, Any]) -> str:
@@ -230,16 +214,7 @@ def _checksum(record: Mapping[str, Any]) -> str:
 
 
 def check_disk_space(folder: Path | str, needed_bytes: int, what: str) -> None:
-    """Raise unless a folder's disk has room.
-
-    Args:
-        folder: need not be there yet.
-        needed_bytes: how much will be written.
-        what: will be written there, in words.
-
-    Raises:
-        OSError: ``ENOSPC``, with what is needed, what is free and what to do.
-    """
+    """Raise an OSError unless a folder's disk has room; it need not be there yet."""
     there = Path(folder).absolute()
     while not there.exists():
         there = there.parent
@@ -247,15 +222,7 @@ def check_disk_space(folder: Path | str, needed_bytes: int, what: str) -> None:
     if free < needed_bytes:
         raise OSError(
             errno.ENOSPC,
-            f"not enough disk space: {_readable(needed_bytes)} are needed for {what}, "
-            f"{_readable(free)} are free. Free space or choose another disk",
+            f"not enough disk space: {needed_bytes / 1e6:,.1f} MB are needed for "
+            f"{what}, {free / 1e6:,.1f} MB are free. Free space or choose another disk",
             str(folder),
         )
-
-
-def _readable(size: int) -> str:
-    """Number of bytes in the unit that people use."""
-    for power, unit in ((3, "GB"), (2, "MB"), (1, "kB")):
-        if size >= 1000**power:
-            return f"{size / 1000**power:.1f} {unit}"
-    return f"{size} bytes"

@@ -10,7 +10,7 @@ import onnxruntime
 import pytest
 import torch
 
-from torchrl_osr.policy.graph import RECORD
+from torchrl_osr._files import RECORD
 
 
 def inputs(policy, rows: int, output: str) -> dict[str, torch.Tensor]:

@@ -6,20 +6,22 @@ Shapes: ``S`` observation, ``A`` action.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import torch
 from numpy.typing import ArrayLike
 from tensordict import TensorDict
 from tensordict.nn import ProbabilisticTensorDictSequential
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.envs import ObservationNorm
 from torchrl.modules import MLP
 from torchrl.objectives import LossModule
 
-from torchrl_osr._checks import check_choice
-from torchrl_osr.policy.mlp import describe_mlp
 from torchrl_osr.policy.policy import DISTRIBUTIONS, Policy
+
+PACKAGES = ("torchrl-osr", "torch", "torchrl", "tensordict")
 
 
 def policy_from_loss(
@@ -43,68 +45,84 @@ def policy_from_loss(
     Keyword Args:
         low, high: bounds of the environment's actions, which the networks' -1 and 1
             stand for; a number or ``[A]``. Default -1 and 1.
-        source: JSON-compatible, kept in ``policy.record["source"]``. Default: only the
-            name of the loss's class.
+        source: JSON-compatible, kept in ``policy.record["source"]``; of absolute paths
+            in it, only the name is kept. Default: the name of the loss's class.
 
     Raises:
-        ValueError: the networks are of another kind.
+        ValueError: the networks are of another kind, or the bounds are not finite or
+            not in order.
 
     Examples:
         >>> import numpy as np
         >>> from torchrl_osr import CQLLoss
         >>> from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
-        >>> networks = tanh_gaussian_actor(3, 1), critic_ensemble(3, 1)
-        >>> loss = CQLLoss(*networks)
+        >>> loss = CQLLoss(tanh_gaussian_actor(3, 1), critic_ensemble(3, 1))
         >>> policy = policy_from_loss(loss, low=-2.0, high=2.0)
         >>> policy.act(np.zeros((4, 3))).shape, policy.value(np.zeros((4, 3))).shape
         ((4, 1), (4,))
     """
-    if not isinstance(loss.actor_network, ProbabilisticTensorDictSequential):
+    network, kind = loss.actor_network, ""
+    if isinstance(network, ProbabilisticTensorDictSequential):
+        kind = network[-1].distribution_class.__name__
+    # A policy acts by the mean of a Gaussian actor, which ends in a tanh.
+    distribution = {"IndependentNormal": "TanhDelta"}.get(kind, kind)
+    if distribution not in DISTRIBUTIONS:
         raise ValueError(
             f"the actor of a policy ends in one of {DISTRIBUTIONS}, as those of "
-            "torchrl_osr.modules; this one has no distribution."
+            f"torchrl_osr.modules; this one has {kind or 'no distribution'}."
         )
     if observation_norm is not None and not observation_norm.standard_normal:
         raise ValueError(
             "a policy standardises as ObservationNorm(standard_normal=True) does, "
             "(observation - loc) / scale; this transform is the other way round."
         )
-    actor, prefix = _mlp(loss.actor_network)
-    distribution = loss.actor_network[-1].distribution_class.__name__
-    # A policy acts by the mean of a Gaussian actor, which ends in a tanh.
-    distribution = {"IndependentNormal": "TanhDelta"}.get(distribution, distribution)
-    check_choice("the actor's distribution", distribution, DISTRIBUTIONS)
+    actor, prefix = _mlp(network)
     size = actor.out_features // (2 if distribution == "TanhNormal" else 1)
     tensors = _weights(loss.actor_network_params, prefix, "actor")
-    critics = {"number": 0} | describe_mlp(actor)
+    critics = {"number": 0} | _sizes(actor)
     if hasattr(loss, "qvalue_network"):
         critic, prefix = _mlp(loss.qvalue_network)
         each = loss.qvalue_network_params.unbind(0)
-        critics = {"number": len(each)} | describe_mlp(critic)
+        critics = {"number": len(each)} | _sizes(critic)
         for number, params in enumerate(each):
             tensors |= _weights(params, prefix, f"critics.{number}")
     for name, default in (("loc", 0.0), ("scale", 1.0)):
         value = torch.as_tensor(getattr(observation_norm, name, default))
         tensors[name] = value.cpu().float().expand(actor.in_features).clone()
     shape = (0,) if distribution == "OneHotCategorical" else (size,)
-    low, high = (torch.as_tensor(each).float().expand(shape) for each in (low, high))
+    for name, given in (("low", low), ("high", high)):
+        tensors[name] = torch.as_tensor(given).float().expand(shape).clone()
+    if (
+        not ((width := tensors["high"] - tensors["low"]) > 0).all()
+        or width.isinf().any()
+    ):
+        raise ValueError(f"low={low!r} must be below high={high!r}, and both finite.")
     record = {
         "distribution": distribution,
         "observation_size": actor.in_features,
         "action_size": size,
-        "low": low.tolist(),
-        "high": high.tolist(),
-        "actor": describe_mlp(actor),
+        "actor": _sizes(actor),
         "critics": critics,
-        "source": {"loss": type(loss).__name__} | dict(source or {}),
+        "source": {"loss": type(loss).__name__} | _without_paths(dict(source or {})),
+        "versions": {name.replace("-", "_"): version(name) for name in PACKAGES},
     }
     policy = Policy(record, tensors)
     _check_same(policy, loss)
     return policy
 
 
-def _mlp(network: torch.nn.Module) -> tuple[MLP, str]:
-    """The only MLP in a network, and what its parameters' names begin with."""
+def _without_paths(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _without_paths(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_without_paths(each) for each in value]
+    if isinstance(value, (str, Path)) and Path(value).is_absolute():
+        return Path(value).name
+    return value
+
+
+def _mlp(network: nn.Module) -> tuple[MLP, str]:
+    """Return the only MLP in a network, and how its parameters' names begin."""
     found = [
         (each, name) for name, each in network.named_modules() if isinstance(each, MLP)
     ]
@@ -114,6 +132,14 @@ def _mlp(network: torch.nn.Module) -> tuple[MLP, str]:
             f"torchrl_osr.modules; this one has {len(found)}."
         )
     return found[0]
+
+
+def _sizes(mlp: MLP) -> dict[str, Any]:
+    return {
+        "num_cells": list(mlp.num_cells),
+        "activation": getattr(mlp.activation_class, "__name__", ""),
+        "layer_norm": mlp.norm_class is nn.LayerNorm,
+    }
 
 
 def _weights(params: TensorDict, prefix: str, name: str) -> dict[str, Tensor]:

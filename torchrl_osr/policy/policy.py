@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -19,19 +18,21 @@ from torch import Tensor, nn
 from torchrl.modules import NormalParamExtractor
 
 from torchrl_osr._checks import check_choice
-from torchrl_osr.modules.actor import SCALE_MAPPING
-from torchrl_osr.policy.graph import write_graph
-from torchrl_osr.policy.mlp import build_mlp, check_size
-from torchrl_osr.policy.tensor_file import write_tensors
+from torchrl_osr._files import read_tensors, write_tensors
+from torchrl_osr.modules.actor import SCALE_MAPPING, mlp
+from torchrl_osr.policy.export import write_graph
 
 DISTRIBUTIONS = ("TanhNormal", "TanhDelta", "OneHotCategorical")
-"""What an actor may end in, by TorchRL's names."""
+"""Distributions that an actor may end in, by TorchRL's names."""
+
+ACTIVATIONS = {
+    each.__name__: each
+    for each in (nn.ELU, nn.GELU, nn.LeakyReLU, nn.ReLU, nn.SiLU, nn.Tanh)
+}
+"""Activations that a network in a file may have."""
 
 SUFFIX = ".safetensors"
 """How the name of a saved policy ends."""
-
-PACKAGES = ("torchrl-osr", "torch", "torchrl", "tensordict")
-MAX_CRITICS = 1000
 
 # How far an action may be out of its bounds, as a share of half their distance: a
 # caller's own arithmetic rounds.
@@ -43,21 +44,18 @@ Array = TypeVar("Array", NDArray[Any], Tensor)
 class Policy(nn.Module):
     """A trained policy and its critics, in the units of the environment.
 
-    :func:`~torchrl_osr.load_policy` and
-    :func:`~torchrl_osr.policy.policy_from_loss` make one. Standardisation of
-    observations and scaling of actions are inside. As a module it maps observations
-    ``[B, S]`` to deterministic actions and checks nothing:
+    :func:`~torchrl_osr.load_policy` and :func:`~torchrl_osr.policy.policy_from_loss`
+    make one. Standardisation of observations and scaling of actions are inside. As a
+    module it maps observations ``[B, S]`` to deterministic actions and checks nothing:
     ``TensorDictModule(policy, ["observation"], ["action"])`` is a TorchRL policy.
 
     Args:
-        record: JSON-compatible description of the networks, the bounds and the origin.
-        tensors: the module's state, which must fit the record.
-
-    Raises:
-        ValueError: they do not fit, or a tensor is not finite.
+        record: JSON-compatible: sizes of the networks, and the origin.
+        tensors: weights, and statistics and bounds by the names of the attributes.
 
     Attributes:
-        record: the description; ``record["source"]`` has what is known of the run.
+        record: see there; ``record["source"]`` has what is known of the run.
+        loc, scale: of the training observations, ``[S]``.
         low, high: bounds of the actions, ``[A]``; empty where actions are discrete.
     """
 
@@ -65,65 +63,29 @@ class Policy(nn.Module):
     scale: Tensor
     low: Tensor
     high: Tensor
-    _center: Tensor
-    _half: Tensor
-    actor: nn.Module
 
     def __init__(
         self, record: Mapping[str, Any], tensors: Mapping[str, Tensor]
     ) -> None:
         super().__init__()
-        self.record = dict(record) | {"source": dict(record["source"])}
-        self.distribution = record["distribution"]
+        self.record, self.distribution = dict(record), record["distribution"]
         check_choice("distribution", self.distribution, DISTRIBUTIONS)
         self.discrete = self.distribution == "OneHotCategorical"
-        self.observation_size = check_size(
-            "observation_size", record["observation_size"]
-        )
-        self.action_size = check_size("action_size", record["action_size"])
-        self._set_bounds(record["low"], record["high"])
-        for name in ("loc", "scale"):
-            empty = torch.empty(self.observation_size, device="meta")
-            self.register_buffer(name, empty)
-        parameters = (2 if self.distribution == "TanhNormal" else 1) * self.action_size
-        self.actor = build_mlp(record["actor"], self.observation_size, parameters)
+        self.observation_size = inputs = record["observation_size"]
+        self.action_size = actions = record["action_size"]
         self.extractor = NormalParamExtractor(SCALE_MAPPING)
-        sizes = (self.observation_size + self.action_size, 1)
-        if self.discrete:
-            sizes = (self.observation_size, self.action_size)
-        critics = record["critics"]
-        number = check_size("number of critics", critics["number"], 0, MAX_CRITICS)
-        self.critics = nn.ModuleList(build_mlp(critics, *sizes) for _ in range(number))
-        self._fill(tensors)
-
-    def _set_bounds(self, low: list[float], high: list[float]) -> None:
-        size = 0 if self.discrete else self.action_size
-        if not len(low) == len(high) == size:
-            raise ValueError(f"low and high must have {size} entries each.")
-        bounds = torch.tensor([low, high], dtype=torch.float32)
-        half = (bounds[1] - bounds[0]) / 2
-        if not ((half > 0) & half.isfinite()).all():
-            raise ValueError(f"low={low} must be below high={high}, and both finite.")
-        values = {"low": bounds[0], "high": bounds[1]}
-        values |= {"_center": bounds.mean(0), "_half": half}
-        for name, value in values.items():
-            # Not in the state: they are in the record. A view could not be exported.
-            self.register_buffer(name, value.clone(), persistent=False)
-
-    def _fill(self, tensors: Mapping[str, Tensor]) -> None:
-        """Give the networks their weights; until here they took no memory."""
-        here = {name: tuple(each.shape) for name, each in self.state_dict().items()}
-        there = {name: tuple(each.shape) for name, each in tensors.items()}
-        for name in sorted(here.keys() | there.keys()):
-            if here.get(name) != there.get(name):
-                raise ValueError(
-                    f"{name} has shape {there.get(name)}, expected {here.get(name)}."
-                )
-        for name, each in tensors.items():
-            if each.dtype != torch.float32 or not each.isfinite().all():
-                raise ValueError(f"{name} must be float32 and finite.")
-        if not (tensors["scale"] > 0).all():
-            raise ValueError("scale, of the observations, must be above 0.")
+        outputs = actions * (2 if self.distribution == "TanhNormal" else 1)
+        pair = (inputs, actions) if self.discrete else (inputs + actions, 1)
+        numbers = {"loc": inputs, "scale": inputs}
+        numbers |= dict.fromkeys(("low", "high"), 0 if self.discrete else actions)
+        with torch.device("meta"):  # without memory, until the weights are assigned
+            self.actor: nn.Module = _built(record["actor"], inputs, outputs)
+            self.critics = nn.ModuleList(
+                _built(record["critics"], *pair)
+                for _ in range(record["critics"]["number"])
+            )
+            for name, size in numbers.items():
+                self.register_buffer(name, torch.empty(size))
         self.load_state_dict(dict(tensors), assign=True)
         self.requires_grad_(False).eval()
 
@@ -131,7 +93,7 @@ class Policy(nn.Module):
     def act(
         self, observation: Array, *, generator: torch.Generator | None = None
     ) -> Array:
-        """Actions for observations, NumPy for NumPy and torch for torch.
+        """Return actions for observations, NumPy for NumPy and torch for torch.
 
         Args:
             observation: as the environment gives it, one ``[S]`` or many ``[B, S]``.
@@ -154,12 +116,12 @@ class Policy(nn.Module):
 
     @torch.no_grad()
     def value(self, observation: Array, action: Array | None = None) -> Array:
-        """Smallest of the critics' values, for gates and alarms.
+        """Return the smallest of the critics' values, for gates and alarms.
 
-        It estimates the discounted sum of the rewards that the run was trained on:
-        ``record["source"]`` has the discount, and scale and shift of the rewards. The
-        minimum is what the losses' own targets take. Conservative losses keep values
-        low on purpose: set thresholds by values of states that are known to be good.
+        It estimates the discounted sum of the rewards that the run was trained on.
+        The minimum is what the losses' own targets take. Conservative losses keep
+        values low on purpose: set thresholds by values of states that are known to be
+        good.
 
         Args:
             observation: as for :meth:`act`.
@@ -181,17 +143,14 @@ class Policy(nn.Module):
     def save(self, path: Path | str) -> None:
         """Write everything to one file, ``policy.safetensors`` for instance.
 
-        :func:`~torchrl_osr.load_policy` reads it. Weights and statistics are tensors;
-        sizes, bounds, origin, versions and checksums are JSON in the file's metadata.
+        :func:`~torchrl_osr.load_policy` reads it. Weights, statistics and bounds are
+        tensors; sizes, origin and versions are JSON in the file's metadata.
 
         Raises:
             ImportError: safetensors is not installed.
             OSError: the file cannot be written.
-            ValueError: its name ends otherwise.
         """
-        if Path(path).suffix != SUFFIX:
-            raise ValueError(f"the path must end in {SUFFIX}, got {path}.")
-        write_tensors(Path(path), self.state_dict(), self._stamped())
+        write_tensors(Path(path), self.state_dict(), self.record)
 
     def export(
         self, path: Path | str, output: Literal["action", "value"] = "action"
@@ -221,22 +180,30 @@ class Policy(nn.Module):
             self._check_critics()
             inputs["action"] = self(inputs["observation"])
             part.actor, graph = nn.Identity(), _Value(part)
-        write_graph(Path(path), graph, inputs, output, self._stamped())
+        write_graph(Path(path), graph, inputs, output, self.record)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Deterministic actions, see :meth:`act`; nothing is checked."""
+        """Return deterministic actions, see :meth:`act`; nothing is checked."""
         return self._in_units(self.mode(self.actor(self._standardized(observation))))
 
     def smallest_value(self, observation: Tensor, action: Tensor) -> Tensor:
-        """Smallest of the critics' values, see :meth:`value`; nothing is checked."""
+        """Return the smallest value, see :meth:`value`; nothing is checked."""
         state = self._standardized(observation)
         if self.discrete:
             index = action.unsqueeze(-1)
             values = [critic(state).gather(-1, index) for critic in self.critics]
         else:
-            unit = (action - self._center) / self._half
+            center, half = (self.low + self.high) / 2, (self.high - self.low) / 2
+            unit = (action - center) / half
             values = [critic(state, unit) for critic in self.critics]
         return torch.stack(values).amin(0).squeeze(-1)
+
+    def mode(self, raw: Tensor) -> Tensor:
+        """Return the deterministic action: an index, or within -1 and 1."""
+        if self.discrete:
+            return raw.argmax(-1)
+        loc = raw.chunk(2, -1)[0] if self.distribution == "TanhNormal" else raw
+        return loc.tanh()
 
     def _sample(self, observation: Tensor, generator: torch.Generator) -> Tensor:
         raw: Tensor = self.actor(self._standardized(observation))
@@ -256,21 +223,15 @@ class Policy(nn.Module):
         # Gymnasium's MuJoCo tasks have float64.
         return (observation.to(self.loc.dtype) - self.loc) / self.scale
 
-    def mode(self, raw: Tensor) -> Tensor:
-        """Deterministic action: an index, or within the network's bounds -1 and 1."""
-        if self.discrete:
-            return raw.argmax(-1)
-        loc = raw.chunk(2, -1)[0] if self.distribution == "TanhNormal" else raw
-        return loc.tanh()
-
     def _in_units(self, action: Tensor) -> Tensor:
         if self.discrete:
             return action
+        center, half = (self.low + self.high) / 2, (self.high - self.low) / 2
         # Rounding may lead out of the bounds by one bit.
-        return (action * self._half + self._center).clamp(self.low, self.high)
+        return (action * half + center).clamp(self.low, self.high)
 
     def _numbers(self, name: str, value: Any, size: int) -> Tensor:
-        """The value as finite float32 rows on the policy's device."""
+        """Return the value as finite float32 rows on the policy's device."""
         rows = _tensor(value).to(self.loc.device, torch.float32)
         if not rows.ndim or rows.shape[-1] != size:
             raise ValueError(
@@ -282,39 +243,69 @@ class Policy(nn.Module):
         return rows
 
     def _actions(self, value: Any, observation: Tensor) -> Tensor:
-        """The value as actions that were taken in these observations."""
-        batch = tuple(observation.shape[:-1])
-        low: Any
-        high: Any
+        """Return the value as actions that were taken in these observations."""
         if self.discrete:
-            action = _tensor(value).to(self.loc.device)
-            if action.is_floating_point() or action.dtype == torch.bool:
-                raise ValueError(f"the action is {action.dtype}, expected integers.")
-            expected, low, high = batch, 0, self.action_size - 1
-            outside = (action < low) | (action > high)
+            action, expected = (
+                _tensor(value).to(self.loc.device),
+                observation.shape[:-1],
+            )
+            within = (action >= 0) & (action < self.action_size) & (action % 1 == 0)
         else:
             action = self._numbers("action", value, self.action_size)
-            expected = (*batch, self.action_size)
-            low, high = self.low.tolist(), self.high.tolist()
-            margin = ROUNDING * self._half
-            outside = (action < self.low - margin) | (action > self.high + margin)
-        if action.shape != expected:
+            expected = torch.Size([*observation.shape[:-1], self.action_size])
+            margin = ROUNDING * (self.high - self.low) / 2
+            within = (action >= self.low - margin) & (action <= self.high + margin)
+        if action.shape != expected or not within.all():
+            bounds = [each.tolist() for each in (self.low, self.high)]
             raise ValueError(
-                f"the action has shape {tuple(action.shape)}, expected {expected} for "
-                f"an observation of shape {tuple(observation.shape)}."
+                f"the action must have shape {tuple(expected)} and lie within "
+                f"{[0, self.action_size - 1] if self.discrete else bounds}; it has "
+                f"shape {tuple(action.shape)}."
             )
-        if outside.any():
-            raise ValueError(f"the action is out of its bounds {low} and {high}.")
         return action.long() if self.discrete else action
 
     def _check_critics(self) -> None:
         if not self.critics:
             raise ValueError("this policy has no critics: the loss had none.")
 
-    def _stamped(self) -> dict[str, Any]:
-        """The record, with the versions that write it."""
-        versions = {name.replace("-", "_"): version(name) for name in PACKAGES}
-        return self.record | {"versions": versions}
+
+def load_policy(path: Path | str) -> Policy:
+    """Load a policy that was saved or exported, on the CPU; nothing is unpickled.
+
+    Args:
+        path: a ``.safetensors`` file of :meth:`~torchrl_osr.policy.Policy.save` or
+            ``torchrl-osr export``.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ImportError: safetensors is not installed.
+        ValueError: the file is no policy, or damaged.
+
+    Examples:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> from torchrl_osr import CQLLoss, load_policy
+        >>> from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
+        >>> from torchrl_osr.policy import policy_from_loss
+        >>> loss = CQLLoss(tanh_gaussian_actor(3, 1), critic_ensemble(3, 1))
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     policy_from_loss(loss).save(f"{folder}/policy.safetensors")
+        ...     policy = load_policy(f"{folder}/policy.safetensors")
+        >>> policy.act(np.zeros(3)).shape
+        (1,)
+    """
+    tensors, record = read_tensors(Path(path))
+    try:
+        return Policy(record, tensors)
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{path} is no saved policy: {error!r}") from error
+
+
+def _built(sizes: Mapping[str, Any], inputs: int, outputs: int) -> nn.Module:
+    activation = ACTIVATIONS[sizes["activation"]]
+    norm, cells = bool(sizes["layer_norm"]), sizes["num_cells"]
+    network: nn.Module = mlp(inputs, outputs, cells, activation, layer_norm=norm)
+    return network
 
 
 class _Value(nn.Module):
@@ -334,7 +325,7 @@ def _tensor(value: Any) -> Tensor:
 
 
 def _like(given: Array, result: Tensor) -> Array:
-    """The result, of the kind and on the device of what was given."""
+    """Return the result as what was given: NumPy, or torch on its device."""
     if isinstance(given, Tensor):
         return result.to(given.device)
     return result.cpu().numpy()

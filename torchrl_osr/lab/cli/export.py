@@ -22,7 +22,7 @@ from torch import Tensor
 
 from torchrl_osr.lab.run.policy_of_run import load_run_policy
 from torchrl_osr.policy import Policy, load_policy
-from torchrl_osr.policy.graph import SUFFIXES
+from torchrl_osr.policy.export import SUFFIXES
 from torchrl_osr.policy.policy import SUFFIX
 
 ROWS = 256

@@ -20,7 +20,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import nn
 
 from torchrl_osr import __version__
-from torchrl_osr._files import write_json
+from torchrl_osr._files import read_tensors, write_json, write_tensors
 from torchrl_osr.lab.data.store import cache_root
 from torchrl_osr.lab.dynamics.conditional_vae import ConditionalVAE, ConditionalVAELoss
 from torchrl_osr.lab.dynamics.data import ModelData
@@ -30,7 +30,6 @@ from torchrl_osr.lab.dynamics.model_adversary import ModelAdversary
 from torchrl_osr.lab.dynamics.options import DynamicsOptions
 from torchrl_osr.lab.dynamics.rollout_buffer import RolloutReplayBuffer
 from torchrl_osr.objectives import ActorCriticLoss
-from torchrl_osr.policy.tensor_file import read_tensors, write_tensors
 from torchrl_osr.trainers import Evaluation, OfflineTrainer
 from torchrl_osr.trainers.checkpoints import safe_checkpoint
 

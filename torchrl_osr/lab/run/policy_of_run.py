@@ -13,9 +13,8 @@ from torchrl_osr.lab.run.trained_run import (
     run_folder_of,
     saved_sizes,
 )
-from torchrl_osr.policy.from_loss import policy_from_loss
-from torchrl_osr.policy.load import load_policy
-from torchrl_osr.policy.policy import SUFFIX, Policy
+from torchrl_osr.policy import Policy, load_policy, policy_from_loss
+from torchrl_osr.policy.policy import SUFFIX
 
 
 def load_run_policy(path: Path | str, trust: Sequence[str] = ()) -> Policy:

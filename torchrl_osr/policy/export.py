@@ -6,8 +6,7 @@ import io
 import json
 import logging
 import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +14,9 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_osr._extras import needed_by
-from torchrl_osr._files import write_atomically
+from torchrl_osr._files import RECORD, write_atomically
 
 SUFFIXES = (".onnx", ".pt2")
-
-RECORD = "torchrl_osr"
-"""Where the record is: in ONNX's metadata; in a ``.pt2`` file as an extra file."""
 
 
 def write_graph(
@@ -37,7 +33,7 @@ def write_graph(
         module: has one output.
         inputs: example of each input, ``[B, ...]``, by name.
         output: name of the output.
-        record: JSON-compatible, kept with the graph.
+        record: JSON-compatible, kept in ONNX's metadata or as an extra file.
 
     Raises:
         ImportError: ONNX needs onnx and onnxscript.
@@ -57,22 +53,6 @@ def write_graph(
         return
     with needed_by("ONNX needs", "export"):
         import onnxscript  # noqa: F401
-    with _without_torchs_own_notes():
-        onnx = torch.onnx.export(
-            module,
-            **given,
-            input_names=list(inputs),
-            output_names=[output],
-            dynamo=True,
-            verbose=False,
-        )
-    assert onnx is not None
-    onnx.model.metadata_props[RECORD] = text
-    write_atomically(path, onnx.model_proto.SerializeToString())
-
-
-@contextmanager
-def _without_torchs_own_notes() -> Iterator[None]:
     # torch 2.13's exporter calls what torch deprecates, and misses torchvision.
     log = logging.getLogger("torch.onnx")
     level = log.level
@@ -80,6 +60,10 @@ def _without_torchs_own_notes() -> Iterator[None]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            yield
+            given |= {"input_names": list(inputs), "output_names": [output]}
+            onnx = torch.onnx.export(module, **given, dynamo=True, verbose=False)
     finally:
         log.setLevel(level)
+    assert onnx is not None
+    onnx.model.metadata_props[RECORD] = text
+    write_atomically(path, onnx.model_proto.SerializeToString())

@@ -1,0 +1,237 @@
+"""Actions and values are those of the networks, in the environment's units."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from safetensors import safe_open
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+
+from torchrl_osr import load_policy
+from torchrl_osr._files import RECORD, read_tensors, write_tensors
+from torchrl_osr.policy import Policy, policy_from_loss
+
+KINDS = ("osr", "td3_bc", "discrete")
+LINEAR = {"num_cells": [], "activation": "ReLU", "layer_norm": False}
+
+
+def linear_policy(low: float = -1.0, high: float = 5.0) -> Policy:
+    """One number in, one out, all weights known."""
+    record = {
+        "distribution": "TanhDelta",
+        "observation_size": 1,
+        "action_size": 1,
+        "actor": LINEAR,
+        "critics": LINEAR | {"number": 2},
+        "source": {},
+    }
+    numbers = {
+        "loc": [2.0],
+        "scale": [4.0],
+        "low": [low],
+        "high": [high],
+        "actor.0.weight": [[0.5]],
+        "actor.0.bias": [0.1],
+        "critics.0.0.weight": [[3.0, 1.0]],
+        "critics.0.0.bias": [0.0],
+        "critics.1.0.weight": [[-3.0, 1.0]],
+        "critics.1.0.bias": [1.0],
+    }
+    return Policy(record, {name: torch.tensor(each) for name, each in numbers.items()})
+
+
+def test_against_hand_calculation():
+    policy = linear_policy()
+    # (10 - 2) / 4 = 2 is what the networks see; -1 and 5 are 2 -+ 3.
+    action = 2 + 3 * math.tanh(0.5 * 2 + 0.1)
+    assert policy.act(np.array([10.0])) == pytest.approx([action])
+    # min(3 * 2 + a, -3 * 2 + a + 1), with a between -1 and 1.
+    assert policy.value(np.array([10.0])) == pytest.approx(-5 + math.tanh(1.1))
+    given = policy.value(np.array([[10.0], [-6.0]]), np.array([[5.0], [2.0]]))
+    assert given == pytest.approx([-4.0, -6.0])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_results_have_the_kind_of_the_observation(make_policy, kind):
+    policy = make_policy(kind)
+    size = () if policy.discrete else (2,)
+    rows = np.linspace(-3, 3, 12).reshape(4, 3)
+    many = policy.act(rows)
+    assert many.shape == (4, *size)
+    assert many.dtype == (np.int64 if policy.discrete else np.float32)
+    frozen = rows[::-1].astype(np.float32)
+    frozen.flags.writeable = False
+    assert np.array_equal(policy.act(frozen), many[::-1])
+    assert policy.act(rows[1]) == pytest.approx(many[1], abs=1e-6)
+    tensors = policy.act(torch.from_numpy(rows).reshape(2, 2, 3))
+    assert not tensors.requires_grad
+    assert tensors.reshape(4, *size).numpy() == pytest.approx(many, abs=1e-6)
+    assert policy.act(np.zeros((0, 3))).shape == (0, *size)
+    assert policy.act(np.arange(3)).shape == size
+    for action in (None, many):
+        assert policy.value(rows, action).shape == (4,)
+    assert policy.value(rows[1]) == pytest.approx(policy.value(rows)[1], abs=1e-5)
+    module = TensorDictModule(policy, ["observation"], ["action"])
+    # Gymnasium's MuJoCo tasks have float64.
+    out = module(TensorDict({"observation": torch.from_numpy(rows)}, [4]))
+    assert np.array_equal(out["action"].numpy(), many)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    observation=arrays(np.float32, (4, 1), elements=st.floats(-1e6, 1e6, width=32)),
+    low=st.floats(-1e6, 1e6, width=32),
+    width=st.floats(1.0, 1e6, width=32),
+    seed=st.none() | st.integers(0, 2**32),
+)
+def test_actions_are_within_their_bounds(observation, low, width, seed):
+    policy = linear_policy(low, low + width)
+    generator = None if seed is None else torch.Generator().manual_seed(seed)
+    action = policy.act(observation, generator=generator)
+    assert policy.low <= action.min()
+    assert action.max() <= policy.high
+    policy.value(observation, action)  # an action of its own is never refused
+
+
+def test_drawn_actions_have_the_distribution_of_the_actor(make_loss, norm):
+    observation, draws = torch.tensor([0.3, -2.5, 1.0]), 20_000
+    state = TensorDict({"observation": (observation - norm.loc) / norm.scale})
+
+    def drawn(kind, **bounds):
+        loss = make_loss(kind)
+        policy = policy_from_loss(loss, norm, **bounds)
+        generator = torch.Generator().manual_seed(3)
+        rows = observation.expand(draws, 3)
+        action = policy.act(rows, generator=generator)
+        again = policy.act(rows, generator=generator.manual_seed(3))
+        assert torch.equal(action, again)
+        with loss.actor_network_params.to_module(loss.actor_network):
+            return action, loss.actor_network.get_dist(state)
+
+    action, theirs = drawn("osr", low=-2.0, high=2.0)
+    normal = torch.atanh((action / 2).clamp(-1 + 1e-6, 1 - 1e-6))
+    error = 5 * theirs.scale / math.sqrt(draws)
+    assert ((normal.mean(0) - theirs.loc).abs() < error).all()
+    assert ((normal.std(0) - theirs.scale).abs() < error).all()
+    action, theirs = drawn("discrete")
+    shares = torch.bincount(action, minlength=2) / draws
+    assert (shares - theirs.probs).abs().max() < 5 * 0.5 / math.sqrt(draws)
+    action, theirs = drawn("td3_bc")
+    assert action.unique(dim=0).shape == (1, 2)
+
+
+@pytest.mark.parametrize(
+    ("observation", "message"),
+    [
+        (np.zeros(4), r"shape \(4,\), expected \(3,\) or \(batch, 3\)"),
+        (np.float64(1.0), r"shape \(\), expected"),
+        (np.array([0.0, np.nan, 0.0]), "NaN or infinite"),
+        (np.array([0.0, 0.0, 1e300]), "NaN or infinite"),
+    ],
+)
+def test_observations_that_are_refused(make_policy, observation, message):
+    policy = make_policy("osr")
+    for method in (policy.act, policy.value):
+        with pytest.raises(ValueError, match=f"^the observation has .*{message}"):
+            method(observation)
+
+
+@pytest.mark.parametrize(
+    ("kind", "action", "message"),
+    [
+        ("osr", np.zeros(3), r"action has shape \(3,\), expected \(2,\) or"),
+        ("osr", np.ones((1, 2)), r"must have shape \(4, 2\).*has shape \(1, 2\)"),
+        ("osr", np.full((4, 2), 1.6), r"within \[\[-2.0, 0.5\], \[4.0, 1.5\]\]"),
+        ("discrete", np.full(4, 0.5), r"lie within \[0, 1\]"),
+        ("discrete", np.array([0, 1, 2, 0]), r"lie within \[0, 1\]"),
+    ],
+)
+def test_actions_that_are_not_valued(make_policy, kind, action, message):
+    with pytest.raises(ValueError, match=message):
+        make_policy(kind).value(np.zeros((4, 3)), action)
+
+
+# -- files ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("layer_norm", [False, True])
+def test_a_saved_policy_comes_back(tmp_path, make_policy, kind, layer_norm):
+    options = {} if kind == "discrete" else {"layer_norm": layer_norm}
+    policy = make_policy(kind, num_qvalue_nets=3, **options)
+    policy.save(tmp_path / "policy.safetensors")
+    again = load_policy(tmp_path / "policy.safetensors")
+    rows = torch.randn(9, 3).numpy()
+    assert np.array_equal(policy.act(rows), again.act(rows))
+    assert np.array_equal(policy.value(rows), again.value(rows))
+    drawn = [
+        each.act(rows, generator=torch.Generator().manual_seed(5))
+        for each in (policy, again)
+    ]
+    assert np.array_equal(*drawn)
+    assert again.record == policy.record
+
+
+def test_the_record_is_json_and_tells_no_paths(tmp_path, make_loss):
+    path = tmp_path / "policy.safetensors"
+    source = {"step": 7, "data": {"path": str(tmp_path / "secret" / "log.csv")}}
+    policy_from_loss(make_loss("osr"), source=source).save(path)
+    with safe_open(path, "np") as file:
+        record = json.loads(file.metadata()[RECORD])
+        assert file.get_tensor("actor.0.weight").shape == (8, 3)
+    wanted = {"loss": "CQLLoss", "step": 7, "data": {"path": "log.csv"}}
+    assert record["source"] == wanted
+    assert record["versions"]["torch"] == torch.__version__
+
+
+def test_other_files_are_refused(tmp_path, make_policy):
+    path = tmp_path / "policy.safetensors"
+    make_policy("osr").save(path)
+    tensors, record = read_tensors(path)
+    for changes, message in [
+        ({"observation_size": 4}, "size mismatch for actor.0.weight"),
+        ({"actor": record["actor"] | {"activation": "Module"}}, "KeyError"),
+        ({"distribution": "Normal"}, "distribution must be one of"),
+    ]:
+        write_tensors(path, tensors, record | changes)
+        with pytest.raises(ValueError, match=f"no saved policy: .*{message}"):
+            load_policy(path)
+    safetensors.torch.save_file({"loc": torch.zeros(3)}, path)
+    with pytest.raises(ValueError, match="is no file of tensors of torchrl-osr"):
+        load_policy(path)
+    with pytest.raises(FileNotFoundError):
+        load_policy(tmp_path / "nothing.safetensors")
+
+
+BLOCKED = """
+import sys
+for name in ("gymnasium", "mujoco", "hydra", "omegaconf", "tqdm", "pandas"):
+    sys.modules[name] = None
+import numpy, torchrl_osr
+print(torchrl_osr.load_policy("policy.safetensors").act(numpy.zeros(3)).shape)
+"""
+
+
+def test_a_file_needs_no_simulator_and_no_hydra(tmp_path, make_policy):
+    make_policy("osr").save(tmp_path / "policy.safetensors")
+    command = [sys.executable, "-c", BLOCKED]
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    done = subprocess.run(command, cwd=tmp_path, check=False, **streams)
+    assert done.stdout == "(2,)\n"
+
+
+def test_a_missing_package_is_named(tmp_path, make_policy, monkeypatch):
+    monkeypatch.setitem(sys.modules, "safetensors.torch", None)
+    with pytest.raises(ImportError, match=r"pip install torchrl-osr\[export\]"):
+        make_policy("osr").save(tmp_path / "policy.safetensors")
