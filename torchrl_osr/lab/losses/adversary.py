@@ -1,9 +1,7 @@
 r"""Perturbed states that an adversary chooses, with the networks at hand.
 
-The noise of equation (5) points anywhere; an adversary looks for the perturbation
-within a box that misleads the policy most. The attacks are those of "RORL: Robust
-Offline Reinforcement Learning via Conservative Smoothing" (Yang et al., NeurIPS 2022),
-https://arxiv.org/abs/2206.02829
+The attacks are those of "RORL: Robust Offline Reinforcement Learning via Conservative
+Smoothing" (Yang et al., NeurIPS 2022), https://arxiv.org/abs/2206.02829
 
 Shapes: ``B`` batch (any leading dimensions), ``A`` action, ``N`` critics, ``M``
 candidate perturbations of one state.
@@ -37,7 +35,7 @@ _Objective = Callable[[tuple[Tensor, ...]], Tensor]
 
 @dataclass(frozen=True)
 class Adversary:
-    r"""Find, for each state, the perturbation in a box that an objective likes best.
+    r"""Find the perturbation of each state within a box that maximises an objective.
 
     The box is :math:`|\delta_i| \le \epsilon` for each number of an observation. The
     objectives, with :math:`\hat s = s + \delta`:
@@ -67,9 +65,7 @@ class Adversary:
         step_size: length of a gradient step in units of ``epsilon``. Default 0.1.
 
     Examples:
-        >>> from torchrl_osr.lab.losses import Adversary
         >>> adversary = Adversary("min_Q", method="gradient", epsilon=0.1)
-        >>> # batch = adversary(loss, buffer.sample())
     """
 
     objective: Literal["action_diff", "min_Q"] = "action_diff"
@@ -90,16 +86,11 @@ class Adversary:
     def __call__(
         self, loss: ActorCriticLoss, tensordict: TensorDictBase
     ) -> TensorDictBase:
-        """A batch whose perturbed states are the worst for a loss's networks.
+        """Return a batch whose perturbed states are the worst for a loss's networks.
 
-        It stands in the place of :class:`~torchrl_osr.StatePerturbation`: in a plain
-        loop ``loss(adversary(loss, buffer.sample()))``, with a trainer in the hook
+        It replaces :class:`~torchrl_osr.StatePerturbation`: in a plain loop
+        ``loss(adversary(loss, buffer.sample()))``, with a trainer in the hook
         ``process_optim_batch``.
-
-        Args:
-            loss: holds the policy and the critics, such as
-                :class:`~torchrl_osr.OSRLoss`.
-            tensordict: a batch ``[B]``, left as it is.
         """
         keys = loss.observation_keys
         critics = loss.qvalue_network_params.detach()
@@ -107,12 +98,10 @@ class Adversary:
         def policy(states: TensorDictBase) -> TanhNormal:
             return distribution(loss.actor_network, loss.actor_network_params, states)
 
-        worst = self.perturb(
-            select(tensordict, keys),
-            keys,
-            policy,
-            lambda states, action: loss.q(states, action, critics),
-        )
+        def qvalue(states: TensorDictBase, action: Tensor) -> Tensor:
+            return loss.q(states, action, critics)
+
+        worst = self.perturb(select(tensordict, keys), keys, policy, qvalue)
         tensordict = tensordict.copy()
         for key in keys:
             tensordict.set(nested(loss.tensor_keys.perturbed, key), worst.get(key))
@@ -129,16 +118,7 @@ class Adversary:
     ) -> TensorDictBase:
         """Return ``states`` with the entries ``keys`` perturbed, without gradient.
 
-        Args:
-            states: ``[B]``, left as it is.
-            keys: the observations to perturb, ``[B, ...]`` each.
-            policy: returns the policy's distribution at states of any batch size.
-            qvalue: returns the critics' values of actions; only ``"min_Q"`` asks.
-            generator: of the uniform draws. Default: torch's own.
-
-        Raises:
-            KeyError: if an observation is missing.
-            TypeError: if an observation is not floating point.
+        Only ``"min_Q"`` calls ``qvalue``.
         """
         states = states.detach()
         noise = tuple(self._draw(states, key, generator) for key in keys)
@@ -162,12 +142,8 @@ class Adversary:
             raise TypeError(
                 f"{key!r} must be floating point to be perturbed, got {state.dtype}."
             )
-        uniform = torch.rand(
-            (self.num_samples, *state.shape),
-            generator=generator,
-            dtype=state.dtype,
-            device=state.device,
-        )
+        uniform = state.new_empty((self.num_samples, *state.shape))
+        uniform.uniform_(generator=generator)
         noise = self.epsilon * (2 * uniform - 1)
         if self.objective == "min_Q" and self.method == "sample":
             noise = torch.cat([torch.zeros_like(noise[:1]), noise])

@@ -31,12 +31,7 @@ class BCLoss(ActorCriticLoss):
             one.
 
     Keyword Args:
-        options: of every loss, of which ``reduction`` and ``use_prioritized_weights``
-            matter here, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
-
-    Raises:
-        ValueError: in the call, if the batch is empty or its actions have another
-            shape.
+        options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
     Examples:
         >>> import torch

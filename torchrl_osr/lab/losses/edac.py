@@ -28,19 +28,14 @@ def gradient_diversity(action_gradients: Tensor) -> Tensor:
             \frac{\nabla_a Q_i(s, a)}{\|\nabla_a Q_i(s, a)\|},
             \frac{\nabla_a Q_j(s, a)}{\|\nabla_a Q_j(s, a)\|} \Big\rangle
 
-    Args:
-        action_gradients: of each critic at the data's action, ``[N, R, A]``,
-            ``N >= 2``.
-
-    Returns:
-        ``[R]``, between -N / (N - 1) and N.
+    ``action_gradients`` of each critic at the data's action, ``[N, R, A]``, give
+    ``[R]``, between -N / (N - 1) and N.
     """
-    number = action_gradients.shape[0]
-    # Without eps: a dead critic's zero gradient would be 0 / 0.
+    # Without eps, a dead critic's zero gradient would be 0 / 0.
     unit = normalize(action_gradients, dim=-1, eps=1e-10)
     # All pairs at once: |sum_i g_i|^2 - sum_i |g_i|^2, with |g_i| = 1.
     pairs = unit.sum(0).square().sum(-1) - unit.square().sum((0, -1))
-    return pairs / (number - 1)
+    return pairs / (len(action_gradients) - 1)
 
 
 class EDACLoss(ActorCriticLoss):
@@ -60,21 +55,12 @@ class EDACLoss(ActorCriticLoss):
     https://arxiv.org/abs/2110.01548. Without the diversity it is SAC-N, see
     :class:`~torchrl_osr.CQLLoss`. ``loss_qvalue`` holds both terms of :math:`L_Q`.
 
-    Args:
-        actor_network: ends in a :class:`~torchrl.modules.TanhNormal`.
-        qvalue_network: one critic, copied by TorchRL, or a list of critics.
-
     Keyword Args:
         diversity_weight: :math:`\eta`. Default 1.0. May be assigned later.
         alpha_init: initial entropy temperature :math:`\alpha_e`. Default 1.0.
         fixed_alpha: keep the temperature. Default ``False``.
         target_entropy: in nats; ``"auto"`` (default) is minus the action's size.
-        options: of every loss, see
-            :class:`~torchrl_osr.objectives.ActorCriticLoss`.
-
-    Raises:
-        TypeError: if the actor's distribution is not a ``TanhNormal``.
-        ValueError: if a number is out of its range or there is a single critic.
+        options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
     Examples:
         >>> from torchrl_osr.lab.losses import EDACLoss
@@ -127,7 +113,7 @@ class EDACLoss(ActorCriticLoss):
 
     def action_gradients(self, batch: Transitions) -> Tensor:
         """Return each critic's gradient by the data's action, ``[N, R, A]``."""
-        number, action, keys = self.num_qvalue_nets, batch.a, self.tensor_keys
+        number, keys = self.num_qvalue_nets, self.tensor_keys
         states = batch.s.select(*state_keys(self.qvalue_network.in_keys), strict=False)
         states = states.expand(number, *states.batch_size)
         params = self.qvalue_network_params
@@ -143,5 +129,5 @@ class EDACLoss(ActorCriticLoss):
 
         # torch.func, unlike torch.autograd.grad, can be compiled; both can be
         # differentiated once more.
-        gradient: Tensor = torch.func.grad(total)(action.expand(number, *action.shape))
+        gradient: Tensor = torch.func.grad(total)(batch.a.expand(number, -1, -1))
         return gradient

@@ -25,21 +25,6 @@ from torchrl_osr.objectives.state_recovery import cloning_distance
 from torchrl_osr.objectives.transitions import Transitions
 
 
-def expectile_error(difference: Tensor, expectile: float) -> Tensor:
-    r"""Return :math:`|\tau - 1(u < 0)|\, u^2`, ``[R]``.
-
-    Args:
-        difference: :math:`u`, ``[R]``.
-        expectile: :math:`\tau`, between 0 and 1.
-
-    Examples:
-        >>> expectile_error(torch.tensor([2.0, -2.0]), 0.75)
-        tensor([3., 1.])
-    """
-    weight = torch.where(difference < 0, 1 - expectile, expectile)
-    return weight * difference.square()
-
-
 class IQLLoss(ActorCriticLoss):
     r"""Implicit Q-learning (IQL).
 
@@ -54,21 +39,15 @@ class IQLLoss(ActorCriticLoss):
     https://arxiv.org/abs/2110.06169.
 
     Args:
-        actor_network: the policy, any with a density; the authors' is
+        actor_network: any with a density; the authors' is
             :func:`~torchrl_osr.modules.gaussian_actor`.
-        qvalue_network: one critic, copied by TorchRL, or a list of critics.
         value_network: :math:`V`, see :func:`~torchrl_osr.modules.state_value`.
 
     Keyword Args:
         temperature: :math:`\beta`, the inverse temperature of the advantages. Default
             3.0, the authors' for the robots; 10.0 for the mazes.
         expectile: :math:`\tau`, between 0 and 1. Default 0.7; 0.9 for the mazes.
-        options: of every loss, see
-            :class:`~torchrl_osr.objectives.ActorCriticLoss`.
-
-    Raises:
-        ValueError: if a number is out of its range; in the call, if a row's action is
-            not the data's.
+        options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
     Examples:
         >>> from torchrl_osr.lab.losses import IQLLoss
@@ -113,8 +92,8 @@ class IQLLoss(ActorCriticLoss):
     def losses(self, batch: Transitions) -> Losses:
         if batch.is_data is not None:
             raise ValueError(
-                "the batch has synthetic rows, and IQL learns from the data's actions "
-                "alone: leave out the roll-outs of a model."
+                "The batch has synthetic rows, but IQL learns from the data's actions: "
+                "leave out the roll-outs of a model."
             )
         pi = distribution(
             self.actor_network, self.actor_network_params, batch.states[:1]
@@ -127,12 +106,11 @@ class IQLLoss(ActorCriticLoss):
         advantage = best - self.state_value(batch.s)
         weight = (self.advantage_temperature * advantage.detach()).exp().clamp(max=100)
         error, metrics = self.td_error(batch, self.q(batch.s, batch.a), target)
+        tau = torch.where(advantage < 0, 1 - self.expectile, self.expectile)
         losses = {
             "loss_actor": self.reduce(weight * nll, batch),
             "loss_qvalue": self.reduce(error, batch),
-            "loss_value": self.reduce(
-                expectile_error(advantage, self.expectile), batch
-            ),
+            "loss_value": self.reduce(tau * advantage.square(), batch),
         }
         return losses, metrics | {"nll": self.mean(nll, batch)}
 

@@ -29,72 +29,13 @@ def jeffreys_divergence(
         \frac12 \sum_i \Big(\frac{\sigma_p}{\sigma_q} - \frac{\sigma_q}{\sigma_p}\Big)^2
         + (\mu_p - \mu_q)^2 \Big(\frac1{\sigma_p^2} + \frac1{\sigma_q^2}\Big)
 
-    It is the sum of both :func:`gaussian_kl`, whose logarithms cancel. A sum of squares
-    keeps its digits where ``p`` and ``q`` are close, and there it is used: for a policy
-    at two neighbouring states.
-
-    Args:
-        loc_p, scale_p: mean and standard deviation of ``p``, ``[R, A]``.
-        loc_q, scale_q: mean and standard deviation of ``q``, ``[R, A]``.
-
-    Returns:
-        ``[R]``, each entry at least 0.
-
-    Examples:
-        >>> p, q = torch.tensor([0.4]), torch.tensor([-0.2])
-        >>> both = jeffreys_divergence(p, torch.tensor([0.3]), q, torch.tensor([0.5]))
-        >>> round(both.item(), 6)
-        3.288889
+    Means and standard deviations ``[R, A]`` give ``[R]``. The logarithms cancel, and a
+    sum of squares keeps its digits where ``p`` and ``q`` are close.
     """
     gap = loc_p - loc_q
     means = (gap / scale_p).square() + (gap / scale_q).square()
     scales = (scale_p / scale_q - scale_q / scale_p).square()
     return 0.5 * (means + scales).sum(-1)
-
-
-def value_smoothness(difference: Tensor, tau: float = 0.2) -> Tensor:
-    r"""RORL penalty of a change of the values around a state, to be minimised.
-
-    .. math::
-        \max_j \frac1N \sum_i (1 - \tau) \max(d_{ij}, 0)^2 + \tau \min(d_{ij}, 0)^2,
-        \quad d_{ij} = Q_i(\hat s_j, a) - Q_i(s, a)
-
-    "RORL: Robust Offline Reinforcement Learning via Conservative Smoothing" (Yang et
-    al. 2022), https://arxiv.org/abs/2206.02829, as its released code has it.
-
-    Args:
-        difference: :math:`d_{ij}` of ``M`` perturbed states, ``[N, M, R]``.
-        tau: weight of values that fall, against those that rise.
-
-    Returns:
-        ``[R]``.
-
-    Examples:
-        >>> value_smoothness(torch.tensor([[[1.0], [-1.0]]])).tolist()
-        [0.800000011920929]
-    """
-    rise, fall = difference.clamp(min=0).square(), difference.clamp(max=0).square()
-    return ((1 - tau) * rise + tau * fall).mean(0).amax(0)
-
-
-def uncertainty_penalty(qvalue: Tensor, weight: Tensor | float) -> Tensor:
-    r"""RORL penalty of actions that the critics do not agree on, to be minimised.
-
-    .. math::
-        \frac1N \sum_i \big( Q_i - [Q_i - \lambda\, \text{std}_i Q_i] \big)^2
-
-    The bracket is a target without gradient: the more the critics disagree, the further
-    each is pulled down. Source: see :func:`value_smoothness`.
-
-    Args:
-        qvalue: ``[N, R]``, ``N >= 2``.
-        weight: :math:`\lambda`.
-
-    Returns:
-        ``[R]``.
-    """
-    target = (qvalue - weight * qvalue.std(0)).detach()
-    return (qvalue - target).square().mean(0)
 
 
 class RORLLoss(ActorCriticLoss):
@@ -109,20 +50,14 @@ class RORLLoss(ActorCriticLoss):
             + \beta_Q\, \mathbb E_D\, \mathcal L_{smooth}
             + \beta_{ood}\, \mathbb E_{D, j}\, \mathcal L_{ood}(\hat s_j, \hat a_j)
 
-    with :func:`~torchrl_osr.value_smoothness` and
-    :func:`~torchrl_osr.uncertainty_penalty` of the policy's actions. "RORL:
-    Robust Offline Reinforcement Learning via Conservative Smoothing",
+    with :meth:`value_smoothness` and :meth:`uncertainty_penalty` of the policy's
+    actions. "RORL: Robust Offline Reinforcement Learning via Conservative Smoothing",
     https://arxiv.org/abs/2206.02829, and its released code, whose names the options
-    have. As there, the ``M`` draws of a term are shared by all rows of the batch. A
-    term whose weight is 0 *here* is left out for good and costs nothing.
+    have. As there, the ``M`` draws of a term are shared by all rows of the batch. Pass
+    0 to remove a term permanently; it then costs nothing.
 
     The weight :math:`\lambda` of the uncertainty falls with every update: call
-    :meth:`decay_uncertainty` after each, as one moves target networks.
-
-    Args:
-        actor_network: ends in a :class:`~torchrl.modules.TanhNormal`.
-        qvalue_network: one critic, copied by TorchRL, or a list of critics that keep
-            their own weights (:func:`~torchrl_osr.modules.critic_ensemble`).
+    :meth:`decay_uncertainty` after each.
 
     Keyword Args:
         num_samples: ``M``. Default 20.
@@ -140,13 +75,7 @@ class RORLLoss(ActorCriticLoss):
         alpha_init: initial entropy temperature :math:`\alpha_e`. Default 1.0.
         fixed_alpha: keep the temperature. Default ``False``.
         target_entropy: in nats; ``"auto"`` (default) is minus the action's size.
-        options: of every loss, see
-            :class:`~torchrl_osr.objectives.ActorCriticLoss`.
-
-    Raises:
-        TypeError: if the actor's distribution is not a ``TanhNormal``.
-        ValueError: if an option is out of its range, or a single critic shall have a
-            deviation; in the call, if the batch is empty.
+        options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
     Examples:
         >>> from torchrl_osr.lab.losses import RORLLoss
@@ -189,20 +118,16 @@ class RORLLoss(ActorCriticLoss):
         check_positive("num_samples", num_samples, minimum=1)
         if q_ood_uncertainty_reg < q_ood_uncertainty_reg_min:
             raise ValueError(
-                f"q_ood_uncertainty_reg={q_ood_uncertainty_reg} falls, and is below "
-                f"q_ood_uncertainty_reg_min={q_ood_uncertainty_reg_min}: lower the "
-                "latter."
+                "q_ood_uncertainty_reg must be at least q_ood_uncertainty_reg_min="
+                f"{q_ood_uncertainty_reg_min}, got {q_ood_uncertainty_reg}."
             )
         if not 0 <= q_smooth_tau <= 1:
             raise ValueError(f"q_smooth_tau must be in [0, 1], got {q_smooth_tau}.")
         super().__init__(**options)
         self.register_action_bounds(actor_network)
         self.register_actor_critic(actor_network, qvalue_network)
-        if self.num_qvalue_nets < 2 and q_ood_reg:
-            raise ValueError(
-                "one critic has no deviation: take num_qvalue_nets of at least 2, or "
-                "q_ood_reg=0."
-            )
+        if q_ood_reg:  # one critic has no deviation
+            check_positive("num_qvalue_nets", self.num_qvalue_nets, minimum=2)
         self.register_temperature(alpha_init, fixed_alpha, target_entropy)
         for name, value in given.items():
             setattr(self, name, value)
@@ -223,9 +148,8 @@ class RORLLoss(ActorCriticLoss):
         self.num_updates += 1
         # Of the number of updates: small steps of a float32 would add up wrongly.
         fallen = self.num_updates.double() * self.q_ood_uncertainty_decay
-        weight = (self.q_ood_uncertainty_reg - fallen).clamp(
-            min=self.q_ood_uncertainty_reg_min
-        )
+        weight = self.q_ood_uncertainty_reg - fallen
+        weight = weight.clamp(min=self.q_ood_uncertainty_reg_min)
         # Into the same tensor: a recording or a CUDA graph reads it there.
         self.uncertainty_weight.copy_(weight)
 
@@ -234,21 +158,19 @@ class RORLLoss(ActorCriticLoss):
         objective, log_prob = self.soft_policy_objective(batch, policy, "clean")
         terms: dict[str, Tensor] = {}
         if self.policy_smooth_reg:
-            terms["policy_smoothness"] = self.policy_smoothness(batch, policy)
-            smoothness = self.policy_smooth_reg * terms["policy_smoothness"]
-            objective = objective + smoothness
-        temperature = self.temperature_loss(batch, log_prob)
+            terms["policy_smoothness"] = term = self.policy_smoothness(batch, policy)
+            objective = objective + self.policy_smooth_reg * term
         q_data = self.q(batch.s, batch.a)
         error, metrics = self.td_error(batch, q_data, self.soft_target(batch, policy))
         if self.q_smooth_reg:
-            terms["value_smoothness"] = self.value_smoothness(batch, q_data)
-            error = error + self.q_smooth_reg * terms["value_smoothness"]
+            terms["value_smoothness"] = term = self.value_smoothness(batch, q_data)
+            error = error + self.q_smooth_reg * term
         if self.q_ood_reg:
-            terms["uncertainty_penalty"] = self.uncertainty_penalty(batch)
-            error = error + self.q_ood_reg * terms["uncertainty_penalty"]
+            terms["uncertainty_penalty"] = term = self.uncertainty_penalty(batch)
+            error = error + self.q_ood_reg * term
         losses = {
             "loss_actor": self.reduce(objective, batch),
-            "loss_alpha": temperature,
+            "loss_alpha": self.temperature_loss(batch, log_prob),
             "loss_qvalue": self.reduce(error, batch),
         }
         metrics |= {name: self.mean(term, batch) for name, term in terms.items()}
@@ -262,21 +184,33 @@ class RORLLoss(ActorCriticLoss):
         return jeffreys_divergence(pi.loc, pi.scale, other.loc, other.scale).amax(0)
 
     def value_smoothness(self, batch: Transitions, q_data: Tensor) -> Tensor:
-        """Return the change of the values around a state, ``[R]``."""
+        r"""Return the change of the values around a state, ``[R]``.
+
+        :math:`\max_j \frac1N \sum_i (1 - \tau) \max(d_{ij}, 0)^2 + \tau \min(d_{ij},
+        0)^2` with :math:`d_{ij} = Q_i(\hat s_j, a) - Q_i(s, a)`, as in RORL's code.
+        """
         around = self.around(batch, self.q_smooth_eps)
         action = batch.a.expand(self.num_samples, *batch.a.shape)
         difference = self.q(around, action) - q_data.unsqueeze(1)
-        return value_smoothness(difference, self.q_smooth_tau)
+        rise, fall = difference.clamp(min=0).square(), difference.clamp(max=0).square()
+        tau = self.q_smooth_tau
+        penalty: Tensor = (1 - tau) * rise + tau * fall
+        return penalty.mean(0).amax(0)
 
     def uncertainty_penalty(self, batch: Transitions) -> Tensor:
-        """Return the penalty of the policy's actions around a state, ``[R]``."""
+        r"""Return the penalty of the policy's actions around a state, ``[R]``.
+
+        :math:`\frac1N \sum_i (Q_i - [Q_i - \lambda\, \text{std}_i Q_i])^2`. The bracket
+        has no gradient: the more the critics disagree, the further each falls.
+        """
         around = self.around(batch, self.q_ood_eps)
         with torch.no_grad():
-            params = self.actor_network_params
-            pi = distribution(self.actor_network, params, around)
+            pi = distribution(self.actor_network, self.actor_network_params, around)
             action, _ = rsample_and_log_prob(pi)
         qvalue = self.q(around, action)
-        return uncertainty_penalty(qvalue, self.uncertainty_weight).mean(0)
+        target = (qvalue - self.uncertainty_weight * qvalue.std(0)).detach()
+        penalty: Tensor = (qvalue - target).square()
+        return penalty.mean(0).mean(0)
 
     def around(self, batch: Transitions, epsilon: float) -> TensorDictBase:
         """Return perturbed states ``[M, R]``; the draws are the same for all rows."""

@@ -9,10 +9,7 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey
-from tensordict.nn import (
-    ProbabilisticTensorDictSequential,
-    TensorDictParams,
-)
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictParams
 from torch import Tensor, nn
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 
@@ -37,22 +34,12 @@ def maximum_mean_discrepancy(first: Tensor, second: Tensor, width: float) -> Ten
     "A Kernel Two-Sample Test", https://jmlr.org/papers/v13/gretton12a.html, the biased
     estimate. Samples much further apart than the width have no gradient.
 
-    Args:
-        first: :math:`x`, ``[n, R, S]``.
-        second: :math:`y`, ``[m, R, S]``.
-        width: :math:`h`, in units of one entry.
-
-    Returns:
-        ``[R]``, each entry between 0 and 2.
-
-    Examples:
-        >>> here, there = torch.zeros(3, 1), torch.full((3, 1), 2.0)
-        >>> maximum_mean_discrepancy(here, there, width=1.0).item()
-        1.7293294...
+    :math:`x`, ``[n, R, S]``, and :math:`y`, ``[m, R, S]``, give ``[R]``, between 0 and
+    2; the width :math:`h` is in units of one entry.
     """
 
     def kernel(x: Tensor, y: Tensor) -> Tensor:
-        """Mean over all pairs, ``[R]``."""
+        """Return the mean over all pairs, ``[R]``."""
         distance = (x.unsqueeze(1) - y.unsqueeze(0)).square().mean(-1)
         return (distance / (-2 * width**2)).exp().mean((0, 1))
 
@@ -77,8 +64,7 @@ class StateDeviationLoss(ActorCriticLoss):
     could find. Kernel, its width, :math:`\eta` and the number of samples are ours.
 
     Args:
-        actor_network: the actor of the other loss, ends in a
-            :class:`~torchrl.modules.TanhNormal`.
+        actor_network: the actor of the other loss.
         dynamics_network: :math:`M`, trained, or loaded later by :meth:`load_frozen`.
         transition_network: :math:`U`, likewise.
 
@@ -86,12 +72,7 @@ class StateDeviationLoss(ActorCriticLoss):
         num_samples: ``n`` of :math:`M` and of :math:`U`. Default 4.
         kernel_width: in units of the observation. Default 1.
         threshold: :math:`\eta`. Default 0.05.
-        options: of every loss, see
-            :class:`~torchrl_osr.objectives.ActorCriticLoss`.
-
-    Raises:
-        ValueError: if a number is out of its range.
-        KeyError: in the call, if the batch has no perturbed states.
+        options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
     Examples:
         >>> from torchrl_osr import CQLLoss
@@ -142,22 +123,19 @@ class StateDeviationLoss(ActorCriticLoss):
         self.declare(losses, ["deviation", "multiplier"])
 
     def input_keys(self) -> list[NestedKey]:
-        networks = (self.actor_network, self.dynamics_network)
-        states = state_keys(key for each in networks for key in each.in_keys)
-        states = [key for key in states if key != self.tensor_keys.action]
+        keys = [*self.actor_network.in_keys, *self.dynamics_network.in_keys]
+        states = state_keys(keys, self.tensor_keys.action)
         perturbed = [nested(self.tensor_keys.perturbed, key) for key in states]
         return [*states, *perturbed]
 
     def losses(self, batch: Transitions) -> Losses:
-        deviation = self.deviation(batch)
-        terms = F.lagrange_terms(deviation, self.log_multiplier, self.threshold)
-        names = ("loss_deviation", "loss_multiplier")
-        losses = {
-            name: self.reduce(term, batch, batch.is_data)
-            for name, term in zip(names, terms, strict=True)
-        }
-        return losses, {
-            "deviation": self.mean(deviation, batch, batch.is_data),
+        value, valid = self.deviation(batch), batch.is_data
+        policy, dual = F.lagrange_terms(value, self.log_multiplier, self.threshold)
+        return {
+            "loss_deviation": self.reduce(policy, batch, valid),
+            "loss_multiplier": self.reduce(dual, batch, valid),
+        }, {
+            "deviation": self.mean(value, batch, valid),
             "multiplier": self.log_multiplier.detach().exp(),
         }
 
@@ -171,8 +149,7 @@ class StateDeviationLoss(ActorCriticLoss):
         action = action.squeeze(1)  # of the one set of states
         key = model.in_keys[0]
         clean = entry(batch.rows, aims.in_keys[0]).expand(number, -1, -1)
-        start = batch.states_of([key], "perturbed")[0].get(key)
-        start = start.expand(number, -1, -1)
+        start = batch.states_of([key], "perturbed")[0].get(key).expand(number, -1, -1)
         with self.dynamics_network_params.to_module(model, preserve_module_state=False):
             change = model.sample(*model.predict(start, action))[..., :-1]
         held = self.transition_network_params
