@@ -82,12 +82,3 @@ def test_rollout_errors_of_a_constant_error() -> None:
     moved = pieces["next", "observation"][:, 3] - pieces["observation"][:, 0]
     wanted = (moved / 2).square().mean().sqrt().item()
     assert off[1]["standing_still"] == pytest.approx(wanted, rel=1e-5)
-
-
-def test_pieces_do_not_run_from_one_trajectory_into_the_next() -> None:
-    data = make_data(30)
-    data["next", "done"][9] = True
-    data["next", "observation"][19] += 1.0  # a gap that nothing marks
-    pieces = consecutive_rows(data, torch.arange(30), 5)
-    firsts = data["observation"][[*range(6), *range(10, 16), *range(20, 26)]]
-    assert torch.equal(pieces["observation"][:, 0], firsts)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import gc
 import io
-import weakref
 from dataclasses import replace
 
 import pytest
@@ -96,19 +94,6 @@ def test_a_rollout_without_rows_is_an_error(data) -> None:
     buffer.roll_out = lambda copied: (rows[:0], 9)
     with pytest.raises(ValueError, match="rejects all rows"):
         buffer.sample()
-
-
-def test_old_generations_are_freed(data) -> None:
-    buffer, held = make_buffer(data), []
-    gc.disable()
-    try:
-        for number in range(18):
-            buffer.sample()
-            if number % 3 == 0:
-                held.append(weakref.ref(buffer.synthetic))
-    finally:
-        gc.enable()
-    assert [each() is not None for each in held] == [False] * 5 + [True]
 
 
 def buffer_of(data: ModelData, options: DynamicsOptions, **batches):

@@ -1,7 +1,6 @@
 """Conditional variational autoencoder of one entry given another, and its loss.
 
-Shapes: ``B`` batch (any leading dimensions), ``C`` condition, ``T`` target, ``Z``
-latent.
+Shapes: ``B`` batch, ``C`` condition, ``T`` target, ``Z`` latent.
 """
 
 from __future__ import annotations
@@ -39,12 +38,7 @@ class ConditionalVAE(nn.Module):
     The first form is for actions in [-1, 1]. The second, ``change=True``, is for next
     states, with mean :math:`m` and standard deviation :math:`w` of the change.
 
-    Args:
-        condition_dim, target_dim: ``C`` and ``T``; equal with ``change=True``.
-
     Keyword Args:
-        condition_key, target_key: entries of a batch.
-        num_cells: width of each hidden layer. Default: BCQ's.
         latent_dim: ``Z``. Default ``2 * T``, BCQ's.
         latent_bound: largest magnitude of a sampled latent; BCQ's is 0.5.
     """

@@ -23,9 +23,8 @@ class ModelData:
         storage: rows to train on.
         held_out: rows to evaluate models on.
         pieces: of trajectories, ``[n, L]``, to evaluate roll-outs on.
-        loc, scale: were subtracted from the task's observations, and divided them.
+        loc, scale: observations are ``(s - loc) / scale``.
         reward_scale, reward_shift: rewards are ``scale * r + shift``.
-        env_id: Gymnasium id of the task.
         backward: exchange state and next state.
     """
 

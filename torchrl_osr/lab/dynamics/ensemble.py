@@ -27,10 +27,8 @@ WEIGHT_DECAY = (2.5e-5, 5e-5, 7.5e-5, 7.5e-5)
 OUTPUT_WEIGHT_DECAY = 1e-4
 """Of MOPO's four hidden layers and its last one; further layers use the fourth's."""
 
-UNWEIGHTED: dict[str, Any] = {
-    "use_prioritized_weights": False,
-    "scalar_output_mode": "exclude",
-}
+UNWEIGHTED: dict[str, Any]
+UNWEIGHTED = {"use_prioritized_weights": False, "scalar_output_mode": "exclude"}
 """Options of the models' losses, which learn from all rows alike."""
 
 
@@ -46,18 +44,9 @@ class DynamicsEnsemble(nn.Module):
     (https://arxiv.org/abs/2005.13239), which sets the defaults. Targets are
     standardised as well as inputs, so that the entries' units do not matter.
 
-    Args:
-        observation_dim, action_dim: ``S`` and ``A``.
-
-    Keyword Args:
-        num_networks, num_elites: ``E``; roll-outs use the elites, see
-            :meth:`calibrate_`.
-        num_cells: width of each hidden layer.
-        observation_key, action_key: entries to read.
+    Roll-outs use the ``num_elites`` best networks, see :meth:`calibrate_`.
 
     Examples:
-        >>> import torch
-        >>> from torchrl_osr.lab.dynamics import DynamicsEnsemble
         >>> model = DynamicsEnsemble(11, 3, num_networks=3, num_elites=2)
         >>> mean, scale = model.predict(torch.zeros(4, 11), torch.zeros(4, 3))
         >>> mean.shape
@@ -141,8 +130,7 @@ class DynamicsEnsemble(nn.Module):
     def disagreement(self, mean: Tensor) -> Tensor:
         r"""Return the elites' :math:`\max_i \lVert \mu_i - \bar\mu \rVert_2`, ``[B]``.
 
-        In standard deviations of the targets. MOReL (https://arxiv.org/abs/2005.05951)
-        takes the largest distance of two networks.
+        In standard deviations of the targets.
         """
         mean = mean[self.elites] / self.target_scale
         distance: Tensor = (mean - mean.mean(0)).norm(dim=-1)

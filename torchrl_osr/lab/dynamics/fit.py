@@ -74,9 +74,8 @@ def rollout_errors(
 ) -> list[dict[str, float]]:
     """Measure errors of the elites' mean, rolled out with the actions of ``[n, L]``.
 
-    Returns:
-        The ``"steps"`` of each horizon up to ``L``, the ``"rmse"`` in standard
-        deviations of each entry, and ``"standing_still"``, that of the first state.
+    ``"rmse"`` is in standard deviations of each entry; ``"standing_still"`` is that of
+    the first state.
     """
     key, action_key = model.in_keys
     unit = model.input_scale[: model.observation_dim]
@@ -86,12 +85,11 @@ def rollout_errors(
         mean, _ = model.predict(state, pieces[action_key][:, step])
         state = state + mean[model.elites].mean(0)[:, :-1]
         if step + 1 in horizons:
-            truth = pieces["next", key][:, step]
-            rolled, still = (
-                ((guess - truth) / unit).square().mean(-1).mean().sqrt().item()
-                for guess in (state, first)
-            )
-            found.append({"steps": step + 1, "rmse": rolled, "standing_still": still})
+            row: dict[str, float] = {"steps": step + 1}
+            for name, guess in (("rmse", state), ("standing_still", first)):
+                error = (guess - pieces["next", key][:, step]) / unit
+                row[name] = error.square().mean(-1).mean().sqrt().item()
+            found.append(row)
     return found
 
 

@@ -43,10 +43,8 @@ class ModelAdversary:
     an end of the task, as in RAMBO's code (https://arxiv.org/abs/2204.12581,
     marc-rigter/rambo).
 
-    Args:
-        options: ``adversarial_weight`` is :math:`\lambda`.
-        model: trained already; ``optimizer`` has its parameters.
-        loss: has the critics.
+    ``adversarial_weight`` is :math:`\lambda`; ``loss`` has the critics; ``optimizer``
+    has the parameters of the model, which is trained already.
     """
 
     def __init__(

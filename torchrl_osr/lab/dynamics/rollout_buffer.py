@@ -43,7 +43,6 @@ class RolloutReplayBuffer:
 
     Keyword Args:
         n_steps: of the recorded rows; synthetic ones are single steps.
-        seed: of the first roll-out; the next one has the next seed.
 
     Attributes:
         synthetic: rows of the newest roll-outs, oldest first, ``[n]``.

@@ -46,12 +46,7 @@ RULES = {"HalfCheetah": never, "Hopper": hopper, "Walker2d": walker2d}
 
 
 def termination(env_id: str) -> Termination:
-    """Return the rule by which a Gymnasium task ends, time limits apart.
-
-    Examples:
-        >>> termination("Hopper-v5")(torch.zeros(2, 11))  # both have fallen
-        tensor([True, True])
-    """
+    """Return the rule by which a Gymnasium task ends, time limits apart."""
     found = re.fullmatch(r"(\w+)-v[2-5]", env_id)
     if found is None or found[1] not in RULES:
         raise ValueError(
@@ -128,10 +123,7 @@ def uniform_policy(action_dim: int) -> Callable[[Tensor], Tensor]:
 def perturbed_starts(
     model: DynamicsEnsemble, starts: Tensor, *, steps: int, **options: Any
 ) -> Tensor:
-    """Sample states ``[B, S]`` 1 to ``steps`` uniform actions after ``starts``.
-
-    The task goes on in them; ``options`` are those of :func:`rollout`.
-    """
+    """Sample as many states 1 to ``steps`` uniform actions later, before an end."""
     policy = uniform_policy(model.action_dim)
     rows, _ = rollout(model, policy, starts, steps=steps, **options)
     following = rows["next", "observation"][~rows["next", "done"].squeeze(-1)]

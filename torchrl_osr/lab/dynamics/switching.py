@@ -18,13 +18,9 @@ from torchrl_osr.lab.dynamics.rollouts import Termination, never
 class EliteNetworks:
     """Predict mean changes of the state and rewards with a model's frozen elites.
 
-    States and actions are in the environment's units, rewards in the model's. All
-    scaling is folded into the first and the last layer, for speed at action time.
-
-    Args:
-        model: is copied.
-        loc, scale: the model's states are ``(s - loc) / scale``.
-        low, high: the environment's actions for the data's -1 and 1.
+    States and actions are in the environment's units, rewards in the model's. The
+    model's states are ``(s - loc) / scale``, its actions -1 and 1 are ``low`` and
+    ``high``. All scaling is folded into two layers, for speed at action time.
     """
 
     @torch.no_grad()
@@ -170,6 +166,6 @@ class SwitchingPolicy:
 
     def _actions(self, state: Tensor) -> Tensor:
         """Return actions for ``[n N, S]``, by each policy in turn."""
-        rows = state.view(-1, len(self.policies), state.shape[-1]).unbind(1)
-        pairs = zip(self.policies, rows, strict=True)
-        return torch.stack([policy(each) for policy, each in pairs], 1).flatten(0, 1)
+        number = len(self.policies)
+        found = [policy(state[i::number]) for i, policy in enumerate(self.policies)]
+        return torch.stack(found, 1).flatten(0, 1)
