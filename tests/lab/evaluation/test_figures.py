@@ -1,4 +1,4 @@
-"""Distance curves, and figures that are drawn."""
+"""Figures are drawn."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from tensordict import TensorDict
 
 from torchrl_osr.lab.evaluation.figures import (
     data_figure,
-    distance_curves,
     learning_curve,
     robustness_figure,
 )
@@ -16,37 +15,12 @@ from torchrl_osr.lab.evaluation.figures import (
 PNG = b"\x89PNG"
 
 
-def level(mean, count):
-    distance = {"offset": [-1, 0, 1, 2], "mean": mean, "count": count}
-    clean = {"clean_mean": [0.5, 0.5, 0.5, None], "clean_count": [1, 1, 1, 0]}
-    return {"name": "knock", "distance": distance | clean}
-
-
-EVALUATIONS = [
-    {"levels": [level([1.5, 3.5, 1.0, None], [2, 2, 1, 0])]},
-    {
-        "levels": [
-            level([1.5, 7.5, 1.0, None], [2, 6, 1, 0]),
-            {"name": "mass", "distance": None},
-        ]
-    },
-]
-
-
-def test_curves_are_weighted_by_episodes():
-    assert distance_curves(EVALUATIONS) == {
-        "knock": ([-1, 0, 1], [1.5, 6.5, 1.0]),  # (2 * 3.5 + 6 * 7.5) / 8
-        "undisturbed": ([-1, 0, 1], [0.5, 0.5, 0.5]),
-    }
-
-
-@pytest.mark.parametrize("evaluations", [EVALUATIONS, []])
-def test_robustness_figure_is_drawn(tmp_path, evaluations):
+def test_robustness_figure_is_drawn(tmp_path):
     numbers = {"return": 5, "return_low": 4, "return_high": 7, "clean_return": 9}
     summary = [{"name": "a", "disturbed_share": 1} | numbers]
     summary.append({"name": "b", "disturbed_share": 0} | numbers)
     path = tmp_path / "figure.png"
-    robustness_figure(summary, evaluations, path, title="hopper")
+    robustness_figure(summary, path, title="hopper")
     assert path.read_bytes().startswith(PNG)
 
 

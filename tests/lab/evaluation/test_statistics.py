@@ -8,15 +8,12 @@ import pytest
 from torchrl_osr.lab.evaluation.statistics import (
     decrease_interval,
     estimate,
-    interquartile_mean,
-    iqm,
     mean_difference,
     mean_interval,
     nested_resamples,
     recovered_share,
     saved_share,
     scores_and_decreases,
-    stratified_resamples,
     wilson_interval,
 )
 
@@ -36,24 +33,6 @@ def test_coverage_of_a_normal_sample():
 def test_no_or_non_finite_values_are_an_error(values):
     with pytest.raises(ValueError, match="finite"):
         mean_interval(values)
-
-
-def test_interquartile_mean_is_that_of_the_sorted_middle():
-    # By hand: of eight values two go at each end, of nine two as well.
-    assert interquartile_mean([9, 1, 100, 2, 3, -50, 4, 8]) == (2 + 3 + 4 + 8) / 4
-    assert (
-        interquartile_mean([9, 1, 100, 2, 3, -50, 4, 8, 5]) == (2 + 3 + 4 + 5 + 8) / 5
-    )
-    assert interquartile_mean([7.0]) == 7
-    rows = np.random.default_rng(0).normal(size=(5, 12))
-    wanted = [sum(sorted(row)[3:9]) / 6 for row in rows.tolist()]
-    np.testing.assert_allclose(interquartile_mean(rows), wanted)
-
-
-def test_strata_keep_their_places_and_sizes():
-    resamples = stratified_resamples([[1, 2], [10, 20, 30]])
-    assert set(np.unique(resamples[:, :2])) == {1, 2}
-    assert set(np.unique(resamples[:, 2:])) == {10, 20, 30}
 
 
 def many_resamples(runs) -> np.ndarray:
@@ -98,7 +77,7 @@ def test_wilson_interval_is_that_of_the_formula():
 )
 def test_an_interval_says_what_it_is_over(runs, over):
     scores = [np.array([1.0, 3.0]) + run for run in range(runs)]
-    assert estimate(scores).over == iqm([scores]).over == over
+    assert estimate(scores).over == mean_difference([scores]).over == over
     assert estimate(scores).mean == pytest.approx(2 + (runs - 1) / 2)
     assert mean_difference([scores, scores * 2]).mean == estimate(scores).mean
 

@@ -12,7 +12,6 @@ import pytest
 from lab.report import fakes
 
 from torchrl_osr.lab.report import read_runs, write_report
-from torchrl_osr.lab.report.figures import MOST
 
 EVIL = '<script>alert("$x_{$")<'
 
@@ -45,7 +44,7 @@ def report(tmp_path_factory) -> SimpleNamespace:
     top = fakes.write_experiment(tmp_path_factory.mktemp("runs"))
     fakes.write_run(top / "unfinished" / "seed0", {}, status="running")
     curve = {step: [50.0, 60.0] for step in range(1000, 8001, 1000)}
-    fakes.write_run(top / EVIL / "seed0", curve, overrides=["x=</td>|"])
+    fakes.write_run(top / EVIL / "seed0", curve, overrides=["x=</td>"])
     folder = tmp_path_factory.mktemp("report") / "new"
     path = write_report(read_runs([top]), folder, reference="cql", command="made <so>")
     return SimpleNamespace(markup=path.read_text(encoding="utf-8"), folder=folder)
@@ -76,20 +75,17 @@ def test_the_verdict_comes_first_and_few_seeds_have_none(report):
     assert not re.search(r'<td class="(better|worse)"', report.markup)
 
 
-def test_tables_are_csv_and_markdown_too(report):
+def test_tables_are_csv_files_too(report):
     scores = pd.read_csv(report.folder / "scores.csv", index_col=["data", "method"])
     row = scores.loc["hopper medium-replay", "cql"]
     assert row["last low"] <= row["last"] <= row["last high"]
     robustness = pd.read_csv(report.folder / "robustness-hand.csv")
     assert set(robustness["disturbance"]) == {"mass", "torque-20"}
-    text = (report.folder / "report.md").read_text(encoding="utf-8")
-    lines = [line for line in text.splitlines() if line.startswith("| hopper")]
-    assert f"{row['last']:.1f} [{row['last low']:.1f}, " in "".join(lines)
-    assert "x=</td>\\|" in text
+    assert f"{row['last']:.1f} [{row['last low']:.1f}, " in report.markup
 
 
-def test_five_seeds_have_a_verdict_and_many_methods_small_panels(tmp_path):
-    for shift in range(MOST + 1):
+def test_five_seeds_have_a_verdict(tmp_path):
+    for shift in range(7):
         for seed in range(5):
             scores = [10.0 * shift + seed, 10.0 * shift + 2 * seed]
             fakes.write_run(
@@ -102,7 +98,7 @@ def test_five_seeds_have_a_verdict_and_many_methods_small_panels(tmp_path):
     markup = first.read_text(encoding="utf-8")
     Outline(markup)
     assert "m1 is better than m0 in undisturbed score on hopper" in markup
-    assert markup.count('<td class="better">') == MOST
+    assert markup.count('<td class="better">') == 6
     with pytest.raises(ValueError, match="no method 'iql'; there are: m0; m1"):
         write_report(tables, tmp_path, reference="iql")
 

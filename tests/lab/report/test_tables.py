@@ -10,7 +10,6 @@ from torchrl_osr.lab.evaluation.statistics import Estimate
 from torchrl_osr.lab.report import read_runs
 from torchrl_osr.lab.report.tables import (
     by_run,
-    mean_table,
     recent,
     recovery_curve,
     robustness_table,
@@ -41,20 +40,6 @@ def test_the_untrained_policy_is_in_no_mean(tmp_path):
     assert recent(tables.episodes)["step"].tolist() == [1, 2]
     row = score_table(tables).loc[PLACE, "osr"]
     assert row["mean of the last 5"].mean == pytest.approx(15)
-
-
-def test_interquartile_mean_pools_data_sets(tmp_path):
-    scores = {("hopper", 0): 10, ("hopper", 1): 20, ("walker2d", 0): 40,
-              ("walker2d", 1): 90}  # fmt: skip
-    for (env, seed), score in scores.items():
-        curve = {1: [score - 5.0, score + 5.0]}
-        fakes.write_run(tmp_path / f"{env}{seed}", curve, env=env, seed=seed)
-    row = mean_table(fakes.read_all(tmp_path)).loc["osr"]
-    mean = row["interquartile mean"]
-    assert (row["data sets"], row["runs"]) == ("2 of 2", 4)
-    assert (mean.mean, mean.over) == (pytest.approx((20 + 40) / 2), "two seeds")
-    # Stratified: the middle two are at least 10 and 40, at most 20 and 90.
-    assert (10 + 40) / 2 <= mean.low < 30 < mean.high <= (20 + 90) / 2
 
 
 def test_a_start_state_that_comes_again_is_no_new_episode(tmp_path):

@@ -165,7 +165,6 @@ def evaluate_files(
         print(f"left out: {name}: {reason}")
     robustness_figure(
         results["summary"],
-        results["evaluations"],
         path.with_suffix(".png"),
         title=title(results),
     )

@@ -4,8 +4,8 @@
     torchrl-osr report multirun/*/ outputs/ --reference cql --output report
 
 Reads what ``torchrl-osr train`` and ``torchrl-osr evaluate`` left in and below the
-folders. ``report.html`` needs no other file; ``report.md``, a CSV file for each table
-and a PNG file for each figure are beside it. How to read them: docs/report.md.
+folders. ``report.html`` needs no other file; a CSV file for each table and a PNG file
+for each figure are beside it. How to read them: docs/report.md.
 """
 
 from __future__ import annotations

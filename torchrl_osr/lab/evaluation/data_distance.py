@@ -12,38 +12,26 @@ from torch import Tensor
 from torchrl_osr.lab.data import observation_statistics
 
 NUM_NEIGHBORS = 10
-"""``K``."""
-
-# States that the threshold is computed from, and at most a fifth of the data.
-MAX_HELD_OUT = 2_000
-
-# More rows do not fit into the processor's cache and are slower.
-ROWS_AT_A_TIME = 64
+MAX_HELD_OUT = 2_000  # and at most a fifth of the data
+ROWS_AT_A_TIME = 64  # more do not fit into the processor's cache and are slower
 
 
 class DataDistance:
-    r"""Mean distance to the ``K = 10`` nearest of the data's states, standardised.
+    r"""Measure the mean distance to the ``K = 10`` nearest states of the data.
 
     .. math::
         d(s) = \frac{1}{K} \sum_{k=1}^{K} \lVert \sigma^{-1} (s - s_{(k)}) \rVert_2
 
-    with :math:`s_{(k)}` the ``k``-th nearest of a random subset of the data's states
-    and :math:`\sigma` their standard deviation in each dimension. A state counts as in
-    the data up to :attr:`threshold`, which 95 % of held-out states are within.
+    with :math:`s_{(k)}` the ``k``-th nearest of a random subset of the states and
+    :math:`\sigma` the data's standard deviation in each dimension. A state counts as
+    in the data up to :attr:`threshold`, which 95 % of held-out states are within.
 
     Args:
-        data: transitions ``[N]`` with raw ``observation`` ``[N, S]``, in memory or on
-            disk.
+        data: transitions ``[N]`` with raw ``observation`` ``[N, S]``.
 
     Keyword Args:
         max_reference: size of the subset, at most. Default 20,000.
         seed: of the random subset and of the held-out states. Default 0.
-
-    Attributes:
-        threshold: see above, in standard deviations.
-
-    Raises:
-        ValueError: if there are too few rows for ``K`` neighbours and a held-out state.
 
     Examples:
         >>> rows = torch.randn(1000, 3, generator=torch.Generator().manual_seed(0))
@@ -78,7 +66,7 @@ class DataDistance:
         self.threshold = float(torch.quantile(self(others).double(), 0.95))
 
     def __call__(self, observation: Tensor) -> Tensor:
-        """Distance of raw observations ``[M, S]``, float32 ``[M]``."""
+        """Return the distances of raw observations ``[M, S]``, float32 ``[M]``."""
         chunks = torch.split(self._standard(observation.cpu()), ROWS_AT_A_TIME)
         return torch.cat([self._distance(states) for states in chunks]).float()
 

@@ -27,10 +27,9 @@ if TYPE_CHECKING:
     import gymnasium
 
 Policy = Callable[[Tensor], Tensor]
-"""Maps observations ``[E, S]`` as the environment gives them to actions ``[E, A]``.
+"""Maps raw observations ``[E, S]`` to actions ``[E, A]`` within -1 and 1.
 
-Real actions are within -1 and 1, see :func:`~torchrl_osr.lab.data.make_environment`;
-discrete ones are their numbers, ``[E]``.
+Discrete actions are their numbers, ``[E]``.
 """
 
 Wrap: TypeAlias = "Callable[[gymnasium.Env[Any, Any]], gymnasium.Env[Any, Any]]"
@@ -42,14 +41,10 @@ Watch = Callable[[int, NDArray[Any], bool, dict[str, Any]], None]
 
 @dataclass(frozen=True)
 class EpisodeResults:
-    """Returns and lengths of an evaluation's episodes, ``[E]`` each.
+    """Undiscounted returns, lengths and reset seeds of episodes, ``[E]`` each.
 
-    Attributes:
-        returns: undiscounted sum of rewards.
-        lengths: steps until the end.
-        seeds: of ``env.reset``.
-        successes: ``info["success"]`` of the last step. Default: the task has no such
-            entry.
+    ``successes`` has ``info["success"]`` of the last step, if the task has such an
+    entry.
     """
 
     returns: NDArray[np.float64]
@@ -64,8 +59,8 @@ def deterministic_policy(
 ) -> Policy:
     """Return the actor's deterministic action as a function of raw observations.
 
-    Of discrete actions that is the number of the likeliest. ``observation_norm`` has
-    the standardisation of the training data. Default: none.
+    Of discrete actions that is the number of the likeliest. Pass the
+    ``observation_norm`` of the training data if the actor needs standardised states.
     """
 
     @torch.no_grad()
@@ -83,8 +78,7 @@ def deterministic_policy(
 class EpisodeEvaluator:
     """Play one episode for each of a fixed list of seeds, to its end.
 
-    The policy is called once a step, with all unfinished episodes. The environments are
-    kept from one evaluation to the next.
+    The policy is called once a step, with all unfinished episodes.
 
     Args:
         env_id: a Gymnasium id, ``"Hopper-v5"`` for instance.
@@ -130,7 +124,7 @@ class EpisodeEvaluator:
     def __call__(
         self, policy: Policy, watch: Watch = lambda *_: None
     ) -> EpisodeResults:
-        """Play an episode for each seed, after the policy's own ``reset``, if any."""
+        """Play an episode for each seed; call the policy's ``reset`` first, if any."""
         getattr(policy, "reset", lambda: None)()
         episodes = len(self.environments)
         returns, lengths = np.zeros(episodes), np.zeros(episodes, dtype=np.int64)
@@ -176,15 +170,13 @@ def measure_of(row: Mapping[str, Any]) -> str:
 def summarize(
     results: EpisodeResults, references: ReferenceReturns | None
 ) -> dict[str, Any]:
-    """Mean score or return, its interval and the raw results, JSON-compatible.
-
-    Returns are normalised by the references, unless these are ``None``.
+    """Summarise episodes, JSON-compatible.
 
     Returns:
         ``"score"`` with its 95 % bootstrap interval ``"score_low"``, ``"score_high"``
         over the episodes, or without references ``"return_low"`` and ``"return_high"``;
-        ``"return"`` (mean), ``"length"`` (mean), and the lists ``"returns"``,
-        ``"lengths"`` and ``"seeds"``. If the task reports successes, also their share
+        the means ``"return"`` and ``"length"``, and the lists ``"returns"``,
+        ``"lengths"`` and ``"seeds"``. If the task reports successes, also
         ``"success_rate"`` with Wilson's 95 % interval ``"success_low"``,
         ``"success_high"``, and the list ``"successes"``.
     """

@@ -16,16 +16,12 @@ from torchrl_osr.lab.data.statistics import sampled_observations
 from torchrl_osr.lab.evaluation.episodes import measure_of
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 # Okabe and Ito's palette, which colour-blind readers can distinguish.
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 
 IN_WORDS = {"score": "normalised score", "return": "return"}
-"""Axis labels of the measure of an episode."""
-
-UNDISTURBED = "undisturbed"
 
 PANELS = {
     "loss_qvalue": "TD error (critics)",
@@ -36,12 +32,11 @@ PANELS = {
 }
 """Logged scalars below the learning curve, and their titles."""
 
-COLUMNS, MOST_PANELS = 5, 30
-"""Histograms in a row and in a figure."""
+COLUMNS, MOST_PANELS = 5, 30  # histograms in a row and in a figure
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Matplotlib figure, ``width`` x ``height`` inches, that needs no display."""
+    """Return a figure of ``width`` x ``height`` inches that needs no display."""
     with needed_by("figures need", "train"):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -68,8 +63,7 @@ def data_figure(
 ) -> None:
     """Draw histograms of the episodes' returns and lengths and of every entry.
 
-    ``manifest`` is that of the readers; ``names`` has those of the entries of
-    ``"observation"`` and ``"action"``.
+    ``names`` has those of the entries of ``"observation"`` and ``"action"``.
     """
     low, high = (np.asarray(each) for each in manifest.get("action_bounds", (-1, 1)))
     actions: NDArray[Any] = low + (data["action"].numpy() + 1) / 2 * (high - low)
@@ -110,10 +104,9 @@ def learning_curve(
     title: str,
     data_mean: float | None,
 ) -> None:
-    """Draw the score, or return, with its interval, and the losses.
+    """Draw the score, or return, of the evaluations, and the losses.
 
-    ``history`` has evaluations with their ``"step"`` and may be empty; ``data_mean`` is
-    that of the data's episodes, if known. ``scalars`` are those of
+    ``scalars`` are those of
     :func:`~torchrl_osr.lab.evaluation.training_summary.read_scalars`.
     """
     panels = [name for name in PANELS if scalars.get(name)]
@@ -147,88 +140,26 @@ def learning_curve(
 
 
 def robustness_figure(
-    summary: Sequence[Mapping[str, Any]],
-    evaluations: Sequence[Mapping[str, Any]],
-    path: Path | str,
-    *,
-    title: str,
+    summary: Sequence[Mapping[str, Any]], path: Path | str, *, title: str
 ) -> None:
-    """Draw scores under disturbances and, after those that end, distances to the data.
-
-    ``summary`` is that of the ``evaluations``, see
-    :func:`~torchrl_osr.lab.evaluation.summarize_disturbances`.
-    """
-    curves = distance_curves(evaluations)
-    figure = new_figure(11 if curves else 6.5, 4.6)
+    """Draw the scores of a summary of disturbances with their intervals."""
+    figure = new_figure(6.5, 4.6)
     figure.suptitle(title)
-    axes = figure.subplots(1, 2 if curves else 1, squeeze=False)[0]
-    measure = measure_of(summary[0])
-    rows = summary[::-1]
-    mean = np.array([row[measure] for row in rows])
-    low, high = (
-        np.array([row[f"{measure}_{end}"] for row in rows]) for end in ("low", "high")
+    axes, measure, rows = figure.subplots(), measure_of(summary[0]), summary[::-1]
+    mean, low, high = (
+        np.array([row[f"{measure}{end}"] for row in rows])
+        for end in ("", "_low", "_high")
     )
-    axes[0].errorbar(
+    axes.errorbar(
         mean, range(len(rows)), xerr=np.abs([low - mean, high - mean]), fmt="o",
         color=BLUE, capsize=3, label="disturbed (mean, 95 % interval)",
     )  # fmt: skip
     clean = rows[0][f"clean_{measure}"]
-    axes[0].axvline(clean, color=GREY, linestyle="--", linewidth=1, label=UNDISTURBED)
+    axes.axvline(clean, color=GREY, linestyle="--", linewidth=1, label="undisturbed")
     names = [
         row["name"] + ("" if row["disturbed_share"] else " (not met)") for row in rows
     ]
-    axes[0].set_yticks(range(len(rows)), names)
-    axes[0].set(xlabel=IN_WORDS[measure], xlim=(0, None) if low.min() >= 0 else None)
-    axes[0].legend(frameon=False, fontsize=8)
-    if curves:
-        _draw_distances(axes[1], curves)
-    save_figure(figure, path)
-
-
-def distance_curves(
-    evaluations: Sequence[Mapping[str, Any]],
-) -> dict[str, tuple[list[int], list[float]]]:
-    """Mean distance to the data around the end of each disturbance.
-
-    Returns:
-        Offsets and distances in units of the threshold, by name of the disturbance;
-        those of all undisturbed episodes are named ``"undisturbed"``. Offsets with
-        fewer than a tenth of the episodes at offset 0 are left out.
-    """
-    parts: dict[str, list[tuple[Any, Any]]] = {}
-    offset: list[int] = []
-    for level in (level for each in evaluations for level in each["levels"]):
-        if (distance := level["distance"]) is None:
-            continue
-        offset = distance["offset"]
-        for name, prefix in ((level["name"], ""), (UNDISTURBED, "clean_")):
-            pair = distance[f"{prefix}mean"], distance[f"{prefix}count"]
-            parts.setdefault(name, []).append(pair)
-    curves = {}
-    for name, pairs in parts.items():
-        mean, count = (np.array(each, dtype=float) for each in zip(*pairs, strict=True))
-        episodes = count.sum(0)
-        shown = episodes >= max(0.1 * episodes[offset.index(0)], 1)
-        total = np.where(count > 0, mean * count, 0).sum(0)  # None became NaN
-        if shown.any():
-            offsets, means = np.array(offset)[shown], total[shown] / episodes[shown]
-            curves[name] = offsets.tolist(), means.tolist()
-    return curves
-
-
-def _draw_distances(
-    axes: Axes, curves: Mapping[str, tuple[list[int], list[float]]]
-) -> None:
-    from matplotlib import colormaps
-
-    disturbed = [name for name in curves if name != UNDISTURBED]
-    shades = colormaps["viridis"](np.linspace(0, 0.9, len(disturbed)))
-    colors = dict(zip(disturbed, shades, strict=True))
-    for name, curve in curves.items():
-        axes.plot(*curve, color=colors.get(name, GREY), linewidth=1.5, label=name)
-    axes.axhline(1, color=GREY, linestyle="--", linewidth=1, label="95 % of the data")
-    axes.axvline(0, color=GREY, linewidth=0.5)
-    axes.set(xlabel="steps since the disturbance ended", ylim=(0, None))
-    axes.set_ylabel("distance to the data / threshold")
-    axes.set_title("mean of the episodes that still run", fontsize=9)
+    axes.set_yticks(range(len(rows)), names)
+    axes.set(xlabel=IN_WORDS[measure], xlim=(0, None) if low.min() >= 0 else None)
     axes.legend(frameon=False, fontsize=8)
+    save_figure(figure, path)

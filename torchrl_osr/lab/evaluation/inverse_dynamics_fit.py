@@ -26,12 +26,9 @@ NORMAL_QUANTILE_95 = 1.6448536269514722
 def inverse_dynamics_report(
     inverse_dynamics_network: ProbabilisticTensorDictSequential, data: TensorDictBase
 ) -> dict[str, Any]:
-    """Held-out likelihood, explained variance and calibration.
+    """Measure held-out likelihood, explained variance and calibration.
 
-    Args:
-        inverse_dynamics_network: reads states and next states, ends in a
-            :class:`~torchrl.modules.TanhNormal` or chooses one of the actions.
-        data: held-out rows, ``[N]``; ``done`` rows are left out.
+    ``done`` rows of the held-out data ``[N]`` are left out.
 
     Returns:
         ``"nll"``, mean negative log-likelihood in nats, and ``"rows"``. Of discrete
@@ -68,7 +65,7 @@ def inverse_dynamics_report(
 
 
 def describe_inverse_dynamics(report: Mapping[str, Any]) -> str:
-    """One line of text with the numbers of a report; ``None`` is a dash."""
+    """Format the numbers of a report as one line."""
     head = f"inverse dynamics, {report['rows']} held-out rows: NLL {report['nll']:.2f}"
     if "accuracy" in report:
         return f"{head}, {100 * report['accuracy']:.0f} % of the actions"

@@ -8,6 +8,7 @@ Shapes: ``M`` states, ``Q`` positions, ``V`` velocities, ``K`` offsets, ``A`` ac
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -26,17 +27,10 @@ from torchrl_osr.lab.evaluation.episodes import EpisodeEvaluator, Policy
 GROUPS = ("easy", "contested", "recoverable")
 """No reference policy failed; some did; all did, and a planner did not."""
 
-SPEED_STEPS = 50
-"""HalfCheetah's speed is its mean over the last so many steps."""
-
-AT_ONCE = 16
-"""States that are played at once."""
-
+SPEED_STEPS = 50  # HalfCheetah's speed is the mean over so many
+AT_ONCE = 16  # states are played at once
 STATES = Path(__file__).parent / "states"
-"""Folder of those that ship, a file for each task and half."""
-
 HALVES = ("public", "held-out")
-"""To choose methods by; and for one look at the finished method."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,15 +75,19 @@ class RecoverableStates:
 
     @property
     def disturbance(self) -> list[str]:
-        """Kind and strength of each, ``"torque 10"`` for instance."""
+        """Kind and strength of each state's disturbance, such as ``"torque 10"``."""
         of_each = zip(self.kind, self.strength, strict=True)
         return [f"{kind} {strength:g}" for kind, strength in of_each]
 
 
 def disturbances_of(names: Iterable[str]) -> list[str]:
-    """Distinct disturbances, sorted by kind and strength."""
-    parts = {name: name.rsplit(" ", 1) for name in names}
-    return sorted(parts, key=lambda name: (parts[name][0], float(parts[name][1])))
+    """Return the distinct disturbances, sorted by kind and strength."""
+
+    def order(name: str) -> tuple[str, float]:
+        kind, _, strength = name.rpartition(" ")
+        return kind, float(strength)
+
+    return sorted({*names}, key=order)
 
 
 def load_recoverable_states(env_name: str, half: str = "public") -> RecoverableStates:
@@ -100,9 +98,6 @@ def load_recoverable_states(env_name: str, half: str = "public") -> RecoverableS
             ``"pointmaze-medium"``.
         half: ``"public"``, to choose methods by, or ``"held-out"``, for one look at the
             finished method. Default ``"public"``.
-
-    Raises:
-        ValueError: if there are none.
 
     Examples:
         >>> states = load_recoverable_states("walker2d")
@@ -127,15 +122,11 @@ def read_recoverable_states(path: Path | str) -> RecoverableStates:
 
 
 def recovers(states: RecoverableStates, policy: Policy) -> NDArray[np.bool_]:
-    """Whether a policy comes back from each state, ``[M]``.
+    """Return whether a policy recovers from each state, ``[M]``.
 
     Hopper and Walker2d: it has not fallen after ``steps`` steps. HalfCheetah: its mean
     speed over the last 50 of them is at least ``least_speed``. Maze: it has reached
     the goal by then.
-
-    Args:
-        states: from :func:`load_recoverable_states`.
-        policy: is called once a step, with all states that are being played.
 
     Examples:
         >>> import torch
@@ -151,26 +142,19 @@ def recovers(states: RecoverableStates, policy: Policy) -> NDArray[np.bool_]:
         fixed_batch=True,  # falls are chaotic: rounding decides some of them
         wrap=lambda env: TimeLimit(_Start(env, states, waiting), states.steps),
     )
+    stood: NDArray[np.bool_]
+    speeds: list[deque[float]]
+
+    def watch(episode: int, _: Any, terminated: bool, info: dict[str, Any]) -> None:
+        stood[episode] &= not terminated
+        speeds[episode].append(float(info.get("x_velocity", 0.0)))
+
     for first in range(0, len(states), AT_ONCE):
         stood = np.ones(len(evaluator.environments), dtype=np.bool_)
-        speeds: list[list[float]] = [[] for _ in stood]
-
-        def watch(
-            episode: int,
-            _: Any,
-            terminated: bool,
-            info: dict[str, Any],
-            stood: NDArray[np.bool_] = stood,
-            speeds: list[list[float]] = speeds,
-        ) -> None:
-            stood[episode] &= not terminated
-            speeds[episode].append(float(info.get("x_velocity", 0.0)))
-
-        results = evaluator(policy, watch)
-        speed = np.array([np.mean(each[-SPEED_STEPS:]) for each in speeds])
-        good = stood & (speed >= states.least_speed)
-        if results.successes is not None:
-            good = results.successes
+        speeds = [deque(maxlen=SPEED_STEPS) for _ in stood]
+        good = evaluator(policy, watch).successes
+        if good is None:
+            good = stood & (np.array([*map(np.mean, speeds)]) >= states.least_speed)
         back[first:][:AT_ONCE] = good[: len(states) - first]
     evaluator.close()
     return back

@@ -17,19 +17,18 @@ from numpy.typing import ArrayLike, NDArray
 Array: TypeAlias = NDArray[np.float64]
 
 NUM_RESAMPLES, NUM_SHARE_RESAMPLES = 2000, 10_000
-"""Bootstrap resamples of intervals, and of those of shares of states."""
+"""Bootstrap resamples of means, and of shares of states."""
 
 NORMAL_QUANTILE_975 = 1.959963984540054
-
 TAIL = 50 * (1 - 0.95)
-"""Percent of the resamples below an interval, and above it."""
+"""Percentage of the resamples below an interval, and above it."""
 
 
 class Estimate(NamedTuple):
     """A mean with its 95 % interval.
 
-    ``over`` says what was resampled: ``"seeds"``; ``"two seeds"``, whose interval is
-    hardly more than the two of them; ``"episodes"`` or ``"walks"`` of a single seed.
+    ``over`` is what was resampled: ``"seeds"``, ``"two seeds"``, or ``"episodes"`` or
+    ``"walks"`` of a single seed.
     """
 
     mean: float
@@ -38,44 +37,39 @@ class Estimate(NamedTuple):
     over: str = "seeds"
 
     def __str__(self) -> str:
-        """Mean and interval."""
         return f"{decimal(self.mean)} {self.interval()}"
 
     def interval(self, sign: str = "") -> str:
-        """Interval in brackets, with a mark if it is not over seeds."""
+        """Format the interval, with a mark if it is not over seeds."""
         mark = {"seeds": "", "two seeds": " ²"}.get(self.over, " ᵉ")
         return f"[{decimal(self.low, sign)}, {decimal(self.high, sign)}]{mark}"
 
 
 def decimal(value: float, sign: str = "") -> str:
-    """Number with one decimal; ``sign="+"`` shows that of positive ones, too."""
+    """Format with one decimal; ``sign="+"`` marks positive numbers, too."""
     # A minus sign, unlike a hyphen, stays with its number at the end of a line.
     return f"{value:{sign}z.1f}".replace("-", "\N{MINUS SIGN}")
 
 
 def over_what(groups: Sequence[Sequence[object]], alone: str = "episodes") -> str:
-    """What an interval is over, given the runs of each data set; ``alone`` with one."""
+    """Return an estimate's ``over`` for the runs of each data set."""
     return {1: alone, 2: "two seeds"}.get(min(map(len, groups)), "seeds")
 
 
 def percentile_interval(resamples: Array) -> tuple[Array, Array]:
-    """Ends of the 95 % percentile interval of resamples ``[R, ...]``."""
+    """Return both ends of the 95 % interval of resamples ``[R, ...]``."""
     low, high = np.percentile(resamples, [TAIL, 100 - TAIL], axis=0)
     return low, high
 
 
 def interval(point: float, resamples: ArrayLike, over: str = "seeds") -> Estimate:
-    """A number with the percentile interval of its resamples ``[R]``."""
+    """Return a number with the interval of its resamples ``[R]``."""
     low, high = percentile_interval(np.asarray(resamples, np.float64))
     return Estimate(float(point), float(low), float(high), over)
 
 
 def mean_interval(values: ArrayLike) -> tuple[float, float, float]:
-    """Mean and its 95 % percentile-bootstrap interval.
-
-    Args:
-        values: independent results, returns of episodes for instance, ``[E]``. With a
-            single one the interval has no width.
+    """Return the mean of ``[E]`` values and its 95 % percentile-bootstrap interval.
 
     Raises:
         ValueError: if there are no values, or some are not finite.
@@ -88,11 +82,14 @@ def mean_interval(values: ArrayLike) -> tuple[float, float, float]:
     sample = np.asarray(values, np.float64).ravel()
     if not sample.size or not np.isfinite(sample).all():
         raise ValueError(f"mean_interval needs finite values, got {sample}.")
-    return interval(sample.mean(), stratified_resamples([sample]).mean(1))[:3]
+    rows = np.random.default_rng(0).integers(
+        sample.size, size=(NUM_RESAMPLES, sample.size)
+    )
+    return interval(sample.mean(), sample[rows].mean(1))[:3]
 
 
 def wilson_interval(count: int, total: int) -> tuple[float, float]:
-    """Wilson's 95 % interval of a share, which keeps its coverage near 0 and 1.
+    """Return Wilson's 95 % interval of a share, which is also right near 0 and 1.
 
     Examples:
         >>> low, high = wilson_interval(20, 20)
@@ -106,36 +103,11 @@ def wilson_interval(count: int, total: int) -> tuple[float, float]:
     return centre - half, min(centre + half, 1.0)
 
 
-def stratified_resamples(strata: Sequence[ArrayLike]) -> Array:
-    """Bootstrap resamples of the runs of all strata, side by side, ``[R, N]``.
-
-    Each stratum, a data set for instance, keeps its number of runs.
-    """
-    rng = np.random.default_rng(0)
-    samples = [np.asarray(stratum, dtype=np.float64) for stratum in strata]
-    return np.concatenate(
-        [
-            sample[rng.integers(sample.size, size=(NUM_RESAMPLES, sample.size))]
-            for sample in samples
-        ],
-        axis=1,
-    )
-
-
 def nested_resamples(runs: Sequence[ArrayLike], *, seed: int = 0) -> Array:
-    """Bootstrap means over resampled runs and, in each of them, resampled episodes.
+    """Resample runs and then their episodes, and return the means ``[R, K]``.
 
-    The numbers of an episode stay together, so that a ratio or a difference of them is
-    one of pairs. With one run only its episodes are resampled.
-
-    Args:
-        runs: numbers of the episodes of each run, ``[E, K]``; ``E`` may differ.
-
-    Keyword Args:
-        seed: of the resampling. Default 0.
-
-    Returns:
-        Means, every run with equal weight, ``[R, K]``.
+    Each run ``[E, K]`` has its own ``E`` and equal weight. The numbers of an episode
+    stay together, so that their ratios and differences are paired.
     """
     tables = [np.asarray(run, dtype=np.float64) for run in runs]
     rng = np.random.default_rng(seed)
@@ -152,48 +124,17 @@ def nested_resamples(runs: Sequence[ArrayLike], *, seed: int = 0) -> Array:
 
 
 def estimate(runs: Sequence[Array]) -> Estimate:
-    """Mean over runs ``[E]`` and its interval; a single run's is over its episodes."""
+    """Return the mean over runs ``[E]``; a single run's interval is over episodes."""
     over = over_what([runs])
     values = runs[0] if over == "episodes" else [run.mean() for run in runs]
     return Estimate(*mean_interval(values), over)
 
 
-def interquartile_mean(values: ArrayLike) -> Array:
-    """Mean without the lowest and the highest quarter, over the last axis.
-
-    As rliable has it (Agarwal et al., 2021, https://arxiv.org/abs/2108.13264): of ``N``
-    values ``N // 4`` are left out at each end.
-
-    Examples:
-        >>> float(interquartile_mean([0.0, 3.0, 5.0, 1000.0]))
-        4.0
-    """
-    ordered = np.sort(np.asarray(values, np.float64), axis=-1)
-    cut = ordered.shape[-1] // 4
-    mean: Array = ordered[..., cut : ordered.shape[-1] - cut].mean(-1)
-    return mean
-
-
-def iqm(groups: Sequence[Sequence[Array]]) -> Estimate:
-    """Interquartile mean of the runs of all data sets, which are given one by one.
-
-    Runs ``[E]`` are resampled within their data sets. If one of these has a single run,
-    the interval is over the runs' episodes instead.
-    """
-    scores = [[run.mean() for run in group] for group in groups]
-    over = over_what(groups)
-    if over == "episodes":
-        runs = [run for group in groups for run in group]
-        each = [nested_resamples([run[:, None]], seed=n) for n, run in enumerate(runs)]
-        resamples = np.concatenate(each, axis=1)
-    else:
-        resamples = stratified_resamples(scores)
-    point = interquartile_mean(np.concatenate(scores))
-    return interval(float(point), interquartile_mean(resamples), over)
-
-
 def mean_difference(data_sets: Sequence[Sequence[Array]]) -> Estimate:
-    """Mean difference; data sets have equal weight, and so have the seeds of each."""
+    """Return the mean of the differences ``[E]`` of each data set's seeds.
+
+    Data sets have equal weight, and so have the seeds of each.
+    """
     point = np.mean([np.mean([run.mean() for run in each]) for each in data_sets])
     # A seed for each data set: with one, they would be drawn alike.
     resamples = [
@@ -207,15 +148,10 @@ def mean_difference(data_sets: Sequence[Sequence[Array]]) -> Estimate:
 def decrease_interval(
     clean: ArrayLike, disturbed: ArrayLike
 ) -> tuple[float | None, float | None, float | None]:
-    """Decrease of the mean score in percent, with its 95 % paired-bootstrap interval.
+    """Return the decrease of the mean in percent and its paired-bootstrap interval.
 
-    Args:
-        clean, disturbed: scores or returns of the pairs of one run, ``[E]`` each.
-
-    Returns:
-        ``100 (1 - mean(disturbed) / mean(clean))``, lower and upper end. All three are
-        ``None`` for fewer than two pairs or a clean mean that is not above 0, the ends
-        alone if that is so in a resample.
+    All three are ``None`` for fewer than two pairs, or if the clean mean is not above
+    0; both ends are ``None`` if it is not above 0 in a resample.
 
     Examples:
         >>> decrease_interval([40.0, 60.0], [20.0, 30.0])
@@ -237,38 +173,29 @@ def decrease_interval(
 def scores_and_decreases(
     runs: Sequence[ArrayLike],
 ) -> list[tuple[Estimate, Estimate | None]]:
-    """Scores of several runs, and their decreases in percent of the clean score.
+    """Return ``K`` mean scores, and their decreases in percent of the first, clean one.
 
-    Args:
-        runs: scores of each run's episodes, ``[E, K]``, the clean one first. Seeds are
-            resampled, then episodes with all of their scores.
-
-    Returns:
-        ``K`` pairs; a decrease is ``None`` where a clean mean is not above 0.
+    Runs are ``[E, K]``. Decreases are ``None`` if a clean mean is not above 0.
     """
     over = over_what([runs])
     means = np.mean([np.mean(np.asarray(run, float), axis=0) for run in runs], axis=0)
     resamples = nested_resamples(runs)
     positive = means[0] > 0 and (resamples[:, 0] > 0).all()
-    found = []
+    found: list[tuple[Estimate, Estimate | None]] = []
     for mean, column in zip(means, resamples.T, strict=True):
-        lost = None
-        if positive:
-            ratios = 100 * (1 - column / resamples[:, 0])
-            lost = interval(100 * (1 - mean / means[0]), ratios, over)
-        found.append((interval(mean, column, over), lost))
+        lost = (100 * (1 - mean / means[0]), 100 * (1 - column / resamples[:, 0]), over)
+        found.append(
+            (interval(mean, column, over), interval(*lost) if positive else None)
+        )
     return found
 
 
 def saved_share(back: ArrayLike, walk: ArrayLike) -> tuple[float, float, float]:
-    """Share of the states that a policy comes back from, with its 95 % interval.
+    """Return the recovery rate over states, with its 95 % interval.
 
-    Seeds are resampled, and walks with all of their states. If all states are saved, or
-    none, the interval is Wilson's, with the walks as trials.
-
-    Args:
-        back: whether it came back, or how often, for each seed and state, ``[N, M]``.
-        walk: of each state, ``[M]``.
+    ``back`` ``[N, M]`` has the rate of each seed and state. Seeds are resampled, and
+    walks with all of their states. If the rate is 0 or 1 everywhere, the interval is
+    Wilson's, with the walks as trials.
 
     Examples:
         >>> saved_share([[1, 0, 1, 0]], walk=[0, 0, 1, 1])
@@ -289,13 +216,13 @@ def saved_share(back: ArrayLike, walk: ArrayLike) -> tuple[float, float, float]:
 def recovered_share(
     method: ArrayLike, baseline: ArrayLike, walk: ArrayLike
 ) -> tuple[float, float, float]:
-    r"""R: share of the states that a baseline loses that a method saves.
+    r"""Return R, the share of the baseline's failures that a method avoids.
 
     .. math::
         R = \frac{p_{method} - p_{baseline}}{1 - p_{baseline}}
 
-    with :math:`p` the share of states that each comes back from, see
-    :func:`saved_share`; row by row method and baseline have the same seed.
+    with the recovery rates :math:`p`, see :func:`saved_share`. Rows ``[N, M]`` of
+    method and baseline have the same seed.
 
     Raises:
         ValueError: if the baseline saves all states, in the data or in a resample.
@@ -316,14 +243,14 @@ def recovered_share(
 
 
 def _by_walk(table: ArrayLike, walk: ArrayLike) -> tuple[Array, Array]:
-    """Sums over the states of each walk, ``[N, W]``, and their numbers, ``[W]``."""
+    """Return sums over the states of each walk ``[N, W]``, and their number ``[W]``."""
     walks, number = np.unique(np.asarray(walk), return_inverse=True)
     member = np.eye(len(walks))[number]
     return np.asarray(table, np.float64) @ member, member.sum(0)
 
 
 def _weights(*sizes: int) -> list[Array]:
-    """How often each counts: once, then in each resample, ``[1 + R, size]``."""
+    """Return how often each is drawn: once, then per resample, ``[1 + R, size]``."""
     rng = np.random.default_rng(0)
     draws = (
         rng.multinomial(size, np.full(size, 1 / size), NUM_SHARE_RESAMPLES)

@@ -11,11 +11,7 @@ import numpy as np
 
 from torchrl_osr.lab.evaluation.episodes import measure_of
 
-NUM_RECENT = 5
-"""Evaluations in the mean of the last ones.
-
-Scores of neighbouring evaluations swing by tens of points, so one of them says little.
-"""
+NUM_RECENT = 5  # neighbouring evaluations swing by tens of points: one says little
 
 
 def score_table(
@@ -25,13 +21,10 @@ def score_table(
     data_mean: float | None,
     folder: Path,
 ) -> str:
-    """Text table of the data's and the policy's scores, or returns without scores.
+    """Format the scores, or returns, of the data and of all evaluations as a table.
 
-    The evaluation of the untrained policy, at step 0, is in no mean.
-
-    ``history`` has all evaluations with their ``"step"``. The ``best`` of them is
-    chosen by its own episodes, hence optimistic. ``data_mean`` is that of the data's
-    episodes, if known.
+    The mean leaves out the untrained policy, at step 0. The ``best`` evaluation is
+    chosen by its own episodes, hence optimistic.
     """
     measure, last = measure_of(best), history[-1]
 
@@ -59,7 +52,7 @@ def score_table(
 
 
 def read_scalars(folder: Path | str) -> dict[str, list[tuple[int, float]]]:
-    """Step and value pairs in a ``scalars`` folder of TorchRL's ``CSVLogger``, by name.
+    """Read steps and values from a ``scalars`` folder of TorchRL's ``CSVLogger``.
 
     A resumed run logs the steps since its checkpoint once more; the later row counts.
     """

@@ -27,8 +27,8 @@ MARKS = {"better": "▲ ", "worse": "▼ ", "no significant difference": "= "}
 MIN_SEEDS = 5
 """Pairs of runs on each data set below which there is no verdict.
 
-A bootstrap over three seeds holds the true mean in about 76 of 100 cases, over five in
-83, over ten in 89: with fewer, an interval without 0 says next to nothing.
+A bootstrap over three seeds covers the true mean in about 76 of 100 cases, over five in
+83, over ten in 89.
 """
 
 EPISODE = ["data", "method", "seed", "step", "episode"]
@@ -37,11 +37,8 @@ EPISODE = ["data", "method", "seed", "step", "episode"]
 class Quantity(NamedTuple):
     """A number of an episode in which methods are compared.
 
-    Attributes:
-        name: in words.
-        rows: ``data``, ``method``, ``seed``, ``step``, ``episode``, ``disturbance``,
-            ``value``, and whether the disturbance was ``met``.
-        sign: 1 where more is better, -1 where less is.
+    ``rows`` has the columns of :data:`EPISODE`, ``disturbance``, ``value``, and whether
+    the disturbance was ``met``. ``sign`` is 1 where more is better, -1 where less is.
     """
 
     name: str
@@ -50,14 +47,10 @@ class Quantity(NamedTuple):
 
 
 class Difference(NamedTuple):
-    """A method less the reference, in one quantity on one data set or all.
+    """A method less the reference, in one quantity on one data set or :data:`ALL_DATA`.
 
-    Attributes:
-        data: a data set, or :data:`ALL_DATA`.
-        method, quantity: what is compared.
-        estimate: method less reference; ``None`` if they cannot be compared.
-        seeds: pairs of runs, the fewest that a data set has.
-        note: why they cannot be compared, or what is left out.
+    ``seeds`` is the smallest number of pairs of runs of a data set; ``note`` says what
+    is left out, or why there is no ``estimate``.
     """
 
     data: str
@@ -69,7 +62,7 @@ class Difference(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """Better, worse, no significant difference, or why there is no verdict."""
+        """Better, worse, no significant difference, or the lack of a verdict."""
         if self.estimate is None:
             return "not compared"
         if self.seeds < MIN_SEEDS:
@@ -80,7 +73,7 @@ class Difference(NamedTuple):
 
 
 def quantities(tables: RunTables) -> list[Quantity]:
-    """The undisturbed score or return, and two quantities of each suite."""
+    """Return the undisturbed score or return, and two quantities of each suite."""
     measure = "score" if tables.measure == "normalised score" else "return"
     rows = recent(tables.episodes).rename(columns={"score": "value"}).assign(met=True)
     found = [Quantity(f"undisturbed {measure}", rows)]
@@ -103,9 +96,7 @@ def compare(
 ) -> list[Difference]:
     """Compare a method with the reference on each data set, and on all together.
 
-    Returns:
-        Data set by data set, then :data:`ALL_DATA` if there are several. Data sets
-        where one of the two has no such numbers are left out.
+    Data sets where one of the two has no such numbers are left out.
     """
     found, paired = [], []
     for data in tables.data:
@@ -126,11 +117,11 @@ def compare(
 
 
 def pair(rows: pd.DataFrame, method: str, reference: str) -> tuple[list[Array], str]:
-    """Differences of the same episodes of two methods on one data set.
+    """Subtract the same episodes of two methods on one data set.
 
     Returns:
-        Method less reference of each seed that both have, averaged over disturbances
-        and checkpoints, ``[E]``, and what is left out; or nothing, and the reason.
+        The difference for each seed that both have, averaged over disturbances and
+        checkpoints, ``[E]``, and what is left out; or nothing, and the reason.
     """
     rows = rows[rows["method"].isin([method, reference])]
     met = rows.groupby(["disturbance", "method"])["met"].any().unstack(fill_value=False)
@@ -168,19 +159,15 @@ def compare_all(tables: RunTables, reference: str) -> list[Difference]:
 
 
 def verdict(differences: Sequence[Difference], reference: str) -> list[str]:
-    """Sentences: which methods differ significantly from the reference, and in what.
+    """Write sentences about the significant differences to the reference.
 
-    A method with several data sets is judged over all of them, any other on its only
-    one.
+    A method with several data sets is judged over all of them.
     """
     everywhere = {each.method for each in differences if each.data == ALL_DATA}
-    found = [
-        each
-        for each in differences
-        if each.data == ALL_DATA or each.method not in everywhere
-    ]
     sentences, rest = [], dict[tuple[str, str], list[str]]()
-    for each in found:
+    for each in differences:
+        if each.data != ALL_DATA and each.method in everywhere:
+            continue
         if each.estimate and each.verdict in ("better", "worse"):
             sentences.append(
                 f"{each.method} is {each.verdict} than {reference} in "
@@ -197,7 +184,7 @@ def verdict(differences: Sequence[Difference], reference: str) -> list[str]:
 
 
 def difference_table(differences: Sequence[Difference]) -> pd.DataFrame:
-    """Differences to the reference, by data set and method, with their verdicts."""
+    """Tabulate differences to the reference, by data set and method."""
     rows: dict[Any, dict[str, str]] = {}
     notes: dict[Any, list[str]] = {}
     for each in differences:

@@ -1,9 +1,8 @@
-"""The page: verdict, tables and figures of all runs, as HTML, Markdown, CSV and PNG."""
+"""The page: verdict, tables and figures of all runs, as HTML, CSV and PNG."""
 
 from __future__ import annotations
 
 import base64
-import io
 import re
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,6 @@ from torchrl_osr.lab.report.comparisons import (
 )
 from torchrl_osr.lab.report.runs import RunTables, comparison_notes
 from torchrl_osr.lab.report.tables import (
-    mean_table,
     robustness_table,
     saved_table,
     score_table,
@@ -33,8 +31,6 @@ from torchrl_osr.lab.report.tables import (
 with needed_by("the report needs", "train"):
     from jinja2 import Environment, PackageLoader
 
-PAGE = "report.html"
-
 
 def write_report(
     tables: RunTables,
@@ -43,16 +39,16 @@ def write_report(
     reference: str | None = None,
     command: str = "",
 ) -> Path:
-    """Write ``report.html``, ``report.md``, and each table and figure by itself.
+    """Write ``report.html``, and each table and figure by itself.
 
-    The others are compared with the method ``reference``. Default: the first. The page
-    names the ``command``.
+    Methods are compared with the ``reference``. Default: the first method. The page
+    prints the ``command``.
 
     Returns:
         The page's path.
 
     Raises:
-        ValueError: if there is no such method, with those that there are.
+        ValueError: if there is no such method.
     """
     methods = tables.methods
     reference = methods[0] if reference is None else reference
@@ -62,7 +58,6 @@ def write_report(
     runs = tables.runs.drop(columns="data_score").set_index("folder")
     frames = {
         "scores": score_table(tables),
-        "means": mean_table(tables),
         "differences": difference_table(found),
         "recoverable": saved_table(tables, reference),
         **{
@@ -81,65 +76,46 @@ def write_report(
     pictures = {}
     for name, figure in drawn.items():
         if figure is not None:
-            save_figure(figure, folder / f"{name}.png", dpi=130)
-            pictures[name] = base64.b64encode(
-                (folder / f"{name}.png").read_bytes()
-            ).decode()
+            path = folder / f"{name}.png"
+            save_figure(figure, path, dpi=130)
+            pictures[name] = base64.b64encode(path.read_bytes()).decode()
     for name, frame in frames.items():
         file = re.sub(r"[^\w.-]+", "-", name)  # suites have any name
         write_atomically(folder / f"{file}.csv", numbers(frame).to_csv())
-    content = {
-        "tables": tables,
-        "frames": {name: frame.map(text) for name, frame in frames.items()},
-        "reference": reference,
-        "pictures": pictures,
-        "verdict": verdict(found, reference),
-        "notes": comparison_notes(tables),
-        "command": command,
-        "num_resamples": NUM_RESAMPLES,
-        "min_seeds": MIN_SEEDS,
-    }
     environment = Environment(
         loader=PackageLoader("torchrl_osr.lab.report", "."),
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    page = environment.get_template("page.html.j2").render(content)
-    write_atomically(folder / PAGE, page)
-    write_atomically(folder / "report.md", markdown(content))
-    return folder / PAGE
+    page = environment.get_template("page.html.j2").render(
+        tables=tables,
+        frames={name: frame.map(text) for name, frame in frames.items()},
+        reference=reference,
+        pictures=pictures,
+        verdict=verdict(found, reference),
+        notes=comparison_notes(tables),
+        command=command,
+        num_resamples=NUM_RESAMPLES,
+        min_seeds=MIN_SEEDS,
+    )
+    write_atomically(folder / "report.html", page)
+    return folder / "report.html"
 
 
 def numbers(frame: pd.DataFrame) -> pd.DataFrame:
-    """Table with three columns, mean, low and high, for each column of estimates."""
+    """Return a table with columns of mean, low and high for each one of estimates."""
     columns: dict[str, Any] = {}
     for name, cells in frame.items():
-        estimates = cells.map(lambda cell: isinstance(cell, Estimate))
-        if not estimates.any():
-            columns[str(name)] = cells
-            continue
-        for place, end in enumerate(("", " low", " high")):
-            columns[f"{name}{end}"] = cells.map(
-                lambda cell, place=place: (
-                    cell[place] if isinstance(cell, Estimate) else None
-                )
-            )
+        estimates = [cell for cell in cells if isinstance(cell, Estimate)]
+        ends = ("", " low", " high") if estimates else ("",)
+        for place, end in enumerate(ends):
+            columns[f"{name}{end}"] = [
+                cell[place]
+                if isinstance(cell, Estimate)
+                else None
+                if estimates
+                else cell
+                for cell in cells
+            ]
     return pd.DataFrame(columns, index=frame.index)
-
-
-def markdown(content: dict[str, Any]) -> str:
-    """The page's texts and tables in Markdown."""
-    file = io.StringIO()
-    print("# Report of runs\n", file=file)
-    for title in ("verdict", "notes"):
-        print("\n".join(f"- {each}" for each in content[title]), end="\n\n", file=file)
-    for name, frame in content["frames"].items():
-        rows = frame.reset_index()
-        print(f"## {name}\n", file=file)
-        lines = [list(rows), ["---"] * len(list(rows)), *rows.values.tolist()]
-        for line in lines:
-            cells = (str(cell).replace("|", "\\|") for cell in line)
-            print(f"| {' | '.join(cells)} |", file=file)
-        print(file=file)
-    return file.getvalue()

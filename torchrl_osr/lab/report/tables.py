@@ -1,4 +1,4 @@
-"""Tables of scores, robustness, recoverable states and differences.
+"""Tables of scores, robustness and recoverable states.
 
 A cell is an :class:`~torchrl_osr.lab.evaluation.statistics.Estimate`, a text or a
 number.
@@ -6,7 +6,8 @@ number.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import contextlib
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,6 @@ from torchrl_osr.lab.evaluation.statistics import (
     Estimate,
     decimal,
     estimate,
-    iqm,
     nested_resamples,
     over_what,
     percentile_interval,
@@ -32,15 +32,12 @@ from torchrl_osr.lab.report.runs import RunTables
 
 
 def undisturbed(episodes: pd.DataFrame) -> pd.DataFrame:
-    """The episodes of the training's own evaluations."""
+    """Select the episodes of the training's own evaluations."""
     return episodes[episodes["suite"] == ""]
 
 
 def recent(episodes: pd.DataFrame, number: int = NUM_RECENT) -> pd.DataFrame:
-    """The undisturbed episodes of each run's last evaluations, by default five.
-
-    The evaluation of the untrained policy, at step 0, is not among them.
-    """
+    """Select the undisturbed episodes of the last evaluations, without step 0."""
     found = undisturbed(episodes)
     found = found[found["step"] > 0]
     rank = found.groupby("run")["step"].rank("dense", ascending=False)
@@ -48,7 +45,7 @@ def recent(episodes: pd.DataFrame, number: int = NUM_RECENT) -> pd.DataFrame:
 
 
 def by_run(episodes: pd.DataFrame) -> list[Array]:
-    """Scores of each run's start states, ``[E]`` each.
+    """Return the scores of each run's start states, ``[E]`` each.
 
     Evaluations that start in the same state are averaged: they are no new episodes.
     """
@@ -57,7 +54,7 @@ def by_run(episodes: pd.DataFrame) -> list[Array]:
 
 
 def score_table(tables: RunTables) -> pd.DataFrame:
-    """Undisturbed scores, by data set and method."""
+    """Tabulate undisturbed scores, by data set and method."""
     rows = {}
     for key, group in tables.episodes.groupby(["data", "method"], sort=False):
         of = tables.runs.loc[group["run"].unique()]
@@ -71,26 +68,11 @@ def score_table(tables: RunTables) -> pd.DataFrame:
     return frame_of(rows, "data", "method")
 
 
-def mean_table(tables: RunTables) -> pd.DataFrame:
-    """Interquartile means over all data sets, by method; empty for a single one."""
-    rows: dict[str, dict[str, Any]] = {}
-    if len(tables.data) == 1:
-        return frame_of(rows, "method")
-    for method, group in recent(tables.episodes).groupby("method", sort=False):
-        groups = [by_run(each) for _, each in group.groupby("data", sort=False)]
-        rows[method] = {
-            "data sets": f"{len(groups)} of {len(tables.data)}",
-            "runs": sum(map(len, groups)),
-            "interquartile mean": iqm(groups),
-        }
-    return frame_of(rows, "method")
-
-
 def robustness_table(tables: RunTables, suite: str) -> pd.DataFrame:
-    """Scores and recovery under a suite, by data set, disturbance and method.
+    """Tabulate scores and recovery under a suite, by data, disturbance and method.
 
-    Scores are over all episodes. The shares after ``met`` are over the episodes that
-    met the disturbance; those of a disturbance that no episode met are left out.
+    Scores are over all episodes. The columns after ``met`` are over the episodes that
+    met the disturbance.
     """
     rows: dict[tuple[str, str], dict[str, Any]] = {}
     episodes = tables.episodes[tables.episodes["suite"] == suite]
@@ -102,16 +84,20 @@ def robustness_table(tables: RunTables, suite: str) -> pd.DataFrame:
             ]
             for _, run in group.groupby("run", sort=False)
         ]
-        for name, (score, lost) in zip(names, scores_and_decreases(runs), strict=True):
-            if name == "":
-                clean = score
-                continue
-            row = {"seeds": len(runs), "clean": clean, "disturbed": score}
+        scores = scores_and_decreases(runs)
+        clean = scores[names.index("")][0]
+        for name, (score, lost) in zip(names, scores, strict=True):
             level = group[group["disturbance"] == name]
             there = level[level["disturbed_at"].notna()]
-            row |= {"lost %": lost if len(there) else None}
-            row |= {"met %": 100 * len(there) / len(level)}
-            rows.setdefault((data, name), {})[method] = row | _recovery(there)
+            row = {
+                "seeds": len(runs),
+                "clean": clean,
+                "disturbed": score,
+                "lost %": lost if len(there) else None,
+                "met %": 100 * len(there) / len(level),
+            }
+            if name:
+                rows.setdefault((data, name), {})[method] = row | _recovery(there)
     flat = {
         (*key, method): row for key, of in rows.items() for method, row in of.items()
     }
@@ -119,7 +105,7 @@ def robustness_table(tables: RunTables, suite: str) -> pd.DataFrame:
 
 
 def _recovery(there: pd.DataFrame) -> dict[str, Any]:
-    """Percentages and steps of the episodes that met a disturbance that ends."""
+    """Return the percentages of the episodes that met a disturbance that ends."""
     if not there["stood"].notna().any():
         return {}
     columns = ["stood", "alive_after", "undisturbed_alive"]
@@ -137,10 +123,9 @@ def _recovery(there: pd.DataFrame) -> dict[str, Any]:
 
 
 def recovery_curve(there: pd.DataFrame) -> tuple[Array, Array, Array, Array]:
-    """Share of disturbed episodes that have been back in the data, by steps after it.
+    """Return the share of disturbed episodes that have been back in the data by a step.
 
-    Returns:
-        Steps, share and its 95 % band over runs and episodes, ``[T]`` each.
+    Steps, share and both ends of its 95 % band, ``[T]`` each.
     """
     steps = np.arange(STEPS_AFTER + 1.0)
     within = [
@@ -151,68 +136,44 @@ def recovery_curve(there: pd.DataFrame) -> tuple[Array, Array, Array, Array]:
     return (steps, share, *percentile_interval(nested_resamples(within)))
 
 
-def came_back(
-    tables: RunTables,
-) -> Iterator[tuple[str, str, pd.DataFrame, pd.DataFrame]]:
-    """Which states each run comes back from, data set by data set.
+def saved_table(tables: RunTables, reference: str) -> pd.DataFrame:
+    """Tabulate recovery rates by group of states and, if recoverable, by disturbance.
 
-    Yields:
-        The data set; half and digest of its states; ``group``, ``disturbance`` and
-        ``walk`` of each, ``M`` rows; and how often each was come back from, ``M``
-        columns and a row for each ``method`` and ``seed``, in the order of the runs.
+    R compares with the reference, with the seeds of both.
     """
+    cells = {}
     for (data, states), rows in tables.saved.groupby(["data", "states"], sort=False):
         rows = rows.assign(state=rows.groupby("run").cumcount())
-        of_each = rows.drop_duplicates("state").set_index("state")
-        keys = ["method", "seed"]
-        back = rows.pivot(index=keys, columns="state", values="back").astype(float)
-        order = pd.MultiIndex.from_frame(rows[keys].drop_duplicates())
-        yield data, states, of_each, back.loc[order]
-
-
-def saved_table(tables: RunTables, reference: str) -> pd.DataFrame:
-    """Percentage of the recoverable states that each method comes back from.
-
-    By group, for the recoverable ones also by disturbance; and R against the reference,
-    with the seeds of both.
-    """
-    rows = {}
-    for data, states, of_each, back in came_back(tables):
+        of_each = rows.drop_duplicates("state")  # they have the same order in each run
         group, disturbance, walk = (
             of_each[name].to_numpy() for name in ("group", "disturbance", "walk")
         )
+        keys = ["run", "method", "seed"]  # sorted by run: resamples draw in this order
+        back = rows.pivot(index=keys, columns="state", values="back").droplevel("run")
         hard = group == GROUPS[-1]
         chosen = {f"{name} %": group == name for name in GROUPS if name in group}
         chosen |= {
             f"{name} %": hard & (disturbance == name)
             for name in disturbances_of(disturbance[hard])
         }
-        methods = back.index.unique("method")
+        methods = rows["method"].unique()
         for method in methods:
-            table = back.loc[method]
+            table = back.loc[method].astype(float)
             row: dict[str, Any] = {"seeds": len(table)}
             if reference in methods and method != reference and hard.any():
-                theirs = back.loc[reference]
+                theirs = back.loc[reference].astype(float)
                 both = table.index.intersection(theirs.index)
                 ours, theirs = (each.loc[both, hard] for each in (table, theirs))
-                row["R %"] = _recovered(ours, theirs, walk[hard])
+                row["R %"] = None
+                if len(both):
+                    with contextlib.suppress(ValueError):  # the reference saves all
+                        share = recovered_share(ours, theirs, walk[hard])
+                        row["R %"] = _percent(share, len(both))
             for name, which in chosen.items():
                 share = saved_share(table.loc[:, which], walk[which])
                 row[name] = _percent(share, len(table))
-            rows[f"{data}, {states}", method] = row
-    return frame_of(rows, "data", "method")
-
-
-def _recovered(ours: pd.DataFrame, theirs: pd.DataFrame, walk: Any) -> Estimate | None:
-    """R of a method; ``None`` without a common seed or a state to save."""
-    try:
-        return (
-            _percent(recovered_share(ours, theirs, walk), len(ours))
-            if len(ours)
-            else None
-        )
-    except ValueError:
-        return None
+            cells[f"{data}, {states}", method] = row
+    return frame_of(cells, "data", "method")
 
 
 def _percent(found: tuple[float, float, float], seeds: int) -> Estimate:
@@ -221,14 +182,14 @@ def _percent(found: tuple[float, float, float], seeds: int) -> Estimate:
 
 
 def text(cell: Any) -> str:
-    """A cell as text; nothing is a dash."""
+    """Format a cell; nothing is a dash."""
     if cell is None or (isinstance(cell, float) and np.isnan(cell)):
         return "-"
     return decimal(cell) if isinstance(cell, float) else str(cell)
 
 
 def frame_of(rows: Mapping[Any, Mapping[str, Any]], *names: str) -> pd.DataFrame:
-    """Table with a row for each key, whose parts have names."""
+    """Return a table with a row for each key, whose parts have names."""
     frame = pd.DataFrame(list(rows.values()), dtype=object)
     if not rows or len(names) == 1:
         return frame.set_axis(pd.Index(list(rows), name=names[0]))
