@@ -1,4 +1,4 @@
-"""A dynamics model in which every number that could be mixed up is another one."""
+"""Dynamics models whose predictions can be computed by hand."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from torchrl_osr.lab.dynamics import DynamicsEnsemble
 
 
 def uneven_dynamics() -> DynamicsEnsemble:
-    """Three networks, of which the first and the last are the elites, in float64."""
+    """Three networks, of which the first and the last are the elites, in float64.
+
+    Every number that could be mixed up is another one.
+    """
     torch.manual_seed(4)
     model = DynamicsEnsemble(3, 2, num_networks=3, num_elites=2, num_cells=[6])
     for each in model.parameters():
@@ -18,3 +21,28 @@ def uneven_dynamics() -> DynamicsEnsemble:
     model.target_scale.uniform_(0.5, 2)
     model.input_loc.normal_()
     return model.double()
+
+
+def linear_dynamics(
+    sizes: tuple[int, int],
+    weights: dict[tuple[int, int], float],
+    networks: tuple[int, int],
+    log_variance: float = -40.0,
+) -> DynamicsEnsemble:
+    """Networks and elites without hidden layers, zero but for some weights.
+
+    ``weights`` lead from an input (state, action) to an output (change, reward).
+    """
+    number, elites = networks
+    model = DynamicsEnsemble(
+        *sizes, num_networks=number, num_elites=elites, num_cells=[]
+    )
+    layer = model.layers[0].requires_grad_(False)
+    layer.weight.zero_()
+    for (start, end), weight in weights.items():
+        layer.weight[:, start, end] = weight
+    layer.bias[..., sizes[0] + 1 :] = log_variance
+    # Bounds far apart do not bend what lies between them.
+    model.lowest_log_variance.data.fill_(-60)
+    model.highest_log_variance.data.fill_(60)
+    return model

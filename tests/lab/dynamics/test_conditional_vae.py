@@ -9,13 +9,10 @@ from torch import nn
 from torchrl_osr.lab.dynamics import ConditionalVAE, ConditionalVAELoss
 
 NEXT = ("next", "observation")
-ACTION = {"condition_key": NEXT, "target_key": "action"}
+CHANGE = {"condition_key": "observation", "target_key": NEXT, "change": True}
 KINDS = {
-    "action": (2, ACTION),
-    "change": (
-        3,
-        {"condition_key": "observation", "target_key": NEXT, "change": True},
-    ),
+    "action": (2, {"condition_key": NEXT, "target_key": "action"}),
+    "change": (3, CHANGE),
 }
 
 

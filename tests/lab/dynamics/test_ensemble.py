@@ -6,6 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
+from uneven_dynamics import linear_dynamics
 
 from torchrl_osr.lab.dynamics import DynamicsEnsemble, DynamicsLoss, EliteNetworks
 from torchrl_osr.lab.dynamics.ensemble import has_next_state
@@ -19,11 +20,9 @@ def rows_of(state, action, change, reward) -> TensorDict:
 
 
 def test_elites_are_the_best_on_held_out_rows() -> None:
-    model = DynamicsEnsemble(1, 1, num_networks=4, num_elites=2, num_cells=[])
-    with torch.no_grad():
-        model.layers[0].weight.zero_()
-        # Predicted change; the truth is 1 and the reward 0.
-        model.layers[0].bias[:, 0, 0] = torch.tensor([5.0, 1.1, -3.0, 0.8])
+    model = linear_dynamics((1, 1), {}, (4, 2))
+    # Predicted change; the truth is 1 and the reward 0.
+    model.layers[0].bias[:, 0, 0] = torch.tensor([5.0, 1.1, -3.0, 0.8])
     ones, zeros = torch.ones(3, 1), torch.zeros(3, 1)
     model.calibrate_(rows_of(zeros, zeros, ones, zeros))
     assert model.elites.tolist() == [1, 3]

@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
+from uneven_dynamics import linear_dynamics
 
 from torchrl_osr.lab.data.rows import consecutive_rows
 from torchrl_osr.lab.dynamics import DynamicsEnsemble
@@ -17,17 +18,8 @@ NOISE = 0.3
 
 def make_model(*, offset: float = 0.0, scale: float = NOISE) -> DynamicsEnsemble:
     """s' = s + a up to noise, reward = s up to noise; two networks that agree."""
-    model = DynamicsEnsemble(1, 1, num_networks=2, num_elites=2, num_cells=[])
-    (layer,) = model.layers
-    with torch.no_grad():
-        layer.weight.zero_()
-        layer.bias.zero_()
-        layer.weight[:, 1, 0] = layer.weight[:, 0, 1] = 1
-        layer.bias[:, 0, 0] = offset
-        # Bounds far apart do not bend what lies between them.
-        model.lowest_log_variance.fill_(-60)
-        model.highest_log_variance.fill_(60)
-        layer.bias[:, 0, 2:] = 2 * math.log(scale)
+    model = linear_dynamics((1, 1), {(1, 0): 1, (0, 1): 1}, (2, 2), 2 * math.log(scale))
+    model.layers[0].bias[:, 0, 0] = offset
     return model
 
 
@@ -57,8 +49,7 @@ def test_report_of_the_true_model() -> None:
 
 def test_disagreement_that_knows_the_error_has_rank_one() -> None:
     model, data = make_model(), make_data(500, noise=0.0)
-    with torch.no_grad():
-        model.layers[0].weight[0, 1, 0] = 1.5  # one network errs with the action's size
+    model.layers[0].weight[0, 1, 0] = 1.5  # one network errs with the action's size
     data["next", "reward"].zero_()
     data["observation"].zero_()
     data["next", "observation"] = data["action"].clone()
@@ -75,8 +66,7 @@ def test_rollout_errors_of_a_constant_error() -> None:
     assert all(each["rmse"] < 1e-4 for each in exact)
     model = make_model(offset=0.25)
     model.input_scale[0] = 2.0  # the unit of the errors
-    with torch.no_grad():
-        model.layers[0].weight[:, 0, 1] = 0
+    model.layers[0].weight[:, 0, 1] = 0
     off = rollout_errors(model, pieces, (1, 4))
     assert [each["rmse"] for each in off] == pytest.approx([0.125, 0.5], abs=1e-4)
     moved = pieces["next", "observation"][:, 3] - pieces["observation"][:, 0]

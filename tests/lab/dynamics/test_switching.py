@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from uneven_dynamics import linear_dynamics
 
 from torchrl_osr.lab.dynamics import DynamicsEnsemble, EliteNetworks, SwitchingPolicy
 
@@ -14,15 +15,9 @@ def cart(*bias: float, elites: int = 1) -> DynamicsEnsemble:
     One network for each bias. ``x`` rises by ``v`` and ``v`` by the action; the reward
     is ``v`` before that.
     """
-    model = DynamicsEnsemble(
-        2, 1, num_networks=len(bias), num_elites=elites, num_cells=[]
-    )
-    (layer,) = model.layers
-    with torch.no_grad():
-        layer.weight.zero_()
-        layer.bias.zero_()
-        layer.weight[:, 1, 0] = layer.weight[:, 2, 1] = layer.weight[:, 1, 2] = 1
-        layer.bias[:, 0, 1] = torch.tensor(bias)
+    weights = {(1, 0): 1.0, (2, 1): 1.0, (1, 2): 1.0}
+    model = linear_dynamics((2, 1), weights, (len(bias), elites))
+    model.layers[0].bias[:, 0, 1] = torch.tensor(bias)
     return model
 
 

@@ -34,15 +34,10 @@ class BCLoss(ActorCriticLoss):
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from torchrl_osr.lab.losses import BCLoss
         >>> from torchrl_osr.modules import tanh_gaussian_actor
-        >>> loss = BCLoss(tanh_gaussian_actor(11, 3))
-        >>> batch = TensorDict({
-        ...     "observation": torch.randn(4, 11), "action": torch.rand(4, 3)}, [4])
-        >>> [*loss(batch).keys()]
-        ['loss_actor']
+        >>> BCLoss(tanh_gaussian_actor(11, 3)).in_keys
+        ['observation', 'action']
     """
 
     def __init__(self, actor_network: TensorDictModuleBase, **options: Any) -> None:

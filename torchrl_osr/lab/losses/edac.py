@@ -21,15 +21,9 @@ from torchrl_osr.objectives.transitions import Transitions
 
 
 def gradient_diversity(action_gradients: Tensor) -> Tensor:
-    r"""EDAC similarity of the critics' action gradients, to be minimised.
+    """Return the similarity of gradients ``[N, R, A]`` in EDAC's critic loss, ``[R]``.
 
-    .. math::
-        \frac{1}{N - 1} \sum_{i \ne j} \Big\langle
-            \frac{\nabla_a Q_i(s, a)}{\|\nabla_a Q_i(s, a)\|},
-            \frac{\nabla_a Q_j(s, a)}{\|\nabla_a Q_j(s, a)\|} \Big\rangle
-
-    ``action_gradients`` of each critic at the data's action, ``[N, R, A]``, give
-    ``[R]``, between -N / (N - 1) and N.
+    It is between -N / (N - 1) and N.
     """
     # Without eps, a dead critic's zero gradient would be 0 / 0.
     unit = normalize(action_gradients, dim=-1, eps=1e-10)
