@@ -36,13 +36,6 @@ def test_sampling_is_uniform_with_replacement() -> None:
     assert counts.max() < 1150
 
 
-def test_empty_or_unflat_data_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"batch size \[0\]; expected a flat \[N\]"):
-        make_replay_buffer(TensorDict({}, [0]), batch_size=1, seed=0)
-    with pytest.raises(ValueError, match=r"batch size \[2, 3\]"):
-        make_replay_buffer(TensorDict({}, [2, 3]), batch_size=1, seed=0)
-
-
 @pytest.fixture
 def both(make_transitions, tmp_path):
     """The same rows in memory and memory-mapped."""

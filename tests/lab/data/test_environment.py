@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import tempfile
 from contextlib import closing
 
@@ -18,7 +16,6 @@ from torchrl_osr.lab.data.environment import MAZE_IDS, environment_id
 PLANE = spaces.Box(-1, 1, (2,), np.float32)
 SPACES = {
     "test/Endless-v0": (PLANE, spaces.Box(-np.inf, np.inf, (1,), np.float32)),
-    "test/Buttons-v0": (PLANE, spaces.MultiDiscrete([2, 2])),
     "test/Shifted-v0": (PLANE, spaces.Discrete(3, start=-1)),
     "test/Lazy-v0": (PLANE, spaces.Discrete(3)),
     "test/Tuple-v0": (spaces.Tuple([PLANE, spaces.Discrete(3)]), PLANE),
@@ -86,51 +83,17 @@ def test_an_episode_ends_at_the_goal_with_its_only_reward():
     assert len(rewards) > 1
 
 
-IN_A_FRESH_PROCESS = """
-import sys, warnings
-from torchrl_osr.lab.data import make_environment
-
-warnings.simplefilter("error")
-make_environment("Hopper-v5")
-assert "gymnasium_robotics" not in sys.modules
-sys.modules["gymnasium_robotics"] = None  # as if it were not installed
-make_environment("Walker2d-v5")
-try:
-    make_environment("PointMaze_UMaze-v3")
-except ImportError as error:
-    print(error)
-del sys.modules["gymnasium_robotics"]
-make_environment("AntMaze_UMaze-v4")
-assert "gymnasium_robotics" in sys.modules
-"""
-
-
-def test_robotics_is_imported_for_its_own_tasks_and_says_nothing():
-    completed = subprocess.run(
-        [sys.executable, "-c", IN_A_FRESH_PROCESS], capture_output=True, text=True
-    )
-    assert completed.returncode == 0, completed.stderr
-    assert completed.stderr == "", "neither notes nor warnings"
-    (line,) = completed.stdout.splitlines()
-    assert line.startswith("Gymnasium itself has no 'PointMaze_UMaze-v3'")
-    assert line.endswith("pip install torchrl-osr[mazes]")
-
-
 @pytest.mark.parametrize(
     ("env_id", "error", "message"),
     [
         ("Hoper-v5", ValueError, r"env.id=Hoper-v5 cannot be made.*Hopper"),
-        ("Hopper-v99", ValueError, "v99"),
-        ("nowhere/Arm-v0", ValueError, "Namespace nowhere"),
         (
             "not_there:Arm-v0",
             ImportError,
             "cannot be made: No module named 'not_there'",
         ),
         ("FrozenLake-v1", ValueError, r"has observations Discrete\(16\)"),
-        ("Blackjack-v1", ValueError, "int64.*expected a vector of real numbers"),
         ("test/Endless-v0", ValueError, "expected bounded real numbers"),
-        ("test/Buttons-v0", ValueError, r"has actions MultiDiscrete"),
         ("test/Shifted-v0", ValueError, "or Discrete from 0"),
     ],
 )
@@ -148,11 +111,6 @@ def test_other_action_bounds_are_rescaled():
         assert env.unwrapped.data.ctrl == pytest.approx([1.5])
 
 
-def test_discrete_actions_are_numbered_from_zero():
-    with closing(make_environment("CartPole-v1")) as env:
-        assert env.action_space == spaces.Discrete(2)
-
-
 def test_tuples_become_vectors():
     with closing(make_environment("test/Tuple-v0")) as env:
         observation, _ = env.reset(seed=0)
@@ -162,11 +120,7 @@ def test_tuples_become_vectors():
 
 @pytest.mark.parametrize(
     ("env_id", "spec"),
-    [
-        ("Pendulum-v1", (3, 1, [-2.0], [2.0])),
-        ("InvertedPendulum-v5", (4, 1, [-3.0], [3.0])),
-        ("CartPole-v1", (4, 2, None, None)),
-    ],
+    [("Pendulum-v1", (3, 1, [-2.0], [2.0])), ("CartPole-v1", (4, 2, None, None))],
 )
 def test_spec_is_in_the_environments_own_units(env_id, spec):
     assert environment_spec(env_id) == (*spec, True)

@@ -102,29 +102,13 @@ def test_a_set_is_cached_and_says_what_it_is_made_of(tmp_path, monkeypatch):
     ("env_name", "source", "message"),
     [
         ("pointmaze-umaze", "play", "data=play of pointmaze-umaze; there are: diverse"),
-        ("pointmaze-large", "medium", "data=medium .* there are: diverse, play"),
         ("antmaze-umaze", "diverse", "there are: minari"),
-        ("antmaze-large", "play", "there are: minari"),
         ("hopper", "diverse", "unknown data='diverse'; there are: random, medium"),
-        ("ant", "medium", "'ant'; there are policies for hopper"),
     ],
 )
 def test_sources_that_are_not_there_are_named(env_name, source, message):
     with pytest.raises(ValueError, match=message):
         collect_source(env_name, source, 9)
-
-
-def maze(*rows: str):
-    return {
-        (i, j) for i, row in enumerate(rows) for j in range(len(row)) if row[j] == "."
-    }
-
-
-def test_the_shorter_of_two_ways_is_taken():
-    free = maze(".....", ".###.", ".###.", ".....")
-    left = [(0, 1), (0, 0), (1, 0), (2, 0), (3, 0)]
-    assert shortest_path(free, (0, 1), (3, 0)) == left
-    assert shortest_path(free, (0, 4), (3, 4)) == [(0, 4), (1, 4), (2, 4), (3, 4)]
 
 
 @given(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -39,6 +37,7 @@ def test_a_sound_log_gives_no_reason_to_complain():
 
 FEW = {name: column[:80] for name, column in make_log().items()}
 ROWS = np.arange(1200)
+STATES = make_log()["observation"]
 
 
 @pytest.mark.parametrize(
@@ -47,48 +46,22 @@ ROWS = np.arange(1200)
         (FEW, "only 78 rows"),
         (make_log(reward=np.full(1200, 2.0)), "reward is 2 in every row: all policies"),
         (
-            make_log(action=np.full((1200, 1), 0.7)),
-            r"action\[0\] is 0.7 in every row: n",
-        ),
-        (
-            make_log(observation=make_log()["observation"] * [1, 0] + [0, 5]),
-            r"observation\[1\] is 5 in every row: it says nothing",
-        ),
-        (
-            make_log(observation=make_log()["observation"] * [1, 1e-4]),
-            r"observation\[1\] has a standard deviation of \S+ and is divided by 0.001",
-        ),
-        (
             make_log(action=np.sign(make_log()["action"])),
             "at one of its bounds in 100%",
         ),
-        (make_log(action=0.1 * make_log()["action"]), r"uses 9% of the way to its bou"),
         (
             make_log(terminated=make_log()["truncated"], truncated=ROWS < 0),
             "all 30 episodes are terminated after 40 steps, like at a time limit",
         ),
-        (
-            make_log(truncated=None, episode=ROWS // 40),
-            "none of the 30 episodes has a f",
-        ),
+        (make_log(truncated=None, episode=ROWS // 40), "none of the 30 episodes has a"),
         (make_log(truncated=None, episode=ROWS * 0), "all rows are one episode"),
-        (
-            make_log(observation=np.repeat(make_log()["observation"][:600], 2, 0)),
-            "in 51% of the rows the next state is the state itself",
-        ),
+        (make_log(observation=np.repeat(STATES[:600], 2, 0)), "in 51% of the rows the"),
         (make_log(truncated=ROWS % 5 == 4), "240 of 1,200 rows are dropped"),
-        (
-            make_log(next_observation=make_log()["observation"] + 1),
-            "after 100% of the rows the next row does not begin where this one ended",
-        ),
-        (
-            make_log(observation=np.c_[make_log()["observation"][:, 0], 1.7e9 + ROWS]),
-            r"entry 1 of 'observation' changes 1,199 times .* vanish in float32",
-        ),
+        (make_log(next_observation=STATES + 1), "after 100% of the rows the next row"),
     ],
 )
-def test_what_looks_wrong_is_said(columns, message):
-    assert [each for each in said(columns) if re.search(message, each)]
+def test_findings_name_what_looks_wrong(columns, message):
+    assert [each for each in said(columns) if message in each]
 
 
 def test_ranges_are_those_that_pandas_finds():

@@ -7,12 +7,8 @@ from contextlib import closing
 import gymnasium
 import numpy as np
 import pytest
-from recorded_logs import columns_of
 
-from torchrl_osr.lab.data import (
-    load_dataset,
-    write_memmap,
-)
+from torchrl_osr.lab.data import load_dataset, write_memmap
 from torchrl_osr.lab.data.environment import open_environment
 from torchrl_osr.lab.data.record import record_episodes, write_log
 
@@ -56,7 +52,7 @@ def test_what_is_written_is_read_in_the_units_of_the_losses(suffix, tmp_path):
     assert (manifest["num_complete_episodes"], manifest["dropped_rows"]) == (2, 0)
     assert manifest["normalized_score"] is None
     assert list(path.parent.iterdir()) == [path], "nothing is left beside it"
-    with pytest.raises(FileExistsError, match="is not replaced"):
+    with pytest.raises(FileExistsError, match="exists"):
         write_log(path, columns)
 
 
@@ -69,14 +65,12 @@ def test_discrete_actions_are_numbers_in_the_log_and_one_hot_in_the_data(tmp_pat
     data, _ = load_dataset("CartPole-v1", "file", **options)
     np.testing.assert_array_equal(data["action"], np.eye(2)[columns["action"]])
     write_memmap([data], tmp_path / "set", progress=False)
-    again, _ = load_dataset(
-        "CartPole-v1", "file", env_id="CartPole-v1", path=str(tmp_path / "set")
-    )
-    assert (again == data).all()
+    options["path"] = str(tmp_path / "set")
+    assert (load_dataset("CartPole-v1", "file", **options)[0] == data).all()
     data["action"] *= 0.5
     write_memmap([data], tmp_path / "set", progress=False)
     with pytest.raises(ValueError, match="discrete"):
-        load_dataset("x", "file", env_id="CartPole-v1", path=str(tmp_path / "set"))
+        load_dataset("x", "file", **options)
 
 
 def test_noise_stays_within_the_bounds_and_zero_is_none():
@@ -98,15 +92,7 @@ def test_noise_stays_within_the_bounds_and_zero_is_none():
     ("env_id", "act", "options", "message"),
     [
         ("Pendulum-v1", lambda _: [2.5], {}, r"action \[2.5\] .* is not in"),
-        (
-            "Pendulum-v1",
-            lambda _: [0.0, 0.0],
-            {},
-            r"of shape \(2,\) is not in",
-        ),
-        ("CartPole-v1", lambda _: 2, {}, r"action 2 of shape \(\) is not in"),
         ("Pendulum-v1", None, {"episodes": 0}, "at least 1 episode"),
-        ("Pendulum-v1", None, {"noise": -1.0}, "noise from 0"),
         ("CartPole-v1", None, {"noise": 1.5}, "noise from 0 to 1"),
     ],
 )
@@ -121,54 +107,19 @@ def test_data_of_another_environment_are_refused_with_sizes_and_bounds(tmp_path)
     message = r"3 observation and 1 action entries, .* has 4 and 1 \(real\)"
     with pytest.raises(ValueError, match=message):
         load_dataset("x", "file", env_id="InvertedPendulum-v5", path=path)
-    wide = columns_of(load_dataset(path=path, action_bounds=(-2, 2))[0])
-    wide["action"] = wide["action"] * 5
-    np.savez(tmp_path / "wide.npz", **wide)
-    with pytest.raises(ValueError, match=r"leaves its bounds.*\[-2.0\] and \[2.0\]"):
-        load_dataset("x", "file", env_id="Pendulum-v1", path=str(tmp_path / "wide.npz"))
 
 
-class Strange(gymnasium.Env):
-    """Gives what no log may hold after some steps."""
-
-    observation_space = gymnasium.spaces.Box(-9, 9, (2,), np.float64)
-    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
-    wrong = None
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.steps = 0
-        return np.array([1.0, 2.0]), {}
-
-    def step(self, action):
-        self.steps += 1
-        found = {"observation": np.array([1.0, self.steps]), "reward": 0.0}
-        if self.steps == 3:
-            found |= self.wrong or {}
-        ended = self.steps == 5
-        return found["observation"], found["reward"], False, ended, {}
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"reward": np.nan},
-        {"reward": np.ones(2)},
-        {"observation": np.ones(3)},
-        {"observation": np.array([1, np.inf])},
-    ],
-)
-def test_a_step_that_no_log_may_hold_is_named(wrong):
-    env = Strange()
-    env.wrong = wrong
-    with pytest.raises(ValueError, match="step 3 of .*Strange.* expected finite"):
-        record_episodes(env, None, 2, progress=False)
+def test_a_step_without_finite_numbers_is_an_error():
+    env = open_environment("Pendulum-v1")
+    strange = gymnasium.wrappers.TransformReward(env, lambda _: np.nan)
+    with closing(strange), pytest.raises(ValueError, match="step 1 .* expected finite"):
+        record_episodes(strange, None, 1, progress=False)
 
 
 def test_a_policy_that_writes_into_its_argument_changes_no_log():
-    def normalise(observation):
+    def spoil(observation):
         observation /= 100
-        return [0.5]
+        return forwards(observation)
 
-    columns = record_episodes(Strange(), normalise, 1, progress=False)
-    assert columns["observation"].tolist() == [[1, 2], [1, 1], [1, 2], [1, 3], [1, 4]]
+    clean, spoilt = record("Pendulum-v1", forwards, 1), record("Pendulum-v1", spoil, 1)
+    assert (clean["observation"] == spoilt["observation"]).all()

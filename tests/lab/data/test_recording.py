@@ -68,18 +68,6 @@ def test_parts_of_any_size_give_the_same(tmp_path_factory, columns, rows):
     assert manifest.items() <= described.items()
 
 
-def test_errors_name_the_rows_and_the_file(tmp_path, monkeypatch):
-    columns = make_columns()
-    columns["reward"][250] = np.inf
-    path = save(tmp_path / "log.parquet", columns)
-    monkeypatch.setattr(recording, "CHUNK_ROWS", 50)
-    message = (
-        r"log.parquet: in the rows from 240 on: 'reward' holds inf in row 10 of 40"
-    )
-    with pytest.raises(ValueError, match=message):
-        load_dataset(path=path, on_disk=True)
-
-
 def test_options_are_part_of_the_cached_set(tmp_path, cache):
     path = save(tmp_path / "log.npz", make_columns())
     for bounds in ((-1, 1), (-2, 2), (-1, 1)):

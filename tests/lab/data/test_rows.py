@@ -29,22 +29,17 @@ def numbered(rows: int, start: int = 0) -> TensorDict:
 @given(rows=st.integers(1, 50), share=st.floats(0, 1), seed=st.integers(0, 1000))
 def test_rows_are_drawn_without_replacement_in_exact_shares(rows, share, seed) -> None:
     mixed = mix_datasets(
-        numbered(rows), numbered(60, start=100), random_share=share, seed=seed
-    )["row"].tolist()
+        numbered(rows), numbered(60, 100), random_share=share, seed=seed
+    )
+    mixed = mixed["row"].tolist()
     number = round(share * rows)
     assert len(mixed) == len(set(mixed)) == rows
     assert sum(row >= 100 for row in mixed) == number
     assert all(row < rows for row in mixed[: rows - number])
     again = mix_datasets(
-        numbered(rows), numbered(60, start=100), random_share=share, seed=seed
+        numbered(rows), numbered(60, 100), random_share=share, seed=seed
     )
     assert again["row"].tolist() == mixed
-
-
-@pytest.mark.parametrize("share", [-0.1, 1.1])
-def test_a_share_out_of_range_is_refused(share) -> None:
-    with pytest.raises(ValueError, match=rf"random_share={share} .*from 0 to 1"):
-        mix_datasets(numbered(10), numbered(10), random_share=share, seed=0)
 
 
 def test_too_few_random_rows_are_refused() -> None:
@@ -63,12 +58,6 @@ def test_split_keeps_every_row_once(held_out: int | float, expected: int) -> Non
     assert torch.equal(both.sort().values, torch.arange(50))
     assert torch.equal(train["row"], again["row"])
     assert not torch.equal(train["row"], other["row"])
-
-
-@pytest.mark.parametrize("held_out", [0, 50, 0.0, 1.0, -1])
-def test_split_with_an_empty_side_is_refused(held_out: int | float) -> None:
-    with pytest.raises(ValueError, match="at least one row on each side"):
-        split_held_out(numbered(50), held_out, seed=0)
 
 
 @tried(20)

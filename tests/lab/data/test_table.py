@@ -64,12 +64,8 @@ def test_all_kinds_of_files_hold_the_same(tmp_path, ending):
     data, manifest = load_dataset(path=path)
     assert (data == expected).all()
     assert about.items() <= (manifest | {"data_sha256": []}).items()
-    for damaged in (b"", b"nothing", path.read_bytes()[:2000]):
-        path.write_bytes(damaged)
-        with pytest.raises(ValueError, match=r"log\.\w+ (cannot be read|is no)"):
-            load_dataset(path=path)
-    path.unlink()
-    with pytest.raises(FileNotFoundError, match="there is no file"):
+    path.write_bytes(path.read_bytes()[:2000])
+    with pytest.raises(ValueError, match=r"log\.\w+ (cannot be read|is no)"):
         load_dataset(path=path)
 
 
@@ -81,21 +77,20 @@ def test_usual_names_need_no_word(write):
 
 
 @pytest.mark.parametrize(
-    ("options", "encoding"),
+    ("name", "encoding", "options"),
     [
-        ({"sep": ";"}, "utf-8"),
-        ({"sep": ";", "decimal": ","}, "utf-8"),
-        ({"sep": "\t", "decimal": ","}, "utf-16"),
-        ({}, "cp1252"),
-        ({}, "utf-8-sig"),
+        ("log.csv", "utf-8", {"sep": ";"}),
+        ("log.csv.gz", "utf-8", {"sep": ";", "decimal": ","}),
+        ("log.csv", "utf-16", {"sep": "\t", "decimal": ","}),
+        ("log.csv", "cp1252", {}),
+        ("log.csv.gz", "utf-8-sig", {}),
     ],
 )
-@pytest.mark.parametrize("ending", ["csv", "csv.gz"])
 def test_separators_decimals_and_encodings_are_detected(
-    tmp_path, options, encoding, ending
+    tmp_path, name, encoding, options
 ):
     frame = robot().rename(columns={"theta": "Größe"})
-    path = tmp_path / f"log.{ending}"
+    path = tmp_path / name
     frame.to_csv(path, index=False, encoding=encoding, **options)
     names = WANTED | {"observation": ["x", "Größe", "v"]}
     data, manifest = load_dataset(path=path, columns=names)
@@ -173,8 +168,6 @@ def test_several_files_are_one_log(tmp_path):
 
 def test_a_task_that_never_ends(write):
     frame = robot().drop(columns="fell")
-    with pytest.raises(ValueError, match="lack terminated; .*terminated=false if noth"):
-        load_dataset(path=write(frame), columns=NAMED | {"reward": "cost"})
     wanted = WANTED | {"terminated": False}
     data, manifest = load_dataset(path=write(frame), columns=wanted)
     assert not data["next", "terminated"].any()
@@ -192,17 +185,12 @@ def test_rows_with_missing_values_can_be_left_out(write):
 @pytest.mark.parametrize(
     ("changes", "columns", "message"),
     [
-        ({"u": "fast"}, {}, "'u' holds 'fast' in row 0 of 120; expected numbers"),
-        ({"run": ["a"] * 60 + [None] * 60}, {}, "'episode' has no value in row 60"),
+        ({"u": "fast"}, {}, "'u' holds other than numbers: .*fast"),
         ({"fell": [0.0] * 119 + [0.5]}, {}, "'terminated' holds 0.5 in row 119"),
-        ({"w": 7.0}, {}, r"'action' leaves its bounds in 120 .*data\.action_bounds"),
         ({}, {"action": "force"}, r"columns\.action=force names no column; expected"),
         ({}, {"action": "x"}, "column 'x' is read twice"),
-        ({}, {"reward": "*"}, r"columns.reward=\* names x, .*expected one of"),
-        ({}, {"speed": "v"}, "data.columns has no speed"),
-        ({}, {"episode": None}, "the data lack truncated or episode; the file"),
-        ({}, {"episode": None, "step": "tick"}, "lack episode"),
-        ({"done": 0}, {"terminated": None}, "data.columns.terminated=done if the task"),
+        ({}, {"episode": None}, "the data lack truncated or episode; there"),
+        ({}, {"terminated": None}, "lack terminated; .*terminated=false if noth"),
     ],
 )
 def test_a_wrong_log_is_one_sentence(write, changes, columns, message):
@@ -227,30 +215,11 @@ def test_entries_are_in_the_order_of_their_numbers(names, named):
     assert find_columns([*names, *others], asked)["observation"] == names
 
 
-def test_a_missing_entry_of_a_vector_is_named():
-    names = ["act", "reward", "terminal", "timeout", "obs_1", f"obs_{10**18}"]
-    with pytest.raises(ValueError, match="but none with the number 2:"):
-        find_columns(names, {})
-    names = [
-        "obs_pos_1",
-        "obs_vel_1",
-        "obs_pos_0",
-        "act",
-        "reward",
-        "terminal",
-        "timeout",
-    ]
-    assert find_columns(names, {})["observation"] == names[:3], "no common numbering"
-
-
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "expected the names of at least two columns"),
         (b",obs_0,action\n0,1,2\n", "expected the names of at least two columns"),
-        (b"0.1,0.2,0.3\n1,2,3\n", "the file has 0.1, 0.2, 0.3"),
         (b"obs_0,action,reward,reward\n1,2,3,4\n", "two columns have one name"),
-        (b"obs_0,action,reward,terminated,episode\n", "the data hold no rows"),
         (b"obs_0,action,reward,terminated,episode\n1,.2,3,0,0,9\n", "cannot be read"),
         (b"obs_0,action,reward,terminated,episode\n1,.2,3\n", "no value in row 0"),
     ],
@@ -261,32 +230,12 @@ def test_wrong_csv_files_are_refused(tmp_path, content, message):
         load_dataset(path=tmp_path / "log.csv")
 
 
-def test_episodes_with_names_are_told_apart(tmp_path):
-    frame = flat(make_columns(24)).drop(columns="truncated")
-    frame["episode"] = ["007"] * 10 + ["0"] * 4 + ["a"] * 10
-    frame.to_csv(tmp_path / "log.csv", index=False)
-    _, manifest = load_dataset(path=tmp_path / "log.csv")
-    lengths = manifest["episode_lengths"] + manifest["incomplete_lengths"]
-    assert sorted(lengths) == [4, 10, 10]
-
-
-@pytest.mark.parametrize(
-    ("name", "column", "message"),
-    [
-        ("action", [[0.1], [0.2, 0.3]] * 30, "holds lists of the lengths"),
-        (
-            "action",
-            [[0.1, 0.2]] * 59 + [[0.1, None]],
-            "'action' has no value in row 59",
-        ),
-        ("reward", [1.0] * 59 + [None], "'reward' has no value in row 59"),
-    ],
-)
-def test_lists_in_parquet_have_one_length(tmp_path, name, column, message):
+def test_lists_in_parquet_have_one_length(tmp_path):
     path = tmp_path / "log.parquet"
     columns = {k: list(v) if v.ndim > 1 else v for k, v in make_columns(60).items()}
-    parquet.write_table(pyarrow.table(columns | {name: column}), path)
-    with pytest.raises(ValueError, match=message):
+    columns["action"] = [[0.1], [0.2, 0.3, 0.1]] * 30
+    parquet.write_table(pyarrow.table(columns), path)
+    with pytest.raises(ValueError, match="holds lists of the lengths"):
         load_dataset(path=path)
 
 

@@ -3,8 +3,7 @@
 The forward pass is NumPy: for a single observation it costs a quarter of a torch call,
 and a roll-out makes hundreds of thousands of them.
 
-Shapes: ``B`` batch, ``S`` observation, ``A`` action, ``H`` hidden width. Weights are
-``[out, in]``, as in :class:`torch.nn.Linear`.
+Shapes: ``B`` batch, ``S`` observation, ``A`` action, ``H`` hidden width.
 """
 
 from __future__ import annotations
@@ -34,8 +33,7 @@ class Affine(NamedTuple):
     bias: FloatArray
 
     def __call__(self, inputs: FloatArray) -> FloatArray:
-        outputs: FloatArray = inputs @ self.weight.T + self.bias
-        return outputs
+        return np.asarray(inputs @ self.weight.T + self.bias)
 
 
 @dataclass(frozen=True)
@@ -45,11 +43,7 @@ class BehaviorPolicy:
     .. math::
         a = \tanh(\mu(s) + \sigma(s)\,\epsilon), \quad \epsilon \sim N(0, I)
 
-    Args:
-        hidden0: first hidden layer, weight ``[H, S]``.
-        hidden1: second hidden layer, weight ``[H, H]``.
-        mean: head of the pre-tanh mean, weight ``[A, H]``.
-        log_std: head of the log standard deviation, weight ``[A, H]``.
+    Layers have weights ``[H, S]``, ``[H, H]`` and twice ``[A, H]``.
 
     Examples:
         >>> import numpy as np
@@ -64,49 +58,26 @@ class BehaviorPolicy:
     mean: Affine
     log_std: Affine
 
-    @property
-    def observation_size(self) -> int:
-        """Number of observation entries ``S``."""
-        return int(self.hidden0.weight.shape[1])
-
-    @property
-    def action_size(self) -> int:
-        """Number of action entries ``A``."""
-        return int(self.mean.weight.shape[0])
-
-    def sample(
-        self, observation: NDArray[np.floating[Any]], rng: np.random.Generator
-    ) -> FloatArray:
-        """Random actions ``[A]`` or ``[B, A]`` in -1 to 1, float32.
-
-        Args:
-            observation: ``[S]`` or ``[B, S]``, not standardised.
-            rng: source of the noise.
-        """
+    def sample(self, observation: NDArray[Any], rng: np.random.Generator) -> FloatArray:
+        """Random actions ``[A]`` or ``[B, A]`` for states that are not standardised."""
         features = self._features(observation)
         loc = self.mean(features)
         log_std = np.clip(self.log_std(features), LOG_STD_MIN, LOG_STD_MAX)
         noise = rng.standard_normal(loc.shape, dtype=np.float32)
-        action: FloatArray = np.tanh(loc + np.exp(log_std) * noise)
-        return action
+        return np.asarray(np.tanh(loc + np.exp(log_std) * noise))
 
-    def deterministic(self, observation: NDArray[np.floating[Any]]) -> FloatArray:
+    def deterministic(self, observation: NDArray[Any]) -> FloatArray:
         """Squashed mean actions ``[A]`` or ``[B, A]``, see :meth:`sample`."""
-        action: FloatArray = np.tanh(self.mean(self._features(observation)))
-        return action
+        return np.asarray(np.tanh(self.mean(self._features(observation))))
 
-    def _features(self, observation: NDArray[np.floating[Any]]) -> FloatArray:
+    def _features(self, observation: NDArray[Any]) -> FloatArray:
         inputs = np.asarray(observation, dtype=np.float32)
         hidden = np.maximum(self.hidden0(inputs), np.float32(0))
         return np.maximum(self.hidden1(hidden), np.float32(0))
 
 
 def load_behavior_card(folder: Path | str | None = None) -> dict[str, Any]:
-    """``card.json``: ``{env_name: {"env": id, "policies": {policy_name: {...}}}}``.
-
-    Args:
-        folder: of the card. Default: the policies of the package.
-    """
+    """``card.json``: ``{env_name: {"env": id, "policies": {policy_name: {...}}}}``."""
     return read_json(Path(folder or BEHAVIOR_POLICIES_DIR) / "card.json")
 
 
@@ -138,14 +109,10 @@ def load_behavior_policy(
             ``examples/train_behavior.py`` writes it. Default: the policies of the
             package.
 
-    Raises:
-        ValueError: unknown name (the message lists the known ones), or a damaged file.
     """
     arrays = read_arrays(behavior_policy_path(env_name, policy_name, folder))
-
-    def layer(name: str) -> Affine:
-        parts = (arrays[f"{name}.{part}"] for part in Affine._fields)
-        return Affine(*(part.astype(np.float32) for part in parts))
-
-    names = [each.name for each in fields(BehaviorPolicy)]
-    return BehaviorPolicy(**{name: layer(name) for name in names})
+    arrays = {name: array.astype(np.float32) for name, array in arrays.items()}
+    layers = (each.name for each in fields(BehaviorPolicy))
+    return BehaviorPolicy(
+        *(Affine(arrays[f"{n}.weight"], arrays[f"{n}.bias"]) for n in layers)
+    )

@@ -1,7 +1,4 @@
-"""Replay buffers of offline data.
-
-Shapes: ``N`` rows of the data set, ``B`` batch.
-"""
+"""Replay buffers of offline data, in memory or memory-mapped."""
 
 from __future__ import annotations
 
@@ -24,8 +21,7 @@ Reader = Callable[[TensorDictBase, Tensor], TensorDictBase]
 class MemmapStorage(Storage):
     """Rows of a memory-mapped set as the storage of a replay buffer, read-only.
 
-    The draws are made on the device of the batches, so that they are those of a buffer
-    that holds the rows there. See :func:`make_replay_buffer` for the arguments.
+    Draws are made on the device of the batches, like those of a buffer in memory.
     """
 
     def __init__(
@@ -82,12 +78,11 @@ def make_replay_buffer(
     Keyword Args:
         batch_size: rows per ``sample()``.
         seed: of the sampling.
-        left_out: sorted numbers of memory-mapped rows that are not drawn, see
-            :func:`~torchrl_osr.lab.data.rows.held_out_rows`. Default: none.
-        transform: applied to each sampled batch. Default: none.
+        left_out: sorted numbers of memory-mapped rows that are not drawn.
+        transform: applied to each sampled batch.
         device: of the rows and the sampling, or, of a memory-mapped set, of the
             batches. Default: the device of ``data``, or CPU if it has none.
-        read: returns rows of memory-mapped data by their numbers. Default: as they are.
+        read: returns rows of memory-mapped data by their numbers.
 
     Examples:
         >>> import torch
@@ -98,11 +93,8 @@ def make_replay_buffer(
         >>> buffer.sample()["observation"].shape
         torch.Size([8, 3])
     """
-    if data.ndim != 1 or data.shape[0] == 0:
-        raise ValueError(
-            f"data has batch size {list(data.shape)}; "
-            "expected a flat [N] with at least one row."
-        )
+    if data.ndim != 1 or not len(data):
+        raise ValueError(f"data has batch size {[*data.shape]}; expected [N], N > 0.")
     device = torch.device(device or data.device or "cpu")
     options: dict[str, Any] = {
         "batch_size": batch_size,
@@ -118,8 +110,7 @@ def make_replay_buffer(
         )
     if left_out is not None or read is not None:
         raise ValueError("left_out and read are for memory-mapped data.")
-    buffer = ReplayBuffer(
-        storage=LazyTensorStorage(data.shape[0], device=device), **options
-    )
+    storage = LazyTensorStorage(len(data), device=device)
+    buffer = ReplayBuffer(storage=storage, **options)
     buffer.extend(data.to(device))
     return buffer

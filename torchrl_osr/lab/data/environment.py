@@ -50,11 +50,7 @@ def environment_id(env_name: str) -> str:
 
 
 def environment_name(env_id: str) -> str:
-    """Short name of a task, which its behaviour policies and reference returns have.
-
-    Of another task it is the id, without the module that registers it and with ``-``
-    for what has no place in a folder's name.
-    """
+    """Short name of a known task; of another one its id, as a folder can be called."""
     names = {known: name for name, known in _known_ids().items()}
     return names.get(env_id) or re.sub(r"[^\w.-]", "-", env_id.split(":")[-1])
 
@@ -66,12 +62,8 @@ def _known_ids() -> dict[str, str]:
 class EnvironmentSpec(NamedTuple):
     """Sizes and action bounds of a task, which data and networks must fit.
 
-    Attributes:
-        observation_size: numbers of an observation, ``S``.
-        action_size: numbers of an action, or the number of discrete actions, ``A``.
-        action_low, action_high: bounds in the task's own units, ``A`` numbers; ``None``
-            if actions are discrete.
-        simulated: whether it can be played; an environment without ``step`` cannot.
+    ``action_size`` numbers are an action, or discrete ones are numbered below it; these
+    have no bounds. A task that is not ``simulated`` cannot be played.
     """
 
     observation_size: int
@@ -118,19 +110,11 @@ def check_simulated(env: gymnasium.Env[Any, Any], env_id: str) -> None:
 
 
 def make_environment(env_id: str) -> gymnasium.Env[Any, Any]:
-    """Make a Gymnasium task with the actions that the losses and the data have.
-
-    Real actions are rescaled to -1 and 1, unless these are their bounds already.
-
-    Args:
-        env_id: see :func:`open_environment`, also for the errors.
-    """
+    """Make a Gymnasium task; real actions are rescaled to -1 and 1."""
     env = open_environment(env_id)
     actions: Any = env.action_space
-    if (
-        isinstance(actions, spaces.Box)
-        and ((actions.low != -1) | (actions.high != 1)).any()
-    ):
+    box = isinstance(actions, spaces.Box)
+    if box and ((actions.low != -1) | (actions.high != 1)).any():
         env = gymnasium.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
     return env
 
@@ -148,7 +132,6 @@ def open_environment(env_id: str) -> gymnasium.Env[Any, Any]:
     Raises:
         ValueError: there is no such task, its observations are no real vectors, or its
             actions neither real vectors with finite bounds nor numbered from 0.
-        ImportError: a package that the task needs is not installed.
     """
     env = _found(env_id)
     if isinstance(env.observation_space, (spaces.Dict, spaces.Tuple)):
@@ -165,31 +148,22 @@ def open_environment(env_id: str) -> gymnasium.Env[Any, Any]:
     bounded = _is_real_vector(actions) and actions.is_bounded()
     numbered = isinstance(actions, spaces.Discrete) and actions.start == 0
     if not _is_real_vector(env.observation_space):
-        flaw = (
-            f"observations {env.observation_space}; expected a vector of real numbers"
-        )
+        flaw = f"observations {env.observation_space}; expected a real vector"
     elif not bounded and not numbered:
         flaw = f"actions {actions}; expected bounded real numbers, or Discrete from 0"
     else:
         limited = env.spec is not None and env.spec.max_episode_steps is not None
         return env if limited else gymnasium.wrappers.TimeLimit(env, MAX_EPISODE)
     raise ValueError(
-        f"{env_id} has {flaw}: change it in a wrapper, such as Gymnasium's ClipAction "
-        "or TransformAction, and register the wrapped environment."
+        f"{env_id} has {flaw}: register it with a wrapper that changes it."
     )
 
 
 def observation_leaves(space: spaces.Space[Any]) -> Leaves:
-    """Entries of an observation in the order in which they make up its vector.
+    """Space of each entry of an observation, by its path of keys.
 
-    Environments, data and policies all have this order: the keys of a dictionary
+    Environments, data and policies have this order: the keys of a dictionary
     alphabetically on every level, the parts of a tuple as they are.
-
-    Returns:
-        The space of each entry, by its path of keys.
-
-    Raises:
-        ValueError: an entry is an image, or cannot be flattened.
 
     Examples:
         >>> from gymnasium.spaces import Box, Dict
@@ -212,11 +186,8 @@ def observation_leaves(space: spaces.Space[Any]) -> Leaves:
 
 
 def _is_real_vector(space: gymnasium.Space[Any]) -> TypeGuard[spaces.Box]:
-    return (
-        isinstance(space, spaces.Box)
-        and len(space.shape) == 1
-        and np.issubdtype(space.dtype, np.floating)
-    )
+    vector = isinstance(space, spaces.Box) and len(space.shape) == 1
+    return vector and np.issubdtype(space.dtype, np.floating)
 
 
 def _found(env_id: str) -> gymnasium.Env[Any, Any]:
@@ -225,7 +196,11 @@ def _found(env_id: str) -> gymnasium.Env[Any, Any]:
         try:
             return _make(env_id)
         except gymnasium.error.NameNotFound as error:
-            _register_robotics(env_id, error)
+            what = f"Gymnasium has no {env_id!r} ({error}); gymnasium-robotics needs"
+            # Importing it prints a note on hands to standard error.
+            with needed_by(what, "mazes"), redirect_stderr(io.StringIO()):
+                import gymnasium_robotics
+            gymnasium.register_envs(gymnasium_robotics)
             return _make(env_id)
     except (gymnasium.error.Error, ModuleNotFoundError) as error:
         missing = gymnasium.error.DependencyNotInstalled, ModuleNotFoundError
@@ -241,23 +216,13 @@ def _make(env_id: str) -> gymnasium.Env[Any, Any]:
     # Without it an episode never ends at the goal, and the return is no success.
     options = {"continuing_task": False} if spec and "maze_map" in spec.kwargs else {}
     with _silent_model_loading(), warnings.catch_warnings():
-        # On purpose, see MAZE_IDS.
-        warnings.filterwarnings(
-            "ignore", r".*AntMaze_\w+-v4 is out of date", DeprecationWarning
-        )
+        old_ant = r".*AntMaze_\w+-v4 is out of date"  # on purpose, see MAZE_IDS
+        warnings.filterwarnings("ignore", old_ant, DeprecationWarning)
         env: gymnasium.Env[Any, Any] = gymnasium.make(env_id, **options)
     if env_id in MAZE_IDS.values():
         # The model's file, which is loaded now and would be left for ever.
         Path(env.get_wrapper_attr("tmp_xml_file_path")).unlink(missing_ok=True)
     return env
-
-
-def _register_robotics(env_id: str, unknown: Exception) -> None:
-    what = f"Gymnasium itself has no {env_id!r} ({unknown}); gymnasium-robotics needs"
-    # Importing it prints a note on hands that were changed, to standard error.
-    with needed_by(what, "mazes"), redirect_stderr(io.StringIO()):
-        import gymnasium_robotics
-    gymnasium.register_envs(gymnasium_robotics)
 
 
 @contextmanager

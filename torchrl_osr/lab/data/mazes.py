@@ -1,9 +1,7 @@
 """A point that finds its way through a maze: the behaviour of the maze data sets.
 
-A planner gives the next cell, a controller pushes the point towards it. Both know only
-the observation, so that the behaviour has no memory.
-
-A step of the planner leads to one of the four cells beside a cell.
+A planner gives the next of the four cells beside a cell, a controller pushes the point
+towards it. Both know only the observation, so that the behaviour has no memory.
 """
 
 from __future__ import annotations
@@ -23,8 +21,9 @@ ActionSampler = Callable[[NDArray[Any], np.random.Generator], NDArray[np.float32
 Cell = tuple[int, int]
 """Row and column."""
 
+# Start and goal are two different free cells, as the environment itself draws them, or
+# a pair of PLAY_CELLS. The environment moves both within their cells.
 MAZE_SOURCES = ("diverse", "play")
-"""What is rolled out in the mazes: how start and goal are chosen."""
 
 # Row and column of start and goal, picked by hand: long ways, from and to all corners.
 PLAY_CELLS: dict[str, list[tuple[Cell, Cell]]] = {
@@ -49,14 +48,7 @@ ACTION_NOISE = 0.5
 
 
 def maze_behavior(env_name: str, source: str) -> dict[str, Any]:
-    """Entries of the manifest that determine a maze set.
-
-    Args:
-        env_name: short name of the maze.
-        source: ``"diverse"``: start and goal are two different free cells, as the
-            environment itself draws them; ``"play"``: a pair of :data:`PLAY_CELLS`. The
-            environment moves both within their cells.
-    """
+    """Entries of the manifest that determine a maze set."""
     known = MAZE_SOURCES if env_name in PLAY_CELLS else ("diverse",)
     if env_name.startswith("antmaze"):
         known = ("minari",)  # no policy that walks ships with the package
@@ -64,12 +56,11 @@ def maze_behavior(env_name: str, source: str) -> dict[str, Any]:
         raise ValueError(
             f"unknown data={source} of {env_name}; there are: {', '.join(known)}."
         )
-    pairs = PLAY_CELLS[env_name] if source == "play" else None
     return {
         "stiffness": STIFFNESS,
         "damping": DAMPING,
         "action_noise": ACTION_NOISE,
-        "cells": pairs,
+        "cells": PLAY_CELLS[env_name] if source == "play" else None,
     }
 
 
@@ -88,28 +79,20 @@ def waypoint_sampler(maze: Any) -> ActionSampler:
     free = {(i, j) for i, row in rows for j, cell in enumerate(row) if cell != 1}
 
     @cache
-    def middle_of_next(start: Cell, goal: Cell) -> NDArray[np.float64] | None:
+    def middle_of_next(start: Cell, goal: Cell) -> Any:
         path = shortest_path(free, start, goal)
-        if len(path) <= 2:
-            return None
-        middle: NDArray[np.float64] = maze.cell_rowcol_to_xy(np.array(path[1]))
-        return middle
+        return maze.cell_rowcol_to_xy(np.array(path[1])) if len(path) > 2 else None
 
-    def cell_of(position: NDArray[Any]) -> Cell:
-        row, column = maze.cell_xy_to_rowcol(position)
-        return int(row), int(column)
+    def cell_of(position: NDArray[Any]) -> Any:
+        return tuple(maze.cell_xy_to_rowcol(position).tolist())
 
-    def sample(
-        observation: NDArray[Any], rng: np.random.Generator
-    ) -> NDArray[np.float32]:
+    def sample(observation: NDArray[Any], rng: np.random.Generator) -> Any:
         position, goal, velocity = observation[:2], observation[2:4], observation[6:8]
         waypoint = middle_of_next(cell_of(position), cell_of(goal))
-        if waypoint is None:
-            waypoint = goal
+        waypoint = goal if waypoint is None else waypoint
         force = STIFFNESS * (waypoint - position) - DAMPING * velocity
         noise = ACTION_NOISE * rng.standard_normal(2)
-        action: NDArray[np.float32] = (np.clip(force, -1, 1) + noise).astype(np.float32)
-        return action
+        return (np.clip(force, -1, 1) + noise).astype(np.float32)
 
     return sample
 
@@ -138,19 +121,13 @@ def shortest_path(free: set[Cell], start: Cell, goal: Cell) -> list[Cell]:
 class StartsAndGoals(gymnasium.Wrapper[Any, Any, Any, Any]):
     """A maze that draws start and goal of each episode from pairs of cells."""
 
-    def __init__(
-        self, env: gymnasium.Env[Any, Any], pairs: Sequence[Sequence[Sequence[int]]]
-    ) -> None:
+    def __init__(self, env: gymnasium.Env[Any, Any], pairs: Sequence[Any]) -> None:
         super().__init__(env)
         self.pairs = pairs
-        self._generator = np.random.default_rng()
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        if seed is not None:
-            # Not the environment's own numbers: they move both within their cells.
-            self._generator = np.random.default_rng([seed, 1])
-        start, goal = self.pairs[int(self._generator.integers(len(self.pairs)))]
+    def reset(self, *, seed: int | None = None, **options: Any) -> Any:
+        # Not the environment's own numbers: they move both within their cells.
+        generator = np.random.default_rng(None if seed is None else [seed, 1])
+        start, goal = self.pairs[int(generator.integers(len(self.pairs)))]
         cells = {"reset_cell": np.array(start), "goal_cell": np.array(goal)}
-        return super().reset(seed=seed, options={**(options or {}), **cells})
+        return super().reset(seed=seed, options=cells)

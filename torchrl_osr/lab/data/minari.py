@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import reduce
+from itertools import chain
 from operator import getitem
 from pathlib import Path
 from typing import Any
@@ -37,19 +38,10 @@ def open_minari(
     download: bool = False,
     progress: bool = True,
 ) -> Recording:
-    """Open a Minari data set; no episode is read yet.
+    """Open a Minari data set by its id or folder; no episode is read yet.
 
-    Args:
-        path: id, such as ``"mujoco/hopper/medium-v0"``, or the folder of a set, which
-            goes first.
-        options: for the conversion; bounds of ``None`` are the set's own.
-        entries: of a dictionary, the observations to take, in this order; nested ones
-            as ``"outer/inner"``. Default: all, see
-            :func:`~torchrl_osr.lab.data.environment.observation_leaves`.
-
-    Keyword Args:
-        download: fetch a set that is not on this machine. Default: ``False``.
-        progress: show a progress bar when on a terminal. Default: ``True``.
+    Bounds of ``None`` are the set's own; ``entries`` of a dictionary are those to take,
+    in this order, nested ones as ``"outer/inner"``.
     """
     opened = _open(str(path), download)
     actions: Any = opened.action_space
@@ -82,30 +74,25 @@ def open_minari(
 
     def parts(rows: int | None) -> Iterator[dict[str, Array]]:
         waiting: list[dict[str, Array]] = []
-        for episode in _read(opened, leaves, progress):
-            waiting.append(episode)
-            if rows and sum(len(each["reward"]) for each in waiting) >= rows:
-                yield _together(waiting)
+        for episode in chain(_read(opened, leaves, progress), [None]):
+            waiting += [episode] if episode else []
+            count = sum(len(each["reward"]) for each in waiting)
+            if count and (episode is None or (rows and count >= rows)):
+                yield {n: np.concatenate([e[n] for e in waiting]) for n in waiting[0]}
                 waiting = []
-        if waiting:
-            yield _together(waiting)
 
-    files = sorted(Path(opened.storage.data_path).rglob("*"))
-    files = [file for file in files if file.is_file()]
+    paths = sorted(Path(opened.storage.data_path).rglob("*"))
+    files = [path for path in paths if path.is_file()]
     return Recording(parts, options, about, files, total=int(opened.total_steps))
 
 
 def _open(dataset: str, download: bool) -> minari.MinariDataset:
-    path = Path(dataset).expanduser()
-    here = get_dataset_path(dataset) / "data"
-    for folder in (path / "data", path):
-        if (folder / "metadata.json").is_file():
-            here = folder
-            break
-    else:
-        if download and not here.exists():
-            hosting.download_dataset(dataset)
-    if not (here / "metadata.json").is_file():
+    path, home = Path(dataset).expanduser(), get_dataset_path(dataset) / "data"
+    places = [path / "data", path, home]
+    if download and not any(place.exists() for place in places):
+        hosting.download_dataset(dataset)
+    here = next((p for p in places if (p / "metadata.json").is_file()), None)
+    if here is None:
         raise FileNotFoundError(
             f"Minari set {dataset!r} is not on this machine: fetch it with "
             "data.download=true, or give its folder."
@@ -123,18 +110,15 @@ def _read(
 ) -> Iterator[dict[str, Array]]:
     """Columns of each episode; raise if some of what the set announces is missing."""
     steps, first = 0, getattr(opened.action_space, "start", 0)
-    total, bar = opened.total_episodes, None if progress else True
-    episodes = tqdm(
-        opened.iterate_episodes(), "read", total, unit="episode", disable=bar
-    )
+    total, hidden = opened.total_episodes, None if progress else True
+    episodes = opened.iterate_episodes()
+    episodes = tqdm(episodes, "read", total, unit="episode", disable=hidden)
     for number, episode in enumerate(episodes):
         count = len(episode.rewards)
         if not count:
             continue
         steps += count
-        states = [
-            _leaf(episode.observations, name, box) for name, box in leaves.items()
-        ]
+        states = [_leaf(episode.observations, *leaf) for leaf in leaves.items()]
         observation = np.concatenate(states, axis=1)
         if len(observation) != count + 1:
             raise ValueError(
@@ -165,7 +149,3 @@ def _leaf(observations: Any, name: tuple[Any, ...], space: spaces.Space[Any]) ->
         return array.reshape(len(array), -1)
     rows: list[Any] = [spaces.flatten(space, each) for each in array]
     return np.stack(rows)
-
-
-def _together(episodes: list[dict[str, Array]]) -> dict[str, Array]:
-    return {name: np.concatenate([e[name] for e in episodes]) for name in episodes[0]}

@@ -28,14 +28,7 @@ JUMP = 20
 
 
 class Entry(NamedTuple):
-    """One number of each row: an entry of a vector, or the reward.
-
-    Attributes:
-        name: of its column in the file, or of the part and the place in it.
-        part: one of ``PARTS``.
-        missing: rows in which it is not finite; the others count below.
-        low, high, mean, deviation: in the recording's own units.
-    """
+    """An entry of a vector, or the reward; ``missing`` rows are not finite."""
 
     name: str
     part: str
@@ -49,13 +42,7 @@ class Entry(NamedTuple):
 def describe_entries(
     rows: Iterable[Mapping[str, Any]], columns: Mapping[str, Sequence[str]]
 ) -> list[Entry]:
-    """Range, mean and deviation of every entry.
-
-    Args:
-        rows: some rows at a time, ``observation`` ``[n, S]``, ``action`` ``[n, A]``
-            and ``reward`` ``[n]``, as they were recorded.
-        columns: names of the file's columns, by part. Default names are numbered.
-    """
+    """Range, mean and deviation of every entry, in the recording's own units."""
     entries, chunks = [], [some for some in rows if len(some["reward"])]
     for part in PARTS:
         arrays = [np.reshape(some[part], (len(some[part]), -1)) for some in chunks]
@@ -92,20 +79,18 @@ def findings(
 
 
 def _about_entries(entries: Sequence[Entry]) -> Iterator[str]:
+    constant = {
+        "observation": "it says nothing about the state.",
+        "action": "nothing can be learnt about its effect.",
+        "reward": "all policies are equally good (data.columns.reward=...).",
+    }
     for name, part, _, low, _, _, deviation in entries:
         if deviation == 0:
-            constant = {
-                "observation": "it says nothing about the state.",
-                "action": "nothing can be learnt about its effect.",
-                "reward": "all policies are equally good; name another column "
-                "(data.columns.reward=...).",
-            }
             yield f"{name} is {low:g} in every row: {constant[part]}"
         elif part == "observation" and deviation < MIN_OBSERVATION_SCALE:
             yield (
                 f"{name} has a standard deviation of {deviation:.2g} and is divided by "
-                f"{MIN_OBSERVATION_SCALE} when standardised, which leaves it small: "
-                "record it in a smaller unit."
+                f"{MIN_OBSERVATION_SCALE}, which leaves it small: use a smaller unit."
             )
 
 
@@ -115,15 +100,13 @@ def _about_actions(data: TensorDict, names: Sequence[str]) -> Iterator[str]:
     for name, most, bound in zip(names, largest, at_bounds, strict=True):
         if bound > MOST:
             yield (
-                f"{name} is at one of its bounds in {bound:.0%} of the rows: unless "
-                "the controller switches between them, the bounds are too narrow "
-                "(data.action_bounds=[low,high])."
+                f"{name} is at one of its bounds in {bound:.0%} of the rows: they may "
+                "be too narrow (data.action_bounds=[low,high])."
             )
         elif most < MOST:
             yield (
-                f"{name} uses {most:.0%} of the way to its bounds: if it was recorded "
-                "in another unit, give the bounds in that unit "
-                "(data.action_bounds=[low,high])."
+                f"{name} uses {most:.0%} of the way to its bounds: they may be in "
+                "another unit (data.action_bounds=[low,high])."
             )
 
 
@@ -134,26 +117,20 @@ def actions_at_bounds(data: TensorDict) -> Tensor:
 
 
 def _about_episodes(manifest: Mapping[str, Any]) -> Iterator[str]:
-    fell, cut, unmarked = (
-        manifest[f"{kind}_ends"] for kind in ("terminated", "truncated", "unmarked")
-    )
+    kinds = ("terminated", "truncated", "unmarked")
+    fell, cut, unmarked = (manifest[f"{kind}_ends"] for kind in kinds)
     lengths = manifest["episode_lengths"]
     if fell + cut + unmarked == 1:
-        yield (
-            "all rows are one episode: if there were more, name the column that tells "
-            "them apart (data.columns.episode=...)."
-        )
+        yield "all rows are one episode: are there more (data.columns.episode=...)?"
     elif fell > 2 and not cut + unmarked and len(set(lengths)) == 1:
         yield (
             f"all {fell} episodes are terminated after {lengths[0]} steps, like at a "
-            "time limit: name the column as truncated "
-            "(data.columns.truncated=... data.columns.terminated=false)."
+            "time limit (data.columns.truncated=... data.columns.terminated=false)."
         )
     elif unmarked > 1 and not fell + cut:
         yield (
-            f"none of the {unmarked} episodes has a flag at its end, so that they "
-            "count as cut and have no return: if they are whole, add a column that is "
-            "1 in their last rows (data.columns.truncated=...)."
+            f"none of the {unmarked} episodes has a flag at its end: they count as cut "
+            "and have no return. Mark their last rows (data.columns.truncated=...)."
         )
 
 
@@ -168,19 +145,16 @@ def _about_next_states(data: TensorDict, manifest: Mapping[str, Any]) -> Iterato
     dropped = manifest.get("dropped_rows", 0)
     if dropped > SOME * (dropped + len(data)):
         yield (
-            f"{dropped:,} of {dropped + len(data):,} rows are dropped, because no next "
-            "state was recorded for the last of an episode: record it "
-            "(data.columns.next_observation=...)."
+            f"{dropped:,} of {dropped + len(data):,} rows are dropped: the last of an "
+            "episode has no next state (data.columns.next_observation=...)."
         )
     change = (after - before).abs()
     usual = change[:: len(change) // MOST_ROWS + 1].quantile(0.9, dim=0)
     large = (change > JUMP * usual) & (change > SOME * before.std(0)) & (usual > 0)
-    jumps = large.any(1).nonzero()[:, 0].tolist()
-    if jumps:
+    if jumps := large.any(1).nonzero()[:, 0].tolist():
         yield (
             f"in {len(jumps):,} rows, such as {jumps[0]}, the state jumps by more than "
-            f"{JUMP} times its usual change: an episode may end there without a flag, "
-            "or flags may be a row late."
+            f"{JUMP} times its usual change: flags may be missing, or a row late."
         )
 
 
@@ -192,8 +166,7 @@ def _about_order(data: TensorDict) -> Iterator[str]:
     if share > SOME:
         yield (
             f"after {share:.0%} of the rows the next row does not begin where this one "
-            "ended: that is fine for single transitions; else sort them "
-            "(data.columns.step=...)."
+            "ended: sort them (data.columns.step=...) unless they are single steps."
         )
     rows = (followed[:-1] & followed[1:]).nonzero()[:MOST_ROWS, 0] + 1
     if len(rows) >= FEW_ROWS:
@@ -203,8 +176,7 @@ def _about_order(data: TensorDict) -> Iterator[str]:
             where = "before" if shift < 0 else "after"
             yield (
                 f"the action of the row {where} explains {best:.0%} of the change of "
-                f"the state, that of the row itself {same:.0%}: actions may be "
-                "recorded one row too late or too early."
+                f"the state, that of the row itself {same:.0%}: actions may be shifted."
             )
 
 
@@ -214,12 +186,11 @@ def _explained(data: TensorDict, rows: Tensor, shift: int) -> float:
     change = data["next", "observation"][rows].double() - state
     known = torch.cat([torch.ones(len(rows), 1), state], 1).double()
     both = torch.cat([known, data["action"][rows + shift].double()], 1)
-    left = [
-        (change - x @ torch.linalg.lstsq(x, change, driver="gelsd").solution)
-        .square()
-        .sum(0)
+    fits = (
+        x @ torch.linalg.lstsq(x, change, driver="gelsd").solution
         for x in (known, both)
-    ]
+    )
+    left = [(change - fit).square().sum(0) for fit in fits]
     return float((1 - left[1] / left[0].clamp_min(1e-12)).max())
 
 
@@ -233,6 +204,6 @@ def out_of_space(
         if entry.low < least - slack or entry.high > most + slack:
             yield (
                 f"{entry.name} goes from {entry.low:g} to {entry.high:g}, where the "
-                f"environment's observation has {least:g} to {most:g}: the columns "
-                "may be in another order (data.columns.observation=[...])."
+                f"environment's observation has {least:g} to {most:g}: are the columns "
+                "in another order (data.columns.observation=[...])?"
             )

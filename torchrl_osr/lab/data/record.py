@@ -45,18 +45,8 @@ def record_episodes(
     Keyword Args:
         noise: standard deviation of Gaussian noise on actions, in half-widths of their
             bounds, which they are clipped to; of discrete actions the share that is
-            drawn uniformly instead. Default 0.
+            drawn uniformly instead.
         seed: the episodes are seeded ``seed, seed + 1, ...``, and the draws by it.
-            Default 0.
-        progress: show a progress bar when on a terminal. Default ``True``.
-
-    Returns:
-        The columns of :func:`~torchrl_osr.lab.data.transitions_from_columns`, with
-        actions as the environment was given them.
-
-    Raises:
-        ValueError: an action of the policy is none of the environment's, or a step
-            gives no finite numbers.
     """
     most = 1 if isinstance(env.action_space, spaces.Discrete) else np.finfo(float).max
     if num_episodes < 1 or not 0 <= noise <= most:
@@ -93,8 +83,12 @@ def record_episodes(
                     )
             observation, ended = step["next_observation"], terminated or truncated
     columns = {name: np.array([step[name] for step in steps]) for name in steps[0]}
-    real = [name for name, each in columns.items() if each.dtype.kind == "f"]
-    return columns | {name: columns[name].astype(np.float32) for name in real}
+    real = {
+        n: each.astype(np.float32)
+        for n, each in columns.items()
+        if each.dtype.kind == "f"
+    }
+    return columns | real
 
 
 def _action(
@@ -131,9 +125,7 @@ def check_log_path(path: Path) -> None:
     if path.suffix not in WRITERS:
         raise ValueError(f"path={path} must end in one of {', '.join(WRITERS)}.")
     if path.exists():
-        raise FileExistsError(
-            f"path={path} exists and is not replaced: choose another."
-        )
+        raise FileExistsError(f"path={path} exists: choose another.")
     with needed_by(f"{path.suffix} files need", "minari"):
         import_module(WRITERS[path.suffix])
 

@@ -52,14 +52,8 @@ VANISHED_SHARE = 0.01
 class Recording:
     """A recorded data set, to be converted once.
 
-    Args:
-        parts: yields columns of whole trajectories: about so many rows at a time, or
-            all at once.
-        options: for the conversion.
-        about: JSON-compatible description of the source, for the manifest.
-        files: that are read.
-        notes: what was detected in them.
-        total: rows of the source, for the progress bar.
+    ``parts`` yields columns of whole trajectories: about so many rows at a time, or all
+    at once. ``about`` goes into the manifest.
     """
 
     parts: Callable[[int | None], Iterable[Columns]]
@@ -77,7 +71,24 @@ class Recording:
         source = str(self.about.get("path", ""))
         try:
             if on_disk:
-                data, manifest = self._load_or_write(progress)
+                # Sizes and times: to read a large source at each start is slow.
+                states = [(str(file.resolve()), file.stat()) for file in self.files]
+                options = asdict(self.options) | {"action_bounds": self._bounds()}
+                request = self.about | {
+                    "reader_version": READER_VERSION,
+                    "source_files": [[n, s.st_size, s.st_mtime_ns] for n, s in states],
+                    "options": options,
+                }
+                text = json.dumps(request, sort_keys=True)
+                digest = hashlib.sha256(text.encode()).hexdigest()[:16]
+                data, manifest = load_or_write(
+                    cache_root() / "recorded" / f"{self.about['source']}-{digest}",
+                    request,
+                    lambda: self._transitions(CHUNK_ROWS),
+                    describe=self._manifest,
+                    total=self.total,
+                    progress=progress,
+                )
             else:
                 first, *others = self._transitions(None)
                 data = torch.cat([first, *others]) if others else first
@@ -92,25 +103,6 @@ class Recording:
         for warning in manifest["warnings"]:
             torchrl_logger.warning(warning)
         return data, manifest
-
-    def _load_or_write(self, progress: bool) -> tuple[TensorDict, dict[str, Any]]:
-        # Sizes and times, not checksums: to read a large source at each start is slow.
-        states = [(str(file.resolve()), file.stat()) for file in self.files]
-        request = self.about | {
-            "reader_version": READER_VERSION,
-            "source_files": [[name, s.st_size, s.st_mtime_ns] for name, s in states],
-            "options": asdict(self.options) | {"action_bounds": self._bounds()},
-        }
-        text = json.dumps(request, sort_keys=True)
-        digest = hashlib.sha256(text.encode()).hexdigest()[:16]
-        return load_or_write(
-            cache_root() / "recorded" / f"{self.about['source']}-{digest}",
-            request,
-            lambda: self._transitions(CHUNK_ROWS),
-            describe=self._manifest,
-            total=self.total,
-            progress=progress,
-        )
 
     def _bounds(self) -> list[Any]:
         return [np.asarray(b, np.float64).tolist() for b in self.options.action_bounds]
@@ -138,8 +130,7 @@ class Recording:
                 yield part.data
         if not kept:
             raise ValueError(
-                f"none of the {read} rows has a true next state; expected at least one "
-                "row that is not the last of its episode, or next_observation."
+                f"none of the {read} rows has a true next state: give next_observation."
             )
 
     def _manifest(self) -> dict[str, Any]:
@@ -184,11 +175,12 @@ def _check_together(episode: Any, seen: set[float]) -> None:
     """Raise if an episode was seen before; remember those in these rows."""
     numbers = np.asarray(episode, np.float64).reshape(-1)
     numbers = numbers[~np.isnan(numbers)]
-    for number in numbers[np.r_[True, np.diff(numbers) != 0][: len(numbers)]].tolist():
+    first = np.r_[True, np.diff(numbers) != 0][: len(numbers)]
+    for number in numbers[first].tolist():
         if number in seen:
             raise ValueError(
-                f"'episode' {number:g} comes back; expected the rows of an episode "
-                "together and in order of time. data.columns.step sorts them."
+                f"'episode' {number:g} comes back; expected its rows together and in "
+                "order of time. data.columns.step sorts them."
             )
         seen.add(number)
 
@@ -200,26 +192,18 @@ def whole_trajectories(
     rest: Mapping[str, Array] = {}
     for chunk in chunks:
         if rest:
-            chunk = {
-                n: np.concatenate([rest[n], column]) for n, column in chunk.items()
-            }
-        end = _last_end(chunk)
+            chunk = {n: np.concatenate([rest[n], new]) for n, new in chunk.items()}
+        ends = np.zeros(len(chunk["reward"]), np.bool_)
+        for name in {"terminated", "truncated"} & chunk.keys():
+            ends |= np.nan_to_num(chunk[name].reshape(-1)).astype(np.bool_)
+        if "episode" in chunk:
+            ends[:-1] |= np.diff(chunk["episode"].reshape(-1)) != 0
+        end = int(ends.nonzero()[0][-1]) + 1 if ends.any() else 0
         if end:
             yield {name: column[:end] for name, column in chunk.items()}
         rest = {name: column[end:] for name, column in chunk.items()}
     if rest and len(rest["reward"]):
         yield rest
-
-
-def _last_end(columns: Mapping[str, Array]) -> int:
-    """Number of rows up to the last known end of a trajectory."""
-    ends = np.zeros(len(columns["reward"]), np.bool_)
-    for name in ("terminated", "truncated"):
-        if name in columns:
-            ends |= np.nan_to_num(columns[name].reshape(-1)).astype(np.bool_)
-    if "episode" in columns:
-        ends[:-1] |= np.diff(columns["episode"].reshape(-1)) != 0
-    return int(ends.nonzero()[0][-1]) + 1 if ends.any() else 0
 
 
 def transitions_from_columns(

@@ -7,8 +7,6 @@ of equal shares. The mazes have sources of their own, see
 
 Gymnasium and a NumPy policy, one environment, one process: on one core that was faster
 than vectorised environments and than a torch policy.
-
-Shapes: ``N`` transitions, ``E`` complete episodes, ``S`` observation, ``A`` action.
 """
 
 from __future__ import annotations
@@ -21,17 +19,14 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
+from gymnasium.spaces import flatdim
 from numpy.typing import NDArray
 from tensordict import TensorDict
 from tqdm.auto import tqdm
 
 from torchrl_osr._files import sha256_of
 from torchrl_osr.lab.data.behavior import behavior_policy_path, load_behavior_policy
-from torchrl_osr.lab.data.environment import (
-    MAZE_IDS,
-    environment_id,
-    make_environment,
-)
+from torchrl_osr.lab.data.environment import MAZE_IDS, environment_id, make_environment
 from torchrl_osr.lab.data.mazes import (
     ActionSampler,
     StartsAndGoals,
@@ -51,13 +46,7 @@ BEHAVIORS: dict[str, tuple[str, ...]] = {
 
 
 class Collection(NamedTuple):
-    """Transitions, and the statistics of the complete episodes.
-
-    Attributes:
-        data: transitions ``[N]``.
-        episode_returns: undiscounted returns ``[E]``, float64.
-        episode_lengths: steps ``[E]``.
-    """
+    """Transitions ``[N]``; returns and lengths ``[E]`` of complete episodes."""
 
     data: TensorDict
     episode_returns: NDArray[np.float64]
@@ -82,37 +71,31 @@ def collect_source(
     seed: int = 0,
     progress: bool = True,
 ) -> Collection:
-    """Roll out a named data set, see :func:`~torchrl_osr.lab.data.load_dataset`.
+    """Roll out a named data set.
 
-    The source enters the seed, so that a medium and a medium-expert set of one seed
-    share no episode.
+    The source enters the seed: a medium and a medium-expert set share no episode.
     """
     behavior_of(env_name, source)  # an unknown source stops here
     entropy = (seed, zlib.crc32(f"{env_name}-{source}".encode()))
     with closing(make_environment(environment_id(env_name))) as env:
         if env_name in MAZE_IDS:
-            samplers = [waypoint_sampler(env.get_wrapper_attr("maze"))]
+            samplers: list[ActionSampler] = [
+                waypoint_sampler(env.get_wrapper_attr("maze"))
+            ]
             if pairs := maze_behavior(env_name, source)["cells"]:
                 env = StartsAndGoals(env, pairs)
         else:
-            policies = [
-                load_behavior_policy(env_name, name) for name in BEHAVIORS[source]
-            ]
-            samplers = [policy.sample for policy in policies] or [uniform_sampler(env)]
+            size = flatdim(env.action_space)
+
+            def uniform(_: Any, rng: np.random.Generator) -> NDArray[np.float32]:
+                return rng.uniform(-ACTION_LIMIT, ACTION_LIMIT, size).astype(np.float32)
+
+            names = BEHAVIORS[source]
+            samplers = [load_behavior_policy(env_name, name).sample for name in names]
+            samplers = samplers or [uniform]
         return collect_transitions(
             env, samplers, num_transitions, seed=entropy, progress=progress
         )
-
-
-def uniform_sampler(env: gymnasium.Env[Any, Any]) -> ActionSampler:
-    """Sampler of uniform actions in ``[-ACTION_LIMIT, ACTION_LIMIT]``."""
-    action_size = gymnasium.spaces.flatdim(env.action_space)
-
-    def sample(_: NDArray[Any], rng: np.random.Generator) -> NDArray[np.float32]:
-        draws = rng.uniform(-ACTION_LIMIT, ACTION_LIMIT, action_size)
-        return draws.astype(np.float32)
-
-    return sample
 
 
 def collect_transitions(
@@ -143,8 +126,8 @@ def collect_transitions(
             f"num_transitions={num_transitions} for {len(samplers)} policies; "
             "expected at least one transition each."
         )
-    state = num_transitions, gymnasium.spaces.flatdim(env.observation_space)
-    action = num_transitions, gymnasium.spaces.flatdim(env.action_space)
+    spaces = env.observation_space, env.action_space
+    state, action = ((num_transitions, flatdim(space)) for space in spaces)
     columns: dict[str, NDArray[Any]] = {
         "observation": np.empty(state, np.float32),
         "action": np.empty(action, np.float32),
@@ -157,12 +140,9 @@ def collect_transitions(
     seeds = np.random.SeedSequence(seed).spawn(len(samplers))
     episodes: list[tuple[float, int]] = []
     hidden = None if progress else True  # None: no bar where there is no terminal
-    with tqdm(
-        total=num_transitions, desc="collect", unit="step", disable=hidden
-    ) as bar:
-        for sampler, child, (start, stop) in zip(
-            samplers, seeds, pairwise(bounds), strict=True
-        ):
+    with tqdm(None, "collect", num_transitions, unit="step", disable=hidden) as bar:
+        shares = zip(samplers, seeds, pairwise(bounds), strict=True)
+        for sampler, child, (start, stop) in shares:
             rng = np.random.default_rng(child)
             while start < stop:
                 rows = {name: column[start:stop] for name, column in columns.items()}

@@ -15,15 +15,7 @@ from torchrl_osr.lab.data.transitions import ROWS_AT_A_TIME, SAME_STATE
 
 
 def held_out_rows(rows: int, held_out: int | float, *, seed: int) -> Tensor:
-    """Numbers of randomly chosen rows, in random order.
-
-    Args:
-        rows: number of rows ``N``.
-        held_out: number of held-out rows (``int``), or their share (``float``).
-
-    Keyword Args:
-        seed: of the choice, which has a generator of its own.
-    """
+    """Random rows in random order; ``held_out`` is a number, or a share (float)."""
     count = round(held_out * rows) if isinstance(held_out, float) else held_out
     if not 0 < count < rows:
         raise ValueError(
@@ -47,10 +39,9 @@ def split_held_out(
 def mix_datasets(
     valuable: TensorDict, random: TensorDict, *, random_share: float, seed: int
 ) -> TensorDict:
-    """Replace a share of the rows by rows of another data set; the number stays.
+    """Replace a share of the rows by rows of another set: section 5.3 of the paper.
 
-    Limited valuable data, section 5.3 of the paper. The rows of each set are drawn
-    without replacement; those kept of ``valuable`` come first.
+    Rows are drawn without replacement; those kept of ``valuable`` come first.
     """
     number = round(random_share * len(valuable))
     if not 0 <= random_share <= 1 or number > len(random):
@@ -66,14 +57,7 @@ def mix_datasets(
 
 
 def is_followed(data: TensorDictBase, rows: Tensor | None = None) -> Tensor:
-    """Whether each row is followed by the row that came next in time, bool ``[B]``.
-
-    Then it ends no episode, and its next state is the state of the following row.
-
-    Args:
-        data: all transitions ``[N]``.
-        rows: numbers of rows ``[B]``. Default: all.
-    """
+    """Whether the row that came next in time follows each row, bool ``[B]``."""
     rows = torch.arange(len(data)) if rows is None else rows
     after = (rows + 1).clamp(max=len(data) - 1)
     reached = data["next", "observation"][rows]
@@ -86,12 +70,7 @@ def is_followed(data: TensorDictBase, rows: Tensor | None = None) -> Tensor:
 
 
 def next_action(data: TensorDictBase, rows: Tensor | None = None) -> Tensor:
-    """Action ``[B, A]`` of the following row, 0 where an episode ends.
-
-    Args:
-        data: all transitions ``[N]`` in order of time, see :func:`check_order`.
-        rows: numbers of rows ``[B]``. Default: all.
-    """
+    """Action ``[B, A]`` of the following row, 0 where an episode ends."""
     rows = torch.arange(len(data)) if rows is None else rows
     following: Tensor = data["action"][(rows + 1).clamp(max=len(data) - 1)]
     return following.masked_fill(data["next", "done"][rows], 0.0)
@@ -113,17 +92,7 @@ def check_order(data: TensorDictBase) -> None:
 
 
 def consecutive_rows(data: TensorDictBase, starts: Tensor, length: int) -> TensorDict:
-    """Pieces of trajectories: each row is followed by the one that came after it.
-
-    Args:
-        data: transitions ``[N]`` in the order in which they were recorded.
-        starts: numbers of the first rows. Those that are not followed by enough rows
-            of the same trajectory are left out.
-        length: rows of a piece, ``L``.
-
-    Returns:
-        Transitions ``[n, L]``; of ``starts``, ``n`` are left.
-    """
+    """Transitions ``[n, L]``; starts without L rows of one trajectory are left out."""
     starts = starts[starts + length <= len(data)]
     rows = starts.unsqueeze(-1) + torch.arange(length, device=starts.device)
     followed = is_followed(data, rows[:, :-1].flatten())
@@ -142,7 +111,7 @@ def multi_step(
     reward_shift: float = 0.0,
     with_next_action: bool = False,
 ) -> TensorDict:
-    r"""What each row leads to in at most ``n_steps`` steps of the data.
+    r"""Entries of ``"next"`` after at most ``n_steps`` steps of the data.
 
     The reward is :math:`\sum_{k<m} \gamma^k (a\,r_k + b)`; state and flags are those
     after the last of the m steps. m is less than ``n_steps`` where an episode ends, or
@@ -151,15 +120,10 @@ def multi_step(
     TorchRL 0.14.1's ``MultiStep`` keeps the flags of the first step, so that returns
     that have reached a terminal state are bootstrapped from it.
 
-    Args:
-        data: all transitions ``[N]``.
-        rows: numbers of rows ``[B]``. Default: all.
-
     Keyword Args:
         n_steps: the largest m.
         gamma: discount factor.
-        reward_scale: a.
-        reward_shift: b.
+        reward_scale, reward_shift: a and b.
         with_next_action: add the data's ``"action"`` at the state that the steps lead
             to, see :func:`next_action`.
 
@@ -186,10 +150,10 @@ def multi_step(
 
 
 def take_multi_step(batch: TensorDictBase) -> TensorDictBase:
-    """A batch whose ``"next"`` is :func:`multi_step`, which was in ``"multi_step"``.
+    """A batch whose ``"next"`` is :func:`multi_step`, and ``"one_step"`` the old one.
 
-    The transition of one step is then in ``"one_step"``, for the losses that ask which
-    action leads to the next state; ``"steps_to_next_obs"`` is TorchRL's name for m.
+    Some losses ask which action leads to the next state. ``"steps_to_next_obs"`` is
+    TorchRL's name for the number of steps.
     """
     after = batch["multi_step"]
     batch = batch.exclude("multi_step").set("one_step", batch["next"])

@@ -4,8 +4,8 @@ A normalised score is 0 for the return of D4RL's uniformly random policy and 100
 the return of its expert. The constants are those of ``d4rl/infos.py`` in
 https://github.com/Farama-Foundation/D4RL.
 
-They were measured on the v2 tasks of the old ``mujoco-py``. On Gymnasium's v5 tasks
-they are a common scale, not the same task: do not put the two in one column.
+They were measured on the v2 tasks of ``mujoco-py``. Gymnasium's v5 tasks share the
+scale, not the task: do not put the two in one column.
 
 In the mazes the return is 1 where the goal was reached and 0 where it was not, and
 D4RL's references of AntMaze are 0 and 1: the normalised score is the success rate in
@@ -52,13 +52,8 @@ def reference_returns(
 ) -> ReferenceReturns | None:
     """Reference returns of a task, ``None`` if there are none.
 
-    Args:
-        env_name: short name; D4RL's references count where there are some.
-        random_return, expert_return: of a task that has none of D4RL's: both, or
-            neither for raw returns (default).
-
-    Raises:
-        ValueError: only one is given, they are no scale, or the task has its own.
+    The arguments are for a task that has none of D4RL's: both returns, or neither for
+    raw returns.
 
     Examples:
         >>> from torchrl_osr.lab.data import reference_returns

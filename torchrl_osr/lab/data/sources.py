@@ -6,7 +6,7 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from tensordict import TensorDict
@@ -43,6 +43,8 @@ log = logging.getLogger(__name__)
 RECORDED = ("minari", "d4rl", "file")
 """Sources that are recorded; the others are rolled out."""
 
+Dataset = tuple[TensorDict, dict[str, Any]]
+
 # Raise it whenever the roll-outs change: older sets are then made anew.
 RECIPE_VERSION = 1
 
@@ -65,7 +67,7 @@ def load_dataset(
     cache_dir: Path | str | None = None,
     on_disk: bool = False,
     progress: bool = True,
-) -> tuple[TensorDict, dict[str, Any]]:
+) -> Dataset:
     """Load a data set that is rolled out on this machine, or a recorded one.
 
     A rolled-out set is collected at first use, about 10,000 transitions a second, and
@@ -78,21 +80,18 @@ def load_dataset(
             ``None``, for recorded data.
         source: ``"random"``, ``"medium"``, ``"medium-replay"``, ``"medium-expert"`` or
             ``"expert"``; of a maze ``"diverse"`` or ``"play"``; ``"minari"``,
-            ``"d4rl"`` or ``"file"``. Default: ``"file"``.
+            ``"d4rl"`` or ``"file"`` (default).
 
     Keyword Args:
         env_id: Gymnasium id of the task. The actions of a ``"file"`` are then in its
             units, and data that do not fit it are refused. Default: actions within -1
             and 1, not compared.
         references: scale of the scores. Default: D4RL's, if there are any.
-        path: of recorded data. ``"file"``: CSV, Parquet, HDF5 or NumPy archive, a list
-            or a pattern (``"logs/*.csv"``) of files that make one log, or a folder that
-            :func:`~torchrl_osr.lab.data.write_memmap` has written. ``"minari"``: a
-            name, such as ``"mujoco/hopper/medium-v0"``, or a folder. ``"d4rl"``: an
-            HDF5 file of D4RL.
-        columns: of a ``"file"``, names of columns by their part: ``observation``,
-            ``action``, ``reward``, ``terminated``, ``truncated``, ``episode``,
-            ``next_observation``, as in
+        path: ``"file"``: CSV, Parquet, HDF5 or NumPy archive, a list or a pattern
+            (``"logs/*.csv"``) of files that make one log, or a folder of
+            :func:`~torchrl_osr.lab.data.write_memmap`. ``"minari"``: a name, such as
+            ``"mujoco/hopper/medium-v0"``, or a folder. ``"d4rl"``: an HDF5 file.
+        columns: of a ``"file"``, names of columns by their part: those of
             :func:`~torchrl_osr.lab.data.transitions_from_columns`, and ``step``, by
             which the rows of an episode are sorted: numbers, or time stamps in ISO
             format. Names may be patterns (``"obs_*"``), or lists, one name an entry.
@@ -102,24 +101,22 @@ def load_dataset(
             ``"minari"`` its action space; otherwise the task's own bounds.
         clip_actions, missing: see
             :func:`~torchrl_osr.lab.data.transitions_from_columns`.
-        download: fetch the Minari set of that name. Default: ``False``.
-        num_transitions: exact number of rolled-out transitions. Default: 200,000.
+        download: fetch the Minari set of that name.
+        num_transitions: exact number of rolled-out transitions.
         random_share: share of the rolled-out rows that are random instead: limited
-            valuable data, section 5.3 of the paper. Default: 0.
-        seed: of the roll-outs, and of the choice of random rows. Default: 0.
-        cache_dir: cache folder of rolled-out data. Default: ``TORCHRL_OSR_CACHE``, else
-            the user's.
+            valuable data, section 5.3 of the paper.
+        seed: of the roll-outs, and of the choice of random rows.
+        cache_dir: of rolled-out data. Default: ``TORCHRL_OSR_CACHE``, else the user's.
         on_disk: leave the rows memory-mapped. Parquet and Minari are converted in
-            parts, other files from memory. Default: ``False``.
-        progress: show a progress bar when on a terminal. Default: ``True``.
+            parts, other files from memory.
+        progress: show a progress bar when on a terminal.
 
     Returns:
         The transitions ``[N]`` and their manifest; ``"normalized_score"`` in it is
         ``None`` without reference returns or without a complete episode.
 
     Raises:
-        ValueError: an option is missing or has no effect, a task or a source is
-            unknown, or the data do not fit the task.
+        ValueError: an option has no effect, or the data do not fit the task.
 
     Examples:
         >>> from torchrl_osr.lab.data import load_dataset
@@ -127,9 +124,8 @@ def load_dataset(
         >>> data["observation"].shape, manifest["env_id"]
         (torch.Size([500, 11]), 'Hopper-v5')
     """
-    columns = {part: name for part, name in (columns or {}).items() if name is not None}
     reading: dict[str, Any] = {
-        "columns": columns,
+        "columns": {k: name for k, name in (columns or {}).items() if name is not None},
         "action_bounds": action_bounds,
         "clip_actions": clip_actions,
         "missing": missing,
@@ -137,10 +133,21 @@ def load_dataset(
     }
     if source not in RECORDED:
         _refuse(reading | {"path": path}, f"data={source}, which is rolled out")
-        _check_rolled_out(env_name, env_id, source)
+        name = env_name if env_id is None else environment_name(env_id)
+        known = [*load_behavior_card(), *MAZE_IDS]
+        if name not in known or name != env_name:
+            raise ValueError(
+                f"data={source} is rolled out for env.name={', '.join(known)}, not for "
+                f"{env_id or env_name} as {env_name}: record data with 'torchrl-osr "
+                f"collect env.id={env_id} path={name}.npz', then add data=file "
+                f"data.path={name}.npz."
+            )
         recipe = {"num_transitions": num_transitions, "seed": seed}
-        root, name = cache_root(cache_dir), str(env_name)
-        return _rolled_out(root, name, source, recipe, random_share, on_disk, progress)
+        sets = RolledOut(cache_root(cache_dir) / "collected", name, recipe, progress)
+        if random_share:
+            return sets.mix(source, random_share, on_disk)
+        data, manifest = sets.open(source)
+        return data if on_disk else data.clone(), manifest
     if path is None:
         raise ValueError(f"data={source} needs data.path=...")
     _refuse({"random_share": random_share}, f"data={source}")
@@ -172,55 +179,40 @@ def open_recorded(
     source: str,
     path: str | Path | Sequence[str],
     *,
-    spec: EnvironmentSpec | None = None,
-    columns: Mapping[str, Any] | None = None,
-    action_bounds: ActionBounds | None = None,
-    clip_actions: bool = False,
-    missing: str = "error",
-    download: bool = False,
-    progress: bool = True,
+    spec: EnvironmentSpec | None,
+    columns: Mapping[str, Any],
+    action_bounds: ActionBounds | None,
+    clip_actions: bool,
+    missing: str,
+    download: bool,
+    progress: bool,
 ) -> Recording:
     """Open recorded data, no row of which is read yet; see :func:`load_dataset`."""
-    columns = {part: name for part, name in (columns or {}).items() if name is not None}
+    columns = {part: name for part, name in columns.items() if name is not None}
     if source != "file":
         given = {f"columns.{part}": name for part, name in columns.items()}
-        if source == "minari":
-            given.pop("columns.observation", None)
+        entries = given.pop("columns.observation", None) if source == "minari" else None
         _refuse(given, f"data={source}")
     number = spec.action_size if spec is not None and spec.discrete else None
     if number is not None:
         _refuse({"action_bounds": action_bounds}, "discrete actions")
-    elif spec is not None and action_bounds is None and source != "minari":
-        low, high = spec.action_low or [], spec.action_high or []
-        # Numbers where they are the same for all: they fit data of another size.
-        alike = len({*low}) == len({*high}) == 1
-        action_bounds = (low[0], high[0]) if alike else (low, high)
     if action_bounds is None and source != "minari":
         action_bounds = -1.0, 1.0
+        if spec is not None and spec.action_low and spec.action_high:
+            low, high = action_bounds = spec.action_low, spec.action_high
+            if len({*low}) == len({*high}) == 1:  # they fit data of another size
+                action_bounds = low[0], high[0]
     options = Reading(action_bounds, clip_actions, number, missing)
     # Each reader needs a library of its own.
     if source == "minari":
         from torchrl_osr.lab.data.minari import open_minari
 
-        entries = columns.get("observation")
         return open_minari(path, options, entries, download=download, progress=progress)
     from torchrl_osr.lab.data.table import D4RL_NAMES, open_log
 
     _refuse({"download": download}, f"data={source}")
     names = D4RL_NAMES if source == "d4rl" else columns
     return open_log(path, names, options, source)
-
-
-def _check_rolled_out(env_name: str | None, env_id: str | None, source: str) -> None:
-    name = env_name if env_id is None else environment_name(env_id)
-    known = [*load_behavior_card(), *MAZE_IDS]
-    if name not in known or name != env_name:
-        raise ValueError(
-            f"data={source} is rolled out for env.name={', '.join(known)}, not for "
-            f"{env_id or env_name} as {env_name}: record data with 'torchrl-osr "
-            f"collect env.id={env_id} path={name}.npz', then add data=file "
-            f"data.path={name}.npz."
-        )
 
 
 def _check_fit(
@@ -248,91 +240,85 @@ def _check_fit(
             )
 
 
-def _rolled_out(
-    root: Path,
-    env_name: str,
-    source: str,
-    recipe: dict[str, int],
-    random_share: float,
-    on_disk: bool,
-    progress: bool,
-) -> tuple[TensorDict, dict[str, Any]]:
-    """Open a rolled-out set, with a share of random rows; collect it if need be."""
-    data, manifest = _collected(root, env_name, source, recipe, progress)
-    if not random_share:
-        return data if on_disk else data.clone(), manifest
-    if source == "random":
-        _refuse({"random_share": random_share}, "data=random")
-    other, random = _collected(root, env_name, "random", recipe, progress)
-    number = round(random_share * len(data))
-    rows = {source: len(data) - number, "random": number}
-    scores = [each["normalized_score"] for each in (manifest, random)]
-    score = None if None in scores else np.average(scores, weights=[*rows.values()])
-    mixture = {
-        "env_name": env_name,
-        "source": source,
-        **recipe,
-        "random_share": random_share,
-        "rows": rows,
-        "normalized_score": None if score is None else float(score),
-        "sources": {source: manifest, "random": random},
-    }
+class RolledOut(NamedTuple):
+    """Rolled-out sets of one task in a cache folder, collected when first opened."""
 
-    def mixed() -> TensorDict:
-        seed = recipe["seed"]
-        return mix_datasets(data, other, random_share=random_share, seed=seed)
+    root: Path
+    env_name: str
+    recipe: dict[str, int]
+    progress: bool
 
-    if not on_disk:
-        return mixed(), mixture
-    name = f"{_name(env_name, source, recipe)}-random{random_share}"
-    folder = root / "collected" / name
-    return load_or_write(folder, mixture, lambda: mixed().split(CHUNK_ROWS))
+    def folder(self, source: str) -> Path:
+        rows, seed = self.recipe.values()
+        return self.root / f"{self.env_name}-{source}-{rows}-seed{seed}"
 
-
-def _collected(
-    root: Path, env_name: str, source: str, recipe: dict[str, int], progress: bool
-) -> tuple[TensorDict, dict[str, Any]]:
-    """Open one source's own set, memory-mapped; collect it first if need be."""
-    folder = root / "collected" / _name(env_name, source, recipe)
-    maze = env_name in MAZE_IDS
-    # Other versions of these give other data for the same seed.
-    packages = ["numpy", "gymnasium", "mujoco"] + ["gymnasium-robotics"] * maze
-    with needed_by("collecting data needs", "mazes" if maze else "train"):
-        versions = {package: version(package) for package in packages}
-    request = {
-        "recipe_version": RECIPE_VERSION,
-        "env_name": env_name,
-        "env_id": environment_id(env_name),
-        "source": source,
-        **recipe,
-        **behavior_of(env_name, source),
-        "versions": versions,
-    }
-    episodes: dict[str, Any] = {}
-
-    def collect() -> Iterator[TensorDict]:
-        rows = recipe["num_transitions"]
-        spec = environment_spec(request["env_id"])
-        size = 4 * (2 * spec.observation_size + spec.action_size + 1) + 3  # three flags
-        what = f"the data set ({CACHE_VARIABLE}=/path chooses the folder)"
-        check_disk_space(folder, rows * size, what)
-        log.info(f"rolls out {rows:,} transitions of {env_name} {source} to {folder}")
-        data, returns, lengths = collect_source(
-            env_name, source, rows, seed=recipe["seed"], progress=progress
+    def open(self, source: str) -> Dataset:
+        """Memory-mapped rows of a source and their manifest."""
+        env_name, rows, folder = (
+            self.env_name,
+            self.recipe["num_transitions"],
+            self.folder(source),
         )
-        episodes.update(describe_episodes(returns, lengths), normalized_score=None)
-        if len(returns):
-            mean = float(returns.mean())
-            episodes["normalized_score"] = REFERENCE_RETURNS[env_name].score(mean)
-        yield from data.split(CHUNK_ROWS)
+        maze = env_name in MAZE_IDS
+        # Other versions of these give other data for the same seed.
+        packages = ["numpy", "gymnasium", "mujoco"] + ["gymnasium-robotics"] * maze
+        with needed_by("collecting data needs", "mazes" if maze else "train"):
+            versions = {package: version(package) for package in packages}
+        env_id = environment_id(env_name)
+        request = {
+            "recipe_version": RECIPE_VERSION,
+            "env_name": env_name,
+            "env_id": env_id,
+            "source": source,
+            **self.recipe,
+            **behavior_of(env_name, source),
+            "versions": versions,
+        }
+        about: dict[str, Any] = {"torchrl_osr_version": __version__}
 
-    return load_or_write(
-        folder,
-        request,
-        collect,
-        describe=lambda: {"torchrl_osr_version": __version__, **episodes},
-    )
+        def collect() -> Iterator[TensorDict]:
+            spec = environment_spec(env_id)
+            size = 4 * (2 * spec.observation_size + spec.action_size + 1) + 3  # 3 flags
+            what = f"the data set ({CACHE_VARIABLE}=/path chooses the folder)"
+            check_disk_space(folder, rows * size, what)
+            log.info(
+                f"rolls out {rows:,} transitions of {env_name} {source} to {folder}"
+            )
+            data, returns, lengths = collect_source(
+                env_name, source, rows, seed=self.recipe["seed"], progress=self.progress
+            )
+            score = REFERENCE_RETURNS[env_name].score
+            mean = float(returns.mean()) if len(returns) else None
+            about.update(describe_episodes(returns, lengths))
+            about["normalized_score"] = None if mean is None else score(mean)
+            yield from data.split(CHUNK_ROWS)
 
+        return load_or_write(folder, request, collect, describe=lambda: about)
 
-def _name(env_name: str, source: str, recipe: Mapping[str, int]) -> str:
-    return f"{env_name}-{source}-{recipe['num_transitions']}-seed{recipe['seed']}"
+    def mix(self, source: str, random_share: float, on_disk: bool) -> Dataset:
+        """Rows of a source, a share of which is replaced by random rows."""
+        if source == "random":
+            _refuse({"random_share": random_share}, "data=random")
+        (data, manifest), (other, random) = self.open(source), self.open("random")
+        number = round(random_share * len(data))
+        rows = {source: len(data) - number, "random": number}
+        scores = [each["normalized_score"] for each in (manifest, random)]
+        mean = None if None in scores else np.average(scores, weights=[*rows.values()])
+        mixture = {
+            "env_name": self.env_name,
+            "source": source,
+            **self.recipe,
+            "random_share": random_share,
+            "rows": rows,
+            "normalized_score": None if mean is None else float(mean),
+            "sources": {source: manifest, "random": random},
+        }
+
+        def mixed() -> TensorDict:
+            seed = self.recipe["seed"]
+            return mix_datasets(data, other, random_share=random_share, seed=seed)
+
+        if not on_disk:
+            return mixed(), mixture
+        folder = f"{self.folder(source)}-random{random_share}"
+        return load_or_write(Path(folder), mixture, lambda: mixed().split(CHUNK_ROWS))

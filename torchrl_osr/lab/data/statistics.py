@@ -32,9 +32,6 @@ def observation_statistics(data: TensorDictBase) -> tuple[Tensor, Tensor]:
         \sigma^2 = \frac{n_A \sigma_A^2 + n_B \sigma_B^2}{n_A + n_B}
             + \frac{n_A n_B}{(n_A + n_B)^2} (\bar x_B - \bar x_A)^2
 
-    Args:
-        data: transitions ``[N]`` with ``observation`` ``[N, S]``.
-
     Returns:
         ``loc`` ``[S]`` and ``scale`` ``[S]``. The scale is at least 0.001; a logged
         warning names entries that vary less.

@@ -88,33 +88,26 @@ def write_memmap(
 
     Keyword Args:
         describe: called when all chunks are written; returns JSON-compatible entries of
-            the manifest. Default: none.
-        total: number of rows, or more, for the bar and to check the free space before
-            the work. Default: unknown.
-        progress: show a progress bar when on a terminal. Default: ``True``.
-
-    Returns:
-        Like :func:`load_memmap`.
+            the manifest.
+        total: number of rows, or more, to check the free space before the work.
+        progress: show a progress bar when on a terminal.
 
     Raises:
         FileExistsError: the folder holds something else, which is not touched.
-        ValueError: :func:`~torchrl_osr.lab.data.check_dataset` refuses the rows.
     """
     folder = Path(folder).expanduser()
-    if os.path.lexists(folder) and not _is_ours(folder):
+    ours = folder.is_dir() and not folder.is_symlink()
+    if ours:
+        ours = {path.name for path in folder.iterdir()} <= {MANIFEST, ROWS}
+    if os.path.lexists(folder) and not ours:
         raise FileExistsError(
             f"{folder} is not replaced: it is no data set, or holds other files. "
             "Choose another folder, or remove it."
         )
     partial = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
-    bar = tqdm(
-        total=total,
-        desc=f"write {folder.name}",
-        unit="row",
-        unit_scale=True,
-        disable=None if progress else True,
-    )
+    hidden, name = None if progress else True, f"write {folder.name}"
+    bar = tqdm(None, name, total, unit="row", unit_scale=True, disable=hidden)
     try:
         (partial / ROWS / "next").mkdir(parents=True)
         with bar:
@@ -139,8 +132,7 @@ def _write_rows(
     rows = 0
     with ExitStack() as stack:
         files = {
-            key: stack.enter_context((folder / name).open("wb"))
-            for key, name in FILES.items()
+            k: stack.enter_context((folder / n).open("wb")) for k, n in FILES.items()
         }
         for chunk in chunks:
             check_rows(chunk)
@@ -176,8 +168,6 @@ def load_memmap(folder: Path | str) -> tuple[TensorDict, dict[str, Any]]:
         The transitions ``[N]``, memory-mapped, and the manifest. What is written into
         these tensors is written into the files: change a ``clone()``.
 
-    Raises:
-        ValueError: it is damaged, or of another version.
     """
     folder = Path(folder).expanduser()
     try:
@@ -199,25 +189,17 @@ def load_or_write(
     total: int | None = None,
     progress: bool = False,
 ) -> tuple[TensorDict, dict[str, Any]]:
-    """Open a cached data set, or write it first, see :func:`write_memmap`.
+    """Open a cached data set; write it first if its manifest differs from ``request``.
 
     Processes that ask for the same data set at once wait for one of them to write it.
-
-    Args:
-        folder: of the data set.
-        request: JSON-compatible entries of the manifest that determine the rows. A data
-            set with others is written anew.
-        chunks: makes the transitions.
     """
     wanted = json.loads(json.dumps(request))  # like the manifest's: without tuples
 
     def load() -> tuple[TensorDict, dict[str, Any]]:
         data, manifest = load_memmap(folder)
-        for key in wanted:
-            if manifest.get(key) != wanted[key]:
-                raise ValueError(
-                    f"its {key} is {manifest.get(key)!r}, wanted {wanted[key]!r}."
-                )
+        if wrong := [key for key in wanted if manifest.get(key) != wanted[key]]:
+            was, want = manifest.get(wrong[0]), wanted[wrong[0]]
+            raise ValueError(f"its {wrong[0]} is {was!r}, wanted {want!r}.")
         return data, manifest
 
     # Without the lock first: a data set can be read from a read-only folder.
@@ -239,19 +221,8 @@ def load_or_write(
         )
 
 
-def _is_ours(folder: Path) -> bool:
-    """Whether a folder holds nothing but a data set, perhaps a damaged one."""
-    if not folder.is_dir() or folder.is_symlink():
-        return False
-    return {path.name for path in folder.iterdir()} <= {MANIFEST, ROWS}
-
-
 def _checksum(folder: Path) -> str:
-    """SHA-256 of the files of a data set.
-
-    Raises:
-        ValueError: they are others; tensordict would unpickle some kinds.
-    """
+    """SHA-256 of a data set; raise if it has other files, which might be pickles."""
     paths = sorted(path for path in folder.rglob("*") if path.is_file())
     names = {path.relative_to(folder).as_posix() for path in paths}
     if names != {*FILES.values(), "meta.json", "next/meta.json"}:

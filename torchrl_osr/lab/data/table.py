@@ -1,7 +1,7 @@
 """Logs of your own as tables: CSV, Parquet, HDF5 or NumPy archives.
 
-The parts of a log (observation, action, reward, ...) are columns that you name, or
-those with the usual names. A vector is a column of rows ``[N, D]``, or several columns.
+The parts of a log are columns that you name, or those with the usual names. A vector is
+a column of rows ``[N, D]``, or several columns.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from glob import glob
-from itertools import chain, pairwise
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -56,11 +56,7 @@ D4RL_NAMES = {
     "terminated": "terminals",
     "truncated": "timeouts",
 }
-"""Names of D4RL's HDF5 files, which have ``next_observations`` in v2 alone.
-
-TorchRL's ``D4RLExperienceReplay`` zeroes the next observation of every row that is
-done; ``d4rl.qlearning_dataset`` puts the next episode's first observation there.
-"""
+"""Names of D4RL's HDF5 files, which have ``next_observations`` in v2 alone."""
 
 VECTORS = ("observation", "action", "next_observation")
 
@@ -72,13 +68,7 @@ ColumnNames = Mapping[str, str | Sequence[str] | bool | None]
 
 
 class Table(NamedTuple):
-    """A file with named columns.
-
-    Attributes:
-        names: of all columns, in the file's order.
-        read: yields some columns, about so many rows at a time or all at once.
-        notes: what was detected.
-    """
+    """A file with named columns; ``read`` yields some, about so many rows at a time."""
 
     names: list[str]
     read: Callable[[list[str], int | None], Iterator[Arrays]]
@@ -91,15 +81,7 @@ def open_log(
     options: Reading,
     source: str = "file",
 ) -> Recording:
-    """Open a log, see :func:`~torchrl_osr.lab.data.load_dataset`; no row is read yet.
-
-    Args:
-        path: of a file; or several that make one log, as a list or a pattern.
-        columns: names of the parts. Without any, they have the usual names, and a
-            column that is not known is an error, otherwise it is left out.
-        options: for the conversion.
-        source: for the manifest.
-    """
+    """Open a log, no row of which is read yet."""
     tables = {file: _table(file) for file in _files(path)}
     first = next(iter(tables.values()))
     layout = find_columns(first.names, columns)
@@ -241,16 +223,7 @@ def _hdf5(path: Path) -> Table:
 
 
 def find_columns(names: Sequence[str], wanted: ColumnNames) -> dict[str, list[str]]:
-    """Names of the columns of each part of a log.
-
-    Args:
-        names: of the file's columns.
-        wanted: names by part. Without any, all columns must be known.
-
-    Raises:
-        ValueError: a named column is not there, or is read twice; a part or an entry of
-            a vector is missing, or a column is not known.
-    """
+    """Names of the columns of each part; without ``wanted``, all must be known."""
     if unknown := wanted.keys() - USUAL_NAMES.keys():
         raise ValueError(
             f"data.columns has no {', '.join(unknown)}, only {', '.join(USUAL_NAMES)}."
@@ -270,23 +243,20 @@ def find_columns(names: Sequence[str], wanted: ColumnNames) -> dict[str, list[st
     if "episode" not in columns and ("step" in columns or "truncated" not in columns):
         missing.append("episode" if "step" in columns else "truncated or episode")
     if missing:
-        part = missing[0].split()[0]
-        cure = f"name it as in data.columns.{part}=<name>"
-        if done := [name for name in unused if name.lower() in ("done", "dones")]:
-            cure = (
-                f"data.columns.terminated={done[0]} if the task ended there, or "
-                f"data.columns.truncated={done[0]} data.columns.terminated=false if "
-                "only the recording did"
+        cure = f"name it as in data.columns.{missing[0].split()[0]}=<name>"
+        if missing[0] == "terminated":
+            cure += (
+                ", or data.columns.terminated=false if nothing ends it; 'done' is "
+                "data.columns.truncated if only the recording ended"
             )
-        elif part == "terminated":
-            cure += ", or data.columns.terminated=false if nothing ends the task"
-        lack, there = ", ".join(missing), _listed(names)
-        raise ValueError(f"the data lack {lack}; the file has {there}: {cure}.")
+        raise ValueError(
+            f"the data lack {', '.join(missing)}; there are {_listed(names)}: {cure}."
+        )
     if unused and not wanted:
         # A misspelt next_observation would otherwise cost rows.
         raise ValueError(
-            f"unknown columns {', '.join(unused)}: rename or remove them, or name "
-            "those to read (data.columns.observation=...): the others are left out."
+            f"unknown columns {', '.join(unused)}: rename, remove, or name those to "
+            "read (data.columns.observation=...)."
         )
     return columns
 
@@ -297,8 +267,8 @@ def _named(part: str, patterns: Any, names: Sequence[str]) -> list[str]:
     for pattern in patterns if isinstance(patterns, (list, tuple)) else [str(patterns)]:
         # A name that looks like a pattern is a name.
         exact = [pattern] * (pattern in names)
-        matching = exact or [name for name in names if fnmatchcase(name, pattern)]
-        found += exact or _in_order(part, matching)
+        matching = exact or _in_order([n for n in names if fnmatchcase(n, pattern)])
+        found += matching
         if not matching or (part not in VECTORS and len(found) > 1):
             raise ValueError(
                 f"data.columns.{part}={pattern} names {_listed(matching)}; expected "
@@ -312,32 +282,23 @@ def _usual(part: str, names: Sequence[str]) -> list[str]:
     for usual in USUAL_NAMES[part]:
         if usual in names:
             return [usual]
-    for usual in USUAL_NAMES[part] if part in VECTORS else ():
-        if found := [name for name in names if name.startswith(f"{usual}_")]:
-            return _in_order(part, found)
-    return []
+    starts = USUAL_NAMES[part] if part in VECTORS else ()
+    found = ([n for n in names if n.startswith(f"{usual}_")] for usual in starts)
+    return _in_order(next(filter(None, found), []))
 
 
-def _in_order(part: str, names: list[str]) -> list[str]:
+def _in_order(names: list[str]) -> list[str]:
     """Entries of a vector by their numbers if all have one, else as in the file."""
-    ends = {name: re.search(r"\d+\D?$", name) for name in names}
-    stems = {name[: end.start()] if end else None for name, end in ends.items()}
-    if None in stems or len(stems) != 1:
+    matches = [re.fullmatch(r"(.*?)(\d+)\D?", name) for name in names]
+    found = [match for match in matches if match]
+    if len(found) < len(names) or len({match[1] for match in found}) != 1:
         return names
-    numbers = {name: int(re.findall(r"\d+", name)[-1]) for name in names}
-    there = sorted(numbers.values())
-    for before, number in pairwise([min(there[0] - 1, 0), *there]):  # from 0 or 1 on
-        if number > before + 1:
-            raise ValueError(
-                f"{part} has the columns {_listed(names)}, but none with the number "
-                f"{before + 1}: name all (data.columns.{part}=[...]) if that is right."
-            )
-    return sorted(names, key=numbers.__getitem__)
+    return [match[0] for match in sorted(found, key=lambda match: int(match[2]))]
 
 
 def _listed(names: Sequence[str], most: int = 20) -> str:
     rest = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + rest if names else "no column"
+    return ", ".join(names[:most]) + rest or "no column"
 
 
 def assemble(
@@ -346,34 +307,25 @@ def assemble(
     codes: dict[Any, int],
     file: Path | None = None,
 ) -> Arrays:
-    """Columns of a log, from those of a file.
-
-    Args:
-        layout: of the file.
-        arrays: all columns of the layout, by their names in the file.
-        codes: numbers of episodes that have names, or are in several files; new ones
-            are added.
-        file: if there are several.
-    """
+    """Columns of a log, from those of a file; ``codes`` number named episodes."""
     lengths = {name: len(array) if array.ndim else 0 for name, array in arrays.items()}
     if len({*lengths.values()}) > 1:
         raise ValueError(f"the columns have {lengths} rows; expected equally many.")
     columns: Arrays = {}
     for part, names in layout.items():
         first = arrays[names[0]]
-        if part == "episode":
-            columns[part] = _episodes(first, codes, file)
-        elif part == "step":
+        if part == "step":
             columns[part] = first.reshape(-1)
-        else:
+        elif part != "episode":
             found = [_numbers(name, arrays[name]) for name in names]
             vector = len(found) > 1 or (part in VECTORS and first.ndim == 1)
             columns[part] = np.column_stack(found) if vector else found[0]
-            if first.ndim > 2:
-                raise ValueError(
-                    f"{names[0]!r} has shape {[*first.shape]}; expected [N] or [N, D], "
-                    "the steps of all episodes below each other."
-                )
+        elif first.dtype.kind in "biuf" and file is None:
+            columns[part] = first.reshape(-1)
+        else:  # numbered in order of appearance
+            places, ids = pd.factorize(first.reshape(-1))
+            numbers = [float(codes.setdefault((file, i), len(codes))) for i in ids]
+            columns[part] = np.array([*numbers, np.nan])[places]  # -1 if missing
     columns.setdefault("terminated", np.zeros(len(columns["reward"]), np.bool_))
     return columns
 
@@ -382,34 +334,15 @@ def _numbers(name: str, array: Array) -> Array:
     """Column of numbers, with NaN for missing values."""
     if array.dtype.kind in "biuf":
         return array
-    values = pd.Series([*array], dtype=object)
-    numbers = pd.to_numeric(values, errors="coerce")
-    if (wrong := (numbers.isna() & values.notna()).to_numpy()).any():
-        row = int(wrong.argmax())
-        raise ValueError(
-            f"{name!r} holds {values[row]!r} in row {row} of {len(array)}; expected "
-            "numbers."
-        )
+    try:
+        numbers = pd.to_numeric(pd.Series([*array], dtype=object))
+    except ValueError as error:
+        raise ValueError(f"{name!r} holds other than numbers: {error}.") from error
     return np.asarray(numbers, np.float64)
 
 
-def _episodes(array: Array, codes: dict[Any, int], file: Path | None) -> Array:
-    """Numbers of episodes, in order of appearance if they have names."""
-    if array.dtype.kind in "biuf" and file is None:
-        return array.reshape(-1)
-    places, names = pd.factorize(array.reshape(-1))
-    found = [float(codes.setdefault((file, name), len(codes))) for name in names]
-    # -1 stands for a missing name
-    return np.asarray(np.array([*found, np.nan])[places])
-
-
 def _sorted(columns: Arrays, name: str, notes: list[str]) -> Arrays:
-    """Rows of all episodes, each in order of its steps or time stamps.
-
-    Raises:
-        ValueError: an episode has a step twice, or lacks one that its next state would
-            be read from.
-    """
+    """Rows of all episodes, each in order of its steps or time stamps."""
     given, episode = columns.pop("step"), columns["episode"]
     step = given
     if clock := given.dtype.kind not in "biuf":
@@ -432,8 +365,7 @@ def _sorted(columns: Arrays, name: str, notes: list[str]) -> Arrays:
         raise ValueError(
             f"episode {rows['episode'][row]:g} goes from {name!r} {given[order[row]]} "
             f"to {given[order[row + 1]]}, where steps are {usual:g} apart, as in "
-            f"{wrong.sum()} places: a next state is missing. Give next_observation, or "
-            "another episode to what follows."
+            f"{wrong.sum()} places: a next state is missing. Give next_observation."
         )
     if not counted:
         rate = f"{usual:g} s ({1 / usual:g} Hz)" if clock else f"{usual:g}"

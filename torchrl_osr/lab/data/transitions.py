@@ -58,13 +58,7 @@ def as_transitions(columns: Mapping[str, Array]) -> TensorDict:
 
 
 def check_dataset(data: TensorDictBase) -> None:
-    """Raise if a transition data set cannot be trained on.
-
-    Args:
-        data: transitions ``[N]`` with ``observation`` ``[N, S]``, ``action``
-            ``[N, A]`` and, under ``next``, ``observation`` ``[N, S]``, ``reward``
-            ``[N, 1]``, and boolean ``done``, ``terminated``, ``truncated``
-            ``[N, 1]``.
+    """Raise unless ``data``, transitions ``[N]``, can be trained on.
 
     Raises:
         ValueError: a key has another shape or type, holds a NaN or an infinity, or an
@@ -91,19 +85,15 @@ def check_rows(data: TensorDictBase) -> None:
             raise ValueError(f"{key!r} holds NaN or infinity in {bad} of {rows} rows.")
     done, *ends = (data[key] for key in FLAG_KEYS)
     if wrong := int((done != (ends[0] | ends[1])).sum()):
-        raise ValueError(
-            f"('next', 'done') differs from terminated | truncated in {wrong} rows."
-        )
+        raise ValueError(f"done differs from terminated | truncated in {wrong} rows.")
 
 
 def check_filled(data: TensorDictBase) -> None:
     """Raise if one of ``VECTOR_KEYS`` is zero in all rows."""
     for key in VECTOR_KEYS:
         if not any(bool(part.any()) for part in data[key].split(ROWS_AT_A_TIME)):
-            raise ValueError(
-                f"{key!r} is zero in all {len(data)} rows; expected real data. TorchRL "
-                "0.11 to 0.14.1 does this to Minari sets (MinariExperienceReplay)."
-            )
+            # TorchRL 0.11 to 0.14.1 does this to Minari sets.
+            raise ValueError(f"{key!r} is zero in all {len(data)} rows.")
 
 
 @dataclass(frozen=True)
@@ -120,16 +110,11 @@ class Reading:
 
 
 class Trajectories(NamedTuple):
-    """Transitions of whole trajectories, and facts about them.
+    """Transitions ``[N]`` of whole trajectories, perhaps none, and facts about them.
 
-    Attributes:
-        data: transitions ``[N]``; part of a data set may have no rows.
-        counts: rows that were dropped, filled or clipped, and kinds of ends.
-        episodes: return, length, and whether it is complete, of each trajectory
-            ``[E, 3]``.
-        changes: for each entry of ``observation`` and ``reward``, how often it changes
-            from one row to the next, and how many of these changes float32 loses,
-            ``[2, D]``.
+    ``episodes`` ``[E, 3]``: return, length, and whether it is complete. ``changes``
+    ``[2, D]``: how often each entry changes from one row to the next, and how many of
+    these changes float32 loses.
     """
 
     data: TensorDict
@@ -141,11 +126,7 @@ class Trajectories(NamedTuple):
 def trajectories(
     rows: Columns, options: Reading, before: Array | float = np.nan
 ) -> Trajectories:
-    """Transitions from columns of whole trajectories, of a data set or a part of it.
-
-    See :func:`~torchrl_osr.lab.data.transitions_from_columns` for the rules; ``before``
-    is the state ``[S]`` that the part before ended in.
-    """
+    """Transitions of a part of a set; the part before ended in state ``before``."""
     columns = _arrays(rows, options.num_actions)
     lost = _missing(columns, options.missing)
     flagged, ends = _ends(columns)
@@ -213,9 +194,7 @@ def _arrays(rows: Columns, num_actions: int | None) -> dict[str, Array]:
     if not {"truncated", "episode"} & rows.keys():
         flaws.append("neither truncated nor episode")
     # A misspelt optional column would otherwise be overlooked.
-    flaws += [
-        f"an unknown {name!r}" for name in rows if name not in REQUIRED + OPTIONAL
-    ]
+    flaws += [f"an unknown {n!r}" for n in rows if n not in REQUIRED + OPTIONAL]
     if flaws:
         raise ValueError(f"the columns have {', '.join(flaws)}.")
     columns: dict[str, Array] = {}
@@ -223,10 +202,7 @@ def _arrays(rows: Columns, num_actions: int | None) -> dict[str, Array]:
     for name, values in rows.items():
         if np.ma.is_masked(values):
             values = np.ma.asarray(values, np.float64).filled(np.nan)
-        try:
-            array = np.asarray(values)
-        except ValueError as error:
-            raise ValueError(f"{name!r} has rows of unequal length.") from error
+        array = np.asarray(values)
         size = int(np.size(array) / max(count, 1))
         if name == "next_observation":
             size = np.shape(rows["observation"])[-1]
@@ -251,8 +227,8 @@ def _missing(columns: Mapping[str, Array], missing: str) -> NDArray[np.bool_]:
         if wrong.any() and missing == "error":
             raise ValueError(
                 f"{name!r} has no value in row {wrong.argmax()} of {len(array)}, "
-                f"one of {wrong.sum()}: leave out such rows (data.missing=row) or "
-                "their episodes (data.missing=episode), or repair them."
+                f"one of {wrong.sum()}: repair them, or leave out such rows or their "
+                "episodes (data.missing=row, data.missing=episode)."
             )
         lost |= wrong
     return lost
@@ -272,16 +248,13 @@ def _ends(columns: Mapping[str, Array]) -> tuple[Array, Array]:
             raise ValueError(
                 f"row {row} ends its episode, and row {row + 1} belongs to the same "
                 f"'episode' {columns['episode'][row]:g}, as in {wrong.sum()} rows: the "
-                "flags may be late, or the rows in another order. Correct the columns, "
-                "or leave out the one that is wrong."
+                "flags may be late, or the rows in another order."
             )
         ends |= ~same
     return flagged, ends
 
 
-def _reset_rows(
-    columns: Mapping[str, Array], flagged: Array, before: Array | float
-) -> NDArray[np.bool_]:
+def _reset_rows(columns: Mapping[str, Array], flagged: Array, before: Any) -> Array:
     """Rows ``[N]`` in which a vector environment was reset: no action was executed.
 
     They begin in the state that an episode ended in, and have a reward of 0.
@@ -338,25 +311,19 @@ def _unit_actions(action: Array, options: Reading) -> tuple[Array, int, int]:
     if options.num_actions is not None:
         return action, 0, 0
     size = action.shape[1]
-    try:
-        low, high = (
-            np.broadcast_to(np.float64(b), size) for b in options.action_bounds
-        )
-        if not (np.isfinite([low, high]).all() and (low < high).all()):
-            raise ValueError("finite numbers")
-    except (TypeError, ValueError) as error:
+    low, high = (np.broadcast_to(np.float64(b), size) for b in options.action_bounds)
+    if not (np.isfinite([low, high]).all() and (low < high).all()):
         raise ValueError(
-            f"action_bounds={options.action_bounds} for {size} actions; expected the "
-            "lowest and the highest, finite numbers or lists (data.action_bounds)."
-        ) from error
+            f"action_bounds={options.action_bounds}; expected the lowest and the "
+            "highest action, finite numbers (data.action_bounds)."
+        )
     whole = ((action >= 0) & (action == np.round(action))).all()
     alone = size == 1 or (action.sum(1) == 1).all()
     if whole and alone and (low < 0).all() and np.ptp(action) > 0:
         raise ValueError(
             f"'action' holds only the whole numbers {action.min():g} to "
-            f"{action.max():g}, which look like discrete actions. If they are, name "
-            "the environment (env.id=...); if they are forces, give their bounds "
-            "(data.action_bounds=[0,high])."
+            f"{action.max():g}, which look like discrete actions: name the environment "
+            "(env.id=...), or give the bounds of forces (data.action_bounds=[0,high])."
         )
     unit = action
     # Bounds of -1 and 1 leave the numbers as they are, bit by bit.
@@ -370,8 +337,8 @@ def _unit_actions(action: Array, options: Reading) -> tuple[Array, int, int]:
             f"'action' leaves its bounds in {outside.sum()} of {len(action)} rows, "
             f"first in row {row}: {action[row].tolist()}, where they are "
             f"{low.tolist()} and {high.tolist()}. Give the true ones "
-            "(data.action_bounds=[low,high]); if the environment itself clipped them, "
-            "data.clip_actions=true."
+            "(data.action_bounds=[low,high]), or data.clip_actions=true if the "
+            "environment clipped them."
         )
     clipped = np.clip(unit, -ACTION_LIMIT, ACTION_LIMIT)
     return clipped, int((clipped != unit).any(1).sum()), int(outside.sum())
