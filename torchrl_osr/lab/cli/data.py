@@ -150,7 +150,6 @@ def overview(
     each = [f"{share:.1%} {name}" for name, share in zip(actions, shares, strict=True)]
     lines.append(f"  actions   {known}: {', '.join(each)}")
     lines += [f"  note      {note}" for note in manifest.get("notes", ())]
-    lines += [f"  note      {note}" for note in manifest.get("notes", ())]
     if unused := manifest.get("unused_columns"):
         lines.append(f"  not read  {', '.join(unused)}")
     return "\n".join(lines)
