@@ -112,7 +112,11 @@ def test_what_looks_wrong_is_numbered(look):
             ["data.columns.action=force"],
             "action=force names no column",
         ),
-        ({"sin": "left"}, [], "'sin' holds 'left' in row 0 of 1200; expected numbers"),
+        (
+            {"sin": "left"},
+            [],
+            "'sin' holds other than numbers: Unable to parse string 'left'",
+        ),
         ({"torque": 5.0}, [], "'action' leaves its bounds in 1200 of 1200 rows"),
         ({"speed": np.nan}, [], "'observation' has no value in row 0 of 1200"),
         ({}, ["data.path=other.csv"], "there is no file"),
