@@ -56,7 +56,6 @@ ON = {
 }
 ALWAYS = {"sensors", "action noise", "delay", "dynamics"}
 
-each_off = pytest.mark.parametrize("wrap", OFF.values(), ids=OFF.keys())
 each_on = pytest.mark.parametrize("wrap", ON.values(), ids=ON.keys())
 
 
@@ -81,17 +80,13 @@ def trajectory(env, *, steps, seed=3, seeds=()):
 
 @pytest.fixture(scope="module")
 def bare():
-    return {
-        name: trajectory(make_environment(name), steps=400)
-        for name in ("Hopper-v5", "HalfCheetah-v5")
-    }
+    return trajectory(make_environment("Hopper-v5"), steps=400)
 
 
-@each_off
-@pytest.mark.parametrize("name", ["Hopper-v5", "HalfCheetah-v5"])
-def test_off_is_the_bare_environment_bit_for_bit(wrap, name, bare):
-    env = wrap(make_environment(name))
-    assert (trajectory(env, steps=400) == bare[name]).all()
+@pytest.mark.parametrize("wrap", OFF.values(), ids=OFF.keys())
+def test_off_is_the_bare_environment_bit_for_bit(wrap, bare):
+    env = wrap(make_environment("Hopper-v5"))
+    assert (trajectory(env, steps=400) == bare).all()
     _, info = env.reset(seed=0)
     assert not info["disturbed"]
     assert not env.step(env.action_space.low)[-1]["disturbed"]
@@ -102,7 +97,7 @@ def test_same_seeds_give_the_same_trajectory(wrap, bare):
     env = wrap(make_environment("Hopper-v5"))
     seeds = range(10, 50)
     once = trajectory(env, steps=100, seeds=seeds)
-    assert not np.array_equal(once, bare["Hopper-v5"][: len(once)])
+    assert not np.array_equal(once, bare[: len(once)])
     # A fresh one, with another past, and with the globals seeded otherwise.
     other = wrap(make_environment("Hopper-v5"))
     trajectory(other, steps=30, seed=8)
@@ -144,13 +139,6 @@ def test_info_says_whether_the_disturbance_acted(name):
         assert 0 < sum(flags) < 20
     else:
         assert sum(flags) == (1 if "official" in name else 5)
-
-
-def test_flags_of_nested_disturbances_are_joined(play, recorder):
-    knock = ActionKnock(recorder(), 2, mode="paper", at=1)
-    env = ActionKnock(knock, 1, mode="paper", at=4)
-    flags = [step[-1]["disturbed"] for step in play(env, 6)]
-    assert flags == [False, True, True, False, True, False]
 
 
 def test_torchrl_reads_the_flags():
@@ -195,50 +183,29 @@ def test_what_the_environment_lacks_is_not_possible(env_id, names):
                 ON[name](env)
 
 
-def test_strengths_in_units_of_the_action_need_bounds(recorder):
-    for name in ("action noise", "knock"):
-        with pytest.raises(NotPossible, match="finite bounds"):
-            ON[name](recorder(high=np.inf))
-
-
 @pytest.mark.parametrize(
     ("wrapper", "options"),
     [
-        (ActionKnock, {"steps": 0, "mode": "paper"}),
         (ActionKnock, {"steps": 5, "mode": "official", "at": 0}),
-        (
-            ActionKnock,
-            {"steps": 5, "mode": "official", "at": "random", "window": (0, 9)},
-        ),
         (ExternalPush, {"force": 1.0, "duration": 1, "window": (9, 9)}),
-        (ExternalPush, {"force": float("nan"), "duration": 1}),
         (ObservationNoise, {"std": -0.1}),
-        (ObservationNoise, {"std": 1.0, "unit": [1.0, 2.0]}),
-        (ActionDelay, {"steps": -1}),
-        (StartStateNoise, {"std": -0.1}),
-        (DynamicsChange, {"mass": 0.0}),
     ],
 )
 def test_values_that_would_silently_do_nothing_are_refused(wrapper, options):
-    with pytest.raises(ValueError, match=r"must be|broadcast"):
+    with pytest.raises(ValueError, match="must be"):
         wrapper(make_environment("Hopper-v5"), **options)
 
 
-@pytest.mark.parametrize("env_id", ["InvertedPendulum-v5", "Swimmer-v5", "Pusher-v5"])
-def test_the_default_suite_is_for_every_mujoco_robot(env_id):
-    assert left_out(env_id, "oos") == {}
-
-
-def test_what_a_suite_needs_is_left_out_elsewhere():
-    needs_mujoco = {"push-1.0", "push-2.0", "start-noise-0.2", "mass-1.5"}
-    assert left_out("Pendulum-v1", "oos").keys() == needs_mujoco
-    assert left_out("CartPole-v1", "oos").keys() == needs_mujoco | {"knock-official-15"}
-    assert left_out("Pendulum-v1", "action") == {}
-
-
-def left_out(env_id, suite):
-    loaded = OmegaConf.load(SUITES / f"{suite}.yaml")
+@pytest.mark.parametrize(
+    ("env_id", "names"),
+    [
+        ("InvertedPendulum-v5", set()),
+        ("Pendulum-v1", {"push-1.0", "push-2.0", "start-noise-0.2", "mass-1.5"}),
+    ],
+)
+def test_disturbances_that_an_environment_does_not_allow(env_id, names):
+    loaded = OmegaConf.load(SUITES / "oos.yaml")
     configs = OmegaConf.merge(OmegaConf.structured(SuiteConfig), loaded).disturbances
     scale = np.ones(environment_spec(env_id).observation_size)
     made = make_disturbances(configs, SimpleNamespace(), scale)
-    return impossible_disturbances(env_id, made)
+    assert impossible_disturbances(env_id, made).keys() == names

@@ -156,12 +156,6 @@ def test_force_is_applied_and_removed(play):
     assert not env.unwrapped.data.xfrc_applied.any()
 
 
-def test_what_is_pushed_is_the_torso_or_the_heaviest_body():
-    for env_id, name in {"Ant-v5": "torso", "InvertedPendulum-v5": "cart"}.items():
-        with closing(ExternalPush(make_environment(env_id), 1.0, duration=1)) as env:
-            assert env.unwrapped.model.body(env.body).name == name
-
-
 def test_torque_draws_discrete_actions():
     with closing(make_environment("CartPole-v1")) as bare:
         env = ActionKnock(bare, 4, mode="torque", at=2)

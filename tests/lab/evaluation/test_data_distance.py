@@ -55,10 +55,3 @@ def test_threshold_is_the_quantile_of_states_that_were_left_out():
     kept = {tuple(row) for row in distance._states.tolist()}
     standard = [tuple(row) for row in distance._standard(rows).tolist()]
     assert len(kept) == len(kept & set(standard)) == 2000
-
-
-def test_too_few_rows_are_named():
-    with pytest.raises(ValueError, match="10 rows.* too few for 10 neighbours"):
-        DataDistance(dataset(torch.randn(10, 2)))
-    with pytest.raises(ValueError, match="max_reference=4"):
-        DataDistance(dataset(torch.randn(50, 2)), max_reference=4)

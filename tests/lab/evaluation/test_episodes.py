@@ -100,16 +100,3 @@ def test_successes_are_those_that_reached_the_goal():
     assert results.successes.tolist() == results.returns.astype(bool).tolist()
     assert len(set(results.successes.tolist())) == 2, "some shall miss it here"
     evaluator.close()
-
-
-def test_success_rate_has_wilsons_interval():
-    successes = np.array([True, True, False, False])
-    results = EpisodeResults(
-        successes.astype(float), np.full(4, 300), np.arange(4), successes
-    )
-    summary = summarize(results, reference_returns("pointmaze-umaze"))
-    assert (summary["score"], summary["success_rate"]) == (50, 0.5)
-    # By hand in test_statistics.
-    interval = summary["success_low"], summary["success_high"]
-    assert interval == pytest.approx((0.15004, 0.84996), abs=1e-5)
-    assert summary["successes"] == [True, True, False, False]

@@ -143,10 +143,3 @@ def test_the_states_that_ship_are_whole(half) -> None:
         hard = states.group == "recoverable"
         assert hard.any()
         assert not states.offsets[~hard].any()
-
-
-def test_states_that_do_not_ship_are_named() -> None:
-    with pytest.raises(ValueError, match=r"'halfcheetah', 'hopper',.* got 'ant'"):
-        load_recoverable_states("ant")
-    with pytest.raises(ValueError, match="half must be one of"):
-        load_recoverable_states("hopper", "all")

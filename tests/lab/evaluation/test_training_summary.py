@@ -41,10 +41,3 @@ def test_the_untrained_policy_is_in_no_mean(tmp_path):
     history = evaluations(100, 20, 40)
     rows = cells(score_table("hopper", history, history[2], None, tmp_path))
     assert rows["policy, mean of last 2"] == ["30.0"]
-
-
-def test_success_rates_have_their_own_row(tmp_path):
-    rate = {"success_rate": 0.5, "success_low": 0.1, "success_high": 0.9}
-    history = evaluations(1, 2, **rate, successes=[True, False])
-    rows = cells(score_table("maze", history, history[1], None, tmp_path))
-    assert rows["policy, last, success"][:4] == ["50.0", "[10.0,", "90.0]", "%"]

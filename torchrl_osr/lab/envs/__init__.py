@@ -1,22 +1,13 @@
 """Disturbances for robustness evaluation, as Gymnasium wrappers.
 
-They work in TorchRL (:class:`~torchrl.envs.GymWrapper`) and in plain Gymnasium loops:
-
 * ``reset(seed=...)`` seeds the disturbance, too. It draws from a generator of its own,
-  so that episodes with and without it start in the same state;
-* strength 0 is the bare environment, bit for bit;
+  so that episodes with and without it start in the same state.
+* Strength 0 is the bare environment, bit for bit.
 * ``info["disturbed"]`` is true in each step in which a disturbance acted.
 
 To combine several, wrap the task first in changes of dynamics and start state, then in
-knocks and pushes, actuators, and sensors. Attacks on observations need the networks:
-:func:`attacked_policy` makes an attacked policy from a policy.
-
-Examples:
-    >>> from torchrl_osr.lab.data import make_environment
-    >>> env = ObservationNoise(make_environment("Hopper-v5"), 0.1)
-    >>> observation, info = env.reset(seed=0)
-    >>> bool(info["disturbed"])
-    True
+knocks and pushes, actuators, and sensors. Attacks on observations need the networks,
+see :func:`attacked_policy`.
 """
 
 from torchrl_osr._extras import needed_by

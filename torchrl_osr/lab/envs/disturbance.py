@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import zlib
-from typing import Any, Literal, TypeAlias
+from typing import Any, TypeAlias
 
 import gymnasium
 import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
 from numpy.typing import NDArray
 
-from torchrl_osr._checks import check_positive
-
 Vector: TypeAlias = NDArray[Any]
 """Observation ``[S]`` or action ``[A]``."""
 
+Env: TypeAlias = gymnasium.Env[Vector, Vector]
+
 Step: TypeAlias = tuple[Vector, Any, bool, bool, dict[str, Any]]
 """Observation, reward, terminated, truncated, info."""
-
-At: TypeAlias = int | Literal["random"]
-"""Steps of the agent before a disturbance; ``"random"`` averages over the gait."""
 
 
 class NotPossible(TypeError):
@@ -37,10 +34,7 @@ def box_of(
 
 
 def mujoco_task(env: gymnasium.Env[Any, Any]) -> Any:
-    """Return the bare environment; raise NotPossible unless it is a MuJoCo task.
-
-    Others, such as the mazes, keep their simulation in another environment.
-    """
+    """Return the bare environment; raise NotPossible unless it is a MuJoCo task."""
     if isinstance(env.unwrapped, MujocoEnv):
         return env.unwrapped
     raise NotPossible(
@@ -50,7 +44,7 @@ def mujoco_task(env: gymnasium.Env[Any, Any]) -> Any:
 
 
 def flag(info: dict[str, Any], disturbed: bool) -> dict[str, Any]:
-    """Set ``info["disturbed"]`` if this disturbance, or one inside it, acted."""
+    """Set ``info["disturbed"]``: whether this disturbance, or one inside it, acted."""
     # A NumPy scalar: TorchRL reads no Python bool from info.
     info["disturbed"] = np.bool_(disturbed or info.get("disturbed", False))
     return info
@@ -60,16 +54,11 @@ class DisturbanceWrapper(gymnasium.Wrapper[Vector, Vector, Vector, Vector]):
     """Base of the disturbances: override :meth:`begin`, :meth:`act` or :meth:`observe`.
 
     A reset with a seed also seeds :attr:`generator`, which differs by class and by the
-    number of wrappers of that class inside; a reset without a seed continues it.
-
-    Args:
-        env: the environment.
-        always: whether it acts in every step and at the reset. Default ``False``.
+    number of wrappers of that class inside; a reset without a seed continues it. An
+    ``always`` disturbance acts in every step and at the reset.
     """
 
-    def __init__(
-        self, env: gymnasium.Env[Vector, Vector], *, always: bool = False
-    ) -> None:
+    def __init__(self, env: Env, *, always: bool = False) -> None:
         super().__init__(env)
         self.always, self.acted = always, False
         self.generator = np.random.default_rng()
@@ -107,23 +96,3 @@ class DisturbanceWrapper(gymnasium.Wrapper[Vector, Vector, Vector, Vector]):
         )
         flag(info, self.acted)
         return self.observe(observation), reward, terminated, truncated, info
-
-
-class Moment:
-    """Time of a disturbance that acts once an episode, at the earliest ``first``."""
-
-    def __init__(self, at: At, window: tuple[int, int], first: int = 0) -> None:
-        check_positive("the length of window", window[1] - window[0], minimum=1)
-        earliest = window[0] if at == "random" else at
-        check_positive("at, or the start of window,", earliest, minimum=first)
-        self.at, self.window, self.next_step = at, (window[0], window[1]), 0
-
-    def begin(self, generator: np.random.Generator) -> None:
-        """Draw the time for an episode."""
-        at = generator.integers(*self.window) if self.at == "random" else self.at
-        self.next_step = -int(at)
-
-    def count(self) -> int:
-        """Count a step; return its number, 0 at the moment, negative before."""
-        self.next_step += 1
-        return self.next_step - 1

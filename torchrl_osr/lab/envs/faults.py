@@ -9,20 +9,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from torchrl_osr._checks import check_positive, check_weight
-from torchrl_osr.lab.envs.disturbance import DisturbanceWrapper, Vector, box_of
+from torchrl_osr.lab.envs.disturbance import DisturbanceWrapper, Env, Vector, box_of
 
 
 class ActionNoise(DisturbanceWrapper):
     """Add Gaussian noise to every action and clip it to the action box.
 
     The random perturbation of "Robust Gymnasium" (https://arxiv.org/abs/2502.19652).
-
-    Args:
-        env: the environment, with bounded real actions.
-        std: standard deviation in half-widths of the box; 0 is off.
+    The standard deviation ``std`` is in half-widths of the box.
     """
 
-    def __init__(self, env: gymnasium.Env[Vector, Vector], std: float) -> None:
+    def __init__(self, env: Env, std: float) -> None:
         check_weight("std", std)
         super().__init__(env, always=std > 0)
         self.box = box_of(env.action_space, "actions", bounded=True)
@@ -43,13 +40,9 @@ class ActionDelay(DisturbanceWrapper):
 
     Constant delays of "Reinforcement Learning with Random Delays"
     (https://arxiv.org/abs/2010.02966).
-
-    Args:
-        env: the environment, with real actions.
-        steps: of the delay; 0 is off.
     """
 
-    def __init__(self, env: gymnasium.Env[Vector, Vector], steps: int) -> None:
+    def __init__(self, env: Env, steps: int) -> None:
         check_positive("steps", steps, minimum=0)
         super().__init__(env, always=steps > 0)
         self.box = box_of(env.action_space, "actions")
@@ -70,13 +63,9 @@ class StickyAction(DisturbanceWrapper):
     :class:`gymnasium.wrappers.StickyAction` with a random stream of its own, from
     "Revisiting the Arcade Learning Environment" (https://arxiv.org/abs/1709.06009),
     where the probability is 0.25.
-
-    Args:
-        env: the environment.
-        probability: of a repetition, from 0 (off) to below 1.
     """
 
-    def __init__(self, env: gymnasium.Env[Vector, Vector], probability: float) -> None:
+    def __init__(self, env: Env, probability: float) -> None:
         super().__init__(env)
         # Around an empty environment, whose random stream becomes that of the wrapper.
         self.sticky = gymnasium.wrappers.StickyAction(gymnasium.Env(), probability)
@@ -98,20 +87,18 @@ class ObservationNoise(DisturbanceWrapper):
 
     Absolute noise is that of DMBP (Yang and Xu, ICLR 2024), noise relative to the data
     that of RORL, https://arxiv.org/abs/2206.02829. The first observation of an episode
-    is noisy, too. Bounds of the observation space are not enforced.
+    is noisy, too. Noisy observations may leave the observation space.
 
     Args:
         env: the environment, with real observations.
-        std: standard deviation, in ``unit``; 0 is off.
+        std: standard deviation, in ``unit``.
 
     Keyword Args:
-        unit: the data's standard deviation of each number of an observation, ``[S]``.
+        unit: the data's standard deviation of each entry of an observation, ``[S]``.
             Default: 1, so that ``std`` is in the observation's own units.
     """
 
-    def __init__(
-        self, env: gymnasium.Env[Vector, Vector], std: float, *, unit: ArrayLike = 1.0
-    ) -> None:
+    def __init__(self, env: Env, std: float, *, unit: ArrayLike = 1.0) -> None:
         check_weight("std", std)
         super().__init__(env, always=std > 0)
         shape = box_of(env.observation_space, "observations").shape

@@ -22,10 +22,9 @@ from torchrl_osr.lab.losses.adversary import TanhNormalPolicy, Values
 
 
 def critics_of(loss: LossModule) -> Values:
-    """Return the values of a loss's critics as a function of states and actions.
+    """Return the values of a loss's ``N`` critics as a function of states and actions.
 
-    ``N`` critics, ``M`` perturbations and ``E`` episodes give ``[N, M, E]``. The
-    critics, not their targets, have the loss's current parameters.
+    ``M`` perturbations and ``E`` episodes give ``[N, M, E]``.
     """
 
     def values(states: TensorDictBase, action: Tensor) -> Tensor:
@@ -51,7 +50,7 @@ def attacked_policy(
     num_samples: int = 50,
     seed: int = 0,
 ) -> Callable[[Tensor], Tensor]:
-    r"""Return a deterministic policy ``[E, S]`` -> ``[E, A]`` that is attacked.
+    r"""Return a deterministic policy ``[E, S]`` -> ``[E, A]`` under attack.
 
     Each number of an observation is off by at most :math:`\epsilon` standard
     deviations: uniformly (``"random"``), or as
@@ -80,9 +79,10 @@ def attacked_policy(
         torch.Size([4, 3])
     """
     check_choice("kind", kind, ("random", "action_diff", "min_Q"))
-    objective: Literal["min_Q", "action_diff"]
-    objective = "min_Q" if kind == "min_Q" else "action_diff"
-    # Checks the other arguments, also for "random".
+    # It checks the other arguments, also for "random".
+    objective: Literal["min_Q", "action_diff"] = (
+        "min_Q" if kind == "min_Q" else "action_diff"
+    )
     adversary = Adversary(objective, method, epsilon, num_samples)
     generator = torch.Generator().manual_seed(seed)
 

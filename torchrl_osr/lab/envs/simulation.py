@@ -5,13 +5,13 @@ from __future__ import annotations
 import copy
 from typing import Any
 
-import gymnasium
 import mujoco
 import numpy as np
 
 from torchrl_osr._checks import check_positive, check_weight
 from torchrl_osr.lab.envs.disturbance import (
     DisturbanceWrapper,
+    Env,
     Vector,
     flag,
     mujoco_task,
@@ -24,9 +24,6 @@ class DynamicsChange(DisturbanceWrapper):
     The changes of SCPO (https://arxiv.org/abs/2112.10513: mass and friction) and ODRL
     (https://arxiv.org/abs/2410.20750: friction and gravity times 0.1, 0.5, 2 and 5).
     The environment has a changed copy of its model until :meth:`close`.
-
-    Args:
-        env: one of Gymnasium's MuJoCo tasks.
 
     Keyword Args:
         mass: factor of all masses and moments of inertia; MuJoCo's armature and the
@@ -43,7 +40,7 @@ class DynamicsChange(DisturbanceWrapper):
 
     def __init__(
         self,
-        env: gymnasium.Env[Vector, Vector],
+        env: Env,
         *,
         mass: float = 1.0,
         friction: float = 1.0,
@@ -78,16 +75,12 @@ class DynamicsChange(DisturbanceWrapper):
 class StartStateNoise(DisturbanceWrapper):
     """Add Gaussian noise to the start state of an episode.
 
-    Orientations of free bodies are rotated. After strong noise an episode may start
+    The standard deviation ``std`` is that of each degree of freedom, in metres or
+    radians, and in metres or radians a second. After strong noise an episode may start
     fallen, or with a foot in the ground. Put this around the bare task.
-
-    Args:
-        env: one of Gymnasium's MuJoCo tasks.
-        std: standard deviation in each degree of freedom, of positions in metres or
-            radians, of velocities in metres or radians a second; 0 is off.
     """
 
-    def __init__(self, env: gymnasium.Env[Vector, Vector], std: float) -> None:
+    def __init__(self, env: Env, std: float) -> None:
         check_weight("std", std)
         super().__init__(env)
         self.std = std

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import gymnasium
 import numpy as np
 
 from torchrl_osr._checks import check_choice, check_positive, check_weight
 from torchrl_osr.lab.envs.disturbance import (
-    At,
     DisturbanceWrapper,
-    Moment,
+    Env,
     Step,
     Vector,
     box_of,
@@ -20,26 +19,50 @@ from torchrl_osr.lab.envs.disturbance import (
 )
 
 EARTH_GRAVITY = 9.81
+SMALL = 1e-3  # of the benchmark's random actions, in units of the action
 
-SMALL = 1e-3
-"""Magnitude of the benchmark's random actions, in units of the action."""
+At: TypeAlias = int | Literal["random"]
+"""Steps of the agent before a disturbance; ``"random"`` averages over the gait."""
 
 
-class ActionKnock(DisturbanceWrapper):
+class TimedDisturbance(DisturbanceWrapper):
+    """Base of the disturbances that act once an episode, at the earliest ``first``."""
+
+    def __init__(
+        self, env: Env, at: At, window: tuple[int, int], *, first: int = 0
+    ) -> None:
+        check_positive("the length of window", window[1] - window[0], minimum=1)
+        earliest = window[0] if at == "random" else at
+        check_positive("at, or the start of window,", earliest, minimum=first)
+        super().__init__(env)
+        self.at, self.window, self.next_step = at, window, 0
+
+    def begin(self) -> None:
+        drawn = self.at == "random"
+        self.next_step = -int(
+            self.generator.integers(*self.window) if drawn else self.at
+        )
+
+    def count(self) -> int:
+        """Count a step; return its number, 0 at the disturbance, negative before."""
+        self.next_step += 1
+        return self.next_step - 1
+
+
+class ActionKnock(TimedDisturbance):
     r"""Random actions for some steps, once an episode.
 
     From "Recovering from Out-of-sample States via Inverse Dynamics in Offline
     Reinforcement Learning", section 5.2, https://openreview.net/forum?id=4gLWjSaw4o.
 
     * ``"official"``: the released sampler (https://github.com/Jack10843/OSR,
-      ``sampler.py``). After ``at`` steps of the agent, unless the episode has ended,
-      the bare environment takes ``steps`` *extra* steps with actions
-      :math:`U[0, 10^{-3})^A`. Sizes s, m, l: 5, 10, 15.
+      ``sampler.py``). After ``at`` steps of the agent, the bare environment takes
+      ``steps`` *extra* steps with actions :math:`U[0, 10^{-3})^A`. Sizes s, m, l: 5,
+      10, 15.
     * ``"paper"``: actions :math:`N(0, 10^{-6} I)` replace the agent's for ``steps``
       steps, which count like all others. Sizes s, m, l: 5, 10, 20.
-    * ``"torque"``: every number of the action is at its lower or upper bound, drawn
-      anew in every step with probability 1/2. The steps count as in ``"paper"``.
-      Discrete actions are drawn uniformly.
+    * ``"torque"``: as ``"paper"``, but each number of the action is at its lower or
+      upper bound with probability 1/2. Discrete actions are drawn uniformly.
 
     The agent's last step before the official knock returns the observation after the
     knock, with the reward and end of the agent's own action; a fall in the knock ends
@@ -69,7 +92,7 @@ class ActionKnock(DisturbanceWrapper):
 
     def __init__(
         self,
-        env: gymnasium.Env[Vector, Vector],
+        env: Env,
         steps: int,
         *,
         mode: Literal["official", "paper", "torque"],
@@ -78,20 +101,16 @@ class ActionKnock(DisturbanceWrapper):
     ) -> None:
         check_choice("mode", mode, ("official", "paper", "torque"))
         check_positive("steps", steps, minimum=1)
-        super().__init__(env)
         # The sampler knocks between two steps of the agent, never before the first.
-        self.moment = Moment(at, window, first=int(mode == "official"))
+        super().__init__(env, at, window, first=int(mode == "official"))
         self.steps, self.mode = steps, mode
         actions = env.action_space
         if mode != "torque" or not isinstance(actions, gymnasium.spaces.Discrete):
             actions = box_of(actions, "actions", bounded=mode == "torque")
         self.actions, self.due = actions, False
 
-    def begin(self) -> None:
-        self.moment.begin(self.generator)
-
     def act(self, action: Vector) -> Vector:
-        number = self.moment.count()
+        number = self.count()
         self.due = self.mode == "official" and number == -1
         self.acted = self.mode != "official" and 0 <= number < self.steps
         return self.random_action() if self.acted else action
@@ -110,7 +129,7 @@ class ActionKnock(DisturbanceWrapper):
         return observation, reward, terminated, truncated, info
 
     def random_action(self) -> Vector:
-        """Draw an action of the knock, in the modes that replace the agent's."""
+        """Draw an action that replaces the agent's."""
         actions = self.actions
         if isinstance(actions, gymnasium.spaces.Discrete):
             return np.asarray(actions.start + self.generator.integers(actions.n))
@@ -121,13 +140,12 @@ class ActionKnock(DisturbanceWrapper):
         return np.where(upper, actions.high, actions.low)
 
 
-class ExternalPush(DisturbanceWrapper):
+class ExternalPush(TimedDisturbance):
     """Push the torso forwards or backwards, once an episode.
 
     The arrow in the figures of the OSR paper, see :class:`ActionKnock`: a force along
-    the world's x axis at the torso's centre of mass (MuJoCo's ``xfrc_applied``). A
-    robot without a body ``torso`` is pushed at its heaviest body. The sign is drawn for
-    each episode.
+    the world's x axis at the torso's centre of mass, or that of the heaviest body. The
+    sign is drawn for each episode.
 
     Args:
         env: one of Gymnasium's MuJoCo tasks.
@@ -143,7 +161,7 @@ class ExternalPush(DisturbanceWrapper):
 
     def __init__(
         self,
-        env: gymnasium.Env[Vector, Vector],
+        env: Env,
         force: float,
         *,
         duration: int,
@@ -154,8 +172,7 @@ class ExternalPush(DisturbanceWrapper):
         check_weight("force", force)
         check_positive("duration", duration, minimum=1)
         check_choice("unit", unit, ("newton", "body_weight"))
-        super().__init__(env)
-        self.moment = Moment(at, window)
+        super().__init__(env, at, window)
         self.bare = mujoco_task(env)
         model = self.bare.model
         names = [model.body(number).name for number in range(model.nbody)]
@@ -167,11 +184,11 @@ class ExternalPush(DisturbanceWrapper):
         self.force, self.duration, self.sign = float(force), duration, 1.0
 
     def begin(self) -> None:
-        self.moment.begin(self.generator)
+        super().begin()
         self.sign = 1.0 if self.generator.random() < 0.5 else -1.0
 
     def step(self, action: Vector) -> Step:
-        pushed = 0 <= self.moment.count() < self.duration and self.force > 0
+        pushed = 0 <= self.count() < self.duration and self.force > 0
         applied = self.bare.data.xfrc_applied[self.body]
         before = applied[0]
         applied[0] = before + pushed * self.sign * self.force
