@@ -5,7 +5,7 @@
 
 Reads what ``torchrl-osr train`` and ``torchrl-osr evaluate`` left in and below the
 folders. ``report.html`` needs no other file; a CSV file for each table and a PNG file
-for each figure are beside it. How to read them: docs/report.md.
+for each figure are beside it. How to read them: docs/robustness.md.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ EXAMPLES = """\
   torchrl-osr report outputs
   torchrl-osr report multirun outputs --reference cql --output page
 
-The page is <output>/report.html; docs/report.md says how to read it.
+The page is <output>/report.html; docs/robustness.md says how to read it.
 """
 
 
