@@ -12,6 +12,8 @@ from torchrl_osr.lab.dynamics.conditional_vae import ConditionalVAE
 from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
 from torchrl_osr.lab.dynamics.rollouts import Termination, never, termination
 
+NEXT_STATE = ("next", "observation")
+
 CHOICES = {
     "terminations": ("auto", "never"),
     "unknown": ("refuse", "halt", "take"),
@@ -63,24 +65,16 @@ class DynamicsOptions:
 
     def transition_vae(self, observation_size: int) -> ConditionalVAE:
         """Build an untrained model of the states that follow a state in the data."""
+        size, cells = observation_size, self.vae_num_cells
         return ConditionalVAE(
-            observation_size,
-            observation_size,
-            condition_key="observation",
-            target_key=("next", "observation"),
-            change=True,
-            num_cells=self.vae_num_cells,
+            size, size, "observation", NEXT_STATE, change=True, num_cells=cells
         )
 
     def reverse_vae(self, observation_size: int, action_size: int) -> ConditionalVAE:
         """Build an untrained model of the actions that lead to a state in the data."""
+        sizes, cells = (observation_size, action_size), self.vae_num_cells
         return ConditionalVAE(
-            observation_size,
-            action_size,
-            condition_key=("next", "observation"),
-            target_key="action",
-            latent_bound=0.5,
-            num_cells=self.vae_num_cells,
+            *sizes, NEXT_STATE, "action", num_cells=cells, latent_bound=0.5
         )
 
     def termination(

@@ -145,16 +145,11 @@ class RolloutReplayBuffer:
             starts = perturbed_starts(model, starts, steps=steps, **self.bounds)
         sizes = data.scale.expand(model.observation_dim)
         units = torch.cat([sizes, sizes.new_tensor([1 / data.reward_scale])])
-        uniform = options.reverse_policy == "uniform"
         roll_out = rollout if options.reverse_policy is None else reverse_rollout
-        rows, rejected = roll_out(
-            model,
-            uniform_policy(model.action_dim) if uniform else act,
-            starts,
-            steps=options.rollout_steps,
-            units=units,
-            **self.bounds,
-        )
+        is_uniform = options.reverse_policy == "uniform"
+        acts = uniform_policy(model.action_dim) if is_uniform else act
+        limits = self.bounds | {"steps": options.rollout_steps, "units": units}
+        rows, rejected = roll_out(model, acts, starts, **limits)
         penalty = options.penalty * data.reward_scale
         rows["next", "reward"] -= penalty * rows["uncertainty"]
         rows = rows.select(*DATASET_KEYS)

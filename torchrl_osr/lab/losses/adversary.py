@@ -58,8 +58,7 @@ class Adversary:
     Args:
         objective: ``"action_diff"`` (default) or ``"min_Q"``.
         method: ``"sample"`` (default) or ``"gradient"``.
-        epsilon: half-width of the box in the observation's units, which are standard
-            deviations where observations are standardised. Default 0.01.
+        epsilon: half-width of the box in the observation's units. Default 0.01.
         num_samples: draws, or starts of the gradient steps. Default 20.
         num_steps: gradient steps. Default 10.
         step_size: length of a gradient step in units of ``epsilon``. Default 0.1.

@@ -38,10 +38,8 @@ class IQLLoss(ActorCriticLoss):
     "Offline Reinforcement Learning with Implicit Q-Learning",
     https://arxiv.org/abs/2110.06169.
 
-    Args:
-        actor_network: any with a density; the authors' is
-            :func:`~torchrl_osr.modules.gaussian_actor`.
-        value_network: :math:`V`, see :func:`~torchrl_osr.modules.state_value`.
+    The authors' actor is :func:`~torchrl_osr.modules.gaussian_actor`;
+    :func:`~torchrl_osr.modules.state_value` is a ``value_network``.
 
     Keyword Args:
         temperature: :math:`\beta`, the inverse temperature of the advantages. Default

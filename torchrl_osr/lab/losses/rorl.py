@@ -62,8 +62,7 @@ class RORLLoss(ActorCriticLoss):
     Keyword Args:
         num_samples: ``M``. Default 20.
         policy_smooth_reg: :math:`\beta_P`. Default 0.1.
-        policy_smooth_eps: half-width of its box, in the observation's units, which are
-            standard deviations where observations are standardised. Default 0.005.
+        policy_smooth_eps: half-width of its box, in units of the state. Default 0.005.
         q_smooth_reg: :math:`\beta_Q`. Default 1e-4.
         q_smooth_eps: half-width of its box. Default 0.005.
         q_smooth_tau: weight of values that fall against those that rise. Default 0.2.

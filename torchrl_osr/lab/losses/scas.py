@@ -48,9 +48,8 @@ class SCASLoss(TD3Loss):
     squared error); rows that are ``done`` have no correction; the target is the
     critics' minimum in mazes, too (there their mean).
 
-    Args:
-        qvalue_network: critics; the authors have four.
-        dynamics_network: :math:`M`, trained, or loaded later by :meth:`load_frozen`.
+    The authors have four critics. :math:`M` is trained, or loaded later by
+    :meth:`load_frozen`.
 
     Keyword Args:
         correction_weight: :math:`\lambda`, between 0 and 1. Default 0.25.

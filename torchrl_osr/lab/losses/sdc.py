@@ -75,18 +75,13 @@ class StateDeviationLoss(ActorCriticLoss):
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
     Examples:
-        >>> from torchrl_osr import CQLLoss
-        >>> from torchrl_osr.lab.dynamics import ConditionalVAE, DynamicsEnsemble
         >>> from torchrl_osr.lab.losses import StateDeviationLoss
-        >>> from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
-        >>> from torchrl_osr.objectives import WithRecovery
-        >>> actor = tanh_gaussian_actor(11, 3)
-        >>> deviation = StateDeviationLoss(
-        ...     actor, DynamicsEnsemble(11, 3),
-        ...     ConditionalVAE(11, 11, condition_key="observation", change=True,
-        ...                    target_key=("next", "observation")))
-        >>> sdc = WithRecovery(CQLLoss(actor, critic_ensemble(11, 3)), deviation)
-        >>> sdc.out_keys[-4:]
+        >>> from torchrl_osr.modules import tanh_gaussian_actor
+        >>> following = ConditionalVAE(
+        ...     11, 11, "observation", ("next", "observation"), change=True)
+        >>> loss = StateDeviationLoss(
+        ...     tanh_gaussian_actor(11, 3), DynamicsEnsemble(11, 3), following)
+        >>> loss.out_keys
         ['loss_deviation', 'loss_multiplier', 'deviation', 'multiplier']
     """
 
