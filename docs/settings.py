@@ -1,8 +1,8 @@
 """The page of settings: every key of ``torchrl-osr train``, from the schemas.
 
 ``conf.py`` writes it when the documentation is built. Names and types are those of the
-schemas and of the losses' signatures, meanings those of their docstrings, values those
-of the two presets.
+schemas and of the losses' signatures, meanings those of their comments and
+docstrings, values those of the two presets.
 """
 
 from __future__ import annotations
@@ -60,6 +60,19 @@ def described(documented: Any) -> dict[str, str]:
     return found
 
 
+def commented(config: type) -> dict[str, str]:
+    """The comment beside each field of a dataclass, or above it."""
+    found, above = {}, []
+    for line in inspect.getsource(config).splitlines():
+        if comment := re.match(r"    # (.*)", line):
+            above.append(comment[1])
+            continue
+        if field := re.match(r"    (\w+): [^#]*(?:# (.*))?$", line):
+            found[field[1]] = field[2] or " ".join(above)
+        above = []
+    return found
+
+
 def markdown(text: str) -> str:
     """A docstring's markup as Markdown that fits into a table's cell."""
     text = re.sub(r":math:`(.*?)`", r"$\1$", text)
@@ -74,7 +87,7 @@ def markdown(text: str) -> str:
 
 def meanings(cfg: DictConfig) -> dict[str, str]:
     """The meaning of every key, dotted."""
-    found = described(schema.TrainConfig)
+    found = commented(schema.TrainConfig)
     found |= dict(meanings_of_groups(schema.TrainConfig))
     for name in ("loss", "inverse_dynamics.loss"):
         target = get_class(OmegaConf.select(cfg, f"{name}._target_"))
@@ -90,7 +103,7 @@ def meanings_of_groups(config: type, prefix: str = "") -> Iterator[tuple[str, st
     for name, field in config.__dataclass_fields__.items():
         if dataclasses.is_dataclass(field.default_factory):
             group = field.default_factory
-            for key, text in described(group).items():
+            for key, text in commented(group).items():
                 yield f"{prefix}{name}.{key}", text
             yield from meanings_of_groups(group, f"{prefix}{name}.")
 
@@ -119,6 +132,10 @@ def page() -> str:
         composed = [compose("train", [f"preset={name}"]) for name in PRESETS]
     values = [
         dict(leaves(OmegaConf.to_container(cfg, resolve=True))) for cfg in composed
+    ]
+    values = [
+        {key: each for key, each in of.items() if not key.startswith("settings.")}
+        for of in values
     ]
     known = meanings(composed[0])
     groups: dict[str, list[str]] = {"The common ones": list(COMMON)}

@@ -27,7 +27,7 @@ from tensordict import TensorDict
 
 from torchrl_osr.lab.data import load_behavior_policy
 from torchrl_osr.lab.envs import ExternalPush
-from torchrl_osr.lab.run.trained_run import load_trained
+from torchrl_osr.lab.run.load import load_trained
 
 BEGIN, DURATION, EVERY, FRAMES = 100, 5, 25, 9  # steps; a frame every 25 from the push
 

@@ -40,9 +40,8 @@ from torchrl_osr.lab.evaluation import (
     summarize,
 )
 from torchrl_osr.lab.evaluation.figures import IN_WORDS
-from torchrl_osr.lab.run.build import references_of
-from torchrl_osr.lab.run.trained_run import TrainedRun, load_trained
-from torchrl_osr.lab.run.training_data import load_training_data
+from torchrl_osr.lab.run.data import load_training_data, references_of
+from torchrl_osr.lab.run.load import TrainedRun, load_trained
 
 FRAMES_PER_BATCH = 100
 
@@ -72,9 +71,9 @@ def make_collector(run: TrainedRun, frames: int, seed: int) -> Collector:
 def make_trainer(run: TrainedRun, frames: int, seed: int) -> OfflineToOnlineTrainer:
     """TorchRL's trainer with the run's data, loss and optimizer: one update a frame."""
     cfg, loss = run.config, run.loss
-    cfg.optim.n_steps = 1  # as the rows that the environment will add
     buffer = OfflineToOnlineReplayBuffer(
-        load_training_data(cfg, torch.device("cpu")).buffer,
+        # One-step rows, as those that the environment will add.
+        load_training_data(cfg.env, cfg.data, batch_size=cfg.trainer.batch_size).buffer,
         online_capacity=frames,
         offline_fraction=0.5,
         batch_size=cfg.trainer.batch_size,
@@ -151,7 +150,7 @@ def main(arguments: Sequence[str]) -> None:
         "seed": options.seed,
         "curve": [],
     }
-    references = references_of(run.config)
+    references = references_of(run.config.env)
     evaluator = EpisodeEvaluator(run.config.env.id, num_episodes=options.episodes)
     policy = deterministic_policy(run.actor, run.observation_norm)
     trainer = make_trainer(run, options.frames, options.seed)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -11,24 +10,9 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-
-try:
-    from warm_runs import Server
-except ModuleNotFoundError:
-    Server = None
+from warm import Server
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-PRINTED = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-
-
-def command(name: str, *arguments: str) -> list[str]:
-    """An example of that file name, or a command of the package."""
-    script = (
-        [str(EXAMPLES / name)]
-        if name.endswith(".py")
-        else ["-m", "torchrl_osr.lab", name]
-    )
-    return [sys.executable, *script, *arguments]
 
 
 @pytest.fixture(scope="module")
@@ -63,45 +47,39 @@ def tiny() -> Callable[..., list[str]]:
 
 @pytest.fixture(scope="session")
 def run_fresh() -> Callable[..., tuple[int, str]]:
-    """Return a function that runs one to its end: exit code and what it printed.
+    """Return a function that runs a command: its exit code and what it printed.
 
     It imports everything itself, which takes seconds: for what is read or said then.
     """
 
-    def run(cwd: Path, script: str, *arguments: str) -> tuple[int, str]:
+    def run(cwd: Path, name: str, *arguments: str) -> tuple[int, str]:
         done = subprocess.run(
-            command(script, *arguments), cwd=cwd, timeout=240, check=False, **PRINTED
-        )
+            [sys.executable, "-m", "torchrl_osr.lab", name, *arguments],
+            cwd=cwd, timeout=240, check=False, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        )  # fmt: skip
         return done.returncode, done.stdout
 
     return run
 
 
 @pytest.fixture(scope="session")
-def server() -> Iterator[Server | None]:
-    """A process that has imported everything and forks commands.
-
-    A source distribution has no benchmarks, and so no such process.
-    """
-    server = Server and Server(os.environ | {"OMP_NUM_THREADS": "1"})
+def server() -> Iterator[Server]:
+    """A process that has imported everything and forks commands."""
+    server = Server()
     yield server
-    if server:
-        server.close()
+    server.close()
 
 
 @pytest.fixture(scope="session")
-def run(tmp_path_factory, server, run_fresh) -> Callable[..., tuple[int, str]]:
-    """Return the same function for processes forked after the imports."""
-    if server is None:
-        return run_fresh
+def run(tmp_path_factory, server) -> Callable[..., tuple[int, str]]:
+    """Return the same function for forked processes, also of an example's file."""
     outputs = tmp_path_factory.mktemp("outputs")
 
-    def run(cwd: Path, script: str, *arguments: str) -> tuple[int, str]:
-        if script.endswith(".py"):
-            script = str(EXAMPLES / script)
+    def run(cwd: Path, name: str, *arguments: str) -> tuple[int, str]:
+        name = str(EXAMPLES / name) if name.endswith(".py") else name
         output = outputs / f"{len(list(outputs.iterdir()))}.txt"
-        given = {"folder": str(cwd), "environment": dict(os.environ)}
-        server.start(script, *arguments, output=output, **given)
+        server.start(name, *arguments, output=output, folder=cwd)
         return server.ended(), output.read_text(encoding="utf-8")
 
     return run

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import torch
 from composed import composed
-from omegaconf import OmegaConf
 from torch.optim.swa_utils import AveragedModel
 from torchrl.checkpoint import CheckpointRotation
 from torchrl.envs import ObservationNorm
 
 from torchrl_osr.lab.evaluation import deterministic_policy
 from torchrl_osr.lab.run.build import make_learner
-from torchrl_osr.lab.run.trained_run import CHECKPOINTS
+from torchrl_osr.lab.run.config import checked, write_config
+from torchrl_osr.lab.run.load import CHECKPOINTS
 from torchrl_osr.trainers.checkpoints import safe_checkpoint
 
 
@@ -22,10 +22,14 @@ def make_run(folder: Path, *overrides: str, sizes: tuple[int, int] = (11, 3)):
 
     The sizes of observation and action are hopper's unless given.
     """
-    cfg = composed("train", "network.num_cells=[8]", *overrides)
+    config = checked(composed("train", "network.num_cells=[8]", *overrides))
+    env = config.env
+    env.observation_size, env.action_size = sizes
+    if "loss=discrete_osr" not in overrides and env.action_low is None:
+        env.action_low, env.action_high = [-1.0] * sizes[1], [1.0] * sizes[1]
     folder.mkdir()
-    OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
-    actor, _, loss, objective = make_learner(cfg, *sizes)
+    write_config(folder, config)
+    actor, _, loss, objective = make_learner(config)
     norm = ObservationNorm(
         torch.full(sizes[:1], 2.0), torch.full(sizes[:1], 3.0), in_keys=["observation"],
         standard_normal=True,

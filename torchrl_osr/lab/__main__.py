@@ -10,23 +10,21 @@ from importlib.metadata import PackageNotFoundError, version
 
 from torchrl_osr.lab.cli.console import errors_as_sentences
 
-# Threads that wait shall not spin; read once, when torch is imported.
+# Waiting threads do not spin; read once, when torch is imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 COMMANDS = {
-    "data": "look at a log before anything is trained on it",
+    "data": "check a log before training on it",
     "train": "train a policy on offline data, or continue a run",
+    "settings": "print the settings of every method on a data set",
     "collect": "roll out a policy in any environment and keep the log",
-    "evaluate": "disturb a trained policy: score lost, survival, way back",
+    "evaluate": "disturb a trained policy: score lost, survival, recovery",
     "report": "compare any number of runs on one page",
     "export": "write a trained policy to one file, for use elsewhere",
 }
 
-CONFIGURED = ("data", "train", "collect", "evaluate")
-"""Those that Hydra configures."""
-
 HELP = """\
-Offline reinforcement learning that recovers when knocked off its data (OSR).
+Offline reinforcement learning that recovers from out-of-distribution states (OSR).
 
   torchrl-osr <command> ...
 
@@ -40,19 +38,18 @@ A first run, its evaluation and a page about both:
 
 For every command:
 
-  --help     what it takes
+  --help     its options
   --debug    the traceback of an error, which is otherwise one sentence
 
-  torchrl-osr --version                        versions, for a bug report
-  eval "$(torchrl-osr -sc install=bash)"       completion in this shell
+  torchrl-osr --version    versions, for a bug report
 """
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Give the rest of the command line to the command that it begins with.
+    """Dispatch to the subcommand.
 
     Args:
-        arguments: the command and what it takes. Default: those of the process.
+        arguments: the command and its arguments. Default: those of the process.
     """
     name, *rest = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if name in ("-h", "--help"):
@@ -60,19 +57,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(HELP.format(commands="\n".join(lines)), end="")
     elif name == "--version":
         print(_versions())
-    elif name in ("-sc", "--shell-completion"):
-        _complete(list(rest))
     elif name in COMMANDS:
-        _start(name, [f"torchrl-osr {name}", *rest])
+        # Hydra takes no flag behind the first key=value.
+        rest.sort(key=lambda each: each not in ("-m", "--multirun"))
+        sys.argv = [f"torchrl-osr {name}", *rest]
+        with errors_as_sentences():
+            import_module(f"torchrl_osr.lab.cli.{name}").main()
     else:
         known = ", ".join(COMMANDS)
         sys.exit(f"torchrl-osr has no command {name!r}; it has {known}.")
-
-
-def _start(name: str, arguments: list[str]) -> None:
-    sys.argv = arguments
-    with errors_as_sentences():
-        import_module(f"torchrl_osr.lab.cli.{name}").main()
 
 
 def _versions() -> str:
@@ -87,23 +80,6 @@ def _versions() -> str:
         except PackageNotFoundError:
             found.append(f"{package} not installed")
     return ", ".join(found)
-
-
-def _complete(arguments: list[str]) -> None:
-    """Give Hydra's completion, which knows no commands, the line without its command.
-
-    Where it has nothing to offer, the shell completes names of files.
-    """
-    if arguments[:1] != ["query=bash"]:  # to install it, any command will do
-        _start("train", ["torchrl-osr", "-sc", *arguments])
-        return
-    line = os.environ["COMP_LINE"]
-    program, name, rest = (*line.split(maxsplit=2), "", "")[:3]
-    if not name or (not rest and not line.endswith(" ")):
-        print(*COMMANDS)
-    elif name in CONFIGURED:
-        os.environ["COMP_LINE"] = f"{program} {rest}"
-        _start(name, [program, "-sc", *arguments])
 
 
 if __name__ == "__main__":

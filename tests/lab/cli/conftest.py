@@ -1,7 +1,5 @@
 """Each file has a cache of its own."""
 
-from __future__ import annotations
-
 import pytest
 
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-from composed import CONF, composed
-from omegaconf import OmegaConf
+from composed import composed
 from PIL import Image
 
 from torchrl_osr.lab.cli import data
@@ -20,7 +18,6 @@ from torchrl_osr.lab.data import (
     write_memmap,
 )
 from torchrl_osr.lab.data.record import record_episodes
-from torchrl_osr.lab.data.table import USUAL_NAMES
 
 
 @pytest.fixture
@@ -141,12 +138,3 @@ def test_rolled_out_data_too(look, tmp_path, monkeypatch):
     assert error is None
     assert "300 rows" in output
     assert "observation[10]" in output
-
-
-def test_help_fits_a_screen():
-    path = CONF / "check_data.yaml"
-    text = OmegaConf.load(path).hydra.help.template.strip()
-    assert len(text.splitlines()) <= 28
-    assert max(map(len, text.splitlines())) <= 80
-    parts = re.search(r"parts: ([\w,\s]+)\n +data", text)[1]
-    assert set(re.findall(r"\w+", parts)) == USUAL_NAMES.keys()

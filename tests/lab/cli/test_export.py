@@ -7,7 +7,7 @@ from untrained_run import make_run
 
 from torchrl_osr.lab.__main__ import main
 from torchrl_osr.lab.cli import export
-from torchrl_osr.lab.run.policy_of_run import load_run_policy
+from torchrl_osr.lab.run.load import load_run_policy
 
 
 @pytest.fixture
@@ -61,16 +61,10 @@ def test_what_cannot_be_exported_is_one_line(tmp_path, command):
     for arguments, kind, message in [
         # A text is printed, with code 1.
         (["nowhere", "p.onnx"], str, "there is no run and no checkpoint at nowhere."),
-        (["p.safetensors", "p.onnx"], str, "p.safetensors cannot be read as a policy"),
+        (["p.safetensors", "p.onnx"], str, "p.safetensors is no file of tensors"),
         (["nowhere", "p.pt"], int, "must end in .safetensors, .onnx or .pt2.\n"),
     ]:
         code, output = command(*arguments)
         assert isinstance(code, kind)
         assert message in f"{code}{output}"
         assert "Traceback" not in output
-
-
-def test_help_fits_a_screen(command):
-    code, output = command("--help")
-    assert code == 0
-    assert len(output.splitlines()) <= 24

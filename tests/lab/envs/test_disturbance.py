@@ -27,7 +27,8 @@ from torchrl_osr.lab.envs import (
     StickyAction,
 )
 from torchrl_osr.lab.evaluation.robustness import impossible_disturbances
-from torchrl_osr.lab.run.suite import SuiteConfig, make_disturbances
+from torchrl_osr.lab.run.evaluate import make_disturbances
+from torchrl_osr.lab.run.schema import SuiteConfig
 
 SUITES = Path(__file__).parents[3] / "conf" / "evaluation" / "suite"
 MAZE = "PointMaze_UMaze-v3"

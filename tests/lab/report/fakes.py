@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 
 from torchrl_osr.lab.data.scores import REFERENCE_RETURNS
 from torchrl_osr.lab.report import RunTables, read_runs
+from torchrl_osr.lab.run.config import FORMAT
 
 IDS = {"hopper": "Hopper-v5", "walker2d": "Walker2d-v5"}
 CONFIG = {
@@ -51,6 +52,7 @@ def write_run(
     config.seed, config.trainer.steps = seed, max(scores, default=8000)
     for key, value in (changes or {}).items():
         OmegaConf.update(config, key, value)
+    config.format = FORMAT
     OmegaConf.save(config, folder / "config.yaml")
     hydra = {"overrides": {"task": overrides or []}}
     hydra |= {"runtime": {"choices": {"loss": choice}}}

@@ -2,36 +2,48 @@
 
 from __future__ import annotations
 
+import gymnasium
+import numpy as np
 import pytest
 import torch
 from composed import CONF, composed
+from gymnasium.spaces import Box
 from hydra.utils import get_class
 from torchrl.modules import TanhDelta, TanhNormal
 from torchrl.objectives import SoftUpdate
 
-from torchrl_osr.lab.losses import TD3BCLoss
-from torchrl_osr.lab.run.build import make_learner
+from torchrl_osr.lab.run.build import make_learner, read_environment, try_out
+from torchrl_osr.lab.run.config import checked
 
 LOSSES = sorted(path.stem for path in (CONF / "loss").glob("*.yaml"))
 
 
 def learner_of(*overrides: str):
     """The networks and loss of a composed configuration, for make_batch's sizes."""
-    cfg = composed("train", "network.num_cells=[8]", "optim.gamma=0.5", *overrides)
-    return cfg, make_learner(cfg, 3, 2)
+    given = "network.num_cells=[8]", "optim.gamma=0.5", "env.observation_size=3"
+    config = checked(composed("train", *given, "env.action_size=2", *overrides))
+    if not any("discrete" in each for each in overrides):
+        config.env.action_low, config.env.action_high = [-1.0, -1.0], [1.0, 1.0]
+    return config, make_learner(config)
+
+
+@pytest.fixture
+def batch(make_batch):
+    batch = make_batch(10).apply(lambda x: x.float() if x.is_floating_point() else x)
+    batch["next", "action"] = batch["action"].flip(0)
+    return batch
 
 
 @pytest.mark.parametrize("name", LOSSES)
-def test_every_loss_is_built_and_trains_its_networks(name, make_batch) -> None:
-    cfg, (actor, _, loss, _) = learner_of(f"loss={name}")
-    assert type(loss) is get_class(cfg.loss._target_)
-    if hasattr(loss, "qvalue_network"):
+def test_every_loss_is_built_and_trains_its_networks(name, batch) -> None:
+    config, learner = learner_of(f"loss={name}")
+    actor, _, loss, _ = learner
+    assert type(loss) is get_class(config.loss["_target_"])
+    if learner.has_critics:
         ten = name == "rorl" or name.endswith("_10")
         assert loss.num_qvalue_nets == (4 if name == "scas" else 10 if ten else 2)
         assert loss.value_estimator.gamma == 0.5
         SoftUpdate(loss, tau=0.1)
-    batch = make_batch(10).apply(lambda x: x.float() if x.is_floating_point() else x)
-    batch["next", "action"] = batch["action"].flip(0)
     if name.startswith("discrete"):
         batch["action"] = torch.eye(2)[torch.arange(10) % 2]
     losses = [value for key, value in loss(batch).items() if key.startswith("loss_")]
@@ -43,34 +55,27 @@ def test_every_loss_is_built_and_trains_its_networks(name, make_batch) -> None:
 
 
 def test_actor_is_of_the_kind_that_the_loss_trains() -> None:
-    kinds = {}
-    for name in ("osr", "td3_bc"):
-        _, (actor, _, loss, _) = learner_of(f"loss={name}")
-        kinds[name] = actor[-1].distribution_class
-    assert kinds == {"osr": TanhNormal, "td3_bc": TanhDelta}
-    assert type(loss) is TD3BCLoss
+    for name, kind in {"osr": TanhNormal, "td3_bc": TanhDelta}.items():
+        _, learner = learner_of(f"loss={name}")
+        assert learner.actor[-1].distribution_class is kind
 
 
 def test_a_loss_is_given_a_model_where_it_uses_one() -> None:
     for name, used in {"osr": True, "cql": False, "edac_10": False}.items():
         _, (_, model, loss, _) = learner_of(f"loss={name}")
         assert (model is not None) == used
-        assert ("inverse_dynamics_network" in loss.__dict__) == used
         held = {each.data_ptr() for each in loss.state_dict().values()}
         assert not used or {each.data_ptr() for each in model.parameters()} <= held
 
 
 @pytest.mark.parametrize(
-    ("name", "recovery"),
-    [("bc", "osr"), ("iql", "osr"), ("rebrac", "noisy_bc"), ("sac_10", "noisy_bc")],
+    ("name", "recovery"), [("bc", "osr"), ("iql", "osr"), ("rebrac", "noisy_bc")]
 )
-def test_recovery_is_added_to_a_loss_without_it(name, recovery, make_batch) -> None:
+def test_recovery_is_added_to_a_loss_without_it(name, recovery, batch) -> None:
     _, added = learner_of(f"loss={name}", f"recovery={recovery}")
     assert (added.model is not None) == (recovery == "osr")
-    if hasattr(added.loss, "qvalue_network"):
+    if added.has_critics:
         SoftUpdate(added.loss, tau=0.1)
-    batch = make_batch(10).apply(lambda x: x.float() if x.is_floating_point() else x)
-    batch["next", "action"] = batch["action"].flip(0)
     out = added.objective(batch)
     assert set(out.keys()) > set(added.loss.out_keys)
     grads = []
@@ -83,16 +88,67 @@ def test_recovery_is_added_to_a_loss_without_it(name, recovery, make_batch) -> N
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["loss=osr"], r"OSRLoss has a recovery term of its own .*recovery_weight=0.5"),
-        (["loss=discrete_cql"], "for real actions.*take loss=discrete_osr"),
+        (["recovery=osr"], "a recovery term of its own"),
+        (["loss=iql", "dynamics=ensemble"], "choose dynamics=none"),
+        (["loss=rebrac", "dynamics=ensemble"], "choose dynamics=none"),
+        (["loss=scas", "dynamics=none"], "choose dynamics=ensemble"),
+        (["loss=scas", "dynamics=reverse"], "choose dynamics=ensemble"),
+        (["loss=rambo", "dynamics.real_ratio=1.0"], "set it to 0"),
+        (["loss=bc", "perturbation=adversarial"], "needs critics, which BCLoss lacks"),
+        (["loss=td3_bc", "perturbation=adversarial"], "tanh-Gaussian"),
+        (["data.held_out=0"], "data.held_out=0.0 leaves nothing"),
+        (["loss=romi", "dynamics.unknown=halt"], "need a forward model"),
     ],
 )
-def test_recovery_that_cannot_be_added_is_refused(overrides, message) -> None:
+def test_options_that_do_not_fit_each_other_are_refused(overrides, message) -> None:
     with pytest.raises(ValueError, match=message):
-        learner_of(*overrides, "recovery=osr")
+        learner_of(*overrides)
 
 
-def test_a_model_with_a_latent_is_built() -> None:
-    _, learner = learner_of("inverse_dynamics=cvae", "loss=osr_official")
-    assert "latent_loc" in learner.model.out_keys
-    assert learner.loss.inverse_dynamics_network.out_keys == learner.model.out_keys
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["env.id=CartPole-v1"], "discrete actions.*loss=discrete_osr"),
+        (["env.id=Pendulum-v1", "loss=discrete_osr"], "real actions.*loss=osr"),
+        (["env.id=Pendulum-v1", "env.action_low=[-1.0]"], "but Pendulum-v1 has"),
+        (["env.id=Pendulums-v1"], "env.id=Pendulums-v1 cannot be made"),
+    ],
+)
+def test_an_environment_of_another_kind_is_refused(overrides, message):
+    config = checked(composed("train", *overrides))
+
+    def build() -> None:
+        read_environment(config.env)
+        make_learner(config)
+
+    with pytest.raises(ValueError, match=message):
+        build()
+
+
+class Broken(gymnasium.Env):
+    """An environment whose step is broken in one of several ways."""
+
+    observation_space = Box(-1, 1, (2,))
+    action_space = Box(-1, 1, (1,))
+
+    def __init__(self, how: str) -> None:
+        self.how = how
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        if self.how == "raise":
+            raise KeyError("motor")
+        state = np.full(2, np.nan if self.how == "nan" else 0, np.float32)
+        five = state, np.zeros(2) if self.how == "array" else 0.0, False, False, {}
+        return five[:3] + five[4:] if self.how == "four" else five
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("how", ["raise", "nan", "array", "four"])
+def test_a_broken_environment_is_found_by_one_step(how):
+    gymnasium.register("Broken-v0", Broken, kwargs={"how": how}, max_episode_steps=5)
+    with pytest.raises(RuntimeError, match="^Broken-v0 (cannot be played|has obs)"):
+        try_out("Broken-v0")
+    del gymnasium.registry["Broken-v0"]

@@ -9,7 +9,6 @@ The log is what ``torchrl-osr train data=file`` reads. See docs/any_environment.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import closing
 from importlib import import_module
 from pathlib import Path
@@ -19,9 +18,8 @@ import numpy as np
 import torch
 from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
-from torchrl_osr.lab.cli import CONF
 from torchrl_osr.lab.cli.console import single_job
 from torchrl_osr.lab.data.environment import check_simulated, open_environment
 from torchrl_osr.lab.data.record import (
@@ -30,28 +28,25 @@ from torchrl_osr.lab.data.record import (
     record_episodes,
     write_log,
 )
-from torchrl_osr.lab.run import schema
-from torchrl_osr.lab.run.limits import check_values
-from torchrl_osr.lab.run.policy_of_run import load_run_policy
-from torchrl_osr.lab.run.run_config import (
-    chosen_environment,
-    import_from_here,
-    module_of,
-)
-from torchrl_osr.policy import Policy
+from torchrl_osr.lab.run import CONF
+from torchrl_osr.lab.run.config import check_environment, import_from_here, module_of
+from torchrl_osr.lab.run.load import load_run_policy
+from torchrl_osr.lab.run.schema import register
 
-schema.register()
+register()
 
 
 @hydra.main(version_base="1.3", config_path=CONF, config_name="collect")
 @single_job
 def main(cfg: DictConfig) -> None:
     """Play the episodes, write the log, and say what is in it."""
-    check_values({name: cfg[name] for name in ("episodes", "seed")})
+    if cfg.episodes < 1 or cfg.seed < 0:
+        raise ValueError("episodes must be at least 1, and seed at least 0.")
     torch.set_num_threads(1)
     path = Path(cfg.path).expanduser()
     check_log_path(path)
-    env_id = chosen_environment(cfg)
+    env_id = None if OmegaConf.is_missing(cfg.env, "id") else str(cfg.env.id)
+    module_of(env_id or "")
     act: Act | None = None
     if cfg.policy == "random":
         if cfg.noise:
@@ -61,7 +56,11 @@ def main(cfg: DictConfig) -> None:
             )
     elif Path(cfg.policy).exists():
         policy = load_run_policy(cfg.policy, cfg.trust)
-        env_id, act = env_id or environment_of(policy, cfg.trust), policy.act
+        known = policy.record["source"].get("env_id")
+        if env_id is None and known:
+            check_environment(known, cfg.trust)  # the policy may come with it
+            env_id = known
+        act = policy.act
     elif ":" in cfg.policy:
         act = imported(cfg.policy)
     else:
@@ -85,22 +84,6 @@ def main(cfg: DictConfig) -> None:
     write_log(path, columns)
     print(description(path, columns))
     print(f"  torchrl-osr train env.id={env_id} {loss}data=file data.path={path}")
-
-
-def environment_of(policy: Policy, trust: Sequence[str]) -> str | None:
-    """Id of the environment that a policy was trained in, if it is known.
-
-    Raises:
-        ValueError: if it imports a package that is not trusted: the policy may come
-            with it.
-    """
-    env_id: str | None = policy.record["source"].get("env_id")
-    if env_id is not None and not {*module_of(env_id)} <= {*trust}:
-        raise ValueError(
-            f"the policy is of env.id={env_id}, which imports a package: if you know "
-            "it, give env.id yourself, or trust=[...]."
-        )
-    return env_id
 
 
 def imported(name: str) -> Act:

@@ -1,19 +1,18 @@
-"""The console of all commands: an error is one sentence, ``--debug`` its traceback."""
+"""Errors of all commands: one sentence, and with ``--debug`` the traceback."""
 
 from __future__ import annotations
 
+import difflib
 import functools
 import logging
 import os
-import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 OURS = (ValueError, OSError, RuntimeError, ImportError, ArithmeticError, MemoryError)
-"""What this package raises, with a whole sentence; anything else is a defect."""
-
+"""Errors that this package raises with a whole sentence; others are defects."""
 
 EXTRAS = (
     *("filelock", "gymnasium", "hydra", "jinja2", "matplotlib", "mujoco"),
@@ -31,7 +30,7 @@ def errors_as_sentences() -> Iterator[None]:
     """
     debug = "--debug" in sys.argv or os.environ.get("HYDRA_FULL_ERROR") == "1"
     sys.argv = [each for each in sys.argv if each != "--debug"]
-    # Without it Hydra prints errors itself, in its own words.
+    # Without it Hydra prints errors itself.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
         yield
@@ -48,7 +47,7 @@ def errors_as_sentences() -> Iterator[None]:
 
 
 def single_job(task: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorate a Hydra task so that its error is told once, by its sentence alone.
+    """Decorate a Hydra task so that its error is printed once, as a sentence.
 
     The traceback goes into the job's log file. In a sweep the error goes on to Hydra,
     for the other jobs are to run.
@@ -76,40 +75,39 @@ def single_job(task: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def sentence(error: BaseException) -> str:
-    """What went wrong, in words; of a defect also its type and how to see more."""
+    """Return an error in words; of a defect also its type and how to see more."""
     if type(error).__module__.startswith(("hydra.", "omegaconf.")):
         return _configuration_error(error)
     if isinstance(error, ModuleNotFoundError) and error.name in EXTRAS:
         return f"{error.name!r} is missing: pip install 'torchrl-osr[train]'"
-    if "Unable to configure handler" in str(error) and error.__cause__:
-        return f"cannot write a log: {sentence(error.__cause__)}"  # Hydra's, of a run
     if isinstance(error, OURS) and str(error):
-        return re.sub(r"\[Errno \d+\] ", "", str(error))  # what follows says it
+        return str(error)
     return f"{type(error).__name__}: {error}\nIts traceback: add --debug."
 
 
 def _configuration_error(error: Any) -> str:
-    """What is wrong with the command line, from an error of Hydra's or OmegaConf's."""
-    from hydra.errors import MissingConfigException, OverrideParseException
-    from omegaconf.errors import (
-        ConfigAttributeError,
-        ConfigKeyError,
-        MissingMandatoryValue,
-    )
+    """Name the key, and list the choices, of an error of Hydra's or OmegaConf's."""
+    from hydra.errors import MissingConfigException
+    from omegaconf.errors import ConfigAttributeError, ConfigKeyError
 
     cause = error.__cause__
-    if isinstance(error, MissingMandatoryValue):
-        return f"{error.full_key} is missing: give {error.full_key}=..., see --help."
-    if isinstance(error, OverrideParseException):
-        why = str(error).splitlines()[1]
-        return f"cannot read {error.override!r} as key=value: {why}."
     if isinstance(error, MissingConfigException) and error.options:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
-        return f"{group} has no option {name!r}; it has {', '.join(error.options)}."
+        options = ", ".join(error.options)
+        guess = _similar(name, error.options)
+        return f"{group} has no option {name!r}{guess}; it has {options}."
     if isinstance(cause, (ConfigKeyError, ConfigAttributeError)):
-        return f"there is no key {cause.full_key!r}; --cfg job prints all that are."
-    told = [str(each).strip().split("\n")[0] for each in (error, cause) if each]
-    return ": ".join(told)
+        last = str(cause.full_key).rpartition(".")[2]
+        guess = _similar(last, map(str, cause.parent_node or ()))
+        return f"there is no key {cause.full_key!r}{guess}; --cfg job prints all keys."
+    lines = [str(each).strip().split("\n")[0] for each in (error, cause) if each]
+    return ": ".join(lines)
+
+
+def _similar(name: str, known: Iterable[str]) -> str:
+    """A question after an unknown name, if a known one is similar."""
+    found = difflib.get_close_matches(name, list(known), 1)
+    return f" (did you mean {found[0]!r}?)" if found else ""
 
 
 def _log(error: Exception, *, files_only: bool) -> None:

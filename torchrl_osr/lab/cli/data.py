@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,6 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 from torchrl import torchrl_logger
 
-from torchrl_osr.lab.cli import CONF
 from torchrl_osr.lab.cli.console import single_job
 from torchrl_osr.lab.data import environment_spec, load_dataset, make_environment
 from torchrl_osr.lab.data.overview import (
@@ -34,13 +34,13 @@ from torchrl_osr.lab.data.overview import (
 from torchrl_osr.lab.data.sources import RECORDED, open_recorded
 from torchrl_osr.lab.data.store import CHUNK_ROWS, is_memmap_folder
 from torchrl_osr.lab.evaluation.figures import data_figure
-from torchrl_osr.lab.run import schema
-from torchrl_osr.lab.run.limits import check_values
-from torchrl_osr.lab.run.run_config import check_types, chosen_environment, flatten
+from torchrl_osr.lab.run import CONF
+from torchrl_osr.lab.run.config import check_types, module_of
+from torchrl_osr.lab.run.schema import DataConfig, register
 
 MOST_ENTRIES = 40  # in the table
 
-schema.register()
+register()
 
 
 @hydra.main(version_base="1.3", config_path=CONF, config_name="check_data")
@@ -48,16 +48,16 @@ schema.register()
 def main(cfg: DictConfig) -> None:
     """Read the data, print what they are, draw them; nothing else is written."""
     torchrl_logger.setLevel("ERROR")  # warnings are among the findings
-    data_only = OmegaConf.create({"data": OmegaConf.to_container(cfg.data)})
-    check_types(OmegaConf.create({"data": schema.DataConfig}), data_only)
-    check_values(flatten(OmegaConf.to_container(data_only)))
-    env_id = chosen_environment(cfg)
+    typed = check_types(OmegaConf.structured(DataConfig), dict(cfg.data))
+    chosen: Any = OmegaConf.to_object(typed)
+    env_id = None if OmegaConf.is_missing(cfg.env, "id") else str(cfg.env.id)
+    module_of(env_id or "")
     env_name = None if env_id is None else cfg.env.get("name")
-    options: Any = OmegaConf.to_container(cfg.data)
+    options = asdict(chosen)
     read = ("columns", "action_bounds", "clip_actions", "missing", "download")
     reading = {name: options[name] for name in read}
     recipe = {name: options[name] for name in ("num_transitions", "seed")}
-    source, path = cfg.data.source, options["path"]
+    source, path = chosen.source, chosen.path
     files = [path] if isinstance(path, str) else path
     title = Path(files[0]).name if path else f"{env_name or 'data'} {source}"
     entries: list[Entry] = []
@@ -78,8 +78,8 @@ def main(cfg: DictConfig) -> None:
             env_id=env_id,
             path=path,
             progress=cfg.progress,
-            on_disk=cfg.data.storage == "disk",
-            random_share=cfg.data.random_share,
+            on_disk=chosen.storage == "disk",
+            random_share=chosen.random_share,
             **reading,
             **recipe,
         )

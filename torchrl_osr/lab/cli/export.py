@@ -20,7 +20,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchrl_osr.lab.run.policy_of_run import load_run_policy
+from torchrl_osr.lab.run.load import load_run_policy
 from torchrl_osr.policy import Policy, load_policy
 from torchrl_osr.policy.export import SUFFIXES
 from torchrl_osr.policy.policy import SUFFIX

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 from torch import Tensor
 
@@ -55,7 +54,6 @@ class DynamicsOptions:
     adversarial_steps: int = 0
     adversarial_weight: float = 3e-4
     adversarial_lr: float = 3e-4
-    published: dict[str, Any] = field(default_factory=dict)  # settings by data set
 
     def ensemble(self, observation_size: int, action_size: int) -> DynamicsEnsemble:
         """Build an untrained ensemble."""

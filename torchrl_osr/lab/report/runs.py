@@ -14,12 +14,12 @@ import pandas as pd
 
 from torchrl_osr._files import read_json
 from torchrl_osr.lab.data import reference_returns
-from torchrl_osr.lab.run.run_config import flatten, read_yaml
-from torchrl_osr.lab.run.run_folder import CONFIG, MAY_DIFFER, read_status
+from torchrl_osr.lab.run.config import CONFIG, flatten, read_config, read_yaml
+from torchrl_osr.lab.run.folder import RESUMABLE, read_status
 from torchrl_osr.lab.run.schema import method_name
 
 IGNORED = (
-    *sorted({*MAY_DIFFER} - {"trainer.steps", "trainer.eval_interval"}),
+    *sorted({*RESUMABLE} - {"trainer.steps", "trainer.eval_interval"}),
     *("resume", "seed", "data.storage", "logger.", "trainer.compile"),
     *("trainer.cudagraph", "trainer.checkpoint_interval", "loss.deactivate_vmap"),
 )
@@ -27,7 +27,7 @@ IGNORED = (
 
 METHOD = (
     *("loss.", "recovery", "network.actor.", "optim.policy_delay", "perturbation."),
-    *("inverse_dynamics.", "dynamics.", "num_random", "min_q_weight"),
+    *("inverse_dynamics.", "dynamics."),
 )
 """Settings in which methods differ by intent; all others should be equal."""
 
@@ -198,8 +198,10 @@ def _read(folder: Path) -> _Run:
         raise ValueError(
             f"not finished, its status is {status['status']}{''.join(why)}"
         )
-    config = flatten(read_yaml(folder / CONFIG))
+    config = flatten(read_config(folder))
     hydra = read_yaml(folder / ".hydra" / "hydra.yaml")["hydra"]
+    choices = hydra["runtime"]["choices"]
+    method = method_name(choices["loss"], choices.get("recovery"))
     returns = read_json(folder / "returns.json")
     env, steps, path = config["env.name"], config["trainer.steps"], config["data.path"]
     references = reference_returns(
@@ -237,7 +239,7 @@ def _read(folder: Path) -> _Run:
     }
     facts = {
         "folder": str(folder),
-        "method": above if in_layout else method_name(hydra["runtime"]["choices"]),
+        "method": above if in_layout else method,
         "data": data + (f", {100 * share:g} % random" if share else ""),
         "seed": int(config["seed"]),
         "steps": int(steps),

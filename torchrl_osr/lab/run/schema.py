@@ -1,8 +1,8 @@
-"""The typed schema of the examples' configuration.
+"""Typed schema of the configuration: every key, its type and its meaning.
 
-Types and meanings are here, values in ``conf/``. :func:`register` makes the schema
-known to Hydra, which then refuses a mistyped key or a value of the wrong type by name.
-An option of a loss is declared once, in the loss: its schema is derived from that.
+Values are in ``conf/``. :func:`register` makes the schema known to Hydra, which then
+refuses a mistyped key or a value of the wrong type. The options of a loss are declared
+once, in its constructor: :func:`schema_of` derives their schema.
 """
 
 from __future__ import annotations
@@ -11,288 +11,161 @@ import functools
 import inspect
 import operator
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, make_dataclass
+from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from hydra.core.config_store import ConfigStore
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import MISSING, OmegaConf
+from hydra.utils import get_class
+from omegaconf import MISSING, DictConfig, OmegaConf
 
 from torchrl_osr import objectives
 from torchrl_osr.lab import losses
 from torchrl_osr.lab.dynamics import DynamicsOptions
-from torchrl_osr.lab.run.published import register_published
-
-# File systems allow 255 bytes, and temporary names beside it need some of them.
-MAX_FOLDER_NAME = 200
 
 CHOSEN = {
     name: getattr(package, name)
     for package in (objectives, losses)
     for name in package.__all__
-    if name != "ActorCriticLoss"
+    if name not in ("ActorCriticLoss", "WithRecovery")
 }
-"""Losses that a configuration can name, and the adversary."""
+"""Classes that a configuration can name: the losses, and the adversary."""
 
 
 @dataclass
 class EnvConfig:
-    """Which task.
+    """The task."""
 
-    Attributes:
-        id: Gymnasium id of the environment that is evaluated; package:Name-v0 imports
-            the package first.
-        name: short name of the task, which behaviour policies and reference scores
-            have.
-        random_return: mean return of a random policy, score 0; null with
-            expert_return: raw returns, unless the task is one of D4RL's.
-        expert_return: mean return of an expert, score 100.
-        action_low: lowest action in the environment's own units, read from it and kept
-            with the run; null if actions are discrete.
-        action_high: highest action, likewise.
-    """
-
-    id: str = MISSING
-    name: str = "${environment_name:${env.id}}"
-    random_return: float | None = None
-    expert_return: float | None = None
-    action_low: list[float] | None = None
+    id: str = MISSING  # Gymnasium id; package:Name-v0 imports the package first
+    name: str = "${environment_name:${env.id}}"  # short name, of behaviours and scores
+    random_return: float | None = None  # mean return of a random policy, score 0;
+    expert_return: float | None = None  # of an expert, score 100; null: raw returns
+    # Read from the environment and kept with the run.
+    action_low: list[float] | None = None  # in its own units; null: discrete actions
     action_high: list[float] | None = None
+    observation_size: int | None = None
+    action_size: int | None = None  # or the number of discrete actions
 
 
 @dataclass
 class ColumnsConfig:
-    """Names of a file's columns; null for the usual names, see docs/your_data.md.
+    """Names of a log's columns; null for the usual names, see docs/your_data.md."""
 
-    Attributes:
-        observation: a name, a pattern such as ``obs_*``, or a list of names.
-        action: likewise.
-        reward: a name.
-        terminated: a name, or false if nothing ever ends the task.
-        truncated: a name.
-        episode: a name; the numbers or texts in it tell episodes apart.
-        step: a name; rows of an episode are sorted by it.
-        next_observation: as observation.
-    """
-
-    observation: Any = None
-    action: Any = None
+    observation: Any = None  # a name, a pattern such as obs_*, or a list of names
+    action: Any = None  # likewise
     reward: str | None = None
-    terminated: Any = None
+    terminated: Any = None  # a name; false: nothing ever ends the task
     truncated: str | None = None
-    episode: str | None = None
-    step: str | None = None
-    next_observation: Any = None
+    episode: str | None = None  # its numbers or texts tell episodes apart
+    step: str | None = None  # rows of an episode are sorted by it
+    next_observation: Any = None  # as observation
 
 
 @dataclass
 class DataConfig:
-    """Which data set: rolled out from the packaged behaviour policies, or recorded.
+    """The data set: rolled out from packaged behaviour policies, or recorded."""
 
-    Attributes:
-        source: of the behaviour: random, medium, medium-replay, medium-expert or
-            expert; diverse or play in a maze; minari, d4rl or file for recorded data.
-        path: recorded data to read, see docs/your_data.md; a list of files is one log.
-        columns: what the columns of a file are called.
-        action_bounds: lowest and highest action as the recording has them, two numbers
-            or two lists; null for those of the environment, or of a Minari set.
-        clip_actions: bring recorded actions that are outside of their bounds back to
-            them, as many environments do, rather than refuse them.
-        missing: error, row or episode: what is left out where values are missing.
-        download: fetch the set that path names.
-        num_transitions: number of rows.
-        seed: random seed of the roll-outs and of the held-out rows.
-        random_share: share of the rows that are of random quality instead.
-        storage: memory, or disk for sets that do not fit in memory, see
-            docs/large_data.md.
-        held_out: share of the rows kept from training, to judge the inverse dynamics
-            model.
-        standardize: bring observations to mean 0 and standard deviation 1.
-        reward_scale: factor of the rewards that are trained on.
-        reward_shift: added to these rewards; evaluation has the task's own.
-    """
-
+    # Behaviour: random, medium, medium-replay, medium-expert, expert; diverse or play
+    # in a maze. Recorded data: minari, d4rl or file.
     source: str = MISSING
-    path: Any = None
+    path: Any = None  # recorded data to read; of several files a list or a pattern
     columns: ColumnsConfig = field(default_factory=ColumnsConfig)
-    action_bounds: Any = None
-    clip_actions: bool = MISSING
-    missing: str = MISSING
-    download: bool = MISSING
+    action_bounds: Any = None  # of the log: two numbers or lists; null: the task's
+    clip_actions: bool = MISSING  # clip actions outside the bounds; false: refuse them
+    missing: str = MISSING  # values that lack: error, or leave out their row or episode
+    download: bool = MISSING  # fetch the set that path names
     num_transitions: int = MISSING
-    seed: int = MISSING
-    random_share: float = MISSING
-    storage: str = MISSING
-    held_out: float = MISSING
-    standardize: bool = MISSING
-    reward_scale: float = MISSING
-    reward_shift: float = MISSING
-
-
-@dataclass
-class TargetConfig:
-    """A function or class to be called, by its full name."""
-
-    _target_: str = MISSING
+    seed: int = MISSING  # of the roll-outs and of the held-out rows
+    random_share: float = MISSING  # share of rows of a random policy instead
+    storage: str = MISSING  # memory; disk: rows are read as they are sampled
+    held_out: float = MISSING  # share of rows that models are judged on
+    standardize: bool = MISSING  # observations to mean 0 and standard deviation 1
+    reward_scale: float = MISSING  # of the rewards that are trained on, not of the
+    reward_shift: float = MISSING  # evaluation's: reward_scale * r + reward_shift
 
 
 @dataclass
 class NetworkConfig:
-    """Actor, critics and inverse dynamics model.
+    """Actor and critics."""
 
-    Attributes:
-        actor: the function that builds the policy, of the kind that the loss trains.
-        critic: the function that builds the critics, likewise.
-        num_cells: width of each hidden layer.
-        layer_norm: layer normalisation in the critics; steadier, not in the paper.
-    """
-
-    actor: TargetConfig = field(default_factory=TargetConfig)
-    critic: TargetConfig = field(default_factory=TargetConfig)
-    num_cells: list[int] = MISSING
-    layer_norm: bool = MISSING
+    actor: dict[str, Any] = MISSING  # _target_ builds it; its options may follow
+    critic: dict[str, Any] = MISSING  # likewise
+    num_cells: list[int] = MISSING  # width of each hidden layer
+    layer_norm: bool = MISSING  # in the critics; steadier, not in the paper
 
 
 @dataclass
 class PerturbationConfig:
-    """The noise of the mixed data set, see ``StatePerturbation``.
+    """Noise of the mixed data set, see StatePerturbation."""
 
-    Attributes:
-        std: standard deviation of the noise, in units of each observation entry's in
-            the data, or of the observation where ``data.standardize`` is false.
-        noise: distribution of the noise: gaussian or uniform.
-        adversary: options of ``Adversary``, which chooses the perturbed states of the
-            policy's training in the place of the noise; null for the noise.
-    """
-
-    std: float = MISSING
-    noise: str = MISSING
+    std: float = MISSING  # in standard deviations of the data, if standardised
+    noise: str = MISSING  # gaussian or uniform
+    # Options of Adversary, which chooses the policy's perturbed states instead.
     adversary: Any = None
 
 
 @dataclass
 class InverseDynamicsConfig:
-    """Which inverse dynamics model, and how it is trained.
+    """The inverse dynamics model and its training."""
 
-    Attributes:
-        network: the function that builds it.
-        loss: options of ``InverseDynamicsLoss``.
-        shuffle_next: an ablation: train the model with the next state of another
-            row.
-    """
-
-    network: TargetConfig = field(default_factory=TargetConfig)
-    loss: Any = MISSING
-    shuffle_next: bool = False
+    network: dict[str, Any] = MISSING  # _target_ builds it
+    loss: Any = MISSING  # options of InverseDynamicsLoss
+    shuffle_next: bool = False  # ablation: train with another row's next state
 
 
 @dataclass
 class OptimConfig:
-    """Adam's learning rates and what moves with them.
+    """Adam's learning rates and what moves with them."""
 
-    Attributes:
-        actor_lr: learning rate of the policy and the entropy temperature.
-        qvalue_lr: learning rate of the critics.
-        inverse_dynamics_lr: learning rate of the inverse dynamics model.
-        gamma: discount factor.
-        n_steps: rewards that the TD target sums before it goes on with the critics'
-            value, as many of them as the data have in a row: n-step returns.
-        tau: step of the target networks towards the critics, at each update.
-        policy_delay: updates of the critics for each of the policy, the entropy
-            temperature and the target networks.
-        actor_schedule: constant, or cosine: actor_lr falls to 0 along half a cosine
-            over trainer.steps.
-        qvalue_schedule: the same of qvalue_lr.
-        policy_average: share of the new weights in the exponential average of the
-            policy's weights, at each update; larger in the first ones, so that the
-            average never covers more than about the last tenth of a run. The average is
-            what is evaluated and exported; with 1 it is the weights themselves.
-    """
-
-    actor_lr: float = MISSING
-    qvalue_lr: float = MISSING
+    actor_lr: float = MISSING  # policy and entropy temperature
+    qvalue_lr: float = MISSING  # critics
     inverse_dynamics_lr: float = MISSING
-    gamma: float = MISSING
-    n_steps: int = 1
-    tau: float = MISSING
-    policy_delay: int = 1
-    actor_schedule: str = "constant"
-    qvalue_schedule: str = "constant"
+    gamma: float = MISSING  # discount factor
+    n_steps: int = 1  # n-step returns, as far as the data have the rows
+    tau: float = MISSING  # step of the target networks at each update
+    policy_delay: int = 1  # updates of the critics for each of policy and targets
+    actor_schedule: str = "constant"  # cosine: actor_lr falls to 0 over the run
+    qvalue_schedule: str = "constant"  # likewise of qvalue_lr
+    # Share of the new weights in the exponential average of the policy's weights, which
+    # is what is evaluated and exported; 1: the weights themselves.
     policy_average: float = 1.0
 
 
 @dataclass
 class TrainerConfig:
-    """How long, how often, where.
-
-    Attributes:
-        batch_size: rows of a gradient step.
-        inverse_dynamics_steps: gradient steps of the inverse dynamics model.
-        steps: gradient steps of the policy and the critics.
-        log_interval: steps between log entries.
-        eval_interval: steps between evaluations.
-        eval_episodes: complete episodes in an evaluation.
-        checkpoint_interval: steps between checkpoints.
-        checkpoints_kept: number of newest checkpoints that stay, beside the best.
-        num_threads: torch threads; 1 where several runs share the machine.
-        device: cpu or cuda.
-        precision: of the losses' matrix products: float32 or bfloat16.
-        matmul_precision: of float32 products, torch's: highest, high or medium.
-        record: repeat a recording of the losses' operations: the same bits in less
-            time, on a CPU.
-        compile: run the losses through ``torch.compile``.
-        progress: show progress bars when on a terminal.
-    """
+    """Length, intervals and hardware. Intervals are in gradient steps."""
 
     batch_size: int = MISSING
-    inverse_dynamics_steps: int = MISSING
-    steps: int = MISSING
+    inverse_dynamics_steps: int = MISSING  # gradient steps of that model
+    steps: int = MISSING  # gradient steps of policy and critics
     log_interval: int = MISSING
     eval_interval: int = MISSING
     eval_episodes: int = MISSING
     checkpoint_interval: int = MISSING
-    checkpoints_kept: int = MISSING
-    num_threads: int = MISSING
-    device: str = MISSING
-    precision: str = MISSING
-    matmul_precision: str = MISSING
-    record: bool = MISSING
-    compile: bool = MISSING
-    progress: bool = MISSING
+    checkpoints_kept: int = MISSING  # newest ones that stay, beside the best
+    num_threads: int = MISSING  # of torch; 1 where several runs share the machine
+    device: str = MISSING  # cpu, cuda or cuda:1
+    precision: str = MISSING  # of the losses' matrix products: float32 or bfloat16
+    matmul_precision: str = MISSING  # of float32 products: highest, high or medium
+    record: bool = MISSING  # repeat recorded operations: same bits, faster, CPU only
+    compile: bool = MISSING  # run the losses through torch.compile
+    progress: bool = MISSING  # progress bars when on a terminal
 
 
 @dataclass
 class LoggerConfig:
-    """Where numbers go besides the CSV files, which are always written.
+    """Loggers besides the CSV files, which are always written."""
 
-    Attributes:
-        kind: csv for the files alone, tensorboard or wandb.
-        project: W&B project.
-        mode: W&B mode: offline, online or disabled.
-    """
-
-    kind: str = MISSING
-    project: str = MISSING
-    mode: str = MISSING
+    kind: str = MISSING  # csv: nothing else; tensorboard or wandb
+    project: str = MISSING  # of W&B
+    mode: str = MISSING  # of W&B: offline, online or disabled
 
 
 @dataclass
 class TrainConfig:
-    """Everything that ``torchrl-osr train`` reads.
-
-    Attributes:
-        seed: random seed of networks, sampling and noise.
-        num_random: value of ``loss.num_random`` for the losses with CQL's term.
-        min_q_weight: value of ``loss.min_q_weight`` for them.
-        recovery: options of ``StateRecoveryLoss``, whose term is added to a loss that
-            has none of its own; null for none.
-        resume: folder of a run to continue, or to extend with more ``trainer.steps``.
-        force: continue although settings differ from those that the run was made with.
-        trust: modules of your own, whose losses, networks and environments may be
-            named, see docs/extend.md.
-    """
+    """Configuration of ``torchrl-osr train``."""
 
     env: EnvConfig = field(default_factory=EnvConfig)
     data: DataConfig = field(default_factory=DataConfig)
@@ -302,68 +175,88 @@ class TrainConfig:
         default_factory=InverseDynamicsConfig
     )
     dynamics: DynamicsOptions = field(default_factory=DynamicsOptions)
-    loss: Any = MISSING  # derived from the class that _target_ names
+    loss: Any = MISSING  # _target_ and options of a loss
+    recovery: Any = None  # options of StateRecoveryLoss, added to a loss without one
     optim: OptimConfig = field(default_factory=OptimConfig)
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
     logger: LoggerConfig = field(default_factory=LoggerConfig)
-    seed: int = MISSING
-    num_random: int = MISSING
-    min_q_weight: float = MISSING
-    recovery: Any = None  # derived like loss
-    resume: str | None = None
-    force: bool = False
-    trust: list[str] = MISSING
+    # Values by data set: rows <env>-<source>, <env> or any, of dotted keys. A key whose
+    # value is ${by_data:key} gets that of the most specific row, see by_data.
+    settings: dict[str, dict[str, Any]] = field(default_factory=dict)
+    seed: int = MISSING  # of networks, sampling and noise
+    resume: str | None = None  # folder of a run to continue, or to extend
+    force: bool = False  # continue although settings differ from those of the run
+    # Modules of your own that may be named, see docs/extend.md.
+    trust: list[str] = field(default_factory=list)
 
 
 @dataclass
 class CheckDataConfig:
-    """Everything that ``torchrl-osr data`` reads.
+    """Configuration of ``torchrl-osr data``."""
 
-    Attributes:
-        env: the task that the data are of; none is needed.
-        data: which data, as in ``torchrl-osr train``.
-        picture: where the picture goes; null for ``<name of the data>-data.png`` in the
-            current folder.
-        progress: show progress bars when on a terminal.
-    """
-
-    env: EnvConfig = field(default_factory=EnvConfig)
+    env: EnvConfig = field(default_factory=EnvConfig)  # compared with, if given
     data: DataConfig = field(default_factory=DataConfig)
-    picture: str | None = None
+    picture: str | None = None  # null: <name of the data>-data.png
     progress: bool = MISSING
 
 
 @dataclass
 class CollectConfig:
-    """Everything that ``torchrl-osr collect`` reads.
-
-    Attributes:
-        env: which environment; of its keys ``id`` alone counts.
-        policy: random, a run's folder, or a function of a module.
-        path: of the log to write.
-        episodes: how many to play.
-        noise: on actions, see ``record_episodes``.
-        seed: of the first episode.
-        progress: a progress bar, when on a terminal.
-        trust: modules of your own that a run may name, see docs/extend.md.
-    """
+    """Configuration of ``torchrl-osr collect``."""
 
     env: EnvConfig = field(default_factory=EnvConfig)
-    policy: str = MISSING
-    path: str = MISSING
+    policy: str = MISSING  # random, a run's folder, or a function: my_package:act
+    path: str = MISSING  # log to write
     episodes: int = MISSING
-    noise: float = MISSING
-    seed: int = MISSING
+    noise: float = MISSING  # on actions, in half-widths of their bounds
+    seed: int = MISSING  # of the first episode
+    progress: bool = MISSING
+    trust: list[str] = MISSING
+
+
+@dataclass
+class DisturbanceConfig:
+    """One kind of disturbance at one strength: either a wrapper or an attack."""
+
+    kind: str = MISSING  # knock, push and start end; others last the whole episode
+    strength: float = MISSING  # for the figure's axis
+    wrap: Any = None  # wrapper of lab.envs, with _target_ and _partial_
+    attack: Any = None  # options of attacked_policy
+
+
+@dataclass
+class SuiteConfig:
+    """A list of disturbances, or a half of the recoverable states."""
+
+    name: str = MISSING  # part of the names of the result files
+    disturbances: dict[str, DisturbanceConfig] = field(default_factory=dict)
+    half: str | None = None  # of the recoverable states: public or held-out
+
+
+@dataclass
+class EvaluateConfig:
+    """Configuration of ``torchrl-osr evaluate``."""
+
+    checkpoint: str | None = None  # a run's folder, or one checkpoint in it
+    sweep: str | None = None  # or a folder: every finished run in or below it
+    switching: bool = MISSING  # the sweep's runs as one policy; the best of them acts
+    jobs: int = MISSING  # runs of a sweep that are evaluated at once
+    suite: SuiteConfig = field(default_factory=SuiteConfig)
+    episodes: int = MISSING  # pairs for each checkpoint and disturbance, at least 2
+    last: int = MISSING  # number of the run's newest checkpoints
+    seed: int = MISSING  # of the first checkpoint's first episode; the next: 1000 more
+    force: bool = MISSING  # repeat a finished evaluation
+    num_threads: int = MISSING  # of torch
     progress: bool = MISSING
     trust: list[str] = MISSING
 
 
 def schema_of(target: type) -> type:
-    """A structured config with the keyword options of ``target``.
+    """Return a structured config with the keyword options of a class.
 
     Args:
-        target: a class whose keyword-only parameters, and those of the bases that its
-            ``**options`` reach, are the fields; or a dataclass.
+        target: its keyword-only parameters, and those of the bases that its
+            ``**options`` reach, are the fields; of a dataclass its own fields.
 
     Returns:
         A dataclass whose ``_target_`` is the public name of ``target``.
@@ -374,9 +267,8 @@ def schema_of(target: type) -> type:
         >>> schema().recovery_weight, schema()._target_
         (0.5, 'torchrl_osr.OSRLoss')
     """
-    package = "torchrl_osr"
-    if target.__module__.startswith(losses.__name__):
-        package = losses.__name__
+    lab = target.__module__.startswith(losses.__name__)
+    package = losses.__name__ if lab else "torchrl_osr"
     name = f"{package}.{target.__name__}"
     options: dict[str, tuple[str, Any, Any]] = {"_target_": ("_target_", str, name)}
     for parameter, annotation in _keyword_options(target):
@@ -396,7 +288,7 @@ def _keyword_options(target: type) -> Iterator[tuple[inspect.Parameter, Any]]:
         is_dataclass = "__dataclass_fields__" in vars(each)
         for parameter in parameters:
             if parameter.name in ("action_spec", "gamma"):
-                continue  # An object of Python, and what every loss refuses.
+                continue  # a Python object, and what every loss refuses
             if parameter.kind is parameter.KEYWORD_ONLY or (
                 is_dataclass and parameter.default is not parameter.empty
             ):
@@ -421,84 +313,75 @@ def _config_type(annotation: Any) -> Any:
     return functools.reduce(operator.or_, kinds)
 
 
-def _environment_name(env_id: str) -> str:
-    from torchrl_osr.lab.data.environment import (
-        environment_name,  # needs Gymnasium
-    )
-
-    return environment_name(env_id)
-
-
+@functools.cache
 def register() -> None:
     """Make schemas and resolvers known to Hydra.
 
-    ``train_schema``, ``check_data_schema``, ``collect_schema``, and in the group
-    ``schema`` one for each class of :mod:`torchrl_osr.objectives`; published settings;
-    ``environment_name``, the short name of a task; ``run_dir``, by which
-    ``resume=folder`` becomes the run's folder; ``method_name``, see
-    :func:`method_name`; and ``job_dir``, see :func:`job_folder`.
+    The schema of each command, and in the group ``schema`` one for each class of
+    :data:`CHOSEN`. Resolvers: :func:`by_data`, :func:`method_name`;
+    ``environment_name``, the short name of a task; ``run_dir``, the folder of a run;
+    and ``short``, a text as a part of a folder's name.
     """
     store = ConfigStore.instance()
     store.store(name="train_schema", node=TrainConfig)
     store.store(name="check_data_schema", node=CheckDataConfig)
     store.store(name="collect_schema", node=CollectConfig)
+    store.store(name="evaluate_schema", node=EvaluateConfig)
     for name, chosen in CHOSEN.items():
         store.store(group="schema", name=name, node=schema_of(chosen))
-    register_published()
     resolvers: dict[str, Callable[..., Any]] = {
         "environment_name": _environment_name,
-        "run_dir": lambda resume, fresh: resume or fresh,
-        "method_name": lambda loss, recovery: method_name(
-            {"loss": loss, "recovery": recovery}
-        ),
-        "job_dir": job_folder,
+        "run_dir": _run_dir,
+        "method_name": method_name,
+        "by_data": by_data,
+        # File systems allow 255 bytes.
+        "short": lambda text: re.sub(r"[^\w.-]+", "-", text)[:200],
     }
     for name, resolver in resolvers.items():
         OmegaConf.register_new_resolver(name, resolver, replace=True)
 
 
-def method_name(choices: Mapping[str, str | None]) -> str:
-    """What a run's method is called, from its choices of Hydra's groups.
+def by_data(key: str, *, _root_: DictConfig) -> Any:
+    """Return the value of a key for the data set of a configuration.
+
+    It is that of the most specific row of ``settings``, or else, of an option of the
+    loss, the default of the constructor.
+
+    Raises:
+        ValueError: there is neither.
+    """
+    rows, env, source = _root_.settings, _root_.env.name, _root_.data.source
+    for name in (f"{env}-{source}", env, "any"):
+        if name in rows and key in rows[name]:
+            return rows[name][key]
+    group, _, option = key.rpartition(".")
+    if group != "loss":
+        raise ValueError(f"settings have no value of {key} for {env}-{source}.")
+    return getattr(schema_of(get_class(_root_.loss._target_))(), option)
+
+
+def _environment_name(env_id: str) -> str:
+    # Needs Gymnasium.
+    from torchrl_osr.lab.data.environment import environment_name
+
+    return environment_name(env_id)
+
+
+def _run_dir(resume: str | None, fresh: str) -> str:
+    """The folder of a run: the one to continue, or a new one."""
+    if resume is not None and not Path(resume, "config.yaml").exists():
+        raise FileNotFoundError(
+            f"resume={resume}: there is no config.yaml in it; give the folder of a run."
+        )
+    return resume or fresh
+
+
+def method_name(loss: str, recovery: str | None = "none") -> str:
+    """Return the name of a run's method, from the options of its groups.
 
     Examples:
         >>> from torchrl_osr.lab.run.schema import method_name
-        >>> method_name({"loss": "rebrac", "recovery": "osr"})
+        >>> method_name("rebrac", "osr")
         'rebrac+osr'
     """
-    recovery = choices.get("recovery", "none")
-    return str(choices["loss"]) + (f"+{recovery}" if recovery != "none" else "")
-
-
-def job_folder(number: int, overrides: str) -> str:
-    """Name of a sweep's job: its number, which is unique, and its overrides.
-
-    Letters, digits and ``._-`` alone: neither a shell nor Hydra needs quotes for it.
-
-    Examples:
-        >>> from torchrl_osr.lab.run.schema import job_folder
-        >>> job_folder(3, "loss=cql,trainer.steps=200,seed=1")
-        '3_loss-cql_steps-200_seed-1'
-    """
-    last_keys = re.sub(r"[\w.]+\.(\w+=)", r"\1", overrides)
-    words = re.sub(r"[^A-Za-z0-9._=,-]+", " ", last_keys)
-    pairs = re.sub(r" *([=,]) *", r"\1", words).strip(" .=,-_")
-    plain = pairs.translate(str.maketrans("=, ", "-_-"))
-    return f"{number}_{plain}"[:MAX_FOLDER_NAME] if plain else str(number)
-
-
-def named_by_what_differs(arguments: Sequence[str]) -> list[str]:
-    """Override that leaves out of :func:`job_folder` what all jobs of a sweep share.
-
-    Returns:
-        Nothing where there is no sweep.
-
-    Raises:
-        OverrideParseException: an override makes no sense.
-    """
-    if not {"-m", "--multirun"} & set(arguments):
-        return []
-    given = [each for each in arguments if "=" in each and not each.startswith("-")]
-    parsed = OverridesParser.create().parse_overrides(given)
-    shared = [each.key_or_group for each in parsed if not each.is_sweep_override()]
-    keys = [key for key in shared if not key.startswith("hydra")]
-    return [f"hydra.job.config.override_dirname.exclude_keys=[{','.join(keys)}]"]
+    return loss if recovery in (None, "none") else f"{loss}+{recovery}"

@@ -1,0 +1,163 @@
+"""A run under disturbances: what is played, kept, continued and refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from composed import CONF, evaluating, trained
+from tensordict.nn import TensorDictModule
+from torchrl.modules import ProbabilisticActor, TanhDelta
+
+from torchrl_osr.lab.evaluation import deterministic_policy
+from torchrl_osr.lab.evaluation.recoverable import load_recoverable_states, recovers
+from torchrl_osr.lab.report import read_runs
+from torchrl_osr.lab.run import evaluate
+from torchrl_osr.lab.run.config import read_run, write_config
+from torchrl_osr.lab.run.evaluate import evaluate_run, impossible, make_disturbances
+from torchrl_osr.lab.run.load import checkpoints_of, load_trained
+
+SUITES = sorted(path.stem for path in (CONF / "evaluation" / "suite").glob("*.yaml"))
+
+pytestmark = pytest.mark.usefixtures("own_cache")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, own_cache) -> Path:
+    """A run with three checkpoints."""
+    more = "trainer.steps=30", "trainer.eval_interval=30"
+    return trained(tmp_path_factory.mktemp("evaluate") / "run", *more)
+
+
+def play(folder: Path, *overrides: str) -> dict:
+    config = evaluating(f"checkpoint={folder}", "episodes=2", *overrides)
+    path, results = evaluate_run(config)
+    assert json.loads(path.read_text()) == json.loads(json.dumps(results))
+    return results
+
+
+def test_results_are_kept_with_what_decides_them(folder, capsys):
+    results = play(folder, "last=2")
+    names = list(evaluating().suite.disturbances)
+    assert (results["env"], results["data"]) == ("hopper", "random")
+    assert {"torchrl_osr", "torch", "mujoco"} < results["versions"].keys()
+    assert [each["step"] for each in results["evaluations"]] == [20, 30]
+    seeds = [each["clean"]["seeds"] for each in results["evaluations"]]
+    assert seeds == [[20_000, 20_001], [21_000, 21_001]]
+    for each in results["evaluations"]:
+        assert [level["name"] for level in each["levels"]] == names
+        for level in each["levels"]:
+            assert level["seeds"] == each["clean"]["seeds"]
+            assert len(level["returns"]) == len(level["scores"]) == 2
+    assert [row["name"] for row in results["summary"]] == names
+    figure = folder / "robustness-oos.png"
+    assert figure.read_bytes().startswith(b"\x89PNG")
+    # Not played again, unless forced; never replaced by other settings.
+    play(folder, "last=2")
+    assert "is there already" in capsys.readouterr().out
+    assert play(folder, "last=2", "force=true") == results
+    with pytest.raises(ValueError, match=r"other settings \(seed\): force=true"):
+        play(folder, "last=2", "seed=5")
+    with pytest.raises(ValueError, match="results of 2 checkpoints, these 1 among"):
+        play(folder, "last=1")
+    other = play(folder, "last=2", "seed=5", "force=true")
+    assert other["evaluations"] != results["evaluations"]
+
+
+def test_a_killed_evaluation_continues_to_the_same_bytes(folder, monkeypatch, capsys):
+    path, partial = (
+        folder / name
+        for name in ("robustness-start.json", ".robustness-start.partial.json")
+    )
+    played, whole = [], evaluate.evaluate_paired
+
+    def dying(*args, **options):
+        played.append(options["seed"])
+        if len(played) == 3:
+            raise SystemExit("killed")
+        return whole(*args, **options)
+
+    monkeypatch.setattr(evaluate, "evaluate_paired", dying)
+    with pytest.raises(SystemExit):
+        play(folder, "suite=start")
+    assert not path.exists()
+    assert len(json.loads(partial.read_text())["evaluations"]) == 2
+    assert "start" not in read_runs([folder]).suites, "a part is no result"
+    play(folder, "suite=start")
+    assert played == [20_000, 21_000, 22_000, 22_000]
+    assert "has 2 of 3 checkpoints" in capsys.readouterr().out
+    assert not partial.exists()
+    continued = path.read_bytes()
+    path.unlink()
+    partial.write_text(continued[:100].decode())  # damaged: not continued
+    play(folder, "suite=start")
+    assert path.read_bytes() == continued
+
+
+def test_one_checkpoint_has_a_file_of_its_own(folder):
+    best = folder / "checkpoint" / "policy" / "best.torchrl"
+    assert len(play(best, "suite=start")["evaluations"]) == 1
+    assert (folder / "best-robustness-start.json").exists()
+
+
+def test_every_suite_is_built_for_a_run(folder):
+    trained = load_trained(folder)
+    for name in SUITES:
+        suite = evaluating(f"suite={name}").suite
+        assert suite.name == name
+        made = make_disturbances(suite.disturbances, trained, np.full(11, 0.5))
+        assert len(made) >= 3 or suite.half
+
+
+def test_attacks_that_a_policy_rules_out_are_left_out(folder):
+    suite, trained = evaluating("suite=observation_attack").suite, load_trained(folder)
+    actor = ProbabilisticActor(
+        TensorDictModule(torch.nn.Linear(11, 3), ["observation"], ["param"]),
+        in_keys=["param"],
+        distribution_class=TanhDelta,
+    )
+    scale = np.full(11, 0.5)
+    assert not impossible(suite, trained, scale)
+    left_out = impossible(suite, trained._replace(actor=actor), scale)
+    assert set(left_out) == {each for each in suite.disturbances if "diff" in each}
+    with pytest.raises(ValueError, match="do not support switching policies"):
+        impossible(suite, trained, scale, attacks=False)
+    trained.config.data.standardize = False
+    with pytest.raises(ValueError, match=r"no disturbance .*data.standardize=true"):
+        impossible(suite, trained, scale)
+    suite.disturbances["random-0.05"].attack = None
+    with pytest.raises(ValueError, match="'random-0.05' needs either wrap or attack"):
+        make_disturbances(suite.disturbances, trained, scale)
+
+
+def test_recoverable_states_are_played_from(folder):
+    results = play(folder, "suite=recoverable", "last=2")
+    states = load_recoverable_states("hopper", "public")
+    assert [each["step"] for each in results["evaluations"]] == [20, 30]
+    trained = load_trained(checkpoints_of(folder)[-1])
+    policy = deterministic_policy(trained.actor, trained.observation_norm)
+    back = recovers(states, policy)
+    assert results["evaluations"][-1]["back"] == back.astype(int).tolist()
+    # Fallen at once, as anything is that has learned nothing.
+    assert not back[states.group == "recoverable"].any()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"name": "cart"}, "recoverable states must be one of .*, got 'cart'"),
+        ({"action_high": [2.0, 2.0, 2.0]}, "action_high=.*, but Hopper-v5 has"),
+        ({"id": "json:Hopper-v5"}, r"allow it with trust=\[json\]"),
+    ],
+)
+def test_a_run_of_another_task_is_refused(folder, tmp_path, changes, message):
+    config = read_run(folder)
+    for name, value in changes.items():
+        setattr(config.env, name, value)
+    write_config(tmp_path, config)
+    (tmp_path / "checkpoint").symlink_to(folder / "checkpoint")
+    with pytest.raises(ValueError, match=message):
+        play(tmp_path, "suite=recoverable")

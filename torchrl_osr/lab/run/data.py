@@ -1,0 +1,192 @@
+"""What a run trains on: rows in memory, prepared once, or on disk, batch by batch.
+
+Observations are standardised and rewards scaled by the same transform, applied to all
+rows in memory or to each batch from disk: the same seed gives the same batches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import ReplayBuffer
+from torchrl.envs import Compose, ObservationNorm, RewardScaling
+
+from torchrl_osr.lab.data import (
+    ReferenceReturns,
+    make_replay_buffer,
+    observation_statistics,
+    reference_returns,
+)
+from torchrl_osr.lab.data.rows import (
+    check_order,
+    consecutive_rows,
+    held_out_rows,
+    multi_step,
+    next_action,
+    split_held_out,
+)
+from torchrl_osr.lab.run.schema import DataConfig, EnvConfig
+
+MAX_HELD_OUT = 50_000
+"""Held-out rows of a set on disk that are read into memory, at most."""
+
+NUM_PIECES, PIECE = 500, 20
+"""Pieces of trajectories to judge a dynamics model by, at most, and their rows."""
+
+
+class TrainingData(NamedTuple):
+    """The rows to train on and to judge by, prepared and on the device.
+
+    Attributes:
+        buffer: samples batches; the trainer seeds it.
+        held_out: rows that are not in the buffer.
+        norm: standardises observations.
+        largest_reward: the largest absolute reward, held-out rows included.
+        mean: score of the behaviour, or return where there are no scores, if known.
+        pieces: of trajectories, each from a held-out row on, ``[n, 20]``; the rows that
+            follow may be trained on. ``None`` if nobody asked for them.
+    """
+
+    buffer: ReplayBuffer
+    held_out: TensorDict
+    norm: ObservationNorm
+    largest_reward: float
+    mean: float | None
+    pieces: TensorDict | None
+
+
+def references_of(env: EnvConfig) -> ReferenceReturns | None:
+    """Return what returns are normalised by, ``None`` if they stay as they are."""
+    return reference_returns(env.name, env.random_return, env.expert_return)
+
+
+def load_data(
+    env: EnvConfig, options: DataConfig, *, progress: bool = True
+) -> tuple[TensorDict, dict[str, Any]]:
+    """Load data set and manifest, see :func:`~torchrl_osr.lab.data.load_dataset`.
+
+    Rewards are the task's own.
+    """
+    from torchrl_osr.lab.data import load_dataset  # needs Gymnasium; networks do not
+
+    if options.storage not in ("memory", "disk"):
+        raise ValueError(
+            f"data.storage must be memory or disk, got {options.storage!r}."
+        )
+    return load_dataset(
+        env.name,
+        options.source,
+        env_id=env.id,
+        references=references_of(env),
+        path=options.path,
+        columns=asdict(options.columns),
+        action_bounds=options.action_bounds,
+        clip_actions=options.clip_actions,
+        missing=options.missing,
+        download=options.download,
+        random_share=options.random_share,
+        num_transitions=options.num_transitions,
+        seed=options.seed,
+        progress=progress,
+        on_disk=options.storage == "disk",
+    )
+
+
+@torch.random.fork_rng(devices=[])
+def load_training_data(
+    env: EnvConfig,
+    options: DataConfig,
+    *,
+    batch_size: int,
+    device: torch.device | str = "cpu",
+    in_keys: Sequence[NestedKey] = (),
+    n_steps: int = 1,
+    gamma: float = 1.0,
+    pieces: bool = False,
+    progress: bool = True,
+) -> TrainingData:
+    """Load a run's data, split and prepared; torch's global generator is left alone.
+
+    Rewards become ``reward_scale * r + reward_shift``; the mean is of the task's own.
+
+    Args:
+        env, options: of the configuration.
+
+    Keyword Args:
+        batch_size: rows of a batch.
+        device: where batches are. Default CPU.
+        in_keys: what the loss reads: with ``("next", "action")`` among it batches have
+            the data's next action. Default: what every data set has.
+        n_steps, gamma: of the n-step returns in ``"multi_step"``. Default: none.
+        pieces: whether pieces of trajectories are needed. Default ``False``.
+        progress: show progress bars. Default ``True``.
+
+    Raises:
+        ValueError: an option does not fit the others, or the loss reads the next
+            action and the rows are in no order of time.
+    """
+    data, manifest = load_data(env, options, progress=progress)
+    if with_next_action := ("next", "action") in in_keys:
+        try:
+            check_order(data)
+        except ValueError as error:
+            raise ValueError(
+                f"the loss reads the data's next action, which data={options.source} "
+                f"does not have: {error}"
+            ) from error
+    loc, scale = observation_statistics(data) if options.standardize else (0.0, 1.0)
+    factor, addend = options.reward_scale, options.reward_shift
+    extremes = torch.stack(data["next", "reward"].aminmax())
+    largest = (factor * extremes + addend).abs().max().item()
+
+    def norm(*keys: NestedKey) -> ObservationNorm:  # one belongs to one Compose
+        return ObservationNorm(loc, scale, in_keys=list(keys), standard_normal=True)
+
+    states = "observation", ("next", "observation")
+    prepare = Compose(norm(*states))
+    if (factor, addend) != (1.0, 0.0):
+        prepare.append(RewardScaling(addend, factor, in_keys=[("next", "reward")]))
+    prepare_steps = norm("observation")
+
+    def read(data: TensorDictBase, rows: Tensor | None = None) -> TensorDictBase:
+        batch = data.copy() if rows is None else data[rows]
+        if with_next_action:
+            batch["next", "action"] = next_action(data, rows)
+        batch = prepare(batch)
+        if n_steps > 1:
+            steps = multi_step(
+                data,
+                rows,
+                n_steps=n_steps,
+                gamma=gamma,
+                reward_scale=factor,
+                reward_shift=addend,
+                with_next_action=with_next_action,
+            )
+            batch["multi_step"] = prepare_steps(steps)
+        return batch
+
+    sampling: dict[str, Any] = {"batch_size": batch_size, "seed": 0, "device": device}
+    chosen = held_out_rows(len(data), options.held_out, seed=options.seed)
+    followed = None
+    if pieces:
+        starts = chosen[:NUM_PIECES]
+        followed = prepare(consecutive_rows(data, starts, PIECE)).to(device)
+    if options.storage == "disk":
+        held_out = read(data, chosen[:MAX_HELD_OUT].sort().values)
+        left_out = chosen.sort().values
+        buffer = make_replay_buffer(data, left_out=left_out, read=read, **sampling)
+    else:  # what follows a row, before some are held out
+        rows, held_out = split_held_out(read(data), options.held_out, seed=options.seed)
+        buffer = make_replay_buffer(rows, **sampling)
+    mean = manifest["normalized_score"]
+    if references_of(env) is None:
+        mean = (manifest.get("return") or {}).get("mean")
+    return TrainingData(
+        buffer, held_out.to(device), norm(*states).to(device), largest, mean, followed
+    )
