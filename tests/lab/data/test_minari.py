@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import minari
 import numpy as np
 import pytest
@@ -150,16 +148,6 @@ def test_nothing_is_fetched_unless_asked_for(monkeypatch):
     data, _ = load("test/far-v0", download=True)
     load("test/far-v0", download=True)
     assert (asked, len(data)) == (["test/far-v0"], sum(LENGTHS))
-
-
-def test_the_environment_of_the_metadata_is_not_made():
-    """Minari asks it for spaces that are missing; it can be any function."""
-    path = make("test/crafted-v0").storage.data_path / "metadata.json"
-    content = json.loads(path.read_text())
-    del content["action_space"]
-    path.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=r"metadata\.json names no spaces"):
-        load("test/crafted-v0")
 
 
 def test_discrete_actions_become_one_hot():

@@ -42,11 +42,6 @@ def test_rows_are_drawn_without_replacement_in_exact_shares(rows, share, seed) -
     assert again["row"].tolist() == mixed
 
 
-def test_too_few_random_rows_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"random_share=0.5 of 10 rows, with 4 random"):
-        mix_datasets(numbered(10), numbered(4), random_share=0.5, seed=0)
-
-
 @pytest.mark.parametrize(("held_out", "expected"), [(7, 7), (0.2, 10)])
 def test_split_keeps_every_row_once(held_out: int | float, expected: int) -> None:
     data = numbered(50)

@@ -1,4 +1,4 @@
-"""Memory-mapped sets and the cache: the same rows, whole or not at all."""
+"""Memory-mapped sets, their cache, and replay buffers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import torch
 from tensordict import TensorDict
 from torchrl import torchrl_logger
 
-from torchrl_osr.lab.data import load_memmap, store, write_memmap
+from torchrl_osr.lab.data import load_memmap, make_replay_buffer, store, write_memmap
+from torchrl_osr.lab.data.rows import held_out_rows, split_held_out
 from torchrl_osr.lab.data.store import is_memory_mapped, load_or_write
 
 ROWS = 60
@@ -77,22 +78,10 @@ def test_a_set_is_replaced_and_other_folders_are_not(folder, data, tmp_path):
     assert (folder / "notes.txt").exists()
 
 
-def spoilt(data, key, value):
-    column = data[key].clone()
-    column[37] = value
-    return data.set(key, column)
-
-
-@pytest.mark.parametrize(
-    ("spoil", "message"),
-    [
-        (lambda d: spoilt(d, "observation", float("nan")), "'observation' holds NaN"),
-        (lambda d: d.set("action", torch.zeros(ROWS, 2)), "'action' is zero in all"),
-    ],
-)
-def test_bad_rows_are_not_written(tmp_path, data, spoil, message):
-    with pytest.raises(ValueError, match=message):
-        write(spoil(data), tmp_path / "set")
+def test_bad_rows_are_not_written(tmp_path, data):
+    data["observation"][37] = torch.nan
+    with pytest.raises(ValueError, match="'observation' holds NaN"):
+        write(data, tmp_path / "set")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -140,33 +129,25 @@ def test_a_cached_set_is_made_once_for_a_request(load, data):
     assert "its seed is [1, 2], wanted 3" in load.warnings[0]
 
 
-def cut(content):
-    return content[:50]
-
-
 @pytest.mark.parametrize(
     ("name", "damage"),
     [
         ("rows/action.memmap", lambda content: content[:-1] + bytes([content[-1] ^ 1])),
-        ("rows/meta.json", cut),
-        ("rows/other.pickle", lambda _: b"tensordict would unpickle it"),
-        ("manifest.json", cut),
+        ("rows/meta.json", lambda content: content[:50]),
+        ("manifest.json", lambda content: content[:50]),
     ],
 )
 def test_a_damaged_set_is_refused_and_made_anew(load, tmp_path, name, damage):
     load()
     path = tmp_path / "set" / name
-    content = path.read_bytes() if path.exists() else b""
-    path.unlink(missing_ok=True)  # not into the file that is mapped
+    content = path.read_bytes()
+    path.unlink()  # not into the file that is mapped
     path.write_bytes(damage(content))
     with pytest.raises(ValueError, match=r"set is damaged: .*Write it again"):
         load_memmap(tmp_path / "set")
-    if name.startswith("rows/other"):
-        path.unlink()
-    else:
-        load()
-        assert load.made == 2
-        assert "Making" in load.warnings[0]
+    load()
+    assert load.made == 2
+    assert "Making" in load.warnings[0]
 
 
 def test_a_whole_set_is_read_without_writing(load, monkeypatch):
@@ -179,3 +160,63 @@ def test_a_whole_set_is_read_without_writing(load, monkeypatch):
     load()
     with pytest.raises(PermissionError):
         load(another="request")
+
+
+def numbered_rows(rows: int) -> TensorDict:
+    observation = torch.arange(rows, dtype=torch.float32)[:, None].repeat(1, 2)
+    following = TensorDict({"observation": observation + 1}, [rows])
+    return TensorDict({"observation": observation, "next": following}, [rows])
+
+
+def draws(buffer, batches: int) -> torch.Tensor:
+    return torch.cat([buffer.sample()["observation"][:, 0] for _ in range(batches)])
+
+
+def test_batches_depend_on_the_seed_alone() -> None:
+    data = numbered_rows(50)
+    first = draws(make_replay_buffer(data, batch_size=16, seed=3), 4)
+    torch.manual_seed(123)
+    second = draws(make_replay_buffer(data, batch_size=16, seed=3), 4)
+    other = draws(make_replay_buffer(data, batch_size=16, seed=4), 4)
+    assert torch.equal(first, second)
+    assert not torch.equal(first, other)
+
+
+def test_sampling_is_uniform_with_replacement() -> None:
+    buffer = make_replay_buffer(numbered_rows(10), batch_size=1000, seed=0)
+    counts = torch.bincount(draws(buffer, 10).long(), minlength=10)
+    # Expected 1000 each with a standard deviation of 30.
+    assert counts.min() > 850
+    assert counts.max() < 1150
+
+
+@pytest.fixture
+def both(make_transitions, tmp_path):
+    """The same rows in memory and memory-mapped."""
+    data = make_transitions(200)
+    return data, write_memmap([data], tmp_path / "set", progress=False)[0]
+
+
+def test_the_same_seed_draws_the_same_rows_from_disk(both) -> None:
+    buffers = [make_replay_buffer(each, batch_size=32, seed=3) for each in both]
+    for _ in range(10):
+        here, there = (buffer.sample() for buffer in buffers)
+        assert (here == there).all()
+    assert len(buffers[1]) == 200
+    with pytest.raises(RuntimeError):
+        buffers[1].extend(both[0])
+
+
+@pytest.mark.parametrize("held_out", [1, 7, 0.2, 199])
+def test_rows_on_disk_that_are_left_out(both, held_out) -> None:
+    data, stored = both
+    left_out = held_out_rows(200, held_out, seed=1).sort().values
+    train, rest = split_held_out(data, held_out, seed=1)
+    assert (stored[left_out] == rest).all()
+    buffer = make_replay_buffer(stored, batch_size=32, seed=3, left_out=left_out)
+    same = make_replay_buffer(train, batch_size=32, seed=3)
+    assert len(buffer) == len(train)
+    for _ in range(20):
+        assert (buffer.sample() == same.sample()).all()
+    with pytest.raises(ValueError, match="for memory-mapped data"):
+        make_replay_buffer(data, batch_size=32, seed=3, left_out=left_out)

@@ -110,7 +110,7 @@ def test_missing_rows_cut_their_trajectory():
     observation, reward = log()["observation"], log()["reward"].copy()
     reward[4] = np.nan
     with pytest.raises(
-        ValueError, match=r"'reward' has no value in row 4 .*missing=row"
+        ValueError, match="'reward' has no value in row 4 .*missing=row"
     ):
         transitions_from_columns(log(reward=reward))
     data, manifest = transitions_from_columns(log(reward=reward), missing="row")
@@ -158,7 +158,10 @@ def with_value(name, row, value):
         ({"observation": np.ones(6)}, r"'observation' has shape \[6\]"),
         ({"next_observations": np.ones((6, 2))}, "an unknown 'next_observations'"),
         ({"truncated": None}, "neither truncated nor episode"),
-        ({"episode": [0, 0, 0, 1, 1, 0], "terminated": [0] * 6}, "'episode' 0 comes b"),
+        (
+            {"episode": [0, 0, 0, 1, 1, 0], "terminated": [0] * 6},
+            "an 'episode' comes b",
+        ),
         ({"episode": [0, 0, 0, 0, 1, 1]}, r"row 2 ends its episode, and row 3 .*late"),
         (
             {"action": np.array([[0], [1], [1], [0], [1], [0]])},

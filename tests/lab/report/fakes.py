@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from omegaconf import OmegaConf
 
-from torchrl_osr.lab.data.scores import REFERENCE_RETURNS
+from torchrl_osr.lab.data.statistics import REFERENCE_RETURNS
 from torchrl_osr.lab.report import RunTables, read_runs
 from torchrl_osr.lab.run.config import FORMAT
 

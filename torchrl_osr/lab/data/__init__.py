@@ -10,11 +10,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from torchrl_osr.lab.data.behavior import load_behavior_policy
-from torchrl_osr.lab.data.buffer import make_replay_buffer
 from torchrl_osr.lab.data.recording import transitions_from_columns
-from torchrl_osr.lab.data.scores import ReferenceReturns, reference_returns
-from torchrl_osr.lab.data.statistics import observation_statistics
-from torchrl_osr.lab.data.store import load_memmap, write_memmap
+from torchrl_osr.lab.data.statistics import (
+    ReferenceReturns,
+    observation_statistics,
+    reference_returns,
+)
+from torchrl_osr.lab.data.store import load_memmap, make_replay_buffer, write_memmap
 from torchrl_osr.lab.data.transitions import check_dataset
 
 if TYPE_CHECKING:

@@ -89,10 +89,11 @@ def environment_spec(env_id: str) -> EnvironmentSpec:
     with closing(open_environment(env_id)) as env:
         size = spaces.flatdim(env.observation_space)
         actions: Any = env.action_space
+        simulated = is_simulated(env)
         if isinstance(actions, spaces.Discrete):
-            return EnvironmentSpec(size, int(actions.n), None, None, is_simulated(env))
+            return EnvironmentSpec(size, int(actions.n), None, None, simulated)
         low, high = actions.low.tolist(), actions.high.tolist()
-        return EnvironmentSpec(size, len(low), low, high, is_simulated(env))
+        return EnvironmentSpec(size, len(low), low, high, simulated)
 
 
 def is_simulated(env: gymnasium.Env[Any, Any]) -> bool:
@@ -103,10 +104,7 @@ def is_simulated(env: gymnasium.Env[Any, Any]) -> bool:
 def check_simulated(env: gymnasium.Env[Any, Any], env_id: str) -> None:
     """Raise a RuntimeError unless an environment can be played."""
     if not is_simulated(env):
-        raise RuntimeError(
-            f"{env_id} has no simulator (its class has no step) and cannot be played: "
-            "train and export do without."
-        )
+        raise RuntimeError(f"{env_id} has no simulator: its class has no step.")
 
 
 def make_environment(env_id: str) -> gymnasium.Env[Any, Any]:

@@ -95,9 +95,10 @@ def _about_entries(entries: Sequence[Entry]) -> Iterator[str]:
 
 
 def _about_actions(data: TensorDict, names: Sequence[str]) -> Iterator[str]:
-    largest = data["action"].abs().amax(0).tolist()
-    at_bounds = actions_at_bounds(data).tolist()
-    for name, most, bound in zip(names, largest, at_bounds, strict=True):
+    largest, at_bounds = data["action"].abs().amax(0), actions_at_bounds(data)
+    for name, most, bound in zip(
+        names, largest.tolist(), at_bounds.tolist(), strict=True
+    ):
         if bound > MOST:
             yield (
                 f"{name} is at one of its bounds in {bound:.0%} of the rows: they may "
@@ -110,10 +111,9 @@ def _about_actions(data: TensorDict, names: Sequence[str]) -> Iterator[str]:
             )
 
 
-def actions_at_bounds(data: TensorDict) -> Tensor:
+def actions_at_bounds(data: TensorDict) -> Any:
     """Share of rows in which each action is at one of its bounds, ``[A]``."""
-    at_bound: Tensor = data["action"].abs() >= ACTION_LIMIT - 1e-6
-    return at_bound.double().mean(0)
+    return (data["action"].abs() >= ACTION_LIMIT - 1e-6).double().mean(0)
 
 
 def _about_episodes(manifest: Mapping[str, Any]) -> Iterator[str]:

@@ -51,8 +51,8 @@ def record_episodes(
     most = 1 if isinstance(env.action_space, spaces.Discrete) else np.finfo(float).max
     if num_episodes < 1 or not 0 <= noise <= most:
         raise ValueError(
-            f"episodes={num_episodes} and noise={noise}; expected at least 1 episode "
-            f"and noise from 0 to {most:g}."
+            f"episodes={num_episodes} noise={noise}: give at least 1 episode and noise "
+            f"from 0 to {most:g}."
         )
     rng = np.random.default_rng([seed, 1])  # not the environment's own numbers
     env.action_space.seed(int(rng.integers(2**31)))
@@ -83,12 +83,10 @@ def record_episodes(
                     )
             observation, ended = step["next_observation"], terminated or truncated
     columns = {name: np.array([step[name] for step in steps]) for name in steps[0]}
-    real = {
-        n: each.astype(np.float32)
-        for n, each in columns.items()
-        if each.dtype.kind == "f"
-    }
-    return columns | real
+    for name, each in columns.items():
+        if each.dtype.kind == "f":
+            columns[name] = each.astype(np.float32)
+    return columns
 
 
 def _action(
@@ -114,8 +112,7 @@ def _action(
         action = action.astype(space.dtype)
     if not space.contains(action):
         raise ValueError(
-            f"the policy's action {np.asarray(action).tolist()} of shape "
-            f"{np.shape(action)} is not in the environment's {space}."
+            f"the policy's action {np.asarray(action).tolist()} is not in {space}."
         )
     return action
 

@@ -57,7 +57,7 @@ class Recording:
     """
 
     parts: Callable[[int | None], Iterable[Columns]]
-    options: Reading = field(default_factory=Reading)
+    options: Reading
     about: dict[str, Any] = field(default_factory=dict)
     files: list[Path] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -115,7 +115,16 @@ class Recording:
         for columns in self.parts(rows):
             try:
                 part = trajectories(columns, self.options, before)
-                _check_together(columns.get("episode", ()), seen)
+                numbers = np.asarray(columns.get("episode", ()), np.float64).reshape(-1)
+                numbers = numbers[~np.isnan(numbers)]
+                first = np.r_[True, np.diff(numbers) != 0][: len(numbers)]
+                found = numbers[first].tolist()
+                if len(seen) + len(found) > len(seen | {*found}):
+                    raise ValueError(
+                        "an 'episode' comes back; expected its rows together and in "
+                        "order of time. data.columns.step sorts them."
+                    )
+                seen |= {*found}
             except ValueError as error:
                 where = f"in the rows from {read:,} on: " if read else ""
                 raise ValueError(f"{where}{error}") from error
@@ -169,20 +178,6 @@ class Recording:
         for name, flaw in WARNINGS.items():
             if counts[name]:
                 yield f"{counts[name]:,} rows {flaw}."
-
-
-def _check_together(episode: Any, seen: set[float]) -> None:
-    """Raise if an episode was seen before; remember those in these rows."""
-    numbers = np.asarray(episode, np.float64).reshape(-1)
-    numbers = numbers[~np.isnan(numbers)]
-    first = np.r_[True, np.diff(numbers) != 0][: len(numbers)]
-    for number in numbers[first].tolist():
-        if number in seen:
-            raise ValueError(
-                f"'episode' {number:g} comes back; expected its rows together and in "
-                "order of time. data.columns.step sorts them."
-            )
-        seen.add(number)
 
 
 def whole_trajectories(
@@ -245,8 +240,7 @@ def transitions_from_columns(
         lengths of the complete and the incomplete episodes, and ``warnings``.
 
     Raises:
-        ValueError: the columns are not as above or contradict one another, hold a NaN
-            or an infinity, or actions look discrete; names the column and the row.
+        ValueError: the columns are not as above or contradict one another.
 
     Examples:
         >>> import numpy as np

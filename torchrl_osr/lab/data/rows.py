@@ -87,7 +87,7 @@ def check_order(data: TensorDictBase) -> None:
         raise ValueError(
             f"{len(wrong):,} of the {len(data):,} rows, row {wrong[0]} the first, end "
             "no episode and are not followed by the row that came next in time. Give "
-            "the rows in order, and mark the last one of each episode as truncated."
+            "the rows in order, and mark ends of episodes as truncated."
         )
 
 

@@ -26,8 +26,11 @@ from torchrl_osr.lab.data.environment import (
 from torchrl_osr.lab.data.recording import Recording
 from torchrl_osr.lab.data.rollout import behavior_of, collect_source
 from torchrl_osr.lab.data.rows import mix_datasets
-from torchrl_osr.lab.data.scores import REFERENCE_RETURNS, ReferenceReturns
-from torchrl_osr.lab.data.statistics import describe_episodes
+from torchrl_osr.lab.data.statistics import (
+    REFERENCE_RETURNS,
+    ReferenceReturns,
+    describe_episodes,
+)
 from torchrl_osr.lab.data.store import (
     CACHE_VARIABLE,
     CHUNK_ROWS,

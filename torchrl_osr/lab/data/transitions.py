@@ -60,9 +60,8 @@ def as_transitions(columns: Mapping[str, Array]) -> TensorDict:
 def check_dataset(data: TensorDictBase) -> None:
     """Raise unless ``data``, transitions ``[N]``, can be trained on.
 
-    Raises:
-        ValueError: a key has another shape or type, holds a NaN or an infinity, or an
-            observation, next observation or action is zero everywhere.
+    Keys, shapes, types and flags must be right, all numbers finite, and observations,
+    next observations and actions not zero everywhere.
     """
     check_rows(data)
     check_filled(data)
@@ -148,7 +147,11 @@ def trajectories(
     reward = columns["reward"].astype(np.float64)
     raw, columns = columns, _cast(columns, options.num_actions)
     columns["action"], clipped, outside = _unit_actions(columns["action"], options)
-    changes = {n: _changes(raw[n], columns[n]) for n in ("observation", "reward")}
+    changes = {}
+    for name in ("observation", "reward"):
+        moved = np.diff(raw[name], axis=0) != 0
+        lost_moves = moved & (np.diff(columns[name], axis=0) == 0)
+        changes[name] = np.stack([moved.sum(0), lost_moves.sum(0)]).reshape(2, -1)
 
     episode = columns.pop("episode", None)
     terminated = columns["terminated"]
@@ -158,7 +161,9 @@ def trajectories(
     complete = flagged[stops] & ~broken[stops]
     if "next_observation" in columns and episode is None:
         # Rows that do not follow one another have no sum of rewards.
-        jumps = np.r_[_jumps(columns) & ~ends[:-1], False]
+        reached, after = columns["next_observation"][:-1], columns["observation"][1:]
+        slack = SAME_STATE * np.maximum(1, np.abs(after))
+        jumps = np.r_[(np.abs(reached - after) > slack).any(1) & ~ends[:-1], False]
         complete &= ~np.logical_or.reduceat(jumps, starts)
     returns = np.add.reduceat(reward, starts)
     episodes = np.c_[returns, stops - starts + 1, complete]
@@ -299,13 +304,6 @@ def _refuse(name: str, array: Array, wrong: Array, expected: str) -> None:
         )
 
 
-def _changes(array: Array, cast: Array) -> NDArray[np.int64]:
-    """See ``changes`` of :class:`Trajectories`."""
-    moved = np.diff(array, axis=0) != 0
-    lost = moved & (np.diff(cast, axis=0) == 0)
-    return np.stack([moved.sum(0), lost.sum(0)]).reshape(2, -1)
-
-
 def _unit_actions(action: Array, options: Reading) -> tuple[Array, int, int]:
     """Actions from -1 to 1, clipped; how many rows were, and how many outside."""
     if options.num_actions is not None:
@@ -342,10 +340,3 @@ def _unit_actions(action: Array, options: Reading) -> tuple[Array, int, int]:
         )
     clipped = np.clip(unit, -ACTION_LIMIT, ACTION_LIMIT)
     return clipped, int((clipped != unit).any(1).sum()), int(outside.sum())
-
-
-def _jumps(columns: Mapping[str, Array]) -> Array:
-    """Rows ``[N - 1]`` whose next observation is not the observation of the next."""
-    before, after = columns["next_observation"][:-1], columns["observation"][1:]
-    slack = SAME_STATE * np.maximum(1, np.abs(after))
-    return np.asarray((np.abs(before - after) > slack).any(1))
