@@ -3,7 +3,8 @@
 A score under disturbances mixes states that every policy survives with states that no
 policy can. Here the states are sorted beforehand, and a policy starts from each.
 
-Shapes: ``M`` states, ``Q`` positions, ``V`` velocities, ``K`` offsets, ``A`` action.
+The files also have the planner's solutions. Shapes: ``M`` states, ``Q`` positions,
+``V`` velocities.
 """
 
 from __future__ import annotations
@@ -44,14 +45,8 @@ class RecoverableStates:
         group: of :data:`GROUPS`.
         walk: number of the undisturbed walk a state comes from; states of one walk are
             alike.
-        moment: step of the walk at which it was disturbed.
         kind, strength: of the disturbance.
-        distance: to the expert's data, in units of the threshold of
-            :class:`~torchrl_osr.lab.evaluation.DataDistance`.
-        offsets: the planner's solution, ``[M, K, A]``, added to the actions of the
-            expert, who then goes on alone, for ``hold`` steps each. 0 if not
-            recoverable.
-        hold, steps: scalars; a policy is played for ``steps`` from each state.
+        steps: a policy is played for so many from each state.
         least_speed: that HalfCheetah must regain, m/s; elsewhere minus infinity.
     """
 
@@ -61,12 +56,8 @@ class RecoverableStates:
     goal: NDArray[np.float64]
     group: NDArray[Any]
     walk: NDArray[np.int32]
-    moment: NDArray[np.int32]
     kind: NDArray[Any]
     strength: NDArray[np.float64]
-    distance: NDArray[np.float32]
-    offsets: NDArray[np.float32]
-    hold: int
     steps: int
     least_speed: float
 
@@ -115,10 +106,11 @@ def load_recoverable_states(env_name: str, half: str = "public") -> RecoverableS
 def read_recoverable_states(path: Path | str) -> RecoverableStates:
     """Read an ``.npz`` file with the arrays of :class:`RecoverableStates`."""
     arrays: dict[str, Any] = read_arrays(Path(path))
-    kinds = {"env_name": str, "hold": int, "steps": int, "least_speed": float}
-    for field in fields(RecoverableStates):
-        arrays[field.name] = kinds.get(field.name, np.asarray)(arrays[field.name])
-    return RecoverableStates(**arrays)
+    kinds = {"env_name": str, "steps": int, "least_speed": float}
+    names = [field.name for field in fields(RecoverableStates)]
+    return RecoverableStates(
+        **{name: kinds.get(name, np.asarray)(arrays[name]) for name in names}
+    )
 
 
 def recovers(states: RecoverableStates, policy: Policy) -> NDArray[np.bool_]:

@@ -43,7 +43,6 @@ RECOVERY = {
 }
 """Entries of a disturbance, a number an episode, and their columns."""
 
-EPISODE = ["suite", "disturbance", "step", "episode", "score", *RECOVERY.values()]
 SAVED = ["states", "group", "disturbance", "walk", "back"]
 
 
@@ -78,12 +77,12 @@ class RunTables:
 
     @property
     def methods(self) -> list[str]:
-        """The methods, in the order of their first runs."""
+        """Methods, in the order of their first runs."""
         return list(self.runs["method"].unique())
 
     @property
     def data(self) -> list[str]:
-        """The data sets, in the order of their first runs."""
+        """Data sets, in the order of their first runs."""
         return list(self.runs["data"].unique())
 
     @property
@@ -93,16 +92,12 @@ class RunTables:
 
     @property
     def suites(self) -> list[str]:
-        """The suites, in the order of their first runs."""
+        """Suites, in the order of their first runs."""
         return [name for name in self.episodes["suite"].unique() if name]
 
 
 def find_runs(tops: Iterable[Path]) -> list[Path]:
-    """Folders of runs in or below the folders, each once, in the order of paths.
-
-    Raises:
-        FileNotFoundError: if one of the folders does not exist.
-    """
+    """Find the folders of runs in or below the folders, each once, sorted by path."""
     found: dict[Path, Path] = {}
     for top in tops:
         if not top.exists():
@@ -180,7 +175,7 @@ def read_runs(folders: Sequence[Path]) -> RunTables:
 
 
 class _Run(NamedTuple):
-    """A run; ``contents`` identifies the data, ``protocols`` how suites were played."""
+    """One run; ``contents`` identifies the data, ``protocols`` the suites."""
 
     facts: dict[str, Any]
     settings: dict[str, str]
@@ -216,14 +211,17 @@ def _read(folder: Path) -> _Run:
     for each in evaluations:
         values = np.array(each["returns"], dtype=float)
         values = values if references is None else references.score(values)
-        rows += _episodes("", "", each["step"], each["seeds"], values, {})
+        rows.append(_episodes("", each["step"], each["seeds"], values, {"name": ""}))
     for file in sorted(folder.glob("robustness-*.json")):
         content = read_json(file)
-        rows += _suite(content, f"{measure}s")
+        for each in content["evaluations"]:
+            seeds = each["clean"]["seeds"]
+            for level in ({"name": "", **each["clean"]}, *each["levels"]):
+                place, values = (content["suite"], each["step"]), level[f"{measure}s"]
+                rows.append(_episodes(*place, seeds, values, level))
         protocols.append(_protocol(content, steps))
         versions.append(content["versions"])
-    episodes = pd.DataFrame(rows, columns=EPISODE)
-    episodes[EPISODE[2:]] = episodes[EPISODE[2:]].astype(float)
+    episodes = pd.concat(rows)
     if not np.isfinite(episodes["score"]).all():
         raise ValueError("not all of its returns are finite numbers")
     saved = [pd.DataFrame(columns=SAVED)]
@@ -256,32 +254,17 @@ def _read(folder: Path) -> _Run:
 
 
 def _episodes(
-    suite: str,
-    disturbance: str,
-    step: int,
-    seeds: Sequence[int],
-    scores: Iterable[float],
-    level: Mapping[str, Any],
-) -> list[tuple[Any, ...]]:
-    """Rows of the episodes of one evaluation."""
-    columns = [level.get(key) or [None] * len(seeds) for key in RECOVERY]
-    of_each = zip(seeds, scores, *columns, strict=True)
-    return [(suite, disturbance, step, *each) for each in of_each]
-
-
-def _suite(content: Mapping[str, Any], measure: str) -> list[tuple[Any, ...]]:
-    """Rows of the episodes of a robustness file."""
-    rows = []
-    for each in content["evaluations"]:
-        seeds = each["clean"]["seeds"]
-        for level in ({"name": "", **each["clean"]}, *each["levels"]):
-            place = content["suite"], level["name"], each["step"]
-            rows += _episodes(*place, seeds, level[measure], level)
-    return rows
+    suite: str, step: int, seeds: list[int], scores: Any, level: Mapping[str, Any]
+) -> pd.DataFrame:
+    """Return the rows of one evaluation under a disturbance."""
+    entries = {name: level.get(key) for key, name in RECOVERY.items()}
+    numbers = {"step": step, "episode": seeds, "score": scores} | entries
+    frame = pd.DataFrame(numbers, dtype=float)
+    return frame.assign(suite=suite, disturbance=level["name"])
 
 
 def _protocol(content: Mapping[str, Any], steps: int) -> dict[str, str]:
-    """What must be equal for two results of a suite to be compared, as texts."""
+    """Return the facts that must be equal in comparable results of a suite."""
     evaluations = content["evaluations"]
     at, keys = [each["step"] for each in evaluations], ("name", "kind", "strength")
     facts = {
@@ -294,7 +277,7 @@ def _protocol(content: Mapping[str, Any], steps: int) -> dict[str, str]:
 
 
 def _saved_states(content: Mapping[str, Any]) -> pd.DataFrame:
-    """The states of a file, and the share of its checkpoints that each was saved by."""
+    """Return the states of a file, and the share of checkpoints that recover."""
     columns = {key: content[key] for key in SAVED[1:-1]}
     back = np.mean([each["back"] for each in content["evaluations"]], axis=0)
     # The same number of the same groups may be other states.
@@ -304,48 +287,39 @@ def _saved_states(content: Mapping[str, Any]) -> pd.DataFrame:
 
 
 def comparable(settings: pd.DataFrame) -> pd.DataFrame:
-    """The settings that must be equal for two runs to be averaged."""
+    """Select the settings that must be equal for two runs to be averaged."""
     return settings[[key for key in settings if not key.startswith(IGNORED)]]
 
 
 def tell_apart(
     names: pd.Series, facts: pd.DataFrame, data: pd.Series | None = None
 ) -> pd.Series:
-    """Add to equal names the facts in which they differ.
-
-    Args:
-        names: of the rows.
-        facts: of each, a column for each kind.
-        data: the data set of each, if facts may differ between data sets.
-    """
+    """Add to equal names the facts in which they differ on one data set."""
     found = names.copy()
     data = pd.Series("", names.index) if data is None else data
     for name, group in facts.groupby(names, sort=False):
         differing = group.loc[:, group.groupby(data).nunique().max() > 1]
         if differing.empty:
             continue
-        texts = [
-            ", ".join(f"{key}={value[:NAMED_WIDTH]}" for key, value in row.items())
-            for row in differing.iloc[:, :NUM_NAMED].to_dict("records")
-        ]
+        short = differing.iloc[:, :NUM_NAMED]
+        texts = short.apply(
+            lambda row: ", ".join(f"{k}={v[:NAMED_WIDTH]}" for k, v in row.items()),
+            axis=1,
+        )
         kinds = differing.groupby(list(differing), sort=False).ngroup() + 1
-        if len(set(texts)) < kinds.max():  # the names are too short for all of it
-            texts = [
-                f"{each}, kind {kind}" for each, kind in zip(texts, kinds, strict=True)
-            ]
-        found[group.index] = [f"{name} ({text})" for text in texts]
+        if texts.nunique() < kinds.max():  # the names are too short for all of it
+            texts += ", kind " + kinds.astype(str)
+        found[group.index] = f"{name} (" + texts + ")"
     return found
 
 
 def comparison_notes(tables: RunTables) -> list[str]:
-    """A sentence for everything that makes a comparison less than fair."""
+    """Write a sentence for everything that makes a comparison less than fair."""
     runs, notes = tables.runs, []
-    versions: dict[str, set[str]] = {}
-    for each in {each for row in runs["versions"] for each in row}:
-        versions.setdefault(each.rpartition(" ")[0], set()).add(each)
-    for name in sorted(versions):
-        if len(versions[name]) > 1:
-            notes.append(f"Mixed versions: {', '.join(sorted(versions[name]))}.")
+    versions = pd.Series(runs["versions"].explode().dropna().unique()).sort_values()
+    for _, each in versions.groupby(versions.str.rpartition(" ")[0]):
+        if len(each) > 1:
+            notes.append(f"Mixed versions: {', '.join(each)}.")
     settings = comparable(tables.settings)
     for data, group in runs.groupby("data", sort=False):
         kinds = settings.loc[group.index].nunique()
