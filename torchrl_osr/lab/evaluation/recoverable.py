@@ -105,12 +105,13 @@ def load_recoverable_states(env_name: str, half: str = "public") -> RecoverableS
 
 def read_recoverable_states(path: Path | str) -> RecoverableStates:
     """Read an ``.npz`` file with the arrays of :class:`RecoverableStates`."""
-    arrays: dict[str, Any] = read_arrays(Path(path))
+    arrays = read_arrays(Path(path))
     kinds = {"env_name": str, "steps": int, "least_speed": float}
-    names = [field.name for field in fields(RecoverableStates)]
-    return RecoverableStates(
-        **{name: kinds.get(name, np.asarray)(arrays[name]) for name in names}
-    )
+    kept: dict[str, Any] = {
+        name: kinds.get(name, np.asarray)(arrays[name])
+        for name in (field.name for field in fields(RecoverableStates))
+    }
+    return RecoverableStates(**kept)
 
 
 def recovers(states: RecoverableStates, policy: Policy) -> NDArray[np.bool_]:
