@@ -216,16 +216,16 @@ def test_entries_are_in_the_order_of_their_numbers(names, named):
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
+    ("rows", "message"),
     [
-        (b",obs_0,action\n0,1,2\n", "expected the names of at least two columns"),
-        (b"obs_0,action,reward,reward\n1,2,3,4\n", "two columns have one name"),
-        (b"obs_0,action,reward,terminated,episode\n1,.2,3,0,0,9\n", "cannot be read"),
-        (b"obs_0,action,reward,terminated,episode\n1,.2,3\n", "no value in row 0"),
+        (",obs_0,action\n0,1,2\n", "expected the names of at least two columns"),
+        ("obs_0,action,reward,reward\n1,2,3,4\n", "two columns have one name"),
+        ("obs_0,action,reward,terminated,episode\n1,.2,3,0,0,9\n", "cannot be read"),
+        ("obs_0,action,reward,terminated,episode\n1,.2,3\n", "no value in row 0"),
     ],
 )
-def test_wrong_csv_files_are_refused(tmp_path, content, message):
-    (tmp_path / "log.csv").write_bytes(content)
+def test_wrong_csv_files_are_refused(tmp_path, rows, message):
+    (tmp_path / "log.csv").write_text(rows)
     with pytest.raises(ValueError, match=message):
         load_dataset(path=tmp_path / "log.csv")
 

@@ -160,7 +160,7 @@ def with_value(name, row, value):
         ({"truncated": None}, "neither truncated nor episode"),
         (
             {"episode": [0, 0, 0, 1, 1, 0], "terminated": [0] * 6},
-            "an 'episode' comes b",
+            "'episode' 0 comes b",
         ),
         ({"episode": [0, 0, 0, 0, 1, 1]}, r"row 2 ends its episode, and row 3 .*late"),
         (

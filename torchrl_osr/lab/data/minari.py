@@ -1,8 +1,8 @@
 """Minari data sets, HDF5 or Arrow, read through the ``minari`` library.
 
 TorchRL 0.11 to 0.14.1 has a reader whose every field is zero
-(``MinariExperienceReplay``). Minari stores ``T + 1`` observations of an episode, so
-that every row has its true next observation.
+(``MinariExperienceReplay``). Minari stores ``T + 1`` observations of an
+episode: every row has its true next observation.
 """
 
 from __future__ import annotations

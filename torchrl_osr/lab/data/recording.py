@@ -1,7 +1,7 @@
 """Recorded steps, read whole or in parts, in memory or on disk.
 
-What becomes of a row depends on its trajectory alone. Hence the transitions are the
-same whether a recording is read at once or in parts of whole trajectories.
+A row's transition depends on its trajectory alone. Hence a recording gives the same
+transitions, read at once or in parts of whole trajectories.
 """
 
 from __future__ import annotations
@@ -118,13 +118,13 @@ class Recording:
                 numbers = np.asarray(columns.get("episode", ()), np.float64).reshape(-1)
                 numbers = numbers[~np.isnan(numbers)]
                 first = np.r_[True, np.diff(numbers) != 0][: len(numbers)]
-                found = numbers[first].tolist()
-                if len(seen) + len(found) > len(seen | {*found}):
-                    raise ValueError(
-                        "an 'episode' comes back; expected its rows together and in "
-                        "order of time. data.columns.step sorts them."
-                    )
-                seen |= {*found}
+                for number in numbers[first].tolist():
+                    if number in seen:
+                        raise ValueError(
+                            f"'episode' {number:g} comes back; expected its rows "
+                            "together. data.columns.step sorts them."
+                        )
+                    seen.add(number)
             except ValueError as error:
                 where = f"in the rows from {read:,} on: " if read else ""
                 raise ValueError(f"{where}{error}") from error
@@ -183,7 +183,7 @@ class Recording:
 def whole_trajectories(
     chunks: Iterable[Mapping[str, Array]],
 ) -> Iterator[Mapping[str, Array]]:
-    """Cut chunks of columns anew, so that each part ends with a trajectory."""
+    """Regroup chunks of columns into parts of whole trajectories."""
     rest: Mapping[str, Array] = {}
     for chunk in chunks:
         if rest:
@@ -214,8 +214,8 @@ def transitions_from_columns(
     A trajectory ends where a row is terminated or truncated, where the episode number
     changes, and at the last row; an end without a flag becomes ``truncated``. Without
     ``next_observation``, a row's next state is the observation of the following row.
-    The last row of a trajectory has none: a terminated row stays, with its own
-    observation in that place, which no loss reads; another row is dropped, and the row
+    The last row of a trajectory has none. A terminated row stays, with its own
+    observation in that place, which no loss reads. Another row is dropped, and the row
     before it becomes ``truncated``.
 
     Args:

@@ -1,13 +1,12 @@
-"""Named data sets, rolled out from the behaviour policies of the package.
+"""Roll out named data sets from the behaviour policies of the package.
 
-``random`` draws uniform actions; ``medium-replay`` stands for the replay buffer of a
-training run by eight snapshots on the way to the medium policy; the mixtures are made
-of equal shares. In the mazes, a planner gives the next of
-the four cells beside a cell, and a controller pushes the point towards it. Both know
-only the observation, so that the behaviour has no memory.
+``random`` draws uniform actions; ``medium-replay`` stands for a replay buffer: eight
+snapshots on the way to the medium policy. Mixtures have equal shares. In the mazes, a
+planner gives the next of the four cells beside a cell, and a controller pushes the
+point towards it. Both see only the observation: the behaviour has no memory.
 
-Gymnasium and a NumPy policy, one environment, one process: on one core that was faster
-than vectorised environments and than a torch policy.
+One environment, one process and NumPy policies: on one core this is faster than
+vectorised environments or torch policies.
 """
 
 from __future__ import annotations

@@ -113,12 +113,12 @@ def multi_step(
 ) -> TensorDict:
     r"""Entries of ``"next"`` after at most ``n_steps`` steps of the data.
 
-    The reward is :math:`\sum_{k<m} \gamma^k (a\,r_k + b)`; state and flags are those
+    The reward is :math:`\sum_{k<m} \gamma^k (a\,r_k + b)`. State and flags are those
     after the last of the m steps. m is less than ``n_steps`` where an episode ends, or
-    where the row after is not the one that came next in time.
+    where the next row did not come next in time.
 
-    TorchRL 0.14.1's ``MultiStep`` keeps the flags of the first step, so that returns
-    that have reached a terminal state are bootstrapped from it.
+    TorchRL 0.14.1's ``MultiStep`` keeps the flags of the first step: it bootstraps
+    returns that have reached a terminal state.
 
     Keyword Args:
         n_steps: the largest m.

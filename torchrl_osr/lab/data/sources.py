@@ -98,7 +98,7 @@ def load_dataset(
             :func:`~torchrl_osr.lab.data.transitions_from_columns`, and ``step``, by
             which the rows of an episode are sorted: numbers, or time stamps in ISO
             format. Names may be patterns (``"obs_*"``), or lists, one name an entry.
-            ``terminated=False`` says that nothing ends the task. Of ``"minari"``,
+            ``terminated=False``: nothing ends the task. Of ``"minari"``,
             ``observation`` alone: entries of a dictionary. Default: the usual names.
         action_bounds: lowest and highest action of the recording. Default: of
             ``"minari"`` its action space; otherwise the task's own bounds.
@@ -190,7 +190,7 @@ def open_recorded(
     download: bool,
     progress: bool,
 ) -> Recording:
-    """Open recorded data, no row of which is read yet; see :func:`load_dataset`."""
+    """Open recorded data without reading a row; see :func:`load_dataset`."""
     columns = {part: name for part, name in columns.items() if name is not None}
     if source != "file":
         given = {f"columns.{part}": name for part, name in columns.items()}
@@ -299,7 +299,7 @@ class RolledOut(NamedTuple):
         return load_or_write(folder, request, collect, describe=lambda: about)
 
     def mix(self, source: str, random_share: float, on_disk: bool) -> Dataset:
-        """Rows of a source, a share of which is replaced by random rows."""
+        """Replace a share of the rows of a source by random rows."""
         if source == "random":
             _refuse({"random_share": random_share}, "data=random")
         (data, manifest), (other, random) = self.open(source), self.open("random")

@@ -5,8 +5,8 @@ the return of its expert (``d4rl/infos.py``). They were measured on the v2 tasks
 ``mujoco-py``. Gymnasium's v5 tasks share the scale, not the task: do not put the two
 in one column.
 
-In the mazes the return is 1 where the goal was reached and 0 where it was not, and
-D4RL's references are 0 and 1: the score is the success rate in percent.
+In the mazes an episode's return is 1 at the goal and 0 otherwise, and D4RL's references
+are 0 and 1. The score is the success rate in percent.
 
 Shapes: ``N`` transitions, ``S`` observation, ``E`` complete episodes.
 """
@@ -34,8 +34,7 @@ MIN_OBSERVATION_SCALE = 1e-3
 def observation_statistics(data: TensorDictBase) -> tuple[Tensor, Tensor]:
     r"""Mean and standard deviation of each observation entry.
 
-    Accumulated in float64 over chunks :math:`A` and :math:`B`, so that a memory-mapped
-    set is not copied, by Chan's formula:
+    Accumulate in float64 over chunks :math:`A` and :math:`B`, by Chan's formula:
 
     .. math::
         \sigma^2 = \frac{n_A \sigma_A^2 + n_B \sigma_B^2}{n_A + n_B}

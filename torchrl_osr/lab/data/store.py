@@ -1,8 +1,7 @@
 """Memory-mapped transitions, their cache folder, and replay buffers of any data.
 
-A data set is a folder with ``rows``, which ``TensorDict.load_memmap`` reads, and
-``manifest.json``, which says what they were made from and holds their checksum. Rows
-are read when they are drawn; the system takes their pages back when memory is short.
+A data set is a folder with ``rows`` (``TensorDict.load_memmap``) and ``manifest.json``,
+which describes their origin and holds their checksum. Rows are read when drawn.
 """
 
 from __future__ import annotations
@@ -172,8 +171,8 @@ def load_memmap(folder: Path | str) -> tuple[TensorDict, dict[str, Any]]:
     Its files are read once, to compare their checksum; rows are read when asked for.
 
     Returns:
-        The transitions ``[N]``, memory-mapped, and the manifest. What is written into
-        these tensors is written into the files: change a ``clone()``.
+        The transitions ``[N]``, memory-mapped, and the manifest. Change a ``clone()``:
+        writing to these tensors writes to the files.
 
     """
     folder = Path(folder).expanduser()

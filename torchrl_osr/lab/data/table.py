@@ -81,7 +81,7 @@ def open_log(
     options: Reading,
     source: str = "file",
 ) -> Recording:
-    """Open a log, no row of which is read yet."""
+    """Open a log without reading a row."""
     tables = {file: _table(file) for file in _files(path)}
     first = next(iter(tables.values()))
     layout = find_columns(first.names, columns)
