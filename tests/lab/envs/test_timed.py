@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import closing
-
 import mujoco
 import numpy as np
 import pytest
@@ -154,14 +152,6 @@ def test_force_is_applied_and_removed(play):
         expected[torso, 0] = 25 * env.sign * (2 <= number < 5)
         assert (applied == expected).all()
     assert not env.unwrapped.data.xfrc_applied.any()
-
-
-def test_torque_draws_discrete_actions():
-    with closing(make_environment("CartPole-v1")) as bare:
-        env = ActionKnock(bare, 4, mode="torque", at=2)
-        env.reset(seed=0)
-        draws = [int(env.random_action()) for _ in range(40)]
-        assert 5 < sum(draws) < 35
 
 
 def test_units_of_body_weight():

@@ -99,37 +99,23 @@ def line_results():
     return results
 
 
-@pytest.fixture
-def levels(line_results):
-    return {each["name"]: each for each in line_results["levels"]}
-
-
-def test_known_returns_and_recovery_steps(line_results, levels):
-    clean, six = line_results["clean"], levels["six"]
+def test_known_returns_and_recovery(line_results):
+    clean = line_results["clean"]
+    six, deadly, late, never, always = line_results["levels"]
     assert clean["returns"] == six["returns"] == [LIMIT] * 3
     assert clean["seeds"] == [4, 5, 6]
     # At 0.5, action 0: shoved to 6.5, then 5.5 ... 0.5, the sixth step is back.
     assert six["recovery_steps"] == [6, 6, 6]
     assert six["disturbed_at"] == six["ended_at"] == [5, 5, 5]
     assert six["survived_knock"] == six["alive_after"] == [True] * 3
-
-
-def test_a_fall_is_no_recovery(levels):
-    deadly = levels["deadly"]
+    # A fall is no recovery.
     assert deadly["lengths"] == deadly["returns"] == [6] * 3
     assert deadly["survived_knock"] == deadly["alive_after"] == [False] * 3
     assert deadly["recovery_steps"] == [None] * 3
-
-
-def test_the_time_limit_censors(levels):
-    late = levels["late"]
+    # The time limit censors.
     assert late["disturbed_at"] == [LIMIT - 3] * 3
     assert late["survived_knock"] == [True] * 3
     assert late["alive_after"] == late["recovery_steps"] == [None] * 3
-
-
-def test_no_disturbance_no_entries(levels):
-    never, always = levels["never"], levels["always"]
     assert never["disturbed_at"] == never["survived_knock"] == [None] * 3
     assert always["recovery_steps"] is None
 

@@ -63,15 +63,12 @@ def attacked_policy(
         observation_norm: standardisation of the training data. Default: none.
 
     Keyword Args:
-        kind: see above.
         epsilon: half-width of the box; RORL's go from 0, the bare policy, to 0.3.
         method: ``"sample"`` (default), or ``"gradient"``: RORL's first order with one
             start, its mixed order with 20.
         num_samples: draws, or starts of the gradient steps. Default 50.
-        seed: of the draws, which continue from call to call. Default 0.
 
     Examples:
-        >>> import torch
         >>> from torchrl_osr.modules import tanh_gaussian_actor
         >>> actor = tanh_gaussian_actor(11, 3)
         >>> policy = attacked_policy(actor.get_dist, None, kind="random", epsilon=0.1)

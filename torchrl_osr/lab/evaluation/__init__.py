@@ -1,13 +1,4 @@
-"""Evaluation of trained policies: episodes, disturbances, statistics and figures.
-
-* :class:`EpisodeEvaluator` plays complete episodes; :func:`summarize` has their scores.
-* :func:`evaluate_paired` plays them with and without a :class:`Disturbance`;
-  :func:`summarize_disturbances` has the score lost, survival and time to recovery.
-* :func:`recovers` plays a policy from each of :func:`load_recoverable_states`.
-* :class:`DataDistance` measures how far a state is from the data.
-* :func:`inverse_dynamics_report` judges an inverse dynamics model.
-* :mod:`~torchrl_osr.lab.evaluation.statistics` has all intervals.
-"""
+"""Evaluation of trained policies: episodes, disturbances, statistics and figures."""
 
 from torchrl_osr.lab.evaluation.data_distance import DataDistance
 from torchrl_osr.lab.evaluation.episodes import (

@@ -41,14 +41,10 @@ RECOVERY = (
 
 @dataclass(frozen=True)
 class Disturbance:
-    """One kind of disturbance at one strength.
+    """One kind of disturbance at one strength, with a name unique in its suite.
 
-    Attributes:
-        name: unique in its suite.
-        kind: of the disturbance; those of :data:`TRANSIENT` end.
-        strength: in the unit of its kind.
-        wrap: puts the disturbance around an environment. Default: nothing.
-        policy: an attacked one, instead of the evaluated one. Default: none.
+    ``wrap`` puts it around an environment; an attacked ``policy`` is played instead of
+    the evaluated one. Kinds in :data:`TRANSIENT` end.
     """
 
     name: str
@@ -79,7 +75,7 @@ def evaluate_paired(
         policy: to be evaluated, on the CPU.
         env_id: a Gymnasium id, ``"Hopper-v5"`` for instance.
         disturbances: of one suite.
-        distance: to the data that the policy was trained on.
+        distance: to the training data.
 
     Keyword Args:
         num_episodes: ``E``. Default 10.
