@@ -293,7 +293,7 @@ class _SoftMaximum(torch.autograd.Function):
         # gradient has a gradient itself, which that of a mean has not.
         if torch.is_grad_enabled():
             raise RuntimeError(
-                "Critics in chunks are once_differentiable: pass chunk_size=None for "
+                "Fused critics are once_differentiable: leave fuse_critics out for "
                 "second derivatives."
             )
         weight = upstream.flatten()[0]

@@ -265,18 +265,27 @@ class ActorCriticLoss(LossModule):
         given = TensorDict.from_module(network).detach()
         held.apply(lambda ours, theirs: ours.copy_(theirs), given, filter_empty=False)
 
+    def _reset_module_parameters(self, module_name: str, module: nn.Module) -> None:
+        # TorchRL's reset_parameters_recursive would redraw a trained, frozen model.
+        if any(True for _ in getattr(self, f"{module_name}_params").parameters()):
+            super()._reset_module_parameters(module_name, module)
+
     def register_action_bounds(
         self,
         actor_network: TensorDictModuleBase,
         inverse_dynamics_network: TensorDictModuleBase | None = None,
     ) -> None:
         """Register the bounds of a tanh-Gaussian actor; a model must share them."""
-        low, high = bounds = action_bounds(actor_network, "actor_network")
-        self.register_buffer("action_low", low, persistent=False)
-        self.register_buffer("action_high", high, persistent=False)
+        bounds = action_bounds(actor_network, "actor_network")
+        self.register_bounds(*bounds)
         if inverse_dynamics_network is not None:
             name = "inverse_dynamics_network"
             check_same_bounds(bounds, action_bounds(inverse_dynamics_network, name))
+
+    def register_bounds(self, low: Tensor, high: Tensor) -> None:
+        """Register bounds of the action, each a number or ``[A]``."""
+        self.register_buffer("action_low", low, persistent=False)
+        self.register_buffer("action_high", high, persistent=False)
 
     def register_coefficient(self, name: str, value: float) -> None:
         """Register the weight of a term, which may be assigned later."""
@@ -380,8 +389,10 @@ class ActorCriticLoss(LossModule):
 
     @property
     def observation_keys(self) -> list[NestedKey]:
-        """The state entries that actor and critics read."""
-        keys = [*self.actor_network.in_keys, *self.qvalue_network.in_keys]
+        """The state entries that actor, critics and a value network read."""
+        names = ("actor_network", "qvalue_network", "value_network")
+        networks = (getattr(self, name) for name in names if name in self.__dict__)
+        keys = [key for network in networks for key in network.in_keys]
         return state_keys(keys, self.tensor_keys.action)
 
     def input_keys(self) -> list[NestedKey]:
@@ -442,9 +453,11 @@ class ActorCriticLoss(LossModule):
         losses, metrics = self.losses(self.unpack(tensordict))
         scalar = losses | metrics
         if self.reduction == "none":
-            out = TensorDict(losses, batch_size=tensordict.batch_size)
+            out = TensorDict({}, batch_size=tensordict.batch_size)
             for name in self.out_keys:
-                if name not in losses:
+                if name in losses:
+                    out.set(name, losses[name])
+                else:
                     out.set_non_tensor(name, metrics[name])
         else:
             out = TensorDict({name: scalar[name] for name in self.out_keys}, [])
@@ -562,6 +575,11 @@ class ActorCriticLoss(LossModule):
         return torch.stack(values)
 
     # -- terms ------------------------------------------------------------------------
+
+    @property
+    def with_lagrange(self) -> bool:
+        """Whether ``loss_alpha_prime`` is written; TorchRL's CQLTrainer asks."""
+        return self.target_action_gap is not None
 
     @property
     def alpha(self) -> Tensor:
@@ -732,6 +750,8 @@ class ActorCriticLoss(LossModule):
         check_action(batch.a, shape, self.tensor_keys.action)
         if self._bounds_are_checked or torch.compiler.is_compiling():
             return
+        if "action_low" not in self._buffers:  # a policy without bounds
+            return
         self._bounds_are_checked = True
         low, high = self.action_low, self.action_high
         margin = 1e-4 * (high - low)
@@ -756,61 +776,57 @@ class ActorCriticLoss(LossModule):
             valid: rows that count, bool ``[R]``; the others are 0 under ``"none"``.
                 Default: all. A mean over no row, or over weights of 0, is 0.
         """
-        given = batch.tensordict
-        value = value.reshape(given.batch_size)
-        weights = self._weights(given)
-        if valid is not None:
-            valid = valid.reshape(given.batch_size)
+        weights, counted = self._weights(batch), batch.counted(valid)
+        if counted is not None:
             # Selected, not multiplied: 0 * nan is nan in the backward pass, too.
-            value = torch.where(valid, value, torch.zeros_like(value))
-        if weights is None or self.reduction != "mean":
-            # A mask under "none" would compact the result, and a sum needs none.
-            mask = valid if self.reduction == "mean" else None
-            reduced: Tensor = self._reduce_loss(
-                value, given, mask=mask, weights=weights
-            )
-            return reduced
-        # Not TorchRL 0.14.1's weighted mean, which is 0 / 0 where no weight counts.
-        weights = weights.to(value.dtype)
-        if valid is not None:
-            weights = weights * valid
-        total: Tensor = self._reduce_loss(value * weights, given, reduction="sum")
-        weight: Tensor = self._reduce_loss(weights, given, reduction="sum")
-        return total / torch.where(weight == 0, torch.ones_like(weight), weight)
+            value = torch.where(counted, value, torch.zeros_like(value))
+            if weights is not None:
+                weights = torch.where(counted, weights, torch.zeros_like(weights))
+        if weights is not None:
+            weights = weights.to(value.dtype)
+            value = value * weights
+        if self.reduction == "none":
+            return value.reshape(batch.tensordict.batch_size)
+        if self.reduction == "sum":
+            return value.sum()
+        if weights is not None:
+            total = weights.sum()
+            return value.sum() / torch.where(total == 0, torch.ones_like(total), total)
+        return _mean(value, counted)
 
     def mean(
         self, value: Tensor, batch: Transitions, valid: Tensor | None = None
     ) -> Tensor:
         """Return the detached mean of a metric ``[..., R]`` over rows that count."""
-        size = batch.tensordict.batch_size
-        value = value.detach().reshape(-1, *size).mean(0)
-        if valid is not None:
-            valid = valid.reshape(size)
-            value = torch.where(valid, value, torch.zeros_like(value))
-        mean: Tensor = self._reduce_loss(
-            value, batch.tensordict, mask=valid, reduction="mean"
-        )
-        return mean
+        value = value.detach()
+        value = value.reshape(-1, value.shape[-1]).mean(0)
+        counted = batch.counted(valid)
+        if counted is not None:
+            value = torch.where(counted, value, torch.zeros_like(value))
+        return _mean(value, counted)
 
-    def _weights(self, tensordict: TensorDictBase) -> Tensor | None:
-        """Return the rows' importance weights ``[B]``, if there and to be used."""
+    def _weights(self, batch: Transitions) -> Tensor | None:
+        """Return the rows' importance weights ``[R]``, if there and to be used."""
         if self.use_prioritized_weights is False:
             return None
+        given, key = batch.tensordict, self.tensor_keys.priority_weight
         # Not TorchRL's _maybe_get_priority_weight, which fails with a nested key.
-        key = self.tensor_keys.priority_weight
-        weights: Tensor | None = tensordict.get(key, None)
-        if weights is None or weights.shape == tensordict.batch_size:
-            return weights
-        if weights.shape == (*tensordict.batch_size, 1):
-            return weights.squeeze(-1)
-        raise ValueError(
-            f"{key!r} has shape {tuple(weights.shape)}, expected one weight a row: "
-            f"{tuple(tensordict.batch_size)}."
-        )
+        weights: Tensor | None = given.get(key, None)
+        if weights is None:
+            return None
+        if weights.shape not in (given.batch_size, (*given.batch_size, 1)):
+            raise ValueError(
+                f"{key!r} has shape {tuple(weights.shape)}, expected one weight a row: "
+                f"{tuple(given.batch_size)}."
+            )
+        return weights.reshape(-1)
 
     def rows_weigh_alike(self, batch: Transitions) -> bool:
         """Return whether every row's term has the same weight in a reduced loss."""
-        given = batch.tensordict
-        masked = any(key in given for key in self._loss_mask_keys())
-        weighted = self._weights(given) is not None
-        return self.reduction != "none" and not (masked or weighted)
+        alike = batch.unmasked is None and self._weights(batch) is None
+        return self.reduction != "none" and alike
+
+
+def _mean(value: Tensor, counted: Tensor | None) -> Tensor:
+    """Return the mean of rows ``[R]``, of which those not counted are 0."""
+    return value.mean() if counted is None else value.sum() / counted.sum().clamp(min=1)

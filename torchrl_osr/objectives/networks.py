@@ -87,6 +87,12 @@ def bounds_of(options: dict[str, Any]) -> tuple[Tensor, Tensor]:
     return low, high
 
 
+def squashing_bounds(network: TensorDictModuleBase) -> tuple[Tensor, ...]:
+    """Return ``low`` and ``high`` of a network that ends in a tanh, or nothing."""
+    head, options = head_of(network)
+    return bounds_of(options) if head in (TanhNormal, TanhDelta) else ()
+
+
 def check_same_bounds(
     policy: tuple[Tensor, Tensor], inverse_dynamics: tuple[Tensor, Tensor]
 ) -> None:
@@ -147,16 +153,27 @@ def check_networks(**networks: nn.Module | Sequence[nn.Module] | None) -> None:
                         "of a list, parameters of its own (copy.deepcopy the encoder)."
                     )
             owners |= dict.fromkeys(parameters, name)
-        kinds = {
-            (repr(each), *(p.requires_grad for p in each.parameters()))
-            for each in modules
-            if each is not None
-        }
-        if len(kinds) > 1:
+        kinds = [_kind(each) for each in modules if each is not None]
+        if any(kind != kinds[0] for kind in kinds):
             raise ValueError(
-                f"the networks of {name} differ in layers, keys or frozen parameters, "
-                "and all are computed by the first one's: build them alike."
+                f"the networks of {name} differ in layers, keys, numbers or frozen "
+                "parameters, and all are computed by the first one's: build them alike."
             )
+
+
+def _kind(network: nn.Module) -> list[Any]:
+    """Return what decides how a network computes, but for its weights."""
+    plain = (bool, int, float, str)
+    return [
+        repr(network),
+        [each.requires_grad for each in network.parameters()],
+        *(
+            (type(each), "forward" in vars(each), name, value)
+            for each in network.modules()
+            for name, value in {"": 0, **vars(each)}.items()
+            if isinstance(value, plain)
+        ),
+    ]
 
 
 def distribution_params(

@@ -30,6 +30,7 @@ from torchrl_osr.objectives.networks import (
     distribution,
     head_of,
     is_deterministic,
+    squashing_bounds,
     written_action,
 )
 from torchrl_osr.objectives.transitions import States, Transitions
@@ -137,6 +138,8 @@ class StateRecoveryLoss(ActorCriticLoss):
             metric = "recovery_error" if self.is_deterministic else "recovery_nll"
             if not by_mean:
                 action_bounds(actor_network, "actor_network")
+            if bounds := squashing_bounds(actor_network):
+                self.register_bounds(*bounds)
         elif inverse_dynamics_network is None:
             raise ValueError(
                 f"recovery_target={recovery_target!r} needs an "
@@ -145,9 +148,8 @@ class StateRecoveryLoss(ActorCriticLoss):
             )
         else:
             name = "inverse_dynamics_network"
-            low, high = bounds = action_bounds(inverse_dynamics_network, name)
-            self.register_buffer("action_low", low, persistent=False)
-            self.register_buffer("action_high", high, persistent=False)
+            bounds = action_bounds(inverse_dynamics_network, name)
+            self.register_bounds(*bounds)
             if not by_mean:
                 check_same_bounds(action_bounds(actor_network, "actor_network"), bounds)
             elif head is TanhDelta:
@@ -179,6 +181,7 @@ class StateRecoveryLoss(ActorCriticLoss):
         )
         if self.recovery_target == "data":
             recovery = cloning_distance(pi, batch.a, self.tensor_keys.action).mean(0)
+            self.check_actions(batch, batch.a.shape)
             if self.action_reduction == "mean":
                 recovery = recovery / batch.a.shape[-1]
         else:
@@ -280,6 +283,11 @@ class WithRecovery(LossModule):
     def out_keys(self) -> list[NestedKey]:
         """The entries that the two write."""
         return [*self.loss.out_keys, *self.recovery.out_keys]
+
+    def make_value_estimator(self, *args: Any, **options: Any) -> Self:
+        """Choose the TD target of the loss."""
+        self.loss.make_value_estimator(*args, **options)
+        return self
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return losses and metrics of both, see ``out_keys``."""

@@ -73,12 +73,13 @@ class Transitions:
         tensordict: the batch ``[B]``.
         read: the entries that the loss reads.
         keys: names of the entries.
-        masks: entries that mark the rows that count, bool ``[B]`` or ``[B, 1]``.
+        masks: entries that mark the rows that count, ``[B]`` or ``[B, 1]``.
         dtype: of the networks.
 
     Attributes:
         tensordict: the batch as it was given.
         rows: what the loss reads of it, ``[R]``.
+        unmasked: rows that count, bool ``[R]``; ``None`` if all do.
         one_step: the same rows with the single step as ``"next"``, see
             :class:`TransitionKeys`.
         states: ``[s, s']`` or ``[s, s', s^]``, ``[2 or 3, R]``, of a loss with critics.
@@ -100,9 +101,12 @@ class Transitions:
         if rows.ndim != 1:
             rows = rows.reshape(-1)
         rows = _in_dtype(rows, dtype)
+        self.unmasked: Tensor | None = None
         for mask in (rows.get(key, None) for key in masks):
             if mask is not None:
-                rows = _zeros_where_not(rows, mask.reshape(-1).bool())
+                mask = mask.reshape(-1).bool()
+                rows = _zeros_where_not(rows, mask)
+                self.unmasked = self.counted(mask)
         self.rows = self.one_step = rows
         if keys.one_step in rows.keys(include_nested=True):
             own = rows.exclude(keys.steps_to_next_obs)
@@ -182,6 +186,12 @@ class Transitions:
         """Return ``value``, ``[R]``, with 0 where the action is not the data's."""
         data = self.is_data
         return value if data is None else torch.where(data, value, 0.0 * value.detach())
+
+    def counted(self, valid: Tensor | None) -> Tensor | None:
+        """Return the unmasked rows that are ``valid``; ``None`` stands for all."""
+        if valid is None or self.unmasked is None:
+            return self.unmasked if valid is None else valid
+        return valid & self.unmasked
 
     @property
     def has_next(self) -> Tensor:

@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from torchrl_osr._entries import state_keys
 from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses
+from torchrl_osr.objectives.networks import squashing_bounds
 from torchrl_osr.objectives.state_recovery import cloning_distance, policy_at
 from torchrl_osr.objectives.transitions import Transitions
 
@@ -43,6 +44,8 @@ class BCLoss(ActorCriticLoss):
     def __init__(self, actor_network: TensorDictModuleBase, **options: Any) -> None:
         super().__init__(**({"scalar_output_mode": "exclude"} | options))
         self.convert_to_functional(actor_network, "actor_network")
+        if bounds := squashing_bounds(actor_network):
+            self.register_bounds(*bounds)
         self.declare(["loss_actor"], [])
 
     def input_keys(self) -> list[NestedKey]:
@@ -53,4 +56,5 @@ class BCLoss(ActorCriticLoss):
         states = batch.states_of(state_keys(network.in_keys), "clean")
         pi = policy_at(network, self.actor_network_params, states, key)
         distance = cloning_distance(pi, batch.a, key).mean(0)
+        self.check_actions(batch, batch.a.shape)
         return {"loss_actor": self.reduce(distance, batch, batch.is_data)}, {}

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModule,
@@ -18,7 +18,6 @@ from tensordict.nn import (
 from torch import Tensor
 
 from torchrl_osr._checks import check_weight
-from torchrl_osr._entries import state_keys
 from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses
 from torchrl_osr.objectives.networks import distribution, full_precision
 from torchrl_osr.objectives.state_recovery import cloning_distance
@@ -80,12 +79,6 @@ class IQLLoss(ActorCriticLoss):
         losses = ["loss_actor", "loss_qvalue", "loss_value"]
         self.declare(losses, ["nll", "pred_value", "target_value"])
         self.make_value_estimator()
-
-    @property
-    def observation_keys(self) -> list[NestedKey]:
-        """The state entries that actor, critics and value network read."""
-        own = state_keys(self.value_network.in_keys)
-        return list(dict.fromkeys([*super().observation_keys, *own]))
 
     def losses(self, batch: Transitions) -> Losses:
         if batch.is_data is not None:
