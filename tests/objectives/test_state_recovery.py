@@ -1,337 +1,223 @@
-"""StateRecoveryLoss by itself and beside TorchRL's own losses."""
+"""StateRecoveryLoss by itself, beside TorchRL's own losses and combined with a loss."""
 
 from __future__ import annotations
 
-import copy
-
 import pytest
 import torch
-from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
+from objectives.losses import (
+    ACTOR,
+    NEXT,
+    PERTURBED,
+    Networks,
+    density,
+    make_batch,
+    make_loss,
+    update_targets,
+)
+from objectives.plain import BOX, UNIT
 from torch import Tensor, nn
-from torch.distributions import Normal, kl_divergence
-from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
+from torch.distributions import kl_divergence
+from torchrl.modules import Actor
 from torchrl.objectives import IQLLoss, SACLoss, SoftUpdate, TD3BCLoss
 
 from torchrl_osr import StateRecoveryLoss
+from torchrl_osr.objectives import WithRecovery
 
-KEY, METRIC, ACTOR = "loss_recovery", "recovery_kl", "actor_network_params"
-NEXT, PERTURBED = ("next", "observation"), ("perturbed", "observation")
-REVERSE = {"recovery_direction": "reverse"}
-STATES = ["both", "clean", "perturbed"]
-BOUNDS = [([-1.0, -1.0], [1.0, 1.0]), ([-1.0, -0.5], [2.0, 1.5])]
-
-
-def double(low, high) -> dict[str, Tensor]:
-    return {"low": torch.tensor(low).double(), "high": torch.tensor(high).double()}
+KEY = "loss_recovery"
+ACTORS = ["actor", "delta", "module", "gaussian"]
+STATES = {"clean": [0], "perturbed": [1], "both": [0, 1]}
 
 
-def make_loss(networks, **kwargs) -> StateRecoveryLoss:
-    model = networks.inverse_dynamics
-    return StateRecoveryLoss(networks.actor, model, **kwargs).double()
-
-
-def value_and_gradients(loss, batch, key: str = KEY) -> list[Tensor]:
-    torch.manual_seed(2)
-    value = loss(batch)[key]
-    actor = list(loss.actor_network_params.parameters())
-    return [value.detach(), *torch.autograd.grad(value.sum(), actor)]
-
-
-class Restatement:
-    """The term once more, with torch.distributions alone, over rows that count."""
-
-    def __init__(self, batch, states: str) -> None:
-        kept = ~batch["next", "done"].squeeze(-1)
-        sets = {"clean": batch["observation"], "perturbed": batch[PERTURBED]}
-        names = ["clean", "perturbed"] if states == "both" else [states]
-        self.states = torch.stack([sets[name][kept] for name in names])
-        self.following = batch[NEXT][kept].expand_as(self.states)
-
-    def model(self, network) -> Normal:
-        with torch.no_grad():
-            _, loc, scale = network[0](self.states, self.following)
-        return Normal(loc, scale)
-
-
-@pytest.mark.parametrize("direction", ["forward", "reverse"])
-@pytest.mark.parametrize("reduction", ["sum", "mean"])
-@pytest.mark.parametrize("states", STATES)
-def test_value_and_gradients_equal_the_divergence_of_torch(
-    make_networks, make_batch, check, direction, reduction, states
-) -> None:
-    networks, batch = make_networks(**double(*BOUNDS[1])), make_batch(10)
-    options = {
-        "recovery_direction": direction,
-        "action_reduction": reduction,
-        "recovery_states": states,
-    }
-    loss = make_loss(copy.deepcopy(networks), recovery_weight=0.75, **options)
-    restated = Restatement(batch, states)
-    model = restated.model(networks.inverse_dynamics)
-    policy = Normal(*networks.actor[0](restated.states)[1:])
-    pair = (model, policy) if direction == "forward" else (policy, model)
-    expected = 0.75 * getattr(kl_divergence(*pair), reduction)(-1).mean()
-    gradients = torch.autograd.grad(expected, list(networks.actor.parameters()))
-    metric = loss(batch)[METRIC]
-    assert not metric.requires_grad
-    got = [*value_and_gradients(loss, batch), metric]
-    wanted = [expected.detach(), *gradients, expected.detach() / 0.75]
-    check("State recovery alone", got, wanted, tolerance=1e-12)
-
-
-@pytest.mark.parametrize("kind", ["delta", "actor", "module"])
-@pytest.mark.parametrize(("low", "high"), BOUNDS)
-@pytest.mark.parametrize("states", STATES)
-def test_deterministic_actors_are_measured_before_the_tanh(
-    make_networks,
-    make_deterministic_actor,
-    make_batch,
-    check,
-    kind,
-    low,
-    high,
-    states,
-) -> None:
-    bounds, batch = double(low, high), make_batch(10)
-    model_network = make_networks(**bounds).inverse_dynamics
-    actor, plain = (make_deterministic_actor(kind, **bounds) for _ in range(2))
-    options = {"recovery_states": states, "recovery_weight": 0.75} | REVERSE
-    loss = StateRecoveryLoss(actor, model_network, **options).double()
-    restated = Restatement(batch, states)
-    model = restated.model(model_network)
-    mlp = plain.module[0].module if kind == "delta" else plain.module[0]
-    x = mlp(restated.states)
+def before_tanh(networks: Networks, kind: str, state: Tensor) -> Tensor:
+    """Return the action before the tanh, of an actor by itself."""
+    actor = getattr(networks, kind)
     if kind == "delta":  # TorchRL moves a TanhDelta's parameter by the center
-        x = x + (bounds["low"] + bounds["high"]) / 2
-    expected = ((x - model.loc) ** 2 / (2 * model.scale**2)).sum(-1).mean()
-    gradients = torch.autograd.grad(0.75 * expected, list(plain.parameters()))
-    got = value_and_gradients(loss, batch)
-    wanted = [0.75 * expected.detach(), *gradients]
-    check("State recovery alone", got, wanted, tolerance=1e-12)
-    # And the pre-tanh action is that of the action which the actor takes.
-    action = actor(batch.select("observation"))["action"]
-    squashed = 2 * (action - bounds["low"]) / (bounds["high"] - bounds["low"]) - 1
-    x = mlp(batch["observation"]) + (kind == "delta") * (low[0] + high[0]) / 2
-    torch.testing.assert_close(torch.atanh(squashed), x)
+        center = (networks.bounds["low"] + networks.bounds["high"]) / 2
+        return actor[0].module(state) + center
+    return (actor[0] if kind == "gaussian" else actor).module[0](state)
 
 
-@pytest.mark.parametrize("kind", ["delta", "actor", "raw"])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_gradient_is_finite_where_the_action_has_saturated(
-    make_networks, make_deterministic_actor, make_batch, kind, dtype
+def restated(networks, kind, batch, states, reverse: bool, reduction: str) -> Tensor:
+    """Return the term by torch.distributions, over rows with a next state."""
+    kept = ~batch["next", "done"].squeeze(-1)
+    both = torch.stack([batch["observation"], batch[PERTURBED]])
+    s = both[STATES[states]][:, kept]
+    with torch.no_grad():
+        model = density(networks.model, s, batch[NEXT][kept].expand_as(s))
+    if kind == "actor":
+        pair = [model, density(networks.actor, s)]
+        each = kl_divergence(*(pair[::-1] if reverse else pair))
+    else:
+        each = (before_tanh(networks, kind, s) - model.loc) ** 2 / (2 * model.scale**2)
+    return getattr(each, reduction)(-1).mean()
+
+
+def check_term(check, label, loss, batch, expected: Tensor, actor) -> None:
+    """Compare value, gradients and metric with an unweighted term."""
+    (metric,) = set(loss.out_keys) - {KEY}
+    out = loss(batch)
+    assert not out[metric].requires_grad
+    (0.75 * expected).backward()
+    out[KEY].backward()
+    held = loss.actor_network_params.flatten_keys(".")
+    pairs = [(held[name].grad, each.grad) for name, each in actor.named_parameters()]
+    # The scale of a Gaussian is not trained by the divergence.
+    ours, theirs = zip(*(pair for pair in pairs if pair[1] is not None), strict=True)
+    found, expected = [out[KEY].detach(), out[metric], *ours], expected.detach()
+    check(label, found, [0.75 * expected, expected, *theirs], tolerance=1e-10)
+
+
+WAYS = [
+    ("actor", "forward", "sum", "both"),
+    ("actor", "forward", "mean", "clean"),
+    ("actor", "reverse", "mean", "perturbed"),
+    ("delta", "reverse", "mean", "both"),
+    ("module", None, "sum", "perturbed"),
+    ("gaussian", None, "sum", "clean"),
+]
+
+
+@pytest.mark.parametrize(("kind", "direction", "reduction", "states"), WAYS)
+def test_value_and_gradients_equal_the_divergence(
+    check, kind, direction, reduction, states
 ) -> None:
-    actor = make_deterministic_actor("delta" if kind == "delta" else "actor").to(dtype)
+    # A Gaussian without a tanh has no bounds of its own.
+    bounds = UNIT if kind == "gaussian" else BOX
+    networks, plain = Networks(**bounds), Networks(**bounds)
+    options = {"recovery_direction": direction, "action_reduction": reduction}
+    options |= {"recovery_states": states, "recovery_weight": 0.75}
+    loss = StateRecoveryLoss(getattr(networks, kind), networks.model, **options)
+    assert (PERTURBED in loss.in_keys) == (states != "clean")
+    batch = make_batch("recovery", 10)
+    reverse = direction == "reverse"
+    expected = restated(plain, kind, batch, states, reverse, reduction)
+    batch = batch.select(*loss.in_keys)
+    actor = getattr(plain, kind)
+    check_term(check, "State recovery alone", loss.double(), batch, expected, actor)
+
+
+@pytest.mark.parametrize("states", STATES)
+@pytest.mark.parametrize("kind", ACTORS)
+def test_noisy_cloning_equals_the_restatement(check, kind, states) -> None:
+    networks, plain, batch = Networks(), Networks(), make_batch("noisy-cloning", 10)
+    options = {"recovery_states": states, "recovery_weight": 0.75}
+    options |= {"recovery_target": "data"}
+    loss = StateRecoveryLoss(getattr(networks, kind), **options).double()
+    assert NEXT not in loss.in_keys
+    actor, kept = getattr(plain, kind), ~batch["next", "done"].squeeze(-1)
+    both = torch.stack([batch["observation"], batch[PERTURBED]])
+    s = both[STATES[states]][:, kept]
+    action = batch["action"][kept].expand(len(s), -1, -1)
+    if kind == "actor":
+        each = (1 - action**2).log() - density(actor, s).log_prob(action.atanh())
+    elif kind == "gaussian":
+        each = -density(actor, s).log_prob(action)
+    else:
+        each = (torch.tanh(before_tanh(plain, kind, s)) - action) ** 2
+    expected = each.sum(-1).mean()
+    check_term(check, "Noisy cloning alone", loss, batch, expected, actor)
+
+
+@pytest.mark.parametrize("kind", ["delta", "module", "raw"])
+def test_gradient_is_finite_where_the_action_has_saturated(kind) -> None:
+    networks = Networks()
+    actor = networks.delta if kind == "delta" else networks.module
     if kind == "raw":
         actor.module[1] = nn.Identity()  # no tanh at all: actions out of bounds
-    last = list(actor.parameters())[-1]
-    last.data.fill_(40.0)
-    model = make_networks().inverse_dynamics.to(dtype)
-    loss = StateRecoveryLoss(actor, model, **REVERSE).to(dtype)
-    batch = make_batch(10).apply(lambda t: t.to(dtype) if t.is_floating_point() else t)
-    gradients = value_and_gradients(loss, batch)
-    assert all(gradient.isfinite().all() for gradient in gradients)
+    last = [each for each in actor.modules() if isinstance(each, nn.Linear)][-1]
+    last.bias.data.fill_(50.0)
+    loss = StateRecoveryLoss(actor, networks.model).double()
+    loss(make_batch("recovery", 10))[KEY].backward()
+    assert last.bias.grad.isfinite().all()
     # A tanh that has saturated lets nothing through; the others pull the action back.
-    assert (gradients[-1] > 0).all() == (kind != "actor")
+    assert (last.bias.grad > 0).all() == (kind != "module")
 
 
-def other_loss(other: str, networks, make_deterministic_actor):
-    """A loss of TorchRL's and the actor in it."""
-    actor, critics = networks.actor, networks.critics
-    if other == "iql":
-        value = ValueOperator(MLP(3, 1, num_cells=[8]), ["observation"]).double()
-        loss = IQLLoss(actor, critics, value)
-    elif other == "sac":
-        loss = SACLoss(actor, critics, target_entropy=-2.0)
+def other_loss(kind: str, networks: Networks):
+    """Return a loss of TorchRL and the actor in it."""
+    networks.plain_actor = Actor(networks.module.module, in_keys=["observation"])
+    if kind == "iql":
+        loss = IQLLoss(networks.actor, networks.critics, networks.value)
+    elif kind == "sac":
+        loss = SACLoss(networks.actor, networks.critics, target_entropy=-2.0)
     else:
-        actor = make_deterministic_actor(other.removeprefix("td3bc-"))
-        loss = TD3BCLoss(actor, critics, bounds=(-1.0, 1.0))
-    loss = loss.double()
+        actor = getattr(networks, kind)
+        loss = TD3BCLoss(actor, networks.critics, bounds=(-1.0, 1.0))
     loss.make_value_estimator(gamma=0.9)
-    SoftUpdate(loss, tau=0.1)
-    return loss, actor
+    SoftUpdate(loss.double(), tau=0.1)
+    return loss, getattr(networks, kind) if kind not in (
+        "iql",
+        "sac",
+    ) else networks.actor
 
 
 def backward(losses, parameters) -> list[Tensor]:
-    """Gradients of one backward over the summed losses, zeros where there is none."""
-    for parameter in parameters:
-        parameter.grad = None
-    sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+    """Return the gradients of one backward over the sum of all losses."""
+    total = sum(value for key, value in losses.items() if key.startswith("loss_"))
+    slopes = torch.autograd.grad(total, parameters, allow_unused=True)
     return [
-        torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
-        for parameter in parameters
+        torch.zeros_like(parameter) if slope is None else slope
+        for parameter, slope in zip(parameters, slopes, strict=True)
     ]
 
 
-@pytest.mark.parametrize("kind", ["iql", "sac", "td3bc-delta", "td3bc-actor"])
-@pytest.mark.parametrize("order", [1, -1], ids=["after", "before"])
-def test_one_summed_backward_gives_the_actor_both_gradients_and_others_one(
-    make_networks, make_deterministic_actor, make_batch, kind, order
-) -> None:
-    networks, batch = make_networks(), make_batch(10)
-    other, actor = other_loss(kind, networks, make_deterministic_actor)
-    direction = "reverse" if kind.startswith("td3") else "forward"
-    model = networks.inverse_dynamics
-    recovery = StateRecoveryLoss(actor, model, recovery_direction=direction).double()
+@pytest.mark.parametrize("kind", ["iql", "sac", "delta", "plain_actor"])
+def test_beside_torchrls_losses_the_actor_gets_both_gradients(kind) -> None:
+    networks, batch = Networks(), make_batch("osr", 10)
+    other, actor = other_loss(kind, networks)
+    recovery = StateRecoveryLoss(actor, networks.model).double()
     assert set(recovery.parameters()) == set(actor.parameters())
-    assert set(recovery.parameters()) <= set(other.parameters())
-
     names, parameters = zip(*other.named_parameters(), strict=True)
     terms = []
-    for loss in (other, recovery):
+    for loss in (other, recovery, WithRecovery(other, recovery)):
         torch.manual_seed(2)
         terms.append(backward(loss(batch.clone()), parameters))
-    torch.manual_seed(2)
-    losses: dict[str, Tensor] = {}
-    for loss in (other, recovery)[::order]:
-        losses |= {**loss(batch)}
-    summed = backward(losses, parameters)
-    for key, both, base, extra in zip(names, summed, *terms, strict=True):
-        if key.startswith(ACTOR):
-            assert extra.abs().max() > 0, key
-            torch.testing.assert_close(both, base + extra, rtol=1e-12, atol=1e-12)
-        else:
-            assert torch.equal(both, base), key
-            assert not extra.any(), key
-    assert all(parameter.grad is None for parameter in model.parameters())
+    for key, base, extra, both in zip(names, *terms, strict=True):
+        torch.testing.assert_close(both, base + extra, rtol=1e-12, atol=1e-12)
+        assert extra.any() == key.startswith(ACTOR), key
 
 
-def test_sharing_survives_a_cast_and_a_step(
-    make_networks, make_deterministic_actor, make_batch
-) -> None:
-    networks = make_networks()
-    iql, actor = other_loss("iql", networks, make_deterministic_actor)
-    recovery = StateRecoveryLoss(actor, networks.inverse_dynamics)
-    iql.float(), recovery.float()
-    assert set(recovery.parameters()) <= set(iql.parameters())
-    batch = make_batch(10).float()
-    batch["next", "done"] = batch["next", "done"].bool()
-    optimizer = torch.optim.SGD(iql.parameters(), lr=1e-2)
-    before = recovery(batch)[KEY]
-    before.backward()
+def test_combined_losses_train_and_load_as_one() -> None:
+    def make():
+        networks = Networks()
+        loss = make_loss("td3-bc", networks)
+        term = StateRecoveryLoss(networks.module, networks.model).double()
+        return WithRecovery(loss, term)
+
+    first, second, batch = make(), make(), make_batch("osr", 10)
+    assert first.in_keys[-1] == PERTURBED
+    optimizer = torch.optim.SGD(first.parameters(), lr=0.1)
+    out = first(batch.select(*first.in_keys))
+    assert list(out.keys()) == first.out_keys
+    sum(out[key] for key in out.keys() if key.startswith("loss_")).backward()  # noqa: SIM118
     optimizer.step()
-    assert recovery(batch)[KEY] < before
+    assert update_targets(first)
+    second.load_state_dict(first.state_dict())
+    for ours, theirs in zip(second.parameters(), first.parameters(), strict=True):
+        assert torch.equal(ours, theirs)
+    with pytest.raises(ValueError, match="of another actor than the loss's"):
+        WithRecovery(make().loss, make().recovery)
 
 
-@pytest.mark.parametrize("states", STATES)
-def test_states_decide_what_is_read(make_networks, make_batch, states) -> None:
-    loss, batch = make_loss(make_networks(), recovery_states=states), make_batch(10)
-    perturbed = [] if states == "clean" else [PERTURBED]
-    assert loss.in_keys == ["observation", NEXT, ("next", "done"), *perturbed]
-    assert loss.out_keys == [KEY, METRIC]
-    out = loss(batch.select(*loss.in_keys))
-    assert list(out.keys()) == loss.out_keys
-    inputs = {
-        "_".join([*[key]] if isinstance(key, str) else key): batch[key]
-        for key in loss.in_keys
-    }
-    assert torch.equal(loss(**inputs)[0], out[KEY])
-    assert set(batch.keys(True, True)) == set(make_batch(10).keys(True, True))
-
-
-def test_states_that_only_the_model_reads_are_asked_for(
-    make_networks, make_batch
-) -> None:
-    networks, batch = make_networks(), make_batch(10)
-    networks.inverse_dynamics = make_networks(observation="goal").inverse_dynamics
+def test_states_that_only_the_model_reads_are_read() -> None:
+    networks, batch = Networks(), make_batch("recovery", 10)
+    expected = make_loss("recovery", networks)(batch)[KEY]
+    networks.model = Networks(observation="goal").model
     for group in (batch, batch["next"], batch["perturbed"]):
         group["goal"] = group["observation"]
-    loss = make_loss(networks)
-    for key in ("goal", ("next", "goal"), ("perturbed", "goal")):
-        assert key in loss.in_keys
-    expected = make_loss(make_networks())(make_batch(10))[KEY]
+    loss = make_loss("recovery", networks)
+    assert ("perturbed", "goal") in loss.in_keys
     assert torch.equal(loss(batch.select(*loss.in_keys))[KEY], expected)
 
 
-@pytest.mark.parametrize("kind", ["delta", "actor", "module"])
-def test_direction_follows_from_the_actor(
-    make_networks, make_deterministic_actor, kind
-) -> None:
-    networks = make_networks()
-    model, actor = networks.inverse_dynamics, make_deterministic_actor(kind)
-    assert StateRecoveryLoss(networks.actor, model).recovery_direction == "forward"
-    assert StateRecoveryLoss(actor, model).recovery_direction == "reverse"
-    with pytest.raises(
-        ValueError, match="deterministic.*Pass recovery_direction='reverse'"
-    ):
-        StateRecoveryLoss(actor, model, recovery_direction="forward")
-
-
-def gaussian_actor() -> ProbabilisticActor:
-    """A Gaussian around a tanh, without one at its end, float64."""
-    torch.manual_seed(0)
-    network = nn.Sequential(
-        MLP(3, 2, num_cells=[8]), nn.Tanh(), AddStateIndependentNormalScale(2)
-    )
-    return ProbabilisticActor(
-        TensorDictModule(network, ["observation"], ["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        out_keys=["action"],
-        distribution_class=IndependentNormal,
-    ).double()
-
-
-@pytest.mark.parametrize("states", STATES)
-def test_mean_of_a_gaussian_is_measured_before_its_tanh(
-    make_networks, make_batch, check, states
-) -> None:
-    network, batch = make_networks().inverse_dynamics, make_batch(10)
-    actor, plain = gaussian_actor(), gaussian_actor()
-    options = {"recovery_states": states, "recovery_weight": 0.75}
-    loss = StateRecoveryLoss(actor, network, **options).double()
-    restated = Restatement(batch, states)
-    model, x = restated.model(network), plain.module[0].module[0](restated.states)
-    expected = ((x - model.loc) ** 2 / (2 * model.scale**2)).sum(-1).mean()
-    mean = list(plain.module[0].module[0].parameters())
-    gradients = torch.autograd.grad(0.75 * expected, mean)
-    loss(batch)[KEY].backward()
-    got = [loss(batch)[KEY].detach()]
-    grads = [each.grad for each in loss.actor_network_params.parameters()]
-    got += [each for each in grads if each is not None]  # not of the scale
-    wanted = [0.75 * expected.detach(), *gradients]
-    check("State recovery alone", got, wanted, tolerance=1e-10)
-
-
-@pytest.mark.parametrize("kind", ["tanh", "gaussian", "delta", "actor", "module"])
-@pytest.mark.parametrize("states", STATES)
-@pytest.mark.parametrize("reduction", ["sum", "mean"])
-def test_the_datas_action_may_be_the_target(
-    make_networks, make_deterministic_actor, make_batch, check, kind, states, reduction
-) -> None:
-    make = {
-        "tanh": lambda: make_networks().actor,
-        "gaussian": gaussian_actor,
-    }.get(kind, lambda: make_deterministic_actor(kind))
-    actor, plain, batch = make(), make(), make_batch(10)
-    options = {"recovery_states": states, "action_reduction": reduction}
-    loss = StateRecoveryLoss(
-        actor, recovery_target="data", recovery_weight=0.75, **options
-    ).double()
-    restated = Restatement(batch, states)
-    kept = ~batch["next", "done"].squeeze(-1)
-    action = batch["action"][kept].expand(len(restated.states), -1, -1)
-    if kind == "tanh":
-        z = action.atanh()
-        density = Normal(*plain.module[0](restated.states)[1:])
-        log_prob = density.log_prob(z) - (1 - action**2).log()
-        expected = -getattr(log_prob, reduction)(-1).mean()
-    elif kind == "gaussian":
-        density = Normal(*plain.module[0].module(restated.states))
-        expected = -getattr(density.log_prob(action), reduction)(-1).mean()
-    else:
-        mlp = plain.module[0].module if kind == "delta" else plain.module[0]
-        error = (torch.tanh(mlp(restated.states)) - action) ** 2
-        expected = getattr(error, reduction)(-1).mean()
-    gradients = torch.autograd.grad(0.75 * expected, list(plain.parameters()))
-    wanted = [0.75 * expected.detach(), *gradients, expected.detach()]
-    (metric,) = set(loss.out_keys) - {KEY}
-    assert metric == "recovery_" + ("nll" if kind in ("tanh", "gaussian") else "error")
-    got = [*value_and_gradients(loss, batch), loss(batch)[metric]]
-    check("Noisy cloning alone", got, wanted, tolerance=1e-10)
-    assert not [key for key in loss.in_keys if "next" in key and "done" not in key]
-    batch["steps_to_next_obs"] = torch.full((10, 1), 5)
-    torch.testing.assert_close(value_and_gradients(loss, batch), got[:-1])
-
-
-def test_a_model_is_needed_unless_the_data_are_the_target(make_networks) -> None:
+@pytest.mark.parametrize("kind", ACTORS)
+def test_direction_follows_from_the_actor(kind) -> None:
+    networks = Networks()
+    pair = getattr(networks, kind), networks.model
+    found = StateRecoveryLoss(*pair).recovery_direction
+    assert found == ("forward" if kind == "actor" else "reverse")
+    if kind != "actor":
+        with pytest.raises(ValueError, match="Pass recovery_direction='reverse'"):
+            StateRecoveryLoss(*pair, recovery_direction="forward")
     with pytest.raises(ValueError, match="needs an inverse_dynamics_network"):
-        StateRecoveryLoss(make_networks().actor)
+        StateRecoveryLoss(pair[0])

@@ -1,0 +1,177 @@
+"""The perturbations that an adversary finds, against plain loops and known optima."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from objectives.losses import Networks, call, make_batch, make_loss
+from objectives.plain import Plain
+from tensordict import TensorDict
+from torch import Tensor
+from torch.distributions import kl_divergence
+from torchrl.modules import TanhNormal
+
+from torchrl_osr.lab.losses.adversary import Adversary
+
+OBJECTIVES, METHODS = ["action_diff", "min_Q"], ["sample", "gradient"]
+KEYS = ["observation"]
+WEIGHT = torch.tensor([0.5, -2.0, 1.0], dtype=torch.float64)
+
+both_objectives = pytest.mark.parametrize("objective", OBJECTIVES)
+both_methods = pytest.mark.parametrize("method", METHODS)
+
+
+def linear_policy(states: TensorDict) -> TanhNormal:
+    loc = (states["observation"].to(WEIGHT) @ WEIGHT).unsqueeze(-1)
+    return TanhNormal(loc, torch.ones_like(loc))
+
+
+def quadratic_qvalue(states: TensorDict, action: Tensor) -> Tensor:
+    # The mean falls with the action, the second critic rises.
+    action = action.squeeze(-1)
+    return torch.stack([-(6 + 2 * action).square(), 9 * action])
+
+
+class Real:
+    """Networks as functions, and states; draws are from a generator of their own."""
+
+    def __init__(self) -> None:
+        self.networks, self.states = Networks(), make_batch("bc", 6).select(*KEYS)
+        self.plain = Plain(self.networks)
+
+    def policy(self, states: TensorDict) -> TanhNormal:
+        return self.networks.actor.get_dist(states.select(*KEYS))
+
+    def qvalue(self, states: TensorDict, action: Tensor) -> Tensor:
+        return self.plain.values(states["observation"], action)
+
+    def perturb(self, adversary: Adversary, seed: int | None = 3) -> Tensor:
+        generator = None if seed is None else torch.Generator().manual_seed(seed)
+        functions = self.policy, self.qvalue
+        return adversary.perturb(self.states, KEYS, *functions, generator)[KEYS[0]]
+
+    def draw(self, adversary: Adversary) -> Tensor:
+        generator, shape = (
+            torch.Generator().manual_seed(3),
+            (adversary.num_samples, 6, 3),
+        )
+        uniform = torch.rand(shape, generator=generator, dtype=torch.float64)
+        return adversary.epsilon * (2 * uniform - 1)
+
+    def scores(self, objective: str, deltas: Tensor) -> Tensor:
+        """Return the objective by torch.distributions, ``[M, R]``."""
+        state, rows = self.states["observation"], []
+        for delta in deltas:
+            p, q = self.plain.policy(state), self.plain.policy(state + delta)
+            if objective == "min_Q":
+                rows.append(-self.plain.values(state, torch.tanh(q.loc)).mean(0))
+            else:
+                rows.append((kl_divergence(p, q) + kl_divergence(q, p)).sum(-1))
+        return torch.stack(rows)
+
+
+@both_objectives
+def test_sampling_equals_a_plain_loop_over_the_same_draws(check, objective) -> None:
+    real, adversary = Real(), Adversary(objective, epsilon=0.5, num_samples=7)
+    deltas = real.draw(adversary)
+    if objective == "min_Q":
+        deltas = torch.cat([torch.zeros_like(deltas[:1]), deltas])
+    found = real.scores(objective, deltas)
+    expected = real.states["observation"].clone()
+    for row in range(6):
+        best = max(range(len(deltas)), key=lambda i: found[i, row].item())
+        expected[row] += deltas[best, row]
+    check("Adversary", [real.perturb(adversary)], [expected], tolerance=1e-13)
+
+
+@both_objectives
+@pytest.mark.parametrize("num_samples", [1, 4])
+def test_gradient_steps_are_those_of_the_released_attack(
+    check, objective, num_samples
+) -> None:
+    """A new Adam for each step, on the mean over rows, then back into the box."""
+    real, adversary = (
+        Real(),
+        Adversary(objective, "gradient", 0.3, num_samples, 10, 0.25),
+    )
+    deltas = real.draw(adversary)
+    for _ in range(adversary.num_steps):
+        deltas = deltas.clone().requires_grad_()
+        optimizer = torch.optim.Adam([deltas], lr=adversary.step_size * 0.3)
+        score = real.scores(objective, deltas).mean()
+        (deltas.grad,) = torch.autograd.grad(-score, [deltas])
+        optimizer.step()
+        deltas = deltas.detach().clamp(-0.3, 0.3)
+    best = real.scores(objective, deltas).argmax(0)
+    expected = real.states["observation"] + deltas[best, torch.arange(6)]
+    # Adam adds 1e-8 to the size of a gradient before it divides by it.
+    check("Adversary", [real.perturb(adversary)], [expected], tolerance=1e-4)
+
+
+@both_objectives
+@pytest.mark.parametrize("num_samples", [1, 5])
+def test_gradient_steps_find_the_best_corner(objective, num_samples) -> None:
+    # Twenty steps of .1 half-widths cross the whole box.
+    adversary = Adversary(objective, "gradient", 0.05, num_samples, num_steps=20)
+    clean = 0.3 * torch.randn(8, 3, dtype=torch.float64)
+    states = TensorDict({"observation": clean}, [8])
+    perturbed = adversary.perturb(states, KEYS, linear_policy, quadratic_qvalue)
+    change = perturbed["observation"] - clean
+    if objective == "min_Q":  # the mean value falls with the action
+        expected = (0.05 * WEIGHT.sign()).expand(8, 3)
+        torch.testing.assert_close(change, expected, rtol=0, atol=1e-12)
+    # The largest change of the mean is .05 * (.5 + 2 + 1), up or down.
+    torch.testing.assert_close(
+        (change @ WEIGHT).abs(), torch.full((8,), 0.175).double()
+    )
+
+
+@both_objectives
+@both_methods
+def test_several_nested_observations_of_any_batch_size(objective, method) -> None:
+    keys = [("agent", "joints"), "camera"]
+    agent = {"joints": torch.randn(4, 5, 2), "goal": torch.randn(4, 5, 1)}
+    states = TensorDict({"agent": agent, "camera": torch.randn(4, 5, 2, 3)}, [4, 5])
+
+    def policy(states: TensorDict) -> TanhNormal:
+        camera = states["camera"].flatten(-2).tanh().sum(-1, keepdim=True)
+        loc = states[keys[0]] * camera + states["agent", "goal"]
+        return TanhNormal(loc, torch.ones_like(loc))
+
+    clean = states.clone()
+    adversary = Adversary(objective, method, epsilon=0.1, num_samples=3)
+    perturbed = adversary.perturb(
+        states.lock_(), keys, policy, lambda states, action: action.movedim(-1, 0)
+    )
+    for key in keys:
+        noise = perturbed[key] - states[key]
+        assert 0 < noise.abs().max() <= 0.1 + 1e-6
+        if (objective, method) == ("action_diff", "sample"):
+            # Each number of each row has a noise of its own.
+            assert noise.unique().numel() > 0.9 * noise.numel()
+    assert torch.equal(perturbed["agent", "goal"], states["agent", "goal"])
+    assert set(perturbed.keys(True, True)) == set(states.keys(True, True))
+    assert (states == clean).all()
+
+
+@both_objectives
+@both_methods
+def test_a_loss_is_given_the_worst_states_of_its_own_networks(
+    objective, method
+) -> None:
+    adversary = Adversary(objective, method, epsilon=0.1, num_samples=3, num_steps=2)
+    networks, batch = Networks(), make_batch("osr", 6)
+    loss, real = make_loss("osr", networks), Real()
+    before, real.states = batch.clone(), batch.select(*KEYS)
+    torch.manual_seed(3)
+    found = adversary(loss, batch)
+    torch.manual_seed(3)
+    written = found["perturbed", "observation"]
+    torch.testing.assert_close(written, real.perturb(adversary, seed=None))
+    assert (found.exclude("perturbed") == batch.exclude("perturbed")).all()
+    assert (batch == before).all()
+    assert not written.requires_grad
+    assert all(parameter.grad is None for parameter in loss.parameters())
+    assert all(value.isfinite() for value in call(loss, found).values())
+    loss.set_keys(perturbed=("worst", "state"))
+    assert ("worst", "state", "observation") in adversary(loss, batch).keys(True)

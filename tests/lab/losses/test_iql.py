@@ -1,0 +1,79 @@
+"""IQLLoss against a plain restatement of its equations, and TorchRL's.
+
+"Offline Reinforcement Learning with Implicit Q-Learning" (Kostrikov et al. 2021,
+https://arxiv.org/abs/2110.06169).
+"""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from objectives.losses import Networks, make_batch, update_targets
+from objectives.plain import GAMMA, Plain, compare, following, prepare
+from torch import Tensor
+from torchrl import objectives
+
+from torchrl_osr.lab.losses import IQLLoss
+from torchrl_osr.modules import gaussian_actor
+
+BETA, TAU = 2.0, 0.8
+OPTIONS = {"temperature": BETA, "expectile": TAU}
+
+
+def make_loss(networks: Networks, loss_class: type = IQLLoss, **options):
+    parts = networks.gaussian, networks.critics, networks.value
+    loss = loss_class(*parts, **(OPTIONS | options)).double()
+    update_targets(loss)
+    return loss
+
+
+@pytest.mark.parametrize("loop", [True, False])
+@pytest.mark.parametrize("number", [2, 3])
+def test_losses_and_gradients_equal_the_restatement(check, loop, number) -> None:
+    networks, batch = Networks(number=number), make_batch("iql", 20)
+    plain, value = Plain(networks, actor="gaussian"), copy.deepcopy(networks.value)
+
+    def restated() -> dict[str, Tensor]:
+        s, a = batch["observation"], batch["action"]
+        lowest = plain.values(s, a, plain.targets).amin(0).detach()
+        u = lowest - value.module(s).squeeze(-1)
+        weight = torch.clamp(torch.exp(BETA * u.detach()), max=100)
+        log_prob = plain.policy(s).log_prob(a).sum(-1)
+        bootstrap = value.module(following(batch)).squeeze(-1).detach()
+        return {
+            "loss_actor": -(weight * log_prob).mean(),
+            "loss_qvalue": plain.td_loss(batch, bootstrap),
+            "loss_value": (torch.where(u < 0, 1 - TAU, TAU) * u.square()).mean(),
+        }
+
+    trained = {
+        "loss_actor actor": plain.actor,
+        "loss_qvalue qvalue": plain.critics,
+        "loss_value value": value,
+    }
+    loss = prepare(make_loss(networks, deactivate_vmap=loop))
+    compare(check, "IQL", loss, batch, restated, trained, 1e-10)
+
+
+def test_losses_are_torchrls_but_for_the_sum_over_critics() -> None:
+    """TorchRL takes the mean of two critics' errors times two: the same."""
+    ours = prepare(make_loss(Networks()))
+    theirs = make_loss(Networks(), objectives.IQLLoss, loss_function="l2")
+    theirs.make_value_estimator(gamma=GAMMA)
+    theirs.target_qvalue_network_params.data.apply_(lambda each: each.mul_(0.8))
+    batch = make_batch("iql", 20)
+    out, wanted = ours(batch), theirs(batch.clone())
+    for key in ("loss_actor", "loss_qvalue", "loss_value"):
+        torch.testing.assert_close(out[key], wanted[key])
+
+
+def test_a_policy_has_bounds_for_its_mean_and_a_scale_that_is_learnt() -> None:
+    actor, fixed = gaussian_actor(3, 2), gaussian_actor(3, 2, scale=0.3)
+    loc, scale = actor.module[0].module(100 * torch.randn(50, 3))
+    assert loc.abs().max() <= 1
+    assert (scale == 1).all()
+    assert len([*actor.parameters()]) == len([*fixed.parameters()]) + 1
+    with pytest.raises(ValueError, match="scale must be above 0"):
+        gaussian_actor(3, 2, scale=0.0)

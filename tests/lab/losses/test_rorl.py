@@ -1,0 +1,116 @@
+"""RORLLoss against a plain restatement of its equations, draw by draw.
+
+"RORL: Robust Offline Reinforcement Learning via Conservative Smoothing" (Yang et al.
+2022, https://arxiv.org/abs/2206.02829), with the released code's reading of them.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from objectives.losses import Networks, call, make_batch, make_loss, update_targets
+from objectives.plain import SOFT, Plain, compare, prepare
+from torch import Tensor, nn
+from torch.distributions import kl_divergence
+
+from torchrl_osr.lab.losses import RORLLoss
+
+OPTIONS = {
+    "num_samples": 4,
+    "policy_smooth_reg": 0.7,
+    "policy_smooth_eps": 0.3,
+    "q_smooth_reg": 0.6,
+    "q_smooth_eps": 0.2,
+    "q_smooth_tau": 0.3,
+    "q_ood_reg": 0.9,
+    "q_ood_eps": 0.4,
+    "q_ood_uncertainty_reg": 1.5,
+    "q_ood_uncertainty_reg_min": 0.5,
+    "q_ood_uncertainty_decay": 0.3,
+}
+PARTS = {
+    "all": {},
+    "policy alone": {"q_smooth_reg": 0.0, "q_ood_reg": 0.0},
+    "values alone": {"policy_smooth_reg": 0.0, "q_ood_reg": 0.0},
+    "uncertainty alone": {"policy_smooth_reg": 0.0, "q_smooth_reg": 0.0},
+}
+
+
+def restated(plain: Plain, batch, options, weight: float) -> dict[str, Tensor]:
+    """Return the losses; ``weight`` is that of the uncertainty."""
+    s, a, number = batch["observation"], batch["action"], options["num_samples"]
+
+    def around(epsilon: float) -> list[Tensor]:
+        box = torch.empty(number, s.shape[-1], dtype=s.dtype)
+        return [s + delta for delta in box.uniform_(-epsilon, epsilon)]
+
+    losses = plain.policy_losses(s.unsqueeze(0))
+    if options["policy_smooth_reg"]:
+        pi, found = plain.policy(s), []
+        for state in around(options["policy_smooth_eps"]):
+            other = plain.policy(state)
+            both = kl_divergence(pi, other) + kl_divergence(other, pi)
+            found.append(both.sum(-1))
+        smoothness = torch.stack([max(row) for row in zip(*found, strict=True)]).mean()
+        losses["loss_actor"] = (
+            losses["loss_actor"] + options["policy_smooth_reg"] * smoothness
+        )
+    total = plain.td_loss(batch, plain.soft_value(batch, entropy=True))
+    if options["q_smooth_reg"]:
+        clean, found = plain.values(s, a), []
+        for state in around(options["q_smooth_eps"]):
+            change = plain.values(state, a) - clean
+            tau = options["q_smooth_tau"]
+            share = torch.where(change > 0, 1 - tau, tau)
+            found.append((share * change.square()).mean(0))
+        smoothness = torch.stack([max(row) for row in zip(*found, strict=True)]).mean()
+        total = total + options["q_smooth_reg"] * smoothness
+    if options["q_ood_reg"]:
+        states = torch.stack(around(options["q_ood_eps"]))
+        with torch.no_grad():
+            noise = torch.randn(*states.shape[:-1], 2, dtype=s.dtype)
+            actions, _ = plain.act(plain.policy(states), noise)
+        values = plain.values(states, actions)
+        pulled = (values - weight * values.std(0, correction=1)).detach()
+        total = total + options["q_ood_reg"] * nn.functional.mse_loss(values, pulled)
+    return losses | {"loss_qvalue": total}
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_losses_and_gradients_equal_the_restatement(check, part) -> None:
+    networks, batch = Networks(number=3), make_batch("rorl", 10)
+    plain, options = Plain(networks), OPTIONS | PARTS[part]
+    loss = RORLLoss(networks.actor, networks.critics, **(SOFT | options)).double()
+    update_targets(loss)
+    loss.decay_uncertainty()
+    expected = lambda: restated(plain, batch, options, weight=1.2)  # noqa: E731
+    out = compare(check, "RORL", prepare(loss), batch, expected, plain.networks, 1e-10)
+    assert loss.out_keys == [*out.keys()]
+
+
+def test_weight_of_the_uncertainty_falls_to_its_floor_and_is_saved() -> None:
+    options = OPTIONS | {"q_ood_uncertainty_reg": 1.0}
+    loss, seen = make_loss("rorl", **options), []
+    for _ in range(4):
+        seen.append(loss.uncertainty_weight.item())
+        loss.decay_uncertainty()
+    assert seen == pytest.approx([1.0, 0.7, 0.5, 0.5])
+    other = make_loss("rorl", **options)
+    other.load_state_dict(loss.state_dict())
+    assert other.num_updates == 4
+    # A million small steps, of which each is lost in float32.
+    options = {"q_ood_uncertainty_reg": 4.0, "q_ood_uncertainty_decay": 1e-7}
+    networks = Networks()
+    single = RORLLoss(networks.actor, networks.critics, **options)
+    single.num_updates += 10**6 - 1
+    single.decay_uncertainty()
+    assert single.uncertainty_weight.item() == pytest.approx(3.9)
+
+
+def test_without_its_terms_it_is_sac_n() -> None:
+    nothing = {"policy_smooth_reg": 0.0, "q_smooth_reg": 0.0, "q_ood_reg": 0.0}
+    loss, batch = make_loss("rorl", **nothing), make_batch("rorl", 10)
+    found, wanted = call(loss, batch), call(make_loss("sac-n"), batch)
+    assert loss.out_keys == [*wanted.keys()]
+    for key, value in wanted.items():
+        torch.testing.assert_close(found[key], value, rtol=1e-12, atol=1e-12)

@@ -1,0 +1,109 @@
+"""StateDeviationLoss, our reading of SDC, and its equations written out."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from objectives.losses import Networks, assert_same_bits, call, make_batch, make_loss
+from objectives.plain import Plain, compare
+from torch import Tensor
+from uneven_dynamics import uneven_dynamics
+
+from torchrl_osr.lab.losses import StateDeviationLoss
+from torchrl_osr.lab.losses.sdc import maximum_mean_discrepancy
+
+SAMPLES, WIDTH, THRESHOLD, MULTIPLIER = 3, 0.7, 0.02, 1.7
+
+
+def kernel(first: Tensor, second: Tensor) -> Tensor:
+    return torch.exp(-((first - second) ** 2).sum() / (2 * WIDTH**2 * 3))
+
+
+def sampled_change(model, state: Tensor, action: Tensor, number: int, noise: Tensor):
+    """Return a draw of the state's change from one network of an ensemble."""
+    low, high = model.lowest_log_variance, model.highest_log_variance
+    first, last = model.layers
+    hidden = (torch.cat([state, action]) - model.input_loc) / model.input_scale
+    hidden = first.weight[number].T @ hidden + first.bias[number, 0]
+    hidden = hidden * torch.sigmoid(hidden)
+    out = last.weight[number].T @ hidden + last.bias[number, 0]
+    free = high - torch.log(1 + torch.exp(high - out[4:]))
+    variance = torch.exp(low + torch.log(1 + torch.exp(free - low)))
+    sample = (out[:4] + variance.sqrt() * noise) * model.target_scale
+    return (sample + model.target_loc)[:3]
+
+
+def sampled_aim(vae, state: Tensor, latent: Tensor) -> Tensor:
+    first, last = vae.decoder[0], vae.decoder[2]
+    hidden = first.weight @ torch.cat([state, latent]) + first.bias
+    out = last.weight @ hidden.clamp(min=0) + last.bias
+    return state + vae.target_loc + vae.target_scale * out.detach()
+
+
+def restated(plain: Plain, dynamics, vae, batch) -> Tensor:
+    """Return the squared discrepancies, row by row and pair by pair."""
+    rows, like = len(batch), {"dtype": torch.float64}
+    action_noise = torch.randn(SAMPLES, 1, rows, 2, **like)[:, 0]
+    drawn = torch.randint(2, (SAMPLES, rows))
+    model_noise = torch.randn(SAMPLES, rows, 4, **like)
+    latent = torch.randn(SAMPLES, rows, vae.latent_dim, **like)
+    found = []
+    for row in range(rows):
+        state = batch["observation"][row]
+        perturbed = batch["perturbed", "observation"][row]
+        density, reached, aimed = plain.policy(perturbed), [], []
+        for i in range(SAMPLES):
+            action, _ = plain.act(density, action_noise[i, row])
+            number = (0, 2)[drawn[i, row]]
+            noise = model_noise[i, row]
+            change = sampled_change(dynamics, perturbed, action, number, noise)
+            reached.append(perturbed + change)
+            aimed.append(sampled_aim(vae, state, latent[i, row]))
+        value = 0.0
+        for i in range(SAMPLES):
+            for j in range(SAMPLES):
+                value = value + kernel(reached[i], reached[j])
+                value = value + kernel(aimed[i], aimed[j])
+                value = value - 2 * kernel(reached[i], aimed[j])
+        found.append(value / SAMPLES**2)
+    return torch.stack(found)
+
+
+def test_losses_and_gradients_equal_the_restatement(check) -> None:
+    networks, batch = Networks(), make_batch("sdc", 10)
+    dynamics, vae, plain = uneven_dynamics(), networks.vae, Plain(networks)
+    vae.target_scale.uniform_(0.5, 2)
+    options = {"num_samples": SAMPLES, "kernel_width": WIDTH, "threshold": THRESHOLD}
+    loss = StateDeviationLoss(networks.actor, dynamics, vae, **options).double()
+    loss.log_multiplier.data.fill_(math.log(MULTIPLIER))
+    multiplier = loss.log_multiplier.detach().clone().requires_grad_()
+
+    def losses() -> dict[str, Tensor]:
+        excess = restated(plain, dynamics, vae, batch).mean() - THRESHOLD
+        return {
+            "loss_deviation": MULTIPLIER * excess,
+            "loss_multiplier": -multiplier.exp() * excess.detach(),
+        }
+
+    trained = {
+        "loss_deviation actor": plain.actor,
+        "loss_multiplier log_multiplier": multiplier,
+    }
+    out = compare(check, "SDC", loss, batch, losses, trained, 1e-10)
+    assert out["multiplier"].item() == pytest.approx(MULTIPLIER)
+
+
+def test_it_adds_to_cql_and_draws_after_it() -> None:
+    batch = make_batch("sdc", 10)
+    cql, both = call(make_loss("cql"), batch), call(make_loss("sdc"), batch)
+    assert_same_bits([both[key] for key in cql.keys()], [*cql.values()])  # noqa: SIM118
+
+
+@pytest.mark.parametrize("distance", [0.0, 0.5, 2.0])
+def test_discrepancy_of_two_points_by_hand(distance) -> None:
+    here, there = torch.zeros(3, 1, 2), torch.full((4, 1, 2), distance)
+    value = maximum_mean_discrepancy(here, there, width=0.5)
+    expected = 2 - 2 * math.exp(-(distance**2) / (2 * 0.5**2))
+    assert value.item() == pytest.approx(expected, abs=1e-6)

@@ -1,0 +1,260 @@
+"""What a loss does with a batch of any type and shape, with masks, weights and ends."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from objectives.losses import (
+    LOSSES,
+    NEXT,
+    WITH_CRITICS,
+    Networks,
+    assert_same,
+    assert_same_bits,
+    call,
+    make_batch,
+    make_loss,
+    record,
+)
+from property_settings import tried
+
+MASK, DONE = ("collector", "mask"), ("next", "done")
+# A model's likelihood is of the data, not of what a sampler finds important.
+WEIGHED = [
+    name for name in LOSSES if "loss_inverse_dynamics" not in LOSSES[name].trains
+]
+every_loss = pytest.mark.parametrize("name", LOSSES)
+
+
+@every_loss
+def test_flags_of_any_type_are_flags(name) -> None:
+    loss, batch = make_loss(name), make_batch(name, 10)
+    batch[MASK] = torch.arange(10).unsqueeze(-1) != 3
+    if name != "iql":
+        batch["is_synthetic"] = torch.arange(10).unsqueeze(-1) > 6
+    flags = [key for key, each in batch.items(True, True) if each.dtype == torch.bool]
+    wanted = record(loss, batch)
+    for dtype in (torch.uint8, torch.int64, torch.float32, torch.float64):
+        other = batch.clone()
+        for key in flags:
+            other[key] = batch[key].to(dtype)
+        assert_same_bits(record(loss, other), wanted)
+
+
+@every_loss
+def test_numbers_of_any_type_are_cast_to_the_networks(name) -> None:
+    loss, batch = make_loss(name).float(), make_batch(name, 10)
+    single = batch.apply(
+        lambda each: each.float() if each.is_floating_point() else each
+    )
+    wanted = record(loss, single)
+    assert_same_bits(record(loss, batch), wanted)
+    assert {each.dtype for each in wanted} == {torch.float32}
+    assert all(each.isfinite().all() for each in wanted)
+    whole = {"action", ("next", "reward"), ("next", "action")}
+    whole = [key for key in loss.in_keys if key in whole]
+    for key in whole:
+        if single[key].is_floating_point():
+            single[key] = torch.zeros_like(single[key])
+            batch[key] = single[key].long()
+    assert_same_bits(record(loss, batch), record(loss, single))
+
+
+@every_loss
+def test_shape_of_the_batch_changes_no_number(name) -> None:
+    loss, flat = make_loss(name), make_batch(name, 10)
+    shaped = flat.reshape(2, 5)
+    assert_same(record(loss, shaped), record(loss, flat))
+    if name in WITH_CRITICS:
+        assert torch.equal(shaped["td_error"], flat["td_error"].reshape(2, 5))
+    row = flat[:1].clone()
+    assert_same(record(loss, row[0]), record(loss, row))
+
+
+@every_loss
+def test_batch_is_unchanged_but_for_the_priority(name) -> None:
+    loss, batch = make_loss(name), make_batch(name, 10)
+    batch["loc"] = torch.ones(10, 2)  # as an actor has written it in a collector
+    before = batch.clone()
+    loss(batch)
+    new = set(batch.keys(True, True)) - set(before.keys(True, True))
+    assert new == ({"td_error"} if name in WITH_CRITICS else set())
+    assert (batch.select(*before.keys(True, True)) == before).all()
+    assert not any(value.requires_grad for value in batch.values(True, True))
+
+
+@every_loss
+@pytest.mark.parametrize("case", ["plain", "weights", "mask and weights"])
+def test_reductions_are_of_the_same_rows(name, case) -> None:
+    """Means count unmasked rows, by their weights; here no row has ended."""
+    batch = make_batch(name, 2, 5, ends=False)
+    counts = torch.ones(2, 5, dtype=torch.float64)
+    if "mask" in case:
+        batch[MASK] = (torch.arange(10).reshape(2, 5, 1) % 4) > 0
+        counts = batch[MASK].squeeze(-1).double()
+    plain = call(make_loss(name), batch)
+    rows = call(make_loss(name, reduction="none"), batch)
+    if "weights" in case:
+        weight = torch.linspace(0.2, 2.0, 10).double().reshape(2, 5)
+        batch["priority_weight"] = weight.unsqueeze(-1) if "mask" in case else weight
+        if name in WEIGHED:
+            counts = counts * weight
+            ignoring = call(make_loss(name, use_prioritized_weights=False), batch)
+            assert_same_bits([*ignoring.values()], [*plain.values()])
+    found = {
+        reduction: call(make_loss(name, reduction=reduction), batch)
+        for reduction in ("mean", "sum", "none")
+    }
+    for key in LOSSES[name].trains:
+        assert rows[key].shape == (2, 5)
+        total = (rows[key] * counts).sum()
+        torch.testing.assert_close(found["none"][key], rows[key] * counts)
+        torch.testing.assert_close(found["sum"][key], total)
+        torch.testing.assert_close(found["mean"][key], total / counts.sum())
+    for key in set(plain.keys()) - set(LOSSES[name].trains):  # never weighted
+        assert torch.equal(found["mean"][key], plain[key])
+        assert torch.equal(found["sum"][key], plain[key])
+
+
+@every_loss
+@pytest.mark.parametrize("reduction", ["mean", "none"])
+def test_masked_rows_may_hold_anything(name, reduction) -> None:
+    loss, batch = make_loss(name, reduction=reduction), make_batch(name, 2, 5)
+    batch[MASK] = torch.arange(10).reshape(2, 5, 1) % 5 < 3
+    wanted, padding = record(loss, batch), ~batch[MASK].squeeze(-1)
+    for garbage in (math.nan, 0.97):
+        spoiled = batch.clone()
+        for key, value in spoiled.items(True, True):
+            if value.is_floating_point():
+                value[padding] = garbage
+            elif key != MASK:
+                value[padding] = value[padding].flip(-1) if value.ndim > 2 else 0
+        found = record(loss, spoiled)
+        assert_same(found, wanted)
+        assert all(each.isfinite().all() for each in found)
+    if reduction == "mean":  # without the mask the garbage shows
+        with pytest.raises(AssertionError):
+            assert_same(record(loss, spoiled.exclude("collector")), wanted)
+
+
+@every_loss
+def test_next_state_of_ended_rows_changes_no_bit(name) -> None:
+    """A row that was cut has a next state for critics, and for them alone."""
+    loss, batch = make_loss(name), make_batch(name, 10)
+    wanted = record(loss, batch)
+    flag = "terminated" if name in WITH_CRITICS else "done"
+    for garbage in (math.nan, 1e6):
+        spoiled = batch.clone()
+        spoiled[NEXT][batch["next", flag].squeeze(-1)] = garbage
+        assert_same_bits(record(loss, spoiled), wanted)
+
+
+RECOVERING = {"osr": "loss_actor", "osr-v": "recovery_gap", "discrete": "loss_actor"}
+
+
+@pytest.mark.parametrize(("name", "key"), RECOVERING.items())
+def test_next_state_of_cut_rows_is_bootstrapped_from_and_not_recovered_to(
+    name, key
+) -> None:
+    loss, batch = make_loss(name), make_batch(name, 10)
+    spoiled = batch.clone()
+    cut = batch[DONE] & ~batch["next", "terminated"]
+    spoiled[NEXT][cut.squeeze(-1)] = 1e6
+    assert call(loss, spoiled)["target_value"] != call(loss, batch)["target_value"]
+    assert torch.equal(call(loss, spoiled)[key], call(loss, batch)[key])
+
+
+flags = st.lists(st.booleans(), min_size=5, max_size=5)
+weights = st.lists(
+    st.one_of(st.just(0.0), st.floats(1e-3, 1e3)), min_size=5, max_size=5
+)
+
+
+# Losses of a single term.
+@pytest.mark.parametrize("name", ["recovery", "bc", "iql", "td3-bc"])
+@given(weights, flags, flags)
+@tried(8)
+def test_no_weight_mask_or_end_spoils_a_value_or_a_gradient(
+    name, weight, mask, done
+) -> None:
+    batch, ended = make_batch(name, 5), torch.tensor(done)
+    batch[DONE] = ended.unsqueeze(-1)
+    batch[NEXT][ended] = 9.0
+    batch[MASK] = torch.tensor(mask).unsqueeze(-1)
+    rows = call(make_loss(name, reduction="none"), batch)
+    batch["priority_weight"] = torch.tensor(weight, dtype=torch.float64)
+    counts = batch["priority_weight"] * torch.tensor(mask)
+    counts = counts * ~ended if name == "recovery" else counts
+    loss = make_loss(name)
+    assert all(each.isfinite().all() for each in record(loss, batch))
+    out = call(loss, batch)
+    for key in LOSSES[name].trains:
+        total = (rows[key] * counts).sum()
+        mean = total / counts.sum() if counts.any() else 0 * total
+        torch.testing.assert_close(out[key], mean, rtol=1e-9, atol=1e-9)
+
+
+# What a loss learns from the data's actions, or from where they led.
+OF_DATA = RECOVERING | {
+    "official": "loss_recovery",
+    "recovery": "loss_recovery",
+    "recovery-module": "loss_recovery",
+    "noisy-cloning": "loss_recovery",
+    "bc": "loss_actor",
+    "scas": "loss_actor",
+    "td3-bc": "loss_actor",
+    "rebrac": "loss_actor",
+}
+
+
+@pytest.mark.parametrize(("name", "key"), OF_DATA.items())
+def test_actions_of_synthetic_rows_are_not_imitated(name, key) -> None:
+    loss, batch = make_loss(name), make_batch(name, 10)
+    batch["is_synthetic"] = torch.arange(10).unsqueeze(-1) >= 6
+    other = batch.clone()
+    for entry in ("action", NEXT):
+        other[entry][6:] = batch[entry][:4]
+    assert torch.equal(call(loss, other)[key], call(loss, batch)[key])
+    for each in (batch, other):
+        del each["is_synthetic"]
+    assert not torch.equal(call(loss, other)[key], call(loss, batch)[key])
+
+
+def test_iql_refuses_synthetic_rows() -> None:
+    batch = make_batch("iql", 4).set("is_synthetic", torch.zeros(4, 1).bool())
+    with pytest.raises(ValueError, match="learns from the data's actions alone"):
+        make_loss("iql")(batch)
+
+
+WITH_BOUNDS = ["cql", "osr", "osr-v", "edac", "rorl", "td3-bc", "rebrac", "scas", "bc"]
+WITH_BOUNDS += ["noisy-cloning", "model", "model-mse", "latent-model"]
+
+
+@pytest.mark.parametrize("name", WITH_BOUNDS)
+def test_actions_beyond_the_bounds_are_warned_about_once(name) -> None:
+    networks, batch = Networks(high=torch.tensor([1.0, 0.5])), make_batch(name, 10)
+    options = {"high": [1.0, 0.5]} if name in ("td3-bc", "rebrac", "scas") else {}
+    batch["action"][:] = 0.2
+    make_loss(name, networks, **options)(batch)
+    loss = make_loss(name, networks, **options)
+    batch["action"][4, 1] = 0.7
+    with pytest.warns(UserWarning, match=r"leave the bounds .*\[1.0, 0.5\].*low="):
+        loss(batch)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        loss(batch)
+
+
+@every_loss
+def test_actions_of_another_shape_are_named(name) -> None:
+    """``[B]`` would broadcast where B is the number of dimensions."""
+    loss, batch = make_loss(name), make_batch(name, 2)
+    if LOSSES[name].action == "continuous" and "action" in loss.in_keys:
+        for shape in ((2,), (2, 1), (2, 3)):
+            with pytest.raises(ValueError, match=r"'action' has shape \(2,"):
+                loss(batch.clone().set("action", torch.zeros(shape)))

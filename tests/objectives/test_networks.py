@@ -1,0 +1,276 @@
+"""How losses call networks of any kind, and which ones they refuse."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from objectives.losses import (
+    BUILDERS,
+    LOSSES,
+    NEXT,
+    PERTURBED,
+    WITH_CRITICS,
+    A,
+    Networks,
+    S,
+    assert_same,
+    call,
+    make_batch,
+    make_loss,
+    make_networks,
+    parts,
+    record,
+)
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torch.distributions import Categorical, Normal
+from torchrl.modules import (
+    MLP,
+    Delta,
+    NormalParamExtractor,
+    OneHotCategorical,
+    ProbabilisticActor,
+)
+
+from torchrl_osr.lab.losses import BCLoss
+
+with_critics = pytest.mark.parametrize("name", WITH_CRITICS)
+
+
+def critics_of(name: str, networks: Networks) -> list[TensorDictModule]:
+    return networks.choice_critics if "discrete" in name else networks.critics
+
+
+class Seeing(nn.Module):
+    """A network of features behind a frozen encoder of images, one batch dimension."""
+
+    def __init__(self, core: nn.Module, encoder: nn.Module) -> None:
+        super().__init__()
+        self.core, self.encoder = core, copy.deepcopy(encoder).requires_grad_(False)
+
+    def forward(self, *inputs: Tensor) -> object:
+        return self.core(*(self.encoder(x) if x.ndim > 2 else x for x in inputs))
+
+
+def seeing(name: str, encoder: nn.Module) -> Networks:
+    """Return a loss's networks, each with an encoder of its own."""
+    networks = make_networks(name)
+    for each in set(BUILDERS) - {"latent_model", "dynamics", "vae"}:
+        built = getattr(networks, each)
+        for network in built if isinstance(built, list) else [built]:
+            while isinstance(network, TensorDictSequential):
+                network = network[0]
+            network.module = Seeing(network.module, encoder)
+    return networks
+
+
+# These hand the state itself to a model of the dynamics, or perturb it themselves.
+SEEING = sorted(set(LOSSES) - {"latent-model", "scas", "sdc", "rorl"})
+
+
+@pytest.mark.parametrize("name", SEEING)
+def test_images_reach_convolutions_with_one_batch_dimension(name) -> None:
+    encoder = nn.Sequential(nn.Conv2d(1, S, 2), nn.Flatten()).double()
+    for size in ((6,), (2, 3)):
+        images, batch = make_batch(name, *size), make_batch(name, *size)
+        for key in ("observation", NEXT, PERTURBED):
+            images[key] = torch.randn(*size, 1, 2, 2, dtype=torch.float64)
+            features = encoder(images[key].flatten(0, len(size) - 1)).detach()
+            batch[key] = features.reshape(*size, S)
+        found = call(make_loss(name, seeing(name, encoder)), images)
+        assert_same([*found.values()], [*call(make_loss(name), batch).values()])
+
+
+class Normalize(nn.Module):
+    def forward(self, value: Tensor) -> Tensor:
+        return nn.functional.normalize(value)
+
+
+LAYERS = {
+    "normalize": Normalize(),
+    "softmax": nn.Softmax(dim=1),
+    "batch norm": nn.BatchNorm1d(8),
+    "group norm": nn.GroupNorm(2, 8),
+}
+
+
+@pytest.mark.parametrize("layer", LAYERS)
+@pytest.mark.parametrize(("name", "weight"), [("bc", 1.0), ("noisy-cloning", 0.5)])
+def test_layers_along_the_second_dimension_compute_as_in_a_direct_call(
+    layer, name, weight
+) -> None:
+    networks, batch = Networks(), make_batch("noisy-cloning", 8, ends=False)
+    networks.actor[0].module[0].insert(1, copy.deepcopy(LAYERS[layer]).double())
+    plain, states = copy.deepcopy(networks.actor), batch.select("observation")
+    if name == "noisy-cloning":  # batch normalisation sees both sets together
+        states = torch.cat([states, batch["perturbed"].auto_batch_size_(1)])
+    action = batch["action"].repeat(len(states) // 8, 1)
+    expected = -plain.get_dist(states).log_prob(action).mean()
+    (key,) = LOSSES[name].trains
+    found = make_loss(name, networks)(batch)[key]
+    torch.testing.assert_close(found, weight * expected)
+
+
+class WithGoal(nn.Module):
+    def __init__(self, core: nn.Module) -> None:
+        super().__init__()
+        self.core = core
+
+    def forward(self, state: Tensor, goal: Tensor, *action: Tensor) -> Tensor:
+        return self.core(state, *action) + goal
+
+
+# RORL draws noise for the goal, too.
+@pytest.mark.parametrize("name", sorted({*WITH_CRITICS} - {"rorl"}))
+def test_critics_may_read_more_than_the_actor(name) -> None:
+    networks, batch = make_networks(name), make_batch(name, 10)
+    expected = record(make_loss(name), batch)
+    for critic in critics_of(name, networks):
+        critic.module = WithGoal(critic.module)
+        critic.in_keys = ["observation", "goal", *critic.in_keys[1:]]
+    loss = make_loss(name, networks)
+    for group in (batch, batch["next"], batch.setdefault("perturbed", {})):
+        group["goal"] = torch.zeros(10, 1)
+    assert_same(record(loss, batch.select(*loss.in_keys)), expected)
+
+
+@with_critics
+def test_critics_may_be_a_list_of_any_length_or_one_to_be_copied(name) -> None:
+    batch = make_batch(name, 10)
+    for number in [1, 3] if name not in ("edac", "rorl") else [3]:
+        networks = make_networks(name, number=number)
+        loss = make_loss(name, networks)
+        held = parts(loss)[0].qvalue_network_params.flatten_keys(".")
+        weights = [dict(each.named_parameters()) for each in critics_of(name, networks)]
+        for key in weights[0]:
+            assert torch.equal(held[key].data, torch.stack([w[key] for w in weights]))
+        loss(batch)["loss_qvalue"].backward()
+        # TorchRL 0.14.1 by itself would hide those of a list of one.
+        assert {id(held[key]) for key in weights[0]} <= {*map(id, loss.parameters())}
+        assert all(held[key].grad.any() for key in weights[0])
+    kind = "choice_critics" if "discrete" in name else "critics"
+    setattr(networks, kind, getattr(networks, kind)[0])
+    loss = make_loss(name, networks, num_qvalue_nets=4)
+    first = next(parts(loss)[0].qvalue_network_params.parameters())
+    assert len(first) == 4
+    assert not torch.equal(first[0], first[1])
+
+
+class Tenfold(MLP):
+    def forward(self, *inputs: Tensor) -> Tensor:
+        return 10 * super().forward(*inputs)
+
+
+OTHER_CRITICS = {
+    "layers": lambda critic: critic.module.insert(1, nn.Dropout(0.1)),
+    "activation": lambda critic: critic.module.__setitem__(1, nn.ReLU()),
+    "frozen": lambda critic: critic.requires_grad_(False),
+    "class": lambda critic: setattr(critic.module, "__class__", Tenfold),
+    "forward": lambda critic: setattr(critic.module, "forward", lambda *x: x[0]),
+    "number": lambda critic: setattr(critic.module, "scale", 10.0),
+}
+
+
+@pytest.mark.parametrize("kind", OTHER_CRITICS)
+def test_a_list_of_unlike_critics_is_refused(kind) -> None:
+    for name in ("cql", "td3-bc", "iql"):
+        networks = Networks()
+        OTHER_CRITICS[kind](networks.critics[1])
+        with pytest.raises(
+            ValueError, match="qvalue_network differ .*build them alike"
+        ):
+            make_loss(name, networks)
+
+
+@pytest.mark.parametrize("name", ["osr", "osr-v", "td3-bc", "iql"])
+def test_networks_with_common_parameters_are_refused(name) -> None:
+    networks, other = Networks(), Networks()
+    networks.critics = [networks.critics[0]] * 2
+    first = {"td3-bc": other.module, "iql": other.gaussian}.get(name, other.actor)
+    other.critics[0].module[0].bias = next(first.parameters())
+    for each in (networks, other):
+        with pytest.raises(ValueError, match=r"share a parameter of shape .*deepcopy"):
+            make_loss(name, each)
+
+
+@pytest.mark.parametrize("name", ["osr", "osr-v", "recovery", "recovery-delta"])
+def test_a_model_of_other_bounds_or_actions_is_refused(name) -> None:
+    networks = Networks()
+    networks.model = Networks(high=torch.tensor([1.0, 2.0])).model
+    with pytest.raises(ValueError, match=r"share their action bounds.*\[1.0, 2.0\]"):
+        make_loss(name, networks)
+    for size in (1, 3):  # 1 would broadcast against any policy
+        networks = Networks()
+        networks.model[0][0].module = MLP(2 * S, 2 * size, num_cells=[8]).double()
+        with pytest.raises(ValueError, match=f"has {size} actions, but actor_network"):
+            make_loss(name, networks)(make_batch(name, 4))
+
+
+FROZEN = {
+    "osr": ("model", "recovery_kl"),
+    "osr-v": ("model", "recovery_gap"),
+    "discrete": ("choice_model", "recovery_kl"),
+    "recovery": ("model", "recovery_kl"),
+    "official": ("model", "recovery_kl"),
+    "scas": ("dynamics", "correction_error"),
+    "sdc": ("dynamics", "deviation"),
+}
+
+
+@pytest.mark.parametrize("name", FROZEN)
+def test_a_frozen_model_is_followed_and_never_trained(name) -> None:
+    """It may be trained in place after the loss was built."""
+    kind, metric = FROZEN[name]
+    networks, batch = make_networks(name), make_batch(name, 10)
+    loss, model = make_loss(name, networks), getattr(networks, kind)
+    assert not {*map(id, loss.parameters())} & {*map(id, model.parameters())}
+    before = call(loss, batch)
+    sum(before[key] for key in LOSSES[name].trains).backward()
+    assert all(each.grad is None for each in model.parameters())
+    for parameter in model.parameters():
+        parameter.data.add_(0.3)
+    after = call(loss, batch)
+    assert after[metric] != before[metric]
+    assert torch.equal(call(make_loss(name, networks), batch)[metric], after[metric])
+
+
+def test_td3_needs_the_bounds_of_a_plain_actor() -> None:
+    for name in ("td3-bc", "rebrac", "scas"):
+        with pytest.raises(ValueError, match="low is needed.*Pass low= and high="):
+            make_loss(name, low=None)
+
+
+HEADS = {"normal": Normal, "delta": Delta}
+HEADS |= {"index": Categorical, "one-hot": OneHotCategorical}
+
+
+@pytest.mark.parametrize("kind", HEADS)
+def test_any_policy_can_be_cloned(kind) -> None:
+    mlp, names = MLP(S, A, num_cells=[8]).double(), ["logits"]
+    if kind == "normal":
+        mlp = nn.Sequential(
+            MLP(S, 2 * A, num_cells=[8]).double(), NormalParamExtractor()
+        )
+        names = ["loc", "scale"]
+    elif kind == "delta":
+        names = ["param"]
+    actor = ProbabilisticActor(
+        TensorDictModule(mlp, ["observation"], names),
+        in_keys=names,
+        distribution_class=HEADS[kind],
+    )
+    batch = make_batch("bc", 2, 3)
+    states, action = batch["observation"], batch["action"]
+    index = (action[..., 0] > 0).long()
+    if kind == "delta":
+        expected = (mlp(states) - action).square().sum(-1).mean()
+    elif kind == "normal":
+        expected = -Normal(*mlp(states)).log_prob(action).sum(-1).mean()
+    else:
+        expected = nn.functional.cross_entropy(
+            mlp(states).flatten(0, 1), index.flatten()
+        )
+        batch["action"] = index if kind == "index" else nn.functional.one_hot(index, A)
+    torch.testing.assert_close(BCLoss(actor)(batch)["loss_actor"], expected)

@@ -1,0 +1,117 @@
+"""The critics' target: its kinds, its discount, and returns of several steps."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from objectives.losses import (
+    ONE_BASE,
+    WITH_CRITICS,
+    WRAPPED,
+    assert_same,
+    call,
+    make_batch,
+    make_loss,
+    parts,
+    record,
+)
+from torchrl.data.postprocs import MultiStep
+from torchrl.objectives import ValueEstimators
+from torchrl.objectives.value import TD0Estimator
+
+with_critics = pytest.mark.parametrize(
+    "name", [each for each in ONE_BASE if each in WITH_CRITICS]
+)
+
+
+def target(name: str, batch, *args, **options):
+    loss = make_loss(name)
+    loss.make_value_estimator(*args, **options)
+    return call(loss, batch)["target_value"]
+
+
+def test_target_is_the_reward_and_the_discounted_value() -> None:
+    loss, batch = make_loss("cql"), make_batch("cql", 5)
+    loss.make_value_estimator(gamma=0.5)
+    batch["next", "reward"] = torch.arange(1.0, 6.0).double().unsqueeze(-1)
+    values = 10 * torch.arange(1.0, 6.0).double()
+    found = loss.td_target(loss.unpack(batch), values)
+    # By hand: 1 + 5, 2 (terminated), 3 + 15 (cut by a time limit), 4 + 20, 5 + 25.
+    assert found.tolist() == [6, 2, 18, 24, 30]
+
+
+@with_critics
+def test_kinds_of_target_agree_where_they_must(name) -> None:
+    batch = make_batch(name, 2, 5)
+    td0 = call(make_loss(name), batch)["target_value"]
+    assert td0 == target(name, batch, "td0", gamma=0.99)
+    assert td0 == target(name, batch, TD0Estimator(gamma=0.99, value_network=None))
+    td1 = target(name, batch, ValueEstimators.TD1)
+    assert td0 != td1
+    # The vectorised estimator of TorchRL 0.14.1 fails at lambda = 0.
+    for lmbda, wanted in {0.0: td0, 1.0: td1}.items():
+        options = {"lmbda": lmbda, "vectorized": False}
+        found = target(name, batch, ValueEstimators.TDLambda, **options)
+        torch.testing.assert_close(found, wanted)
+    zero, half, one = (target(name, batch, gamma=each) for each in (0.0, 0.5, 1.0))
+    torch.testing.assert_close(zero, batch["next", "reward"].mean())
+    torch.testing.assert_close(half, (zero + one) / 2)
+    with pytest.raises(NotImplementedError):
+        make_loss(name).make_value_estimator(ValueEstimators.GAE)
+
+
+@with_critics
+def test_rows_are_not_taken_for_a_trajectory(name) -> None:
+    loss = make_loss(name)
+    loss.make_value_estimator(ValueEstimators.TDLambda)
+    with pytest.raises(
+        ValueError, match=r"a batch \[B, T\] of trajectories, got \[10\]"
+    ):
+        loss(make_batch(name, 10))
+    assert loss(make_batch(name, 2, 5))["loss_qvalue"].isfinite()
+
+
+@pytest.mark.parametrize("name", WRAPPED)
+def test_a_combined_loss_has_the_estimator_of_its_critics(name) -> None:
+    loss, batch = make_loss(name), make_batch(name, 10)
+    loss.make_value_estimator(gamma=0.0)
+    found = call(loss, batch)["target_value"]
+    torch.testing.assert_close(found, batch["next", "reward"].mean())
+
+
+@with_critics
+def test_a_return_of_one_step_changes_nothing(name) -> None:
+    loss, batch = make_loss(name), make_batch(name, 2, 5)
+    assert_same(record(loss, MultiStep(0.875, 1)(batch.clone())), record(loss, batch))
+
+
+# Those that read the next state as the one an action leads to, and the term that does.
+SINGLE = {
+    "osr": "recovery_kl",
+    "osr-v": "recovery_gap",
+    "discrete": "recovery_kl",
+    "recovery": "loss_recovery",
+    "official": "loss_recovery",
+    "model": "loss_inverse_dynamics",
+    "scas": "correction_error",
+}
+
+
+@pytest.mark.parametrize(("name", "key"), SINGLE.items())
+def test_models_read_single_steps_kept_beside_those_of_several(name, key) -> None:
+    single = make_batch(name, 30, ends=False)
+    several = single.clone().set("next", single["next"].roll(1, 0))
+    several["steps_to_next_obs"] = torch.full((30, 1), 2)
+    loss = make_loss(name)
+    with pytest.raises(
+        ValueError, match=r"multi-step .*\(2 steps\).*leave MultiStep out"
+    ):
+        loss(several)
+    both = several.clone().set("one_step", single["next"])
+    assert torch.equal(call(loss, both)[key], call(loss, single)[key])
+    if name in WITH_CRITICS:
+        parts(loss)[0].make_value_estimator(gamma=0.5)
+        found = call(loss, both)["target_value"]
+        parts(loss)[0].make_value_estimator(gamma=0.25)
+        several["steps_to_next_obs"].fill_(1)
+        torch.testing.assert_close(found, call(loss, several)["target_value"])
