@@ -7,19 +7,19 @@ import torch
 from objectives.losses import Networks, call, make_batch, make_loss, update_targets
 
 from torchrl_osr.lab.losses import TD3BCLoss
-from torchrl_osr.lab.losses.td3 import TargetPolicySmoothing, magnitude
 
 
 def test_smoothed_actions_stay_within_the_bounds_of_each_dimension() -> None:
     networks, batch = Networks(low=-2.0, high=2.0), make_batch("td3-bc", 200)
-    bounds = {"low": [-2.0, -0.5], "high": [2.0, 0.25]}
-    loss = TD3BCLoss(networks.module, networks.critics, **bounds).double()
-    update_targets(loss)
-    action, _ = TargetPolicySmoothing(2.0, 9.0)(loss, loss.unpack(batch))
+    options = {"low": [-2.0, -0.5], "high": [2.0, 0.25], "policy_noise": 2.0}
+    loss = TD3BCLoss(networks.module, networks.critics, noise_clip=9.0, **options)
+    update_targets(loss.double())
+    action, _ = loss.smoothed(loss.unpack(batch))
     assert action.amax(0).tolist() == [2.0, 0.25]
     assert action.amin(0).tolist() == [-2.0, -0.5]
     # Without noise the target's action is the actor's own, however far it goes.
-    action, _ = TargetPolicySmoothing(0.0, 0.5)(loss, loss.unpack(batch))
+    loss.policy_noise = 0.0
+    action, _ = loss.smoothed(loss.unpack(batch))
     wanted = networks.module.module(loss.unpack(batch).s_next["observation"])
     torch.testing.assert_close(action[:, 0], wanted[:, 0])
 
@@ -33,8 +33,8 @@ def test_bounds_are_those_of_a_delta_actor() -> None:
 
 def test_magnitude_of_no_values_is_one() -> None:
     loss, batch = make_loss("td3-bc"), make_batch("td3-bc", 4)
-    assert magnitude(loss, loss.unpack(batch), torch.zeros(4)) == 1
+    assert loss.magnitude(loss.unpack(batch), torch.zeros(4)) == 1
     batch["collector", "mask"] = torch.tensor([True, False, False, True])
     values = torch.tensor([1.0, 9.0, 9.0, -3.0])
-    assert magnitude(loss, loss.unpack(batch), values) == 2
+    assert loss.magnitude(loss.unpack(batch), values) == 2
     assert call(loss, batch)["loss_actor"].isfinite()
