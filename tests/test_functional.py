@@ -8,7 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch.distributions import Normal, kl_divergence
+from torch.distributions import Categorical, Normal, kl_divergence
 
 from torchrl_osr import functional
 
@@ -157,3 +157,24 @@ def test_value_constraint_weighs_actions_by_density(temperature, expected) -> No
         policy, model, log_prob=log_prob, temperature=temperature
     )
     assert value.item() == pytest.approx(expected - 1, abs=1e-6)
+
+
+def test_value_constraint_has_a_floor_with_the_logsumexp_alone() -> None:
+    """Gibbs: log of the integral of exp(Q), less E_I Q, is no less than its entropy.
+
+    Actions are nine cells of width 2 / 9, so that all integrals are sums.
+    """
+    density = torch.tensor(4.5, dtype=torch.float64).log()
+    model = Categorical(logits=3 * torch.randn(500, 9, dtype=torch.float64))
+    floor = model.entropy() - density
+
+    def gap(qvalue: torch.Tensor, **options) -> torch.Tensor:
+        mean = (model.probs * qvalue).sum(-1, keepdim=True)
+        return functional.value_constraint(qvalue, mean, **options)
+
+    weighed = {"log_prob": density.expand(500, 9)}
+    qvalue = 30 * torch.randn(500, 9, dtype=torch.float64)
+    assert (gap(qvalue, **weighed) >= floor - 1e-9).all()
+    # The log-density itself is at the floor; the printed constraint has none.
+    torch.testing.assert_close(gap(model.logits + density, **weighed), floor)
+    assert gap(qvalue).min() < floor.min()

@@ -103,14 +103,14 @@ def test_what_is_left_of_a_push_is_the_closed_form(behavior_std) -> None:
     assert std == pytest.approx(behavior_std, abs=0.01)
 
 
-def pushed_rows(push: float) -> TensorDict:
+def pushed_rows(push: float, width: float = 1.0) -> TensorDict:
     """Return 64 rows of this world and pushed states, second moments exact.
 
     Here it is the action before the tanh that is linear in the state, so that linear
     networks are of the right class.
     """
     draws = exact_draws(64, 4)
-    rows = transitions(draws[:, :1], draws[:, 1:3], BEHAVIOR_STD)
+    rows = transitions(width * draws[:, :1], draws[:, 1:3], BEHAVIOR_STD)
     rows["action"] = BOUND * rows["action"].tanh()
     rows["perturbed", "observation"] = rows["observation"] + push * draws[:, 3:]
     return rows
@@ -142,8 +142,9 @@ def policy_gradient(actor: torch.nn.Module, loss: Tensor) -> Tensor:
     return torch.cat([weight[0], bias])
 
 
-def recovery(actor, model, rows: TensorDict) -> Tensor:
-    return StateRecoveryLoss(actor, model, recovery_weight=1.0)(rows)["loss_recovery"]
+def recovery(actor, model, rows: TensorDict, **options) -> Tensor:
+    loss = StateRecoveryLoss(actor, model, recovery_weight=1.0, **options)
+    return loss(rows)["loss_recovery"]
 
 
 @pytest.mark.parametrize("push", [1e-3, 0.5, 2.0])
@@ -176,6 +177,27 @@ def test_a_model_of_pushed_states_teaches_noisy_cloning(push, shuffled) -> None:
         # So could a gradient that is zero or that does not see the model.
         assert expected.abs().max() > 1e-2
         if push >= 0.1 and not shuffled:
-            # A model of clean states adds a step towards the data.
             by_clean = policy_gradient(actor, recovery(actor, clean, rows))
             assert (by_clean - expected).abs().max() > 1e-4
+
+
+# k - G (A + B k) push^2 / (width^2 + push^2), with G (A + B k) = 1.2 here.
+@pytest.mark.parametrize(
+    ("push", "width", "slope"),
+    [(1e-3, 1.0, -0.3000012), (0.1, 0.1, -0.9), (0.5, 0.1, -1.4538462)],
+)
+def test_a_clean_model_adds_a_step_towards_the_data(push, width, slope) -> None:
+    """Gain times the squared push times the score of the density of pushed states."""
+    rows, actor = pushed_rows(push, width), linear_gaussian("observation")
+    model = most_likely_model(rows, [rows["observation"]])
+    layer, found = actor[0][0].module[0], []
+    for mean in (slope, GAIN):
+        with torch.no_grad():
+            layer.weight.copy_(torch.tensor([[mean], [0.0]]))
+            layer.bias.zero_()
+        term = recovery(actor, model, rows, recovery_states="perturbed")
+        found.append(policy_gradient(actor, term)[:2])
+    # At its minimum, with a standard deviation of 1, but for the rounding of the slope.
+    assert found[0].abs().max() < 1e-6
+    expected = (GAIN - slope) * (width**2 + push**2)
+    assert found[1][0].item() == pytest.approx(expected, abs=1e-6)

@@ -28,6 +28,8 @@ from torchrl.modules import (
     TanhNormal,
 )
 
+from torchrl_osr._checks import check_positive
+
 SCALE_MAPPING = "biased_softplus_1.0_0.01"
 """Standard deviation before the tanh, of policy and inverse dynamics alike: a softplus
 that is 1 at 0 and never below 0.01.
@@ -170,6 +172,8 @@ def gaussian_actor(
         An actor that writes ``"loc"`` (the mean), ``"scale"`` and the action, each
         ``[B, A]``.
     """
+    if scale is not None:
+        check_positive("scale", scale)
     spread = AddStateIndependentNormalScale(
         action_dim, make_param=scale is None, init_value=math.log(scale or 1.0)
     )
