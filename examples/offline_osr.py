@@ -1,14 +1,198 @@
-"""Train a policy with OSR on real MuJoCo transitions, from nothing, with one command.
+"""Train a policy with OSR on offline data: a whole run on one page.
 
     python examples/offline_osr.py env=hopper
+    python examples/offline_osr.py env=walker2d data=medium-expert loss=osr_v
+    python examples/offline_osr.py -m env=hopper,walker2d seed=0,1,2
+    python examples/offline_osr.py resume=<folder of a run> trainer.steps=40_000
 
-The same as ``torchrl-osr train env=hopper``; :mod:`torchrl_osr.lab.cli.train` is the
-whole story: data, inverse dynamics model, policy, on TorchRL's trainer.
+Out-of-sample State Recovery keeps a policy close to the states of its data. An inverse
+dynamics model learns which action leads from a state, clean or perturbed, to the next
+state of the data. The policy learns to choose that action, so that it returns to the
+data after a push.
+
+``torchrl-osr train`` makes the same run from the same parts, and has the other methods.
+The configuration is in ``conf/``; ``--cfg job --resolve`` prints it.
 """
 
-import sys
+from __future__ import annotations
 
-from torchrl_osr.lab.__main__ import main
+from functools import partial
+
+import hydra
+import torch
+from omegaconf import DictConfig
+from torchrl.objectives import SoftUpdate
+
+from torchrl_osr import InverseDynamicsLoss, OSRLoss, OSRVLoss, StatePerturbation
+from torchrl_osr._files import write_json
+from torchrl_osr.fast import fast_update
+from torchrl_osr.lab.cli.console import single_job
+from torchrl_osr.lab.data.rows import take_multi_step
+from torchrl_osr.lab.evaluation import inverse_dynamics_report
+from torchrl_osr.lab.run import CONF
+from torchrl_osr.lab.run.build import Learner
+from torchrl_osr.lab.run.data import load_training_data
+from torchrl_osr.lab.run.folder import Run, Settings, open_run
+from torchrl_osr.lab.run.load import CHECKPOINTS
+from torchrl_osr.lab.run.parts import (
+    adam,
+    averaged,
+    evaluation,
+    optimizer_of,
+    prepare_machine,
+    report,
+    save_policies,
+    still_ours,
+    trainer_options,
+)
+from torchrl_osr.lab.run.schema import TrainConfig, register
+from torchrl_osr.modules import (
+    critic_ensemble,
+    tanh_gaussian_actor,
+    tanh_gaussian_inverse_dynamics,
+)
+from torchrl_osr.trainers import Evaluation, OfflineTrainer, largest_value
+
+LOSSES = {"torchrl_osr.OSRLoss": OSRLoss, "torchrl_osr.OSRVLoss": OSRVLoss}
+
+register()
+
+
+@hydra.main(version_base="1.3", config_path=CONF, config_name="train")
+@single_job
+def main(cfg: DictConfig) -> float:
+    """Check the configuration, hold the folder of the run, and train."""
+    with open_run(cfg) as run:
+        check_scope(run.config)
+        return train(run)
+
+
+def train(run: Run) -> float:
+    """Train inverse dynamics model, critics and policy; return the last score."""
+    config, folder = run.config, run.folder
+    env, optim, sizes = config.env, config.optim, config.trainer
+    device, autocast = prepare_machine(run)
+    update = partial(fast_update, autocast_dtype=autocast, trace=sizes.record)
+
+    # 1. Networks and loss: OSR (equations 2 and 11), or OSR-v (equation 8).
+    torch.manual_seed(config.seed)
+    spaces = env.observation_size, env.action_size
+    cells, number = config.network.num_cells, config.loss["num_qvalue_nets"]
+    actor = tanh_gaussian_actor(*spaces, num_cells=cells).to(device)
+    critics = critic_ensemble(
+        *spaces,
+        num_qvalue_nets=number,
+        num_cells=cells,
+        layer_norm=config.network.layer_norm,
+    )
+    model = tanh_gaussian_inverse_dynamics(*spaces, num_cells=cells).to(device)
+    loss_class = LOSSES[config.loss["_target_"]]
+    loss = loss_class(actor, critics, model, **options_in(config.loss)).to(device)
+    loss.make_value_estimator(gamma=optim.gamma)
+
+    # 2. Data: transitions with standardised states, and a perturbed state beside each
+    # state. Both together are the paper's mixed data set D_tot.
+    data = load_training_data(
+        env,
+        config.data,
+        batch_size=sizes.batch_size,
+        device=device,
+        n_steps=optim.n_steps,
+        gamma=optim.gamma,
+        progress=sizes.progress,
+    )
+    noise = config.perturbation
+    perturbation = StatePerturbation(noise.std, noise=noise.noise, seed=config.seed)
+    data.buffer.append_transform(perturbation)
+
+    # What all trainers share. A killed run continues from its last checkpoint.
+    shared = trainer_options(run)
+    kept = {
+        "perturbation": perturbation,
+        "observation_norm": data.norm,
+        "settings": Settings(config),
+    }
+
+    # 3. The inverse dynamics model, by maximum likelihood on D_tot.
+    model_loss = InverseDynamicsLoss(model, **options_in(config.inverse_dynamics.loss))
+    optimizer = adam(model_loss.parameters(), lr=optim.inverse_dynamics_lr)
+    steps = sizes.inverse_dynamics_steps
+    trainer = OfflineTrainer(
+        update(model_loss, optimizer),
+        data.buffer,
+        steps,
+        folder / "checkpoint" / "inverse_dynamics",
+        seed=config.seed,
+        hooks=[still_ours(run)],
+        components=kept,
+        evaluation=Evaluation(
+            lambda: inverse_dynamics_report(model, data.held_out), steps, "nll", "min"
+        ),
+        description="inverse_dynamics",
+        **shared,
+    )
+    trainer.train()
+    write_json(folder / "inverse_dynamics.json", trainer.history[-1])
+
+    # 4. Critics and policy. One step: sample a batch, compute the losses, go backward
+    # on their sum, step the optimizer, move the target networks and the average of the
+    # policy's weights, which is evaluated and exported.
+    values = list(loss.qvalue_network_params.parameters())
+    known = set(values)
+    policy = [each for each in loss.parameters() if each not in known]
+    optimizer, schedule = optimizer_of(run, values, policy)
+    targets = SoftUpdate(loss, tau=optim.tau)
+    delay = {"policy_delay": optim.policy_delay, "policy_params": policy}
+    average = averaged(actor, optim.policy_average)
+    if optim.n_steps > 1:
+        data.buffer.append_transform(take_multi_step)
+    limit = largest_value(data.largest_reward, optim.gamma)
+    with evaluation(run, data.norm, actor, average) as evaluate:
+        trainer = OfflineTrainer(
+            update(loss, optimizer, targets, **delay),
+            data.buffer,
+            sizes.steps,
+            folder / CHECKPOINTS,
+            seed=config.seed + 1,
+            hooks=[
+                still_ours(run),
+                ("post_optim", schedule.step),
+                ("post_optim", partial(average.update_parameters, actor)),
+            ],
+            components=kept | {"schedule": schedule, "policy_average": average},
+            evaluation=evaluate,
+            value_limits={"pred_value": limit, "target_value": limit},
+            description="policy",
+            **shared,
+        )
+        trainer.train()
+
+    # 5. Results: policy.safetensors, returns.json, curve.png and a table.
+    save_policies(run, Learner(actor, model, loss, loss), data.norm)
+    return report(run, data.mean, trainer)
+
+
+def options_in(options: dict) -> dict:
+    """Return the options of a class in the configuration."""
+    return {name: value for name, value in options.items() if name != "_target_"}
+
+
+def check_scope(config: TrainConfig) -> None:
+    """Raise a ValueError for what this page leaves to ``torchrl-osr train``."""
+    network, model = config.network, config.inverse_dynamics
+    built = [network.actor, network.critic, model.network]
+    ours = [tanh_gaussian_actor, critic_ensemble, tanh_gaussian_inverse_dynamics]
+    if (
+        config.loss["_target_"] not in LOSSES
+        or built != [{"_target_": f"torchrl_osr.modules.{x.__name__}"} for x in ours]
+        or config.recovery is not None
+        or config.perturbation.adversary is not None
+        or config.dynamics.use
+        or config.trainer.compile
+        or model.shuffle_next
+    ):
+        raise ValueError("this page trains loss=osr or osr_v: use torchrl-osr train.")
+
 
 if __name__ == "__main__":
-    main(["train", *sys.argv[1:]])
+    main()

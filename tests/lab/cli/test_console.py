@@ -62,9 +62,9 @@ def test_error_is_printed_once_and_debug_shows_where(tmp_path, run):
     wrong = ["loss.recovery_weight=-1", "hydra.run.dir=run"]
     code, output = run(tmp_path, "train", *wrong)
     assert code == 1
-    *logged, printed = output.splitlines()
+    printed = output.splitlines()[-1]
     assert "recovery_weight" in printed
-    assert all("[INFO]" in line for line in logged)
+    assert "Traceback" not in output
     log = (tmp_path / "run" / "train.log").read_text()
     assert "Traceback (most recent call last)" in log
     code, output = run(tmp_path, "evaluate", "checkpoint=nowhere", "--debug")

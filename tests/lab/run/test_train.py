@@ -81,7 +81,7 @@ def test_wandb_gets_the_run_its_curve_and_its_results(tmp_path, monkeypatch):
     fake = SimpleNamespace(init=init, Image=lambda path: path)
     monkeypatch.setitem(sys.modules, "wandb", fake)
     monkeypatch.setattr("torchrl.record.loggers.wandb._has_wandb", True)
-    monkeypatch.setattr("torchrl_osr.lab.run.train.find_spec", lambda _: True)
+    monkeypatch.setattr("torchrl_osr.lab.run.parts.find_spec", lambda _: True)
     # It is handed what update() of a real configuration takes besides.
     monkeypatch.setattr("torchrl.record.loggers.wandb._collect_env_metadata", dict)
     given = ["loss=rebrac", "recovery=osr", "logger=wandb", "logger.project=mine"]
@@ -99,6 +99,6 @@ def test_wandb_gets_the_run_its_curve_and_its_results(tmp_path, monkeypatch):
 
 
 def test_a_missing_logger_names_the_extra(tmp_path, monkeypatch):
-    monkeypatch.setattr("torchrl_osr.lab.run.train.find_spec", lambda _: None)
+    monkeypatch.setattr("torchrl_osr.lab.run.parts.find_spec", lambda _: None)
     with pytest.raises(ImportError, match=r"torchrl-osr\[wandb\]"):
         trained(tmp_path / "run", "logger=wandb")

@@ -1,0 +1,261 @@
+"""Parts of a training run, for ``torchrl-osr train`` and examples/offline_osr.py."""
+
+from __future__ import annotations
+
+import logging
+import math
+import uuid
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import asdict
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict.nn import ProbabilisticTensorDictSequential
+from torch import Tensor
+from torch.nn import Parameter
+from torch.optim.lr_scheduler import LambdaLR
+from torch.optim.swa_utils import AveragedModel
+from torchrl import torchrl_logger
+from torchrl.envs import ObservationNorm
+from torchrl.record.loggers import CSVLogger, Logger, get_logger
+from torchrl.record.loggers.wandb import WandbLogger
+
+from torchrl_osr._files import write_atomically, write_json
+from torchrl_osr.lab.evaluation import (
+    EpisodeEvaluator,
+    deterministic_policy,
+    measure_of,
+    summarize,
+)
+from torchrl_osr.lab.evaluation.figures import learning_curve
+from torchrl_osr.lab.evaluation.training_summary import read_scalars, score_table
+from torchrl_osr.lab.run.build import Learner
+from torchrl_osr.lab.run.data import references_of
+from torchrl_osr.lab.run.folder import Run, check_ours, code_versions
+from torchrl_osr.lab.run.load import CHECKPOINTS, POLICY, policy_of, restore
+from torchrl_osr.trainers import Evaluation, OfflineTrainer
+
+log = logging.getLogger(__name__)
+
+adam = partial(torch.optim.Adam, fused=True)
+
+EVALUATION_SEED = 10_000  # far from the seeds of the data's episodes
+
+Hook = tuple[str, Callable[..., Any]]
+
+
+def prepare_machine(run: Run) -> tuple[torch.device, torch.dtype | None]:
+    """Log what is trained where, and set torch's threads; device and autocast type."""
+    config = run.config
+    torchrl_logger.setLevel("WARNING")
+    versions = ", ".join(f"{name} {each}" for name, each in code_versions().items())
+    log.info(
+        f"{config.env.name} {config.data.source}, seed {config.seed}, in {run.folder}"
+    )
+    log.info(versions)
+    torch.set_num_threads(config.trainer.num_threads)
+    torch.set_float32_matmul_precision(config.trainer.matmul_precision)
+    precisions = {"float32": None, "bfloat16": torch.bfloat16}
+    return torch.device(config.trainer.device), precisions[config.trainer.precision]
+
+
+def make_loggers(run: Run) -> list[Logger]:
+    """Make the CSV logger, which figures are drawn from, and the one that is chosen.
+
+    A continued run continues its W&B run.
+
+    Raises:
+        ImportError: if the logger's package is not installed.
+    """
+    config, folder, kind = run.config, run.folder, run.config.logger.kind
+    loggers: list[Logger] = [CSVLogger("csv", log_dir=str(folder))]
+    if kind == "csv":
+        return loggers
+    if find_spec(kind) is None:
+        extra = "wandb" if kind == "wandb" else "train"
+        raise ImportError(
+            f"logger={kind} needs {kind!r}: pip install 'torchrl-osr[{extra}]'"
+        )
+    name, options = kind, {}
+    if kind == "wandb":
+        if not (known := folder / ".wandb_id").exists():
+            write_atomically(known, uuid.uuid4().hex)
+        group = f"{config.env.name}-{config.data.source} {run.method}"
+        name = f"{group} seed{config.seed}"
+        options = {
+            "id": known.read_text(),
+            "project": config.logger.project,
+            "mode": config.logger.mode,
+            # A sweep's jobs may share a process, and a failed one left its run open.
+            "reinit": "finish_previous",
+            "group": group,
+            "tags": [config.env.name, config.data.source, run.method],
+            "config": asdict(config) | {"versions": code_versions()},
+        }
+    return [*loggers, get_logger(kind, str(folder), name, wandb_kwargs=options)]
+
+
+def trainer_options(run: Run) -> dict[str, Any]:
+    """Return the options that the trainers of all phases share, loggers among them."""
+    options = run.config.trainer
+    return {
+        "loggers": make_loggers(run),
+        "log_interval": options.log_interval,
+        "checkpoint_interval": options.checkpoint_interval,
+        "checkpoints_kept": options.checkpoints_kept,
+        "progress": options.progress,
+    }
+
+
+def still_ours(run: Run) -> Hook:
+    """Return a hook that ends a run whose folder was removed: nothing would be kept."""
+    return "post_steps", partial(check_ours, run.folder)
+
+
+def optimizer_of(
+    run: Run, critics: Sequence[Parameter], policy: Sequence[Parameter]
+) -> tuple[torch.optim.Optimizer, LambdaLR]:
+    """Return Adam with a learning rate and a schedule for critics and policy each."""
+    optim, total = run.config.optim, run.config.trainer.steps
+
+    def cosine(step: int) -> float:
+        return 0.5 * (1 + math.cos(math.pi * min(step / total, 1)))
+
+    factors = {"cosine": cosine, "constant": lambda _: 1.0}
+    groups, schedules = [], []
+    for params, rate, schedule in (
+        (critics, optim.qvalue_lr, optim.qvalue_schedule),
+        (policy, optim.actor_lr, optim.actor_schedule),
+    ):
+        if params:
+            groups.append({"params": params, "lr": rate})
+            schedules.append(factors[schedule])
+    optimizer = adam(groups)
+    return optimizer, LambdaLR(optimizer, schedules)
+
+
+def averaged(network: torch.nn.Module, share: float) -> AveragedModel:
+    """Return an exponential average of a network's weights, which is what is evaluated.
+
+    It forgets the first weights, which would stay in it for longer than a short run
+    lasts: until update number ``10 / share`` it is of about the last tenth of all
+    updates.
+
+    Args:
+        network: is copied.
+        share: of the new weights at each update; 1 for the weights themselves.
+    """
+
+    @torch.no_grad()
+    def move(average: Any, weights: Any, count: Tensor | int) -> None:
+        torch._foreach_lerp_(average, weights, max(share, 10 / (int(count) + 10)))
+
+    return AveragedModel(network, multi_avg_fn=move)
+
+
+@contextmanager
+def evaluation(
+    run: Run,
+    norm: ObservationNorm,
+    actor: ProbabilisticTensorDictSequential,
+    average: AveragedModel,
+) -> Iterator[Evaluation | None]:
+    """Open the episodes that evaluate a policy.
+
+    It plays the averaged weights, and the last ones besides if they differ. ``None``
+    without a simulator.
+    """
+    if not run.simulated:
+        yield None
+        return
+    references = references_of(run.config.env)
+    episodes = EpisodeEvaluator(
+        run.config.env.id,
+        num_episodes=run.config.trainer.eval_episodes,
+        seed=EVALUATION_SEED,
+        device=run.config.trainer.device,
+    )
+
+    def evaluate() -> dict[str, Any]:
+        results = summarize(
+            episodes(deterministic_policy(average.module, norm)), references
+        )
+        if run.config.optim.policy_average < 1:
+            last = summarize(episodes(deterministic_policy(actor, norm)), references)
+            measure = measure_of(last)
+            results[f"{measure}_of_last_weights"] = last[measure]
+        return results
+
+    measure = "return" if references is None else "score"
+    with closing(episodes):
+        yield Evaluation(evaluate, run.config.trainer.eval_interval, measure)
+
+
+def save_policies(run: Run, learner: Learner, norm: ObservationNorm) -> None:
+    """Export the last policy and the best one, for ``torchrl_osr.load_policy``."""
+    best = run.folder / CHECKPOINTS / "best.torchrl"
+    newest = max((run.folder / CHECKPOINTS).glob("checkpoint-*.torchrl"))
+    places = {best: best.with_suffix(".safetensors"), newest: run.folder / POLICY}
+    for checkpoint, place in places.items():
+        if not checkpoint.exists():  # best: without a simulator
+            continue
+        try:
+            policy_of(restore(checkpoint, run.config, learner, norm)).save(place)
+        except ValueError as error:  # networks of the user's own
+            log.warning(f"The policy is not exported: {error}")
+            return
+
+
+def report(run: Run, data_mean: float | None, trainer: OfflineTrainer) -> float:
+    """Write raw returns and the figure, print the table; return the last score.
+
+    Without a simulator there are no evaluations, and the score is NaN.
+    """
+    config, folder = run.config, run.folder
+    history, best = trainer.history, trainer.best()
+    measure = "return" if references_of(config.env) is None else "score"
+    rows: dict[str, Any] = {}
+    if history:
+        rows = {"last": history[-1], "best": best or history[0]}
+    results = {"versions": code_versions(), f"data_{measure}": data_mean, **rows}
+    write_json(folder / "returns.json", results | {"evaluations": history})
+    name = f"{config.env.name} {config.data.source}"
+    learning_curve(
+        history,
+        read_scalars(folder / "csv" / "scalars" / "policy"),
+        folder / "curve.png",
+        title=f"{name}, {run.method}, seed {config.seed}",
+        data_mean=data_mean,
+    )
+    _finish_wandb(trainer.loggers, rows, folder / "curve.png")
+    if rows:
+        print("\n" + score_table(name, history, rows["best"], data_mean, folder))
+    if failed := trainer.failed_evaluations:
+        raise RuntimeError(
+            f"The run is finished, but {len(failed)} of its evaluations failed, the "
+            f"last at step {failed[-1]['step']}: {failed[-1]['error']}"
+        )
+    if not rows:
+        print(f"\n{name}: nothing was played, for {config.env.id} has no simulator")
+        print(f"  {'files':<26}{folder}")
+        return math.nan
+    return float(history[-1][measure])
+
+
+def _finish_wandb(
+    loggers: Sequence[Logger], rows: Mapping[str, Mapping[str, Any]], curve: Path
+) -> None:
+    """Give W&B the last results, and close its run; all else is in the curves."""
+    for logger in loggers:
+        if isinstance(logger, WandbLogger):
+            import wandb
+
+            logger.experiment.log({"curve": wandb.Image(str(curve))})
+            for name, row in rows.items():
+                measure = measure_of(row)
+                logger.experiment.summary[f"{name}_{measure}"] = row[measure]
+            logger.experiment.finish()
