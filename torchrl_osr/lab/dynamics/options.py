@@ -24,36 +24,36 @@ CHOICES = {
 class DynamicsOptions:
     """Which models a run trains, and how its policy is rolled out in them."""
 
-    use: bool = False  # train a model, and the policy on its roll-outs
+    use: bool = False  # train a model, and the policy on its rollouts
     # The ensemble. Defaults are MOPO's.
-    num_networks: int = 7
-    num_elites: int = 5  # networks that are rolled out, the best on held-out rows
+    num_networks: int = 7  # number of networks
+    num_elites: int = 5  # networks used for rollouts, the best on held-out rows
     num_cells: list[int] = field(default_factory=lambda: [200, 200, 200, 200])
-    lr: float = 1e-3
+    lr: float = 1e-3  # learning rate of the model
     batch_size: int = 256  # rows of a gradient step, for each network
-    steps: int = 40_000  # gradient steps; the best evaluation counts
-    path: str | None = None  # a model to take, dynamics.safetensors of another run
+    steps: int = 40_000  # gradient steps of the model; the best evaluation counts
+    path: str | None = None  # model to use: dynamics.safetensors of another run
     # The conditional autoencoder of loss=sdc or dynamics=reverse.
     vae_num_cells: list[int] = field(default_factory=lambda: [750, 750])
-    vae_steps: int = 100_000
+    vae_steps: int = 100_000  # gradient steps of the autoencoder
     # Roll-outs.
-    real_ratio: float = 0.05  # share of real rows in a batch; 1: no roll-outs
-    rollout_steps: int = 5
-    rollout_starts: int = 50_000  # states of the data that roll-outs start from
-    perturbed_start_steps: int = 0  # random actions before a roll-out, at most
-    action_noise: float = 0.0  # largest deviation of noise on deterministic policies
-    rollout_interval: int = 1000  # gradient steps of the policy between roll-outs
-    generations: int = 5  # newest roll-outs that are trained on
-    terminations: str = "auto"  # rule that ends roll-outs; "never": only a time limit
-    penalty: float = 0.0  # of the model's uncertainty, in the task's reward
-    unknown: str = "refuse"  # rows of high disagreement: "refuse", "halt" or "take"
-    known_share: float = 1.0  # of the held-out rows that are no such rows
+    real_ratio: float = 0.05  # share of recorded rows in a batch; 1: no rollouts
+    rollout_steps: int = 5  # steps of a rollout
+    rollout_starts: int = 50_000  # number of rollouts at a time
+    perturbed_start_steps: int = 0  # most random actions before a rollout
+    action_noise: float = 0.0  # largest noise on a deterministic policy's actions
+    rollout_interval: int = 1000  # gradient steps between rollouts
+    generations: int = 5  # newest rollouts in the batches
+    terminations: str = "auto"  # "auto", or "never" where only a time limit ends a task
+    penalty: float = 0.0  # weight of the model's uncertainty in rewards
+    unknown: str = "refuse"  # unknown rows: "refuse", "halt" (end there) or "take"
+    known_share: float = 1.0  # share of held-out rows that count as known
     # "cvae" or "uniform": roll a reverse model out with these actions, as in ROMI.
     reverse_policy: str | None = None
     # RAMBO's training of the model against the policy, before each further roll-out.
-    adversarial_steps: int = 0
-    adversarial_weight: float = 3e-4
-    adversarial_lr: float = 3e-4
+    adversarial_steps: int = 0  # gradient steps against the policy
+    adversarial_weight: float = 3e-4  # weight of the adversarial term
+    adversarial_lr: float = 3e-4  # learning rate of these steps
 
     def ensemble(self, observation_size: int, action_size: int) -> DynamicsEnsemble:
         """Build an untrained ensemble."""

@@ -39,14 +39,14 @@ class EnvConfig:
     """The task."""
 
     id: str = MISSING  # Gymnasium id; package:Name-v0 imports the package first
-    name: str = "${environment_name:${env.id}}"  # short name, of behaviours and scores
-    random_return: float | None = None  # mean return of a random policy, score 0;
-    expert_return: float | None = None  # of an expert, score 100; null: raw returns
+    name: str = "${environment_name:${env.id}}"  # short name of the task
+    random_return: float | None = None  # mean return of a random policy
+    expert_return: float | None = None  # mean return of an expert; null: raw returns
     # Read from the environment and kept with the run.
-    action_low: list[float] | None = None  # in its own units; null: discrete actions
-    action_high: list[float] | None = None
-    observation_size: int | None = None
-    action_size: int | None = None  # or the number of discrete actions
+    action_low: list[float] | None = None  # lowest actions; null: discrete
+    action_high: list[float] | None = None  # highest actions; null: discrete
+    observation_size: int | None = None  # number of observation entries
+    action_size: int | None = None  # number of action entries, or of discrete actions
 
 
 @dataclass
@@ -54,53 +54,53 @@ class ColumnsConfig:
     """Names of a log's columns; null for the usual names, see docs/your_data.md."""
 
     observation: Any = None  # a name, a pattern such as obs_*, or a list of names
-    action: Any = None  # likewise
-    reward: str | None = None
+    action: Any = None  # a name, a pattern, or a list of names
+    reward: str | None = None  # a name
     terminated: Any = None  # a name; false: nothing ever ends the task
-    truncated: str | None = None
-    episode: str | None = None  # its numbers or texts tell episodes apart
-    step: str | None = None  # rows of an episode are sorted by it
-    next_observation: Any = None  # as observation
+    truncated: str | None = None  # a name
+    episode: str | None = None  # a name; tells episodes apart
+    step: str | None = None  # a name; sorts the rows of an episode
+    next_observation: Any = None  # a name, a pattern, or a list of names
 
 
 @dataclass
 class DataConfig:
     """The data set: rolled out from packaged behaviour policies, or recorded."""
 
-    # Behaviour: random, medium, medium-replay, medium-expert, expert; diverse or play
-    # in a maze. Recorded data: minari, d4rl or file.
+    # Behaviour policy: random, medium, medium-replay, medium-expert or expert; in a
+    # maze diverse or play. Recorded data: minari, d4rl or file.
     source: str = MISSING
-    path: Any = None  # recorded data to read; of several files a list or a pattern
+    path: Any = None  # recorded data: a file, a folder, a list or a pattern
     columns: ColumnsConfig = field(default_factory=ColumnsConfig)
-    action_bounds: Any = None  # of the log: two numbers or lists; null: the task's
+    action_bounds: Any = None  # bounds in the log's units; null: the task's
     clip_actions: bool = MISSING  # clip actions outside the bounds; false: refuse them
-    missing: str = MISSING  # values that lack: error, or leave out their row or episode
-    download: bool = MISSING  # fetch the set that path names
-    num_transitions: int = MISSING
-    seed: int = MISSING  # of the roll-outs and of the held-out rows
-    random_share: float = MISSING  # share of rows of a random policy instead
-    storage: str = MISSING  # memory; disk: rows are read as they are sampled
-    held_out: float = MISSING  # share of rows that models are judged on
-    standardize: bool = MISSING  # observations to mean 0 and standard deviation 1
-    reward_scale: float = MISSING  # of the rewards that are trained on, not of the
-    reward_shift: float = MISSING  # evaluation's: reward_scale * r + reward_shift
+    missing: str = MISSING  # missing values: error, or leave out the row or episode
+    download: bool = MISSING  # download the set that path names
+    num_transitions: int = MISSING  # number of collected rows
+    seed: int = MISSING  # random seed of collection and held-out rows
+    random_share: float = MISSING  # share of rows replaced by random data
+    storage: str = MISSING  # memory, or disk for sets larger than memory
+    held_out: float = MISSING  # share of rows kept to judge models
+    standardize: bool = MISSING  # standardise observations
+    reward_scale: float = MISSING  # factor of the training rewards
+    reward_shift: float = MISSING  # added to the scaled training rewards
 
 
 @dataclass
 class NetworkConfig:
     """Actor and critics."""
 
-    actor: dict[str, Any] = MISSING  # _target_ builds it; its options may follow
-    critic: dict[str, Any] = MISSING  # likewise
+    actor: dict[str, Any] = MISSING  # builder (_target_) and its options
+    critic: dict[str, Any] = MISSING  # builder (_target_) and its options
     num_cells: list[int] = MISSING  # width of each hidden layer
-    layer_norm: bool = MISSING  # in the critics; steadier, not in the paper
+    layer_norm: bool = MISSING  # layer normalisation in the critics
 
 
 @dataclass
 class PerturbationConfig:
     """Noise of the mixed data set, see StatePerturbation."""
 
-    std: float = MISSING  # in standard deviations of the data, if standardised
+    std: float = MISSING  # width of the noise, in deviations of the data
     noise: str = MISSING  # gaussian or uniform
     # Options of Adversary, which chooses the policy's perturbed states instead.
     adversary: Any = None
@@ -110,7 +110,7 @@ class PerturbationConfig:
 class InverseDynamicsConfig:
     """The inverse dynamics model and its training."""
 
-    network: dict[str, Any] = MISSING  # _target_ builds it
+    network: dict[str, Any] = MISSING  # builder (_target_) and its options
     loss: Any = MISSING  # options of InverseDynamicsLoss
     shuffle_next: bool = False  # ablation: train with another row's next state
 
@@ -119,17 +119,17 @@ class InverseDynamicsConfig:
 class OptimConfig:
     """Adam's learning rates and what moves with them."""
 
-    actor_lr: float = MISSING  # policy and entropy temperature
-    qvalue_lr: float = MISSING  # critics
-    inverse_dynamics_lr: float = MISSING
+    actor_lr: float = MISSING  # learning rate of policy and temperature
+    qvalue_lr: float = MISSING  # learning rate of the critics
+    inverse_dynamics_lr: float = MISSING  # learning rate of the model
     gamma: float = MISSING  # discount factor
-    n_steps: int = 1  # n-step returns, as far as the data have the rows
-    tau: float = MISSING  # step of the target networks at each update
-    policy_delay: int = 1  # updates of the critics for each of policy and targets
+    n_steps: int = 1  # steps of the returns, if the data have them
+    tau: float = MISSING  # step size of the target networks
+    policy_delay: int = 1  # critic updates for each policy update
     actor_schedule: str = "constant"  # cosine: actor_lr falls to 0 over the run
-    qvalue_schedule: str = "constant"  # likewise of qvalue_lr
-    # Share of the new weights in the exponential average of the policy's weights, which
-    # is what is evaluated and exported; 1: the weights themselves.
+    qvalue_schedule: str = "constant"  # cosine: qvalue_lr falls to 0 over the run
+    # Weight of the new policy in its exponential average, which is evaluated and
+    # exported; 1: no average.
     policy_average: float = 1.0
 
 
@@ -137,30 +137,32 @@ class OptimConfig:
 class TrainerConfig:
     """Length, intervals and hardware. Intervals are in gradient steps."""
 
-    batch_size: int = MISSING
-    inverse_dynamics_steps: int = MISSING  # gradient steps of that model
+    batch_size: int = MISSING  # rows of a gradient step
+    inverse_dynamics_steps: int = MISSING  # gradient steps of the model
     steps: int = MISSING  # gradient steps of policy and critics
-    log_interval: int = MISSING
-    eval_interval: int = MISSING
-    eval_episodes: int = MISSING
-    checkpoint_interval: int = MISSING
-    checkpoints_kept: int = MISSING  # newest ones that stay, beside the best
-    num_threads: int = MISSING  # of torch; 1 where several runs share the machine
+    log_interval: int = MISSING  # steps between log entries
+    eval_interval: int = MISSING  # steps between evaluations
+    eval_episodes: int = MISSING  # episodes of an evaluation
+    checkpoint_interval: int = MISSING  # steps between checkpoints
+    checkpoints_kept: int = MISSING  # number of newest checkpoints kept
+    num_threads: int = MISSING  # torch threads; 1 if several runs share the machine
     device: str = MISSING  # cpu, cuda or cuda:1
-    precision: str = MISSING  # of the losses' matrix products: float32 or bfloat16
-    matmul_precision: str = MISSING  # of float32 products: highest, high or medium
-    record: bool = MISSING  # repeat recorded operations: same bits, faster, CPU only
-    compile: bool = MISSING  # run the losses through torch.compile
-    progress: bool = MISSING  # progress bars when on a terminal
+    precision: str = MISSING  # precision of the losses: float32 or bfloat16
+    matmul_precision: str = (
+        MISSING  # precision of float32 products: highest, high, medium
+    )
+    record: bool = MISSING  # repeat recorded operations: same numbers, faster (CPU)
+    compile: bool = MISSING  # compile the losses
+    progress: bool = MISSING  # show progress bars
 
 
 @dataclass
 class LoggerConfig:
     """Loggers besides the CSV files, which are always written."""
 
-    kind: str = MISSING  # csv: nothing else; tensorboard or wandb
-    project: str = MISSING  # of W&B
-    mode: str = MISSING  # of W&B: offline, online or disabled
+    kind: str = MISSING  # csv, tensorboard or wandb
+    project: str = MISSING  # W&B project
+    mode: str = MISSING  # W&B mode: offline, online or disabled
 
 
 @dataclass
@@ -180,13 +182,13 @@ class TrainConfig:
     optim: OptimConfig = field(default_factory=OptimConfig)
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
     logger: LoggerConfig = field(default_factory=LoggerConfig)
-    # Values by data set: rows <env>-<source>, <env> or any, of dotted keys. A key whose
-    # value is ${by_data:key} gets that of the most specific row, see by_data.
+    # Values by data set: rows <env>-<source>, <env> or any, of dotted keys. A key with
+    # the value ${by_data:key} takes the most specific row, see by_data.
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
-    seed: int = MISSING  # of networks, sampling and noise
+    seed: int = MISSING  # random seed of networks, sampling and noise
     resume: str | None = None  # folder of a run to continue, or to extend
     force: bool = False  # continue although settings differ from those of the run
-    # Modules of your own that may be named, see docs/extend.md.
+    # Your modules that a configuration may import, see docs/extend.md.
     trust: list[str] = field(default_factory=list)
 
 
@@ -207,9 +209,9 @@ class CollectConfig:
     env: EnvConfig = field(default_factory=EnvConfig)
     policy: str = MISSING  # random, a run's folder, or a function: my_package:act
     path: str = MISSING  # log to write
-    episodes: int = MISSING
-    noise: float = MISSING  # on actions, in half-widths of their bounds
-    seed: int = MISSING  # of the first episode
+    episodes: int = MISSING  # number of episodes
+    noise: float = MISSING  # action noise, in half-widths of the bounds
+    seed: int = MISSING  # seed of the first episode
     progress: bool = MISSING
     trust: list[str] = MISSING
 
@@ -239,14 +241,14 @@ class EvaluateConfig:
 
     checkpoint: str | None = None  # a run's folder, or one checkpoint in it
     sweep: str | None = None  # or a folder: every finished run in or below it
-    switching: bool = MISSING  # the sweep's runs as one policy; the best of them acts
+    switching: bool = MISSING  # play the runs of the sweep as one policy
     jobs: int = MISSING  # runs of a sweep that are evaluated at once
     suite: SuiteConfig = field(default_factory=SuiteConfig)
     episodes: int = MISSING  # pairs for each checkpoint and disturbance, at least 2
     last: int = MISSING  # number of the run's newest checkpoints
     seed: int = MISSING  # of the first checkpoint's first episode; the next: 1000 more
     force: bool = MISSING  # repeat a finished evaluation
-    num_threads: int = MISSING  # of torch
+    num_threads: int = MISSING  # torch threads
     progress: bool = MISSING
     trust: list[str] = MISSING
 
