@@ -30,6 +30,7 @@ from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 from torch.fx import GraphModule, Node, map_arg
 from torch.fx.experimental.proxy_tensor import make_fx
+from torch.jit._fuser import optimized_execution
 from torch.utils.hooks import RemovableHandle
 from torchrl.data import TensorSpec
 from torchrl.objectives import LossModule
@@ -132,7 +133,8 @@ class LossGradients:
         check = self._replays % CHECK_INTERVAL == 0
         self._replays += 1
         start = torch.get_rng_state() if check else None
-        with torch.no_grad():
+        # Optimised, TorchScript joins matrix products, which rounds otherwise.
+        with torch.no_grad(), optimized_execution(False):
             outputs = trace.run(*trace.tensors(batch))
         if start is not None:
             end = torch.get_rng_state()
