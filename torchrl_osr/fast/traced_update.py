@@ -10,7 +10,7 @@ the same bits, without a compiler.
 TorchScript's interpreter repeats them: without Python in between they take two thirds
 of the time. It is deprecated in PyTorch 2.13, in which nothing else repeats operations
 from C++ without a compiler. Where it is missing, the same graph runs from Python, as
-the ``torch.fx.GraphModule`` that the tracer returns.
+the :class:`torch.fx.GraphModule` that the tracer returns.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
-from torch.fx import GraphModule, Node, map_arg
+from torch.fx import GraphModule
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.jit._fuser import optimized_execution
 from torch.utils.hooks import RemovableHandle
@@ -111,12 +111,11 @@ class LossGradients:
 
     def _try_to_trace(self, batch: TensorDictBase) -> None:
         assert self._state is not None
-        generator = torch.get_rng_state()
-        before = [each.detach().clone() for each in self._state.tensors]
+        generator, tensors = torch.get_rng_state(), self._state.tensors
+        before = [each.detach().clone() for each in tensors]
         try:
             trace = _Trace(self._losses, self.loss_module, batch, self.parameters)
-            after = self._state.tensors
-            if all(map(torch.equal, after, before)) and self._state.holds():
+            if all(map(torch.equal, tensors, before)) and self._state.holds():
                 self._trace = trace
             else:
                 self._give_up("it writes into its own tensors")
@@ -125,14 +124,13 @@ class LossGradients:
         finally:
             torch.set_rng_state(generator)
             if self._trace is None:
-                for tensor, value in zip(self._state.tensors, before, strict=True):
+                for tensor, value in zip(tensors, before, strict=True):
                     tensor.data.copy_(value)
 
     def _replay(self, trace: _Trace, batch: TensorDictBase) -> TensorDictBase:
         """Repeat the trace; at first and now and then, compare it with the loss."""
-        check = self._replays % CHECK_INTERVAL == 0
+        start = None if self._replays % CHECK_INTERVAL else torch.get_rng_state()
         self._replays += 1
-        start = torch.get_rng_state() if check else None
         # Optimised, TorchScript joins matrix products, which rounds otherwise.
         with torch.no_grad(), optimized_execution(False):
             outputs = trace.run(*trace.tensors(batch))
@@ -140,8 +138,9 @@ class LossGradients:
             end = torch.get_rng_state()
             torch.set_rng_state(start)
             wanted = trace.update(*trace.tensors(batch))
-            wanted, found = [*wanted, torch.get_rng_state()], [*outputs, end]
-            if not all(map(torch.equal, found, wanted)):
+            if not all(
+                map(torch.equal, [*outputs, end], [*wanted, torch.get_rng_state()])
+            ):
                 outputs = wanted
                 self._give_up("it reads numbers from outside of its attributes")
         return trace.spread(outputs, batch)
@@ -152,9 +151,6 @@ class LossGradients:
         log.warning(f"{name} runs without a trace, slower: {why}")
 
 
-Run = Callable[..., Sequence[Tensor]]
-
-
 def _total(losses: TensorDictBase) -> Any:
     return sum(value for key, value in losses.items() if key.startswith("loss_"))
 
@@ -163,11 +159,7 @@ _OPAQUE = (
     *(type, types.FunctionType, types.MethodType, types.ModuleType),
     *(enum.Enum, TensorSpec),
 )
-_INERT = (nn.Linear, nn.ReLU)
-"""Modules without a state of their own but for tensors and hooks, of which a network
-has most."""
-
-
+_INERT = (nn.Linear, nn.ReLU)  # no state but tensors and hooks; networks have many
 _USUAL = {key for key, value in vars(nn.Module()).items() if value in ({}, set())}
 
 
@@ -180,7 +172,7 @@ class _State:
 
     def __init__(self, loss_module: LossModule) -> None:
         self.tensors: list[Tensor] = []
-        owners: list[dict[str, Any]] = []
+        self._attributes: list[tuple[dict[str, Any], int, Callable[..., Any], Any]] = []
         seen: set[int] = set()
         stack: list[Any] = [loss_module]
         while stack:
@@ -199,17 +191,17 @@ class _State:
             elif hasattr(each, "__dict__") and not isinstance(each, _OPAQUE):
                 stack += vars(each).values()
                 if type(each) not in _INERT:
-                    owners.append(vars(each))
+                    self._remember(vars(each))
         self._traits = self._traits_now()
-        self._attributes = []
-        for attributes in owners:
-            # Most of what a module has are empty dictionaries. What comes into them
-            # also changes the length, or the number of the next hook.
-            names = [key for key in attributes if attributes[key] or key not in _USUAL]
-            if len(names) > 1:
-                get = operator.itemgetter(*names)
-                row = attributes, len(attributes), get, _copied(get(attributes))
-                self._attributes.append(row)
+
+    def _remember(self, attributes: dict[str, Any]) -> None:
+        # Most of what a module has are empty dictionaries. What comes into them also
+        # changes the length, or the number of the next hook.
+        names = [key for key in attributes if attributes[key] or key not in _USUAL]
+        if len(names) > 1:
+            get = operator.itemgetter(*names)
+            row = attributes, len(attributes), get, _copied(get(attributes))
+            self._attributes.append(row)
 
     def holds(self) -> bool:
         """Whether everything is as it was."""
@@ -243,14 +235,7 @@ def _copied(value: Any) -> Any:
 
 
 class _Trace:
-    """The operations of one update.
-
-    Args:
-        losses: of a batch, with their graph.
-        loss_module: its parameters, buffers and options are part of the trace.
-        batch: of the kind that is to come; a loss may write into it.
-        parameters: that get a gradient; ``None`` for all.
-    """
+    """The operations of one update: arguments as of :class:`LossGradients`."""
 
     def __init__(
         self,
@@ -269,7 +254,7 @@ class _Trace:
         self._kind = self._kind_of(batch)
         self._empty = TensorDict({}, batch.batch_size, device=batch.device)
         tensors = self.tensors(batch)
-        self.run = _without_python(_simplified(make_fx(self.update)(*tensors)), tensors)
+        self.run = _without_python(make_fx(self.update)(*tensors), tensors)
 
     def update(self, *tensors: Tensor) -> list[Tensor]:
         """Return losses, entries written to the batch, and gradients."""
@@ -301,7 +286,7 @@ class _Trace:
         losses = TensorDict({name: next(remaining) for name in self._names}, [])
         for key in self._written:
             batch.set(key, next(remaining))
-        for parameter, gradient in zip(self._trained, remaining, strict=False):
+        for parameter, gradient in zip(self._trained, remaining, strict=True):
             grad = parameter.grad
             parameter.grad = gradient if grad is None else grad + gradient
         return losses
@@ -333,96 +318,38 @@ def _laid_out(gradient: Tensor, like: Tensor) -> Tensor:
     return torch.empty_like(like).copy_(gradient)
 
 
-_VIEWS = {
-    operator.getitem,
-    *(
-        getattr(torch.ops.aten, name).default
-        for name in ("t", "unsqueeze", "expand", "permute", "view")
-    ),
-    torch.ops.aten.transpose.int,
-    torch.ops.aten.select.int,
-    torch.ops.aten.unbind.int,
-    torch.ops.aten.slice.Tensor,
-    torch.ops.aten.squeeze.dim,
-}
-
-
-def _simplified(graph: GraphModule) -> GraphModule:
-    """Leave out what has no effect without autograd, and what nobody reads.
-
-    Views of the module's own tensors are made now, once: they show whatever an
-    optimizer writes into these.
-    """
-    own: dict[Node, Any] = {}
-    for node in list(graph.graph.nodes):
-        if node.op == "get_attr":
-            own[node] = getattr(graph, node.target)
-        elif node.target is torch.ops.aten.detach.default:
-            node.replace_all_uses_with(node.args[0])
-        elif node.target in _VIEWS and set(node.all_input_nodes) <= own.keys():
-            arguments = map_arg((node.args, node.kwargs), own.__getitem__)
-            own[node] = value = node.target(*arguments[0], **arguments[1])
-            if isinstance(value, Tensor):
-                graph.register_buffer(f"{node.name}_made", value)
-                with graph.graph.inserting_before(node):
-                    made = graph.graph.get_attr(f"{node.name}_made")
-                node.replace_all_uses_with(made)
-                own[made] = value
-    graph.graph.eliminate_dead_code()
-    graph.recompile()
-    return graph
-
-
-_LAYER_NORM_GRADIENTS = """
-def of_all(
+@cache
+def _layer_norm_backward() -> torch.jit.CompilationUnit:
+    # TorchScript's tracer does not know the list of flags that the operation takes.
+    # Never freed: a trace points at the functions that it calls and does not own them.
+    return torch.jit.CompilationUnit("""
+def layer_norm_backward(
     upstream: Tensor, x: Tensor, shape: List[int], mean: Tensor, rstd: Tensor,
     weight: Optional[Tensor], bias: Optional[Tensor]
 ) -> Tuple[Tensor, Tensor, Tensor]:
     return torch.ops.aten.native_layer_norm_backward(
         upstream, x, shape, mean, rstd, weight, bias, [True, True, True]
     )
-
-def of_input(
-    upstream: Tensor, x: Tensor, shape: List[int], mean: Tensor, rstd: Tensor,
-    weight: Optional[Tensor], bias: Optional[Tensor]
-) -> Tuple[Tensor]:
-    return torch.ops.aten.native_layer_norm_backward(
-        upstream, x, shape, mean, rstd, weight, bias, [True, False, False]
-    )[:1]
-"""
-"""Layer normalisation's gradients: the tracer knows neither the list of flags that
-PyTorch's operation takes, nor the gaps in what it gives back."""
+""")
 
 
-@cache
-def _layer_norm_gradients() -> torch.jit.CompilationUnit:
-    # Never freed: a trace points at the functions that it calls and does not own them.
-    return torch.jit.CompilationUnit(_LAYER_NORM_GRADIENTS)
-
-
-def _without_python(graph: GraphModule, tensors: list[Tensor]) -> Run:
-    """The graph as TorchScript, or as it is where that cannot be had.
-
-    TorchScript is deprecated in PyTorch 2.13, in which nothing else repeats operations
-    from C++ without a compiler.
-    """
+def _without_python(
+    graph: GraphModule, tensors: list[Tensor]
+) -> Callable[..., Sequence[Tensor]]:
+    """The graph as TorchScript, or as it is where that cannot be had."""
     try:
-        gradients = _layer_norm_gradients()
+        unit = _layer_norm_backward()
 
-        def of_all(*arguments: Any) -> Any:
-            return gradients.of_all(*arguments)
-
-        def of_input(*arguments: Any) -> Any:
-            return gradients.of_input(*arguments)
+        def layer_norm_backward(*arguments: Any) -> Any:
+            return unit.layer_norm_backward(*arguments[:-1])
 
         for node in graph.graph.nodes:
             if node.target is torch.ops.aten.native_layer_norm_backward.default:
-                node.target = of_all if all(node.args[-1]) else of_input
-                node.args = node.args[:-1]
+                node.target = layer_norm_backward
         with warnings.catch_warnings(), torch.no_grad():
             warnings.simplefilter("ignore")  # of deprecation, and of fixed shapes
             graph.recompile()
-            run: Run = torch.jit.trace(  # type: ignore[no-untyped-call]
+            run: Callable[..., Sequence[Tensor]] = torch.jit.trace(  # type: ignore[no-untyped-call]
                 graph, tuple(tensors), check_trace=False
             )
         return run

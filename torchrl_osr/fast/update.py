@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
 
 import torch
 from tensordict import TensorDictBase
@@ -25,15 +24,12 @@ class NonfiniteError(FloatingPointError):
 
     def __init__(self, losses: dict[str, float], gradients: list[str]) -> None:
         bad = [name for name, value in losses.items() if not math.isfinite(value)]
+        more = f" and {len(gradients) - 5} more" if len(gradients) > 5 else ""
         super().__init__(
-            f"not finite: losses {_listed(bad)}; gradients {_listed(gradients)}"
+            f"not finite: losses {', '.join(bad) or 'none'}; gradients "
+            f"{', '.join(gradients[:5]) or 'none'}{more}"
         )
         self.losses, self.gradients = losses, gradients
-
-
-def _listed(names: list[str], most: int = 5) -> str:
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return (", ".join(names[:most]) or "none") + more
 
 
 def fast_update(
@@ -51,21 +47,19 @@ def fast_update(
 
     It sums the ``loss_*`` entries, goes backward once, steps the optimizer, clears the
     gradients and moves the target networks. On a CPU it is up to twice as fast as these
-    lines of a training loop for small networks, with the same numbers. It lets the
-    losses of this package evaluate plain MLP critics in fewer, larger products
-    (:mod:`torchrl_osr.fast.critics`). From update number ``warm_up`` on, it repeats a
-    trace of the tensor operations (:mod:`torchrl_osr.fast.traced_update`).
+    lines of a training loop for small networks. Plain MLP critics of this package's
+    losses are evaluated in fewer, larger products. After ``warm_up`` updates it repeats
+    a trace of the tensor operations, with the same bits.
 
-    The trace follows everything that the loss keeps in attributes. When you change a
-    weight, ``gamma``, ``requires_grad`` or a hook, or call ``eval()``, the loss itself
-    runs and is traced again later. A loss that cannot be traced runs as it is, and a
-    warning says so. Use ``trace=False`` for a loss that reads numbers from elsewhere,
-    such as a global variable.
+    The trace follows everything that the loss keeps in attributes: change a weight,
+    ``gamma``, ``requires_grad`` or a hook, or call ``eval()``, and the loss itself runs
+    and is traced again later. A loss that cannot be traced runs as it is, and a warning
+    says so. Pass ``trace=False`` for a loss that reads numbers from elsewhere, such as
+    a global variable.
 
     Args:
         loss_module: any loss module whose ``loss_*`` entries may be summed.
-        optimizer: over its parameters. ``torch.optim.Adam(..., fused=True)`` is the
-            fastest.
+        optimizer: over its parameters; fused ones are the fastest.
         target_updater: moves the target networks after each update. Default: none.
 
     Keyword Args:
@@ -75,8 +69,7 @@ def fast_update(
         autocast_dtype: precision of the losses' matrix products, for instance
             ``torch.bfloat16``. Default: that of the parameters.
         trace: on a CPU, unless the loss is compiled. Default ``True``.
-        warm_up: updates before the trace, which costs as much as some hundred updates.
-            Default 100.
+        warm_up: updates before the trace, which takes about a second. Default 100.
 
     Returns:
         ``update(batch)``, which returns the detached losses and metrics and raises
@@ -87,27 +80,19 @@ def fast_update(
 
     Examples:
         >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_osr import InverseDynamicsLoss
+        >>> from torchrl.objectives import SoftUpdate
+        >>> from torchrl_osr import CQLLoss
         >>> from torchrl_osr.fast import fast_update
-        >>> from torchrl_osr.modules import tanh_gaussian_inverse_dynamics
-        >>> loss = InverseDynamicsLoss(tanh_gaussian_inverse_dynamics(11, 3))
+        >>> from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
+        >>> loss = CQLLoss(tanh_gaussian_actor(11, 3), critic_ensemble(11, 3))
         >>> optimizer = torch.optim.Adam(loss.parameters(), fused=True)
-        >>> update = fast_update(loss, optimizer)
-        >>> s, a = torch.randn(2, 64, 11), torch.rand(64, 3)
-        >>> batch = TensorDict({
-        ...     "observation": s[0], "action": a, "perturbed": {"observation": s[0]},
-        ...     "next": {"observation": s[1], "done": torch.zeros(64, 1).bool()}}, [64])
-        >>> for _ in range(3):
-        ...     losses = update(batch)
+        >>> update = fast_update(loss, optimizer, SoftUpdate(loss, tau=5e-3))
+        >>> # for batch in buffer: losses = update(batch)
     """
     compiled = loss_module._compiled_call_impl is not None
     if not compiled and next(loss_module.parameters()).device.type == "cpu":
         fuse_critics(loss_module)
-    gradients = partial(
-        LossGradients, loss_module, autocast_dtype, trace=trace, warm_up=warm_up
-    )
-    between = None
+    parameters: list[Sequence[nn.Parameter] | None] = [None]
     if policy_delay > 1:
         delayed = set(policy_params)
         rest = [each for each in loss_module.parameters() if each not in delayed]
@@ -117,8 +102,14 @@ def fast_update(
                 f"parameters to train in between; there are {len(delayed)} and "
                 f"{len(rest)}."
             )
-        between = gradients(parameters=rest)
-    return Update(gradients(), optimizer, _mover(target_updater), policy_delay, between)
+        parameters.append(rest)
+    gradients = [
+        LossGradients(
+            loss_module, autocast_dtype, parameters=each, trace=trace, warm_up=warm_up
+        )
+        for each in parameters
+    ]
+    return Update(gradients, optimizer, _mover(target_updater), policy_delay)
 
 
 class Update:
@@ -132,18 +123,13 @@ class Update:
 
     def __init__(
         self,
-        gradients: LossGradients,
+        gradients: list[LossGradients],
         optimizer: torch.optim.Optimizer,
         move_targets: Callable[[], None],
         delay: int,
-        between: LossGradients | None,
     ) -> None:
-        self.loss_module, self.optimizer, self.count = (
-            gradients.loss_module,
-            optimizer,
-            0,
-        )
-        self._gradients, self._between = gradients, between or gradients
+        self.loss_module, self.optimizer = gradients[0].loss_module, optimizer
+        self.gradients, self.count = gradients, 0
         self._move_targets, self._delay = move_targets, delay
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
@@ -151,7 +137,7 @@ class Update:
         self.count += 1
         whole = self.count % self._delay == 0
         try:
-            losses = (self._gradients if whole else self._between)(batch)
+            losses = self.gradients[0 if whole else 1](batch)
             self._check_finite(losses)
             self.optimizer.step()
         finally:

@@ -21,11 +21,7 @@ from pickle import UnpicklingError
 from typing import Any
 
 import torch
-from torchrl.checkpoint import (
-    Checkpoint,
-    CheckpointAdapter,
-    CheckpointError,
-)
+from torchrl.checkpoint import Checkpoint, CheckpointAdapter, CheckpointError
 from torchrl.data import PrioritizedSampler
 
 from torchrl_osr._files import check_disk_space
@@ -48,13 +44,10 @@ class WeightsOnlyAdapter(CheckpointAdapter):
 
     def load(self, component: Any, path: Path, *, map_location: Any, **_: Any) -> None:
         """Restore the component's state from the folder ``path``."""
+        file = path / self.filename
         try:
-            state = torch.load(
-                path / self.filename, map_location=map_location, weights_only=True
-            )
-        except (
-            UnpicklingError
-        ) as error:  # its message says how to unpickle all the same
+            state = torch.load(file, map_location=map_location, weights_only=True)
+        except UnpicklingError as error:  # whose message says how to unpickle it
             raise ValueError(
                 f"{self.filename} holds other things than tensors, which are never "
                 "unpickled"
@@ -67,11 +60,7 @@ class WeightsOnlyAdapter(CheckpointAdapter):
 def _check_fits(here: Mapping[str, Any], there: Mapping[str, Any]) -> None:
     """Raise before anything is overwritten; tensordict's own error names no shapes."""
     shapes, saved = (
-        {
-            key: tuple(value.shape)
-            for key, value in state.items()
-            if torch.is_tensor(value)
-        }
+        {key: tuple(each.shape) for key, each in state.items() if torch.is_tensor(each)}
         for state in (here, there)
     )
     differences = [
@@ -193,20 +182,17 @@ class Checkpoints:
         return max(self._found(), default=None)
 
     def _found(self) -> list[Path]:
-        """Checkpoints, oldest first."""
         return sorted(self.folder.glob("checkpoint-*.torchrl"))
 
     def check_room(
         self, loss_module: torch.nn.Module, optimizer: torch.optim.Optimizer
     ) -> None:
         """Raise an OSError unless all checkpoints of a run will fit on the disk."""
-        groups = optimizer.param_groups
-        trained = [each for group in groups for each in group["params"]]
+        trained = [each for group in optimizer.param_groups for each in group["params"]]
         # The networks, and Adam's two moments of what is trained.
         held = [*loss_module.parameters(), *loss_module.buffers(), *trained, *trained]
         size = sum(each.numel() * each.element_size() for each in held)
-        # The best, the newest, and one being written.
-        number = self.kept + 3
+        number = self.kept + 3  # the best, the newest, and one being written
         there = sum(path.stat().st_size for path in self.folder.glob("*.torchrl"))
         check_disk_space(self.folder, number * size - there, f"{number} checkpoints")
 
@@ -229,10 +215,7 @@ class Checkpoints:
             os.replace(beside, path)
 
     def check_folder(self) -> None:
-        """Raise a FileNotFoundError if the folder is gone.
-
-        TorchRL would make it anew, and the run would seem to end well.
-        """
+        """Raise a FileNotFoundError if the folder is gone; TorchRL would remake it."""
         if not self.folder.is_dir():
             raise FileNotFoundError(
                 f"{self.folder} was removed or renamed while the run was going on. "
@@ -254,12 +237,9 @@ class Checkpoints:
             path.unlink()
 
     def restore(self) -> Path | None:
-        """Restore the newest undamaged checkpoint.
+        """Restore the newest undamaged checkpoint; return its path, if there is one.
 
         What a killed process left half written is removed: only one run uses a folder.
-
-        Returns:
-            Path of the checkpoint, or ``None`` if the folder holds none.
 
         Raises:
             CheckpointError: if a checkpoint does not fit the components, or every one
@@ -267,10 +247,7 @@ class Checkpoints:
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         for leftover in self.folder.glob(".*.torchrl.*"):
-            if leftover.is_dir():
-                shutil.rmtree(leftover)
-            else:
-                leftover.unlink()
+            shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
         found = self._found()
         for path in reversed(found):
             damage = find_damage(path)
