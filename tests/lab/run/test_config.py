@@ -44,9 +44,14 @@ def test_keys_that_were_added_are_refused(key):
         ("loss.recovery_weight", "x", "loss.recovery_weight: Value 'x'"),
         ("env.id", "???", "lacks env.id"),
         ("trainer.steps", 0, "trainer.steps must be at least 1, got 0"),
-        ("data.held_out", float("nan"), "data.held_out must be a number"),
+        (
+            "data.held_out",
+            float("nan"),
+            "data.held_out must be between 0 and 1, got nan",
+        ),
         ("optim.tau", 5.0, "optim.tau must be between 0 and 1, got 5"),
         ("seed", -1, "seed must be between 0"),
+        ("data.storage", "tape", "data.storage must be one of memory, disk, got tape"),
     ],
 )
 def test_wrong_values_of_a_foreign_run_are_named(tmp_path, key, value, reason):

@@ -117,7 +117,7 @@ with open_run(composed("train"), Path(sys.argv[1]), job()):
 """
 
 
-def test_a_second_process_in_the_folder_is_refused(tmp_path, caplog):
+def test_a_second_process_in_the_folder_is_refused(tmp_path):
     arguments = [sys.executable, "-c", HOLDER, str(tmp_path)]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
@@ -128,21 +128,18 @@ def test_a_second_process_in_the_folder_is_refused(tmp_path, caplog):
             claim(tmp_path)
         found = status(tmp_path)
         assert found["pid"] == holder.pid, "left as it was"
-        assert read_status(tmp_path) == found | {"reason": f"{process} is at work"}
+        assert read_status(tmp_path) == found
         holder.kill()
     # A lock does not outlive its process.
     killed = found | {"status": "killed", "reason": f"{process} is gone"}
     assert read_status(tmp_path) == killed
     claim(tmp_path)
-    assert f"was begun by {process} and did not end" in caplog.text
 
 
 def test_a_process_of_another_machine_may_still_run(tmp_path):
     found = {"status": "running", "pid": os.getpid(), "host": "elsewhere"}
     (tmp_path / "status.json").write_text(json.dumps(found))
-    read = read_status(tmp_path)
-    assert read["status"] == "running"
-    assert "cannot see whether it still runs" in read["reason"]
+    assert read_status(tmp_path) == found
     assert [path.name for path in tmp_path.iterdir()] == ["status.json"]
 
 

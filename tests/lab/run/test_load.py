@@ -168,7 +168,7 @@ def test_an_exported_policy_needs_neither_configuration_nor_environment(tmp_path
     with pytest.raises(ValueError, match=r"trust=\[absent\]"):
         load_run_policy(checkpoints_of(folder)[-1])
     assert "absent" not in sys.modules
-    assert policy.record["source"]["data"]["path"] == ""
+    assert policy.record["source"]["data"]["path"] is None
 
 
 # -- several runs as one policy ------------------------------------------------------

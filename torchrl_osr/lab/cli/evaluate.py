@@ -81,11 +81,7 @@ def main(cfg: DictConfig) -> None:
 
 
 def finished_runs(sweep: str) -> list[Path]:
-    """Return folders of a sweep's finished runs; print the others.
-
-    Raises:
-        ValueError: there is none.
-    """
+    """Return folders of a sweep's finished runs; print the others."""
     runs = []
     for folder in find_runs([Path(sweep)]):
         try:
@@ -102,12 +98,7 @@ def finished_runs(sweep: str) -> list[Path]:
 
 
 def evaluate_sweep(config: EvaluateConfig) -> None:
-    """Evaluate every finished run below a folder, ``jobs`` at once; print a table.
-
-    Raises:
-        ValueError: if there is no finished run, or, when all others are done, if some
-            could not be evaluated.
-    """
+    """Evaluate every finished run below a folder, ``jobs`` at once; print a table."""
     runs = finished_runs(str(config.sweep))
     rows: dict[Path, dict[str, str]] = {}
     failed = []
@@ -161,10 +152,9 @@ def evaluate_one_of_many(config: EvaluateConfig, folder: Path) -> dict[str, str]
 
 
 def shares(results: Mapping[str, Any]) -> dict[str, tuple[int, float, float, float]]:
-    """Return number of states, and the recovery rate of all checkpoints with interval.
+    """Return number of states and recovery rate with interval, by group of states.
 
-    Returns:
-        By group; and for the recoverable ones also by disturbance.
+    For the recoverable ones they are also by disturbance.
     """
     of_each = "group", "disturbance", "walk"
     group, disturbance, walk = (np.array(results[key]) for key in of_each)

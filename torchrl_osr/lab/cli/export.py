@@ -20,6 +20,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from torchrl_osr._extras import needed_by
 from torchrl_osr.lab.run.load import load_run_policy
 from torchrl_osr.policy import Policy, load_policy
 from torchrl_osr.policy.export import SUFFIXES
@@ -42,25 +43,11 @@ def main() -> None:
         epilog="The suffix decides: .safetensors for load_policy, .onnx for ONNX "
         "Runtime, .pt2 for torch.export. More in docs/deploy.md.",
     )
-    parser.add_argument(
-        "source",
-        type=Path,
-        help="a run's folder, a checkpoint in it, or a .safetensors",
-    )
-    parser.add_argument("path", type=Path, help="the file to write")
-    parser.add_argument(
-        "--output",
-        choices=("action", "value"),
-        default="action",
-        help="what a graph computes (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--trust",
-        action="append",
-        default=[],
-        metavar="MODULE",
-        help="of your own, that the run may name; may be repeated",
-    )
+    add = parser.add_argument
+    add("source", type=Path, help="a run's folder, a checkpoint, or a .safetensors")
+    add("path", type=Path, help="the file to write")
+    add("--output", choices=("action", "value"), default="action", help="of a graph")
+    add("--trust", action="append", default=[], metavar="MODULE", help="see train")
     options = parser.parse_args()
     if options.path.suffix not in (SUFFIX, *SUFFIXES):
         parser.error(f"the path must end in {SUFFIX}, {' or '.join(SUFFIXES)}.")
@@ -79,11 +66,7 @@ def main() -> None:
 
 
 def check(policy: Policy, path: Path, output: str) -> float:
-    """Largest deviation of the written file from the policy, at random observations.
-
-    Raises:
-        ValueError: it is larger than :data:`TOLERANCE`.
-    """
+    """Largest deviation of the written file from the policy, at random observations."""
     generator = torch.Generator().manual_seed(0)
     noise = torch.randn(ROWS, policy.observation_size, generator=generator)
     observation = policy.loc + policy.scale * noise
@@ -108,13 +91,8 @@ def read(path: Path, output: str) -> Function:
         return policy.value if output == "value" else policy.act
     if path.suffix == ".pt2":
         return torch.export.load(path).module()
-    try:
+    with needed_by("a check of the ONNX file needs", "export"):
         import onnxruntime
-    except ImportError as error:
-        raise ImportError(
-            f"{path} was written; checking it needs onnxruntime: "
-            "pip install torchrl-osr[export]"
-        ) from error
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
 
     def run(**inputs: Tensor) -> Tensor:

@@ -160,8 +160,7 @@ def read_environment(env: EnvConfig) -> EnvironmentSpec:
 
     Raises:
         ValueError: there is no such environment, its spaces are not supported, or a
-            number is set to another value, as in a run of another version of it.
-        ImportError: a package that the environment needs is not installed.
+            number was another one when the run was trained.
     """
     from torchrl_osr.lab.data import environment_spec  # needs Gymnasium
 
@@ -175,11 +174,7 @@ def read_environment(env: EnvConfig) -> EnvironmentSpec:
 
 
 def try_out(env_id: str) -> None:
-    """Reset an environment and take a step: a broken one is found before training.
-
-    Raises:
-        RuntimeError: if that fails, or gives no finite numbers.
-    """
+    """Reset an environment and take a step: a broken one is found before training."""
     from torchrl_osr.lab.data import make_environment  # needs Gymnasium
 
     with closing(make_environment(env_id)) as env:

@@ -52,6 +52,14 @@ SHARES = (
 )
 """Keys between 0 and 1."""
 
+CHOICES = {
+    "data.storage": ("memory", "disk"),
+    "logger.kind": ("csv", "tensorboard", "wandb"),
+    "optim.actor_schedule": ("constant", "cosine"),
+    "optim.qvalue_schedule": ("constant", "cosine"),
+    "trainer.precision": ("float32", "bfloat16"),
+}
+
 
 def checked(config: DictConfig, trust: Sequence[str] = ()) -> TrainConfig:
     """Check all of a run's configuration, of whatever origin.
@@ -82,14 +90,10 @@ def checked(config: DictConfig, trust: Sequence[str] = ()) -> TrainConfig:
 
 
 def check_types(schema: DictConfig, values: Any, prefix: str = "") -> DictConfig:
-    """Return values with the types of a schema.
+    """Return values with the types of a schema; name what the schema refuses.
 
     Hydra refuses a mistyped ``key=value``, but adds ``+key=value`` even to a typed
     group, where nothing would read it.
-
-    Raises:
-        ValueError: naming a key that the schema lacks or whose value is of another
-            type.
     """
     try:
         typed = OmegaConf.merge(schema, values)
@@ -116,28 +120,31 @@ def check_values(values: Mapping[str, Any]) -> None:
         ValueError: optim.gamma must be between 0 and 1, got 1.5.
     """
     for key, value in values.items():
-        if isinstance(value, float) and math.isnan(value):
-            raise ValueError(f"{key} must be a number, got nan.")
-        if key in SHARES and not 0 <= value <= 1:
-            raise ValueError(f"{key} must be between 0 and 1, got {value}.")
-        counts = key.startswith(("trainer.", "dynamics.")) and key not in MAY_BE_0
-        if counts and type(value) is int and value < 1:
-            raise ValueError(f"{key} must be at least 1, got {value}.")
-        if key in ("seed", "data.seed") and not 0 <= value < 2**32:
-            raise ValueError(f"{key} must be between 0 and 2**32 - 1, got {value}.")
+        wanted = ""
+        if key in CHOICES and value not in CHOICES[key]:
+            wanted = f"one of {', '.join(CHOICES[key])}"
+        elif key in SHARES and not 0 <= value <= 1:
+            wanted = "between 0 and 1"
+        elif key in ("seed", "data.seed") and not 0 <= value < 2**32:
+            wanted = "between 0 and 2**32 - 1"
+        elif isinstance(value, float) and math.isnan(value):
+            wanted = "a number"
+        elif (
+            type(value) is int
+            and value < 1
+            and key.startswith(("trainer.", "dynamics."))
+            and key not in MAY_BE_0
+        ):
+            wanted = "at least 1"
+        if wanted:
+            raise ValueError(f"{key} must be {wanted}, got {value}.")
 
 
 # -- files ---------------------------------------------------------------------------
 
 
 def read_run(folder: Path, trust: Sequence[str] = ()) -> TrainConfig:
-    """Read and check the configuration in the folder of a run.
-
-    Raises:
-        OSError: if it cannot be read.
-        ValueError: naming the file, if :func:`read_config` or :func:`checked` refuses
-            it.
-    """
+    """Read and check the configuration in the folder of a run."""
     config = OmegaConf.create(read_config(folder))
     try:
         return checked(config, trust)
@@ -146,12 +153,7 @@ def read_run(folder: Path, trust: Sequence[str] = ()) -> TrainConfig:
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """Read the configuration in the folder of a run; nothing is built.
-
-    Raises:
-        OSError: if it cannot be read.
-        ValueError: if it is damaged, or of another version.
-    """
+    """Read the configuration in the folder of a run; refuse that of another version."""
     content = read_yaml(folder / CONFIG)
     found = content.pop("format", 1)
     if found != FORMAT:
@@ -172,12 +174,7 @@ def write_config(folder: Path, config: TrainConfig) -> None:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a small YAML file into plain containers.
-
-    Raises:
-        OSError: if it cannot be read.
-        ValueError: naming the file, if it is no YAML mapping, or has more than 64 KiB.
-    """
+    """Read a small YAML mapping; a ValueError names a damaged file."""
     try:
         content = yaml.safe_load(read_text(path, max_bytes=MAX_BYTES))
     except (yaml.YAMLError, RecursionError) as error:
@@ -193,16 +190,10 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def check_targets(config: Mapping[str, Any], trust: Sequence[str] = ()) -> None:
-    """Raise unless every ``_target_`` is one of our networks or losses.
+    """Raise a ValueError unless every ``_target_`` is one of our networks or losses.
 
-    Args:
-        config: of the run.
-        trust: modules whose public names, those in ``__all__`` or defined in the module
-            itself, are allowed too. They are imported, if need be from the current
-            folder.
-
-    Raises:
-        ValueError: naming the target, or a trusted module that is not there.
+    Public names of the modules that the user trusts, those in ``__all__`` or defined in
+    the module itself, are allowed too.
     """
     allowed = {f"torchrl_osr.{name}" for name in objectives.__all__}
     for name in (*TARGET_PACKAGES, *trust):

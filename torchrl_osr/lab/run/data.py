@@ -74,10 +74,6 @@ def load_data(
     """
     from torchrl_osr.lab.data import load_dataset  # needs Gymnasium; networks do not
 
-    if options.storage not in ("memory", "disk"):
-        raise ValueError(
-            f"data.storage must be memory or disk, got {options.storage!r}."
-        )
     return load_dataset(
         env.name,
         options.source,

@@ -88,11 +88,7 @@ def file_name(suite: SuiteConfig) -> str:
 def evaluate_files(
     config: EvaluateConfig, path: Path, files: list[Path]
 ) -> tuple[Path, dict[str, Any]]:
-    """Evaluate checkpoints, unless ``path`` has the results; return these, too.
-
-    Raises:
-        ValueError: ``path`` has results of other settings, or of more checkpoints.
-    """
+    """Evaluate checkpoints, unless ``path`` has the results; return these, too."""
     torchrl_logger.setLevel("WARNING")
     torch.set_num_threads(config.num_threads)
     request = _requested(config, files, path.parent)
@@ -197,14 +193,8 @@ def play_states(
 ) -> dict[str, Any]:
     """Play all checkpoints from every recoverable state of a task.
 
-    Returns:
-        JSON-compatible: ``env``, ``data``, ``half``; of each state ``group``,
-        ``disturbance`` (kind and strength) and ``walk``; and ``evaluations``, with
-        ``step`` and, for each state, 1 if it came ``back`` and 0 if not.
-
-    Raises:
-        ValueError: there are no such states, or the run is of another version of the
-            task.
+    ``back`` of an evaluation has 1 for each state that it came back from, and 0 for
+    others.
     """
     half = config.suite.half
     assert half is not None
@@ -253,15 +243,12 @@ def make_disturbances(
 
     Args:
         configs: by name.
-        trained: its networks are those that are attacked.
+        trained: its networks are attacked.
         scale: standard deviation of each observation entry in the data, ``[S]``; takes
             the place of a wrapper's ``unit: data``.
 
     Keyword Args:
         seed: of the attacks' draws. Default 0.
-
-    Raises:
-        ValueError: if a disturbance has both wrapper and attack, or neither.
     """
     made = []
     for name, config in configs.items():
@@ -291,11 +278,7 @@ def impossible(
     *,
     attacks: bool = True,
 ) -> dict[str, str]:
-    """Return the disturbances that environment or policy rule out, and why, by name.
-
-    Raises:
-        ValueError: none is left.
-    """
+    """Return the disturbances that environment or policy rule out, and why, by name."""
     configs, left_out = suite.disturbances, {}
     for name, config in configs.items():
         if config.attack is None:
@@ -338,10 +321,7 @@ def _obstacle(kind: str, trained: TrainedRun) -> str:
 def _requested(
     config: EvaluateConfig, files: list[Path], folder: Path
 ) -> dict[str, Any]:
-    """Everything that decides the results: settings, checkpoints' digests, versions.
-
-    Checkpoints are named as seen from a folder.
-    """
+    """Everything that decides the results: settings, checkpoints' digests, versions."""
     folder = folder.absolute()
     names = [each.absolute().relative_to(folder).as_posix() for each in files]
     request: dict[str, Any] = {

@@ -12,6 +12,7 @@ import subprocess
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
+from glob import glob
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +21,7 @@ from filelock import FileLock, Timeout
 from hydra.conf import HydraConf
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import Container, DictConfig, OmegaConf
+from omegaconf import Container, DictConfig, ListConfig, OmegaConf
 from torchrl.checkpoint import CheckpointError
 
 from torchrl_osr._files import read_json, write_atomically, write_json
@@ -110,9 +111,8 @@ def open_run(
         with _refusal_noted(folder):
             if cfg.resume is None:
                 trust += [name] if (name := module_of(cfg.env.id)) else []
-                for group in (cfg.data, cfg.dynamics):
-                    if group.path and Path(group.path).expanduser().exists():
-                        group.path = str(Path(group.path).expanduser().absolute())
+                cfg.data.path = _absolute(cfg.data.path)
+                cfg.dynamics.path = _absolute(cfg.dynamics.path)
             else:
                 cfg = resumed(folder, cfg, overrides)
             config = checked(cfg, trust)
@@ -121,6 +121,16 @@ def open_run(
             choices = OmegaConf.load(folder / HYDRA).hydra.runtime.choices
             method = method_name(choices.loss, choices.get("recovery"))
             yield Run(config, folder, spec.simulated, method)
+
+
+def _absolute(path: Any) -> Any:
+    """The path of a file, a list or a pattern of them, seen from any folder."""
+    if isinstance(path, ListConfig):
+        return [_absolute(each) for each in path]
+    if path is None:
+        return None
+    full = str(Path(path).expanduser().absolute())
+    return full if Path(full).exists() or glob(full) else path
 
 
 def resumed(folder: Path, composed: DictConfig, overrides: Sequence[str]) -> DictConfig:
@@ -134,13 +144,11 @@ def resumed(folder: Path, composed: DictConfig, overrides: Sequence[str]) -> Dic
     Raises:
         ValueError: if an override is no setting of the run.
     """
-    there = OmegaConf.create(read_config(folder))
+    start: dict[str, Any] = {"resume": None, "trust": [], "force": False}
+    there = OmegaConf.create(read_config(folder) | start)
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key, absent = override.key_or_group, object()
         value = OmegaConf.select(composed, key, default=absent)
-        if key in ("resume", "trust", "force"):
-            there[key] = value
-            continue
         if absent in (value, OmegaConf.select(there, key, default=absent)):
             raise ValueError(
                 f"resume={folder} continues that run, and {override.input_line} is "
@@ -149,8 +157,6 @@ def resumed(folder: Path, composed: DictConfig, overrides: Sequence[str]) -> Dic
         if isinstance(value, Container):
             value = OmegaConf.to_container(value, resolve=True)
         OmegaConf.update(there, key, value, merge=False)
-    for key, default in (("resume", None), ("trust", []), ("force", False)):
-        there.setdefault(key, default)
     return there
 
 
@@ -270,7 +276,6 @@ def _lock(folder: Path) -> Iterator[None]:
 def _status(folder: Path, trust: Sequence[str]) -> Iterator[None]:
     """Keep ``status.json`` true; log the command that continues a preempted run."""
     with signals_raised():
-        _warn_if_killed(folder)
         write_json(folder / STATUS, _running())
         try:
             with interrupts_kept():
@@ -296,45 +301,33 @@ def _status(folder: Path, trust: Sequence[str]) -> Iterator[None]:
 def read_status(folder: Path) -> dict[str, Any]:
     """Read ``status.json``; the status of a run whose process is gone is ``killed``.
 
-    A process on another machine that does not hold the lock may be gone, or the file
-    system has no locks: then ``running`` stays, and the ``reason`` says so.
+    A run on another machine stays ``running``: its lock may not be seen from here.
 
     Raises:
         OSError: if the file cannot be read.
         ValueError: if it is damaged.
     """
     found = read_json(folder / STATUS)
-    if found.get("status") != "running" or "host" not in found:
+    if found.get("status") != "running" or found.get("host") != platform.node():
         return found
-    process, free = _process(found), True
     try:
         if (folder / LOCK).exists():  # not in a copy; looking leaves no file behind
             FileLock(folder / LOCK).acquire(timeout=0).lock.release()
     except Timeout:
-        return found | {"reason": f"{process} is at work"}
-    except OSError:
-        free = False
-    if free and found["host"] == platform.node():
-        return found | {"status": "killed", "reason": f"{process} is gone"}
-    return found | {
-        "reason": f"{process}; {platform.node()} cannot see whether it still runs"
-    }
+        return found
+    return found | {"status": "killed", "reason": f"{_process(found)} is gone"}
 
 
 def check_ours(folder: Path) -> None:
     """Raise a FileNotFoundError if a run's folder is not this process's any more."""
     if not _is_ours(folder):
-        raise FileNotFoundError(
-            f"{folder} was removed or renamed while the run was going on. Start the "
-            "run again in a folder that stays."
-        )
+        raise FileNotFoundError(f"{folder} was removed or renamed during the run.")
 
 
 def _is_ours(folder: Path) -> bool:
-    try:
+    with suppress(OSError, ValueError):
         return read_json(folder / STATUS) == _running()
-    except (OSError, ValueError):
-        return False
+    return False
 
 
 def _running() -> dict[str, Any]:
@@ -345,24 +338,12 @@ def _process(found: Mapping[str, Any]) -> str:
     return f"process {found.get('pid')} on {found.get('host')}"
 
 
-def _warn_if_killed(folder: Path) -> None:
-    with suppress(OSError, ValueError):
-        found = read_json(folder / STATUS)
-        if found.get("status") == "running":
-            log.warning(
-                f"This run was begun by {_process(found)} and did not end. The lock is "
-                "free: that process is gone, or on another machine to which this file "
-                "system does not pass on locks."
-            )
-
-
 def _write_end(folder: Path, end: dict[str, Any]) -> None:
     """Write how a run has ended badly, or warn that this cannot be written."""
-    if not _is_ours(folder):
-        return
     try:
-        with signals_noted():
-            write_json(folder / STATUS, end)
+        if _is_ours(folder):
+            with signals_noted():
+                write_json(folder / STATUS, end)
     except OSError as error:
         log.warning(f"{error}: the file still says that the run is running.")
 
@@ -377,18 +358,12 @@ def package_versions() -> dict[str, str]:
 
 @functools.cache  # of the code that runs: a later commit changes nothing in it
 def code_versions() -> dict[str, str]:
-    """Return :func:`package_versions`, and the commit of a checkout.
-
-    ``-dirty`` is behind the commit where files were changed since.
-    """
-    root = Path(__file__).parents[3]
+    """Return :func:`package_versions`, and ``git describe --dirty`` of a checkout."""
+    root, commit = Path(__file__).parents[3], {}
     describe = "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"
-    commit = {}
     if (root / ".git").exists():
         with suppress(OSError, subprocess.SubprocessError):
-            done = subprocess.run(
-                ["git", "-C", str(root), *describe],
-                capture_output=True, text=True, timeout=10, check=True,
-            )  # fmt: skip
+            command = ["git", "-C", str(root), *describe]
+            done = subprocess.run(command, capture_output=True, text=True, check=True)
             commit = {"commit": done.stdout.strip()}
     return package_versions() | commit

@@ -55,11 +55,7 @@ class TrainedRun(NamedTuple):
 
 
 def run_folder_of(path: Path | str) -> Path:
-    """Return the folder of the run that a checkpoint, or the folder itself, belongs to.
-
-    Raises:
-        FileNotFoundError: if nothing is there, or no run.
-    """
+    """Return the folder of the run that a checkpoint, or the folder itself, is of."""
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"there is no run and no checkpoint at {path}.")
@@ -73,11 +69,7 @@ def run_folder_of(path: Path | str) -> Path:
 
 
 def checkpoints_of(folder: Path | str) -> list[Path]:
-    """Return the checkpoints that a run has kept, oldest first, without the best.
-
-    Raises:
-        FileNotFoundError: if there is no run, or it has no checkpoint yet.
-    """
+    """Return the checkpoints that a run has kept, oldest first, without the best."""
     folder = run_folder_of(folder)
     found = sorted((folder / CHECKPOINTS).glob("checkpoint-*.torchrl"))
     if not found:
@@ -123,11 +115,7 @@ def load_trained(path: Path | str, *, trust: Sequence[str] = ()) -> TrainedRun:
 def restore(
     path: Path, config: TrainConfig, learner: Learner, norm: ObservationNorm
 ) -> TrainedRun:
-    """Load a checkpoint's averaged policy, critics and statistics into networks.
-
-    Raises:
-        CheckpointError: if it does not fit the configuration.
-    """
+    """Load a checkpoint's averaged policy, critics and statistics into networks."""
     average = AveragedModel(learner.actor)
     checkpoint = safe_checkpoint(
         loss_module=learner.objective, observation_norm=norm, policy_average=average
@@ -161,11 +149,7 @@ def load_run_policy(path: Path | str, trust: Sequence[str] = ()) -> Policy:
 
 
 def policy_of(run: TrainedRun) -> Policy:
-    """Copy the policy of a run, in the units of its environment.
-
-    Raises:
-        ValueError: the networks are of another kind than the package's.
-    """
+    """Copy the policy of a run, in the units of its environment."""
     config = run.config
     low, high = config.env.action_low, config.env.action_high
     return policy_from_loss(
@@ -180,7 +164,7 @@ def policy_of(run: TrainedRun) -> Policy:
             "seed": config.seed,
             "discount": config.optim.gamma,
             # Without the place of a log on this machine.
-            "data": asdict(config.data) | {"path": Path(config.data.path or "").name},
+            "data": asdict(config.data) | {"path": None},
         },
     )
 

@@ -64,12 +64,9 @@ def prepare_machine(run: Run) -> tuple[torch.device, torch.dtype | None]:
 
 
 def make_loggers(run: Run) -> list[Logger]:
-    """Make the CSV logger, which figures are drawn from, and the one that is chosen.
+    """Make the CSV logger, which figures are drawn from, and the chosen one.
 
     A continued run continues its W&B run.
-
-    Raises:
-        ImportError: if the logger's package is not installed.
     """
     config, folder, kind = run.config, run.folder, run.config.logger.kind
     loggers: list[Logger] = [CSVLogger("csv", log_dir=str(folder))]
@@ -139,15 +136,11 @@ def optimizer_of(
 
 
 def averaged(network: torch.nn.Module, share: float) -> AveragedModel:
-    """Return an exponential average of a network's weights, which is what is evaluated.
+    """Return an exponential average of a network's weights; it is evaluated.
 
-    It forgets the first weights, which would stay in it for longer than a short run
-    lasts: until update number ``10 / share`` it is of about the last tenth of all
-    updates.
-
-    Args:
-        network: is copied.
-        share: of the new weights at each update; 1 for the weights themselves.
+    ``share`` is that of the new weights at each update. The first weights would stay in
+    the average for longer than a short run lasts: until update number ``10 / share`` it
+    covers about the last tenth of all updates.
     """
 
     @torch.no_grad()
