@@ -153,6 +153,21 @@ def test_a_trace_has_the_bits_of_the_loss(name, make_batch):
         assert_same_bits(given, expected)
 
 
+def test_wide_networks_have_the_bits_too(make_batch):
+    """TorchScript, optimised, would join the products of two layers and round anew."""
+    cells = {"num_cells": [256, 256]}
+    actor, critics = (
+        tanh_gaussian_actor(*SIZES, **cells),
+        critic_ensemble(*SIZES, **cells),
+    )
+    loss = OSRVLoss(actor, critics, tanh_gaussian_inverse_dynamics(*SIZES, **cells))
+    SoftUpdate(loss, tau=0.1)
+    batch = single(make_batch(6))
+    eager, traced = pair(loss, batch)
+    assert traced.is_traced
+    assert_same_bits(results(traced, loss, batch), results(eager, loss, batch))
+
+
 def test_without_torchscript_the_graph_runs_from_python(make_batch, monkeypatch):
     monkeypatch.delattr(torch.jit, "trace")
     loss = make("osr")

@@ -45,31 +45,18 @@ class Interrupted(SystemExit):
 
 
 class StopRequest:
-    """Whether the process was asked to end.
-
-    Attributes:
-        signal: the first of the signals that came, or ``None``.
-    """
+    """Request to end the process: the first signal that came, or ``None``."""
 
     signal: signal.Signals | None = None
 
 
 @contextmanager
 def signals_noted() -> Iterator[StopRequest]:
-    """Note SIGTERM, SIGINT and SIGHUP instead of dying of them.
+    """Note SIGTERM, SIGINT and SIGHUP in a :class:`StopRequest`.
 
     A second Ctrl-C raises :class:`KeyboardInterrupt` at once. Handlers are installed in
     the main thread only, since Python runs them there, and only in place of Python's
-    defaults and of :func:`signals_raised`: a handler that somebody else has installed
-    stays, such as submitit's.
-
-    Examples:
-        >>> import os, signal
-        >>> from torchrl_osr.trainers.interruption import signals_noted
-        >>> with signals_noted() as request:
-        ...     os.kill(os.getpid(), signal.SIGTERM)
-        ...     request.signal.name
-        'SIGTERM'
+    defaults and of :func:`signals_raised`: other handlers stay, such as submitit's.
     """
     request = StopRequest()
 
@@ -87,10 +74,9 @@ def signals_noted() -> Iterator[StopRequest]:
 
 @contextmanager
 def signals_raised() -> Iterator[None]:
-    """Raise :class:`Interrupted` at once on SIGTERM, SIGINT and SIGHUP.
+    """Raise :class:`Interrupted` at once on the signals, see :func:`signals_noted`.
 
-    For what can be repeated, around trainings that note the signals. Where handlers are
-    installed: see :func:`signals_noted`.
+    For work that can be repeated, around trainings that note the signals.
     """
 
     def stop(number: int, frame: FrameType | None) -> None:

@@ -57,11 +57,10 @@ class Evaluation:
 class OfflineTrainer(Trainer):
     """Train on a replay buffer, with evaluation, checkpoints and resume.
 
-    It knows no algorithm: one step is a batch and one ``update`` on it. A killed run
-    continues from its newest whole checkpoint and ends with the same bits as one that
-    was never killed (on the same machine and libraries, on a CPU): networks, optimizer,
-    targets, random generators, the order or priorities of the buffer's sampler, and
-    ``components`` are restored.
+    One step is a batch and one ``update`` on it. A killed run continues from its newest
+    whole checkpoint and ends with the same bits as one that was never killed (on the
+    same machine and libraries, on a CPU): networks, optimizer, targets, random
+    generators, the sampler's order or priorities, and ``components`` are restored.
 
     Args:
         update: one gradient step; :func:`~torchrl_osr.fast.fast_update` returns it from
@@ -78,13 +77,11 @@ class OfflineTrainer(Trainer):
         components: more state to checkpoint, by name: a transform with a generator, a
             learning rate schedule, an average of the weights.
         evaluation: run before the first step, at its interval and at the end, after the
-            checkpoint of the step. The results are in ``history``. One that fails is
-            logged and counted in ``failed_evaluations``; the run goes on. Default:
-            none.
+            checkpoint. The results are in ``history``. One that fails later is in
+            ``failed_evaluations``, and the run goes on. Default: none.
         checkpoint_interval: steps between checkpoints. Default: that of the evaluation,
             or 5000.
-        checkpoints_kept: number of regular checkpoints that stay, beside the newest
-            and the best. Default 2.
+        checkpoints_kept: regular ones, beside the newest and the best. Default 2.
         loggers: TorchRL loggers; all get every number. Default: none.
         log_interval: steps between log entries, which are means over them. Default 200.
         value_limits: largest plausible magnitude of a logged mean, by name; a larger
@@ -94,16 +91,13 @@ class OfflineTrainer(Trainer):
         progress: show a progress bar on a terminal; elsewhere a line is logged every
             half minute. Default ``True``.
 
-    Raises:
-        ValueError: while training, if the folder's checkpoint is beyond
-            ``total_steps``, or the results of the evaluation lack the metric.
-        FloatingPointError: while training, if a loss or a gradient is not finite; the
-            batch is saved beside the checkpoints.
-        Interrupted: while training, after SIGTERM, SIGHUP or Ctrl-C, when a checkpoint
-            is written.
-        CheckpointError: while training, if a checkpoint in ``folder`` does not fit.
-        OSError: while training, if there is no room for the checkpoints, or their
-            folder is removed.
+    Raises (while training):
+        ValueError: if the folder's checkpoint is beyond ``total_steps``, or the results
+            of the evaluation lack the metric.
+        FloatingPointError: if a loss or a gradient is not finite; the batch is saved.
+        Interrupted: after SIGTERM, SIGHUP or Ctrl-C, when a checkpoint is written.
+        CheckpointError: if a checkpoint in ``folder`` does not fit.
+        OSError: if there is no room for the checkpoints, or their folder is removed.
     """
 
     def __init__(
@@ -448,13 +442,9 @@ class _Stepper(OptimizationStepper):
 
 
 def cut_back(folder: Path, step: int) -> None:
-    """Cut off the rows that a ``CSVLogger`` wrote after a step.
+    """Cut off the rows ``step,value`` that a ``CSVLogger`` wrote after a step.
 
     A last line that a kill left unfinished goes, too.
-
-    Args:
-        folder: of CSV files with rows ``step,value``, steps in ascending order.
-        step: the last one that stays.
     """
     for path in folder.glob("*.csv"):
         with path.open("r+b") as file:
@@ -474,14 +464,5 @@ def largest_value(largest_reward: float, gamma: float) -> float:
     No policy's value is above :math:`\max|r| / (1 - \gamma)`, the discounted sum of the
     largest reward for ever. Learned values may be: the conservative penalty pushes them
     down, and errors are bootstrapped. Ten times as much is neither.
-
-    Args:
-        largest_reward: largest magnitude of a reward in the data.
-        gamma: discount factor; with 1 there is no such magnitude.
-
-    Examples:
-        >>> from torchrl_osr.trainers import largest_value
-        >>> round(largest_value(2.0, 0.99))
-        2000
     """
     return 10 * largest_reward / (1 - gamma) if gamma < 1 else math.inf

@@ -19,34 +19,30 @@ SECONDS_BETWEEN_LINES = 30
 
 
 class Progress:
-    """Shows how far a phase is, and logs a line where there is no bar to look at.
+    """Show the progress of a phase, as a bar or as lines of the log.
 
     ``policy: step 2500 of 20000, 210 steps/s, 01:23 left, score 31.2``.
 
     Args:
-        description: names the phase.
+        description: name of the phase.
         total: steps of the whole run.
-        bar: show a progress bar when on a terminal.
-        unit: what a step is called. Default "step".
+        bar: show a progress bar on a terminal.
+        unit: name of a step. Default "step".
     """
 
     def __init__(
         self, description: str, total: int, bar: bool, unit: str = "step"
     ) -> None:
-        self._description, self._total, self._wanted = description, total, bar
-        self._unit = unit
+        self._description, self._total, self._unit = description, total, unit
+        self._disable = None if bar else True  # None: without a terminal
         self._result = ""
 
     @contextmanager
     def shown(self, step: int) -> Iterator[None]:
         """Show the bar, if there is one, from a step on."""
+        options = {"unit": self._unit, "disable": self._disable}
         self._bar = tqdm(
-            total=self._total,
-            initial=step,
-            desc=self._description,
-            unit=self._unit,
-            # None: disabled where the output is not a terminal.
-            disable=None if self._wanted else True,
+            total=self._total, initial=step, desc=self._description, **options
         )
         self._first, self._began = step, time.monotonic()
         self._last_line = self._began

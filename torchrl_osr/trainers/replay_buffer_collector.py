@@ -18,21 +18,11 @@ class ReplayBufferCollector(BaseCollector):
     TorchRL 0.14.1's trainers take every frame from an environment. With this collector
     they train on recorded data alone: every batch is one ``replay_buffer.sample()``,
     and frames count its rows. Such a trainer gets ``optim_steps_per_batch=1`` and no
-    ``replay_buffer`` of its own.
+    ``replay_buffer`` of its own. ``examples/torchrl_trainer.py`` is one.
 
     Args:
         replay_buffer: has a batch size; is not written to.
         total_frames: rows to draw, ``B`` for each gradient step.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_osr.lab.data import make_replay_buffer
-        >>> from torchrl_osr.trainers import ReplayBufferCollector
-        >>> data = TensorDict({"observation": torch.rand(100, 3)}, [100])
-        >>> buffer = make_replay_buffer(data, batch_size=8, seed=0)
-        >>> [len(batch) for batch in ReplayBufferCollector(buffer, total_frames=16)]
-        [8, 8]
     """
 
     init_random_frames = 0
