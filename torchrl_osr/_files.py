@@ -38,10 +38,7 @@ RECORD = "torchrl_osr"
 def whole_file(path: Path) -> Iterator[BinaryIO]:
     """Open a file for writing that readers find whole, or as it was before.
 
-    It is written beside its place, synced to the disk and renamed.
-
-    Raises:
-        OSError: naming ``path``, if it cannot be written.
+    It is written beside its place, synced to the disk and renamed. An OSError names it.
     """
     beside = path.with_name(f".{path.name}.new")
     try:
@@ -71,13 +68,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def finite_or_none(value: Any) -> Any:
-    """JSON-compatible value with ``None`` in place of every float that is not finite.
-
-    Examples:
-        >>> from torchrl_osr._files import finite_or_none
-        >>> finite_or_none({"r2": [0.5, float("-inf")]})
-        {'r2': [0.5, None]}
-    """
+    """JSON-compatible value with ``None`` in place of every float that is not finite."""
     if isinstance(value, Mapping):
         return {key: finite_or_none(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -113,10 +104,7 @@ def read_json(path: Path, *, max_bytes: int = MAX_JSON_BYTES) -> dict[str, Any]:
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """Return the arrays of a NumPy archive (``.npz``) by name; nothing is unpickled.
 
-    Raises:
-        OSError: it cannot be read.
-        ValueError: it is no archive of arrays, damaged, or would unpack to more than
-            :func:`check_unpacked_size` allows.
+    A ValueError names a file that is none, damaged or too large in memory.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -158,10 +146,7 @@ def write_tensors(
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Return tensors and record of a file; nothing is unpickled.
 
-    Raises:
-        ImportError: safetensors is not installed.
-        OSError: the file cannot be read.
-        ValueError: it is something else, or damaged.
+    A ValueError names a file that is something else, or damaged.
     """
     with needed_by("files of tensors need", "export"):
         from safetensors import SafetensorError, safe_open

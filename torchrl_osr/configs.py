@@ -1,20 +1,8 @@
 """OSR in TorchRL's own configuration system (``torchrl.trainers.algorithms.configs``).
 
-:func:`register` adds to TorchRL's own options, with the defaults of the Python
-signatures:
-
-=============  ================================================================
-group          options
-=============  ================================================================
-``loss``       ``osr``, ``osr_v``, ``inverse_dynamics``
-``transform``  ``state_perturbation``
-``model``      ``tanh_gaussian_actor``, ``critic_ensemble``,
-               ``tanh_gaussian_inverse_dynamics``, ``cvae_inverse_dynamics``
-``collector``  ``replay_buffer``
-=============  ================================================================
-
-A nested key is a list, as in TorchRL's own options: ``observation_key: [agent, obs]``.
-``docs/torchrl.md`` has a whole configuration.
+:func:`register` adds :data:`OPTIONS` to TorchRL's own options, with the defaults of the
+Python signatures. A nested key is a list, as in TorchRL: ``observation_key: [agent,
+obs]``. ``docs/torchrl.md`` has a whole configuration.
 """
 
 from __future__ import annotations
@@ -65,10 +53,6 @@ def build(part: str, **options: Any) -> Any:
 
     Lists become keys where keys are meant, and ``gamma`` goes to a loss's value
     estimator, as TorchRL's own configurations of losses do it.
-
-    Args:
-        part: dotted name of a class or function.
-        options: its arguments.
     """
     for name, value in options.items():
         if name == "perturbed" or name.endswith("_key"):

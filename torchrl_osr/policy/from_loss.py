@@ -35,10 +35,9 @@ def policy_from_loss(
     """Copy actor and critics of a loss into a policy.
 
     Args:
-        loss: of this package or of TorchRL, with networks as
-            :mod:`torchrl_osr.modules` builds them: one :class:`~torchrl.modules.MLP`
-            each, actions in [-1, 1] or one-hot. Of
-            :func:`~torchrl_osr.modules.gaussian_actor` the mean is taken alone.
+        loss: with networks as :mod:`torchrl_osr.modules` builds them: one
+            :class:`~torchrl.modules.MLP` each, actions in [-1, 1] or one-hot. Of a
+            Gaussian actor the mean is taken alone.
         observation_norm: how the training data were standardised
             (``standard_normal=True``). Default: not at all.
 
