@@ -127,7 +127,7 @@ def test_without_a_simulator_a_log_still_makes_a_policy(tmp_path, capsys):
         (["path=log.npz"], ValueError, "env.id is not given"),
         (["env=hopper", "path=a.npz", "policy=good"], ValueError, "neither random"),
         (["env=hopper", "path=a.npz", "policy=no:act"], ValueError, "cannot be imp"),
-        (["env=hopper", "path=a.npz", "policy=own:act"], ValueError, r"\[0.5\] is not in Box"),
+        (["env=hopper", "path=a.npz", "policy=own:act"], ValueError, "is not in Box"),
         (["env=hopper", "path=a.npz", "noise=0.1"], ValueError, "random has none"),
         (["env=hopper", "path=a.npz", "seed=-1"], ValueError, "seed"),
     ],
