@@ -68,7 +68,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def finite_or_none(value: Any) -> Any:
-    """JSON-compatible value with ``None`` in place of every float that is not finite."""
+    """Return the value with ``None`` in place of every float that is not finite."""
     if isinstance(value, Mapping):
         return {key: finite_or_none(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
