@@ -91,7 +91,7 @@ class OfflineTrainer(Trainer):
         progress: show a progress bar on a terminal; elsewhere a line is logged every
             half minute. Default ``True``.
 
-    Raises (while training):
+    Raises:
         ValueError: if the folder's checkpoint is beyond ``total_steps``, or the results
             of the evaluation lack the metric.
         FloatingPointError: if a loss or a gradient is not finite; the batch is saved.
