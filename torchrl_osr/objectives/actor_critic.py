@@ -603,13 +603,18 @@ class ActorCriticLoss(LossModule):
         objective = F.soft_policy_value(log_prob, qvalue, self.alpha)
         return objective.mean(0), log_prob
 
-    def temperature_loss(
-        self, batch: Transitions, log_prob: Tensor, auto: float | None = None
-    ) -> Tensor:
-        """Return SAC's objective of the entropy temperature, reduced.
+    def soft_actor_losses(
+        self,
+        batch: Transitions,
+        objective: Tensor,
+        log_prob: Tensor,
+        auto: float | None = None,
+    ) -> Losses:
+        """Return the losses of SAC's policy and temperature, and their metrics.
 
         Args:
             batch: the batch.
+            objective: of the policy, to be minimised, ``[R]``.
             log_prob: log-density of the policy's own actions, ``[D, R]``.
             auto: target of ``target_entropy="auto"``, in nats. Default: minus the
                 number of the action's dimensions.
@@ -617,13 +622,18 @@ class ActorCriticLoss(LossModule):
         wanted = self.target_entropy
         if wanted == "auto":
             wanted = -batch.a.shape[-1] if auto is None else auto
-        objective = F.temperature_objective(self.log_alpha, log_prob, wanted)
-        return self.reduce(objective.mean(0), batch)
+        temperature = F.temperature_objective(self.log_alpha, log_prob, wanted)
+        losses = {
+            "loss_actor": self.reduce(objective, batch),
+            "loss_alpha": self.reduce(temperature.mean(0), batch),
+        }
+        entropy = -self.mean(log_prob, batch)
+        return losses, {"alpha": self.alpha, "entropy": entropy}
 
     def critic_losses(self, batch: Transitions, policy: StatePolicy) -> Losses:
         """Return the TD error and CQL(H)'s penalty, weighted, and their metrics."""
         losses: dict[str, Tensor] = {}
-        metrics: dict[str, Tensor] = {"alpha": self.alpha}
+        metrics: dict[str, Tensor] = {}
         if self.has_cql:
             q_data, gap = self.conservative_gap(batch, policy)
             if self.target_action_gap is not None:

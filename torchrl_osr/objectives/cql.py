@@ -109,8 +109,6 @@ class CQLLoss(ActorCriticLoss):
     def losses(self, batch: Transitions) -> Losses:
         policy, states = self.policy(batch), self.actor_states
         objective, log_prob = self.soft_policy_objective(batch, policy, states)
-        losses, metrics = self.critic_losses(batch, policy)
-        losses["loss_actor"] = self.reduce(objective, batch)
-        losses["loss_alpha"] = self.temperature_loss(batch, log_prob)
-        metrics["entropy"] = -self.mean(log_prob, batch)
-        return losses, metrics
+        losses, metrics = self.soft_actor_losses(batch, objective, log_prob)
+        critics, values = self.critic_losses(batch, policy)
+        return losses | critics, metrics | values

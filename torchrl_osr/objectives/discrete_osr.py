@@ -153,23 +153,19 @@ class DiscreteOSRLoss(ActorCriticLoss):
         params = self.qvalue_network_params.detach()
         sought = self.action_values(batch.states[SETS[states]], params, pi)
         objective = F.discrete_policy_value(pi.logits, sought, self.alpha)
-        actor, metrics = self.reduce(objective.mean(0), batch), {}
+        log_prob, auto = -pi.entropy(), 0.98 * math.log(pi.logits.shape[-1])
+        losses, metrics = self.soft_actor_losses(
+            batch, objective.mean(0), log_prob, auto
+        )
         if self.has_recovery:
             recovery = self.recovery(batch, policy)
             term = self.reduce(recovery, batch, batch.has_next)
-            actor = actor + self.recovery_weight * term
+            losses["loss_actor"] = losses["loss_actor"] + self.recovery_weight * term
             metrics["recovery_kl"] = self.mean(recovery, batch, batch.has_next)
         error, values = self.td_error(batch, q_data, self.soft_target(batch, policy))
-        entropy = pi.entropy()
-        auto = 0.98 * math.log(pi.logits.shape[-1])
-        losses = {
-            "loss_actor": actor,
-            "loss_alpha": self.temperature_loss(batch, -entropy, auto=auto),
-            "loss_qvalue": self.reduce(error, batch),
-        }
+        losses["loss_qvalue"] = self.reduce(error, batch)
         if self.has_cql:
             losses["loss_cql"] = self.min_q_weight * self.penalty(batch, qvalue, q_data)
-        metrics |= {"alpha": self.alpha, "entropy": self.mean(entropy, batch)}
         return losses, metrics | values
 
     def action_values(

@@ -136,15 +136,13 @@ class OSRLoss(ActorCriticLoss):
     def losses(self, batch: Transitions) -> Losses:
         policy = self.policy(batch)
         objective, log_prob = self.soft_policy_objective(batch, policy, "both")
+        losses, metrics = self.soft_actor_losses(batch, objective, log_prob)
         recovery = self.recovery(batch, policy)
-        actor = self.reduce(objective, batch)
-        actor += self.recovery_weight * self.reduce(recovery, batch, batch.has_next)
-        losses, metrics = self.critic_losses(batch, policy)
-        temperature = self.temperature_loss(batch, log_prob)
-        losses |= {"loss_actor": actor, "loss_alpha": temperature}
-        metrics["entropy"] = -self.mean(log_prob, batch)
+        term = self.reduce(recovery, batch, batch.has_next)
+        losses["loss_actor"] = losses["loss_actor"] + self.recovery_weight * term
         metrics["recovery_kl"] = self.mean(recovery, batch, batch.has_next)
-        return losses, metrics
+        critics, values = self.critic_losses(batch, policy)
+        return losses | critics, metrics | values
 
     def recovery(self, batch: Transitions, policy: StatePolicy) -> Tensor:
         """Return the state-recovery term (11), the mean over D_tot, ``[R]``."""

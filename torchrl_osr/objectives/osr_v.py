@@ -127,22 +127,14 @@ class OSRVLoss(ActorCriticLoss):
     def losses(self, batch: Transitions) -> Losses:
         policy = self.policy(batch)
         objective, log_prob = self.soft_policy_objective(batch, policy, "both")
-        temperature = self.temperature_loss(batch, log_prob)
+        losses, metrics = self.soft_actor_losses(batch, objective, log_prob)
         q_data, gap = self.data_values_and_gap(batch, policy)
         # The paper prints OSR-v's TD error without the square; (2) has it.
         error, values = self.td_error(batch, q_data, self.soft_target(batch, policy))
         constraint = self.reduce(gap, batch, batch.has_next)
         qvalue = self.reduce(error, batch) + self.recovery_weight * constraint
-        losses = {
-            "loss_actor": self.reduce(objective, batch),
-            "loss_alpha": temperature,
-            "loss_qvalue": qvalue,
-        }
-        return losses, values | {
-            "alpha": self.alpha,
-            "entropy": -self.mean(log_prob, batch),
-            "recovery_gap": self.mean(gap, batch, batch.has_next),
-        }
+        metrics["recovery_gap"] = self.mean(gap, batch, batch.has_next)
+        return losses | {"loss_qvalue": qvalue}, metrics | values
 
     def data_values_and_gap(
         self, batch: Transitions, policy: StatePolicy

@@ -90,20 +90,13 @@ class EDACLoss(ActorCriticLoss):
     def losses(self, batch: Transitions) -> Losses:
         policy = self.policy(batch)
         objective, log_prob = self.soft_policy_objective(batch, policy, "clean")
+        losses, metrics = self.soft_actor_losses(batch, objective, log_prob)
         q_data = self.q(batch.s, batch.a)
         diversity = gradient_diversity(self.action_gradients(batch))
-        error, metrics = self.td_error(batch, q_data, self.soft_target(batch, policy))
-        qvalue = error + self.diversity_weight * diversity
-        losses = {
-            "loss_actor": self.reduce(objective, batch),
-            "loss_alpha": self.temperature_loss(batch, log_prob),
-            "loss_qvalue": self.reduce(qvalue, batch),
-        }
-        return losses, metrics | {
-            "alpha": self.alpha,
-            "entropy": -self.mean(log_prob, batch),
-            "diversity": self.mean(diversity, batch),
-        }
+        error, values = self.td_error(batch, q_data, self.soft_target(batch, policy))
+        qvalue = self.reduce(error + self.diversity_weight * diversity, batch)
+        metrics["diversity"] = self.mean(diversity, batch)
+        return losses | {"loss_qvalue": qvalue}, metrics | values
 
     def action_gradients(self, batch: Transitions) -> Tensor:
         """Return each critic's gradient by the data's action, ``[N, R, A]``."""

@@ -159,22 +159,18 @@ class RORLLoss(ActorCriticLoss):
         if self.policy_smooth_reg:
             terms["policy_smoothness"] = term = self.policy_smoothness(batch, policy)
             objective = objective + self.policy_smooth_reg * term
+        losses, metrics = self.soft_actor_losses(batch, objective, log_prob)
         q_data = self.q(batch.s, batch.a)
-        error, metrics = self.td_error(batch, q_data, self.soft_target(batch, policy))
+        error, values = self.td_error(batch, q_data, self.soft_target(batch, policy))
         if self.q_smooth_reg:
             terms["value_smoothness"] = term = self.value_smoothness(batch, q_data)
             error = error + self.q_smooth_reg * term
         if self.q_ood_reg:
             terms["uncertainty_penalty"] = term = self.uncertainty_penalty(batch)
             error = error + self.q_ood_reg * term
-        losses = {
-            "loss_actor": self.reduce(objective, batch),
-            "loss_alpha": self.temperature_loss(batch, log_prob),
-            "loss_qvalue": self.reduce(error, batch),
-        }
+        losses["loss_qvalue"] = self.reduce(error, batch)
         metrics |= {name: self.mean(term, batch) for name, term in terms.items()}
-        metrics |= {"alpha": self.alpha, "entropy": -self.mean(log_prob, batch)}
-        return losses, metrics
+        return losses, metrics | values
 
     def policy_smoothness(self, batch: Transitions, policy: StatePolicy) -> Tensor:
         """Return the largest divergence of the policy around a state, ``[R]``."""
