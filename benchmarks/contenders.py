@@ -34,7 +34,7 @@ from torchrl_osr.modules import (
 )
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
-from plain_osr import Batch, PlainOSR
+from plain_osr import Batch, PlainOSR, unpack
 
 Update = Callable[[Any], Any]
 
@@ -231,20 +231,6 @@ def torchrl_update(size: Size, device: torch.device) -> Update:
         updater.step()
 
     return update
-
-
-def unpack(batch: TensorDictBase) -> Batch:
-    """Return the batch as the plain script reads it."""
-    following = batch["next"]
-    return Batch(
-        batch["observation"],
-        batch["action"],
-        following["reward"].squeeze(-1),
-        following["observation"],
-        following["done"].squeeze(-1),
-        following["terminated"].squeeze(-1),
-        batch["perturbed", "observation"],
-    )
 
 
 def make_contender(

@@ -35,6 +35,20 @@ class Batch(NamedTuple):
     perturbed: Tensor  # s + noise, N(0, std^2)
 
 
+def unpack(batch) -> Batch:
+    """Return a TorchRL batch with perturbed states as this page reads it."""
+    following = batch["next"]
+    return Batch(
+        batch["observation"],
+        batch["action"],
+        following["reward"].squeeze(-1),
+        following["observation"],
+        following["done"].squeeze(-1),
+        following["terminated"].squeeze(-1),
+        batch["perturbed", "observation"],
+    )
+
+
 class Noise(NamedTuple):
     """Random draws of one update: standard normal; ``uniform`` in [-1, 1]."""
 

@@ -24,20 +24,6 @@ S, A, CELLS, B, K = 3, 2, [8, 8], 10, 4
 LOSSES = ["loss_actor", "loss_alpha", "loss_qvalue", "loss_cql"]
 
 
-def unpack(batch):
-    """Return the batch as the plain page reads it."""
-    following = batch["next"]
-    return page.Batch(
-        batch["observation"],
-        batch["action"],
-        following["reward"].squeeze(-1),
-        following["observation"],
-        following["done"].squeeze(-1),
-        following["terminated"].squeeze(-1),
-        batch["perturbed", "observation"],
-    )
-
-
 @pytest.fixture(params=[False, True], ids=["plain", "layer norm"])
 def both(request):
     """Both with the same weights, target critics and temperatures off the start."""
@@ -88,7 +74,7 @@ def test_losses_and_gradients_equal_ours(both, make_batch, check):
     torch.manual_seed(5)
     ours = loss(make_batch(B))
     torch.manual_seed(5)
-    reference = plain.losses(unpack(make_batch(B)), draw_as_ours())
+    reference = plain.losses(page.unpack(make_batch(B)), draw_as_ours())
     assert set(reference) == set(LOSSES)
     values = [[losses[key] for key in LOSSES] for losses in (ours, reference)]
     check("plain OSR", *values, tolerance=1e-12)
@@ -122,7 +108,7 @@ def test_update_moves_the_same_weights_as_ours(both, make_batch, check):
         optimizer.zero_grad()
         updater.step()
         torch.manual_seed(seed)
-        plain.update(unpack(make_batch(B)))
+        plain.update(page.unpack(make_batch(B)))
     got = list(loss.actor_network_params.values(True, True))
     wanted = list(plain.actor.parameters())
     for params, critics in (
@@ -144,7 +130,7 @@ def test_inverse_dynamics_loss_equals_ours(both, make_batch, check):
         parameter.data.copy_(value.data)
     batch = make_batch(B)
     ours = InverseDynamicsLoss(network)(batch)["loss_inverse_dynamics"]
-    reference = plain.inverse_dynamics_loss(unpack(batch))
+    reference = plain.inverse_dynamics_loss(page.unpack(batch))
     check("plain inverse dynamics", [ours], [reference], tolerance=1e-12)
 
 
