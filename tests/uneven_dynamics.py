@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from torchrl_osr.lab.dynamics import DynamicsEnsemble
 
@@ -21,6 +21,22 @@ def uneven_dynamics() -> DynamicsEnsemble:
     model.target_scale.uniform_(0.5, 2)
     model.input_loc.normal_()
     return model.double()
+
+
+def plain_gaussian(
+    model: DynamicsEnsemble, number: int, state: Tensor, action: Tensor
+) -> tuple[Tensor, Tensor]:
+    """One network's mean and variance of the standardised target, layer by layer."""
+    hidden = (torch.cat([state, action]) - model.input_loc) / model.input_scale
+    for layer in model.layers[:-1]:
+        hidden = layer.weight[number].T @ hidden + layer.bias[number, 0]
+        hidden = hidden * torch.sigmoid(hidden)
+    last = model.layers[-1]
+    out = last.weight[number].T @ hidden + last.bias[number, 0]
+    mean, free = out.chunk(2)
+    low, high = model.lowest_log_variance, model.highest_log_variance
+    free = high - torch.log(1 + torch.exp(high - free))
+    return mean, torch.exp(low + torch.log(1 + torch.exp(free - low)))
 
 
 def linear_dynamics(

@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
-from uneven_dynamics import linear_dynamics
+from uneven_dynamics import linear_dynamics, plain_gaussian
 
 from torchrl_osr.lab.dynamics import DynamicsEnsemble, DynamicsLoss, EliteNetworks
 from torchrl_osr.lab.dynamics.ensemble import has_next_state
@@ -96,18 +96,11 @@ def plain_loss(model: DynamicsEnsemble, batch, weight: float) -> torch.Tensor:
             change = after["observation"] - row["observation"]
             if after["terminated"] and not change.any():
                 continue
-            hidden = torch.cat([row["observation"], row["action"]])
-            hidden = (hidden - model.input_loc) / model.input_scale
-            for layer in model.layers[:-1]:
-                hidden = layer.weight[number].T @ hidden + layer.bias[number, 0]
-                hidden = hidden * torch.sigmoid(hidden)
-            last = model.layers[-1]
-            out = last.weight[number].T @ hidden + last.bias[number, 0]
+            inputs = row["observation"], row["action"]
+            mean, variance = plain_gaussian(model, number, *inputs)
             truth = torch.cat([change, after["reward"]])
             truth = (truth - model.target_loc) / model.target_scale
-            free = high - torch.log(1 + torch.exp(high - out[4:]))
-            variance = torch.exp(low + torch.log(1 + torch.exp(free - low)))
-            value += ((truth - out[:4]) ** 2 / variance + torch.log(variance)).mean()
+            value += ((truth - mean) ** 2 / variance + torch.log(variance)).mean()
             counted += 1
         total = total + value / counted
     return total

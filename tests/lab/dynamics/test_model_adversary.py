@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torchrl.data import LazyTensorStorage
 from torchrl.objectives import SoftUpdate
-from uneven_dynamics import uneven_dynamics
+from uneven_dynamics import plain_gaussian, uneven_dynamics
 
 from torchrl_osr import CQLLoss
 from torchrl_osr.lab.dynamics import (
@@ -57,7 +57,6 @@ def restated(networks, model: DynamicsEnsemble, states: Tensor) -> Tensor:
     action_noise = torch.normal(zeros, torch.ones_like(zeros))
     drawn = torch.randint(2, (rows,))
     noise = torch.randn(rows, 4, dtype=torch.float64)
-    low, high = model.lowest_log_variance, model.highest_log_variance
     critics = [each.module for each in networks.critics]
     advantage, log_density = [], []
 
@@ -73,14 +72,8 @@ def restated(networks, model: DynamicsEnsemble, states: Tensor) -> Tensor:
         action = torch.tanh(loc + scale * action_noise[row]).detach()
         gaussians = []
         for number in (0, 2):
-            first, last = model.layers
-            inputs = (torch.cat([state, action]) - model.input_loc) / model.input_scale
-            hidden = first.weight[number].T @ inputs + first.bias[number, 0]
-            hidden = hidden * torch.sigmoid(hidden)
-            out = last.weight[number].T @ hidden + last.bias[number, 0]
-            free = high - torch.log(1 + torch.exp(high - out[4:]))
-            variance = torch.exp(low + torch.log(1 + torch.exp(free - low)))
-            mean = out[:4] * model.target_scale + model.target_loc
+            mean, variance = plain_gaussian(model, number, state, action)
+            mean = mean * model.target_scale + model.target_loc
             gaussians.append((mean, variance.sqrt() * model.target_scale))
         mean, scale = gaussians[drawn[row]]
         sample = (mean + scale * noise[row]).detach()

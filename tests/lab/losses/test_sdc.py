@@ -9,7 +9,7 @@ import torch
 from objectives.losses import Networks, assert_same_bits, call, make_batch, make_loss
 from objectives.plain import Plain, compare
 from torch import Tensor
-from uneven_dynamics import uneven_dynamics
+from uneven_dynamics import plain_gaussian, uneven_dynamics
 
 from torchrl_osr.lab.losses import StateDeviationLoss
 from torchrl_osr.lab.losses.sdc import maximum_mean_discrepancy
@@ -23,15 +23,8 @@ def kernel(first: Tensor, second: Tensor) -> Tensor:
 
 def sampled_change(model, state: Tensor, action: Tensor, number: int, noise: Tensor):
     """Return a draw of the state's change from one network of an ensemble."""
-    low, high = model.lowest_log_variance, model.highest_log_variance
-    first, last = model.layers
-    hidden = (torch.cat([state, action]) - model.input_loc) / model.input_scale
-    hidden = first.weight[number].T @ hidden + first.bias[number, 0]
-    hidden = hidden * torch.sigmoid(hidden)
-    out = last.weight[number].T @ hidden + last.bias[number, 0]
-    free = high - torch.log(1 + torch.exp(high - out[4:]))
-    variance = torch.exp(low + torch.log(1 + torch.exp(free - low)))
-    sample = (out[:4] + variance.sqrt() * noise) * model.target_scale
+    mean, variance = plain_gaussian(model, number, state, action)
+    sample = (mean + variance.sqrt() * noise) * model.target_scale
     return (sample + model.target_loc)[:3]
 
 
