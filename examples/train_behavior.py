@@ -1,8 +1,8 @@
 """Train behaviour policies for a Gymnasium MuJoCo task with soft actor-critic.
 
-Writes a medium and an expert actor and eight snapshots from the start of training to
-the medium actor, with a card of their returns, in the layout that
-``torchrl_osr.lab.data.load_behavior_policy(name, policy, folder=...)`` reads::
+Writes a medium actor, an expert actor, eight snapshots from the start of training to
+the medium actor, and a card of their returns.
+``torchrl_osr.lab.data.load_behavior_policy(name, policy, folder=...)`` reads them::
 
     python examples/train_behavior.py --env Hopper-v5 --steps 300000 --out policies
 

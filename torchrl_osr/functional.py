@@ -5,8 +5,8 @@ Learning" (Jiang et al., NeurIPS 2023), https://openreview.net/forum?id=4gLWjSaw
 
 Shapes: ``B`` batch (any leading dimensions), ``A`` action, ``N`` critics, ``M``
 sampled actions of one state, ``n`` discrete actions. Every function returns one number
-a sample; the loss modules weigh and reduce. Where the printed paper and these
-files differ, the line says so and why.
+a sample; the loss modules weigh and reduce. A comment marks each departure from the
+printed paper, and gives the reason.
 
 Symbols: ``pi`` policy, ``I`` inverse dynamics model, ``s`` clean state, ``s^``
 perturbed state, ``s~`` a state of the mixed data set (clean and perturbed).
@@ -335,9 +335,9 @@ def lagrange_terms(
     .. math::
         \max_{\alpha' \ge 0} \min_Q \; \alpha' \, (\text{gap}(Q) - \tau)
 
-    CQL's appendix F (https://arxiv.org/abs/2006.04779). The multiplier is constant in
-    the critics' term and the gap is constant in the multiplier's, so that one backward
-    over the sum of both moves each the right way. TorchRL 0.14.1 ``CQLLoss`` detaches
+    CQL's appendix F (https://arxiv.org/abs/2006.04779). The critics' term detaches
+    the multiplier, and the multiplier's term detaches the gap. One backward over the
+    sum of both then moves each the right way. TorchRL 0.14.1 ``CQLLoss`` detaches
     neither: there the multiplier's loss raises the gap.
 
     Args:

@@ -174,9 +174,9 @@ def soft_maximum(
     """Return :func:`~torchrl_osr.functional.soft_maximum` of the critics' values.
 
     Differentiable by the critics' parameters, once. The gradient is exact for every use
-    of the result. It costs nothing more where all rows weigh the same, as in a mean or
-    a sum; otherwise, with masks or importance weights, the chunks are computed once
-    more with the weights that they have.
+    of the result. In a mean or a sum all rows weigh the same: the forward pass then
+    computes the gradient, too. With masks or importance weights the backward pass
+    computes the chunks once more.
 
     Args:
         layers: of all critics.

@@ -53,8 +53,8 @@ def fast_update(
 
     The trace follows everything that the loss keeps in attributes: change a weight,
     ``gamma``, ``requires_grad`` or a hook, or call ``eval()``, and the loss itself runs
-    and is traced again later. A loss that cannot be traced runs as it is, and a warning
-    says so. Pass ``trace=False`` for a loss that reads numbers from elsewhere, such as
+    and is traced again later. A loss that cannot be traced runs untraced, with a
+    warning. Pass ``trace=False`` for a loss that reads numbers from elsewhere, such as
     a global variable.
 
     Args:

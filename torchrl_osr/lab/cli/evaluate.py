@@ -9,8 +9,9 @@
 
 The run's folder gets ``robustness-<suite>.json`` with all raw results, and a figure of
 the same name; with ``suite=recoverable`` it gets ``recoverable-<half>.json``.
-``sweep=`` does this for every run below a folder; with ``switching=true`` all of them
-are one policy instead, of which the best run acts. See ``docs/robustness.md``.
+``sweep=`` does this for every run below a folder. With ``switching=true`` these runs
+form one policy: the run with the largest predicted return acts. See
+``docs/robustness.md``.
 """
 
 from __future__ import annotations

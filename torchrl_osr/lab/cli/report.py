@@ -4,8 +4,8 @@
     torchrl-osr report multirun/*/ outputs/ --reference cql --output report
 
 Reads what ``torchrl-osr train`` and ``torchrl-osr evaluate`` left in and below the
-folders. ``report.html`` needs no other file; a CSV file for each table and a PNG file
-for each figure are beside it. How to read them: docs/robustness.md.
+folders. Writes ``report.html``, which is complete in itself, a CSV file for each table
+and a PNG file for each figure. How to read them: docs/robustness.md.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Offline data: rolled out on this machine or recorded, in memory or memory-mapped.
 
 :func:`load_dataset` loads any of them. Names that need Gymnasium are loaded on first
-use, so that a trained policy can be read without it.
+use: reading a trained policy does not need it.
 """
 
 from __future__ import annotations

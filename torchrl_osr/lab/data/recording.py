@@ -214,9 +214,9 @@ def transitions_from_columns(
     A trajectory ends where a row is terminated or truncated, where the episode number
     changes, and at the last row; an end without a flag becomes ``truncated``. Without
     ``next_observation``, a row's next state is the observation of the following row.
-    The last row of a trajectory has none. A terminated row stays, with its own
-    observation in that place, which no loss reads. Another row is dropped, and the row
-    before it becomes ``truncated``.
+    The last row of a trajectory has no following row. If it is terminated, it stays
+    with its own observation as next state, which no loss reads. If not, it is dropped,
+    and the row before it becomes ``truncated``.
 
     Args:
         columns: ``observation`` ``[N, S]``, ``action`` ``[N, A]``, ``reward`` and

@@ -41,8 +41,8 @@ class DynamicsEnsemble(nn.Module):
         \quad i = 1 \dots E
 
     as in PETS (https://arxiv.org/abs/1805.12114) and MOPO
-    (https://arxiv.org/abs/2005.13239), which sets the defaults. Targets are
-    standardised as well as inputs, so that the entries' units do not matter.
+    (https://arxiv.org/abs/2005.13239), which sets the defaults. Inputs and
+    targets are standardised: the entries' units do not matter.
 
     Roll-outs use the ``num_elites`` best networks, see :meth:`calibrate_`.
 

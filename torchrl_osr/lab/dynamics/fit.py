@@ -31,12 +31,15 @@ def dynamics_report(
     """Measure an ensemble's errors on rows ``[N]``, and how well it predicts them.
 
     Returns:
-        ``"nll"`` of the elites in nats, summed over entries; ``"mse"`` of standardised
-        targets, of all networks; ``"r2"`` of the elites' mean for each entry, the last
-        of the reward; ``"within_1_sigma"`` and ``"within_2_sigma"``, shares of errors
-        (0.683 and 0.954 are calibrated); ``"disagreement_rank"``, Spearman's
-        correlation of disagreement and error; ``"rollout"``, see
-        :func:`rollout_errors`.
+        A dictionary of
+
+        - ``"nll"``: of the elites, in nats, summed over entries.
+        - ``"mse"``: of all networks, in standardised targets.
+        - ``"r2"``: of the elites' mean, for each entry; the reward is the last.
+        - ``"within_1_sigma"``, ``"within_2_sigma"``: shares of the errors. A calibrated
+          model has 0.683 and 0.954.
+        - ``"disagreement_rank"``: Spearman's correlation of disagreement and error.
+        - ``"rollout"``: see :func:`rollout_errors`.
     """
     rows = held_out[has_next_state(held_out, model.in_keys[0])]
     _, targets = model.inputs_and_targets(rows)
