@@ -48,7 +48,8 @@ def main() -> None:
     page = write_report(
         tables, options.output, reference=options.reference, command=command
     )
-    print(f"{len(tables.runs)} runs in {page}")
+    number = len(tables.runs)
+    print(f"{number} run{'s' * (number > 1)} in {page}")
 
 
 if __name__ == "__main__":
