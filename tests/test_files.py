@@ -18,9 +18,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays, scalar_dtypes
 
 from torchrl_osr._files import (
-    check_checksum,
     check_disk_space,
-    checksummed,
     read_arrays,
     read_json,
     read_tensors,
@@ -66,14 +64,6 @@ def test_other_files_are_no_json(tmp_path, content, message):
     (tmp_path / "card.json").write_bytes(content)
     with pytest.raises(ValueError, match=rf"card\.json {message}"):
         read_json(tmp_path / "card.json", max_bytes=256)
-
-
-def test_a_record_knows_whether_it_was_changed():
-    record = checksummed({"rows": 7})
-    check_checksum(record, "card.json")
-    for other in (record | {"rows": 8}, {"rows": 7}):
-        with pytest.raises(ValueError, match=r"checksum of card\.json is wrong"):
-            check_checksum(other, "card.json")
 
 
 @given(

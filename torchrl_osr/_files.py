@@ -181,23 +181,6 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def checksummed(record: Mapping[str, Any]) -> dict[str, Any]:
-    """JSON-compatible record with the checksum of its contents in it."""
-    return dict(record) | {CHECKSUM: _checksum(record)}
-
-
-def check_checksum(record: Mapping[str, Any], name: str) -> None:
-    """Raise a ValueError that names the file unless :func:`checksummed` made it so."""
-    if record.get(CHECKSUM) != _checksum(record):
-        raise ValueError(f"the checksum of {name} is wrong or missing")
-
-
-def _checksum(record: Mapping[str, Any]) -> str:
-    # Sorted: the order of a JSON object's keys says nothing.
-    rest = {key: value for key, value in record.items() if key != CHECKSUM}
-    return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
-
-
 def check_disk_space(folder: Path | str, needed_bytes: int, what: str) -> None:
     """Raise an OSError unless a folder's disk has room; it need not be there yet."""
     there = Path(folder).absolute()
