@@ -66,7 +66,7 @@ def test_discrete_actions_of_a_converted_set_are_drawn(look, tmp_path):
     with closing(make_environment("CartPole-v1")) as env:
         log = record_episodes(env, None, 3, progress=False)
     data, manifest = transitions_from_columns(log, num_actions=2)
-    write_memmap([data], "set", describe=lambda: manifest, progress=False)
+    write_memmap([data], "set", describe=lambda: manifest)
     output, error = look("data.path=set", "env.id=CartPole-v1")
     assert error is None, error
     assert "Picture: " in output
@@ -107,7 +107,7 @@ def test_what_looks_wrong_is_numbered(look):
         (
             {},
             ["data.columns.action=force"],
-            "action=force names no column",
+            "action=force names 0 columns",
         ),
         (
             {"sin": "left"},

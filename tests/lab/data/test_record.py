@@ -64,11 +64,11 @@ def test_discrete_actions_are_numbers_in_the_log_and_one_hot_in_the_data(tmp_pat
     options = {"env_id": "CartPole-v1", "path": str(path)}
     data, _ = load_dataset("CartPole-v1", "file", **options)
     np.testing.assert_array_equal(data["action"], np.eye(2)[columns["action"]])
-    write_memmap([data], tmp_path / "set", progress=False)
+    write_memmap([data], tmp_path / "set")
     options["path"] = str(tmp_path / "set")
     assert (load_dataset("CartPole-v1", "file", **options)[0] == data).all()
     data["action"] *= 0.5
-    write_memmap([data], tmp_path / "set", progress=False)
+    write_memmap([data], tmp_path / "set")
     with pytest.raises(ValueError, match="discrete"):
         load_dataset("x", "file", **options)
 

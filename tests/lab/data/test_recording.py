@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import os
 from unittest import mock
 
 import numpy as np
@@ -13,8 +15,12 @@ from recorded_logs import make_columns, save
 
 from torchrl_osr.lab.data import load_dataset, recording, transitions_from_columns
 from torchrl_osr.lab.data.store import is_memory_mapped
+from torchrl_osr.lab.data.transitions import Reading
 
 pytestmark = pytest.mark.usefixtures("cache")
+
+
+NUMBERS = itertools.count()
 
 
 @st.composite
@@ -49,9 +55,17 @@ def recordings(draw):
 
 
 @tried(80)
-@given(columns=recordings(), rows=st.integers(1, 40))
-def test_parts_of_any_size_give_the_same(tmp_path_factory, columns, rows):
-    path = save(tmp_path_factory.mktemp("log") / "log.parquet", columns)
+@given(columns=recordings(), size=st.integers(1, 40), rows=st.integers(1, 40))
+def test_parts_of_any_size_give_the_same(columns, size, rows):
+    count = len(columns["reward"])
+    starts = range(0, count, size)
+    chunks = [{n: c[i : i + size] for n, c in columns.items()} for i in starts]
+
+    def parts():
+        return recording.whole_trajectories(chunks)
+
+    about = {"source": "test", "number": next(NUMBERS)}
+    in_parts = recording.Recording(parts, Reading(), about, total=count)
     try:
         data, manifest = transitions_from_columns(columns)
     except ValueError:
@@ -59,20 +73,21 @@ def test_parts_of_any_size_give_the_same(tmp_path_factory, columns, rows):
     with mock.patch.object(recording, "CHUNK_ROWS", rows):
         if data is None:
             with pytest.raises(ValueError, match="no value|comes back|true next state"):
-                load_dataset(path=path, on_disk=True, progress=False)
+                in_parts.load()
             return
-        stored, described = load_dataset(path=path, on_disk=True, progress=False)
+        stored, described = in_parts.load(on_disk=True)
     assert is_memory_mapped(stored)
     assert (stored == data).all()
-    described = described | {"data_sha256": []}
     assert manifest.items() <= described.items()
 
 
-def test_options_are_part_of_the_cached_set(tmp_path, cache):
+def test_options_and_the_file_are_part_of_the_cached_set(tmp_path, cache):
     path = save(tmp_path / "log.npz", make_columns())
     for bounds in ((-1, 1), (-2, 2), (-1, 1)):
-        options = {"action_bounds": bounds, "on_disk": True, "progress": False}
-        data, _ = load_dataset(path=path, **options)
+        data, _ = load_dataset(path=path, action_bounds=bounds, on_disk=True)
         expected, _ = transitions_from_columns(make_columns(), action_bounds=bounds)
         assert (data == expected).all()
     assert len(list((cache / "recorded").glob("file-*/"))) == 2
+    save(path, make_columns(100))
+    os.utime(path, ns=(0, 0))  # clocks may be coarse
+    assert len(load_dataset(path=path, on_disk=True)[0]) < 100

@@ -77,28 +77,21 @@ def test_usual_names_need_no_word(write):
 
 
 @pytest.mark.parametrize(
-    ("name", "encoding", "options"),
+    ("name", "options"),
     [
-        ("log.csv", "utf-8", {"sep": ";"}),
-        ("log.csv.gz", "utf-8", {"sep": ";", "decimal": ","}),
-        ("log.csv", "utf-16", {"sep": "\t", "decimal": ","}),
-        ("log.csv", "cp1252", {}),
-        ("log.csv.gz", "utf-8-sig", {}),
+        ("log.csv", {"sep": ";", "encoding": "utf-8-sig"}),
+        ("log.csv.gz", {"sep": ";", "decimal": ","}),
+        ("log.csv", {"sep": "\t", "decimal": ","}),
     ],
 )
-def test_separators_decimals_and_encodings_are_detected(
-    tmp_path, name, encoding, options
-):
-    frame = robot().rename(columns={"theta": "Größe"})
-    path = tmp_path / name
-    frame.to_csv(path, index=False, encoding=encoding, **options)
-    names = WANTED | {"observation": ["x", "Größe", "v"]}
-    data, manifest = load_dataset(path=path, columns=names)
+def test_separators_and_decimals_are_detected(tmp_path, name, options):
+    robot().to_csv(tmp_path / name, index=False, **options)
     robot().to_csv(tmp_path / "plain.csv", index=False)
-    expected, plain = load_dataset(path=tmp_path / "plain.csv", columns=WANTED)
+    data, expected = (
+        load_dataset(path=tmp_path / each, columns=WANTED)[0]
+        for each in (name, "plain.csv")
+    )
     assert (data == expected).all()
-    assert plain["notes"] == []
-    assert bool(manifest["notes"]) == (encoding != "utf-8-sig")
 
 
 def test_columns_are_taken_by_their_names(write):
@@ -127,15 +120,13 @@ def test_steps_bring_the_rows_of_an_episode_into_order(write, clock):
     ordered = robot().assign(tick=clock(robot()["tick"]))
     shuffled = ordered.sample(frac=1, random_state=0)
     wanted = WANTED | {"step": "tick"}
-    data, manifest = load_dataset(path=write(shuffled), columns=wanted)
+    data, _ = load_dataset(path=write(shuffled), columns=wanted)
     # Episodes in the order in which they come up in the file.
     order = {name: i for i, name in enumerate(shuffled["run"].unique())}
     parts = np.argsort([order[f"monday {number}"] for number in range(3)])
     ends = expected["next", "done"][:, 0].nonzero()[:, 0] + 1
     episodes = expected.split(np.diff(ends.numpy(), prepend=0).tolist())
     assert (data == torch.cat([episodes[part] for part in parts])).all()
-    if clock is stamps:
-        assert "0.02 s (50 Hz)" in manifest["notes"][0]
     with pytest.raises(ValueError, match="where steps are .* a next state is missing"):
         load_dataset(path=write(ordered.drop(index=17)), columns=wanted)
     with pytest.raises(ValueError, match="the rows in another order"):
@@ -187,7 +178,11 @@ def test_rows_with_missing_values_can_be_left_out(write):
     [
         ({"u": "fast"}, {}, "'u' holds other than numbers: .*fast"),
         ({"fell": [0.0] * 119 + [0.5]}, {}, "'terminated' holds 0.5 in row 119"),
-        ({}, {"action": "force"}, r"columns\.action=force names no column; expected"),
+        (
+            {},
+            {"action": "force"},
+            r"columns\.action=force names 0 columns; there are x",
+        ),
         ({}, {"action": "x"}, "column 'x' is read twice"),
         ({}, {"episode": None}, "the data lack truncated or episode; there"),
         ({}, {"terminated": None}, "lack terminated; .*terminated=false if noth"),
@@ -218,9 +213,8 @@ def test_entries_are_in_the_order_of_their_numbers(names, named):
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
-        (",obs_0,action\n0,1,2\n", "expected the names of at least two columns"),
-        ("obs_0,action,reward,reward\n1,2,3,4\n", "two columns have one name"),
-        ("obs_0,action,reward,terminated,episode\n1,.2,3,0,0,9\n", "cannot be read"),
+        ("obs_0,action,reward,reward\n1,2,3,4\n", "lack terminated"),
+        ("obs_0,action,reward,terminated,episode\n1,.2,3,0,0,9\n", "more values than"),
         ("obs_0,action,reward,terminated,episode\n1,.2,3\n", "no value in row 0"),
     ],
 )

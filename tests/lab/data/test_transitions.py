@@ -75,7 +75,7 @@ def test_actions_are_mapped_to_the_unit_box_and_clipped():
     limit = torch.tensor(0.999)
     expected = torch.tensor([[-1.0, -1], [1, 1], [0, 0], [0.5, 0], [0.5, 0]])
     assert data["action"].tolist() == (expected.clamp(-limit, limit)).tolist()
-    assert (manifest["clipped_actions"], manifest["action_limit"]) == (2, 0.999)
+    assert manifest["clipped_actions"] == 2
 
 
 def test_actions_out_of_bounds_are_refused_or_clipped():
@@ -102,7 +102,7 @@ def test_changes_that_vanish_in_float32_are_a_warning():
     observation = np.c_[log()["observation"][:, 0], clock]
     _, manifest = transitions_from_columns(log(observation=observation))
     (warning,) = manifest["warnings"]
-    assert "entry 1 of 'observation' changes 5 times" in warning
+    assert "observation[1] changes 5 times" in warning
     assert transitions_from_columns(log())[1]["warnings"] == []
 
 

@@ -71,7 +71,7 @@ def main(cfg: DictConfig) -> None:
                 source, path, spec=spec, progress=cfg.progress, **reading
             )
             names = log.about.get("columns", {})
-            entries = describe_entries(log.parts(None), names)
+            entries = describe_entries(log.parts(), names)
         data, manifest = load_dataset(
             str(env_name),
             source,
@@ -149,7 +149,6 @@ def overview(
         actions = [str(number) for number in range(len(shares))]
     each = [f"{share:.1%} {name}" for name, share in zip(actions, shares, strict=True)]
     lines.append(f"  actions   {known}: {', '.join(each)}")
-    lines += [f"  note      {note}" for note in manifest.get("notes", ())]
     if unused := manifest.get("unused_columns"):
         lines.append(f"  not read  {', '.join(unused)}")
     return "\n".join(lines)

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import reduce
-from itertools import chain
 from operator import getitem
 from pathlib import Path
 from typing import Any
@@ -22,8 +21,8 @@ from tqdm.auto import tqdm
 from torchrl_osr._extras import needed_by
 from torchrl_osr._files import read_json
 from torchrl_osr.lab.data.environment import Leaves, observation_leaves
-from torchrl_osr.lab.data.recording import Recording
-from torchrl_osr.lab.data.transitions import Array, Reading
+from torchrl_osr.lab.data.recording import Recording, whole_trajectories
+from torchrl_osr.lab.data.transitions import Array, Columns, Reading
 
 with needed_by("Minari data sets need", "minari"):
     import minari
@@ -72,18 +71,12 @@ def open_minari(
         "observation_layout": [[*each] for each in zip(names, sizes, strict=True)],
     }
 
-    def parts(rows: int | None) -> Iterator[dict[str, Array]]:
-        waiting: list[dict[str, Array]] = []
-        for episode in chain(_read(opened, leaves, progress), [None]):
-            waiting += [episode] if episode else []
-            count = sum(len(each["reward"]) for each in waiting)
-            if count and (episode is None or (rows and count >= rows)):
-                yield {n: np.concatenate([e[n] for e in waiting]) for n in waiting[0]}
-                waiting = []
+    def parts() -> Iterator[Columns]:
+        return whole_trajectories(_read(opened, leaves, progress))
 
     paths = sorted(Path(opened.storage.data_path).rglob("*"))
     files = [path for path in paths if path.is_file()]
-    return Recording(parts, options, about, files, total=int(opened.total_steps))
+    return Recording(parts, options, about, files, int(opened.total_steps))
 
 
 def _open(dataset: str, download: bool) -> minari.MinariDataset:

@@ -1,7 +1,7 @@
-"""Recorded steps, read whole or in parts, in memory or on disk.
+"""Recorded steps become transitions, in memory or on disk.
 
 A row's transition depends on its trajectory alone. Hence a recording gives the same
-transitions, read at once or in parts of whole trajectories.
+transitions, whatever parts of whole trajectories it is read in.
 """
 
 from __future__ import annotations
@@ -21,21 +21,20 @@ from torchrl import torchrl_logger
 
 from torchrl_osr._files import sha256_of
 from torchrl_osr.lab.data.statistics import describe_episodes
-from torchrl_osr.lab.data.store import CHUNK_ROWS, cache_root, load_or_write
+from torchrl_osr.lab.data.store import CHUNK_ROWS, Dataset, cache_root, load_or_write
 from torchrl_osr.lab.data.transitions import (
-    ACTION_LIMIT,
     ActionBounds,
     Array,
     Columns,
+    Part,
     Reading,
-    Trajectories,
     check_dataset,
     trajectories,
 )
 
 # Raise it whenever other rows or another manifest are made of a source: recordings in
 # the cache are then converted anew.
-READER_VERSION = 3
+READER_VERSION = 4
 
 WARNINGS = {
     "actions_outside": "had actions outside their bounds, which were clipped",
@@ -52,54 +51,38 @@ VANISHED_SHARE = 0.01
 class Recording:
     """A recorded data set, to be converted once.
 
-    ``parts`` yields columns of whole trajectories: about so many rows at a time, or all
-    at once. ``about`` goes into the manifest.
+    ``parts`` is its reader: it yields columns of whole trajectories. ``about`` goes
+    into the manifest. ``total`` is the number of rows if not all are read at once.
     """
 
-    parts: Callable[[int | None], Iterable[Columns]]
+    parts: Callable[[], Iterable[Columns]]
     options: Reading
     about: dict[str, Any] = field(default_factory=dict)
     files: list[Path] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
     total: int | None = None
-    _parts: list[Trajectories] = field(default_factory=list, init=False)
+    _parts: list[Part] = field(default_factory=list, init=False)
 
-    def load(
-        self, *, on_disk: bool = False, progress: bool = True
-    ) -> tuple[TensorDict, dict[str, Any]]:
+    def load(self, *, on_disk: bool = False) -> Dataset:
         """Transitions ``[N]`` and their manifest; on disk, converted in parts."""
-        source = str(self.about.get("path", ""))
-        try:
-            if on_disk:
-                # Sizes and times: to read a large source at each start is slow.
-                states = [(str(file.resolve()), file.stat()) for file in self.files]
-                options = asdict(self.options) | {"action_bounds": self._bounds()}
-                request = self.about | {
-                    "reader_version": READER_VERSION,
-                    "source_files": [[n, s.st_size, s.st_mtime_ns] for n, s in states],
-                    "options": options,
-                }
-                text = json.dumps(request, sort_keys=True)
-                digest = hashlib.sha256(text.encode()).hexdigest()[:16]
-                data, manifest = load_or_write(
-                    cache_root() / "recorded" / f"{self.about['source']}-{digest}",
-                    request,
-                    lambda: self._transitions(CHUNK_ROWS),
-                    describe=self._manifest,
-                    total=self.total,
-                    progress=progress,
-                )
-            else:
-                first, *others = self._transitions(None)
-                data = torch.cat([first, *others]) if others else first
-                check_dataset(data)
-                manifest = {"num_transitions": len(data)} | self._manifest()
-        except ValueError as error:
-            if source in str(error):
-                raise
-            raise ValueError(f"{source}: {error}") from error
-        for note in manifest["notes"]:
-            torchrl_logger.info(note)
+        if on_disk:
+            # Sizes and times: to read a large source at each start is slow.
+            states = [(str(file.resolve()), file.stat()) for file in self.files]
+            request = self.about | {
+                "reader_version": READER_VERSION,
+                "source_files": [[n, s.st_size, s.st_mtime_ns] for n, s in states],
+                "options": asdict(self.options) | {"action_bounds": self._bounds()},
+            }
+            text = json.dumps(request, sort_keys=True)
+            digest = hashlib.sha256(text.encode()).hexdigest()[:16]
+            folder = cache_root() / "recorded" / f"{self.about['source']}-{digest}"
+            describe, total = self._manifest, self.total
+            data, manifest = load_or_write(
+                folder, request, self._transitions, describe=describe, total=total
+            )
+        else:
+            data = torch.cat([*self._transitions()])
+            check_dataset(data)
+            manifest = {"num_transitions": len(data)} | self._manifest()
         for warning in manifest["warnings"]:
             torchrl_logger.warning(warning)
         return data, manifest
@@ -107,24 +90,14 @@ class Recording:
     def _bounds(self) -> list[Any]:
         return [np.asarray(b, np.float64).tolist() for b in self.options.action_bounds]
 
-    def _transitions(self, rows: int | None) -> Iterator[TensorDict]:
-        """Yield transitions of about so many rows of the source, or all at once."""
+    def _transitions(self) -> Iterator[TensorDict]:
         read = kept = 0
         before: Array | float = np.nan
         seen: set[float] = set()
-        for columns in self.parts(rows):
+        for columns in self.parts():
             try:
                 part = trajectories(columns, self.options, before)
-                numbers = np.asarray(columns.get("episode", ()), np.float64).reshape(-1)
-                numbers = numbers[~np.isnan(numbers)]
-                first = np.r_[True, np.diff(numbers) != 0][: len(numbers)]
-                for number in numbers[first].tolist():
-                    if number in seen:
-                        raise ValueError(
-                            f"'episode' {number:g} comes back; expected its rows "
-                            "together. data.columns.step sorts them."
-                        )
-                    seen.add(number)
+                _check_episodes(columns, seen)
             except ValueError as error:
                 where = f"in the rows from {read:,} on: " if read else ""
                 raise ValueError(f"{where}{error}") from error
@@ -155,50 +128,72 @@ class Recording:
             "data_sha256": [sha256_of(file) for file in self.files],
             **counts,
             "num_actions": self.options.num_actions,
-            "action_limit": ACTION_LIMIT,
             "action_bounds": self._bounds(),
             **describe_episodes(returns[whole], lengths[whole]),
             "incomplete_returns": returns[~whole].tolist(),
             "incomplete_lengths": lengths[~whole].tolist(),
-            "notes": [*dict.fromkeys(self.notes)],
             "warnings": [*self._warnings(counts)],
         }
 
     def _warnings(self, counts: Mapping[str, int]) -> Iterator[str]:
-        for name in ("observation", "reward"):
-            total: Any = sum(part.changes[name] for part in self._parts)
-            moved, lost = total
-            for entry in np.flatnonzero(lost > VANISHED_SHARE * moved):
-                which = f"entry {entry} of {name!r}" if len(moved) > 1 else repr(name)
-                yield (
-                    f"{which} changes {moved[entry]:,} times from one row to the next, "
-                    f"and {lost[entry]:,} of these changes vanish in float32: subtract "
-                    "a constant (of a clock, its first value), or leave the entry out."
-                )
+        total: Any = sum(part.changes for part in self._parts)
+        moved, lost = total
+        for entry in np.flatnonzero(lost > VANISHED_SHARE * moved):
+            reward = entry == len(moved) - 1
+            yield (
+                f"{'reward' if reward else f'observation[{entry}]'} changes "
+                f"{moved[entry]:,} times from one row to the next, and {lost[entry]:,} "
+                "of these changes vanish in float32: subtract a constant (of a clock, "
+                "its first value), or leave the entry out."
+            )
         for name, flaw in WARNINGS.items():
             if counts[name]:
                 yield f"{counts[name]:,} rows {flaw}."
 
 
+def _check_episodes(columns: Columns, seen: set[float]) -> None:
+    """Raise if an episode goes on after another one; add new ones to ``seen``."""
+    numbers = np.asarray(columns.get("episode", ()), np.float64).reshape(-1)
+    numbers = numbers[~np.isnan(numbers)]
+    first = np.r_[True, np.diff(numbers) != 0][: len(numbers)]
+    for number in numbers[first].tolist():
+        if number in seen:
+            raise ValueError(
+                f"'episode' {number:g} comes back; expected its rows together. "
+                "data.columns.step sorts them."
+            )
+        seen.add(number)
+
+
 def whole_trajectories(
     chunks: Iterable[Mapping[str, Array]],
 ) -> Iterator[Mapping[str, Array]]:
-    """Regroup chunks of columns into parts of whole trajectories."""
-    rest: Mapping[str, Array] = {}
+    """Regroup chunks of columns into large parts of whole trajectories."""
+    waiting: list[Mapping[str, Array]] = []
+    rows = 0
     for chunk in chunks:
-        if rest:
-            chunk = {n: np.concatenate([rest[n], new]) for n, new in chunk.items()}
-        ends = np.zeros(len(chunk["reward"]), np.bool_)
-        for name in {"terminated", "truncated"} & chunk.keys():
-            ends |= np.nan_to_num(chunk[name].reshape(-1)).astype(np.bool_)
-        if "episode" in chunk:
-            ends[:-1] |= np.diff(chunk["episode"].reshape(-1)) != 0
+        waiting.append(chunk)
+        rows += len(chunk["reward"])
+        if rows < CHUNK_ROWS:
+            continue
+        whole = joined(waiting)
+        ends = np.zeros(rows, np.bool_)
+        for name in {"terminated", "truncated"} & whole.keys():
+            ends |= np.nan_to_num(whole[name].reshape(-1)).astype(np.bool_)
+        if "episode" in whole:
+            ends[:-1] |= np.diff(whole["episode"].reshape(-1)) != 0
         end = int(ends.nonzero()[0][-1]) + 1 if ends.any() else 0
         if end:
-            yield {name: column[:end] for name, column in chunk.items()}
-        rest = {name: column[end:] for name, column in chunk.items()}
-    if rest and len(rest["reward"]):
-        yield rest
+            yield {name: column[:end] for name, column in whole.items()}
+        waiting = [{name: column[end:] for name, column in whole.items()}]
+        rows -= end
+    if rows:
+        yield joined(waiting)
+
+
+def joined(chunks: list[Mapping[str, Array]]) -> dict[str, Array]:
+    """Rows of several chunks of columns."""
+    return {n: np.concatenate([each[n] for each in chunks]) for n in chunks[0]}
 
 
 def transitions_from_columns(
@@ -208,15 +203,15 @@ def transitions_from_columns(
     clip_actions: bool = False,
     num_actions: int | None = None,
     missing: str = "error",
-) -> tuple[TensorDict, dict[str, Any]]:
+) -> Dataset:
     """Turn recorded steps, in order of time, into a data set.
 
     A trajectory ends where a row is terminated or truncated, where the episode number
     changes, and at the last row; an end without a flag becomes ``truncated``. Without
     ``next_observation``, a row's next state is the observation of the following row.
-    The last row of a trajectory has no following row. If it is terminated, it stays
-    with its own observation as next state, which no loss reads. If not, it is dropped,
-    and the row before it becomes ``truncated``.
+    The last row of a trajectory has none: it stays, with its own observation as next
+    state, if it is terminated, because no loss reads that. Otherwise it is dropped, and
+    the row before it becomes ``truncated``.
 
     Args:
         columns: ``observation`` ``[N, S]``, ``action`` ``[N, A]``, ``reward`` and
@@ -226,7 +221,7 @@ def transitions_from_columns(
 
     Keyword Args:
         action_bounds: lowest and highest action, mapped to -1 and 1. Default: -1 and 1.
-            The actions are then clipped to ±0.999, see ``ACTION_LIMIT``.
+            The actions are then clipped to ±0.999.
         clip_actions: clip actions outside their bounds, as MuJoCo does, rather than
             raise. Default: ``False``.
         num_actions: number of discrete actions: ``action`` then holds their numbers
@@ -238,9 +233,6 @@ def transitions_from_columns(
     Returns:
         The transitions in float32, and a manifest: counts of rows and ends, returns and
         lengths of the complete and the incomplete episodes, and ``warnings``.
-
-    Raises:
-        ValueError: the columns are not as above or contradict one another.
 
     Examples:
         >>> import numpy as np
@@ -259,4 +251,4 @@ def transitions_from_columns(
         (1, [2.0, 2.0])
     """
     options = Reading(action_bounds, clip_actions, num_actions, missing)
-    return Recording(lambda _: [columns], options).load()
+    return Recording(lambda: [columns], options).load()

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from tensordict import TensorDict
@@ -14,7 +13,6 @@ from torchrl import torchrl_logger
 
 from torchrl_osr import __version__
 from torchrl_osr._extras import needed_by
-from torchrl_osr._files import check_disk_space
 from torchrl_osr.lab.data.behavior import load_behavior_card
 from torchrl_osr.lab.data.environment import (
     MAZE_IDS,
@@ -32,8 +30,7 @@ from torchrl_osr.lab.data.statistics import (
     describe_episodes,
 )
 from torchrl_osr.lab.data.store import (
-    CACHE_VARIABLE,
-    CHUNK_ROWS,
+    Dataset,
     cache_root,
     is_memmap_folder,
     load_memmap,
@@ -41,12 +38,8 @@ from torchrl_osr.lab.data.store import (
 )
 from torchrl_osr.lab.data.transitions import ActionBounds, Reading
 
-log = logging.getLogger(__name__)
-
 RECORDED = ("minari", "d4rl", "file")
 """Sources that are recorded; the others are rolled out."""
-
-Dataset = tuple[TensorDict, dict[str, Any]]
 
 # Raise it whenever the roll-outs change: older sets are then made anew.
 RECIPE_VERSION = 1
@@ -67,7 +60,6 @@ def load_dataset(
     num_transitions: int = 200_000,
     random_share: float = 0.0,
     seed: int = 0,
-    cache_dir: Path | str | None = None,
     on_disk: bool = False,
     progress: bool = True,
 ) -> Dataset:
@@ -107,9 +99,8 @@ def load_dataset(
         download: fetch the Minari set of that name.
         num_transitions: exact number of rolled-out transitions.
         random_share: share of the rolled-out rows that are random instead: limited
-            valuable data, section 5.3 of the paper.
+            valuable data, section 5.3 of the paper. They are mixed in memory.
         seed: of the roll-outs, and of the choice of random rows.
-        cache_dir: of rolled-out data. Default: ``TORCHRL_OSR_CACHE``, else the user's.
         on_disk: leave the rows memory-mapped. Parquet and Minari are converted in
             parts, other files from memory.
         progress: show a progress bar when on a terminal.
@@ -134,8 +125,14 @@ def load_dataset(
         "missing": missing,
         "download": download,
     }
+    references = references or REFERENCE_RETURNS.get(str(env_name))
     if source not in RECORDED:
         _refuse(reading | {"path": path}, f"data={source}, which is rolled out")
+        if random_share and (source == "random" or on_disk):
+            raise ValueError(
+                f"data.random_share={random_share} mixes a source with random rows, in "
+                "memory: choose another source, and leave out data.storage=disk."
+            )
         name = env_name if env_id is None else environment_name(env_id)
         known = [*load_behavior_card(), *MAZE_IDS]
         if name not in known or name != env_name:
@@ -146,27 +143,43 @@ def load_dataset(
                 f"data.path={name}.npz."
             )
         recipe = {"num_transitions": num_transitions, "seed": seed}
-        sets = RolledOut(cache_root(cache_dir) / "collected", name, recipe, progress)
+        data, manifest = rolled_out(name, source, recipe, progress=progress)
+        score = _score(manifest, references)
         if random_share:
-            return sets.mix(source, random_share, on_disk)
-        data, manifest = sets.open(source)
-        return data if on_disk else data.clone(), manifest
-    if path is None:
-        raise ValueError(f"data={source} needs data.path=...")
-    _refuse({"random_share": random_share}, f"data={source}")
-    spec = None if env_id is None else environment_spec(env_id)
-    if source == "file" and isinstance(path, (str, Path)) and is_memmap_folder(path):
-        _refuse(reading, f"{path}, which is converted")
-        data, manifest = load_memmap(path)
-        data = data if on_disk else data.clone()
+            random, about = rolled_out(name, "random", recipe, progress=progress)
+            data = mix_datasets(data, random, random_share=random_share, seed=seed)
+            number = round(random_share * len(data))
+            scores: Any = [score, _score(about, references)]
+            score = None
+            if None not in scores:
+                score = float(np.average(scores, weights=[len(data) - number, number]))
+            manifest = recipe | {
+                "random_share": random_share,
+                "env_id": about["env_id"],
+            }
+        elif not on_disk:
+            data = data.clone()
     else:
-        recording = open_recorded(source, path, spec=spec, progress=progress, **reading)
-        data, manifest = recording.load(on_disk=on_disk, progress=progress)
-    if spec is not None:
-        _check_fit(data, manifest, str(env_id), spec)
-    mean = (manifest.get("return") or {}).get("mean")
-    references = references or REFERENCE_RETURNS.get(str(env_name))
-    score = None if mean is None or references is None else references.score(mean)
+        if path is None:
+            raise ValueError(f"data={source} needs data.path=...")
+        _refuse({"random_share": random_share}, f"data={source}")
+        spec = None if env_id is None else environment_spec(env_id)
+        if (
+            source == "file"
+            and isinstance(path, (str, Path))
+            and is_memmap_folder(path)
+        ):
+            _refuse(reading, f"{path}, which is converted")
+            data, manifest = load_memmap(path)
+            data = data if on_disk else data.clone()
+        else:
+            recording = open_recorded(
+                source, path, spec=spec, progress=progress, **reading
+            )
+            data, manifest = recording.load(on_disk=on_disk)
+        if spec is not None:
+            _check_fit(data, manifest, str(env_id), spec)
+        score = _score(manifest, references)
     added = {"env_name": env_name, "source": source, "normalized_score": score}
     return data, manifest | added
 
@@ -176,6 +189,45 @@ def _refuse(options: Mapping[str, Any], source: str) -> None:
     for name, value in options.items():
         if value and value != "error":
             raise ValueError(f"data.{name}={value} has no effect with {source}.")
+
+
+def _score(
+    manifest: Mapping[str, Any], references: ReferenceReturns | None
+) -> float | None:
+    mean = (manifest.get("return") or {}).get("mean")
+    return None if mean is None or references is None else references.score(mean)
+
+
+def rolled_out(
+    env_name: str, source: str, recipe: Mapping[str, int], *, progress: bool
+) -> Dataset:
+    """Memory-mapped rows of a source, collected when they are first needed."""
+    rows, seed = recipe["num_transitions"], recipe["seed"]
+    maze = env_name in MAZE_IDS
+    # Other versions of these give other data for the same seed.
+    packages = ["numpy", "gymnasium", "mujoco"] + ["gymnasium-robotics"] * maze
+    with needed_by("collecting data needs", "mazes" if maze else "train"):
+        versions = {package: version(package) for package in packages}
+    request = {
+        "recipe_version": RECIPE_VERSION,
+        "env_name": env_name,
+        "env_id": environment_id(env_name),
+        "source": source,
+        **recipe,
+        **behavior_of(env_name, source),
+        "versions": versions,
+    }
+    about: dict[str, Any] = {"torchrl_osr_version": __version__}
+
+    def collect() -> Iterator[TensorDict]:
+        data, returns, lengths = collect_source(
+            env_name, source, rows, seed=seed, progress=progress
+        )
+        about.update(describe_episodes(returns, lengths))
+        yield data
+
+    folder = cache_root() / "collected" / f"{env_name}-{source}-{rows}-seed{seed}"
+    return load_or_write(folder, request, collect, describe=lambda: about, total=rows)
 
 
 def open_recorded(
@@ -190,8 +242,10 @@ def open_recorded(
     download: bool,
     progress: bool,
 ) -> Recording:
-    """Open recorded data without reading a row; see :func:`load_dataset`."""
-    columns = {part: name for part, name in columns.items() if name is not None}
+    """Open recorded data without reading a row; see :func:`load_dataset`.
+
+    Each reader is a function that returns a :class:`Recording`; add yours at the end.
+    """
     if source != "file":
         given = {f"columns.{part}": name for part, name in columns.items()}
         entries = given.pop("columns.observation", None) if source == "minari" else None
@@ -211,10 +265,10 @@ def open_recorded(
         from torchrl_osr.lab.data.minari import open_minari
 
         return open_minari(path, options, entries, download=download, progress=progress)
-    from torchrl_osr.lab.data.table import D4RL_NAMES, open_log
+    from torchrl_osr.lab.data.table import open_log
 
     _refuse({"download": download}, f"data={source}")
-    names = D4RL_NAMES if source == "d4rl" else columns
+    names = {"observation": "observations"} if source == "d4rl" else columns
     return open_log(path, names, options, source)
 
 
@@ -223,9 +277,11 @@ def _check_fit(
 ) -> None:
     """Raise unless the data have the task's observations and actions."""
     ours = [data[name].shape[-1] for name in ("observation", "action")]
-    parts = data["action"].split(CHUNK_ROWS)
-    hot = all(bool((p.sum(1) == 1).all() and (p * (1 - p) == 0).all()) for p in parts)
-    if ours != [spec.observation_size, spec.action_size] or spec.discrete > hot:
+    action = data["action"]
+    hot = not spec.discrete or bool(
+        (action.sum(1) == 1).all() & (action * (1 - action) == 0).all()
+    )
+    if ours != [spec.observation_size, spec.action_size] or not hot:
         kind = "discrete" if spec.discrete else "real"
         raise ValueError(
             f"the data have {ours[0]} observation and {ours[1]} action entries, "
@@ -233,7 +289,7 @@ def _check_fit(
             "choose the env that the data are of."
         )
     if manifest.get("source") == "minari" and not spec.discrete:
-        bounds = manifest["action_bounds"]
+        bounds: Any = manifest["action_bounds"]
         task: Any = [spec.action_low, spec.action_high]
         if not all(map(np.allclose, bounds, task)):
             torchrl_logger.warning(
@@ -241,87 +297,3 @@ def _check_fit(
                 f"{env_id} {task}: actions are rescaled. If the environment clipped "
                 "them, give data.action_bounds=[low,high] and data.clip_actions=true."
             )
-
-
-class RolledOut(NamedTuple):
-    """Rolled-out sets of one task in a cache folder, collected when first opened."""
-
-    root: Path
-    env_name: str
-    recipe: dict[str, int]
-    progress: bool
-
-    def folder(self, source: str) -> Path:
-        rows, seed = self.recipe.values()
-        return self.root / f"{self.env_name}-{source}-{rows}-seed{seed}"
-
-    def open(self, source: str) -> Dataset:
-        """Memory-mapped rows of a source and their manifest."""
-        env_name, rows, folder = (
-            self.env_name,
-            self.recipe["num_transitions"],
-            self.folder(source),
-        )
-        maze = env_name in MAZE_IDS
-        # Other versions of these give other data for the same seed.
-        packages = ["numpy", "gymnasium", "mujoco"] + ["gymnasium-robotics"] * maze
-        with needed_by("collecting data needs", "mazes" if maze else "train"):
-            versions = {package: version(package) for package in packages}
-        env_id = environment_id(env_name)
-        request = {
-            "recipe_version": RECIPE_VERSION,
-            "env_name": env_name,
-            "env_id": env_id,
-            "source": source,
-            **self.recipe,
-            **behavior_of(env_name, source),
-            "versions": versions,
-        }
-        about: dict[str, Any] = {"torchrl_osr_version": __version__}
-
-        def collect() -> Iterator[TensorDict]:
-            spec = environment_spec(env_id)
-            size = 4 * (2 * spec.observation_size + spec.action_size + 1) + 3  # 3 flags
-            what = f"the data set ({CACHE_VARIABLE}=/path chooses the folder)"
-            check_disk_space(folder, rows * size, what)
-            log.info(
-                f"rolls out {rows:,} transitions of {env_name} {source} to {folder}"
-            )
-            data, returns, lengths = collect_source(
-                env_name, source, rows, seed=self.recipe["seed"], progress=self.progress
-            )
-            score = REFERENCE_RETURNS[env_name].score
-            mean = float(returns.mean()) if len(returns) else None
-            about.update(describe_episodes(returns, lengths))
-            about["normalized_score"] = None if mean is None else score(mean)
-            yield from data.split(CHUNK_ROWS)
-
-        return load_or_write(folder, request, collect, describe=lambda: about)
-
-    def mix(self, source: str, random_share: float, on_disk: bool) -> Dataset:
-        """Replace a share of the rows of a source by random rows."""
-        if source == "random":
-            _refuse({"random_share": random_share}, "data=random")
-        (data, manifest), (other, random) = self.open(source), self.open("random")
-        number = round(random_share * len(data))
-        rows = {source: len(data) - number, "random": number}
-        scores = [each["normalized_score"] for each in (manifest, random)]
-        mean = None if None in scores else np.average(scores, weights=[*rows.values()])
-        mixture = {
-            "env_name": self.env_name,
-            "source": source,
-            **self.recipe,
-            "random_share": random_share,
-            "rows": rows,
-            "normalized_score": None if mean is None else float(mean),
-            "sources": {source: manifest, "random": random},
-        }
-
-        def mixed() -> TensorDict:
-            seed = self.recipe["seed"]
-            return mix_datasets(data, other, random_share=random_share, seed=seed)
-
-        if not on_disk:
-            return mixed(), mixture
-        folder = f"{self.folder(source)}-random{random_share}"
-        return load_or_write(Path(folder), mixture, lambda: mixed().split(CHUNK_ROWS))

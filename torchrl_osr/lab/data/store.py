@@ -1,7 +1,7 @@
 """Memory-mapped transitions, their cache folder, and replay buffers of any data.
 
-A data set is a folder with ``rows`` (``TensorDict.load_memmap``) and ``manifest.json``,
-which describes their origin and holds their checksum. Rows are read when drawn.
+A data set is a folder with ``rows``, files of ``TensorDict.memmap``, and
+``manifest.json``, which describes them and holds their checksum.
 """
 
 from __future__ import annotations
@@ -12,33 +12,25 @@ import operator
 import os
 import shutil
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import torch
 from filelock import FileLock
-from tensordict import MemoryMappedTensor, NestedKey, TensorDict, TensorDictBase
+from tensordict import MemoryMappedTensor, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl import torchrl_logger
 from torchrl.data import ImmutableDatasetWriter, LazyTensorStorage, ReplayBuffer
 from torchrl.data.replay_buffers.storages import Storage
 from torchrl.envs.transforms import Transform
-from tqdm.auto import tqdm
 
 from torchrl_osr._extras import needed_by
 from torchrl_osr._files import check_disk_space, read_json, sha256_of, write_json
-from torchrl_osr.lab.data.transitions import (
-    DATASET_KEYS,
-    FLAG_KEYS,
-    check_filled,
-    check_rows,
-)
+from torchrl_osr.lab.data.transitions import DATASET_KEYS, check_filled, check_rows
 
-Reader = Callable[[TensorDictBase, Tensor], TensorDictBase]
-
-CACHE_VARIABLE = "TORCHRL_OSR_CACHE"
-"""Environment variable that moves the cache folder."""
+Dataset = tuple[TensorDict, dict[str, Any]]
+"""Transitions ``[N]`` and their manifest."""
 
 CHUNK_ROWS = 200_000
 """Rows that are converted and written at a time: some ten megabytes of hopper."""
@@ -48,16 +40,10 @@ MANIFEST, ROWS = "manifest.json", "rows"
 # Raise the number whenever the files or the required entries of the manifest change.
 FORMAT = "torchrl-osr transitions 2"
 
-FILES: dict[NestedKey, str] = {
-    key: f"{key if isinstance(key, str) else '/'.join(key)}.memmap"
-    for key in DATASET_KEYS
-}
-"""Files of the columns, below ``rows``, as tensordict names them."""
 
-
-def cache_root(cache_dir: Path | str | None = None) -> Path:
-    """Folder of all cached data sets. Default: the user's, or ``TORCHRL_OSR_CACHE``."""
-    root = cache_dir or os.environ.get(CACHE_VARIABLE)
+def cache_root() -> Path:
+    """Folder of all cached data: ``TORCHRL_OSR_CACHE``, or the user's."""
+    root = os.environ.get("TORCHRL_OSR_CACHE")
     if root is None:
         with needed_by("the cache needs", "train"):
             import platformdirs
@@ -79,93 +65,63 @@ def write_memmap(
     chunks: Iterable[TensorDict],
     folder: Path | str,
     *,
-    describe: Callable[[], Mapping[str, Any]] = dict,
     total: int | None = None,
-    progress: bool = True,
-) -> tuple[TensorDict, dict[str, Any]]:
+    describe: Callable[[], Mapping[str, Any]] = dict,
+) -> Dataset:
     """Write transitions to a folder, chunk by chunk, and open them.
 
     They are written to a hidden folder, ``.<name>.partial``, which is renamed at the
     end: an interrupted call leaves no data set.
 
     Args:
-        chunks: transitions ``[n]`` each, float32. Only one is in memory at a time.
+        chunks: transitions ``[n]`` each, float32.
         folder: of the data set, which is made, or replaced.
 
     Keyword Args:
+        total: number of rows, or more: only one chunk is in memory at a time. Default:
+            all chunks are read first.
         describe: called when all chunks are written; returns JSON-compatible entries of
             the manifest.
-        total: number of rows, or more, to check the free space before the work.
-        progress: show a progress bar when on a terminal.
 
     Raises:
         FileExistsError: the folder holds something else, which is not touched.
     """
     folder = Path(folder).expanduser()
-    ours = folder.is_dir() and not folder.is_symlink()
-    if ours:
-        ours = {path.name for path in folder.iterdir()} <= {MANIFEST, ROWS}
-    if os.path.lexists(folder) and not ours:
+    if folder.exists() and not {p.name for p in folder.iterdir()} <= {MANIFEST, ROWS}:
         raise FileExistsError(
-            f"{folder} is not replaced: it is no data set, or holds other files. "
-            "Choose another folder, or remove it."
+            f"{folder} is not replaced: it is no data set, or holds other files."
         )
+    if total is None:
+        chunks = [*chunks]
+        total = sum(len(chunk) for chunk in chunks)
     partial = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
-    hidden, name = None if progress else True, f"write {folder.name}"
-    bar = tqdm(None, name, total, unit="row", unit_scale=True, disable=hidden)
     try:
-        (partial / ROWS / "next").mkdir(parents=True)
-        with bar:
-            rows = _write_rows(chunks, partial / ROWS, total, bar)
+        stored, rows = TensorDict(), 0
+        for chunk in chunks:
+            check_rows(chunk)
+            chunk = chunk.select(*DATASET_KEYS)
+            if not rows:
+                needed = total * chunk.bytes() // len(chunk)
+                check_disk_space(folder, needed, "the data set")
+                stored = chunk[:1].expand(total).memmap_like(partial / ROWS)
+            stored[rows : rows + len(chunk)] = chunk
+            rows += len(chunk)
+        if not rows:
+            raise ValueError("there is no row to write; expected at least one.")
+        check_filled(stored[:rows])
         manifest = dict(describe()) | {"format": FORMAT, "num_transitions": rows}
         manifest["rows_sha256"] = _checksum(partial / ROWS)
         write_json(partial / MANIFEST, manifest)
         if folder.exists():
             shutil.rmtree(folder)
         os.replace(partial, folder)
-    except BaseException:
+    finally:
         shutil.rmtree(partial, ignore_errors=True)
-        raise
     return load_memmap(folder)
 
 
-def _write_rows(
-    chunks: Iterable[TensorDict], folder: Path, total: int | None, bar: Any
-) -> int:
-    """Append the columns to their files and describe these as tensordict does."""
-    sizes: dict[NestedKey, int] = {}
-    rows = 0
-    with ExitStack() as stack:
-        files = {
-            k: stack.enter_context((folder / n).open("wb")) for k, n in FILES.items()
-        }
-        for chunk in chunks:
-            check_rows(chunk)
-            found = {key: chunk.get(key).shape[-1] for key in FILES}
-            if found != (sizes or found):
-                raise ValueError(f"rows from {rows:,} on have other sizes than before.")
-            if not sizes and total is not None:
-                needed = total * chunk.bytes() // len(chunk)
-                check_disk_space(folder, needed, "the data set")
-            sizes = found
-            for key, file in files.items():
-                file.write(chunk.get(key).numpy(force=True).tobytes())
-            rows += len(chunk)
-            bar.update(len(chunk))
-        if not rows:
-            raise ValueError("there is no row to write; expected at least one.")
-    data = TensorDict({"next": TensorDict({}, [rows])}, [rows])
-    for key, name in FILES.items():
-        dtype = torch.bool if key in FLAG_KEYS else torch.float32
-        shape = torch.Size([rows, sizes[key]])
-        data[key] = MemoryMappedTensor.from_filename(folder / name, dtype, shape)
-    check_filled(data)
-    data.memmap(folder, existsok=True)
-    return rows
-
-
-def load_memmap(folder: Path | str) -> tuple[TensorDict, dict[str, Any]]:
+def load_memmap(folder: Path | str) -> Dataset:
     """Open a data set that :func:`write_memmap` has written.
 
     Its files are read once, to compare their checksum; rows are read when asked for.
@@ -181,9 +137,10 @@ def load_memmap(folder: Path | str) -> tuple[TensorDict, dict[str, Any]]:
         found = [manifest.get(key) for key in ("format", "rows_sha256")]
         if found != [FORMAT, _checksum(folder / ROWS)]:
             raise ValueError("its format or its checksum is wrong")
+        data: TensorDict = TensorDict.load_memmap(folder / ROWS, allow_pickle=False)
     except ValueError as error:
         raise ValueError(f"{folder} is damaged: {error}. Write it again.") from error
-    return TensorDict.load_memmap(folder / ROWS), manifest
+    return data[: manifest["num_transitions"]], manifest
 
 
 def load_or_write(
@@ -191,17 +148,16 @@ def load_or_write(
     request: Mapping[str, Any],
     chunks: Callable[[], Iterable[TensorDict]],
     *,
-    describe: Callable[[], Mapping[str, Any]] = dict,
     total: int | None = None,
-    progress: bool = False,
-) -> tuple[TensorDict, dict[str, Any]]:
+    describe: Callable[[], Mapping[str, Any]] = dict,
+) -> Dataset:
     """Open a cached data set; write it first if its manifest differs from ``request``.
 
     Processes that ask for the same data set at once wait for one of them to write it.
     """
     wanted = json.loads(json.dumps(request))  # like the manifest's: without tuples
 
-    def load() -> tuple[TensorDict, dict[str, Any]]:
+    def load() -> Dataset:
         data, manifest = load_memmap(folder)
         if wrong := [key for key in wanted if manifest.get(key) != wanted[key]]:
             was, want = manifest.get(wrong[0]), wanted[wrong[0]]
@@ -219,23 +175,20 @@ def load_or_write(
             if folder.exists():
                 torchrl_logger.warning(f"Making {folder} anew: {flaw}")
 
-        return write_memmap(
-            chunks(),
-            folder,
-            describe=lambda: wanted | dict(describe()),
-            total=total,
-            progress=progress,
-        )
+        def described() -> dict[str, Any]:
+            return {**wanted, **describe()}
+
+        return write_memmap(chunks(), folder, total=total, describe=described)
 
 
 def _checksum(folder: Path) -> str:
-    """SHA-256 of a data set; raise if it has other files, which might be pickles."""
+    """SHA-256 of the files of the rows."""
     paths = sorted(path for path in folder.rglob("*") if path.is_file())
-    names = {path.relative_to(folder).as_posix() for path in paths}
-    if names != {*FILES.values(), "meta.json", "next/meta.json"}:
-        raise ValueError(f"it has the files {', '.join(sorted(names))}")
     digests = [sha256_of(path) for path in paths]
     return hashlib.sha256("".join(digests).encode()).hexdigest()
+
+
+Reader = Callable[[TensorDictBase, Tensor], TensorDictBase]
 
 
 class MemmapStorage(Storage):

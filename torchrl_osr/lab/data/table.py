@@ -6,14 +6,9 @@ a column of rows ``[N, D]``, or several columns.
 
 from __future__ import annotations
 
-import codecs
-import csv
 import gzip
 import re
-import warnings
-import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from glob import glob
 from itertools import chain
@@ -23,16 +18,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from torchrl_osr._extras import needed_by
-from torchrl_osr._files import check_unpacked_size, read_arrays
-from torchrl_osr.lab.data.recording import Recording, whole_trajectories
+from torchrl_osr._files import read_arrays
+from torchrl_osr.lab.data.recording import Recording, joined, whole_trajectories
 from torchrl_osr.lab.data.transitions import Array, Reading
 
 with needed_by("tables need", "train"):
     import pandas as pd
 
 Arrays = dict[str, Array]
-
-ENDINGS = (".csv", ".csv.gz", ".parquet", ".hdf5", ".h5", ".npz")
 
 USUAL_NAMES = {
     "observation": ("observation", "observations", "obs", "state", "states"),
@@ -49,15 +42,6 @@ USUAL_NAMES = {
 }
 """Parts of a log, and what their columns are called unless you name them."""
 
-D4RL_NAMES = {
-    "observation": "observations",
-    "action": "actions",
-    "reward": "rewards",
-    "terminated": "terminals",
-    "truncated": "timeouts",
-}
-"""Names of D4RL's HDF5 files, which have ``next_observations`` in v2 alone."""
-
 VECTORS = ("observation", "action", "next_observation")
 
 ColumnNames = Mapping[str, str | Sequence[str] | bool | None]
@@ -68,11 +52,14 @@ ColumnNames = Mapping[str, str | Sequence[str] | bool | None]
 
 
 class Table(NamedTuple):
-    """A file with named columns; ``read`` yields some, about so many rows at a time."""
+    """A file with named columns; ``read`` yields rows of some of them.
+
+    ``total`` is the number of rows if not all are read at once.
+    """
 
     names: list[str]
-    read: Callable[[list[str], int | None], Iterator[Arrays]]
-    notes: tuple[str, ...] = ()
+    read: Callable[[list[str]], Iterator[Arrays]]
+    total: int | None = None
 
 
 def open_log(
@@ -86,22 +73,19 @@ def open_log(
     first = next(iter(tables.values()))
     layout = find_columns(first.names, columns)
     names = [*chain(*layout.values())]
-    notes = [f"{file.name}: {n}" for file, table in tables.items() for n in table.notes]
 
-    def parts(rows: int | None) -> Iterator[Mapping[str, Array]]:
+    def parts() -> Iterator[Mapping[str, Array]]:
         codes: dict[Any, int] = {}
-        step = layout.get("step")
         for file, table in tables.items():
             if lacking := {*names} - {*table.names}:
                 raise ValueError(f"{file} lacks {', '.join(lacking)}.")
-            # To sort them, all rows are needed.
-            chunks: Iterable[Arrays] = (
+            chunks: Any = (
                 assemble(layout, arrays, codes, file if len(tables) > 1 else None)
-                for arrays in table.read(names, None if step else rows)
+                for arrays in table.read(names)
             )
-            if step:
-                chunks = (_sorted(each, step[0], notes) for each in chunks)
-            yield from chunks if step or not rows else whole_trajectories(chunks)
+            if "step" in layout:
+                chunks = [_sorted(joined([*chunks]), layout["step"][0])]
+            yield from whole_trajectories(chunks)
 
     files = [str(file) for file in tables]
     about = {
@@ -110,7 +94,9 @@ def open_log(
         "columns": layout,
         "unused_columns": [name for name in first.names if name not in names],
     }
-    return Recording(parts, options, about, [*tables], notes)
+    totals = [table.total for table in tables.values()]
+    total = None if None in totals else sum(filter(None, totals))
+    return Recording(parts, options, about, [*tables], total)
 
 
 def _files(path: str | Path | Sequence[str]) -> list[Path]:
@@ -122,65 +108,41 @@ def _files(path: str | Path | Sequence[str]) -> list[Path]:
         files += found
         if not files:
             raise FileNotFoundError(f"there is no file {whole}: give a log's path.")
-    if wrong := [file for file in files if not file.name.endswith(ENDINGS)]:
-        raise ValueError(f"{wrong[0]} must end in one of {', '.join(ENDINGS)}.")
     return files
 
 
 def _table(path: Path) -> Table:
-    kinds = {".parquet": _parquet, ".hdf5": _hdf5, ".h5": _hdf5, ".npz": _npz}
-    with _explained(path):
-        table = kinds.get(path.suffix, _csv)(path)
-        if len({*table.names}) < len(table.names):
-            raise ValueError(f"two columns have one name: {_listed(table.names)}")
-    return table
-
-
-@contextmanager
-def _explained(path: Path) -> Iterator[None]:
-    """Name the file and the kind of error when a library cannot read it."""
+    readers = {".parquet": _parquet, ".hdf5": _hdf5, ".h5": _hdf5, ".npz": _npz}
+    readers |= {".csv": _csv, ".gz": _csv}
+    if path.suffix not in readers:
+        raise ValueError(f"{path} must end in one of {', '.join(readers)}.")
     try:
-        yield
-    except (EOFError, OSError, RuntimeError, ValueError, Warning, zlib.error) as error:
-        kind = f"{type(error).__name__}: {error}"
-        raise ValueError(f"{path} cannot be read ({kind}); is it whole?") from error
+        return readers[path.suffix](path)
+    except (EOFError, OSError, ValueError) as error:
+        raise ValueError(f"{path} cannot be read: {error!r}. Is it whole?") from error
 
 
 def _npz(path: Path) -> Table:
     arrays = read_arrays(path)
-    return Table([*arrays], lambda names, _: iter([{n: arrays[n] for n in names}]))
+    return Table([*arrays], lambda names: iter([{n: arrays[n] for n in names}]))
 
 
 def _csv(path: Path) -> Table:
-    with (gzip.open if path.suffix == ".gz" else open)(path, "rb") as file:
-        head = file.read(2**16)
-    wide = head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    encoding = "utf-16" if wide else "utf-8-sig"
-    try:
-        text = codecs.getincrementaldecoder(encoding)().decode(head)
-    except UnicodeDecodeError:
-        encoding = "cp1252"
-        text = head.decode(encoding, errors="replace")
-    lines = text.splitlines() or [""]
-    separator = max(",;\t", key=lines[0].count)
-    names = [n.strip() for n in next(csv.reader(lines[:1], delimiter=separator), [])]
-    if len(names) < 2 or not all(names):
-        raise ValueError(
-            f"its first line holds {names}; expected the names of at least two columns"
-        )
-    comma = separator != "," and any(re.search(r"\d,\d", line) for line in lines[1:])
-    form = {"sep": separator, "decimal": "," if comma else ".", "encoding": encoding}
-    usual = {"sep": ",", "decimal": ".", "encoding": "utf-8-sig"}
+    opened = gzip.open if path.suffix == ".gz" else open
+    with opened(path, "rt", encoding="utf-8-sig") as file:
+        header, *lines = file.read(2**16).splitlines() or [""]
+    separator = max(",;\t", key=header.count)
+    comma = separator != "," and any(re.search(r"\d,\d", line) for line in lines)
+    form: Any = {"sep": separator, "decimal": "," if comma else "."}
+    names = [name.strip() for name in pd.read_csv(path, nrows=0, **form).columns]
 
-    def read(chosen: list[str], _: int | None) -> Iterator[Arrays]:
-        with _explained(path), warnings.catch_warnings():
-            # pandas drops what a line has beyond the header, with a warning.
-            warnings.simplefilter("error", pd.errors.ParserWarning)
-            options: Any = {"header": 0, "names": names, "index_col": False, **form}
-            frame = pd.read_csv(path, low_memory=False, **options)
+    def read(chosen: list[str]) -> Iterator[Arrays]:
+        frame = pd.read_csv(path, header=0, names=names, low_memory=False, **form)
+        if not isinstance(frame.index, pd.RangeIndex):
+            raise ValueError(f"{path}: lines have more values than the header names.")
         yield {name: frame[name].to_numpy() for name in chosen}
 
-    return Table(names, read, (f"read as {form}",) if form != usual else ())
+    return Table(names, read)
 
 
 def _parquet(path: Path) -> Table:
@@ -188,13 +150,11 @@ def _parquet(path: Path) -> Table:
         from pyarrow import parquet
     file = parquet.ParquetFile(path)
 
-    def read(chosen: list[str], rows: int | None) -> Iterator[Arrays]:
-        with _explained(path):
-            size = rows or max(file.metadata.num_rows, 1)
-            for batch in file.iter_batches(size, columns=chosen):
-                yield {name: _from_arrow(name, batch[name]) for name in chosen}
+    def read(chosen: list[str]) -> Iterator[Arrays]:
+        for batch in file.iter_batches(columns=chosen):
+            yield {name: _from_arrow(name, batch[name]) for name in chosen}
 
-    return Table(file.schema_arrow.names, read)
+    return Table(file.schema_arrow.names, read, file.metadata.num_rows)
 
 
 def _from_arrow(name: str, column: Any) -> Array:
@@ -211,15 +171,13 @@ def _hdf5(path: Path) -> Table:
     with needed_by("HDF5 files need", "minari"):
         import h5py
     with h5py.File(path, "r") as file:
-        sizes = {n: a.nbytes for n, a in file.items() if isinstance(a, h5py.Dataset)}
+        names = [n for n, each in file.items() if isinstance(each, h5py.Dataset)]
 
-    def read(chosen: list[str], _: int | None) -> Iterator[Arrays]:
-        with _explained(path), h5py.File(path, "r") as file:
-            check_unpacked_size(path, sum(sizes[name] for name in chosen))
-            arrays = {name: np.asarray(file[name]) for name in chosen}
-        yield arrays
+    def read(chosen: list[str]) -> Iterator[Arrays]:
+        with h5py.File(path, "r") as file:
+            yield {name: np.asarray(file[name]) for name in chosen}
 
-    return Table([*sizes], read)
+    return Table(names, read)
 
 
 def find_columns(names: Sequence[str], wanted: ColumnNames) -> dict[str, list[str]]:
@@ -237,7 +195,6 @@ def find_columns(names: Sequence[str], wanted: ColumnNames) -> dict[str, list[st
     used = [*chain(*columns.values())]
     if twice := [name for name in used if used.count(name) > 1]:
         raise ValueError(f"column {twice[0]!r} is read twice: {columns}.")
-    unused = [name for name in names if name not in used]
     required = ["observation", "action", "reward"] + ["terminated"] * (not endless)
     missing = [part for part in required if part not in columns]
     if "episode" not in columns and ("step" in columns or "truncated" not in columns):
@@ -245,13 +202,11 @@ def find_columns(names: Sequence[str], wanted: ColumnNames) -> dict[str, list[st
     if missing:
         cure = f"name it as in data.columns.{missing[0].split()[0]}=<name>"
         if missing[0] == "terminated":
-            cure += (
-                ", or data.columns.terminated=false if nothing ends it; 'done' is "
-                "data.columns.truncated if only the recording ended"
-            )
+            cure += ", or data.columns.terminated=false if nothing ends the task"
         raise ValueError(
-            f"the data lack {', '.join(missing)}; there are {_listed(names)}: {cure}."
+            f"the data lack {', '.join(missing)}; there are {', '.join(names)}: {cure}."
         )
+    unused = [name for name in names if name not in used]
     if unused and not wanted:
         # A misspelt next_observation would otherwise cost rows.
         raise ValueError(
@@ -271,8 +226,8 @@ def _named(part: str, patterns: Any, names: Sequence[str]) -> list[str]:
         found += matching
         if not matching or (part not in VECTORS and len(found) > 1):
             raise ValueError(
-                f"data.columns.{part}={pattern} names {_listed(matching)}; expected "
-                f"{'some' if part in VECTORS else 'one'} of {_listed(names)}."
+                f"data.columns.{part}={pattern} names {len(matching)} columns; there "
+                f"are {', '.join(names)}."
             )
     return found
 
@@ -294,11 +249,6 @@ def _in_order(names: list[str]) -> list[str]:
     if len(found) < len(names) or len({match[1] for match in found}) != 1:
         return names
     return [match[0] for match in sorted(found, key=lambda match: int(match[2]))]
-
-
-def _listed(names: Sequence[str], most: int = 20) -> str:
-    rest = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + rest or "no column"
 
 
 def assemble(
@@ -341,11 +291,11 @@ def _numbers(name: str, array: Array) -> Array:
     return np.asarray(numbers, np.float64)
 
 
-def _sorted(columns: Arrays, name: str, notes: list[str]) -> Arrays:
+def _sorted(columns: Arrays, name: str) -> Arrays:
     """Rows of all episodes, each in order of its steps or time stamps."""
     given, episode = columns.pop("step"), columns["episode"]
     step = given
-    if clock := given.dtype.kind not in "biuf":
+    if given.dtype.kind not in "biuf":
         times = pd.to_datetime(given, format="ISO8601", utc=True)
         step = np.asarray((times - times[0]).total_seconds())
     if not np.isfinite(step).all():
@@ -367,7 +317,4 @@ def _sorted(columns: Arrays, name: str, notes: list[str]) -> Arrays:
             f"to {given[order[row + 1]]}, where steps are {usual:g} apart, as in "
             f"{wrong.sum()} places: a next state is missing. Give next_observation."
         )
-    if not counted:
-        rate = f"{usual:g} s ({1 / usual:g} Hz)" if clock else f"{usual:g}"
-        notes.append(f"{name!r} has a row every {rate}")
     return rows

@@ -108,23 +108,21 @@ class Reading:
         check_choice("data.missing", self.missing, ("error", "row", "episode"))
 
 
-class Trajectories(NamedTuple):
+class Part(NamedTuple):
     """Transitions ``[N]`` of whole trajectories, perhaps none, and facts about them.
 
     ``episodes`` ``[E, 3]``: return, length, and whether it is complete. ``changes``
-    ``[2, D]``: how often each entry changes from one row to the next, and how many of
-    these changes float32 loses.
+    ``[2, S + 1]``: how often each observation and the reward change from one row to the
+    next, and how many of these changes float32 loses.
     """
 
     data: TensorDict
     counts: dict[str, int]
     episodes: NDArray[np.float64]
-    changes: dict[str, NDArray[np.int64]]
+    changes: NDArray[np.int64]
 
 
-def trajectories(
-    rows: Columns, options: Reading, before: Array | float = np.nan
-) -> Trajectories:
+def trajectories(rows: Columns, options: Reading, before: Array | float) -> Part:
     """Transitions of a part of a set; the part before ended in state ``before``."""
     columns = _arrays(rows, options.num_actions)
     lost = _missing(columns, options.missing)
@@ -138,20 +136,18 @@ def trajectories(
     keep = ~(lost | resets)
     if not keep.any():
         counts = {"missing_rows": int(lost.sum()), "reset_rows": int(resets.sum())}
-        none = {n: np.zeros((2, 1), int) for n in ("observation", "reward")}
-        return Trajectories(TensorDict({}, [0]), counts, np.empty((0, 3)), none)
+        return Part(TensorDict(), counts, np.empty((0, 3)), np.zeros((2, 1), int))
     if not keep.all():
         columns = {name: array[keep] for name, array in columns.items()}
         flagged, ends, broken = flagged[keep], ends[keep], broken[keep]
     ends[-1] = True
     reward = columns["reward"].astype(np.float64)
-    raw, columns = columns, _cast(columns, options.num_actions)
+    numbers = np.c_[columns["observation"], reward]
+    columns = _cast(columns, options.num_actions)
     columns["action"], clipped, outside = _unit_actions(columns["action"], options)
-    changes = {}
-    for name in ("observation", "reward"):
-        moved = np.diff(raw[name], axis=0) != 0
-        lost_moves = moved & (np.diff(columns[name], axis=0) == 0)
-        changes[name] = np.stack([moved.sum(0), lost_moves.sum(0)]).reshape(2, -1)
+    moved = np.diff(numbers, axis=0) != 0
+    vanished = moved & (np.diff(numbers.astype(np.float32), axis=0) == 0)
+    changes = np.stack([moved.sum(0), vanished.sum(0)])
 
     episode = columns.pop("episode", None)
     terminated = columns["terminated"]
@@ -190,7 +186,7 @@ def trajectories(
         "truncated_ends": int((truncated & ~terminated)[stops].sum()),
         "unmarked_ends": int((~flagged)[stops].sum()),
     }
-    return Trajectories(as_transitions(columns), counts, episodes, changes)
+    return Part(as_transitions(columns), counts, episodes, changes)
 
 
 def _arrays(rows: Columns, num_actions: int | None) -> dict[str, Array]:
