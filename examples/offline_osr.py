@@ -147,7 +147,7 @@ def train(run: Run) -> float:
     if optim.n_steps > 1:
         data.buffer.append_transform(take_multi_step)
     limit = largest_value(data.largest_reward, optim.gamma)
-    with evaluation(run, data.norm, actor, average) as evaluate:
+    with evaluation(run, data.norm, average) as evaluate:
         trainer = OfflineTrainer(
             update(loss, optimizer, targets, **delay),
             data.buffer,

@@ -34,9 +34,9 @@ def test_unknown_command_lists_commands():
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("sed=1", "there is no key 'sed' .did you mean 'seed'.*; --cfg job prints"),
-        ("loss.num_randm=1", ".*'loss.num_randm' .did you mean 'num_random'"),
-        ("loss=sql", r"loss has no option 'sql' .did you mean 'iql'.*; it has .*osr"),
+        ("sed=1", "there is no key 'sed'; its group has .*seed, resume, "),
+        ("loss.num_randm=1", "there is no key 'loss.num_randm'; .*num_random, "),
+        ("loss=sql", "loss has no option 'sql'; it has .*iql, .*osr"),
         ("seed=a", "Error merging override seed=a: Value 'a' .* to Integer"),
     ],
 )
@@ -53,7 +53,7 @@ def test_other_errors_are_one_sentence():
     assert sentence(missing.value) == "Missing mandatory value: checkpoint"
     assert sentence(ValueError("seed is too large.")) == "seed is too large."
     package = ModuleNotFoundError("No module named 'hydra'", name="hydra")
-    assert sentence(package) == "'hydra' is missing: pip install 'torchrl-osr[train]'"
+    assert "'hydra': pip install 'torchrl-osr[train]'" in sentence(package)
     # A defect of ours: there is no sentence to it.
     assert sentence(KeyError("x")) == "KeyError: 'x'\nIts traceback: add --debug."
 

@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-import difflib
 import functools
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 OURS = (ValueError, OSError, RuntimeError, ImportError, ArithmeticError, MemoryError)
 """Errors that this package raises with a whole sentence; others are defects."""
-
-EXTRAS = (
-    *("filelock", "gymnasium", "hydra", "jinja2", "matplotlib", "mujoco"),
-    *("omegaconf", "pandas", "platformdirs", "safetensors", "tqdm"),
-)
-"""Modules that the commands need, and the package without extras does not."""
 
 
 @contextmanager
@@ -65,10 +58,14 @@ def single_job(task: Callable[..., Any]) -> Callable[..., Any]:
         except Exception as error:
             if not HydraConfig.initialized():  # called as a function
                 raise
-            single = HydraConfig.get().mode is RunMode.RUN
-            _log(error, files_only=single)
-            if single:
+            details = type(error), error, error.__traceback__
+            record = {"levelname": "ERROR", "name": __name__, "exc_info": details}
+            for handler in logging.getLogger().handlers:
+                if isinstance(handler, logging.FileHandler):
+                    handler.handle(logging.makeLogRecord(record))
+            if HydraConfig.get().mode is RunMode.RUN:
                 raise SystemExit(sentence(error)) from error
+            print(sentence(error), file=sys.stderr)
             raise
 
     return run
@@ -78,8 +75,8 @@ def sentence(error: BaseException) -> str:
     """Return an error in words; of a defect also its type and how to see more."""
     if type(error).__module__.startswith(("hydra.", "omegaconf.")):
         return _configuration_error(error)
-    if isinstance(error, ModuleNotFoundError) and error.name in EXTRAS:
-        return f"{error.name!r} is missing: pip install 'torchrl-osr[train]'"
+    if isinstance(error, ModuleNotFoundError):
+        return f"{error}: pip install 'torchrl-osr[train]' has what commands need."
     if isinstance(error, OURS) and str(error):
         return str(error)
     return f"{type(error).__name__}: {error}\nIts traceback: add --debug."
@@ -93,33 +90,9 @@ def _configuration_error(error: Any) -> str:
     cause = error.__cause__
     if isinstance(error, MissingConfigException) and error.options:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
-        options = ", ".join(error.options)
-        guess = _similar(name, error.options)
-        return f"{group} has no option {name!r}{guess}; it has {options}."
+        return f"{group} has no option {name!r}; it has {', '.join(error.options)}."
     if isinstance(cause, (ConfigKeyError, ConfigAttributeError)):
-        last = str(cause.full_key).rpartition(".")[2]
-        guess = _similar(last, map(str, cause.parent_node or ()))
-        return f"there is no key {cause.full_key!r}{guess}; --cfg job prints all keys."
+        known = ", ".join(map(str, cause.parent_node or ()))
+        return f"there is no key {cause.full_key!r}; its group has {known}."
     lines = [str(each).strip().split("\n")[0] for each in (error, cause) if each]
     return ": ".join(lines)
-
-
-def _similar(name: str, known: Iterable[str]) -> str:
-    """A question after an unknown name, if a known one is similar."""
-    found = difflib.get_close_matches(name, list(known), 1)
-    return f" (did you mean {found[0]!r}?)" if found else ""
-
-
-def _log(error: Exception, *, files_only: bool) -> None:
-    """Log an error, its traceback in log files alone."""
-    log = logging.getLogger(__name__)
-    details = type(error), error, error.__traceback__
-    for handler in logging.getLogger().handlers:
-        to_file = isinstance(handler, logging.FileHandler)
-        if to_file or not files_only:
-            handler.handle(
-                log.makeRecord(
-                    log.name, logging.ERROR, __file__, 0, sentence(error), (),
-                    details if to_file else None,
-                )
-            )  # fmt: skip

@@ -4,10 +4,8 @@
     torchrl-osr export policy.safetensors policy.onnx
     torchrl-osr export policy.safetensors value.onnx --output value
 
-The source is a run's folder (its last checkpoint), a checkpoint's file in it, or a
-saved policy. The suffix of the new file decides: ``.safetensors`` for ``load_policy``,
-``.onnx`` for ONNX Runtime, ``.pt2`` for ``torch.export``. How to use each:
-docs/deploy.md.
+The suffix decides: .safetensors for load_policy, .onnx for ONNX Runtime, .pt2 for
+torch.export. docs/deploy.md says how to use each.
 """
 
 from __future__ import annotations
@@ -26,23 +24,15 @@ from torchrl_osr.policy import Policy, load_policy
 from torchrl_osr.policy.export import SUFFIXES
 from torchrl_osr.policy.policy import SUFFIX
 
-ROWS = 256
-"""Observations that a written file is checked on."""
-
-TOLERANCE = 1e-5
-"""Largest deviation, relative to the larger of 1 and the number itself."""
-
-Function = Callable[..., Tensor]
+ROWS, TOLERANCE = 256, 1e-5
+"""Random observations that a file is checked on, and its largest deviation, relative to
+the larger of 1 and the number itself."""
 
 
 def main() -> None:
     """Load, write, check, and say what was written."""
-    parser = argparse.ArgumentParser(
-        prog=sys.argv[0],
-        description=__doc__.split("\n")[0],
-        epilog="The suffix decides: .safetensors for load_policy, .onnx for ONNX "
-        "Runtime, .pt2 for torch.export. More in docs/deploy.md.",
-    )
+    parser = argparse.ArgumentParser(prog=sys.argv[0], description=__doc__)
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     add = parser.add_argument
     add("source", type=Path, help="a run's folder, a checkpoint, or a .safetensors")
     add("path", type=Path, help="the file to write")
@@ -66,7 +56,7 @@ def main() -> None:
 
 
 def check(policy: Policy, path: Path, output: str) -> float:
-    """Largest deviation of the written file from the policy, at random observations."""
+    """Return the largest deviation of a written file from the policy."""
     generator = torch.Generator().manual_seed(0)
     noise = torch.randn(ROWS, policy.observation_size, generator=generator)
     observation = policy.loc + policy.scale * noise
@@ -84,8 +74,8 @@ def check(policy: Policy, path: Path, output: str) -> float:
     return largest
 
 
-def read(path: Path, output: str) -> Function:
-    """What a written file computes, as a function of named tensors."""
+def read(path: Path, output: str) -> Callable[..., Tensor]:
+    """Return what a written file computes, as a function of named tensors."""
     if path.suffix == SUFFIX:
         policy = load_policy(path)
         return policy.value if output == "value" else policy.act

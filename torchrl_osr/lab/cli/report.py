@@ -1,11 +1,10 @@
 """Compare any number of finished runs: verdict, tables and figures.
 
     torchrl-osr report outputs/oos
-    torchrl-osr report multirun/*/ outputs/ --reference cql --output report
+    torchrl-osr report multirun outputs --reference cql --output page
 
-Reads what ``torchrl-osr train`` and ``torchrl-osr evaluate`` left in and below the
-folders. Writes ``report.html``, which is complete in itself, a CSV file for each table
-and a PNG file for each figure. How to read them: docs/robustness.md.
+The page is <output>/report.html, with a CSV file for each table and a PNG file for each
+figure beside it. docs/robustness.md says how to read it.
 """
 
 from __future__ import annotations
@@ -17,27 +16,15 @@ from pathlib import Path
 
 from torchrl_osr.lab.report import comparison_notes, read_runs, write_report
 
-EXAMPLES = """\
-  torchrl-osr report outputs
-  torchrl-osr report multirun outputs --reference cql --output page
-
-The page is <output>/report.html; docs/robustness.md says how to read it.
-"""
-
 
 def main() -> None:
     """Read the runs and write the report."""
-    parser = argparse.ArgumentParser(
-        prog=sys.argv[0],
-        description=__doc__.split("\n")[0],
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument(
-        "runs", nargs="+", type=Path, help="folders of runs, or above them"
-    )
-    parser.add_argument("--output", type=Path, default=Path("report"), help="a folder")
-    parser.add_argument("--reference", help="method to compare with; default the first")
+    parser = argparse.ArgumentParser(prog=sys.argv[0], description=__doc__)
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    add = parser.add_argument
+    add("runs", nargs="+", type=Path, help="folders of runs, or above them")
+    add("--output", type=Path, default=Path("report"), help="a folder")
+    add("--reference", help="method to compare with; default the first")
     options = parser.parse_args()
     command = " ".join([sys.argv[0], shlex.join(sys.argv[1:])])
     tables = read_runs(options.runs)

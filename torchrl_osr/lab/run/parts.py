@@ -5,16 +5,14 @@ from __future__ import annotations
 import logging
 import math
 import uuid
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict
 from functools import partial
-from importlib.util import find_spec
-from pathlib import Path
+from importlib import import_module
 from typing import Any
 
 import torch
-from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 from torch.nn import Parameter
 from torch.optim.lr_scheduler import LambdaLR
@@ -24,11 +22,11 @@ from torchrl.envs import ObservationNorm
 from torchrl.record.loggers import CSVLogger, Logger, get_logger
 from torchrl.record.loggers.wandb import WandbLogger
 
+from torchrl_osr._extras import needed_by
 from torchrl_osr._files import write_atomically, write_json
 from torchrl_osr.lab.evaluation import (
     EpisodeEvaluator,
     deterministic_policy,
-    measure_of,
     summarize,
 )
 from torchrl_osr.lab.evaluation.figures import learning_curve
@@ -72,11 +70,8 @@ def make_loggers(run: Run) -> list[Logger]:
     loggers: list[Logger] = [CSVLogger("csv", log_dir=str(folder))]
     if kind == "csv":
         return loggers
-    if find_spec(kind) is None:
-        extra = "wandb" if kind == "wandb" else "train"
-        raise ImportError(
-            f"logger={kind} needs {kind!r}: pip install 'torchrl-osr[{extra}]'"
-        )
+    with needed_by(f"logger={kind} needs", "wandb" if kind == "wandb" else "train"):
+        import_module(kind)
     name, options = kind, {}
     if kind == "wandb":
         if not (known := folder / ".wandb_id").exists():
@@ -90,7 +85,6 @@ def make_loggers(run: Run) -> list[Logger]:
             # A sweep's jobs may share a process, and a failed one left its run open.
             "reinit": "finish_previous",
             "group": group,
-            "tags": [config.env.name, config.data.source, run.method],
             "config": asdict(config) | {"versions": code_versions()},
         }
     return [*loggers, get_logger(kind, str(folder), name, wandb_kwargs=options)]
@@ -152,16 +146,9 @@ def averaged(network: torch.nn.Module, share: float) -> AveragedModel:
 
 @contextmanager
 def evaluation(
-    run: Run,
-    norm: ObservationNorm,
-    actor: ProbabilisticTensorDictSequential,
-    average: AveragedModel,
+    run: Run, norm: ObservationNorm, average: AveragedModel
 ) -> Iterator[Evaluation | None]:
-    """Open the episodes that evaluate a policy.
-
-    It plays the averaged weights, and the last ones besides if they differ. ``None``
-    without a simulator.
-    """
+    """Open the episodes that evaluate the averaged policy; ``None``: no simulator."""
     if not run.simulated:
         yield None
         return
@@ -174,14 +161,8 @@ def evaluation(
     )
 
     def evaluate() -> dict[str, Any]:
-        results = summarize(
-            episodes(deterministic_policy(average.module, norm)), references
-        )
-        if run.config.optim.policy_average < 1:
-            last = summarize(episodes(deterministic_policy(actor, norm)), references)
-            measure = measure_of(last)
-            results[f"{measure}_of_last_weights"] = last[measure]
-        return results
+        policy = deterministic_policy(average.module, norm)
+        return summarize(episodes(policy), references)
 
     measure = "return" if references is None else "score"
     with closing(episodes):
@@ -209,11 +190,11 @@ def report(run: Run, data_mean: float | None, trainer: OfflineTrainer) -> float:
     Without a simulator there are no evaluations, and the score is NaN.
     """
     config, folder = run.config, run.folder
-    history, best = trainer.history, trainer.best()
+    history = trainer.history
     measure = "return" if references_of(config.env) is None else "score"
     rows: dict[str, Any] = {}
     if history:
-        rows = {"last": history[-1], "best": best or history[0]}
+        rows = {"last": history[-1], "best": trainer.best() or history[0]}
     results = {"versions": code_versions(), f"data_{measure}": data_mean, **rows}
     write_json(folder / "returns.json", results | {"evaluations": history})
     name = f"{config.env.name} {config.data.source}"
@@ -224,7 +205,12 @@ def report(run: Run, data_mean: float | None, trainer: OfflineTrainer) -> float:
         title=f"{name}, {run.method}, seed {config.seed}",
         data_mean=data_mean,
     )
-    _finish_wandb(trainer.loggers, rows, folder / "curve.png")
+    for logger in trainer.loggers:
+        if isinstance(logger, WandbLogger):
+            import wandb
+
+            logger.experiment.log({"curve": wandb.Image(str(folder / "curve.png"))})
+            logger.experiment.finish()
     if rows:
         print("\n" + score_table(name, history, rows["best"], data_mean, folder))
     if failed := trainer.failed_evaluations:
@@ -237,18 +223,3 @@ def report(run: Run, data_mean: float | None, trainer: OfflineTrainer) -> float:
         print(f"  {'files':<26}{folder}")
         return math.nan
     return float(history[-1][measure])
-
-
-def _finish_wandb(
-    loggers: Sequence[Logger], rows: Mapping[str, Mapping[str, Any]], curve: Path
-) -> None:
-    """Give W&B the last results, and close its run; all else is in the curves."""
-    for logger in loggers:
-        if isinstance(logger, WandbLogger):
-            import wandb
-
-            logger.experiment.log({"curve": wandb.Image(str(curve))})
-            for name, row in rows.items():
-                measure = measure_of(row)
-                logger.experiment.summary[f"{name}_{measure}"] = row[measure]
-            logger.experiment.finish()

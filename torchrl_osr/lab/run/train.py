@@ -256,7 +256,7 @@ def train_policy(
     elif optim.n_steps > 1:
         data.buffer.append_transform(take_multi_step)
     limit = largest_value(data.largest_reward, optim.gamma)
-    with evaluation(run, data.norm, actor, average) as evaluate:
+    with evaluation(run, data.norm, average) as evaluate:
         trainer = new_trainer(
             objective,
             optimizer,
