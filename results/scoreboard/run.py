@@ -30,7 +30,7 @@ METHODS = {
     name: [f"loss={name}"]
     for name in (
         *("osr", "noisy_bc", "cql_noisy_bc", "cql", "iql", "td3_bc", "rebrac", "bc"),
-        *("osr_v", "osr_10", "sac_10", "edac_10", "rorl", "mopo", "rambo", "romi"),
+        *("osr_v", "osr_10", "sac_10", "edac_10", "rorl", "mopo", "rambo"),
         *("scas", "sdc", "osr_v_data", "rim"),
     )
 } | {

@@ -27,7 +27,7 @@ from torchrl_osr import (
     modules,
 )
 from torchrl_osr.lab import losses as lab
-from torchrl_osr.lab.dynamics import ConditionalVAE, DynamicsEnsemble
+from torchrl_osr.lab.dynamics import DynamicsEnsemble, TransitionVAE
 from torchrl_osr.objectives import WithRecovery
 
 S, A, ACTIONS = 3, 2, 4
@@ -63,11 +63,6 @@ def _dynamics(size: int, number: int, **keys: Any) -> DynamicsEnsemble:
     return DynamicsEnsemble(size, number, **options, **keys)
 
 
-def _vae(size: int, *, observation_key: Any) -> ConditionalVAE:
-    keys = {"condition_key": observation_key, "target_key": ("next", observation_key)}
-    return ConditionalVAE(size, size, change=True, num_cells=[6], **keys)
-
-
 MLPS, LIMITS = {"num_cells": [8], "activation_class": nn.Tanh}, ("low", "high")
 LATENT = MLPS | {"latent_dim": 2}
 STATE, COUNT = ("observation_key",), ("num_qvalue_nets",)
@@ -88,7 +83,7 @@ BUILDERS: dict[str, tuple[Callable[..., Any], tuple[int, ...], dict, tuple]] = {
     ),
     "choice_model": (modules.categorical_inverse_dynamics, (S, ACTIONS), MLPS, BOTH),
     "dynamics": (_dynamics, (S, A), {}, BOTH),
-    "vae": (_vae, (S,), {}, STATE),
+    "vae": (TransitionVAE, (S,), {"num_cells": [6]}, STATE),
 }  # fmt: skip
 
 

@@ -16,5 +16,7 @@ def data(transitions) -> ModelData:
     held_out = transitions(60, observation=11, action=3, seed=8)
     loc, scale = torch.zeros(11), torch.full([11], 0.1)
     loc[0] = 1.2  # upright
-    pieces = held_out.reshape(3, 20)
-    return ModelData(storage, held_out, pieces, loc, scale, 2.0, 0.0, "Hopper-v5")
+    return ModelData(
+        storage, held_out, held_out.reshape(3, 20), loc, scale, reward_scale=2.0,
+        reward_shift=0.0, gamma=0.99, env_id="Hopper-v5", seed=0,
+    )  # fmt: skip

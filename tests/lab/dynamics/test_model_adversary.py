@@ -36,16 +36,14 @@ def make_adversary(networks, make_batch) -> ModelAdversary:
     rows, storage = make_batch(50, twin=False), LazyTensorStorage(50)
     storage.set(range(50), rows)
     data = ModelData(
-        storage, rows, None, torch.zeros(3), torch.ones(3), 1.0, 0.0, "Hopper-v5"
-    )
-    model = uneven_dynamics()
-    optimizer = torch.optim.Adam(model.parameters(), lr=1e-2)
+        storage, rows, None, torch.zeros(3), torch.ones(3), reward_scale=1.0,
+        reward_shift=0.0, gamma=GAMMA, env_id="Hopper-v5", seed=0,
+    )  # fmt: skip
     options = DynamicsOptions(
-        adversarial_steps=5, adversarial_weight=0.5, rollout_steps=2, batch_size=8
-    )
-    adversary = ModelAdversary(
-        options, data, model, loss, networks.actor, optimizer, GAMMA, seed=0
-    )
+        adversarial_steps=5, adversarial_weight=0.5, adversarial_lr=1e-2,
+        rollout_steps=2, batch_size=8,
+    )  # fmt: skip
+    adversary = ModelAdversary(options, data, uneven_dynamics(), loss, networks.actor)
     adversary.terminated = falls
     return adversary
 

@@ -12,8 +12,6 @@ from torchrl_osr.lab.dynamics import DynamicsOptions
     [
         ({"num_elites": 9}, "num_elites must be between 1 and num_networks=7"),
         ({"real_ratio": 0.01}, "real_ratio=0.01: 0 of 8 rows"),
-        ({"unknown": "halt", "reverse_policy": "cvae"}, "need a forward model"),
-        ({"perturbed_start_steps": 3, "reverse_policy": "cvae"}, "need a forward"),
         ({"unknown": "halt"}, "needs optim.gamma below 1"),
         ({"unknown": "halts"}, "dynamics.unknown must be one of"),
         ({"adversarial_steps": 9, "batch_size": 1}, "batch_size must be at least 2"),

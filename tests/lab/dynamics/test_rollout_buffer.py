@@ -40,7 +40,7 @@ def make_buffer(data: ModelData) -> Numbered:
     storage.set(range(50), rows_of(zeros - 1, zeros, zeros.bool()))
     buffer = Numbered(
         replace(TINY, unknown="take"), replace(data, storage=storage),
-        TINY.ensemble(11, 3), policy, batch_size=40, gamma=0.9, n_steps=1, seed=0,
+        TINY.ensemble(11, 3), policy, batch_size=40, n_steps=1,
         transform=lambda batch: batch,
     )  # fmt: skip
     buffer.set_rng(torch.Generator().manual_seed(5))
@@ -100,9 +100,9 @@ def buffer_of(data: ModelData, options: DynamicsOptions, **batches):
     """Return a buffer of roll-outs, a batch, the untrained model and the actor."""
     torch.manual_seed(0)
     model, actor = options.ensemble(11, 3), deterministic_actor(11, 3, num_cells=[8])
-    batches = {"batch_size": 8, "gamma": 0.99, "n_steps": 1} | batches
+    batches = {"batch_size": 8, "n_steps": 1} | batches
     buffer = RolloutReplayBuffer(
-        options, data, model, actor, seed=0, transform=lambda batch: batch, **batches
+        options, data, model, actor, transform=lambda batch: batch, **batches
     )
     return buffer, buffer.sample(), model, actor
 

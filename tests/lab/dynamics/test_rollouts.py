@@ -12,11 +12,7 @@ from uneven_dynamics import linear_dynamics
 
 from torchrl_osr.lab.data import make_environment
 from torchrl_osr.lab.dynamics import DynamicsEnsemble, rollout, termination
-from torchrl_osr.lab.dynamics.rollouts import (
-    perturbed_starts,
-    reverse_rollout,
-    reverse_transitions,
-)
+from torchrl_osr.lab.dynamics.rollouts import perturbed_starts
 
 
 def linear_world(change=1.0, spread=0.0, log_variance=-40.0) -> DynamicsEnsemble:
@@ -93,32 +89,6 @@ def test_perturbed_starts_are_where_random_actions_lead_in_the_task() -> None:
     world, starts = linear_world(), torch.zeros(100, 1)
     states = perturbed_starts(world, starts, steps=5, terminated=lambda s: s[:, 0] < 0)
     assert (states >= 0).all()
-
-
-def test_reverse_rollouts_lead_into_the_given_states() -> None:
-    rows, rejected = reverse_rollout(
-        linear_world(change=-1.0), one, torch.tensor([[0.0], [3.0]]), steps=4,
-        terminated=lambda state: state[:, 0] < -1.5,
-    )  # fmt: skip
-    assert rows["observation"].flatten().tolist() == [-1, 2, 1, 0, -1]
-    assert rejected == 1  # nobody acts after the end
-    # The forward world agrees with these rows.
-    after = rows["next", "observation"]
-    torch.testing.assert_close(rows["observation"] + rows["action"], after)
-    torch.testing.assert_close(rows["next", "reward"], after)
-    for key in ("done", "terminated"):
-        assert not rows["next", key].any()
-
-
-def test_reversed_transitions_exchange_states_and_nothing_else(transitions) -> None:
-    rows = transitions(6)
-    before = rows.clone()
-    reverse = reverse_transitions(rows)
-    assert torch.equal(reverse["observation"], rows["next", "observation"])
-    for each in (rows, reverse_transitions(reverse)):
-        assert (each == before).all()
-    reverse.update({"observation": before["observation"], "next": before["next"]})
-    assert (reverse == before).all()
 
 
 @pytest.mark.parametrize("env_id", ["Hopper-v5", "Walker2d-v5", "HalfCheetah-v5"])

@@ -92,12 +92,10 @@ def test_recovery_is_added_to_a_loss_without_it(name, recovery, batch) -> None:
         (["loss=iql", "dynamics=ensemble"], "choose dynamics=none"),
         (["loss=rebrac", "dynamics=ensemble"], "choose dynamics=none"),
         (["loss=scas", "dynamics=none"], "choose dynamics=ensemble"),
-        (["loss=scas", "dynamics=reverse"], "choose dynamics=ensemble"),
         (["loss=rambo", "dynamics.real_ratio=1.0"], "set it to 0"),
         (["loss=bc", "perturbation=adversarial"], "needs critics, which BCLoss lacks"),
         (["loss=td3_bc", "perturbation=adversarial"], "tanh-Gaussian"),
         (["data.held_out=0"], "data.held_out=0.0 leaves nothing"),
-        (["loss=romi", "dynamics.unknown=halt"], "need a forward model"),
     ],
 )
 def test_options_that_do_not_fit_each_other_are_refused(overrides, message) -> None:

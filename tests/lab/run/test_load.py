@@ -184,7 +184,7 @@ def folders(tmp_path_factory) -> list[Path]:
         torch.manual_seed(seed)
         make_run(folder := top / f"seed{seed}", LOSS, *BOUNDS)
         model = DynamicsEnsemble(11, 3, num_networks=2, num_elites=1, num_cells=[4])
-        write_dynamics(folder / FILE, model, {"direction of time": "forward"})
+        write_dynamics(folder / FILE, model, {})
         found.append(folder)
     return found
 
@@ -234,17 +234,14 @@ def test_runs_that_do_not_fit_together_are_refused(folders, tmp_path) -> None:
         "bare": [LOSS],
         "clone": ["loss=bc"],
         "hasty": [LOSS, "optim.gamma=0.9"],
-        "reverse": [LOSS, "dynamics=reverse"],
         "scaled": [LOSS, "data.reward_scale=100"],
     }
     for name, options in kinds.items():
         make_run(tmp_path / name, *options)
     make_run(tmp_path / "walker", LOSS, "env=walker2d", sizes=(17, 6))
-    facts = {"direction of time": "backward"}
-    write_dynamics(tmp_path / "reverse" / FILE, DynamicsEnsemble(11, 3), facts)
     for name, message in {
-        "bare": "does not exist", "reverse": "direction of time",
-        "clone": "no critics", "hasty": "optim.gamma: .0.9, 0.99",
+        "bare": "does not exist", "clone": "no critics",
+        "hasty": "optim.gamma: .0.9, 0.99",
         "walker": "env.id: ..Hopper-v5., .Walker2d-v5",
         "scaled": "data.reward_scale: .1.0, 100.0",
     }.items():  # fmt: skip

@@ -27,10 +27,6 @@ WEIGHT_DECAY = (2.5e-5, 5e-5, 7.5e-5, 7.5e-5)
 OUTPUT_WEIGHT_DECAY = 1e-4
 """Of MOPO's four hidden layers and its last one; further layers use the fourth's."""
 
-UNWEIGHTED: dict[str, Any]
-UNWEIGHTED = {"use_prioritized_weights": False, "scalar_output_mode": "exclude"}
-"""Options of the models' losses, which learn from all rows alike."""
-
 
 class DynamicsEnsemble(nn.Module):
     r"""Networks that predict Gaussians of the state's change and the reward.
@@ -229,7 +225,6 @@ class DynamicsLoss(ActorCriticLoss):
 
     Keyword Args:
         bound_weight: ``w``. Default 0.01, MOPO's.
-        options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
     """
 
     dynamics_network: DynamicsEnsemble
@@ -237,13 +232,9 @@ class DynamicsLoss(ActorCriticLoss):
     target_dynamics_network_params: TensorDictParams
 
     def __init__(
-        self,
-        dynamics_network: DynamicsEnsemble,
-        *,
-        bound_weight: float = 0.01,
-        **options: Any,
+        self, dynamics_network: DynamicsEnsemble, *, bound_weight: float = 0.01
     ) -> None:
-        super().__init__(**(UNWEIGHTED | options))
+        super().__init__(use_prioritized_weights=False)
         self.convert_to_functional(dynamics_network, "dynamics_network")
         self.bound_weight = bound_weight
         self.declare(["loss_dynamics", "loss_bounds"], [])
@@ -255,26 +246,22 @@ class DynamicsLoss(ActorCriticLoss):
 
     def losses(self, batch: Transitions) -> Losses:
         check_single_steps(batch, "the model of the dynamics")
-        tensordict, model = batch.one_step, self.dynamics_network
-        rows = tensordict.batch_size.numel()
-        if rows % model.num_networks:
-            number = model.num_networks
-            raise ValueError(f"{rows} rows cannot be divided among {number} networks.")
+        rows, model = batch.one_step, self.dynamics_network
+        number = model.num_networks
+        if len(rows) % number:
+            raise ValueError(
+                f"{len(rows)} rows cannot be divided among {number} networks."
+            )
         with self.dynamics_network_params.to_module(model):
-            inputs, targets = model.inputs_and_targets(tensordict)
+            inputs, targets = model.inputs_and_targets(rows)
             targets = (targets - model.target_loc) / model.target_scale
-            inputs = inputs.reshape(model.num_networks, -1, inputs.shape[-1])
-            targets = targets.reshape(model.num_networks, -1, targets.shape[-1])
+            inputs = inputs.reshape(number, -1, inputs.shape[-1])
+            targets = targets.reshape(number, -1, targets.shape[-1])
             mean, log_variance = model.standardized(inputs)
             width = model.highest_log_variance - model.lowest_log_variance
             bounds = self.bound_weight * width.sum()
-        error = gaussian_error(mean, log_variance, targets)
         # Of the mean over E times as many rows as each network has.
-        value = error.reshape(tensordict.batch_size) * (
-            model.num_networks if self.reduction == "mean" else 1
-        )
-        valid = has_next_state(tensordict, model.in_keys[0])
-        loss = self.reduce(value, batch, valid)
-        if self.reduction == "none":
-            bounds = bounds.expand(batch.tensordict.batch_size) / rows
+        error = number * gaussian_error(mean, log_variance, targets).flatten()
+        valid = has_next_state(rows, model.in_keys[0])
+        loss = self.reduce(error, batch, valid)
         return {"loss_dynamics": loss, "loss_bounds": bounds}, {}

@@ -31,15 +31,11 @@ def dynamics_report(
     """Measure an ensemble's errors on rows ``[N]``, and how well it predicts them.
 
     Returns:
-        A dictionary of
-
-        - ``"nll"``: of the elites, in nats, summed over entries.
-        - ``"mse"``: of all networks, in standardised targets.
-        - ``"r2"``: of the elites' mean, for each entry; the reward is the last.
-        - ``"within_1_sigma"``, ``"within_2_sigma"``: shares of the errors. A calibrated
-          model has 0.683 and 0.954.
-        - ``"disagreement_rank"``: Spearman's correlation of disagreement and error.
-        - ``"rollout"``: see :func:`rollout_errors`.
+        ``"nll"`` of the elites, in nats, summed over entries; ``"mse"`` of all
+        networks, in standardised targets; ``"r2"`` of the elites' mean for each entry,
+        the reward last; the shares of errors ``"within_1_sigma"`` and
+        ``"within_2_sigma"``, 0.683 and 0.954 if calibrated; Spearman's correlation of
+        disagreement and error, ``"disagreement_rank"``; :func:`rollout_errors`.
     """
     rows = held_out[has_next_state(held_out, model.in_keys[0])]
     _, targets = model.inputs_and_targets(rows)
@@ -71,9 +67,7 @@ def dynamics_report(
 
 @torch.no_grad()
 def rollout_errors(
-    model: DynamicsEnsemble,
-    pieces: TensorDictBase,
-    horizons: Sequence[int] = HORIZONS,
+    model: DynamicsEnsemble, pieces: TensorDictBase, horizons: Sequence[int] = HORIZONS
 ) -> list[dict[str, float]]:
     """Measure errors of the elites' mean, rolled out with the actions of ``[n, L]``.
 

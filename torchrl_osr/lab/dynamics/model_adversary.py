@@ -19,9 +19,8 @@ from tensordict.nn import (
 from torch import Tensor
 from torch.distributions import Normal
 
-from torchrl_osr.lab.dynamics.data import ModelData
 from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble, DynamicsLoss
-from torchrl_osr.lab.dynamics.options import DynamicsOptions
+from torchrl_osr.lab.dynamics.options import DynamicsOptions, ModelData
 from torchrl_osr.objectives import ActorCriticLoss
 
 SEED = 2**40
@@ -37,14 +36,12 @@ class ModelAdversary:
         A = r + \gamma\,(1 - \text{terminated}) \min_j Q_j(s', \pi(s'))
             - \min_j Q_j(s, a)
 
-    The first term is :class:`~torchrl_osr.lab.dynamics.DynamicsLoss` on the data. The
-    second is a policy gradient with the model as the policy, on roll-outs of the actor:
-    transitions to worse states than expected become more likely. Roll-outs go on after
-    an end of the task, as in RAMBO's code (https://arxiv.org/abs/2204.12581,
-    marc-rigter/rambo).
+    The first term is :class:`DynamicsLoss` on the data. The second is a policy gradient
+    with the model as the policy, on roll-outs of the actor: transitions to worse states
+    than expected become more likely. Roll-outs go on after an end of the task, as in
+    RAMBO's code (https://arxiv.org/abs/2204.12581, marc-rigter/rambo).
 
-    ``adversarial_weight`` is :math:`\lambda`; ``loss`` has the critics; ``optimizer``
-    has the parameters of the model, which is trained already.
+    ``loss`` has the critics; the model is trained already.
     """
 
     def __init__(
@@ -54,13 +51,11 @@ class ModelAdversary:
         model: DynamicsEnsemble,
         loss: ActorCriticLoss,
         actor: ProbabilisticTensorDictSequential,
-        optimizer: torch.optim.Optimizer,
-        gamma: float,
-        seed: int,
     ) -> None:
-        self.options, self.model = options, model.requires_grad_(True)
-        self.loss, self.actor, self.optimizer = loss, actor, optimizer
-        self.gamma, self.seed = gamma, seed
+        self.options, self.data, self.loss, self.actor = options, data, loss, actor
+        self.model = model.requires_grad_(True)
+        groups, rate = model.parameter_groups(), options.adversarial_lr
+        self.optimizer = torch.optim.Adam(groups, lr=rate, fused=True)
         self.terminated = options.termination(data.env_id, data.loc, data.scale)
         self.real, self.likelihood = data.buffer(), DynamicsLoss(model)
         self.metrics: dict[str, float] = {}
@@ -71,7 +66,7 @@ class ModelAdversary:
         steps, length = options.adversarial_steps, options.rollout_steps
         totals = torch.zeros(2, device=device)
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
-            torch.manual_seed(SEED + self.seed + number)
+            torch.manual_seed(SEED + self.data.seed + number)
             for step in range(steps):
                 if step % length == 0:
                     rows = self.real.sample(options.batch_size)
@@ -99,7 +94,7 @@ class ModelAdversary:
             goes_on = ~self.terminated(following)
             after = self._action(following, InteractionType.DETERMINISTIC)
             value = self._value(following, after)
-            advantage = reward + self.gamma * goes_on * value
+            advantage = reward + self.data.gamma * goes_on * value
             advantage = advantage - self._value(state, action)
         density = Normal(mean[model.elites], scale[model.elites])
         log_prob = density.log_prob(sample).sum(-1)  # type: ignore[no-untyped-call]

@@ -1,23 +1,61 @@
-"""Options of dynamics models and of the roll-outs in them."""
+"""Options of dynamics models, and the data that they learn from."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
+from tensordict import TensorDict
 from torch import Tensor
+from torchrl.data import ImmutableDatasetWriter, ReplayBuffer, Storage
 
 from torchrl_osr._checks import check_choice
-from torchrl_osr.lab.dynamics.conditional_vae import ConditionalVAE
 from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
 from torchrl_osr.lab.dynamics.rollouts import Termination, never, termination
 
-NEXT_STATE = ("next", "observation")
 
-CHOICES = {
-    "terminations": ("auto", "never"),
-    "unknown": ("refuse", "halt", "take"),
-    "reverse_policy": (None, "cvae", "uniform"),
-}
+@dataclass(frozen=True)
+class ModelData:
+    """The data of a run as its models see them, and what rewards and values mean.
+
+    Attributes:
+        storage: rows to train on.
+        held_out: rows to evaluate models on.
+        pieces: of trajectories, ``[n, L]``, to evaluate roll-outs on.
+        loc, scale: observations are ``(s - loc) / scale``.
+        reward_scale, reward_shift: rewards are ``scale * r + shift``.
+        gamma: discount factor.
+    """
+
+    storage: Storage
+    held_out: TensorDict
+    pieces: TensorDict | None
+    loc: Tensor
+    scale: Tensor
+    reward_scale: float
+    reward_shift: float
+    gamma: float
+    env_id: str
+    seed: int
+
+    def buffer(self, batch_size: int | None = None) -> ReplayBuffer:
+        """Return a buffer of the rows to train on, without transforms."""
+        return ReplayBuffer(
+            storage=self.storage,
+            writer=ImmutableDatasetWriter(),
+            collate_fn=lambda batch: batch,
+            batch_size=batch_size,
+        )
+
+    def units(self) -> dict[str, Any]:
+        """Return the units in which a model predicts, JSON-compatible."""
+        return {
+            "environment": self.env_id,
+            "observation mean": self.loc.tolist(),
+            "observation scale": self.scale.tolist(),
+            "reward scale": self.reward_scale,
+            "reward shift": self.reward_shift,
+        }
 
 
 @dataclass
@@ -33,7 +71,7 @@ class DynamicsOptions:
     batch_size: int = 256  # rows of a gradient step, for each network
     steps: int = 40_000  # gradient steps of the model; the best evaluation counts
     path: str | None = None  # model to use: dynamics.safetensors of another run
-    # The conditional autoencoder of loss=sdc or dynamics=reverse.
+    # The autoencoder of loss=sdc.
     vae_num_cells: list[int] = field(default_factory=lambda: [750, 750])
     vae_steps: int = 100_000  # gradient steps of the autoencoder
     # Roll-outs.
@@ -48,8 +86,6 @@ class DynamicsOptions:
     penalty: float = 0.0  # weight of the model's uncertainty in rewards
     unknown: str = "refuse"  # unknown rows: "refuse", "halt" (end there) or "take"
     known_share: float = 1.0  # share of held-out rows that count as known
-    # "cvae" or "uniform": roll a reverse model out with these actions, as in ROMI.
-    reverse_policy: str | None = None
     # RAMBO's training of the model against the policy, before each further roll-out.
     adversarial_steps: int = 0  # gradient steps against the policy
     adversarial_weight: float = 3e-4  # weight of the adversarial term
@@ -61,20 +97,6 @@ class DynamicsOptions:
         options = {name: getattr(self, name) for name in names}
         return DynamicsEnsemble(observation_size, action_size, **options)
 
-    def transition_vae(self, observation_size: int) -> ConditionalVAE:
-        """Build an untrained model of the states that follow a state in the data."""
-        size, cells = observation_size, self.vae_num_cells
-        return ConditionalVAE(
-            size, size, "observation", NEXT_STATE, change=True, num_cells=cells
-        )
-
-    def reverse_vae(self, observation_size: int, action_size: int) -> ConditionalVAE:
-        """Build an untrained model of the actions that lead to a state in the data."""
-        sizes, cells = (observation_size, action_size), self.vae_num_cells
-        return ConditionalVAE(
-            *sizes, NEXT_STATE, "action", num_cells=cells, latent_bound=0.5
-        )
-
     def termination(
         self, env_id: str, loc: Tensor | float = 0.0, scale: Tensor | float = 1.0
     ) -> Termination:
@@ -85,17 +107,18 @@ class DynamicsOptions:
     def check(self, env_id: str, *, batch_size: int, gamma: float) -> None:
         """Raise a ValueError if the options contradict each other or the task."""
         self.ensemble(1, 1)
-        for name, known in CHOICES.items():
+        for name, known in (
+            ("terminations", ("auto", "never")),
+            ("unknown", ("refuse", "halt", "take")),
+        ):
             check_choice(f"dynamics.{name}", getattr(self, name), known)
         if self.real_ratio == 1:
             return
         self.termination(env_id)
-        real, halts = round(self.real_ratio * batch_size), self.unknown == "halt"
+        real = round(self.real_ratio * batch_size)
         if not 0 < real < batch_size:
             why = f"real_ratio={self.real_ratio}: {real} of {batch_size} rows are real"
-        elif self.reverse_policy and (self.perturbed_start_steps or halts):
-            why = "perturbed_start_steps and unknown=halt need a forward model"
-        elif halts and gamma == 1:
+        elif self.unknown == "halt" and gamma == 1:
             why = "unknown=halt needs optim.gamma below 1"
         elif self.adversarial_steps and self.batch_size < 2:
             why = "batch_size must be at least 2: advantages are standardised"

@@ -13,18 +13,10 @@ from torch import Tensor, nn
 
 from torchrl_osr.lab.data.rows import take_multi_step
 from torchrl_osr.lab.data.transitions import DATASET_KEYS
-from torchrl_osr.lab.dynamics.conditional_vae import ConditionalVAE
-from torchrl_osr.lab.dynamics.data import ModelData
 from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
 from torchrl_osr.lab.dynamics.model_adversary import ModelAdversary
-from torchrl_osr.lab.dynamics.options import DynamicsOptions
-from torchrl_osr.lab.dynamics.rollouts import (
-    Rollout,
-    perturbed_starts,
-    reverse_rollout,
-    rollout,
-    uniform_policy,
-)
+from torchrl_osr.lab.dynamics.options import DynamicsOptions, ModelData
+from torchrl_osr.lab.dynamics.rollouts import Rollout, perturbed_starts, rollout
 
 
 class RolloutReplayBuffer:
@@ -37,8 +29,6 @@ class RolloutReplayBuffer:
 
     Args:
         data: the recorded rows, which come first in a batch.
-        model: of the dynamics, a reverse one with ``options.reverse_policy``.
-        policy: an actor, or for a reverse model a :class:`ConditionalVAE`.
         adversary: trains the model before each further roll-out.
 
     Keyword Args:
@@ -53,22 +43,20 @@ class RolloutReplayBuffer:
         options: DynamicsOptions,
         data: ModelData,
         model: DynamicsEnsemble,
-        policy: nn.Module,
+        actor: nn.Module,
         adversary: ModelAdversary | None = None,
         *,
         batch_size: int,
-        gamma: float,
         n_steps: int,
-        seed: int,
         transform: Callable[[TensorDictBase], TensorDictBase],
     ) -> None:
         self.options, self.data, self.model = options, data, model
-        self.adversary, self.seed, self.n_steps = adversary, seed, n_steps
+        self.adversary, self.n_steps = adversary, n_steps
         self.batch_size, self.transform = batch_size, transform
         self.real = data.buffer()
         # The adversary's model is copied too: a roll-out must be repeatable.
-        self.policy = policy if adversary is None else nn.ModuleList([policy, model])
-        self.bounds = self._bounds(gamma)
+        self.policy = actor if adversary is None else nn.ModuleList([actor, model])
+        self.bounds = self._bounds()
         self.num_batches = 0
         self.synthetic: TensorDictBase = TensorDict({}, [0])
         self._rng: torch.Generator | None = None
@@ -77,7 +65,7 @@ class RolloutReplayBuffer:
         self._rollouts: list[Rollout] = []
 
     @torch.no_grad()
-    def _bounds(self, gamma: float) -> dict[str, Any]:
+    def _bounds(self) -> dict[str, Any]:
         """Return options of :func:`rollout` for ends and for unknown rows."""
         options, data, held_out = self.options, self.data, self.data.held_out
         terminated = options.termination(data.env_id, data.loc, data.scale)
@@ -90,7 +78,7 @@ class RolloutReplayBuffer:
         if options.unknown == "halt":
             # An end must not be better than the data's worst rewards for ever.
             worst = held_out["next", "reward"].quantile(0.01).clamp(max=0)
-            bounds["halt_reward"] = worst.item() / (1 - gamma)
+            bounds["halt_reward"] = worst.item() / (1 - data.gamma)
         return bounds
 
     def set_rng(self, generator: torch.Generator) -> None:
@@ -117,9 +105,8 @@ class RolloutReplayBuffer:
         real, device = self.real.sample(num_real), None if rng is None else rng.device
         index = torch.randint(len(self.synthetic), size, generator=rng, device=device)
         batch = self.transform(torch.cat([real, self.synthetic[index]]))
-        if options.reverse_policy is None:  # own actions are no labels
-            order = torch.arange(len(batch), device=batch.device)
-            batch["is_synthetic"] = order.unsqueeze(-1) >= num_real
+        order = torch.arange(len(batch), device=batch.device)
+        batch["is_synthetic"] = order.unsqueeze(-1) >= num_real
         return take_multi_step(batch) if self.n_steps > 1 else batch
 
     def roll_out(self, copied: nn.Module) -> Rollout:
@@ -129,8 +116,6 @@ class RolloutReplayBuffer:
             policy, model = cast(tuple[nn.Module, DynamicsEnsemble], copied.children())
 
         def act(state: Tensor) -> Tensor:
-            if isinstance(policy, ConditionalVAE):
-                return policy.sample(state)
             batch = TensorDict({"observation": state}, state.shape[:-1])
             with set_interaction_type(InteractionType.RANDOM):
                 action: Tensor = policy(batch)["action"]
@@ -145,11 +130,8 @@ class RolloutReplayBuffer:
             starts = perturbed_starts(model, starts, steps=steps, **self.bounds)
         sizes = data.scale.expand(model.observation_dim)
         units = torch.cat([sizes, sizes.new_tensor([1 / data.reward_scale])])
-        roll_out = rollout if options.reverse_policy is None else reverse_rollout
-        is_uniform = options.reverse_policy == "uniform"
-        acts = uniform_policy(model.action_dim) if is_uniform else act
         limits = self.bounds | {"steps": options.rollout_steps, "units": units}
-        rows, rejected = roll_out(model, acts, starts, **limits)
+        rows, rejected = rollout(model, act, starts, **limits)
         penalty = options.penalty * data.reward_scale
         rows["next", "reward"] -= penalty * rows["uncertainty"]
         rows = rows.select(*DATASET_KEYS)
@@ -163,7 +145,7 @@ class RolloutReplayBuffer:
         self._copy.load_state_dict(weights)
         device = next(self._copy.parameters()).device
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
-            torch.manual_seed(self.seed + number)
+            torch.manual_seed(self.data.seed + number)
             rows, rejected = self.roll_out(self._copy)
         if not len(rows):
             raise ValueError(
@@ -181,23 +163,29 @@ class RolloutReplayBuffer:
         self._rollouts = list(zip(slices, rejected, strict=True))
 
     def metrics(self) -> dict[str, float]:
-        """Return the share of rejected rows, and of the others that end the task."""
+        """Return the share of rejected rows, and numbers of the others."""
         rejected = sum(number for _, number in self._rollouts)
         following = self.synthetic["next"]
-        return {
+        found = {
             "rollout_rejected": rejected / (rejected + len(following)),
             "rollout_terminated": following["terminated"].float().mean().item(),
             "rollout_reward": following["reward"].mean().item(),
         }
+        return found if self.adversary is None else found | self.adversary.metrics
 
     def state_dict(self) -> dict[str, Any]:
         """Return the number of batches and the policies that were rolled out."""
-        return {"num_batches": self.num_batches, "policies": self._policies}
+        state = {"num_batches": self.num_batches, "policies": self._policies}
+        if self.adversary is not None:
+            state["adversary"] = self.adversary.state_dict()
+        return state
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Repeat the roll-outs of a state."""
         self.num_batches = state_dict["num_batches"]
         self._policies = list(state_dict["policies"])
+        if self.adversary is not None:
+            self.adversary.load_state_dict(state_dict["adversary"])
         following = -(-self.num_batches // self.options.rollout_interval)  # rounded up
         numbers = range(following - len(self._policies), following)
         if self._policies:

@@ -71,13 +71,12 @@ def rollout(
     r"""Sample transitions of a policy in a model, with torch's global generator.
 
     Args:
-        model: draws an elite for each row, and a next state and reward.
         policy: maps states ``[B, S]`` to actions ``[B, A]``.
-        starts: ``[B, S]``, in the units of the model's data.
+        starts: ``[B, S]``, in the units of the model's data, as all states.
 
     Keyword Args:
         steps: largest length of a roll-out.
-        terminated: of next states, in the same units.
+        terminated: of next states.
         max_disagreement: of the elites; rows with more, or that are not finite, are
             rejected.
         halt_reward: keep rows with more disagreement, as ends of the task with this
@@ -115,47 +114,17 @@ def rollout(
     return torch.cat(kept), rejected
 
 
-def uniform_policy(action_dim: int) -> Callable[[Tensor], Tensor]:
-    """Return a policy whose actions are uniform in [-1, 1]."""
-    return lambda state: 2 * torch.rand(len(state), action_dim, device=state.device) - 1
-
-
 def perturbed_starts(
     model: DynamicsEnsemble, starts: Tensor, *, steps: int, **options: Any
 ) -> Tensor:
     """Sample as many states 1 to ``steps`` uniform actions later, before an end."""
-    policy = uniform_policy(model.action_dim)
+
+    def policy(state: Tensor) -> Tensor:
+        return 2 * torch.rand(len(state), model.action_dim, device=state.device) - 1
+
     rows, _ = rollout(model, policy, starts, steps=steps, **options)
     following = rows["next", "observation"][~rows["next", "done"].squeeze(-1)]
     if not len(following):
-        raise ValueError(
-            "The model ends the task after every random action. Train it longer "
-            "(dynamics.steps)."
-        )
+        raise ValueError("The model ends the task after every random action.")
     chosen: Tensor = following[torch.randint(len(following), [len(starts)])]
     return chosen
-
-
-def reverse_rollout(
-    model: DynamicsEnsemble,
-    policy: Callable[[Tensor], Tensor],
-    ends: Tensor,
-    **options: Any,
-) -> Rollout:
-    """Sample transitions that lead into given states, as in ROMI.
-
-    "Offline Reinforcement Learning with Reverse Model-based Imagination",
-    https://arxiv.org/abs/2110.00188. The model is trained on
-    :func:`reverse_transitions`; the policy maps next states to actions that led there.
-    Rows that begin after the task's end are rejected.
-    """
-    rows, rejected = rollout(model, policy, ends, **options)
-    acted = ~rows["next", "terminated"].squeeze(-1)
-    return reverse_transitions(rows[acted]), rejected + int((~acted).sum())
-
-
-def reverse_transitions(rows: TensorDict) -> TensorDict:
-    """Return the same transitions with state and next state exchanged."""
-    reverse, key = rows.copy(), "observation"
-    reverse[key], reverse["next", key] = rows["next", key], rows[key]
-    return reverse

@@ -16,8 +16,8 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl_osr import functional as F
 from torchrl_osr._checks import check_positive, check_weight
 from torchrl_osr._entries import entry, nested, state_keys
-from torchrl_osr.lab.dynamics.conditional_vae import ConditionalVAE
 from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
+from torchrl_osr.lab.dynamics.transition_vae import TransitionVAE
 from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses
 from torchrl_osr.objectives.networks import distribution
 from torchrl_osr.objectives.transitions import Transitions
@@ -75,12 +75,11 @@ class StateDeviationLoss(ActorCriticLoss):
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
     Examples:
+        >>> from torchrl_osr.lab.dynamics import DynamicsEnsemble, TransitionVAE
         >>> from torchrl_osr.lab.losses import StateDeviationLoss
         >>> from torchrl_osr.modules import tanh_gaussian_actor
-        >>> following = ConditionalVAE(
-        ...     11, 11, "observation", ("next", "observation"), change=True)
         >>> loss = StateDeviationLoss(
-        ...     tanh_gaussian_actor(11, 3), DynamicsEnsemble(11, 3), following)
+        ...     tanh_gaussian_actor(11, 3), DynamicsEnsemble(11, 3), TransitionVAE(11))
         >>> loss.out_keys
         ['loss_deviation', 'loss_multiplier', 'deviation', 'multiplier']
     """
@@ -89,7 +88,7 @@ class StateDeviationLoss(ActorCriticLoss):
     dynamics_network: DynamicsEnsemble
     dynamics_network_params: TensorDictParams
     target_dynamics_network_params: TensorDictParams
-    transition_network: ConditionalVAE
+    transition_network: TransitionVAE
     transition_network_params: TensorDictParams
     target_transition_network_params: TensorDictParams
 
@@ -97,7 +96,7 @@ class StateDeviationLoss(ActorCriticLoss):
         self,
         actor_network: ProbabilisticTensorDictSequential,
         dynamics_network: DynamicsEnsemble,
-        transition_network: ConditionalVAE,
+        transition_network: TransitionVAE,
         *,
         num_samples: int = 4,
         kernel_width: float = 1.0,
@@ -143,7 +142,7 @@ class StateDeviationLoss(ActorCriticLoss):
         action, _ = rsample_and_log_prob(pi, (number,))
         action = action.squeeze(1)  # of the one set of states
         key = model.in_keys[0]
-        clean = entry(batch.rows, aims.in_keys[0]).expand(number, -1, -1)
+        clean = entry(batch.rows, aims.observation_key).expand(number, -1, -1)
         start = batch.states_of([key], "perturbed")[0].get(key).expand(number, -1, -1)
         with self.dynamics_network_params.to_module(model, preserve_module_state=False):
             change = model.sample(*model.predict(start, action))[..., :-1]

@@ -13,6 +13,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torchrl.modules import TanhNormal
 from torchrl.objectives import LossModule
 
+from torchrl_osr.lab.dynamics import TransitionVAE
 from torchrl_osr.lab.losses import Adversary, IQLLoss
 from torchrl_osr.lab.run.schema import EnvConfig, TrainConfig
 from torchrl_osr.modules import state_value
@@ -90,7 +91,8 @@ def make_learner(config: TrainConfig, device: torch.device | str = "cpu") -> Lea
         if "dynamics_network" in wanted:
             networks["dynamics_network"] = config.dynamics.ensemble(*sizes).to(device)
         if "transition_network" in wanted:
-            vae = config.dynamics.transition_vae(sizes[0])
+            vae_cells = config.dynamics.vae_num_cells
+            vae = TransitionVAE(sizes[0], num_cells=vae_cells)
             networks["transition_network"] = vae.to(device)
         if "value_network" in wanted:
             value = state_value(sizes[0], num_cells=cells, layer_norm=layer_norm)
@@ -131,14 +133,12 @@ def _check_combination(config: TrainConfig, learner: Learner) -> None:
         elif compares and head_of(learner.actor)[0] is not TanhNormal:
             why = f"perturbation=adversarial needs the tanh-Gaussian policy that {name}"
             why += " lacks, or perturbation.adversary.objective=min_Q"
-    forward = dynamics.use and not dynamics.reverse_policy
     modules = learner.objective.modules()
-    if not forward and any(hasattr(each, "dynamics_network") for each in modules):
-        why = f"{name} needs a forward model: choose dynamics=ensemble"
-    attacked = rolled_out and forward and learner.has_critics
+    if not dynamics.use and any(hasattr(each, "dynamics_network") for each in modules):
+        why = f"{name} needs a model of the dynamics: choose dynamics=ensemble"
+    attacked = rolled_out and learner.has_critics
     if dynamics.use and dynamics.adversarial_steps and not attacked:
-        why = "dynamics.adversarial_steps needs roll-outs forward and critics: set it "
-        why += "to 0"
+        why = "dynamics.adversarial_steps needs roll-outs and critics: set it to 0"
     if rolled_out:
         reads = learner.objective.in_keys
         if isinstance(learner.loss, IQLLoss) or ("next", "action") in reads:

@@ -195,7 +195,7 @@ def load_switching_policy(
     Raises:
         FileNotFoundError: there is no such run, or a judge has no model.
         ValueError: the runs differ in task, discount or units of reward, have discrete
-            actions, or a judge lacks critics or has a reverse model.
+            actions, or a judge lacks critics.
     """
     paths = [Path(each) for each in runs]
     judging = paths if judges is None else [Path(each) for each in judges]
@@ -236,7 +236,7 @@ def load_switching_policy(
                 f"{file} does not exist: train with loss=rim or dynamics=ensemble, or "
                 "choose with critics_only=True."
             )
-        model = load_dynamics(file, {"direction of time": "forward"})
+        model = load_dynamics(file)
         return EliteNetworks(model, policy.loc, policy.scale, policy.low, policy.high)
 
     first = trained[judging[0]].config

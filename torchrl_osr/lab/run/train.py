@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from functools import partial
 from typing import Any
 
@@ -21,12 +20,7 @@ from torchrl_osr import StatePerturbation
 from torchrl_osr._files import write_json
 from torchrl_osr.fast import fast_update
 from torchrl_osr.lab.data.rows import take_multi_step
-from torchrl_osr.lab.dynamics import (
-    ModelAdversary,
-    ModelData,
-    RolloutReplayBuffer,
-    training,
-)
+from torchrl_osr.lab.dynamics import ModelData, RolloutReplayBuffer, training
 from torchrl_osr.lab.evaluation import (
     describe_inverse_dynamics,
     inverse_dynamics_report,
@@ -88,12 +82,10 @@ def train(run: Run) -> float:
     new_trainer = trainer_maker(run, data, perturbation, options, autocast)
     if learner.model is not None:
         train_inverse_dynamics(run, data, learner.model, new_trainer)
-    rollouts = adversary = None
+    rollouts = None
     if config.dynamics.use:
-        rollouts, adversary = train_dynamics(
-            run, data, learner, perturbation, new_trainer
-        )
-    trainer = train_policy(run, data, learner, rollouts, adversary, new_trainer)
+        rollouts = train_dynamics(run, data, learner, perturbation, new_trainer)
+    trainer = train_policy(run, data, learner, rollouts, new_trainer)
     save_policies(run, learner, data.norm)
     return report(run, data.mean, trainer)
 
@@ -180,9 +172,9 @@ def train_dynamics(
     learner: Learner,
     perturbation: StatePerturbation,
     new_trainer: NewTrainer,
-) -> tuple[RolloutReplayBuffer | None, ModelAdversary | None]:
+) -> RolloutReplayBuffer | None:
     """Train models of the dynamics, see ``lab/dynamics/training.py``."""
-    config, arithmetic = run.config, asdict(run.config.trainer)
+    config = run.config
     model_data = ModelData(
         data.buffer.storage,
         data.held_out,
@@ -191,25 +183,31 @@ def train_dynamics(
         data.norm.scale,
         config.data.reward_scale,
         config.data.reward_shift,
+        config.optim.gamma,
         config.env.id,
-    )
-    names = "device", "precision", "matmul_precision", "compile"
-    phase = training.Phase(
-        run.folder,
-        new_trainer,
-        adam,
         config.seed,
-        name=f"{config.env.name}-{config.data.source}",
-        arithmetic={name: arithmetic[name] for name in names},
     )
+
+    def fit(name: str, loss: LossModule, params: Any, **options: Any) -> OfflineTrainer:
+        trainer = new_trainer(
+            loss,
+            adam(params, lr=config.dynamics.lr),
+            folder=run.folder / "checkpoint" / name,
+            seed=config.seed,
+            description=name,
+            **options,
+        )
+        trainer.train()
+        return trainer
+
     return training.train_dynamics(
         config.dynamics,
         model_data,
         learner.objective,
         learner.actor,
-        phase,
+        fit,
+        run.folder,
         batch_size=config.trainer.batch_size,
-        gamma=config.optim.gamma,
         n_steps=config.optim.n_steps,
         transform=perturbation,
     )
@@ -220,13 +218,12 @@ def train_policy(
     data: TrainingData,
     learner: Learner,
     rollouts: RolloutReplayBuffer | None,
-    adversary: ModelAdversary | None,
     new_trainer: NewTrainer,
 ) -> OfflineTrainer:
     """Train the policy, by the critics and frozen models; return its trainer.
 
-    Batches are from ``rollouts`` in part, if there are any; the ``adversary`` trains
-    the model of the dynamics on. It is evaluated if its environment is simulated.
+    Batches are from ``rollouts`` in part, if there are any. It is evaluated if its
+    environment is simulated.
     """
     config, optim = run.config, run.config.optim
     actor, _, loss, objective = learner
@@ -246,13 +243,9 @@ def train_policy(
     if config.perturbation.adversary is not None:
         attack = instantiate(config.perturbation.adversary)
         hooks.append(("process_optim_batch", partial(attack, loss)))
-    if adversary is not None:  # before the roll-outs, which are of a copy of it
-        components["adversary"] = adversary
     if rollouts is not None:
-        components["imagined"] = rollouts
-        hooks.append(
-            ("post_steps", lambda: _log_rollouts(trainer, rollouts, adversary))
-        )
+        components["rollouts"] = rollouts
+        hooks.append(("post_steps", lambda: _log_rollouts(trainer, rollouts)))
     elif optim.n_steps > 1:
         data.buffer.append_transform(take_multi_step)
     limit = largest_value(data.largest_reward, optim.gamma)
@@ -286,14 +279,9 @@ def _parameters_of(learner: Learner) -> tuple[list[Parameter], list[Parameter]]:
     return critics, rest
 
 
-def _log_rollouts(
-    trainer: OfflineTrainer,
-    rollouts: RolloutReplayBuffer,
-    adversary: ModelAdversary | None,
-) -> None:
+def _log_rollouts(trainer: OfflineTrainer, rollouts: RolloutReplayBuffer) -> None:
     """Log numbers of the synthetic rows."""
-    of_model = {} if adversary is None else adversary.metrics
-    for name, value in (rollouts.metrics() | of_model).items():
+    for name, value in rollouts.metrics().items():
         for logger in trainer.loggers:
             logger.log_scalar(f"policy/{name}", value, step=trainer.step)
 
