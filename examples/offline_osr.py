@@ -70,13 +70,13 @@ def main(cfg: DictConfig) -> float:
 def train(run: Run) -> float:
     """Train inverse dynamics model, critics and policy; return the last score."""
     config, folder = run.config, run.folder
-    env, optim, sizes = config.env, config.optim, config.trainer
+    optim, sizes = config.optim, config.trainer
     device, autocast = prepare_machine(run)
     update = partial(fast_update, autocast_dtype=autocast, trace=sizes.record)
 
     # 1. Networks and loss: OSR (equations 2 and 11), or OSR-v (equation 8).
     torch.manual_seed(config.seed)
-    spaces = env.observation_size, env.action_size
+    spaces = config.env.observation_size, config.env.action_size
     cells, number = config.network.num_cells, config.loss["num_qvalue_nets"]
     actor = tanh_gaussian_actor(*spaces, num_cells=cells).to(device)
     critics = critic_ensemble(
@@ -92,15 +92,7 @@ def train(run: Run) -> float:
 
     # 2. Data: transitions with standardised states, and a perturbed state beside each
     # state. Both together are the paper's mixed data set D_tot.
-    data = load_training_data(
-        env,
-        config.data,
-        batch_size=sizes.batch_size,
-        device=device,
-        n_steps=optim.n_steps,
-        gamma=optim.gamma,
-        progress=sizes.progress,
-    )
+    data = load_training_data(config, device)
     noise = config.perturbation
     perturbation = StatePerturbation(noise.std, noise=noise.noise, seed=config.seed)
     data.buffer.append_transform(perturbation)

@@ -71,9 +71,9 @@ def make_collector(run: TrainedRun, frames: int, seed: int) -> Collector:
 def make_trainer(run: TrainedRun, frames: int, seed: int) -> OfflineToOnlineTrainer:
     """TorchRL's trainer with the run's data, loss and optimizer: one update a frame."""
     cfg, loss = run.config, run.loss
+    cfg.optim.n_steps = 1  # as the rows that the environment will add
     buffer = OfflineToOnlineReplayBuffer(
-        # One-step rows, as those that the environment will add.
-        load_training_data(cfg.env, cfg.data, batch_size=cfg.trainer.batch_size).buffer,
+        load_training_data(cfg).buffer,
         online_capacity=frames,
         offline_fraction=0.5,
         batch_size=cfg.trainer.batch_size,

@@ -84,6 +84,7 @@ def test_wandb_gets_the_run_its_curve_and_its_results(tmp_path, monkeypatch):
     # It is handed what update() of a real configuration takes besides.
     monkeypatch.setattr("torchrl.record.loggers.wandb._collect_env_metadata", dict)
     given = ["loss=rebrac", "recovery=osr", "logger=wandb", "logger.project=mine"]
+    given += ["data.storage=disk"]
     folder = trained(tmp_path / "run", *given)
     trained(folder, *given, "trainer.steps=12")
     first, second = runs

@@ -30,7 +30,7 @@ from torchrl_osr.lab.data.rows import (
     next_action,
     split_held_out,
 )
-from torchrl_osr.lab.run.schema import DataConfig, EnvConfig
+from torchrl_osr.lab.run.schema import DataConfig, EnvConfig, TrainConfig
 
 MAX_HELD_OUT = 50_000
 """Held-out rows of a set on disk that are read into memory, at most."""
@@ -40,23 +40,15 @@ NUM_PIECES, PIECE = 500, 20
 
 
 class TrainingData(NamedTuple):
-    """The rows to train on and to judge by, prepared and on the device.
+    """The rows to train on and to judge by, prepared and on the device."""
 
-    Attributes:
-        buffer: samples batches; the trainer seeds it.
-        held_out: rows that are not in the buffer.
-        norm: standardises observations.
-        largest_reward: the largest absolute reward, held-out rows included.
-        mean: score of the behaviour, or return where there are no scores, if known.
-        pieces: of trajectories, each from a held-out row on, ``[n, 20]``; the rows that
-            follow may be trained on. ``None`` if nobody asked for them.
-    """
-
-    buffer: ReplayBuffer
-    held_out: TensorDict
-    norm: ObservationNorm
-    largest_reward: float
-    mean: float | None
+    buffer: ReplayBuffer  # samples batches; the trainer seeds it
+    held_out: TensorDict  # rows that are not in the buffer
+    norm: ObservationNorm  # standardises observations
+    largest_reward: float  # the largest absolute one, held-out rows included
+    mean: float | None  # score of the behaviour, or return without scores, if known
+    # For models of the dynamics: pieces of trajectories, each from a held-out row on,
+    # [n, 20]; the rows that follow may be trained on.
     pieces: TensorDict | None
 
 
@@ -95,38 +87,22 @@ def load_data(
 
 @torch.random.fork_rng(devices=[])
 def load_training_data(
-    env: EnvConfig,
-    options: DataConfig,
-    *,
-    batch_size: int,
+    config: TrainConfig,
     device: torch.device | str = "cpu",
     in_keys: Sequence[NestedKey] = (),
-    n_steps: int = 1,
-    gamma: float = 1.0,
-    pieces: bool = False,
-    progress: bool = True,
 ) -> TrainingData:
     """Load a run's data, split and prepared; torch's global generator is left alone.
 
     Rewards become ``reward_scale * r + reward_shift``; the mean is of the task's own.
-
-    Args:
-        env, options: of the configuration.
-
-    Keyword Args:
-        batch_size: rows of a batch.
-        device: where batches are. Default CPU.
-        in_keys: what the loss reads: with ``("next", "action")`` among it batches have
-            the data's next action. Default: what every data set has.
-        n_steps, gamma: of the n-step returns in ``"multi_step"``. Default: none.
-        pieces: whether pieces of trajectories are needed. Default ``False``.
-        progress: show progress bars. Default ``True``.
+    With ``("next", "action")`` among ``in_keys``, the keys that the loss reads, batches
+    have the data's next action.
 
     Raises:
         ValueError: an option does not fit the others, or the loss reads the next
             action and the rows are in no order of time.
     """
-    data, manifest = load_data(env, options, progress=progress)
+    env, options, optim = config.env, config.data, config.optim
+    data, manifest = load_data(env, options, progress=config.trainer.progress)
     if with_next_action := ("next", "action") in in_keys:
         try:
             check_order(data)
@@ -154,12 +130,12 @@ def load_training_data(
         if with_next_action:
             batch["next", "action"] = next_action(data, rows)
         batch = prepare(batch)
-        if n_steps > 1:
+        if optim.n_steps > 1:
             steps = multi_step(
                 data,
                 rows,
-                n_steps=n_steps,
-                gamma=gamma,
+                n_steps=optim.n_steps,
+                gamma=optim.gamma,
                 reward_scale=factor,
                 reward_shift=addend,
                 with_next_action=with_next_action,
@@ -167,12 +143,13 @@ def load_training_data(
             batch["multi_step"] = prepare_steps(steps)
         return batch
 
-    sampling: dict[str, Any] = {"batch_size": batch_size, "seed": 0, "device": device}
+    size = config.trainer.batch_size
+    sampling: dict[str, Any] = {"batch_size": size, "seed": 0, "device": device}
     chosen = held_out_rows(len(data), options.held_out, seed=options.seed)
-    followed = None
-    if pieces:
+    pieces = None
+    if config.dynamics.use:
         starts = chosen[:NUM_PIECES]
-        followed = prepare(consecutive_rows(data, starts, PIECE)).to(device)
+        pieces = prepare(consecutive_rows(data, starts, PIECE)).to(device)
     if options.storage == "disk":
         held_out = read(data, chosen[:MAX_HELD_OUT].sort().values)
         left_out = chosen.sort().values
@@ -184,5 +161,5 @@ def load_training_data(
     if references_of(env) is None:
         mean = (manifest.get("return") or {}).get("mean")
     return TrainingData(
-        buffer, held_out.to(device), norm(*states).to(device), largest, mean, followed
+        buffer, held_out.to(device), norm(*states).to(device), largest, mean, pieces
     )

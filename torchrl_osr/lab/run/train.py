@@ -62,17 +62,7 @@ def train(run: Run) -> float:
 
     # Transitions with standardised states. Each batch gets a perturbed state for every
     # state, which is the paper's mixed data set.
-    data = load_training_data(
-        config.env,
-        config.data,
-        batch_size=config.trainer.batch_size,
-        device=device,
-        in_keys=learner.objective.in_keys,
-        n_steps=config.optim.n_steps,
-        gamma=config.optim.gamma,
-        pieces=config.dynamics.use,
-        progress=config.trainer.progress,
-    )
+    data = load_training_data(config, device, learner.objective.in_keys)
     noise: Any = config.perturbation.noise
     perturbation = StatePerturbation(
         config.perturbation.std, noise=noise, seed=config.seed
