@@ -14,7 +14,7 @@ from torchrl.modules import TanhNormal
 from torchrl.objectives import LossModule
 
 from torchrl_osr.lab.dynamics import TransitionVAE
-from torchrl_osr.lab.losses import Adversary, IQLLoss
+from torchrl_osr.lab.losses import IQLLoss
 from torchrl_osr.lab.run.schema import EnvConfig, TrainConfig
 from torchrl_osr.modules import state_value
 from torchrl_osr.objectives import ActorCriticLoss, WithRecovery
@@ -25,20 +25,12 @@ if TYPE_CHECKING:
 
 
 class Learner(NamedTuple):
-    """A policy's loss and the networks in it.
-
-    Attributes:
-        actor: the policy.
-        model: the inverse dynamics model; ``None`` if nothing uses it.
-        loss: holds the actor's tensors, and the critics if it has any.
-        objective: what is trained: the loss, with the recovery term that is added to
-            it. Holds the model's tensors, frozen.
-    """
+    """A policy's loss and the networks in it."""
 
     actor: ProbabilisticTensorDictSequential
-    model: ProbabilisticTensorDictSequential | None
-    loss: LossModule
-    objective: LossModule
+    model: ProbabilisticTensorDictSequential | None  # inverse dynamics, if used
+    loss: LossModule  # holds the tensors of the actor, and of the critics if any
+    objective: LossModule  # what is trained: the loss, with a recovery term added to it
 
     @property
     def has_critics(self) -> bool:
@@ -58,7 +50,7 @@ def make_learner(config: TrainConfig, device: torch.device | str = "cpu") -> Lea
         device: of the networks. Default CPU.
 
     Raises:
-        ValueError: if an option is out of its range, or does not fit the others.
+        ValueError: if options do not fit each other or the environment.
     """
     env, cells = config.env, list(config.network.num_cells)
     assert env.observation_size is not None
@@ -122,31 +114,31 @@ def make_learner(config: TrainConfig, device: torch.device | str = "cpu") -> Lea
 
 def _check_combination(config: TrainConfig, learner: Learner) -> None:
     """Raise a ValueError for options that would be ignored, or train nonsense."""
-    dynamics, name = config.dynamics, type(learner.loss).__name__
+    dynamics, loss, name = config.dynamics, learner.loss, type(learner.loss).__name__
+    adversary, modules = config.perturbation.adversary, learner.objective.modules()
     rolled_out = dynamics.use and dynamics.real_ratio < 1
+    reads_data = ("next", "action") in learner.objective.in_keys
     why = ""
-    if config.perturbation.adversary is not None:
-        adversary: Adversary = instantiate(config.perturbation.adversary)
-        compares = adversary.objective == "action_diff"
-        if not (isinstance(learner.loss, ActorCriticLoss) and learner.has_critics):
-            why = f"perturbation=adversarial needs critics, which {name} lacks"
-        elif compares and head_of(learner.actor)[0] is not TanhNormal:
-            why = f"perturbation=adversarial needs the tanh-Gaussian policy that {name}"
-            why += " lacks, or perturbation.adversary.objective=min_Q"
-    modules = learner.objective.modules()
-    if not dynamics.use and any(hasattr(each, "dynamics_network") for each in modules):
+    if adversary and not (isinstance(loss, ActorCriticLoss) and learner.has_critics):
+        why = f"perturbation=adversarial needs critics, which {name} lacks"
+    elif (
+        adversary
+        and adversary.get("objective") == "action_diff"
+        and head_of(learner.actor)[0] is not TanhNormal
+    ):
+        why = f"perturbation=adversarial needs the tanh-Gaussian policy that {name}"
+        why += " lacks, or perturbation.adversary.objective=min_Q"
+    elif not dynamics.use and any(hasattr(m, "dynamics_network") for m in modules):
         why = f"{name} needs a model of the dynamics: choose dynamics=ensemble"
-    attacked = rolled_out and learner.has_critics
-    if dynamics.use and dynamics.adversarial_steps and not attacked:
+    elif rolled_out and (reads_data or isinstance(loss, IQLLoss)):
+        why = f"{name} learns from actions of the data alone, which roll-outs lack:"
+        why += " choose dynamics=none"
+    elif (
+        dynamics.use
+        and dynamics.adversarial_steps
+        and not (rolled_out and learner.has_critics)
+    ):
         why = "dynamics.adversarial_steps needs roll-outs and critics: set it to 0"
-    if rolled_out:
-        reads = learner.objective.in_keys
-        if isinstance(learner.loss, IQLLoss) or ("next", "action") in reads:
-            why = f"{name} learns from actions of the data alone, which roll-outs lack:"
-            why += " choose dynamics=none"
-    if config.data.held_out in (0, 1):
-        why = f"data.held_out={config.data.held_out} leaves nothing to train on, or "
-        why += "nothing to judge models by"
     if why:
         raise ValueError(f"{why}.")
     if dynamics.use:
@@ -183,8 +175,8 @@ def try_out(env_id: str) -> None:
             after, reward, terminated, truncated, _ = env.step(
                 env.action_space.sample()
             )
-            numbers = [*observation, *after, float(reward)]
-            _ = bool(terminated), bool(truncated)
+            flags = bool(terminated), bool(truncated)
+            numbers = [*observation, *after, float(reward), *flags]
         except Exception as error:
             raise RuntimeError(
                 f"{env_id} cannot be played: a reset and a step ended with "
