@@ -176,12 +176,13 @@ def measure(
         ("deterministic", mean_action),
         ("stochastic", policy.sample),
     ):
-        played = collect_transitions(env, [sampler], steps, seed=seed, progress=False)
-        returns = played.episode_returns
+        _, returns, lengths = collect_transitions(
+            env, [sampler], steps, seed=seed, progress=False
+        )
         if not len(returns):
             raise SystemExit(f"no {name} episode ended in {steps} steps: take more.")
         entry[f"{name}_return"] = [float(returns.mean()), float(returns.std())]
-    entry["episode_length"] = float(played.episode_lengths.mean())
+    entry["episode_length"] = float(lengths.mean())
     entry["episodes"] = len(returns)
     return entry
 

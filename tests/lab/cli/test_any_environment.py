@@ -122,7 +122,7 @@ def test_without_a_simulator_a_log_still_makes_a_policy(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("overrides", "error", "message"),
     [
-        (["env.id=Pendulum-v1", "path=log.txt"], ValueError, "must end in one of"),
+        (["env.id=Pendulum-v1", "path=log.txt"], ValueError, "must end in .npz"),
         (["env.id=Pendulum-v1", "path=there.npz"], FileExistsError, "there.npz exists"),
         (["path=log.npz"], ValueError, "env.id is not given"),
         (["env=hopper", "path=a.npz", "policy=good"], ValueError, "neither random"),

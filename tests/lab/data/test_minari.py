@@ -5,7 +5,6 @@ from __future__ import annotations
 import minari
 import numpy as np
 import pytest
-import torch
 from gymnasium import spaces
 from minari.data_collector import EpisodeBuffer
 from torchrl import torchrl_logger
@@ -34,6 +33,7 @@ UNIT = spaces.Box(-1, 1, (2,))
 @pytest.fixture(autouse=True)
 def _home(tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    monkeypatch.setenv("TORCHRL_OSR_CACHE", str(tmp_path / "cache"))
 
 
 def load(path, **options):
@@ -74,7 +74,7 @@ def make(name, observations=VECTOR, actions=UNIT, data_format="hdf5", **buffer):
 
 @pytest.mark.parametrize("data_format", FORMATS)
 @pytest.mark.parametrize("space", [VECTOR, NESTED], ids=["vector", "dictionary"])
-def test_every_row_is_minaris_own(space, data_format):
+def test_every_row_is_minaris_own(space, data_format, monkeypatch):
     made = make("test/set-v0", space, data_format=data_format)
     data, manifest = load("test/set-v0")
     check_dataset(data)
@@ -93,7 +93,11 @@ def test_every_row_is_minaris_own(space, data_format):
         assert np.array_equal(column, np.concatenate(parts).astype(column.dtype))
     assert manifest["episode_lengths"] == LENGTHS
     assert manifest["dropped_rows"] == 0
-    again, _ = load(made.storage.data_path.parent)
+    layout = [("achieved/place", 3), ("achieved/speed", 1), ("desired_goal", 4)]
+    layout = [*layout, ("observation", 2)] if space is NESTED else [("", 3)]
+    assert [*map(tuple, manifest["observation_layout"])] == layout
+    monkeypatch.setattr("torchrl_osr.lab.data.minari.CHUNK_ROWS", 10)
+    again, _ = load(made.storage.data_path.parent, on_disk=True)
     assert (again == data).all()
 
 
@@ -104,25 +108,6 @@ def flat(space, observations, steps):
         return node[step]
 
     return np.stack([spaces.flatten(space, at(observations, t)) for t in range(steps)])
-
-
-def test_entries_of_a_dictionary_can_be_chosen():
-    make("test/set-v0", NESTED)
-    everything, manifest = load("test/set-v0")
-    sizes = dict(map(tuple, manifest["observation_layout"]))
-    assert [*sizes.items()] == [
-        ("achieved/place", 3),
-        ("achieved/speed", 1),
-        ("desired_goal", 4),
-        ("observation", 2),
-    ]
-    split = everything["observation"].split([*sizes.values()], 1)
-    parts = dict(zip(sizes, split, strict=True))
-    keys = ["observation", "achieved/speed"]
-    data, _ = load("test/set-v0", columns={"observation": keys})
-    assert data["observation"].equal(torch.cat([parts[key] for key in keys], 1))
-    with pytest.raises(ValueError, match="expected a list of some of achieved/place"):
-        load("test/set-v0", columns={"observation": ["achieved"]})
 
 
 def test_the_action_space_is_mapped_to_the_unit_box():
@@ -156,15 +141,6 @@ def test_discrete_actions_become_one_hot():
     numbers = np.concatenate([each.actions for each in made.iterate_episodes()]) - 1
     assert np.array_equal(data["action"], np.eye(3)[numbers])
     assert manifest["num_actions"] == 3
-
-
-def test_environment_and_data_have_one_order_of_entries():
-    speed, angle = spaces.Box(-9, 9, (2,)), spaces.Box(-9, 9, (1,))
-    made = make("test/set-v0", spaces.Dict([("speed", speed), ("angle", angle)]))
-    data, manifest = load("test/set-v0")
-    first = next(iter(made.iterate_episodes())).observations["speed"][0]
-    assert data["observation"][0, 1:].tolist() == first.tolist()
-    assert manifest["observation_layout"] == [["angle", 1], ["speed", 2]]
 
 
 def test_other_action_bounds_than_the_tasks_are_a_warning(monkeypatch):

@@ -22,6 +22,7 @@ from torchrl_osr.lab.data.environment import MAZE_IDS
 from torchrl_osr.lab.data.rollout import (
     BEHAVIORS,
     PLAY_CELLS,
+    behavior_of,
     collect_source,
     shortest_path,
     waypoint_sampler,
@@ -122,9 +123,9 @@ def test_same_seed_same_data_whatever_the_global_generators() -> None:
     torch.manual_seed(1)
     second = collect_source("hopper", "medium-replay", 400, seed=5)
     other = collect_source("hopper", "medium-replay", 400, seed=6)
-    assert (first.data == second.data).all()
-    np.testing.assert_array_equal(first.episode_returns, second.episode_returns)
-    assert not torch.equal(first.data["observation"], other.data["observation"])
+    assert (first[0] == second[0]).all()
+    np.testing.assert_array_equal(first[1], second[1])
+    assert not torch.equal(first[0]["observation"], other[0]["observation"])
 
 
 @pytest.mark.parametrize(
@@ -137,12 +138,10 @@ def test_same_seed_same_data_whatever_the_global_generators() -> None:
 def test_returns_are_near_the_card(
     env_name: str, source: str, transitions: int
 ) -> None:
-    result = collect_source(env_name, source, transitions, progress=False)
+    _, returns, _ = collect_source(env_name, source, transitions, progress=False)
     card = load_behavior_card()[env_name]["policies"][source]
     # Loose: few episodes of chaotic dynamics, of which a rare one falls early.
-    assert np.median(result.episode_returns) == pytest.approx(
-        card["stochastic_return"][0], rel=0.2
-    )
+    assert np.median(returns) == pytest.approx(card["stochastic_return"][0], rel=0.2)
 
 
 SETS = [
@@ -218,12 +217,12 @@ def test_the_controller_by_hand():
     ("env_name", "source", "message"),
     [
         ("pointmaze-umaze", "play", "data=play of pointmaze-umaze; there are: diverse"),
-        ("hopper", "diverse", "unknown data='diverse'; there are: random, medium"),
+        ("hopper", "diverse", "data=diverse of hopper; there are: random, medium"),
     ],
 )
 def test_sources_that_are_not_there_are_named(env_name, source, message):
     with pytest.raises(ValueError, match=message):
-        collect_source(env_name, source, 9)
+        behavior_of(env_name, source)
 
 
 @given(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from concurrent.futures import ThreadPoolExecutor
 from unittest import mock
 
@@ -117,6 +118,19 @@ def test_a_set_that_was_written_by_hand(tmp_path):
         data, _ = load_dataset("hopper", path=str(tmp_path / "mine"), on_disk=on_disk)
         assert is_memory_mapped(data) == on_disk
         assert (data == rows).all()
+
+
+def test_a_converted_log_is_kept_until_the_file_or_an_option_changes(cache, tmp_path):
+    path = save(tmp_path / "log.npz", make_columns())
+    for bounds in ((-1, 1), (-2, 2), (-1, 1)):
+        data, manifest = load_dataset(path=path, action_bounds=bounds, on_disk=True)
+        expected, about = load_dataset(path=path, action_bounds=bounds)
+        assert (data == expected).all()
+        assert about.items() <= manifest.items()
+    assert len(list((cache / "recorded").glob("file-*/"))) == 2
+    save(path, make_columns(100))
+    os.utime(path, ns=(0, 0))  # clocks may be coarse
+    assert len(load_dataset(path=path, on_disk=True)[0]) < 100
 
 
 def test_bounds_come_from_the_environment_unless_given(tmp_path):

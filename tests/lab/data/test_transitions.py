@@ -167,7 +167,7 @@ def with_value(name, row, value):
             {"action": np.array([[0], [1], [1], [0], [1], [0]])},
             "only the whole numbers 0 to 1, which look like discrete",
         ),
-        ({"terminated": [0] * 6, "truncated": [1] * 6}, "none of the 6 rows"),
+        ({"terminated": [0] * 6, "truncated": [1] * 6}, "no row has a true next"),
     ],
 )
 def test_bad_columns_are_named(changes, message):

@@ -7,7 +7,7 @@ episode: every row has its true next observation.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import reduce
 from operator import getitem
@@ -21,7 +21,8 @@ from tqdm.auto import tqdm
 from torchrl_osr._extras import needed_by
 from torchrl_osr._files import read_json
 from torchrl_osr.lab.data.environment import Leaves, observation_leaves
-from torchrl_osr.lab.data.recording import Recording, whole_trajectories
+from torchrl_osr.lab.data.recording import Recording
+from torchrl_osr.lab.data.store import CHUNK_ROWS
 from torchrl_osr.lab.data.transitions import Array, Columns, Reading
 
 with needed_by("Minari data sets need", "minari"):
@@ -30,17 +31,11 @@ with needed_by("Minari data sets need", "minari"):
 
 
 def open_minari(
-    path: Any,
-    options: Reading,
-    entries: Sequence[str] | None = None,
-    *,
-    download: bool = False,
-    progress: bool = True,
+    path: Any, options: Reading, *, download: bool, progress: bool
 ) -> Recording:
     """Open a Minari data set by its id or folder; no episode is read yet.
 
-    Bounds of ``None`` are the set's own; ``entries`` of a dictionary are those to take,
-    in this order, nested ones as ``"outer/inner"``.
+    Bounds of ``None`` are the set's own.
     """
     opened = _open(str(path), download)
     actions: Any = opened.action_space
@@ -52,15 +47,7 @@ def open_minari(
         bounds = actions.low.ravel(), actions.high.ravel()
         options = replace(options, action_bounds=bounds)
     leaves = observation_leaves(opened.observation_space)
-    names = {"/".join(map(str, name)): name for name in leaves}
-    if entries is not None:
-        if isinstance(entries, str) or not entries or {*entries} - {*names}:
-            raise ValueError(
-                f"data.columns.observation={entries}; expected a list of some of "
-                f"{', '.join(names)}."
-            )
-        names = {entry: names[entry] for entry in entries}
-        leaves = {name: leaves[name] for name in names.values()}
+    names = ["/".join(map(str, name)) for name in leaves]
     sizes = [spaces.flatdim(leaf) for leaf in leaves.values()]
     about = {
         "source": "minari",
@@ -72,11 +59,19 @@ def open_minari(
     }
 
     def parts() -> Iterator[Columns]:
-        return whole_trajectories(_read(opened, leaves, progress))
+        waiting: list[dict[str, Array]] = []
+        rows, left = 0, opened.total_steps
+        for episode in _read(opened, leaves, progress):
+            waiting.append(episode)
+            rows += len(episode["reward"])
+            left -= len(episode["reward"])
+            if rows >= CHUNK_ROWS or not left:
+                yield {n: np.concatenate([e[n] for e in waiting]) for n in waiting[0]}
+                waiting, rows = [], 0
 
     paths = sorted(Path(opened.storage.data_path).rglob("*"))
     files = [path for path in paths if path.is_file()]
-    return Recording(parts, options, about, files, int(opened.total_steps))
+    return Recording(parts, options, about, files)
 
 
 def _open(dataset: str, download: bool) -> minari.MinariDataset:

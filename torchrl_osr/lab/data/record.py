@@ -5,8 +5,8 @@ Shapes: ``N`` steps, ``S`` observation, ``A`` action.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +16,10 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
-from torchrl_osr._extras import needed_by
 from torchrl_osr._files import whole_file
 
 Act = Callable[[NDArray[Any]], ArrayLike]
 """Action in the environment's own units, ``[A]`` or a number, for a state ``[S]``."""
-
-WRITERS = {".npz": "numpy", ".hdf5": "h5py", ".h5": "h5py", ".parquet": "pyarrow"}
-"""The package that writes each kind of file, by its suffix."""
 
 
 def record_episodes(
@@ -48,11 +44,11 @@ def record_episodes(
             drawn uniformly instead.
         seed: the episodes are seeded ``seed, seed + 1, ...``, and the draws by it.
     """
-    most = 1 if isinstance(env.action_space, spaces.Discrete) else np.finfo(float).max
+    most = 1.0 if isinstance(env.action_space, spaces.Discrete) else math.inf
     if num_episodes < 1 or not 0 <= noise <= most:
         raise ValueError(
             f"episodes={num_episodes} noise={noise}: give at least 1 episode and noise "
-            f"from 0 to {most:g}."
+            f"from 0 to {most}."
         )
     rng = np.random.default_rng([seed, 1])  # not the environment's own numbers
     env.action_space.seed(int(rng.integers(2**31)))
@@ -83,10 +79,10 @@ def record_episodes(
                     )
             observation, ended = step["next_observation"], terminated or truncated
     columns = {name: np.array([step[name] for step in steps]) for name in steps[0]}
-    for name, each in columns.items():
-        if each.dtype.kind == "f":
-            columns[name] = each.astype(np.float32)
-    return columns
+    return {
+        name: each.astype(np.float32) if each.dtype.kind == "f" else each
+        for name, each in columns.items()
+    }
 
 
 def _action(
@@ -119,12 +115,10 @@ def _action(
 
 def check_log_path(path: Path) -> None:
     """Raise unless a log can be written there."""
-    if path.suffix not in WRITERS:
-        raise ValueError(f"path={path} must end in one of {', '.join(WRITERS)}.")
+    if path.suffix != ".npz":
+        raise ValueError(f"path={path} must end in .npz.")
     if path.exists():
         raise FileExistsError(f"path={path} exists: choose another.")
-    with needed_by(f"{path.suffix} files need", "minari"):
-        import_module(WRITERS[path.suffix])
 
 
 def write_log(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
@@ -132,16 +126,4 @@ def write_log(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     check_log_path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as file:
-        if path.suffix == ".npz":
-            np.savez(file, allow_pickle=False, **columns)
-        elif path.suffix == ".parquet":
-            from pyarrow import parquet, table
-
-            lists = {name: list(each) for name, each in columns.items()}
-            parquet.write_table(table(lists), file)
-        else:
-            import h5py
-
-            with h5py.File(file, "w") as archive:
-                for name, each in columns.items():
-                    archive[name] = each
+        np.savez(file, allow_pickle=False, **columns)

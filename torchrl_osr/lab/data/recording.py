@@ -1,8 +1,4 @@
-"""Recorded steps become transitions, in memory or on disk.
-
-A row's transition depends on its trajectory alone. Hence a recording gives the same
-transitions, whatever parts of whole trajectories it is read in.
-"""
+"""Recorded steps become transitions, in memory or on disk."""
 
 from __future__ import annotations
 
@@ -21,10 +17,9 @@ from torchrl import torchrl_logger
 
 from torchrl_osr._files import sha256_of
 from torchrl_osr.lab.data.statistics import describe_episodes
-from torchrl_osr.lab.data.store import CHUNK_ROWS, Dataset, cache_root, load_or_write
+from torchrl_osr.lab.data.store import Dataset, cache_root, load_or_write
 from torchrl_osr.lab.data.transitions import (
     ActionBounds,
-    Array,
     Columns,
     Part,
     Reading,
@@ -51,15 +46,14 @@ VANISHED_SHARE = 0.01
 class Recording:
     """A recorded data set, to be converted once.
 
-    ``parts`` is its reader: it yields columns of whole trajectories. ``about`` goes
-    into the manifest. ``total`` is the number of rows if not all are read at once.
+    ``parts`` is its reader: it yields columns of whole trajectories, a file or many
+    rows at a time. ``about`` goes into the manifest.
     """
 
     parts: Callable[[], Iterable[Columns]]
     options: Reading
     about: dict[str, Any] = field(default_factory=dict)
     files: list[Path] = field(default_factory=list)
-    total: int | None = None
     _parts: list[Part] = field(default_factory=list, init=False)
 
     def load(self, *, on_disk: bool = False) -> Dataset:
@@ -75,9 +69,8 @@ class Recording:
             text = json.dumps(request, sort_keys=True)
             digest = hashlib.sha256(text.encode()).hexdigest()[:16]
             folder = cache_root() / "recorded" / f"{self.about['source']}-{digest}"
-            describe, total = self._manifest, self.total
             data, manifest = load_or_write(
-                folder, request, self._transitions, describe=describe, total=total
+                folder, request, self._transitions, describe=self._manifest
             )
         else:
             data = torch.cat([*self._transitions()])
@@ -91,29 +84,15 @@ class Recording:
         return [np.asarray(b, np.float64).tolist() for b in self.options.action_bounds]
 
     def _transitions(self) -> Iterator[TensorDict]:
-        read = kept = 0
-        before: Array | float = np.nan
-        seen: set[float] = set()
+        kept = 0
         for columns in self.parts():
-            try:
-                part = trajectories(columns, self.options, before)
-                _check_episodes(columns, seen)
-            except ValueError as error:
-                where = f"in the rows from {read:,} on: " if read else ""
-                raise ValueError(f"{where}{error}") from error
-            flags = [columns.get(n, [0])[-1] for n in ("terminated", "truncated")]
-            if "next_observation" in columns:
-                reached = np.asarray(columns["next_observation"])[-1]
-                before = reached if np.any(flags) else np.nan
-            read += np.size(columns["reward"])
+            part = trajectories(columns, self.options)
             kept += len(part.data)
             self._parts.append(part._replace(data=TensorDict()))  # not the rows
             if len(part.data):
                 yield part.data
         if not kept:
-            raise ValueError(
-                f"none of the {read} rows has a true next state: give next_observation."
-            )
+            raise ValueError("no row has a true next state: give next_observation.")
 
     def _manifest(self) -> dict[str, Any]:
         """Facts about the transitions once all have been read."""
@@ -149,51 +128,6 @@ class Recording:
         for name, flaw in WARNINGS.items():
             if counts[name]:
                 yield f"{counts[name]:,} rows {flaw}."
-
-
-def _check_episodes(columns: Columns, seen: set[float]) -> None:
-    """Raise if an episode goes on after another one; add new ones to ``seen``."""
-    numbers = np.asarray(columns.get("episode", ()), np.float64).reshape(-1)
-    numbers = numbers[~np.isnan(numbers)]
-    first = np.r_[True, np.diff(numbers) != 0][: len(numbers)]
-    for number in numbers[first].tolist():
-        if number in seen:
-            raise ValueError(
-                f"'episode' {number:g} comes back; expected its rows together. "
-                "data.columns.step sorts them."
-            )
-        seen.add(number)
-
-
-def whole_trajectories(
-    chunks: Iterable[Mapping[str, Array]],
-) -> Iterator[Mapping[str, Array]]:
-    """Regroup chunks of columns into large parts of whole trajectories."""
-    waiting: list[Mapping[str, Array]] = []
-    rows = 0
-    for chunk in chunks:
-        waiting.append(chunk)
-        rows += len(chunk["reward"])
-        if rows < CHUNK_ROWS:
-            continue
-        whole = joined(waiting)
-        ends = np.zeros(rows, np.bool_)
-        for name in {"terminated", "truncated"} & whole.keys():
-            ends |= np.nan_to_num(whole[name].reshape(-1)).astype(np.bool_)
-        if "episode" in whole:
-            ends[:-1] |= np.diff(whole["episode"].reshape(-1)) != 0
-        end = int(ends.nonzero()[0][-1]) + 1 if ends.any() else 0
-        if end:
-            yield {name: column[:end] for name, column in whole.items()}
-        waiting = [{name: column[end:] for name, column in whole.items()}]
-        rows -= end
-    if rows:
-        yield joined(waiting)
-
-
-def joined(chunks: list[Mapping[str, Array]]) -> dict[str, Array]:
-    """Rows of several chunks of columns."""
-    return {n: np.concatenate([each[n] for each in chunks]) for n in chunks[0]}
 
 
 def transitions_from_columns(

@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from functools import cache
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -39,7 +39,6 @@ BEHAVIORS: dict[str, tuple[str, ...]] = {
     "expert": ("expert",),
 }
 """Behaviour policies of each source, in equal shares; ``random`` needs none."""
-
 
 ActionSampler = Callable[[NDArray[Any], np.random.Generator], NDArray[np.float32]]
 """Draws an action ``[A]`` for an observation ``[S]``."""
@@ -73,37 +72,29 @@ STIFFNESS, DAMPING = 2.0, 0.4
 ACTION_NOISE = 0.5
 
 
-def maze_behavior(env_name: str, source: str) -> dict[str, Any]:
-    """Entries of the manifest that determine a maze set."""
-    known = MAZE_SOURCES if env_name in PLAY_CELLS else ("diverse",)
-    if env_name.startswith("antmaze"):
-        known = ("minari",)  # no policy that walks ships with the package
-    if source not in known:
-        raise ValueError(
-            f"unknown data={source} of {env_name}; there are: {', '.join(known)}."
-        )
-    return {
-        "stiffness": STIFFNESS,
-        "damping": DAMPING,
-        "action_noise": ACTION_NOISE,
-        "cells": PLAY_CELLS[env_name] if source == "play" else None,
-    }
-
-
-class Collection(NamedTuple):
-    """Transitions ``[N]``; returns and lengths ``[E]`` of complete episodes."""
-
-    data: TensorDict
-    episode_returns: NDArray[np.float64]
-    episode_lengths: NDArray[np.int64]
+Collection = tuple[TensorDict, NDArray[np.float64], NDArray[np.int64]]
+"""Transitions ``[N]``; returns and lengths ``[E]`` of complete episodes."""
 
 
 def behavior_of(env_name: str, source: str) -> dict[str, Any]:
     """Entries of the manifest that determine the rows, beside the seed."""
+    known: Sequence[str] = [*BEHAVIORS]
+    if env_name.startswith("antmaze"):
+        known = ("minari",)  # no policy that walks ships with the package
+    elif env_name in MAZE_IDS:
+        known = MAZE_SOURCES if env_name in PLAY_CELLS else ("diverse",)
+    if source not in known:
+        raise ValueError(
+            f"unknown data={source} of {env_name}; there are: {', '.join(known)}."
+        )
     if env_name in MAZE_IDS:
-        return {"behavior": maze_behavior(env_name, source)}
-    if source not in BEHAVIORS:
-        raise ValueError(f"unknown data={source!r}; there are: {', '.join(BEHAVIORS)}.")
+        behavior = {
+            "stiffness": STIFFNESS,
+            "damping": DAMPING,
+            "action_noise": ACTION_NOISE,
+            "cells": PLAY_CELLS[env_name] if source == "play" else None,
+        }
+        return {"behavior": behavior}
     paths = {name: behavior_policy_path(env_name, name) for name in BEHAVIORS[source]}
     return {"behavior_sha256": {name: sha256_of(path) for name, path in paths.items()}}
 
@@ -116,28 +107,24 @@ def collect_source(
     seed: int = 0,
     progress: bool = True,
 ) -> Collection:
-    """Roll out a named data set.
+    """Roll out a named data set, see :func:`behavior_of`.
 
     The source enters the seed: a medium and a medium-expert set share no episode.
     """
-    behavior_of(env_name, source)  # an unknown source stops here
     entropy = (seed, zlib.crc32(f"{env_name}-{source}".encode()))
     with closing(make_environment(environment_id(env_name))) as env:
+        size = flatdim(env.action_space)
+
+        def uniform(_: Any, rng: np.random.Generator) -> NDArray[np.float32]:
+            return rng.uniform(-ACTION_LIMIT, ACTION_LIMIT, size).astype(np.float32)
+
+        samplers: list[ActionSampler] = [uniform]
         if env_name in MAZE_IDS:
-            samplers: list[ActionSampler] = [
-                waypoint_sampler(env.get_wrapper_attr("maze"))
-            ]
-            if pairs := maze_behavior(env_name, source)["cells"]:
-                env = StartsAndGoals(env, pairs)
-        else:
-            size = flatdim(env.action_space)
-
-            def uniform(_: Any, rng: np.random.Generator) -> NDArray[np.float32]:
-                return rng.uniform(-ACTION_LIMIT, ACTION_LIMIT, size).astype(np.float32)
-
-            names = BEHAVIORS[source]
+            samplers = [waypoint_sampler(env.get_wrapper_attr("maze"))]
+            if source == "play":
+                env = StartsAndGoals(env, PLAY_CELLS[env_name])
+        elif names := BEHAVIORS[source]:
             samplers = [load_behavior_policy(env_name, name).sample for name in names]
-            samplers = samplers or [uniform]
         return collect_transitions(
             env, samplers, num_transitions, seed=entropy, progress=progress
         )
@@ -155,7 +142,7 @@ def collect_transitions(
 
     Each policy plays episode after episode until its share is full; the last row of
     a share is then marked truncated. Rows are ordered by policy and time. The stored
-    actions are the executed ones, clipped to ``ACTION_LIMIT``.
+    actions are the executed ones, clipped to ±0.999.
 
     Args:
         env: task as :func:`~torchrl_osr.lab.data.make_environment` returns it.
@@ -163,8 +150,11 @@ def collect_transitions(
         num_transitions: ``N``, at least one for each policy.
 
     Keyword Args:
-        seed: non-negative seed or seeds; global generators are not used. Default: 0.
-        progress: show a progress bar when on a terminal. Default: ``True``.
+        seed: non-negative seed or seeds; global generators are not used.
+        progress: show a progress bar when on a terminal.
+
+    Returns:
+        The transitions ``[N]``; returns and lengths ``[E]`` of complete episodes.
     """
     if not 0 < len(samplers) <= num_transitions:
         raise ValueError(
@@ -197,7 +187,7 @@ def collect_transitions(
                 start += length
                 bar.update(length)
     returns, lengths = np.array(episodes, np.float64).reshape(-1, 2).T
-    return Collection(as_transitions(columns), returns, lengths.astype(np.int64))
+    return as_transitions(columns), returns, lengths.astype(np.int64)
 
 
 def _play_episode(

@@ -90,8 +90,7 @@ def load_dataset(
             :func:`~torchrl_osr.lab.data.transitions_from_columns`, and ``step``, by
             which the rows of an episode are sorted: numbers, or time stamps in ISO
             format. Names may be patterns (``"obs_*"``), or lists, one name an entry.
-            ``terminated=False``: nothing ends the task. Of ``"minari"``,
-            ``observation`` alone: entries of a dictionary. Default: the usual names.
+            ``terminated=False``: nothing ends the task. Default: the usual names.
         action_bounds: lowest and highest action of the recording. Default: of
             ``"minari"`` its action space; otherwise the task's own bounds.
         clip_actions, missing: see
@@ -101,8 +100,8 @@ def load_dataset(
         random_share: share of the rolled-out rows that are random instead: limited
             valuable data, section 5.3 of the paper. They are mixed in memory.
         seed: of the roll-outs, and of the choice of random rows.
-        on_disk: leave the rows memory-mapped. Parquet and Minari are converted in
-            parts, other files from memory.
+        on_disk: leave the rows memory-mapped. They are converted in parts: a file of
+            a log, or many episodes of Minari, at a time.
         progress: show a progress bar when on a terminal.
 
     Returns:
@@ -227,7 +226,7 @@ def rolled_out(
         yield data
 
     folder = cache_root() / "collected" / f"{env_name}-{source}-{rows}-seed{seed}"
-    return load_or_write(folder, request, collect, describe=lambda: about, total=rows)
+    return load_or_write(folder, request, collect, describe=lambda: about)
 
 
 def open_recorded(
@@ -248,7 +247,6 @@ def open_recorded(
     """
     if source != "file":
         given = {f"columns.{part}": name for part, name in columns.items()}
-        entries = given.pop("columns.observation", None) if source == "minari" else None
         _refuse(given, f"data={source}")
     number = spec.action_size if spec is not None and spec.discrete else None
     if number is not None:
@@ -264,7 +262,7 @@ def open_recorded(
     if source == "minari":
         from torchrl_osr.lab.data.minari import open_minari
 
-        return open_minari(path, options, entries, download=download, progress=progress)
+        return open_minari(path, options, download=download, progress=progress)
     from torchrl_osr.lab.data.table import open_log
 
     _refuse({"download": download}, f"data={source}")

@@ -1,12 +1,8 @@
 """Statistics of a data set, and scores normalised by D4RL's reference returns.
 
 A normalised score is 0 for the return of D4RL's uniformly random policy and 100 for
-the return of its expert (``d4rl/infos.py``). They were measured on the v2 tasks of
-``mujoco-py``. Gymnasium's v5 tasks share the scale, not the task: do not put the two
-in one column.
-
-In the mazes an episode's return is 1 at the goal and 0 otherwise, and D4RL's references
-are 0 and 1. The score is the success rate in percent.
+the return of its expert (``d4rl/infos.py``), measured on the v2 tasks of ``mujoco-py``.
+In the mazes it is the success rate in percent.
 
 Shapes: ``N`` transitions, ``S`` observation, ``E`` complete episodes.
 """
@@ -32,13 +28,7 @@ MIN_OBSERVATION_SCALE = 1e-3
 
 
 def observation_statistics(data: TensorDictBase) -> tuple[Tensor, Tensor]:
-    r"""Mean and standard deviation of each observation entry.
-
-    Accumulate in float64 over chunks :math:`A` and :math:`B`, by Chan's formula:
-
-    .. math::
-        \sigma^2 = \frac{n_A \sigma_A^2 + n_B \sigma_B^2}{n_A + n_B}
-            + \frac{n_A n_B}{(n_A + n_B)^2} (\bar x_B - \bar x_A)^2
+    """Mean and standard deviation of each observation entry, summed in float64.
 
     Returns:
         ``loc`` ``[S]`` and ``scale`` ``[S]``. The scale is at least 0.001; a logged
@@ -53,6 +43,7 @@ def observation_statistics(data: TensorDictBase) -> tuple[Tensor, Tensor]:
         (tensor([2., 5.]), tensor([1.0000, 0.0010]))
     """
     observation = data.get("observation")
+    # Chan's formula for the variance of two sets together.
     loc = torch.zeros_like(observation[0], dtype=torch.float64)
     variance, count = torch.zeros_like(loc), 0
     for rows in observation.split(ROWS_AT_A_TIME):
@@ -67,20 +58,10 @@ def observation_statistics(data: TensorDictBase) -> tuple[Tensor, Tensor]:
     if small := (scale < MIN_OBSERVATION_SCALE).nonzero()[:, 0].tolist():
         torchrl_logger.warning(
             f"{len(small)} observation entries have a standard deviation below "
-            f"{MIN_OBSERVATION_SCALE} and are divided by that when standardised, the "
-            f"first of them {small[:5]}."
+            f"{MIN_OBSERVATION_SCALE}, by which they are divided: {small[:5]}."
         )
     scale = scale.clamp_min(MIN_OBSERVATION_SCALE)
     return loc.to(observation.dtype), scale.to(observation.dtype)
-
-
-def sampled_observations(data: TensorDictBase, max_rows: int = 200_000) -> Tensor:
-    """Observations ``[N, S]``, of a larger set ``max_rows`` at random."""
-    observation: Tensor = data.get("observation")
-    if len(observation) <= max_rows:
-        return observation
-    order = torch.randperm(len(data), generator=torch.Generator().manual_seed(0))
-    return observation[order[:max_rows].sort().values]
 
 
 def describe_episodes(returns: ArrayLike, lengths: ArrayLike) -> dict[str, Any]:

@@ -65,7 +65,6 @@ def write_memmap(
     chunks: Iterable[TensorDict],
     folder: Path | str,
     *,
-    total: int | None = None,
     describe: Callable[[], Mapping[str, Any]] = dict,
 ) -> Dataset:
     """Write transitions to a folder, chunk by chunk, and open them.
@@ -74,12 +73,10 @@ def write_memmap(
     end: an interrupted call leaves no data set.
 
     Args:
-        chunks: transitions ``[n]`` each, float32.
+        chunks: transitions ``[n]`` each, float32. Only one is in memory at a time.
         folder: of the data set, which is made, or replaced.
 
     Keyword Args:
-        total: number of rows, or more: only one chunk is in memory at a time. Default:
-            all chunks are read first.
         describe: called when all chunks are written; returns JSON-compatible entries of
             the manifest.
 
@@ -91,25 +88,24 @@ def write_memmap(
         raise FileExistsError(
             f"{folder} is not replaced: it is no data set, or holds other files."
         )
-    if total is None:
-        chunks = [*chunks]
-        total = sum(len(chunk) for chunk in chunks)
     partial = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     try:
-        stored, rows = TensorDict(), 0
+        parts: list[TensorDict] = []
         for chunk in chunks:
             check_rows(chunk)
+            # For this copy and the one of all parts.
+            check_disk_space(partial, 2 * chunk.bytes(), "the data set")
             chunk = chunk.select(*DATASET_KEYS)
-            if not rows:
-                needed = total * chunk.bytes() // len(chunk)
-                check_disk_space(folder, needed, "the data set")
-                stored = chunk[:1].expand(total).memmap_like(partial / ROWS)
-            stored[rows : rows + len(chunk)] = chunk
-            rows += len(chunk)
-        if not rows:
+            parts.append(chunk.memmap(partial / f"part{len(parts)}"))
+        if not parts:
             raise ValueError("there is no row to write; expected at least one.")
-        check_filled(stored[:rows])
+        rows = sum(len(part) for part in parts)
+        stored = parts[0][:1].expand(rows).memmap_like(partial / ROWS)
+        torch.cat(parts, out=stored)
+        check_filled(stored)
+        for number in range(len(parts)):
+            shutil.rmtree(partial / f"part{number}")
         manifest = dict(describe()) | {"format": FORMAT, "num_transitions": rows}
         manifest["rows_sha256"] = _checksum(partial / ROWS)
         write_json(partial / MANIFEST, manifest)
@@ -140,7 +136,7 @@ def load_memmap(folder: Path | str) -> Dataset:
         data: TensorDict = TensorDict.load_memmap(folder / ROWS, allow_pickle=False)
     except ValueError as error:
         raise ValueError(f"{folder} is damaged: {error}. Write it again.") from error
-    return data[: manifest["num_transitions"]], manifest
+    return data, manifest
 
 
 def load_or_write(
@@ -148,7 +144,6 @@ def load_or_write(
     request: Mapping[str, Any],
     chunks: Callable[[], Iterable[TensorDict]],
     *,
-    total: int | None = None,
     describe: Callable[[], Mapping[str, Any]] = dict,
 ) -> Dataset:
     """Open a cached data set; write it first if its manifest differs from ``request``.
@@ -178,7 +173,7 @@ def load_or_write(
         def described() -> dict[str, Any]:
             return {**wanted, **describe()}
 
-        return write_memmap(chunks(), folder, total=total, describe=described)
+        return write_memmap(chunks(), folder, describe=described)
 
 
 def _checksum(folder: Path) -> str:

@@ -19,7 +19,7 @@ import numpy as np
 
 from torchrl_osr._extras import needed_by
 from torchrl_osr._files import read_arrays
-from torchrl_osr.lab.data.recording import Recording, joined, whole_trajectories
+from torchrl_osr.lab.data.recording import Recording
 from torchrl_osr.lab.data.transitions import Array, Reading
 
 with needed_by("tables need", "train"):
@@ -52,14 +52,10 @@ ColumnNames = Mapping[str, str | Sequence[str] | bool | None]
 
 
 class Table(NamedTuple):
-    """A file with named columns; ``read`` yields rows of some of them.
-
-    ``total`` is the number of rows if not all are read at once.
-    """
+    """A file with named columns, of which ``read`` returns some."""
 
     names: list[str]
-    read: Callable[[list[str]], Iterator[Arrays]]
-    total: int | None = None
+    read: Callable[[list[str]], Arrays]
 
 
 def open_log(
@@ -74,18 +70,14 @@ def open_log(
     layout = find_columns(first.names, columns)
     names = [*chain(*layout.values())]
 
-    def parts() -> Iterator[Mapping[str, Array]]:
+    def parts() -> Iterator[Arrays]:
         codes: dict[Any, int] = {}
         for file, table in tables.items():
             if lacking := {*names} - {*table.names}:
                 raise ValueError(f"{file} lacks {', '.join(lacking)}.")
-            chunks: Any = (
-                assemble(layout, arrays, codes, file if len(tables) > 1 else None)
-                for arrays in table.read(names)
-            )
-            if "step" in layout:
-                chunks = [_sorted(joined([*chunks]), layout["step"][0])]
-            yield from whole_trajectories(chunks)
+            several = file if len(tables) > 1 else None
+            rows = assemble(layout, table.read(names), codes, several)
+            yield _sorted(rows, layout["step"][0]) if "step" in layout else rows
 
     files = [str(file) for file in tables]
     about = {
@@ -94,9 +86,7 @@ def open_log(
         "columns": layout,
         "unused_columns": [name for name in first.names if name not in names],
     }
-    totals = [table.total for table in tables.values()]
-    total = None if None in totals else sum(filter(None, totals))
-    return Recording(parts, options, about, [*tables], total)
+    return Recording(parts, options, about, [*tables])
 
 
 def _files(path: str | Path | Sequence[str]) -> list[Path]:
@@ -124,7 +114,7 @@ def _table(path: Path) -> Table:
 
 def _npz(path: Path) -> Table:
     arrays = read_arrays(path)
-    return Table([*arrays], lambda names: iter([{n: arrays[n] for n in names}]))
+    return Table([*arrays], lambda names: {name: arrays[name] for name in names})
 
 
 def _csv(path: Path) -> Table:
@@ -136,11 +126,11 @@ def _csv(path: Path) -> Table:
     form: Any = {"sep": separator, "decimal": "," if comma else "."}
     names = [name.strip() for name in pd.read_csv(path, nrows=0, **form).columns]
 
-    def read(chosen: list[str]) -> Iterator[Arrays]:
+    def read(chosen: list[str]) -> Arrays:
         frame = pd.read_csv(path, header=0, names=names, low_memory=False, **form)
         if not isinstance(frame.index, pd.RangeIndex):
             raise ValueError(f"{path}: lines have more values than the header names.")
-        yield {name: frame[name].to_numpy() for name in chosen}
+        return {name: frame[name].to_numpy() for name in chosen}
 
     return Table(names, read)
 
@@ -148,23 +138,22 @@ def _csv(path: Path) -> Table:
 def _parquet(path: Path) -> Table:
     with needed_by("Parquet files need", "minari"):
         from pyarrow import parquet
-    file = parquet.ParquetFile(path)
 
-    def read(chosen: list[str]) -> Iterator[Arrays]:
-        for batch in file.iter_batches(columns=chosen):
-            yield {name: _from_arrow(name, batch[name]) for name in chosen}
+    def read(chosen: list[str]) -> Arrays:
+        table = parquet.read_table(path, columns=chosen)
+        return {name: _from_arrow(name, table[name]) for name in chosen}
 
-    return Table(file.schema_arrow.names, read, file.metadata.num_rows)
+    return Table(parquet.read_schema(path).names, read)
 
 
 def _from_arrow(name: str, column: Any) -> Array:
     """Column ``[N]``, or ``[N, D]`` if it holds lists."""
-    if not hasattr(column, "value_lengths"):
-        return np.asarray(column.to_pandas().to_numpy())
-    lengths = {*column.value_lengths().to_pylist()}
-    if len(lengths) > 1 or None in lengths:
-        raise ValueError(f"{name!r} holds lists of the lengths {lengths}; expected one")
-    return np.asarray(column.flatten().to_numpy(False)).reshape(len(column), -1)
+    array = column.to_numpy()
+    if array.dtype.kind == "O" and len(array) and isinstance(array[0], np.ndarray):
+        if len(lengths := {np.size(each) for each in array}) > 1:
+            raise ValueError(f"{name!r} holds lists of the lengths {lengths}.")
+        array = np.stack(array)
+    return np.asarray(array)
 
 
 def _hdf5(path: Path) -> Table:
@@ -173,9 +162,9 @@ def _hdf5(path: Path) -> Table:
     with h5py.File(path, "r") as file:
         names = [n for n, each in file.items() if isinstance(each, h5py.Dataset)]
 
-    def read(chosen: list[str]) -> Iterator[Arrays]:
+    def read(chosen: list[str]) -> Arrays:
         with h5py.File(path, "r") as file:
-            yield {name: np.asarray(file[name]) for name in chosen}
+            return {name: np.asarray(file[name]) for name in chosen}
 
     return Table(names, read)
 

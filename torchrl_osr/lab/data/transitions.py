@@ -122,8 +122,8 @@ class Part(NamedTuple):
     changes: NDArray[np.int64]
 
 
-def trajectories(rows: Columns, options: Reading, before: Array | float) -> Part:
-    """Transitions of a part of a set; the part before ended in state ``before``."""
+def trajectories(rows: Columns, options: Reading) -> Part:
+    """Transitions of a part of a set, see :func:`transitions_from_columns`."""
     columns = _arrays(rows, options.num_actions)
     lost = _missing(columns, options.missing)
     flagged, ends = _ends(columns)
@@ -131,7 +131,7 @@ def trajectories(rows: Columns, options: Reading, before: Array | float) -> Part
     broken = np.isin(trajectory, trajectory[lost])  # recorded in part
     if options.missing == "episode":
         lost = broken
-    resets = _reset_rows(columns, flagged, before) & ~lost
+    resets = _reset_rows(columns, flagged) & ~lost
     ends[:-1] |= lost[1:]
     keep = ~(lost | resets)
     if not keep.any():
@@ -252,20 +252,25 @@ def _ends(columns: Mapping[str, Array]) -> tuple[Array, Array]:
                 "flags may be late, or the rows in another order."
             )
         ends |= ~same
+        numbers, times = np.unique(columns["episode"][ends], return_counts=True)
+        if (times > 1).any():
+            raise ValueError(
+                f"'episode' {numbers[times > 1][0]:g} comes back; expected its rows "
+                "together. data.columns.step sorts them."
+            )
     return flagged, ends
 
 
-def _reset_rows(columns: Mapping[str, Array], flagged: Array, before: Any) -> Array:
+def _reset_rows(columns: Mapping[str, Array], flagged: Array) -> Array:
     """Rows ``[N]`` in which a vector environment was reset: no action was executed.
 
     They begin in the state that an episode ended in, and have a reward of 0.
     """
     if "next_observation" not in columns:
         return np.zeros_like(flagged)
-    reached = np.roll(columns["next_observation"], 1, axis=0).astype(np.float64)
-    reached[0] = before
+    reached = np.roll(columns["next_observation"], 1, axis=0)
     same = (reached == columns["observation"]).all(1) & (columns["reward"] == 0)
-    return np.asarray(same & np.r_[True, flagged[:-1]])
+    return np.asarray(same & np.r_[False, flagged[:-1]])
 
 
 def _cast(columns: Mapping[str, Array], num_actions: int | None) -> dict[str, Array]:

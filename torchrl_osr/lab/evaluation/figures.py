@@ -12,7 +12,6 @@ from tensordict import TensorDict
 
 from torchrl_osr._extras import needed_by
 from torchrl_osr._files import whole_file
-from torchrl_osr.lab.data.statistics import sampled_observations
 from torchrl_osr.lab.evaluation.episodes import measure_of
 
 if TYPE_CHECKING:
@@ -33,6 +32,7 @@ PANELS = {
 """Logged scalars below the learning curve, and their titles."""
 
 COLUMNS, MOST_PANELS = 5, 30  # histograms in a row and in a figure
+MOST_ROWS = 200_000  # of a data set, in a histogram
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -76,7 +76,7 @@ def data_figure(
         ]
         panels.append((name, np.concatenate(values), GREEN))
     panels.append(("reward", data["next", "reward"][:, 0].numpy(), GREY))
-    observations = sampled_observations(data).numpy()
+    observations = data["observation"][:: len(data) // MOST_ROWS + 1].numpy()
     panels += [(*each, ORANGE) for each in zip(names["action"], actions.T, strict=True)]
     columns = zip(names["observation"], observations.T, strict=True)
     panels += [(*each, BLUE) for each in columns]
