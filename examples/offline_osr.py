@@ -32,7 +32,7 @@ from torchrl_osr.lab.evaluation import inverse_dynamics_report
 from torchrl_osr.lab.run import CONF
 from torchrl_osr.lab.run.build import Learner
 from torchrl_osr.lab.run.data import load_training_data
-from torchrl_osr.lab.run.folder import Run, Settings, open_run
+from torchrl_osr.lab.run.folder import Run, open_run
 from torchrl_osr.lab.run.load import CHECKPOINTS
 from torchrl_osr.lab.run.parts import (
     adam,
@@ -42,7 +42,6 @@ from torchrl_osr.lab.run.parts import (
     prepare_machine,
     report,
     save_policies,
-    still_ours,
     trainer_options,
 )
 from torchrl_osr.lab.run.schema import TrainConfig, register
@@ -99,11 +98,7 @@ def train(run: Run) -> float:
 
     # What all trainers share. A killed run continues from its last checkpoint.
     shared = trainer_options(run)
-    kept = {
-        "perturbation": perturbation,
-        "observation_norm": data.norm,
-        "settings": Settings(config),
-    }
+    kept = {"perturbation": perturbation, "observation_norm": data.norm}
 
     # 3. The inverse dynamics model, by maximum likelihood on D_tot.
     model_loss = InverseDynamicsLoss(model, **options_in(config.inverse_dynamics.loss))
@@ -115,7 +110,6 @@ def train(run: Run) -> float:
         steps,
         folder / "checkpoint" / "inverse_dynamics",
         seed=config.seed,
-        hooks=[still_ours(run)],
         components=kept,
         evaluation=Evaluation(
             lambda: inverse_dynamics_report(model, data.held_out), steps, "nll", "min"
@@ -147,7 +141,6 @@ def train(run: Run) -> float:
             folder / CHECKPOINTS,
             seed=config.seed + 1,
             hooks=[
-                still_ours(run),
                 ("post_optim", schedule.step),
                 ("post_optim", partial(average.update_parameters, actor)),
             ],

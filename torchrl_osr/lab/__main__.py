@@ -61,6 +61,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         # Hydra takes no flag behind the first key=value.
         rest.sort(key=lambda each: each not in ("-m", "--multirun"))
         sys.argv = [f"torchrl-osr {name}", *rest]
+        # For modules of the user's; last, where they replace no installed package.
+        sys.path.append(os.getcwd())
         with errors_as_sentences():
             import_module(f"torchrl_osr.lab.cli.{name}").main()
     else:

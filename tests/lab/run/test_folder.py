@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import platform
-import shlex
 import signal
 import subprocess
 import sys
@@ -13,7 +11,6 @@ import sys
 import pytest
 from composed import composed, job
 from omegaconf import OmegaConf
-from torchrl.checkpoint import CheckpointError
 
 from torchrl_osr.lab.run.folder import open_run, read_status
 from torchrl_osr.trainers import Interrupted
@@ -37,10 +34,6 @@ def status(folder) -> dict:
     return json.loads((folder / "status.json").read_text())
 
 
-def resume(folder, *overrides):
-    return claim(folder, f"resume={folder}", *overrides)
-
-
 def test_a_new_run_is_named_checked_and_done(tmp_path):
     folder = tmp_path / "run"
     with opened(folder, "loss=cql", "recovery=none", "seed=3") as run:
@@ -52,50 +45,33 @@ def test_a_new_run_is_named_checked_and_done(tmp_path):
     config = written(folder)
     assert config["seed"] == 3
     assert config.keys().isdisjoint({"resume", "force", "trust", "settings"})
-    assert resume(folder) == config
+    assert claim(folder, f"resume={folder}") == config
 
 
 def test_some_settings_may_differ_and_steps_may_grow(tmp_path):
     claim(tmp_path)
     more = ["trainer.steps=40_000", "logger=wandb", "trainer.progress=false"]
-    config = claim(tmp_path, *more)
-    assert config["trainer"]["steps"] == 40_000
-    assert resume(tmp_path, "trainer.steps=50_000")["trainer"]["steps"] == 50_000
+    assert claim(tmp_path, *more)["trainer"]["steps"] == 40_000
+    resume = f"resume={tmp_path}"
+    config = claim(tmp_path, resume, "trainer.steps=50_000")
+    assert (config["trainer"]["steps"], config["logger"]["kind"]) == (50_000, "wandb")
     with pytest.raises(ValueError, match="trainer.steps=50000, and 4 are fewer"):
-        resume(tmp_path, "trainer.steps=4", "force=true")
+        claim(tmp_path, resume, "trainer.steps=4", "force=true")
 
 
-def test_other_settings_are_refused_by_key_unless_forced(tmp_path, caplog):
-    config, before = claim(tmp_path), status(tmp_path)
-    for refused in (claim, resume):
-        with pytest.raises(ValueError, match=r"holds a run.*\(seed: 0 there, 1 now\)"):
-            refused(tmp_path, "seed=1")
-        assert (written(tmp_path), status(tmp_path)) == (config, before)
-    assert resume(tmp_path, "seed=1", "force=true")["seed"] == 1
+@pytest.mark.parametrize("resumed", [False, True])
+def test_other_settings_are_refused_by_key_unless_forced(tmp_path, caplog, resumed):
+    config, resume = claim(tmp_path), [f"resume={tmp_path}"] * resumed
+    for override, message in {
+        "seed=1": r"holds a run.*\(seed: 0 there, 1 now\)",
+        "trainer.batch_size=0": "trainer.batch_size must be at least 1",
+        **({"preset=paper": "preset=paper is none of its"} if resumed else {}),
+    }.items():
+        with pytest.raises(ValueError, match=message):
+            claim(tmp_path, *resume, override)
+        assert (written(tmp_path), status(tmp_path)) == (config, {"status": "done"})
+    assert claim(tmp_path, *resume, "seed=1", "force=true")["seed"] == 1
     assert "by force=true: seed: 0 there, 1 now" in caplog.text
-
-
-def test_a_run_whose_checkpoints_do_not_fit_is_what_it_was(tmp_path):
-    config = claim(tmp_path)
-    with pytest.raises(CheckpointError), opened(tmp_path, "seed=1", "force=true"):
-        raise CheckpointError("5 tensors differ")
-    assert (written(tmp_path), status(tmp_path)) == (config, {"status": "done"})
-
-
-def test_overrides_that_are_no_settings_are_refused(tmp_path):
-    claim(tmp_path)
-    with pytest.raises(ValueError, match="preset=paper is none of its settings"):
-        resume(tmp_path, "preset=paper")
-
-
-def test_a_refused_run_says_why_and_an_old_one_stays(tmp_path):
-    with pytest.raises(ValueError, match="trainer.steps must be at least 1"):
-        claim(tmp_path / "new", "trainer.steps=0")
-    assert "trainer.steps must be" in status(tmp_path / "new")["error"]
-    claim(tmp_path / "old")
-    with pytest.raises(ValueError, match="trainer.steps must be at least 1"):
-        claim(tmp_path / "old", "trainer.steps=0")
-    assert status(tmp_path / "old") == {"status": "done"}
 
 
 @pytest.mark.parametrize("error", [ValueError("why"), KeyboardInterrupt("why")])
@@ -123,16 +99,14 @@ def test_a_second_process_in_the_folder_is_refused(tmp_path):
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     with subprocess.Popen(arguments, env=environment, **pipes) as holder:
         assert holder.stdout.readline() == "training\n"
-        process = f"process {holder.pid} on {platform.node()}"
-        with pytest.raises(ValueError, match=f"{process} is training in"):
+        with pytest.raises(ValueError, match="another process is training in"):
             claim(tmp_path)
         found = status(tmp_path)
         assert found["pid"] == holder.pid, "left as it was"
         assert read_status(tmp_path) == found
         holder.kill()
     # A lock does not outlive its process.
-    killed = found | {"status": "killed", "reason": f"{process} is gone"}
-    assert read_status(tmp_path) == killed
+    assert read_status(tmp_path)["status"] == "killed"
     claim(tmp_path)
 
 
@@ -143,21 +117,6 @@ def test_a_process_of_another_machine_may_still_run(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["status.json"]
 
 
-@pytest.mark.parametrize("made_anew", [False, True])
-def test_a_folder_that_is_gone_at_the_end_is_no_success(tmp_path, made_anew):
-    folder, other = tmp_path / "run", {"status": "running", "pid": 1, "host": "x"}
-
-    def move():
-        folder.rename(tmp_path / "elsewhere")
-        if made_anew:
-            folder.mkdir()
-            (folder / "status.json").write_text(json.dumps(other))
-
-    with pytest.raises(FileNotFoundError, match="removed or renamed"), opened(folder):
-        move()
-    assert status(folder) == other if made_anew else not folder.exists()
-
-
 @pytest.mark.parametrize(("name", "code"), [("TERM", 75), ("HUP", 75), ("INT", 130)])
 def test_a_signal_outside_of_the_training_ends_the_run_in_order(
     tmp_path, caplog, name, code
@@ -166,19 +125,10 @@ def test_a_signal_outside_of_the_training_ends_the_run_in_order(
         os.kill(os.getpid(), signal.Signals[f"SIG{name}"])
         pytest.fail("not reached")
 
-    with pytest.raises(Interrupted) as raised, opened(tmp_path):
+    folder = tmp_path / "a run"
+    with pytest.raises(Interrupted) as raised, opened(folder):
         stop()
     assert raised.value.code == code
-    assert status(tmp_path)["status"] == "preempted"
-    assert f"stopped by SIG{name}" in status(tmp_path)["reason"]
-
-
-def test_a_preempted_run_logs_the_command_that_continues_it(tmp_path, caplog):
-    folder, trust = tmp_path / "0_loss=cql,seed=1", "trust=[json,tabnanny]"
-    with pytest.raises(Interrupted), opened(folder, trust):
-        raise Interrupted("saved at step 3", 75)
-    assert status(folder) == {"status": "preempted", "reason": "saved at step 3"}
-    *_, line = caplog.text.strip().splitlines()
-    _, command = line.split("Continue with: ")
-    # Quoted for Hydra, and then for the shell.
-    assert shlex.split(command)[2:] == [f"resume='{folder}'", trust]
+    assert status(folder)["status"] == "preempted"
+    assert f"stopped by SIG{name}" in status(folder)["reason"]
+    assert f"Continue with: torchrl-osr train 'resume={folder}'" in caplog.text

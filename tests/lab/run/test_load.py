@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from composed import configured
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torch.optim.swa_utils import AveragedModel
@@ -120,7 +119,7 @@ def test_a_foreign_run_calls_nothing_of_theirs(tmp_path):
     crafted = {"_target_": "os.mkdir", "path": str(tmp_path / "marker")}
     config.inverse_dynamics.network["more"] = crafted
     write_config(folder, config)
-    with pytest.raises(ValueError, match=r"_target_=os\.mkdir, which is none of"):
+    with pytest.raises(ValueError, match=r"_target_=os\.mkdir, which is no"):
         load_trained(folder)
     assert not (tmp_path / "marker").exists()
 
@@ -216,12 +215,8 @@ def test_switching_uses_all_runs_policies_models_and_critics(folders) -> None:
     assert torch.equal(switching(state), actions[torch.arange(6), wanted.argmax(1)])
 
 
-def test_others_may_judge_and_critics_may_judge_alone(folders, tmp_path) -> None:
-    make_run(tmp_path / "bc", "loss=bc", *BOUNDS)
+def test_critics_may_judge_alone(folders) -> None:
     state = torch.zeros(1, 11)
-    judged = load_switching_policy([tmp_path / "bc"], judges=folders[:1])
-    assert (len(judged.policies), len(judged.networks.weights[0])) == (1, 1)
-    assert torch.equal(judged(state), load_run_policy(tmp_path / "bc")(state))
     alone = load_switching_policy(folders, critics_only=True)
     policies = [load_run_policy(folder) for folder in folders]
     for column, policy in zip(alone.returns(state).T, policies, strict=True):
@@ -229,27 +224,17 @@ def test_others_may_judge_and_critics_may_judge_alone(folders, tmp_path) -> None
         torch.testing.assert_close(column, sum(values) / 2)
 
 
-def test_runs_that_do_not_fit_together_are_refused(folders, tmp_path) -> None:
-    kinds = {
-        "bare": [LOSS],
-        "clone": ["loss=bc"],
-        "hasty": [LOSS, "optim.gamma=0.9"],
-        "scaled": [LOSS, "data.reward_scale=100"],
-    }
-    for name, options in kinds.items():
-        make_run(tmp_path / name, *options)
-    make_run(tmp_path / "walker", LOSS, "env=walker2d", sizes=(17, 6))
-    for name, message in {
-        "bare": "does not exist", "clone": "no critics",
-        "hasty": "optim.gamma: .0.9, 0.99",
-        "walker": "env.id: ..Hopper-v5., .Walker2d-v5",
-        "scaled": "data.reward_scale: .1.0, 100.0",
-    }.items():  # fmt: skip
-        with pytest.raises((ValueError, FileNotFoundError), match=message):
-            load_switching_policy([*folders, tmp_path / name])
-    load_switching_policy([*folders, tmp_path / "scaled"], judges=folders)
-
-
-def test_sizes_come_from_the_environment_once():
-    config = configured("env=walker2d")
-    assert (config.env.observation_size, config.env.action_size) == (17, 6)
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ([LOSS], "does not exist"),
+        (["loss=bc"], "no critics"),
+        ([LOSS, "optim.gamma=0.9"], "optim.gamma: .0.9, 0.99"),
+        ([LOSS, "data.reward_scale=100"], "data.reward_scale: .1.0, 100.0"),
+        ([LOSS, "env=walker2d"], "env.id: ..Hopper-v5., .Walker2d-v5"),
+    ],
+)
+def test_runs_that_do_not_fit_together_are_refused(folders, tmp_path, options, message):
+    make_run(tmp_path / "run", *options)
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        load_switching_policy([*folders, tmp_path / "run"])

@@ -29,7 +29,7 @@ from torchrl_osr.lab.data.record import (
     write_log,
 )
 from torchrl_osr.lab.run import CONF
-from torchrl_osr.lab.run.config import check_environment, import_from_here, module_of
+from torchrl_osr.lab.run.config import check_environment
 from torchrl_osr.lab.run.load import load_run_policy
 from torchrl_osr.lab.run.schema import register
 
@@ -46,7 +46,6 @@ def main(cfg: DictConfig) -> None:
     path = Path(cfg.path).expanduser()
     check_log_path(path)
     env_id = None if OmegaConf.is_missing(cfg.env, "id") else str(cfg.env.id)
-    module_of(env_id or "")
     act: Act | None = None
     if cfg.policy == "random":
         if cfg.noise:
@@ -87,8 +86,7 @@ def main(cfg: DictConfig) -> None:
 
 
 def imported(name: str) -> Act:
-    """Function of a module, as in ``"my_package:act"``; the current folder counts."""
-    import_from_here()
+    """Function of a module, as in ``"my_package:act"``."""
     module, _, function = name.partition(":")
     try:
         act: Act = getattr(import_module(module), function)

@@ -35,8 +35,7 @@ from torchrl_osr.lab.data.sources import RECORDED, open_recorded
 from torchrl_osr.lab.data.store import CHUNK_ROWS, is_memmap_folder
 from torchrl_osr.lab.evaluation.figures import data_figure
 from torchrl_osr.lab.run import CONF
-from torchrl_osr.lab.run.config import check_types, module_of
-from torchrl_osr.lab.run.schema import DataConfig, register
+from torchrl_osr.lab.run.schema import register
 
 MOST_ENTRIES = 40  # in the table
 
@@ -48,10 +47,8 @@ register()
 def main(cfg: DictConfig) -> None:
     """Read the data, print what they are, draw them; nothing else is written."""
     torchrl_logger.setLevel("ERROR")  # warnings are among the findings
-    typed = check_types(OmegaConf.structured(DataConfig), dict(cfg.data))
-    chosen: Any = OmegaConf.to_object(typed)
+    chosen: Any = OmegaConf.to_object(cfg.data)
     env_id = None if OmegaConf.is_missing(cfg.env, "id") else str(cfg.env.id)
-    module_of(env_id or "")
     env_name = None if env_id is None else cfg.env.get("name")
     options = asdict(chosen)
     read = ("columns", "action_bounds", "clip_actions", "missing", "download")

@@ -6,33 +6,26 @@ Networks and loss are built by calling the functions that a configuration names 
 
 from __future__ import annotations
 
-import math
 import os
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 from typing import Any, cast
 
 import yaml
-from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
+from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_osr import objectives
 from torchrl_osr._files import read_text, write_atomically
-from torchrl_osr.lab.run.schema import TrainConfig, schema_of
+from torchrl_osr.lab.run.schema import TrainConfig
 
 CONFIG = "config.yaml"
 """Configuration in the folder of a run."""
 
 FORMAT = 2
 """Format of a run's folder; raised when older runs cannot be read any more."""
-
-MAX_BYTES = 2**16
-"""Size of a run's YAML file, at most; ours have 4 kB."""
 
 TARGET_PACKAGES = (
     "torchrl_osr.modules",
@@ -41,9 +34,6 @@ TARGET_PACKAGES = (
 )
 """Packages whose public names are allowed as ``_target_``: none of them reads a file or
 imports a module. A loss may be named as ``torchrl_osr``'s, too."""
-
-PARTS = ("loss", "recovery", "inverse_dynamics.loss", "perturbation.adversary")
-"""Keys whose options are those of the class that their ``_target_`` names."""
 
 MAY_BE_0 = ("dynamics.adversarial_steps", "dynamics.perturbed_start_steps")
 SHARES = (
@@ -62,10 +52,7 @@ CHOICES = {
 
 
 def checked(config: DictConfig, trust: Sequence[str] = ()) -> TrainConfig:
-    """Check all of a run's configuration, of whatever origin.
-
-    Returns:
-        The configuration as plain objects.
+    """Check a run's configuration, of whatever origin; return it as plain objects.
 
     Raises:
         ValueError: naming the key, if there is no such key, one is missing, of the
@@ -74,70 +61,35 @@ def checked(config: DictConfig, trust: Sequence[str] = ()) -> TrainConfig:
     plain: Any = OmegaConf.to_container(config, resolve=True)
     plain.pop("settings", None)  # interpolations have read them
     check_targets(plain, trust)
-    for key in PARTS:
-        group, last = _holder(plain, key)
-        target = (group.get(last) or {}).get("_target_", "")
-        if target.startswith("torchrl_osr."):
-            schema = OmegaConf.structured(schema_of(get_class(target)))
-            options = check_types(schema, group[last], f"{key}.")
-            group[last] = OmegaConf.to_container(options)
-    typed = check_types(OmegaConf.structured(TrainConfig), plain)
-    if missing := sorted(OmegaConf.missing_keys(typed)):
-        raise ValueError(f"the configuration lacks {', '.join(missing)}.")
-    made: Any = OmegaConf.to_object(typed)
-    check_values(flatten(asdict(made)))
-    return cast(TrainConfig, made)
-
-
-def check_types(schema: DictConfig, values: Any, prefix: str = "") -> DictConfig:
-    """Return values with the types of a schema; name what the schema refuses.
-
-    Hydra refuses a mistyped ``key=value``, but adds ``+key=value`` even to a typed
-    group, where nothing would read it.
-    """
     try:
-        typed = OmegaConf.merge(schema, values)
-    except ConfigKeyError as error:
-        raise ValueError(f"there is no key {prefix}{error.full_key}.") from error
+        typed = OmegaConf.merge(OmegaConf.structured(TrainConfig), plain)
     except OmegaConfBaseException as error:
         what = str(error).split("\n")[0]  # then OmegaConf's own types
-        raise ValueError(f"{prefix}{error.full_key}: {what}.") from error
-    assert isinstance(typed, DictConfig)
-    return typed
+        raise ValueError(f"{error.full_key}: {what}.") from error
+    if missing := sorted(OmegaConf.missing_keys(typed)):
+        raise ValueError(f"the configuration lacks {', '.join(missing)}.")
+    made = cast(TrainConfig, OmegaConf.to_object(typed))
+    for key, value in flatten(asdict(made)).items():
+        _check_value(key, value)
+    return made
 
 
-def check_values(values: Mapping[str, Any]) -> None:
-    """Raise a ValueError for a number that would train nonsense, or fail hours later.
-
-    Args:
-        values: by dotted key, see :func:`flatten`.
-
-    Examples:
-        >>> from torchrl_osr.lab.run.config import check_values
-        >>> check_values({"optim.gamma": 1.5})
-        Traceback (most recent call last):
-            ...
-        ValueError: optim.gamma must be between 0 and 1, got 1.5.
-    """
-    for key, value in values.items():
-        wanted = ""
-        if key in CHOICES and value not in CHOICES[key]:
-            wanted = f"one of {', '.join(CHOICES[key])}"
-        elif key in SHARES and not 0 <= value <= 1:
-            wanted = "between 0 and 1"
-        elif key in ("seed", "data.seed") and not 0 <= value < 2**32:
-            wanted = "between 0 and 2**32 - 1"
-        elif isinstance(value, float) and math.isnan(value):
-            wanted = "a number"
-        elif (
-            type(value) is int
-            and value < 1
-            and key.startswith(("trainer.", "dynamics."))
-            and key not in MAY_BE_0
-        ):
-            wanted = "at least 1"
-        if wanted:
-            raise ValueError(f"{key} must be {wanted}, got {value}.")
+def _check_value(key: str, value: Any) -> None:
+    """Raise a ValueError for a value that would train nonsense, or fail hours later."""
+    wanted = ""
+    if key in CHOICES and value not in CHOICES[key]:
+        wanted = f"one of {', '.join(CHOICES[key])}"
+    elif key in SHARES and not 0 <= value <= 1:
+        wanted = "between 0 and 1"
+    elif (
+        key.startswith(("trainer.", "dynamics."))
+        and key not in MAY_BE_0
+        and type(value) is int
+        and value < 1
+    ):
+        wanted = "at least 1"
+    if wanted:
+        raise ValueError(f"{key} must be {wanted}, got {value}.")
 
 
 # -- files ---------------------------------------------------------------------------
@@ -174,15 +126,15 @@ def write_config(folder: Path, config: TrainConfig) -> None:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a small YAML mapping; a ValueError names a damaged file."""
+    """Read a YAML mapping; a ValueError names a damaged file."""
     try:
-        content = yaml.safe_load(read_text(path, max_bytes=MAX_BYTES))
-    except (yaml.YAMLError, RecursionError) as error:
+        content = yaml.safe_load(read_text(path))
+        if not isinstance(content, dict):
+            raise ValueError("it holds no mapping")
+    except (yaml.YAMLError, ValueError) as error:
         raise ValueError(
             f"{path} is damaged: {' '.join(str(error).split())}"
         ) from error
-    if not isinstance(content, dict):
-        raise ValueError(f"{path} holds no mapping.")
     return content
 
 
@@ -197,18 +149,15 @@ def check_targets(config: Mapping[str, Any], trust: Sequence[str] = ()) -> None:
     """
     allowed = {f"torchrl_osr.{name}" for name in objectives.__all__}
     for name in (*TARGET_PACKAGES, *trust):
-        allowed |= _public_names(_imported(name))
+        allowed |= _public_names(name)
     for target in _targets(config):
-        if target in allowed:
-            continue
-        module, _, name = str(target).rpartition(".")
-        cure = f"allow it with trust=[{module}] if you know that module"
-        if module in (*TARGET_PACKAGES, *trust):
-            cure = f"{module} has no public function or class {name!r}"
-        raise ValueError(
-            f"the configuration names _target_={target}, which is none of "
-            f"{', '.join([*TARGET_PACKAGES, *trust])}: {cure}."
-        )
+        if target not in allowed:
+            module = str(target).rpartition(".")[0]
+            raise ValueError(
+                f"the configuration names _target_={target}, which is no public name "
+                f"of {', '.join([*TARGET_PACKAGES, *trust])}: allow it with "
+                f"trust=[{module}] if you know that module."
+            )
 
 
 def check_environment(env_id: str, trust: Sequence[str] = ()) -> None:
@@ -217,49 +166,23 @@ def check_environment(env_id: str, trust: Sequence[str] = ()) -> None:
     Gymnasium imports the module that an id begins with, as in ``"module:Name-v0"``, and
     a run may come from somebody else.
     """
-    if (module := module_of(env_id)) and module not in trust:
+    module = env_id.rpartition(":")[0]
+    if module and module not in trust:
         raise ValueError(
             f"env.id={env_id} imports a module: allow it with trust=[{module}] if you "
             "know it."
         )
 
 
-def module_of(env_id: str) -> str:
-    """Return the module that Gymnasium imports for an environment, or nothing.
-
-    The module may lie in the current folder, which comes last: no file in it takes the
-    place of an installed package.
-
-    Examples:
-        >>> from torchrl_osr.lab.run.config import module_of
-        >>> module_of("my_robots.arms:Arm-v0"), module_of("Hopper-v5")
-        ('my_robots.arms', '')
-    """
-    module = env_id.rpartition(":")[0]
-    if module:
-        import_from_here()
-    return module
-
-
-def import_from_here() -> None:
-    """Let modules be imported from the current folder, after all others."""
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())
-
-
-def _imported(name: str) -> ModuleType:
-    import_from_here()
+def _public_names(name: str) -> set[str]:
+    """Full names of what a module offers, without what it has imported itself."""
     try:
-        return import_module(name)
-    except (ImportError, TypeError, ValueError) as error:
+        module = import_module(name)
+    except ImportError as error:
         raise ValueError(
             f"trust=[{name}] cannot be imported ({error}): give the name of a module "
             f"that is installed, or of a file without its .py in {os.getcwd()}."
         ) from error
-
-
-def _public_names(module: ModuleType) -> set[str]:
-    """Full names of what a module offers, without what it has imported itself."""
     names = getattr(module, "__all__", None) or [
         name
         for name, value in vars(module).items()
@@ -276,14 +199,6 @@ def _targets(value: Any) -> Iterator[Any]:
         value = list(value.values())
     for each in value if isinstance(value, list) else []:
         yield from _targets(each)
-
-
-def _holder(config: dict[str, Any], key: str) -> tuple[dict[str, Any], str]:
-    """The group that holds a dotted key, and the key in it."""
-    *groups, last = key.split(".")
-    for group in groups:
-        config = config[group]
-    return config, last
 
 
 def flatten(value: Any, prefix: str = "") -> dict[str, Any]:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 import os
 import platform
-import re
 import shlex
-import subprocess
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from glob import glob
 from importlib.metadata import version
@@ -22,7 +19,6 @@ from hydra.conf import HydraConf
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import Container, DictConfig, ListConfig, OmegaConf
-from torchrl.checkpoint import CheckpointError
 
 from torchrl_osr._files import read_json, write_atomically, write_json
 from torchrl_osr.lab.run.build import read_environment
@@ -30,7 +26,6 @@ from torchrl_osr.lab.run.config import (
     CONFIG,
     checked,
     flatten,
-    module_of,
     read_config,
     read_run,
     write_config,
@@ -89,9 +84,8 @@ def open_run(
 ) -> Iterator[Run]:
     """Check a configuration, and hold the folder of its run while it is trained.
 
-    The folder is locked, gets ``config.yaml``, and its ``status.json`` is kept true:
-    running, then done, preempted, or failed and why. With ``resume`` the run in that
-    folder continues.
+    The folder is locked and gets ``config.yaml``. Its ``status.json`` is running, then
+    done, preempted or failed. With ``resume`` the run in that folder continues.
 
     Args:
         cfg: as Hydra has composed it.
@@ -106,20 +100,23 @@ def open_run(
     if folder is None:
         folder = Path(cfg.resume or job.runtime.output_dir).absolute()
     trust = list(cfg.trust)  # by the command line, not by a run's folder
-    overrides = list(job.overrides.task)
     with _lock(folder):
-        with _refusal_noted(folder):
-            if cfg.resume is None:
-                trust += [name] if (name := module_of(cfg.env.id)) else []
-                cfg.data.path = _absolute(cfg.data.path)
-                cfg.dynamics.path = _absolute(cfg.dynamics.path)
-            else:
-                cfg = resumed(folder, cfg, overrides)
-            config = checked(cfg, trust)
-            spec = read_environment(config.env)
-        with _claimed(folder, config, trust, job), _status(folder, trust):
-            choices = OmegaConf.load(folder / HYDRA).hydra.runtime.choices
-            method = method_name(choices.loss, choices.get("recovery"))
+        if cfg.resume is None:
+            cfg.data.path = _absolute(cfg.data.path)
+            cfg.dynamics.path = _absolute(cfg.dynamics.path)
+        else:
+            cfg = _resumed(folder, cfg, list(job.overrides.task))
+        config = checked(cfg, trust)
+        spec = read_environment(config.env)
+        if (folder / CONFIG).exists():
+            _check_same(read_run(folder, trust), config, folder)
+        else:
+            (folder / HYDRA).parent.mkdir(exist_ok=True)
+            write_atomically(folder / HYDRA, OmegaConf.to_yaml({"hydra": job}))
+        write_config(folder, config)  # last: it makes the folder that of a run
+        choices = OmegaConf.load(folder / HYDRA).hydra.runtime.choices
+        method = method_name(choices.loss, choices.get("recovery"))
+        with _status(folder):
             yield Run(config, folder, spec.simulated, method)
 
 
@@ -133,17 +130,8 @@ def _absolute(path: Any) -> Any:
     return full if Path(full).exists() or glob(full) else path
 
 
-def resumed(folder: Path, composed: DictConfig, overrides: Sequence[str]) -> DictConfig:
-    """Return the configuration of a run that continues.
-
-    Args:
-        folder: of the run.
-        composed: what Hydra has made of the command line.
-        overrides: of the command line; they replace settings of the run.
-
-    Raises:
-        ValueError: if an override is no setting of the run.
-    """
+def _resumed(folder: Path, composed: DictConfig, overrides: Sequence[str]) -> Any:
+    """Return a run's configuration with the overrides of the command line."""
     start: dict[str, Any] = {"resume": None, "trust": [], "force": False}
     there = OmegaConf.create(read_config(folder) | start)
     for override in OverridesParser.create().parse_overrides(list(overrides)):
@@ -160,94 +148,34 @@ def resumed(folder: Path, composed: DictConfig, overrides: Sequence[str]) -> Dic
     return there
 
 
-class Settings:
-    """Settings of a run, as a part of its checkpoints.
+def _check_same(run: TrainConfig, config: TrainConfig, folder: Path) -> None:
+    """Raise a ValueError that names the settings in which a continued run differs.
 
-    Args:
-        config: of the run. With its ``force`` it continues where settings differ.
+    :data:`RESUMABLE` may, and with ``force`` all, except that a run never goes back.
     """
-
-    def __init__(self, config: TrainConfig) -> None:
-        self.values = flatten(asdict(config))
-        for key in ("resume", "trust", "settings"):  # of one start alone
-            self.values.pop(key, None)
-        self.force = self.values.pop("force")
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the settings."""
-        return {"settings": self.values}
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Raise a ValueError that names the settings that differ.
-
-        :data:`RESUMABLE` may, except that a run never goes back.
-        """
-        there, now = state_dict["settings"], self.values
-        if now["trainer.steps"] < there["trainer.steps"]:
-            raise ValueError(
-                f"it was made with trainer.steps={there['trainer.steps']}, and "
-                f"{now['trainer.steps']} are fewer: give more, or choose another "
-                "folder."
-            )
-        different = "; ".join(
-            f"{key}: {there.get(key, 'nothing')!r} there, "
-            f"{now.get(key, 'nothing')!r} now"
-            for key in sorted(now.keys() | there.keys())
-            if now.get(key, ...) != there.get(key, ...) and key not in RESUMABLE
+    if config.trainer.steps < run.trainer.steps:
+        raise ValueError(
+            f"{folder} holds a run with trainer.steps={run.trainer.steps}, and "
+            f"{config.trainer.steps} are fewer: give more, or choose another folder."
         )
-        if different and not self.force:
-            raise ValueError(
-                f"it was made with other settings ({different}). Leave these as they "
-                "were, choose another folder, or continue with force=true."
-            )
-        if different:
-            log.warning(
-                f"Continues with other settings, by force=true: {different}. What the "
-                "checkpoint restores stays: networks, learning rates, discount, "
-                "weights of the loss's terms, width of the noise."
-            )
-
-
-@contextmanager
-def _claimed(
-    folder: Path, config: TrainConfig, trust: Sequence[str], job: HydraConf
-) -> Iterator[None]:
-    """Write a run's configuration into its folder, unless that holds another run.
-
-    If its checkpoints then turn out not to fit, configuration and status are put back.
-    """
-    files = [each for each in (folder / CONFIG, folder / STATUS) if each.exists()]
-    old = {each: each.read_text() for each in files}
-    if (folder / CONFIG).exists():
-        there = Settings(read_run(folder, trust))
-        try:
-            Settings(config).load_state_dict(there.state_dict())
-        except ValueError as error:
-            raise ValueError(f"{folder} holds a run, and {error}") from error
-    else:
-        old = {}
-        (folder / HYDRA).parent.mkdir(exist_ok=True)
-        write_atomically(folder / HYDRA, OmegaConf.to_yaml({"hydra": job}))
-    # Last: this file makes the folder that of a run.
-    write_config(folder, config)
-    try:
-        yield
-    except CheckpointError:
-        for each, content in old.items():
-            write_atomically(each, content)
-        raise
-
-
-@contextmanager
-def _refusal_noted(folder: Path) -> Iterator[None]:
-    """Write why a run does not begin, unless its folder holds one already."""
-    try:
-        yield
-    except Exception as error:
-        if not (folder / CONFIG).exists():
-            reason = f"{type(error).__name__}: {error}"
-            write_json(folder / STATUS, {"status": "failed", "error": reason})
-        raise
+    of_one_start = ("resume", "trust", "force", "settings", *RESUMABLE)
+    there, now = flatten(asdict(run)), flatten(asdict(config))
+    different = "; ".join(
+        f"{key}: {there.get(key, 'nothing')!r} there, {now.get(key, 'nothing')!r} now"
+        for key in sorted(now.keys() | there.keys())
+        if now.get(key, ...) != there.get(key, ...) and key not in of_one_start
+    )
+    if different and not config.force:
+        raise ValueError(
+            f"{folder} holds a run with other settings ({different}). Leave these as "
+            "they were, choose another folder, or continue with force=true."
+        )
+    if different:
+        log.warning(
+            f"Continues with other settings, by force=true: {different}. What the "
+            "checkpoint restores stays: networks, learning rates, discount, weights of "
+            "the loss's terms, width of the noise."
+        )
 
 
 @contextmanager
@@ -255,46 +183,37 @@ def _lock(folder: Path) -> Iterator[None]:
     """Keep other processes out of a folder; the lock goes with the process."""
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        # Who looks whether the run is at work has the lock for an instant.
+        # A reader of the status has the lock for an instant.
         held = FileLock(folder / LOCK).acquire(timeout=1)
     except Timeout as error:
-        process = "another process"  # that has just begun
-        with suppress(OSError, ValueError):
-            process = _process(read_json(folder / STATUS))
         raise ValueError(
-            f"{process} is training in {folder}: wait for its end or stop it, or "
-            "choose another folder."
+            f"another process is training in {folder}: wait for its end or stop it, "
+            "or choose another folder."
         ) from error
     with held:
         yield
 
 
-# -- status --------------------------------------------------------------------------
-
-
 @contextmanager
-def _status(folder: Path, trust: Sequence[str]) -> Iterator[None]:
+def _status(folder: Path) -> Iterator[None]:
     """Keep ``status.json`` true; log the command that continues a preempted run."""
+    end: dict[str, Any]
+    running = {"status": "running", "pid": os.getpid(), "host": platform.node()}
     with signals_raised():
-        write_json(folder / STATUS, _running())
+        write_json(folder / STATUS, running)
         try:
             with interrupts_kept():
                 yield
-            check_ours(folder)
             with signals_noted():
                 write_json(folder / STATUS, {"status": "done"})
-        except Interrupted as error:
-            _write_end(folder, {"status": "preempted", "reason": error.reason})
-            plain = re.fullmatch(r"[\w./-]+", str(folder))
-            place = folder if plain else f"'{folder}'"  # quoted for Hydra
-            command = f"torchrl-osr train {shlex.quote(f'resume={place}')}"
-            if trust:  # which no run's folder may say
-                command += " " + shlex.quote(f"trust=[{','.join(trust)}]")
-            log.warning(f"Continue with: {command}")
-            raise
         except BaseException as error:
-            reason = f"{type(error).__name__}: {error}"
-            _write_end(folder, {"status": "failed", "error": reason})
+            end = {"status": "failed", "error": f"{type(error).__name__}: {error}"}
+            if isinstance(error, Interrupted):
+                end = {"status": "preempted", "reason": error.reason}
+                resume = shlex.quote(f"resume={folder}")
+                log.warning(f"Continue with: torchrl-osr train {resume}")
+            with signals_noted():
+                write_json(folder / STATUS, end)
             raise
 
 
@@ -315,55 +234,9 @@ def read_status(folder: Path) -> dict[str, Any]:
             FileLock(folder / LOCK).acquire(timeout=0).lock.release()
     except Timeout:
         return found
-    return found | {"status": "killed", "reason": f"{_process(found)} is gone"}
-
-
-def check_ours(folder: Path) -> None:
-    """Raise a FileNotFoundError if a run's folder is not this process's any more."""
-    if not _is_ours(folder):
-        raise FileNotFoundError(f"{folder} was removed or renamed during the run.")
-
-
-def _is_ours(folder: Path) -> bool:
-    with suppress(OSError, ValueError):
-        return read_json(folder / STATUS) == _running()
-    return False
-
-
-def _running() -> dict[str, Any]:
-    return {"status": "running", "pid": os.getpid(), "host": platform.node()}
-
-
-def _process(found: Mapping[str, Any]) -> str:
-    return f"process {found.get('pid')} on {found.get('host')}"
-
-
-def _write_end(folder: Path, end: dict[str, Any]) -> None:
-    """Write how a run has ended badly, or warn that this cannot be written."""
-    try:
-        if _is_ours(folder):
-            with signals_noted():
-                write_json(folder / STATUS, end)
-    except OSError as error:
-        log.warning(f"{error}: the file still says that the run is running.")
-
-
-# -- versions ------------------------------------------------------------------------
+    return found | {"status": "killed", "reason": f"process {found['pid']} is gone"}
 
 
 def package_versions() -> dict[str, str]:
     """Return versions of :data:`PACKAGES`, by name with underscores."""
     return {package.replace("-", "_"): version(package) for package in PACKAGES}
-
-
-@functools.cache  # of the code that runs: a later commit changes nothing in it
-def code_versions() -> dict[str, str]:
-    """Return :func:`package_versions`, and ``git describe --dirty`` of a checkout."""
-    root, commit = Path(__file__).parents[3], {}
-    describe = "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"
-    if (root / ".git").exists():
-        with suppress(OSError, subprocess.SubprocessError):
-            command = ["git", "-C", str(root), *describe]
-            done = subprocess.run(command, capture_output=True, text=True, check=True)
-            commit = {"commit": done.stdout.strip()}
-    return package_versions() | commit

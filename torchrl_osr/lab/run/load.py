@@ -37,8 +37,7 @@ class TrainedRun(NamedTuple):
     Attributes:
         config: the run's configuration.
         actor: the policy, with the average of its weights (``optim.policy_average``).
-        inverse_dynamics: the model that taught the policy, with its frozen
-            parameters; ``None`` if there was none, as in CQL and SAC-N.
+        inverse_dynamics: the frozen model that taught the policy, or ``None``.
         loss: holds the critics, too.
         observation_norm: standardisation of the networks' observations.
         step: gradient steps of the checkpoint.
@@ -70,8 +69,7 @@ def run_folder_of(path: Path | str) -> Path:
 
 def checkpoints_of(folder: Path | str) -> list[Path]:
     """Return the checkpoints that a run has kept, oldest first, without the best."""
-    folder = run_folder_of(folder)
-    found = sorted((folder / CHECKPOINTS).glob("checkpoint-*.torchrl"))
+    found = sorted((run_folder_of(folder) / CHECKPOINTS).glob("checkpoint-*.torchrl"))
     if not found:
         raise FileNotFoundError(f"the run in {folder} has no checkpoint yet.")
     return found
@@ -95,13 +93,12 @@ def load_trained(path: Path | str, *, trust: Sequence[str] = ()) -> TrainedRun:
             configuration; tensors of another shape are named.
         ValueError: if the configuration is refused.
     """
-    folder = run_folder_of(path)
+    config = read_run(run_folder_of(path), trust)
     path = checkpoints_of(path)[-1] if Path(path).is_dir() else Path(path)
     if damage := find_damage(path):
         raise CheckpointError(
             f"checkpoint {path} is damaged: {damage}. Take another one of the run."
         )
-    config = read_run(folder, trust)
     with torch.random.fork_rng(devices=[]):
         learner = make_learner(config)
     shape = [config.env.observation_size or 0] if config.data.standardize else []
@@ -172,7 +169,6 @@ def policy_of(run: TrainedRun) -> Policy:
 def load_switching_policy(
     runs: Sequence[Path | str],
     *,
-    judges: Sequence[Path | str] | None = None,
     critics_only: bool = False,
     trust: Sequence[str] = (),
     **options: Any,
@@ -186,36 +182,29 @@ def load_switching_policy(
         runs: folders, or checkpoints in them.
 
     Keyword Args:
-        judges: other runs whose models and critics predict. Default: ``runs``.
         critics_only: use no models.
         trust: modules of your own that a run may name.
         options: ``steps`` and ``hold`` of
             :class:`~torchrl_osr.lab.dynamics.SwitchingPolicy`.
 
     Raises:
-        FileNotFoundError: there is no such run, or a judge has no model.
+        FileNotFoundError: there is no such run, or it has no model.
         ValueError: the runs differ in task, discount or units of reward, have discrete
-            actions, or a judge lacks critics.
+            actions, or lack critics.
     """
-    paths = [Path(each) for each in runs]
-    judging = paths if judges is None else [Path(each) for each in judges]
-    trained = {
-        each: load_trained(each, trust=trust)
-        for each in dict.fromkeys([*paths, *judging])
-    }
-    policies = {each: policy_of(run) for each, run in trained.items()}
-    for path, policy in policies.items():
-        if policy.discrete or (path in judging and not policy.critics):
+    trained = [load_trained(each, trust=trust) for each in runs]
+    policies = [policy_of(run) for run in trained]
+    configs = [run.config for run in trained]
+    for run, policy in zip(runs, policies, strict=True):
+        if policy.discrete or not policy.critics:
             raise ValueError(
-                f"{path} has discrete actions or no critics: choose other runs."
+                f"{run} has discrete actions or no critics: choose other runs."
             )
-    configs = [run.config for run in trained.values()]
-    units = [trained[each].config.data for each in judging]
     numbers: dict[str, set[Any]] = {
         "env.id": {each.env.id for each in configs},
         "optim.gamma": {each.optim.gamma for each in configs},
-        "data.reward_scale": {each.reward_scale for each in units},
-        "data.reward_shift": {each.reward_shift for each in units},
+        "data.reward_scale": {each.data.reward_scale for each in configs},
+        "data.reward_shift": {each.data.reward_shift for each in configs},
     }
     for name, found in numbers.items():
         if len(found) > 1:
@@ -223,14 +212,13 @@ def load_switching_policy(
                 f"The runs differ in {name}: {sorted(found)}. Choose runs of one task, "
                 "with the same discount and units of reward."
             )
-    critics = [policies[each] for each in judging]
 
     def value(state: Tensor, action: Tensor) -> Tensor:
-        values = [each.smallest_value(state, action) for each in critics]
+        values = [each.smallest_value(state, action) for each in policies]
         return torch.stack(values).mean(0)
 
-    def networks_of(path: Path) -> EliteNetworks:
-        file, policy = run_folder_of(path) / FILE, policies[path]
+    def networks(run: Path | str, policy: Policy) -> EliteNetworks:
+        file = run_folder_of(run) / FILE
         if not file.exists():
             raise FileNotFoundError(
                 f"{file} does not exist: train with loss=rim or dynamics=ensemble, or "
@@ -239,12 +227,15 @@ def load_switching_policy(
         model = load_dynamics(file)
         return EliteNetworks(model, policy.loc, policy.scale, policy.low, policy.high)
 
-    first = trained[judging[0]].config
+    models = None
+    if not critics_only:
+        models = EliteNetworks.join([*map(networks, runs, policies)])
+    config = configs[0]
     return SwitchingPolicy(
-        [policies[each] for each in paths],
-        None if critics_only else EliteNetworks.join([*map(networks_of, judging)]),
+        policies,
+        models,
         value,
-        terminated=first.dynamics.termination(first.env.id),
-        gamma=first.optim.gamma,
+        terminated=config.dynamics.termination(config.env.id),
+        gamma=config.optim.gamma,
         **options,
     )

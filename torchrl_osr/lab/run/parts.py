@@ -33,7 +33,7 @@ from torchrl_osr.lab.evaluation.figures import learning_curve
 from torchrl_osr.lab.evaluation.training_summary import read_scalars, score_table
 from torchrl_osr.lab.run.build import Learner
 from torchrl_osr.lab.run.data import references_of
-from torchrl_osr.lab.run.folder import Run, check_ours, code_versions
+from torchrl_osr.lab.run.folder import Run, package_versions
 from torchrl_osr.lab.run.load import CHECKPOINTS, POLICY, policy_of, restore
 from torchrl_osr.trainers import Evaluation, OfflineTrainer
 
@@ -50,7 +50,7 @@ def prepare_machine(run: Run) -> tuple[torch.device, torch.dtype | None]:
     """Log what is trained where, and set torch's threads; device and autocast type."""
     config = run.config
     torchrl_logger.setLevel("WARNING")
-    versions = ", ".join(f"{name} {each}" for name, each in code_versions().items())
+    versions = ", ".join(f"{name} {each}" for name, each in package_versions().items())
     log.info(
         f"{config.env.name} {config.data.source}, seed {config.seed}, in {run.folder}"
     )
@@ -85,7 +85,7 @@ def make_loggers(run: Run) -> list[Logger]:
             # A sweep's jobs may share a process, and a failed one left its run open.
             "reinit": "finish_previous",
             "group": group,
-            "config": asdict(config) | {"versions": code_versions()},
+            "config": asdict(config) | {"versions": package_versions()},
         }
     return [*loggers, get_logger(kind, str(folder), name, wandb_kwargs=options)]
 
@@ -100,11 +100,6 @@ def trainer_options(run: Run) -> dict[str, Any]:
         "checkpoints_kept": options.checkpoints_kept,
         "progress": options.progress,
     }
-
-
-def still_ours(run: Run) -> Hook:
-    """Return a hook that ends a run whose folder was removed: nothing would be kept."""
-    return "post_steps", partial(check_ours, run.folder)
 
 
 def optimizer_of(
@@ -195,7 +190,7 @@ def report(run: Run, data_mean: float | None, trainer: OfflineTrainer) -> float:
     rows: dict[str, Any] = {}
     if history:
         rows = {"last": history[-1], "best": trainer.best() or history[0]}
-    results = {"versions": code_versions(), f"data_{measure}": data_mean, **rows}
+    results = {"versions": package_versions(), f"data_{measure}": data_mean, **rows}
     write_json(folder / "returns.json", results | {"evaluations": history})
     name = f"{config.env.name} {config.data.source}"
     learning_curve(

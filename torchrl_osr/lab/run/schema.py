@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import functools
 import inspect
-import operator
 import re
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, make_dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field, is_dataclass, make_dataclass
 from pathlib import Path
 from types import NoneType
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 from hydra.core.config_store import ConfigStore
 from hydra.utils import get_class
@@ -148,9 +147,7 @@ class TrainerConfig:
     num_threads: int = MISSING  # torch threads; 1 if several runs share the machine
     device: str = MISSING  # cpu, cuda or cuda:1
     precision: str = MISSING  # precision of the losses: float32 or bfloat16
-    matmul_precision: str = (
-        MISSING  # precision of float32 products: highest, high, medium
-    )
+    matmul_precision: str = MISSING  # of float32 products: highest, high or medium
     record: bool = MISSING  # repeat recorded operations: same numbers, faster (CPU)
     compile: bool = MISSING  # compile the losses
     progress: bool = MISSING  # show progress bars
@@ -254,14 +251,10 @@ class EvaluateConfig:
 
 
 def schema_of(target: type) -> type:
-    """Return a structured config with the keyword options of a class.
+    """Return a dataclass of the options of a loss, or of the adversary.
 
-    Args:
-        target: its keyword-only parameters, and those of the bases that its
-            ``**options`` reach, are the fields; of a dataclass its own fields.
-
-    Returns:
-        A dataclass whose ``_target_`` is the public name of ``target``.
+    Its fields are the keyword-only parameters of the class, and of the bases that its
+    ``**options`` reach. Its ``_target_`` is the public name of the class.
 
     Examples:
         >>> from torchrl_osr import OSRLoss
@@ -271,48 +264,30 @@ def schema_of(target: type) -> type:
     """
     lab = target.__module__.startswith(losses.__name__)
     package = losses.__name__ if lab else "torchrl_osr"
-    name = f"{package}.{target.__name__}"
-    options: dict[str, tuple[str, Any, Any]] = {"_target_": ("_target_", str, name)}
-    for parameter, annotation in _keyword_options(target):
-        option = parameter.name, _config_type(annotation), parameter.default
-        options.setdefault(parameter.name, option)
+    options: dict[str, tuple[str, Any, Any]] = {
+        "_target_": ("_target_", str, f"{package}.{target.__name__}")
+    }
+    for each in target.__mro__:
+        if "__init__" not in vars(each):
+            continue
+        parameters = inspect.signature(each).parameters
+        hints = get_type_hints(vars(each)["__init__"])
+        for name, parameter in parameters.items():
+            # Not a Python object, nor what every loss refuses.
+            if name not in ("action_spec", "gamma") and (
+                parameter.kind is parameter.KEYWORD_ONLY or is_dataclass(target)
+            ):
+                option = name, _config_type(hints[name]), parameter.default
+                options.setdefault(name, option)
+        if not any(each.kind is each.VAR_KEYWORD for each in parameters.values()):
+            break
     return make_dataclass(f"{target.__name__}Config", options.values())
 
 
-def _keyword_options(target: type) -> Iterator[tuple[inspect.Parameter, Any]]:
-    """Parameters with a default that a configuration can set, and their types."""
-    for each in target.__mro__:
-        initialize = vars(each).get("__init__")
-        if initialize is None:
-            continue
-        hints = get_type_hints(initialize, vars(inspect.getmodule(each)))
-        parameters = inspect.signature(initialize).parameters.values()
-        is_dataclass = "__dataclass_fields__" in vars(each)
-        for parameter in parameters:
-            if parameter.name in ("action_spec", "gamma"):
-                continue  # a Python object, and what every loss refuses
-            if parameter.kind is parameter.KEYWORD_ONLY or (
-                is_dataclass and parameter.default is not parameter.empty
-            ):
-                yield parameter, hints[parameter.name]
-        if not any(each.kind is each.VAR_KEYWORD for each in parameters):
-            return
-
-
 def _config_type(annotation: Any) -> Any:
-    """The annotation as OmegaConf knows it: a ``Literal`` is the literals' type."""
-    if get_origin(annotation) is Literal:
-        (kind,) = {type(value) for value in get_args(annotation)}
-        return kind
-    parts = get_args(annotation)
-    if not parts:
-        return annotation
-    kinds = dict.fromkeys(_config_type(part) for part in parts if part is not NoneType)
-    if float in kinds and len(kinds) > 1:
-        kinds[int] = None  # in a union OmegaConf does not make a float of an int
-    if NoneType in parts:
-        kinds[None] = None
-    return functools.reduce(operator.or_, kinds)
+    """The annotation, where OmegaConf can check it: a plain type, or that or none."""
+    parts = {*get_args(annotation)} - {NoneType} or {annotation}
+    return annotation if parts < {bool, int, float, str} else Any
 
 
 @functools.cache
@@ -348,9 +323,6 @@ def by_data(key: str, *, _root_: DictConfig) -> Any:
 
     It is that of the most specific row of ``settings``, or else, of an option of the
     loss, the default of the constructor.
-
-    Raises:
-        ValueError: there is neither.
     """
     rows, env, source = _root_.settings, _root_.env.name, _root_.data.source
     for name in (f"{env}-{source}", env, "any"):
@@ -363,8 +335,7 @@ def by_data(key: str, *, _root_: DictConfig) -> Any:
 
 
 def _environment_name(env_id: str) -> str:
-    # Needs Gymnasium.
-    from torchrl_osr.lab.data.environment import environment_name
+    from torchrl_osr.lab.data.environment import environment_name  # needs Gymnasium
 
     return environment_name(env_id)
 
@@ -379,11 +350,5 @@ def _run_dir(resume: str | None, fresh: str) -> str:
 
 
 def method_name(loss: str, recovery: str | None = "none") -> str:
-    """Return the name of a run's method, from the options of its groups.
-
-    Examples:
-        >>> from torchrl_osr.lab.run.schema import method_name
-        >>> method_name("rebrac", "osr")
-        'rebrac+osr'
-    """
+    """Return the name of a run's method, from the options of its groups."""
     return loss if recovery in (None, "none") else f"{loss}+{recovery}"

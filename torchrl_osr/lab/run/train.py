@@ -27,7 +27,7 @@ from torchrl_osr.lab.evaluation import (
 )
 from torchrl_osr.lab.run.build import Learner, make_learner, try_out
 from torchrl_osr.lab.run.data import TrainingData, load_training_data
-from torchrl_osr.lab.run.folder import Run, Settings
+from torchrl_osr.lab.run.folder import Run
 from torchrl_osr.lab.run.load import CHECKPOINTS
 from torchrl_osr.lab.run.parts import (
     Hook,
@@ -38,7 +38,6 @@ from torchrl_osr.lab.run.parts import (
     prepare_machine,
     report,
     save_policies,
-    still_ours,
     trainer_options,
 )
 from torchrl_osr.trainers import Evaluation, OfflineTrainer, largest_value
@@ -89,11 +88,7 @@ def trainer_maker(
 ) -> NewTrainer:
     """Return a function that makes a phase's trainer, with what all phases share."""
     config = run.config
-    kept: dict[str, Any] = {
-        "perturbation": perturbation,
-        "observation_norm": data.norm,
-        "settings": Settings(config),
-    }
+    kept = {"perturbation": perturbation, "observation_norm": data.norm}
 
     def new_trainer(
         loss: LossModule,
@@ -118,7 +113,7 @@ def trainer_maker(
         )
         return OfflineTrainer(
             update,
-            hooks=[still_ours(run), *hooks],
+            hooks=hooks,
             components=kept | dict(components or {}),
             **{"replay_buffer": data.buffer, **shared, **own},
         )
