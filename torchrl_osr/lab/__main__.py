@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 
@@ -36,21 +37,13 @@ A first run, its evaluation and a page about both:
   torchrl-osr evaluate sweep=outputs
   torchrl-osr report outputs
 
-For every command:
-
-  --help     its options
-  --debug    the traceback of an error, which is otherwise one sentence
-
-  torchrl-osr --version    versions, for a bug report
+Every command takes --help for its options, and --debug for the traceback of an error.
+"torchrl-osr --version" prints versions, for a bug report.
 """
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Dispatch to the subcommand.
-
-    Args:
-        arguments: the command and its arguments. Default: those of the process.
-    """
+    """Dispatch to the subcommand; ``arguments`` are by default the process's."""
     name, *rest = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if name in ("-h", "--help"):
         lines = [f"  {command:10}{does}" for command, does in COMMANDS.items()]
@@ -71,17 +64,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _versions() -> str:
-    """The package's version, Python's and those that decide its numbers."""
-    found = [
-        f"torchrl-osr {version('torchrl-osr')}",
-        f"python {sys.version.split()[0]}",
-    ]
+    """Python's version, and those of the packages that decide numbers."""
+    found = [f"python {sys.version.split()[0]}"]
     for package in ("torch", "torchrl", "tensordict", "gymnasium", "mujoco"):
-        try:
+        with suppress(PackageNotFoundError):
             found.append(f"{package} {version(package)}")
-        except PackageNotFoundError:
-            found.append(f"{package} not installed")
-    return ", ".join(found)
+    return ", ".join([f"torchrl-osr {version('torchrl-osr')}", *found])
 
 
 if __name__ == "__main__":

@@ -105,7 +105,3 @@ def description(path: Path, columns: dict[str, NDArray[np.generic]]) -> str:
         f"{path}: {len(columns['reward']):,} steps, {len(returns)} episodes, "
         f"return {returns.mean():.1f} ({returns.min():.1f} to {returns.max():.1f})"
     )
-
-
-if __name__ == "__main__":
-    main()

@@ -164,7 +164,3 @@ def entries_table(entries: Sequence[Entry]) -> str:
     if left := len(entries) - MOST_ENTRIES:
         lines += [f"  and {left} more entries"] if left > 0 else []
     return "\n".join(lines)
-
-
-if __name__ == "__main__":
-    main()

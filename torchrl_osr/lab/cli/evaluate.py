@@ -155,7 +155,3 @@ def recoverable_table(results: Mapping[str, Any]) -> str:
     number = len(results["evaluations"])
     title = f"{results['env']} {results['data']}, {results['half']} recoverable states"
     return "\n".join([f"{title}: {number} x each", *aligned_columns(rows)])
-
-
-if __name__ == "__main__":
-    main()

@@ -90,7 +90,3 @@ def read(path: Path, output: str) -> Callable[..., Tensor]:
         return torch.from_numpy(session.run(None, arrays)[0])
 
     return run
-
-
-if __name__ == "__main__":
-    main()

@@ -37,7 +37,3 @@ def main() -> None:
     )
     number = len(tables.runs)
     print(f"{number} run{'s' * (number > 1)} in {page}")
-
-
-if __name__ == "__main__":
-    main()

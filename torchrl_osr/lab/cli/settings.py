@@ -62,7 +62,3 @@ def main() -> None:
     for row in rows:
         cells = zip(row, widths, strict=True)
         print("  ".join(cell.rjust(width) for cell, width in cells))
-
-
-if __name__ == "__main__":
-    main()

@@ -32,7 +32,3 @@ def main(cfg: DictConfig) -> float:
     """Do or continue one run; return its last score or return, for a sweeper."""
     with open_run(cfg) as run:
         return train(run)
-
-
-if __name__ == "__main__":
-    main()

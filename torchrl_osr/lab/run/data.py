@@ -1,7 +1,6 @@
 """What a run trains on: rows in memory, prepared once, or on disk, batch by batch.
 
-Observations are standardised and rewards scaled by the same transform, applied to all
-rows in memory or to each batch from disk: the same seed gives the same batches.
+The same transforms prepare both: the same seed gives the same batches.
 """
 
 from __future__ import annotations
@@ -32,6 +31,9 @@ from torchrl_osr.lab.data.rows import (
 )
 from torchrl_osr.lab.run.schema import DataConfig, EnvConfig, TrainConfig
 
+OF_TRAINING = ("storage", "held_out", "standardize", "reward_scale", "reward_shift")
+"""Options of the data that do not decide which rows there are."""
+
 MAX_HELD_OUT = 50_000
 """Held-out rows of a set on disk that are read into memory, at most."""
 
@@ -60,28 +62,19 @@ def references_of(env: EnvConfig) -> ReferenceReturns | None:
 def load_data(
     env: EnvConfig, options: DataConfig, *, progress: bool = True
 ) -> tuple[TensorDict, dict[str, Any]]:
-    """Load data set and manifest, see :func:`~torchrl_osr.lab.data.load_dataset`.
-
-    Rewards are the task's own.
-    """
+    """Load data set and manifest; rewards are the task's own."""
     from torchrl_osr.lab.data import load_dataset  # needs Gymnasium; networks do not
 
+    reading = asdict(options)
+    for name in OF_TRAINING:
+        del reading[name]
     return load_dataset(
         env.name,
-        options.source,
         env_id=env.id,
         references=references_of(env),
-        path=options.path,
-        columns=asdict(options.columns),
-        action_bounds=options.action_bounds,
-        clip_actions=options.clip_actions,
-        missing=options.missing,
-        download=options.download,
-        random_share=options.random_share,
-        num_transitions=options.num_transitions,
-        seed=options.seed,
-        progress=progress,
         on_disk=options.storage == "disk",
+        progress=progress,
+        **reading,
     )
 
 
@@ -94,12 +87,8 @@ def load_training_data(
     """Load a run's data, split and prepared; torch's global generator is left alone.
 
     Rewards become ``reward_scale * r + reward_shift``; the mean is of the task's own.
-    With ``("next", "action")`` among ``in_keys``, the keys that the loss reads, batches
-    have the data's next action.
-
-    Raises:
-        ValueError: an option does not fit the others, or the loss reads the next
-            action and the rows are in no order of time.
+    If ``in_keys``, the keys that the loss reads, have ``("next", "action")``, batches
+    have the data's next action, and the rows must be in order of time.
     """
     env, options, optim = config.env, config.data, config.optim
     data, manifest = load_data(env, options, progress=config.trainer.progress)

@@ -50,9 +50,8 @@ from torchrl_osr.lab.run.schema import DisturbanceConfig, EvaluateConfig, SuiteC
 from torchrl_osr.objectives.networks import head_of, is_categorical
 from torchrl_osr.trainers.progress import Progress
 
-SEED_STRIDE = 1000  # between checkpoints: no two of them play the same episodes
-DATA_UNIT = "data"
-"""As a wrapper's ``unit``: the data's standard deviations."""
+SEED_STRIDE = 1000
+"""Between checkpoints: no two of them play the same episodes."""
 
 Player = tuple[TrainedRun, Policy]
 """A checkpoint, and the policy that plays."""
@@ -201,16 +200,10 @@ def make_disturbances(
     *,
     seed: int = 0,
 ) -> list[Disturbance]:
-    """Build the wrappers and attacks of a suite.
+    """Build the wrappers of a suite, and its attacks on a run's networks.
 
-    Args:
-        configs: by name.
-        trained: its networks are attacked.
-        scale: standard deviation of each observation entry in the data, ``[S]``; takes
-            the place of a wrapper's ``unit: data``.
-
-    Keyword Args:
-        seed: of the attacks' draws. Default 0.
+    ``scale``, the deviation of each observation entry in the data ``[S]``, takes the
+    place of a wrapper's ``unit: data``.
     """
     made = []
     for name, config in configs.items():
@@ -219,7 +212,7 @@ def make_disturbances(
         wrap = policy = None
         if config.wrap is not None:
             wrap = instantiate(config.wrap)
-            if wrap.keywords.get("unit") == DATA_UNIT:
+            if wrap.keywords.get("unit") == "data":
                 wrap = partial(wrap, unit=scale)
         else:
             policy = attacked_policy(
