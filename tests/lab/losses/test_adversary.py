@@ -51,10 +51,8 @@ class Real:
         return adversary.perturb(self.states, KEYS, *functions, generator)[KEYS[0]]
 
     def draw(self, adversary: Adversary) -> Tensor:
-        generator, shape = (
-            torch.Generator().manual_seed(3),
-            (adversary.num_samples, 6, 3),
-        )
+        generator, shape = torch.Generator(), (adversary.num_samples, 6, 3)
+        generator.manual_seed(3)
         uniform = torch.rand(shape, generator=generator, dtype=torch.float64)
         return adversary.epsilon * (2 * uniform - 1)
 
@@ -90,10 +88,8 @@ def test_gradient_steps_are_those_of_the_released_attack(
     check, objective, num_samples
 ) -> None:
     """A new Adam for each step, on the mean over rows, then back into the box."""
-    real, adversary = (
-        Real(),
-        Adversary(objective, "gradient", 0.3, num_samples, 10, 0.25),
-    )
+    real = Real()
+    adversary = Adversary(objective, "gradient", 0.3, num_samples, 10, 0.25)
     deltas = real.draw(adversary)
     for _ in range(adversary.num_steps):
         deltas = deltas.clone().requires_grad_()

@@ -16,7 +16,6 @@ from torch import Tensor
 from torchrl import objectives
 
 from torchrl_osr.lab.losses import IQLLoss
-from torchrl_osr.modules import gaussian_actor
 
 BETA, TAU = 2.0, 0.8
 OPTIONS = {"temperature": BETA, "expectile": TAU}
@@ -67,13 +66,3 @@ def test_losses_are_torchrls_but_for_the_sum_over_critics() -> None:
     out, wanted = ours(batch), theirs(batch.clone())
     for key in ("loss_actor", "loss_qvalue", "loss_value"):
         torch.testing.assert_close(out[key], wanted[key])
-
-
-def test_a_policy_has_bounds_for_its_mean_and_a_scale_that_is_learnt() -> None:
-    actor, fixed = gaussian_actor(3, 2), gaussian_actor(3, 2, scale=0.3)
-    loc, scale = actor.module[0].module(100 * torch.randn(50, 3))
-    assert loc.abs().max() <= 1
-    assert (scale == 1).all()
-    assert len([*actor.parameters()]) == len([*fixed.parameters()]) + 1
-    with pytest.raises(ValueError, match="scale must be above 0"):
-        gaussian_actor(3, 2, scale=0.0)

@@ -30,8 +30,6 @@ TanhNormalPolicy = Callable[[TensorDictBase], TanhNormal]
 Values = Callable[[TensorDictBase, Tensor], Tensor]
 """Maps states ``[M, B]`` and actions ``[M, B, A]`` to all critics' ``[N, M, B]``."""
 
-_Objective = Callable[[tuple[Tensor, ...]], Tensor]
-
 
 @dataclass(frozen=True)
 class Adversary:
@@ -41,27 +39,19 @@ class Adversary:
     objectives, with :math:`\hat s = s + \delta`:
 
     * ``"action_diff"``: :math:`KL(\pi(s) \| \pi(\hat s)) + KL(\pi(\hat s) \| \pi(s))`;
-    * ``"min_Q"``: :math:`-\frac1N \sum_i Q_i(s, a)` with the deterministic action
-      :math:`a = \tanh(\mu(\hat s))`, within its bounds. The critics see the true
-      state: what counts is where the misled action leads from there.
+    * ``"min_Q"``: :math:`-\frac1N \sum_i Q_i(s, \pi(\hat s))` with the deterministic
+      action. The critics see the true state, from which the misled action is taken.
 
     The methods:
 
     * ``"sample"`` (RORL's zero order): the best of ``num_samples`` uniform draws, for
       ``"min_Q"`` also of no perturbation;
-    * ``"gradient"``: ``num_steps`` steps along the sign of the gradient from each of
-      ``num_samples`` draws, kept in the box; then the best of the ends. One start is
-      RORL's first order, 20 are its mixed order.
+    * ``"gradient"``: ``num_steps`` steps of ``step_size * epsilon`` along the sign of
+      the gradient from each of ``num_samples`` draws, kept in the box; then the best of
+      the ends. One start is RORL's first order, 20 are its mixed order.
 
-    Here each row draws for itself; RORL's code draws once for the whole batch.
-
-    Args:
-        objective: ``"action_diff"`` (default) or ``"min_Q"``.
-        method: ``"sample"`` (default) or ``"gradient"``.
-        epsilon: half-width of the box in the observation's units. Default 0.01.
-        num_samples: draws, or starts of the gradient steps. Default 20.
-        num_steps: gradient steps. Default 10.
-        step_size: length of a gradient step in units of ``epsilon``. Default 0.1.
+    Each row draws for itself; RORL's code draws once for the whole batch. ``epsilon``
+    is in units of the observation.
 
     Examples:
         >>> adversary = Adversary("min_Q", method="gradient", epsilon=0.1)
@@ -87,9 +77,8 @@ class Adversary:
     ) -> TensorDictBase:
         """Return a batch whose perturbed states are the worst for a loss's networks.
 
-        It replaces :class:`~torchrl_osr.StatePerturbation`: in a plain loop
-        ``loss(adversary(loss, buffer.sample()))``, with a trainer in the hook
-        ``process_optim_batch``.
+        In place of :class:`~torchrl_osr.StatePerturbation`: in a plain loop
+        ``loss(adversary(loss, buffer.sample()))``.
         """
         keys = loss.observation_keys
         critics = loss.qvalue_network_params.detach()
@@ -120,45 +109,11 @@ class Adversary:
         Only ``"min_Q"`` calls ``qvalue``.
         """
         states = states.detach()
-        noise = tuple(self._draw(states, key, generator) for key in keys)
-        objective = self._objective(states, keys, policy, qvalue)
-        if self.method == "gradient":
-            noise = self._ascend(noise, objective)
-        best = objective(noise).argmax(0, keepdim=True)
-        worst = states.copy()
-        for key, candidates in zip(keys, noise, strict=True):
-            index = best.reshape(best.shape + (1,) * (candidates.ndim - best.ndim))
-            chosen = candidates.take_along_dim(index, 0).squeeze(0)
-            worst.set(key, states.get(key) + chosen)
-        return worst
-
-    def _draw(
-        self, states: TensorDictBase, key: NestedKey, generator: torch.Generator | None
-    ) -> Tensor:
-        """Return candidates for one observation, ``[M, B, ...]``."""
-        state = entry(states, key)
-        if not state.is_floating_point():
-            raise TypeError(
-                f"{key!r} must be floating point to be perturbed, got {state.dtype}."
-            )
-        uniform = state.new_empty((self.num_samples, *state.shape))
-        uniform.uniform_(generator=generator)
-        noise = self.epsilon * (2 * uniform - 1)
-        if self.objective == "min_Q" and self.method == "sample":
-            noise = torch.cat([torch.zeros_like(noise[:1]), noise])
-        return noise
-
-    def _objective(
-        self,
-        states: TensorDictBase,
-        keys: Sequence[NestedKey],
-        policy: TanhNormalPolicy,
-        qvalue: Values,
-    ) -> _Objective:
-        """Return the function to maximise, from perturbations to ``[M, B]``."""
+        noise = tuple(self._draw(entry(states, key), generator) for key in keys)
         clean = policy(states.copy()) if self.objective == "action_diff" else None
 
         def objective(noise: tuple[Tensor, ...]) -> Tensor:
+            """Return ``[M, B]`` of perturbations."""
             candidates = states.expand(len(noise[0]), *states.batch_size)
             perturbed = candidates.copy()
             for key, delta in zip(keys, noise, strict=True):
@@ -168,19 +123,28 @@ class Adversary:
                 return -qvalue(candidates, pi.deterministic_sample).mean(0)
             return jeffreys_divergence(clean.loc, clean.scale, pi.loc, pi.scale)
 
-        return objective
+        if self.method == "gradient":
+            # Not torch.autograd.grad: torch.compile cannot trace it, and this one is
+            # not switched off by no_grad, so that no parameter enters a graph.
+            gradient = torch.func.grad(lambda noise: objective(noise).sum())
+            step = self.step_size * self.epsilon
+            for _ in range(self.num_steps):
+                noise = tuple(
+                    (delta + step * slope.sign()).clamp(-self.epsilon, self.epsilon)
+                    for delta, slope in zip(noise, gradient(noise), strict=True)
+                )
+        best, worst = objective(noise).argmax(0, keepdim=True), states.copy()
+        for key, candidates in zip(keys, noise, strict=True):
+            index = best.reshape(best.shape + (1,) * (candidates.ndim - best.ndim))
+            chosen = candidates.take_along_dim(index, 0).squeeze(0)
+            worst.set(key, states.get(key) + chosen)
+        return worst
 
-    def _ascend(
-        self, noise: tuple[Tensor, ...], objective: _Objective
-    ) -> tuple[Tensor, ...]:
-        """Return where the gradient steps end that start at ``noise``."""
-        # Not torch.autograd.grad: torch.compile cannot trace it, and this one is not
-        # switched off by no_grad, so that no parameter enters a graph.
-        gradient = torch.func.grad(lambda noise: objective(noise).sum())
-        step = self.step_size * self.epsilon
-        for _ in range(self.num_steps):
-            noise = tuple(
-                (delta + step * slope.sign()).clamp(-self.epsilon, self.epsilon)
-                for delta, slope in zip(noise, gradient(noise), strict=True)
-            )
+    def _draw(self, state: Tensor, generator: torch.Generator | None) -> Tensor:
+        """Return candidates for one observation, ``[M, B, ...]``."""
+        uniform = state.new_empty((self.num_samples, *state.shape))
+        uniform.uniform_(generator=generator)
+        noise = self.epsilon * (2 * uniform - 1)
+        if self.objective == "min_Q" and self.method == "sample":
+            noise = torch.cat([torch.zeros_like(noise[:1]), noise])
         return noise

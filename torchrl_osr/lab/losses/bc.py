@@ -1,7 +1,4 @@
-r"""Behaviour cloning.
-
-Shapes: ``R`` rows, ``A`` action.
-"""
+"""Behaviour cloning."""
 
 from __future__ import annotations
 
@@ -23,13 +20,9 @@ class BCLoss(ActorCriticLoss):
     .. math::
         L_\pi = -\mathbb E_D \log\pi(a \mid s)
 
-    and :math:`\mathbb E_D \|\pi(s) - a\|^2` of a deterministic actor. There are no
-    critics. Noisy behaviour cloning, on D_tot, is
+    and :math:`\mathbb E_D \|\pi(s) - a\|^2` of a deterministic actor. The actor may
+    have discrete actions. Noisy behaviour cloning, on D_tot, is
     :class:`~torchrl_osr.StateRecoveryLoss` with ``recovery_target="data"``.
-
-    Args:
-        actor_network: any with a density, also of discrete actions, or a deterministic
-            one.
 
     Keyword Args:
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.

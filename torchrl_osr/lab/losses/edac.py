@@ -21,10 +21,7 @@ from torchrl_osr.objectives.transitions import Transitions
 
 
 def gradient_diversity(action_gradients: Tensor) -> Tensor:
-    """Return the similarity of gradients ``[N, R, A]`` in EDAC's critic loss, ``[R]``.
-
-    It is between -N / (N - 1) and N.
-    """
+    """Return the diversity term of gradients ``[N, R, A]``, ``[R]``."""
     # Without eps, a dead critic's zero gradient would be 0 / 0.
     unit = normalize(action_gradients, dim=-1, eps=1e-10)
     # All pairs at once: |sum_i g_i|^2 - sum_i |g_i|^2, with |g_i| = 1.
@@ -51,9 +48,7 @@ class EDACLoss(ActorCriticLoss):
 
     Keyword Args:
         diversity_weight: :math:`\eta`. Default 1.0. May be assigned later.
-        alpha_init: initial entropy temperature :math:`\alpha_e`. Default 1.0.
-        fixed_alpha: keep the temperature. Default ``False``.
-        target_entropy: in nats; ``"auto"`` (default) is minus the action's size.
+        alpha_init, fixed_alpha, target_entropy: see :class:`~torchrl_osr.CQLLoss`.
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
     Examples:

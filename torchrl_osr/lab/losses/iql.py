@@ -35,15 +35,13 @@ class IQLLoss(ActorCriticLoss):
         L_\pi &= -\mathbb E_D \min(e^{\beta u}, 100) \log\pi(a \mid s)
 
     "Offline Reinforcement Learning with Implicit Q-Learning",
-    https://arxiv.org/abs/2110.06169.
-
-    The authors' actor is :func:`~torchrl_osr.modules.gaussian_actor`;
-    :func:`~torchrl_osr.modules.state_value` is a ``value_network``.
+    https://arxiv.org/abs/2110.06169. The authors' actor is
+    :func:`~torchrl_osr.modules.gaussian_actor`.
 
     Keyword Args:
-        temperature: :math:`\beta`, the inverse temperature of the advantages. Default
-            3.0, the authors' for the robots; 10.0 for the mazes.
-        expectile: :math:`\tau`, between 0 and 1. Default 0.7; 0.9 for the mazes.
+        temperature: :math:`\beta`. Default 3.0, the authors' for the robots; 10.0 for
+            the mazes.
+        expectile: :math:`\tau`. Default 0.7; 0.9 for the mazes.
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
     Examples:

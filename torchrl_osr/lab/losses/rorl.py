@@ -23,14 +23,10 @@ from torchrl_osr.objectives.transitions import Transitions
 def jeffreys_divergence(
     loc_p: Tensor, scale_p: Tensor, loc_q: Tensor, scale_q: Tensor
 ) -> Tensor:
-    r"""Jeffreys divergence :math:`KL(p \,\|\, q) + KL(q \,\|\, p)` of Gaussians.
+    r"""Return :math:`KL(p \,\|\, q) + KL(q \,\|\, p)` of Gaussians ``[R, A]``, ``[R]``.
 
-    .. math::
-        \frac12 \sum_i \Big(\frac{\sigma_p}{\sigma_q} - \frac{\sigma_q}{\sigma_p}\Big)^2
-        + (\mu_p - \mu_q)^2 \Big(\frac1{\sigma_p^2} + \frac1{\sigma_q^2}\Big)
-
-    Means and standard deviations ``[R, A]`` give ``[R]``. The logarithms cancel, and a
-    sum of squares keeps its digits where ``p`` and ``q`` are close.
+    The logarithms cancel, and a sum of squares keeps its digits where ``p`` and ``q``
+    are close.
     """
     gap = loc_p - loc_q
     means = (gap / scale_p).square() + (gap / scale_q).square()
@@ -53,27 +49,21 @@ class RORLLoss(ActorCriticLoss):
     with :meth:`value_smoothness` and :meth:`uncertainty_penalty` of the policy's
     actions. "RORL: Robust Offline Reinforcement Learning via Conservative Smoothing",
     https://arxiv.org/abs/2206.02829, and its released code, whose names the options
-    have. As there, the ``M`` draws of a term are shared by all rows of the batch. Pass
-    0 to remove a term permanently; it then costs nothing.
+    have. As there, the ``M`` draws of a term are shared by all rows of the batch. A
+    term with weight 0 is left out for good.
 
-    The weight :math:`\lambda` of the uncertainty falls with every update: call
-    :meth:`decay_uncertainty` after each.
+    Call :meth:`decay_uncertainty` after each update.
 
     Keyword Args:
-        num_samples: ``M``. Default 20.
-        policy_smooth_reg: :math:`\beta_P`. Default 0.1.
-        policy_smooth_eps: half-width of its box, in units of the state. Default 0.005.
-        q_smooth_reg: :math:`\beta_Q`. Default 1e-4.
-        q_smooth_eps: half-width of its box. Default 0.005.
-        q_smooth_tau: weight of values that fall against those that rise. Default 0.2.
-        q_ood_reg: :math:`\beta_{ood}`. Default 0.5.
-        q_ood_eps: half-width of its box. Default 0.01.
-        q_ood_uncertainty_reg: :math:`\lambda` at first. Default 0.1.
-        q_ood_uncertainty_reg_min: what it falls to. Default 0.
-        q_ood_uncertainty_decay: by how much an update. Default 1e-6.
-        alpha_init: initial entropy temperature :math:`\alpha_e`. Default 1.0.
-        fixed_alpha: keep the temperature. Default ``False``.
-        target_entropy: in nats; ``"auto"`` (default) is minus the action's size.
+        num_samples: ``M``.
+        policy_smooth_reg, q_smooth_reg, q_ood_reg: the weights :math:`\beta_P`,
+            :math:`\beta_Q` and :math:`\beta_{ood}`.
+        policy_smooth_eps, q_smooth_eps, q_ood_eps: half-widths of their boxes, in units
+            of the state.
+        q_smooth_tau: weight of values that fall against those that rise.
+        q_ood_uncertainty_reg, q_ood_uncertainty_reg_min, q_ood_uncertainty_decay:
+            :math:`\lambda` at first, what it falls to, and by how much an update.
+        alpha_init, fixed_alpha, target_entropy: see :class:`~torchrl_osr.CQLLoss`.
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
     Examples:
@@ -115,13 +105,6 @@ class RORLLoss(ActorCriticLoss):
         for name, value in given.items():
             check_weight(name, value)
         check_positive("num_samples", num_samples, minimum=1)
-        if q_ood_uncertainty_reg < q_ood_uncertainty_reg_min:
-            raise ValueError(
-                "q_ood_uncertainty_reg must be at least q_ood_uncertainty_reg_min="
-                f"{q_ood_uncertainty_reg_min}, got {q_ood_uncertainty_reg}."
-            )
-        if not 0 <= q_smooth_tau <= 1:
-            raise ValueError(f"q_smooth_tau must be in [0, 1], got {q_smooth_tau}.")
         super().__init__(**options)
         self.register_action_bounds(actor_network)
         self.register_actor_critic(actor_network, qvalue_network)

@@ -9,11 +9,10 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictParams
 from torch import Tensor
 
-from torchrl_osr._checks import check_positive, check_weight
+from torchrl_osr._checks import check_weight
 from torchrl_osr._entries import entry, nested
 from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
 from torchrl_osr.lab.losses.td3 import TD3Loss
@@ -37,24 +36,20 @@ class SCASLoss(TD3Loss):
         w(s, s') &= \min\big(e^{\tau (V(s') - V(s))}, w_{max}\big), \quad
         V(s) = \frac1N \sum_i Q_i(s, \pi(s))
 
-    with a perturbed state :math:`\hat s`, a frozen model :math:`M` of the dynamics and
-    the critics of :class:`~torchrl_osr.lab.losses.td3.TD3Loss`. "Offline Reinforcement
-    Learning with OOD State Correction and OOD Action Suppression",
-    https://arxiv.org/abs/2410.19400. It prints :math:`\tilde s = \hat s`; its released
-    code (MAOYIXIU/SCAS) has :math:`\tilde s = s`, the default here.
+    with a perturbed state :math:`\hat s`, a frozen model :math:`M` of the dynamics, and
+    the critics of :class:`~torchrl_osr.lab.losses.td3.TD3Loss`, of which the authors
+    have four. "Offline Reinforcement Learning with OOD State Correction and OOD Action
+    Suppression", https://arxiv.org/abs/2410.19400. It prints :math:`\tilde s = \hat s`;
+    its released code (MAOYIXIU/SCAS) has :math:`\tilde s = s`, the default here.
 
-    Differences from that code: :math:`M` is the mean of an ensemble's elites, which
-    predicts the state's change by likelihood (there one network, the next state by its
-    squared error); rows that are ``done`` have no correction; the target is the
-    critics' minimum in mazes, too (there their mean).
-
-    The authors have four critics. :math:`M` is trained, or loaded later by
-    :meth:`load_frozen`.
+    Differences from that code: :math:`M` is the mean of an ensemble's elites, trained
+    by likelihood (there one network, by squared error); rows that are ``done`` have no
+    correction; the target is the critics' minimum in mazes, too (there their mean).
 
     Keyword Args:
         correction_weight: :math:`\lambda`, between 0 and 1. Default 0.25.
-        correction_action: the state :math:`\tilde s` of the corrected action:
-            ``"clean"`` (default) or ``"perturbed"``.
+        correction_action: the state :math:`\tilde s`, ``"clean"`` (default) or
+            ``"perturbed"``.
         gain_temperature: :math:`\tau`. Default 5.0.
         largest_weight: :math:`w_{max}`. Default 50.0.
         options: of :class:`~torchrl_osr.lab.losses.td3.TD3Loss`.
@@ -90,7 +85,6 @@ class SCASLoss(TD3Loss):
         check_weight("correction_weight", correction_weight)
         check_weight("1 - correction_weight", 1 - correction_weight)
         check_weight("gain_temperature", gain_temperature)
-        check_positive("largest_weight", largest_weight)
         super().__init__(actor_network, qvalue_network, **options)
         self.register_frozen("dynamics_network", dynamics_network)
         self.correction_weight = correction_weight
@@ -98,14 +92,11 @@ class SCASLoss(TD3Loss):
         self.gain_temperature, self.largest_weight = gain_temperature, largest_weight
 
     def losses(self, batch: Transitions) -> Losses:
-        perturbed, share = batch.states[2], self.correction_weight
+        share = self.correction_weight
         action, qvalues = self.policy_values(batch)
         lowest = qvalues.min(0).values
         weight = self.weight(batch, qvalues.detach().mean(0))
-        if self.correction_action == "perturbed":
-            action = self.act(perturbed, self.actor_network_params)
-        predicted = self.predict(perturbed, action)
-        error = weight * (predicted - self.data_next_state(batch)).square().mean(-1)
+        error = weight * self.deviation(batch, action)
         sought = self.reduce(-lowest / self.magnitude(batch, lowest), batch)
         correction = self.reduce(error, batch, batch.has_next)
         actor = (1 - share) * sought + share * correction
@@ -122,18 +113,20 @@ class SCASLoss(TD3Loss):
         gain = self.q(after, action).mean(0) - value
         return (self.gain_temperature * gain).exp().clamp(max=self.largest_weight)
 
-    def predict(self, states: TensorDictBase, action: Tensor) -> Tensor:
-        """Return where the elites' mean says that an action leads, ``[R, S]``."""
-        model = self.dynamics_network
-        with self.dynamics_network_params.to_module(model, preserve_module_state=False):
-            state = entry(states, model.in_keys[0])
-            mean, _ = model.predict(state, action)
-            return state + mean[model.elites].mean(0)[..., :-1]
+    def deviation(self, batch: Transitions, action: Tensor) -> Tensor:
+        """Return the squared distance from the data's next state, ``[R]``.
 
-    def data_next_state(self, batch: Transitions) -> Tensor:
-        """Return the data's next state, ``[R, S]``; 0 after an end."""
+        Of where the model says that the policy's action leads from the perturbed state.
+        """
         check_single_steps(batch, "the model of the dynamics")
-        key = nested("next", self.dynamics_network.in_keys[0])
-        found = entry(batch.one_step, key)
+        perturbed, model = batch.states[2], self.dynamics_network
+        if self.correction_action == "perturbed":
+            action = self.act(perturbed, self.actor_network_params)
+        key = model.in_keys[0]
+        state, after = entry(perturbed, key), entry(batch.one_step, nested("next", key))
+        with self.dynamics_network_params.to_module(model, preserve_module_state=False):
+            mean, _ = model.predict(state, action)
+            reached = state + mean[model.elites].mean(0)[..., :-1]
         # What follows an end may be anything, and 0 * nan is nan in the backward pass.
-        return torch.where(batch.done.unsqueeze(-1), torch.zeros_like(found), found)
+        after = torch.where(batch.done.unsqueeze(-1), torch.zeros_like(after), after)
+        return (reached - after).square().mean(-1)

@@ -31,11 +31,9 @@ def maximum_mean_discrepancy(first: Tensor, second: Tensor, width: float) -> Ten
         - \frac2{nm} \sum_{i,j} k(x_i, y_j), \quad
         k(x, y) = \exp\Big(-\frac{\|x - y\|^2}{2 h^2 S}\Big)
 
-    "A Kernel Two-Sample Test", https://jmlr.org/papers/v13/gretton12a.html, the biased
-    estimate. Samples much further apart than the width have no gradient.
-
-    :math:`x`, ``[n, R, S]``, and :math:`y`, ``[m, R, S]``, give ``[R]``, between 0 and
-    2; the width :math:`h` is in units of one entry.
+    The biased estimate of https://jmlr.org/papers/v13/gretton12a.html, from
+    :math:`x`, ``[n, R, S]``, and :math:`y`, ``[m, R, S]``, to ``[R]``, between 0 and 2.
+    The width :math:`h` is in units of one entry.
     """
 
     def kernel(x: Tensor, y: Tensor) -> Tensor:
@@ -54,19 +52,14 @@ class StateDeviationLoss(ActorCriticLoss):
         U(\cdot \mid s) \big) \le \eta
 
     with perturbed states :math:`\hat s`, a frozen model :math:`M` of the dynamics and a
-    frozen model :math:`U` of the data's next states. A Lagrange multiplier is learned
-    by dual ascent: ``loss_deviation`` moves the policy, ``loss_multiplier`` the
-    multiplier. "State Deviation Correction for Offline Reinforcement Learning" (Zhang
-    et al., AAAI 2022, https://doi.org/10.1609/aaai.v36i8.20886) adds it to CQL(H), see
+    frozen model :math:`U` of the data's next states. ``loss_deviation`` moves the
+    policy, ``loss_multiplier`` a Lagrange multiplier. "State Deviation Correction for
+    Offline Reinforcement Learning" (AAAI 2022,
+    https://doi.org/10.1609/aaai.v36i8.20886) adds it to CQL(H), see
     :class:`~torchrl_osr.objectives.WithRecovery`.
 
     **This is our reading**: the authors have published no code and no settings that we
     could find. Kernel, its width, :math:`\eta` and the number of samples are ours.
-
-    Args:
-        actor_network: the actor of the other loss.
-        dynamics_network: :math:`M`, trained, or loaded later by :meth:`load_frozen`.
-        transition_network: :math:`U`, likewise.
 
     Keyword Args:
         num_samples: ``n`` of :math:`M` and of :math:`U`. Default 4.

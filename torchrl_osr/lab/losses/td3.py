@@ -1,4 +1,4 @@
-r"""Base of TD3+BC, ReBRAC and SCAS: TD3's critics and a deterministic actor.
+r"""TD3 with a deterministic actor that stays with the data: TD3+BC and ReBRAC.
 
 Shapes: ``R`` rows, ``A`` action, ``N`` critics.
 """
@@ -9,14 +9,16 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from tensordict import NestedKey
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 from torchrl.modules import TanhDelta
 
 from torchrl_osr import functional as F
 from torchrl_osr._checks import check_weight
-from torchrl_osr.objectives.actor_critic import ActorCriticLoss
-from torchrl_osr.objectives.networks import bounds_of, head_of
+from torchrl_osr._entries import column, entry, nested
+from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses
+from torchrl_osr.objectives.networks import bounds_of, check_action, head_of
 from torchrl_osr.objectives.transitions import Transitions
 
 
@@ -35,8 +37,8 @@ class TD3Loss(ActorCriticLoss):
         policy_noise: standard deviation of :math:`\epsilon`, in units of the action.
             Default 0.2.
         noise_clip: largest magnitude of :math:`\epsilon`. Default 0.5.
-        low, high: action bounds, numbers or ``[A]``; needed unless the actor ends in a
-            :class:`~torchrl.modules.TanhDelta`, which has them.
+        low, high: action bounds, numbers or ``[A]``. Those of an actor that ends in a
+            :class:`~torchrl.modules.TanhDelta` are the actor's.
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
     """
 
@@ -58,22 +60,14 @@ class TD3Loss(ActorCriticLoss):
         super().__init__(**options)
         self.policy_noise, self.noise_clip = policy_noise, noise_clip
         head, found = head_of(actor_network)
-        own = bounds_of(found) if head is TanhDelta else (None, None)
-        for name, given, actors in zip(("low", "high"), (low, high), own, strict=True):
-            if given is None and actors is None:
-                raise ValueError(
-                    f"{name} is missing. Pass low= and high= of the environment's "
-                    "actions: the actor's module does not have them."
-                )
-            bound = torch.as_tensor(actors if given is None else given).float()
-            if actors is not None and not torch.equal(bound.expand_as(actors), actors):
-                raise ValueError(
-                    f"the loss has {name}={bound.tolist()}, but its actor "
-                    f"{name}={actors.tolist()}: leave it out."
-                )
-            self.register_buffer(f"action_{name}", bound, persistent=False)
-        if not bool((self.action_low < self.action_high).all()):
-            raise ValueError(f"high must be above low={low}, got {high}.")
+        own = bounds_of(found) if head is TanhDelta else None
+        if own is None and (low is None or high is None):
+            raise ValueError(
+                "Pass low= and high= of the environment's actions: the actor's module "
+                "does not have them."
+            )
+        bounds = own or (torch.as_tensor(low).float(), torch.as_tensor(high).float())
+        self.register_bounds(*bounds)
         self.register_actor_critic(
             actor_network, qvalue_network, delay_actor=self.delay_qvalue
         )
@@ -112,3 +106,125 @@ class TD3Loss(ActorCriticLoss):
             target = self.td_target(batch, self.next_value(batch))
         error, metrics = self.td_error(batch, self.q(batch.s, batch.a), target)
         return self.reduce(error, batch), metrics
+
+
+class TD3BCLoss(TD3Loss):
+    r"""TD3 with behaviour cloning (TD3+BC).
+
+    .. math::
+        L_\pi = \mathbb E_D \Big[ \|\pi(s) - a\|^2 / A
+            - \frac{\alpha}{\mathbb E_D |Q_1(s, \pi(s))|}\, Q_1(s, \pi(s)) \Big]
+
+    and the critics of :class:`~torchrl_osr.lab.losses.td3.TD3Loss`. "A Minimalist
+    Approach to Offline Reinforcement Learning", https://arxiv.org/abs/2106.06860,
+    equations (3) to (5). Unlike in TorchRL 0.14.1's ``TD3BCLoss``, masks and priority
+    weights reach the cloning term.
+
+    Keyword Args:
+        alpha: weight of the values against cloning. Default 2.5.
+        options: of :class:`~torchrl_osr.lab.losses.td3.TD3Loss`.
+
+    Examples:
+        >>> from torchrl_osr.lab.losses import TD3BCLoss
+        >>> from torchrl_osr.modules import critic_ensemble, deterministic_actor
+        >>> loss = TD3BCLoss(deterministic_actor(11, 3), critic_ensemble(11, 3))
+        >>> loss.out_keys
+        ['loss_actor', 'loss_qvalue', 'cloning_error', 'pred_value', 'target_value']
+    """
+
+    def __init__(
+        self,
+        actor_network: TensorDictModuleBase,
+        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+        *,
+        alpha: float = 2.5,
+        **options: Any,
+    ) -> None:
+        check_weight("alpha", alpha)
+        super().__init__(actor_network, qvalue_network, **options)
+        self.weight_of_values = alpha
+
+    def losses(self, batch: Transitions) -> Losses:
+        action, qvalues = self.policy_values(batch)
+        cloning = batch.of_data((action - batch.a).square().mean(-1))
+        weight = self.weight_of_values / self.magnitude(batch, qvalues[0])
+        actor = self.reduce(cloning - weight * qvalues[0], batch)
+        qvalue, metrics = self.critic_loss(batch)
+        metrics["cloning_error"] = self.mean(cloning, batch, batch.is_data)
+        return {"loss_actor": actor, "loss_qvalue": qvalue}, metrics
+
+
+class ReBRACLoss(TD3Loss):
+    r"""Revisited behaviour-regularised actor-critic (ReBRAC).
+
+    .. math::
+        L_\pi &= \mathbb E_D \Big[ \beta_1 \|\pi(s) - a\|^2
+            - \frac{\min_i Q_i(s, \pi(s))}{\mathbb E_D |\min_i Q_i(s, \pi(s))|} \Big]
+            \\
+        T &= r + \gamma\,(1 - \text{terminated}) \Big[ \min_i \bar Q_i(s', \tilde a')
+            - \beta_2 \|\tilde a' - a'\|^2 \Big], \quad
+        \tilde a' = \bar\pi(s') + \epsilon
+
+    and otherwise :class:`~torchrl_osr.lab.losses.td3.TD3Loss`. "Revisiting the
+    Minimalist Approach to Offline Reinforcement Learning",
+    https://arxiv.org/abs/2305.09836; the normaliser is that of its code. The critics
+    should have layer normalisation.
+
+    :math:`a'` is the data's action at :math:`s'`, the entry ``("next", "action")``. In
+    rows that are ``done`` it is unknown, and the penalty does not count.
+
+    Keyword Args:
+        actor_bc_coef: :math:`\beta_1`. Default 0.01.
+        critic_bc_coef: :math:`\beta_2`. Default 0.01; with 0 no next action is read.
+        options: of :class:`~torchrl_osr.lab.losses.td3.TD3Loss`.
+
+    Examples:
+        >>> from torchrl_osr.lab.losses import ReBRACLoss
+        >>> from torchrl_osr.modules import critic_ensemble, deterministic_actor
+        >>> critics = critic_ensemble(11, 3, layer_norm=True)
+        >>> loss = ReBRACLoss(deterministic_actor(11, 3), critics)
+        >>> ("next", "action") in loss.in_keys
+        True
+    """
+
+    def __init__(
+        self,
+        actor_network: TensorDictModuleBase,
+        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+        *,
+        actor_bc_coef: float = 0.01,
+        critic_bc_coef: float = 0.01,
+        **options: Any,
+    ) -> None:
+        check_weight("actor_bc_coef", actor_bc_coef)
+        check_weight("critic_bc_coef", critic_bc_coef)
+        super().__init__(actor_network, qvalue_network, **options)
+        self.actor_bc_coef, self.critic_bc_coef = actor_bc_coef, critic_bc_coef
+
+    def input_keys(self) -> list[NestedKey]:
+        keys = super().input_keys()
+        if self.critic_bc_coef:
+            keys.append(nested("next", self.tensor_keys.action))
+        return keys
+
+    def losses(self, batch: Transitions) -> Losses:
+        action, qvalues = self.policy_values(batch)
+        lowest = qvalues.min(0).values
+        distance = batch.of_data(F.action_distance(action, batch.a))
+        sought = lowest / self.magnitude(batch, lowest)
+        actor = self.reduce(self.actor_bc_coef * distance - sought, batch)
+        qvalue, metrics = self.critic_loss(batch)
+        metrics["cloning_error"] = self.mean(distance, batch, batch.is_data)
+        return {"loss_actor": actor, "loss_qvalue": qvalue}, metrics
+
+    def next_value(self, batch: Transitions) -> Tensor:
+        """Return the value of the next state less its penalty, ``[R]``."""
+        action, value = self.smoothed(batch)
+        if not self.critic_bc_coef:
+            return value
+        key = nested("next", self.tensor_keys.action)
+        data_action = entry(batch.rows, key)
+        check_action(data_action, action.shape, key)
+        done = column(batch.rows, nested("next", self.tensor_keys.done))
+        penalty = F.action_distance(action, data_action).masked_fill(done, 0.0)
+        return value - self.critic_bc_coef * penalty
