@@ -11,7 +11,6 @@ All take ``observation_dim`` (``S``), ``action_dim`` (``A``) and these keywords:
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -28,14 +27,11 @@ from torchrl.modules import (
     TanhNormal,
 )
 
-from torchrl_osr._checks import check_positive
-
 SCALE_MAPPING = "biased_softplus_1.0_0.01"
-"""Standard deviation before the tanh, of policy and inverse dynamics alike: a softplus
-that is 1 at 0 and never below 0.01.
+"""Standard deviation before the tanh, of policy and inverse dynamics alike.
 
-The forward KL divides by the policy's variance: without a floor one confident,
-wrong state owns the whole gradient.
+A softplus that is 1 at 0 and never below 0.01: the forward KL divides by the policy's
+variance, and without a floor one confident, wrong state owns the whole gradient.
 """
 
 
@@ -48,17 +44,12 @@ def mlp(
     layer_norm: bool = False,
 ) -> MLP:
     """Return an MLP; with ``layer_norm``, each hidden layer is normalised."""
-    norm: dict[str, Any] = {}
+    cells = list(num_cells)
+    options: dict[str, Any] = {"activation_class": activation_class}
     if layer_norm:
-        widths = [{"normalized_shape": width} for width in num_cells]
-        norm = {"norm_class": nn.LayerNorm, "norm_kwargs": widths}
-    return MLP(
-        inputs,
-        outputs,
-        num_cells=list(num_cells),
-        activation_class=activation_class,
-        **norm,
-    )
+        options["norm_class"] = nn.LayerNorm
+        options["norm_kwargs"] = [{"normalized_shape": width} for width in cells]
+    return MLP(inputs, outputs, num_cells=cells, **options)
 
 
 def tanh_normal(
@@ -101,9 +92,8 @@ def tanh_gaussian_actor(
 ) -> ProbabilisticActor:
     """Return a tanh-Gaussian actor; see the module for the arguments.
 
-    Returns:
-        An actor that writes ``"loc"``, ``"scale"`` (before the tanh) and the action,
-        each ``[B, A]``, and ``"action_log_prob"``, ``[B]``.
+    It writes ``"loc"``, ``"scale"`` (before the tanh) and the action, each ``[B, A]``,
+    and ``"action_log_prob"``, ``[B]``.
 
     Examples:
         >>> import torch
@@ -133,10 +123,8 @@ def deterministic_actor(
 ) -> ProbabilisticActor:
     """Return a deterministic actor, whose action ends in a tanh.
 
-    Returns:
-        An actor that writes ``"param"`` (before the tanh, which
-        :class:`~torchrl.modules.TanhDelta` takes of its sum with the center of the
-        bounds) and the action, each ``[B, A]``.
+    It writes ``"param"`` (before the tanh, which :class:`~torchrl.modules.TanhDelta`
+    takes of its sum with the center of the bounds) and the action, each ``[B, A]``.
     """
     network = mlp(observation_dim, action_dim, num_cells, activation_class)
     return ProbabilisticActor(
@@ -154,31 +142,20 @@ def gaussian_actor(
     *,
     num_cells: Sequence[int] = (256, 256),
     activation_class: type[nn.Module] = nn.ReLU,
-    scale: float | None = None,
     observation_key: NestedKey = "observation",
     action_key: NestedKey = "action",
 ) -> ProbabilisticActor:
-    r"""Return a Gaussian actor: IQL's.
+    """Return a Gaussian actor: IQL's.
 
     Its mean ends in a tanh, between -1 and 1; its samples do not. So the density is
-    moderate at actions on the bounds, of which data have many.
-
-    Keyword Args:
-        scale: fixed standard deviation. With :math:`1 / \sqrt 2` the log-density is
-            minus the squared distance from the mean, up to a constant: that of a
-            deterministic policy. Default: learned, the same for all states, 1 at first.
-
-    Returns:
-        An actor that writes ``"loc"`` (the mean), ``"scale"`` and the action, each
-        ``[B, A]``.
+    moderate at actions on the bounds, of which data have many. The standard deviation
+    is learned, the same for all states. It writes ``"loc"`` (the mean), ``"scale"`` and
+    the action, each ``[B, A]``.
     """
-    if scale is not None:
-        check_positive("scale", scale)
-    spread = AddStateIndependentNormalScale(
-        action_dim, make_param=scale is None, init_value=math.log(scale or 1.0)
-    )
     network = nn.Sequential(
-        mlp(observation_dim, action_dim, num_cells, activation_class), nn.Tanh(), spread
+        mlp(observation_dim, action_dim, num_cells, activation_class),
+        nn.Tanh(),
+        AddStateIndependentNormalScale(action_dim),
     )
     return ProbabilisticActor(
         TensorDictModule(network, [observation_key], ["loc", "scale"]),
@@ -199,12 +176,8 @@ def categorical_actor(
 ) -> ProbabilisticActor:
     """Return an actor that chooses one of ``n`` discrete actions.
 
-    Its actions are one-hot, as :class:`~torchrl.envs.GymEnv` gives and takes them
-    unless it was made with ``categorical_action_encoding=True``.
-
-    Returns:
-        An actor that writes ``"logits"`` and the action, each ``[B, n]``, and
-        ``"action_log_prob"``, ``[B]``.
+    It writes ``"logits"`` and the action, one-hot as :class:`~torchrl.envs.GymEnv`
+    takes it by default, each ``[B, n]``, and ``"action_log_prob"``, ``[B]``.
     """
     network = mlp(observation_dim, num_actions, num_cells, activation_class)
     return one_hot(network, [observation_key], action_key)

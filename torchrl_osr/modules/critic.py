@@ -29,21 +29,10 @@ def critic_ensemble(
     uniformly between the smallest and the largest weight, which is another
     distribution than the one the layers were initialised from.
 
-    Args:
-        observation_dim: size of the observation, ``S``.
-        action_dim: size of the action, ``A``.
-        num_qvalue_nets: number of critics, ``N``.
-        num_cells: width of each hidden layer.
-        activation_class: activation between the layers.
-        layer_norm: normalise each hidden layer before its activation, which bounds
-            the values of actions far from the data ("Efficient Online Reinforcement
-            Learning with Offline Data", https://arxiv.org/abs/2302.02948). Not in the
-            paper; default ``False``.
-        observation_key, action_key: the entries they read. Default ``"observation"``
-            and ``"action"``.
-
-    Returns:
-        ``N`` modules that write ``"state_action_value"``, ``[B, 1]``.
+    Each of the ``num_qvalue_nets`` writes ``"state_action_value"``, ``[B, 1]``. With
+    ``layer_norm`` each hidden layer is normalised before its activation, which bounds
+    the values of actions far from the data (https://arxiv.org/abs/2302.02948). Other
+    arguments are those of :mod:`torchrl_osr.modules.actor`.
 
     Examples:
         >>> import torch
@@ -77,10 +66,7 @@ def discrete_critic_ensemble(
 ) -> list[TensorDictModule]:
     """Return Q networks that value all ``n`` discrete actions of a state at once.
 
-    A list, and with the arguments, of :func:`critic_ensemble`.
-
-    Returns:
-        ``N`` modules that write ``"action_value"``, ``[B, n]``.
+    As :func:`critic_ensemble`; each writes ``"action_value"``, ``[B, n]``.
     """
     sizes = observation_dim, num_actions
     return [

@@ -22,13 +22,10 @@ from torchrl_osr._entries import nested
 from torchrl_osr.modules.actor import SCALE_MAPPING, mlp, one_hot, tanh_normal
 
 LATENT_LOG_SCALE_BOUNDS = (-4.0, 15.0)
-"""Range of the latent's log standard deviation, that of BCQ's VAE
-(https://arxiv.org/abs/1812.02900).
+"""Range of the latent's log standard deviation, BCQ's (https://arxiv.org/abs/1812.02900).
 
-The KL to the unit prior takes the logarithm and the square of the scale: unbounded,
-the exponential underflows to a logarithm of 0 or overflows. A latent known to
-``exp(-4) = 0.018`` is as good as noiseless beside a prior of 1, and the upper end is
-far out on purpose, because outside the range the gradient that would lead back is 0.
+Unbounded, the KL to the prior would underflow to a logarithm of 0, or overflow. The
+upper end is far out on purpose: beyond it no gradient leads back.
 """
 
 
@@ -46,11 +43,8 @@ def tanh_gaussian_inverse_dynamics(
     r"""Return a tanh-Gaussian model of :math:`I(a \mid s, s')`, section 4.2.
 
     It has the policy's distribution family and bounds, so that the divergence between
-    the two is exact (:func:`~torchrl_osr.functional.gaussian_kl`).
-
-    Returns:
-        A module that writes ``"loc"``, ``"scale"`` (before the tanh), ``"action"`` and
-        ``"action_log_prob"``.
+    the two is exact (:func:`~torchrl_osr.functional.gaussian_kl`). It writes ``"loc"``,
+    ``"scale"`` (before the tanh), ``"action"`` and ``"action_log_prob"``.
 
     Examples:
         >>> import torch
@@ -83,12 +77,7 @@ def categorical_inverse_dynamics(
     observation_key: NestedKey = "observation",
     action_key: NestedKey = "action",
 ) -> ProbabilisticActor:
-    """Return a model over ``n`` discrete actions.
-
-    Returns:
-        A module that writes ``"logits"`` and one-hot ``"action"``, each ``[B, n]``, and
-        ``"action_log_prob"``, ``[B]``.
-    """
+    """Return a model over ``n`` discrete actions, which writes what an actor does."""
     network = mlp(2 * observation_dim, num_actions, num_cells, activation_class)
     keys = [observation_key, nested("next", observation_key)]
     return one_hot(network, keys, action_key)
@@ -113,33 +102,19 @@ def cvae_inverse_dynamics(
         I(a \mid s, s', z) = \tanh \mathcal N(\mu, \sigma^2)
 
     It stands in for :func:`tanh_gaussian_inverse_dynamics` and writes the latent's
-    parameters besides, from which :class:`~torchrl_osr.InverseDynamicsLoss` adds
-    :math:`KL(q(z) \,\|\, N(0, 1))`. ``z`` is drawn anew in every call under
-    ``set_interaction_type(InteractionType.RANDOM)``, as in training, and is its mean
-    under every other type, hence by default and in the policy's losses.
+    parameters besides, ``"latent_loc"`` and ``"latent_scale"``, ``[B, Z]``, from which
+    :class:`~torchrl_osr.InverseDynamicsLoss` adds :math:`KL(q(z) \,\|\, N(0, 1))`.
+    ``z`` is drawn under ``set_interaction_type(InteractionType.RANDOM)``, as in
+    training, and is its mean under every other type, hence in the policy's losses.
 
-    A known limit, of the original too: the encoder does not see the action. ``z``
-    tells the decoder nothing that :math:`(s, s')` does not, so that its noise can only
-    do harm: training teaches the decoder to ignore it and :math:`q` to be the prior.
-    The action stays a single tanh-Gaussian.
+    A known limit, of the original too: the encoder does not see the action, so ``z``
+    tells the decoder nothing new. Training teaches the decoder to ignore it.
 
-    Departures from the released code (https://github.com/Jack10843/OSR):
-
-    - There the action's log standard deviation is read from the columns of the mean,
-      an affine function of it. Here it has columns of its own.
-    - There it is unbounded in the divergence from the policy. Here it has the map and
-      the floor of the policy's, ``SCALE_MAPPING``.
-    - There the latent's is unbounded. Here it is kept in ``LATENT_LOG_SCALE_BOUNDS``.
-
-    Keyword Args:
-        latent_dim: size of the latent, ``Z``. Default 32, the authors'.
-        num_cells: width of each hidden layer of the decoder. The encoder has one more,
-            as wide as the last. By default both then match the authors'.
-
-    Returns:
-        A module that writes ``"loc"``, ``"scale"`` (before the tanh), ``"latent_loc"``,
-        ``"latent_scale"``, ``[B, Z]``, ``"action"`` and ``"action_log_prob"`` (given
-        ``z``).
+    Departures from the released code (https://github.com/Jack10843/OSR): the action's
+    log standard deviation has columns of its own (there those of the mean) and the map
+    and floor of the policy's, ``SCALE_MAPPING``; the latent's is kept in
+    ``LATENT_LOG_SCALE_BOUNDS``. By default sizes are the authors'; the encoder has one
+    layer more than ``num_cells``, the decoder's.
     """
     pair = 2 * observation_dim
     encoder_cells = [*num_cells, *num_cells[-1:]]
@@ -154,12 +129,7 @@ def cvae_inverse_dynamics(
 
 
 class _ConditionalVAE(nn.Module):
-    """Encoder, latent and decoder.
-
-    Args:
-        encoder: from both states, ``[B, S]`` each, to ``[B, 2 * Z]``.
-        decoder: from both states and the latent to ``[B, 2 * A]``.
-    """
+    """Encoder of both states to ``[B, 2 * Z]``; decoder, of ``z`` too, to ``2 * A``."""
 
     def __init__(self, encoder: nn.Module, decoder: nn.Module) -> None:
         super().__init__()
