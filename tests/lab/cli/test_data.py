@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from contextlib import closing
 from pathlib import Path
 
@@ -30,8 +31,8 @@ def look(tmp_path, monkeypatch, capsys):
         error = None
         try:
             data.main(cfg)
-        except SystemExit as end:
-            error = str(end)
+        except (ValueError, FileNotFoundError) as refusal:
+            error = str(refusal)
         return capsys.readouterr().out, error
 
     return look
@@ -55,13 +56,6 @@ NAMED = [
 ]
 
 
-def test_a_picture_that_cannot_be_written_loses_no_table(look, capsys):
-    write_log("log.csv")
-    with pytest.raises(OSError, match="cannot write the file"):
-        look(*NAMED, "env.id=Pendulum-v1", "picture=/proc/x.png")
-    assert "looks wrong" in capsys.readouterr().out
-
-
 def test_discrete_actions_of_a_converted_set_are_drawn(look, tmp_path):
     with closing(make_environment("CartPole-v1")) as env:
         log = record_episodes(env, None, 3, progress=False)
@@ -81,13 +75,10 @@ def test_a_log_is_described_and_drawn(look, tmp_path):
     assert "200 (200 to 200), 6 complete episodes" in output
     assert "-2.0 to 2.0 become -1 to 1" in output
     assert "not read  note" in output
-    assert output.count("observation  ") == 3
+    assert re.search(r"(?m)^action +torque +-1.99\d? ", output)
     picture = Image.open(tmp_path / "log-data.png")
     assert np.asarray(picture.convert("L")).std() > 10
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "log-data.png",
-        "log.csv",
-    ]
+    assert {path.name for path in tmp_path.iterdir()} == {"log-data.png", "log.csv"}
 
 
 def test_what_looks_wrong_is_numbered(look):
@@ -120,12 +111,9 @@ def test_what_looks_wrong_is_numbered(look):
 )
 def test_what_cannot_be_trained_on_is_one_sentence(look, changes, overrides, message):
     write_log("log.csv", **changes)
-    output, error = look(*NAMED, "data.action_bounds=[-2,2]", *overrides)
+    _, error = look(*NAMED, "data.action_bounds=[-2,2]", *overrides)
     assert message in error
-    assert "cannot be trained on" in error
     assert not list(Path().glob("*.png"))
-    if "nan" in message:
-        assert "1,200" in output, "the table says where the numbers are missing"
 
 
 def test_rolled_out_data_too(look, tmp_path, monkeypatch):

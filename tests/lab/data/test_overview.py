@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from torchrl_osr.lab.cli.data import overview
 from torchrl_osr.lab.data import transitions_from_columns
-from torchrl_osr.lab.data.overview import describe_entries, findings
+from torchrl_osr.lab.data.overview import (
+    describe_entries,
+    findings,
+    recorded_columns,
+)
 from torchrl_osr.lab.evaluation.figures import data_figure
 
 
@@ -28,7 +31,8 @@ def make_log(rows=1200, **changes):
 
 def said(columns, **options):
     data, manifest = transitions_from_columns(columns, **options)
-    return [*findings(data, manifest, describe_entries([columns], {}))]
+    entries = describe_entries(recorded_columns(data, manifest))
+    return [*findings(data, manifest, entries)]
 
 
 def test_a_sound_log_gives_no_reason_to_complain():
@@ -55,31 +59,32 @@ def test_findings_name_what_looks_wrong(changes, message):
     assert message in found
 
 
-def test_ranges_are_those_that_pandas_finds():
-    columns = make_log(observation=make_log()["observation"] * 1e-3 + [1e6, -3])
-    columns["observation"][5, 1] = np.nan
-    columns["observation"][6:9, 1] = np.inf
-    parts = [{k: v[i : i + 500] for k, v in columns.items()} for i in (0, 500, 1000)]
-    entries = describe_entries(parts, {"observation": ["x", "y"]})
-    assert [entry.name for entry in entries] == ["x", "y", "action[0]", "reward"]
-    assert [entry.missing for entry in entries] == [0, 4, 0, 0]
-    table = np.c_[columns["observation"], columns["action"], columns["reward"]]
-    frame = pd.DataFrame(table).replace(np.inf, np.nan)
-    expected = frame.agg(["min", "max", "mean", "std"]).T.to_numpy()
-    found = np.array([[e.low, e.high, e.mean, e.deviation] for e in entries])
-    np.testing.assert_allclose(found, expected, rtol=1e-3)
-    np.testing.assert_allclose(found[:, :2], expected[:, :2], rtol=1e-12)
+def test_columns_are_in_the_units_of_the_recording():
+    log = make_log(action=np.array([5.0, 10.0]) * make_log()["action"])
+    log["next_observation"] = log["observation"] + 1
+    data, manifest = transitions_from_columns(log, action_bounds=([-5, -10], [5, 10]))
+    manifest["columns"] = {"observation": ["x", "y"]}
+    columns = recorded_columns(data, manifest)
+    assert [name for _, name in columns] == [
+        "x",
+        "y",
+        "action[0]",
+        "action[1]",
+        "reward",
+    ]
+    recorded = np.c_[log["observation"], log["action"], log["reward"]]
+    np.testing.assert_allclose(columns, recorded, atol=1e-5)
 
 
 def test_discrete_actions_are_not_measured_by_bounds(tmp_path):
     columns = make_log(action=np.arange(1200) % 2)
+    assert said(columns, num_actions=2) == []
     data, manifest = transitions_from_columns(columns, num_actions=2)
-    assert [*findings(data, manifest, describe_entries([columns], {}))] == []
-    assert "actions   discrete, 2; shares of the rows: 51.3% 0, 48.7% 1" in overview(
-        data, manifest, ["action"]
-    )
-    names = {"observation": ["x", "y"], "action": ["action"]}
-    data_figure(data, manifest, names, tmp_path / "log.png", title="log")
+    text = overview(data, manifest, ["action"])
+    assert "actions   discrete, 2; shares of the rows: 51.3% 0, 48.7% 1" in text
+    recorded = recorded_columns(data, manifest)
+    assert set(recorded["action"].to_numpy().ravel()) == {0, 1}
+    data_figure(recorded, manifest, tmp_path / "log.png", title="log")
     assert (tmp_path / "log.png").stat().st_size > 10_000
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
-import numpy as np
 import pandas as pd
 import torch
 from tensordict import TensorDict
@@ -19,8 +18,6 @@ CONSTANT = {
     "action": "nothing can be learnt about its effect.",
     "reward": "all policies are equally good (data.columns.reward=...).",
 }
-PARTS = tuple(CONSTANT)
-"""Parts that are described entry by entry."""
 
 FEW_ROWS, MOST_ROWS = 1000, 20_000
 SOME, MOST = 0.1, 0.5
@@ -29,51 +26,45 @@ SOME, MOST = 0.1, 0.5
 JUMP = 20
 
 
-class Entry(NamedTuple):
-    """An entry of a vector, or the reward; ``missing`` rows are not finite."""
-
-    name: str
-    part: str
-    missing: int
-    low: float
-    high: float
-    mean: float
-    deviation: float
-
-
-def describe_entries(
-    rows: Iterable[Mapping[str, Any]], columns: Mapping[str, Sequence[str]]
-) -> list[Entry]:
-    """Range, mean and deviation of every entry, in the recording's own units."""
-    entries, chunks = [], [*rows]
-    for part in PARTS if chunks else ():
-        arrays = [np.reshape(each[part], (len(each[part]), -1)) for each in chunks]
-        table = np.concatenate(arrays).astype(np.float64)
-        names = columns.get(part, ())
+def recorded_columns(data: TensorDict, manifest: Mapping[str, Any]) -> pd.DataFrame:
+    """Return the rows in the recording's own units; columns are ``(part, name)``."""
+    low, high = map(torch.tensor, manifest.get("action_bounds", (-1.0, 1.0)))
+    action = low + (data["action"] + 1) / 2 * (high - low)
+    if manifest.get("num_actions") is not None:
+        action = data["action"].argmax(1, keepdim=True)
+    parts = {
+        "observation": data["observation"],
+        "action": action,
+        "reward": data["next", "reward"],
+    }
+    frames = {}
+    for part, table in parts.items():
+        names = manifest.get("columns", {}).get(part, ())
         if len(names) != table.shape[1]:
             numbered = [f"{part}[{entry}]" for entry in range(table.shape[1])]
             names = [part] if part == "reward" else numbered
-        known = pd.DataFrame(table, columns=names).where(np.isfinite(table))
-        facts = known.isna().sum(), known.min(), known.max(), known.mean()
-        each_fact = zip(names, *facts, known.std(ddof=0), strict=True)
-        entries += [Entry(name, part, *numbers) for name, *numbers in each_fact]
-    return entries
+        frames[part] = pd.DataFrame(table.double().numpy(), columns=names)
+    return pd.concat(frames, axis=1)
+
+
+def describe_entries(columns: pd.DataFrame) -> pd.DataFrame:
+    """Return range, mean and deviation of each of :func:`recorded_columns`."""
+    return columns.agg(["min", "mean", "max", "std"]).T
 
 
 def findings(
-    data: TensorDict, manifest: Mapping[str, Any], entries: Sequence[Entry]
+    data: TensorDict, manifest: Mapping[str, Any], entries: pd.DataFrame
 ) -> Iterator[str]:
     """Yield what looks wrong with a data set that can be trained on, and the cure."""
     yield from manifest.get("warnings", [])
     # Where episodes end by themselves, to last long is worth something.
     falls = bool(data["next", "terminated"].any())
-    for name, part, _, low, high, *_ in entries:
-        if low == high and not (part == "reward" and falls):
-            yield f"{name} is {low:g} in every row: {CONSTANT[part]}"
+    for (part, name), entry in entries.iterrows():
+        if entry["min"] == entry["max"] and not (part == "reward" and falls):
+            yield f"{name} is {entry['min']:g} in every row: {CONSTANT[part]}"
     if manifest.get("num_actions") is None:
-        names = [entry.name for entry in entries if entry.part == "action"]
         shares = actions_at_bounds(data).tolist()
-        for name, share in zip(names, shares, strict=True):
+        for name, share in zip(entries.loc["action"].index, shares, strict=True):
             if share > MOST:
                 yield (
                     f"{name} is at one of its bounds in {share:.0%} of the rows: they "
@@ -142,15 +133,16 @@ def _explained(data: TensorDict, rows: Tensor, shift: int) -> float:
 
 
 def out_of_space(
-    entries: Sequence[Entry], low: Sequence[float], high: Sequence[float]
+    entries: pd.DataFrame, low: Sequence[float], high: Sequence[float]
 ) -> Iterator[str]:
     """Yield which observations leave the range of their task's space."""
-    observed = [entry for entry in entries if entry.part == "observation"]
-    for entry, least, most in zip(observed, low, high, strict=True):
-        slack = 1e-3 * max(1.0, abs(entry.low), abs(entry.high))
-        if entry.low < least - slack or entry.high > most + slack:
+    observed = entries.loc["observation"].iterrows()
+    for (name, entry), least, most in zip(observed, low, high, strict=True):
+        first, last = entry["min"], entry["max"]
+        slack = 1e-3 * max(1.0, abs(first), abs(last))
+        if first < least - slack or last > most + slack:
             yield (
-                f"{entry.name} goes from {entry.low:g} to {entry.high:g}, where the "
-                f"environment's observation has {least:g} to {most:g}: are the columns "
-                "in another order (data.columns.observation=[...])?"
+                f"{name} goes from {first:g} to {last:g}, where the environment's "
+                f"observation has {least:g} to {most:g}: are the columns in another "
+                "order (data.columns.observation=[...])?"
             )

@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
-from tensordict import TensorDict
 
 from torchrl_osr._extras import needed_by
 from torchrl_osr._files import whole_file
 from torchrl_osr.lab.evaluation.episodes import measure_of
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.figure import Figure
 
 # Okabe and Ito's palette, which colour-blind readers can distinguish.
@@ -54,37 +53,30 @@ def save_figure(figure: Figure, path: Path | str, *, dpi: int = 150) -> None:
 
 
 def data_figure(
-    data: TensorDict,
+    columns: pd.DataFrame,
     manifest: Mapping[str, Any],
-    names: Mapping[str, Sequence[str]],
     path: Path | str,
     *,
     title: str,
 ) -> None:
     """Draw histograms of the episodes' returns and lengths and of every entry.
 
-    ``names`` has those of the entries of ``"observation"`` and ``"action"``.
+    ``columns`` are those of :func:`~torchrl_osr.lab.data.overview.recorded_columns`.
     """
-    low, high = (np.asarray(each) for each in manifest.get("action_bounds", (-1, 1)))
-    actions: NDArray[Any] = low + (data["action"].numpy() + 1) / 2 * (high - low)
-    if manifest.get("num_actions") is not None and len(names["action"]) == 1:
-        actions = data["action"].numpy().argmax(1)[:, None]
     panels: list[tuple[str, Any, str]] = []
     for name, kind in (("return of an episode", "returns"), ("steps", "lengths")):
         values = [
             manifest.get(f"{part}_{kind}", []) for part in ("episode", "incomplete")
         ]
         panels.append((name, np.concatenate(values), GREEN))
-    panels.append(("reward", data["next", "reward"][:, 0].numpy(), GREY))
-    observations = data["observation"][:: len(data) // MOST_ROWS + 1].numpy()
-    panels += [(*each, ORANGE) for each in zip(names["action"], actions.T, strict=True)]
-    columns = zip(names["observation"], observations.T, strict=True)
-    panels += [(*each, BLUE) for each in columns]
-    rows = -(-min(len(panels), MOST_PANELS) // COLUMNS)
-    figure = new_figure(2.6 * COLUMNS, 2.0 * rows + 0.6)
+    rows = columns.iloc[:: len(columns) // MOST_ROWS + 1]
+    for part, colour in {"reward": GREY, "action": ORANGE, "observation": BLUE}.items():
+        panels += [(name, rows[part, name], colour) for name in rows[part]]
+    height = -(-min(len(panels), MOST_PANELS) // COLUMNS)
+    figure = new_figure(2.6 * COLUMNS, 2.0 * height + 0.6)
     left = max(len(panels) - MOST_PANELS, 0)
     figure.suptitle(title + (f" ({left} more entries are not shown)" if left else ""))
-    grid = figure.subplots(rows, COLUMNS, squeeze=False).ravel()
+    grid = figure.subplots(height, COLUMNS, squeeze=False).ravel()
     for axes, (name, values, colour) in zip(grid, panels, strict=False):
         if len(values):
             axes.hist(values, bins=40, color=colour)

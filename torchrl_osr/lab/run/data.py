@@ -60,22 +60,22 @@ def references_of(env: EnvConfig) -> ReferenceReturns | None:
 
 
 def load_data(
-    env: EnvConfig, options: DataConfig, *, progress: bool = True
+    env: EnvConfig | None, options: DataConfig, *, progress: bool = True
 ) -> tuple[TensorDict, dict[str, Any]]:
-    """Load data set and manifest; rewards are the task's own."""
+    """Load data set and manifest; rewards are the task's own.
+
+    Without a task, recorded data are not compared with it.
+    """
     from torchrl_osr.lab.data import load_dataset  # needs Gymnasium; networks do not
 
     reading = asdict(options)
     for name in OF_TRAINING:
         del reading[name]
-    return load_dataset(
-        env.name,
-        env_id=env.id,
-        references=references_of(env),
-        on_disk=options.storage == "disk",
-        progress=progress,
-        **reading,
-    )
+    if env is not None:
+        reading |= {"env_name": env.name, "env_id": env.id}
+        reading["references"] = references_of(env)
+    on_disk = options.storage == "disk"
+    return load_dataset(**reading, on_disk=on_disk, progress=progress)
 
 
 @torch.random.fork_rng(devices=[])
