@@ -50,7 +50,7 @@ from torchrl_osr.modules import (
     tanh_gaussian_actor,
     tanh_gaussian_inverse_dynamics,
 )
-from torchrl_osr.trainers import Evaluation, OfflineTrainer, largest_value
+from torchrl_osr.trainers import Evaluation, OfflineTrainer, divergence_warning
 
 LOSSES = {"torchrl_osr.OSRLoss": OSRLoss, "torchrl_osr.OSRVLoss": OSRVLoss}
 
@@ -132,7 +132,6 @@ def train(run: Run) -> float:
     average = averaged(actor, optim.policy_average)
     if optim.n_steps > 1:
         data.buffer.append_transform(take_multi_step)
-    limit = largest_value(data.largest_reward, optim.gamma)
     with evaluation(run, data.norm, average) as evaluate:
         trainer = OfflineTrainer(
             update(loss, optimizer, targets, **delay),
@@ -141,12 +140,12 @@ def train(run: Run) -> float:
             folder / CHECKPOINTS,
             seed=config.seed + 1,
             hooks=[
+                divergence_warning(data.largest_reward, optim.gamma),
                 ("post_optim", schedule.step),
                 ("post_optim", partial(average.update_parameters, actor)),
             ],
             components=kept | {"schedule": schedule, "policy_average": average},
             evaluation=evaluate,
-            value_limits={"pred_value": limit, "target_value": limit},
             description="policy",
             **shared,
         )

@@ -1,4 +1,4 @@
-"""What the tests of the trainer share: a small run of any loss, and its state."""
+"""What the tests of the trainer share: a small run of OSR, and its state."""
 
 from __future__ import annotations
 
@@ -8,20 +8,12 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torch.utils._pytree import tree_leaves
 from torchrl.objectives import SoftUpdate
 
-from torchrl_osr import (
-    CQLLoss,
-    InverseDynamicsLoss,
-    OSRLoss,
-    OSRVLoss,
-    StatePerturbation,
-)
+from torchrl_osr import InverseDynamicsLoss, OSRLoss, StatePerturbation
 from torchrl_osr.fast import fast_update
 from torchrl_osr.lab.data import make_replay_buffer
-from torchrl_osr.lab.losses import EDACLoss
 from torchrl_osr.modules import (
     critic_ensemble,
     tanh_gaussian_actor,
@@ -29,100 +21,18 @@ from torchrl_osr.modules import (
 )
 from torchrl_osr.trainers import Evaluation, OfflineTrainer
 
-LOSSES = {
-    "OSR": {"num_random": 2},
-    "OSR-v": {},
-    "CQL": {"target_action_gap": 0.0},
-    "OSR-10": {"min_q_weight": 0, "deterministic_backup": False},
-    "EDAC": {},
-}
-UPDATE = {
-    "target_updater",
-    "policy_delay",
-    "policy_params",
-    "autocast_dtype",
-    "trace",
-    "warm_up",
-}
-CRITICS = {"OSR-10": 10, "EDAC": 3}
+
+def inverse_dynamics_loss() -> InverseDynamicsLoss:
+    torch.manual_seed(0)
+    return InverseDynamicsLoss(tanh_gaussian_inverse_dynamics(3, 2), states="clean")
 
 
-def make_data(device: str, rows: int = 64) -> TensorDict:
-    generator = torch.Generator().manual_seed(0)
-    state = torch.randn(rows, 3, generator=generator)
-    ends = torch.arange(rows).unsqueeze(-1) % 5 == 0
-    next_ = {
-        "observation": state.roll(1, 0),
-        "reward": state[:, :1].clone(),
-        "done": ends,
-        "terminated": ends & (torch.arange(rows).unsqueeze(-1) % 2 == 0),
-    }
-    action = torch.rand(rows, 2, generator=generator) - 0.5
-    now = {"observation": state, "action": action, "next": next_}
-    return TensorDict(now, [rows]).to(device)
-
-
-def build_loss(name: str, *, layer_norm=False, cells=8, device="cpu", **options):
-    """Return a small loss of a name, its networks on the device from the beginning."""
-    torch.manual_seed(0)  # of all devices
-    inverse_dynamics = tanh_gaussian_inverse_dynamics(3, 2, num_cells=[cells]).to(
-        device
-    )
-    if name == "inverse dynamics":
-        return InverseDynamicsLoss(inverse_dynamics, **options)
-    critics = critic_ensemble(
-        3,
-        2,
-        num_cells=[cells],
-        num_qvalue_nets=CRITICS.get(name, 2),
-        layer_norm=layer_norm,
-    )
-    actor = tanh_gaussian_actor(3, 2, num_cells=[cells]).to(device)
-    options = LOSSES[name] | options
-    critics = [each.to(device) for each in critics]
-    if name == "EDAC":
-        return EDACLoss(actor, critics, **options)
-    if name == "CQL":
-        return CQLLoss(actor, critics, **options)
-    kind = OSRVLoss if name == "OSR-v" else OSRLoss
-    return kind(actor, critics, inverse_dynamics, **options)
-
-
-def policy_params(loss) -> list[torch.nn.Parameter]:
-    """What a delay of the policy is about: all but the critics."""
-    critics = set(getattr(loss, "qvalue_network_params", loss).parameters())
-    return [each for each in loss.parameters() if each not in critics]
-
-
-def build_run(folder, name="OSR", *, device="cpu", loss_options=(), **options):
-    """Return a fresh trainer; two of them are the same run up to their folders."""
-    loss = build_loss(name, **dict(loss_options)).to(device)
-    targets = name != "inverse dynamics"
-    perturbation = StatePerturbation(0.1, seed=0)
-    update = {
-        "target_updater": SoftUpdate(loss, tau=0.1) if targets else None,
-        "policy_params": policy_params(loss),
-        "trace": False,
-    }
-    update |= {name: options.pop(name) for name in UPDATE & options.keys()}
-    options = {
-        "total_steps": 12,
-        "components": {"perturbation": perturbation},
-        "log_interval": 4,
-        "checkpoint_interval": 6,
-        "progress": False,
-    } | options
-    if evaluate := options.pop("evaluate", None):
-        interval = options.pop("eval_interval", 6)
-        options["evaluation"] = Evaluation(
-            evaluate, interval, *options.pop("metric", ())
-        )
-    buffer = make_replay_buffer(
-        make_data(device), batch_size=8, seed=0, transform=perturbation
-    )
-    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2, fused=True)
-    update = fast_update(loss, optimizer, **update)
-    return OfflineTrainer(update, buffer, folder=folder, **options)
+def osr_loss(cells: int = 8) -> OSRLoss:
+    torch.manual_seed(0)
+    each = {"num_cells": [cells]}
+    critics = critic_ensemble(3, 2, **each)
+    model = tanh_gaussian_inverse_dynamics(3, 2, **each)
+    return OSRLoss(tanh_gaussian_actor(3, 2, **each), critics, model, num_random=2)
 
 
 def state_of_run(trainer: OfflineTrainer) -> list[torch.Tensor]:
@@ -132,22 +42,13 @@ def state_of_run(trainer: OfflineTrainer) -> list[torch.Tensor]:
         for name in sorted(archive.namelist()):
             if name.endswith("state.pt"):
                 content = io.BytesIO(archive.read(name))
-                state = torch.load(content, weights_only=True, map_location="cpu")
+                state = torch.load(content, weights_only=True)
                 # Nothing here seeds Python's and NumPy's generators.
                 for other in ("python", "numpy"):
                     state.pop(other, None)
-                tensors += [
-                    each for each in tree_leaves(state) if torch.is_tensor(each)
-                ]
+                tensors += filter(torch.is_tensor, tree_leaves(state))
     assert len(tensors) > 10
     return tensors
-
-
-def log_of(numbers: list) -> SimpleNamespace:
-    """Logger that appends name, step and value of every number."""
-    return SimpleNamespace(
-        log_scalar=lambda name, value, step: numbers.append((name, step, value))
-    )
 
 
 def assert_same_bits(mine, theirs) -> None:
@@ -155,13 +56,61 @@ def assert_same_bits(mine, theirs) -> None:
 
 
 @pytest.fixture
+def make(transitions):
+    """Return a factory of trainers of 20 steps, which score 0, 1, 2 and so on.
+
+    Two of them are the same run up to their folders.
+    """
+
+    def make(folder, *, cells=8, targets=True, **options) -> OfflineTrainer:
+        loss, perturbation = osr_loss(cells), StatePerturbation(0.1, seed=0)
+        updater = SoftUpdate(loss, tau=0.1)
+        tracing = {name: options.pop(name, False) for name in ("trace", "warm_up")}
+        scores = iter(range(1000))
+        evaluate = options.pop("evaluate", lambda: {"score": next(scores), "raw": [1]})
+        interval, best = options.pop("eval_interval", 5), options.pop("best", "max")
+        options = {
+            "total_steps": 20,
+            "components": {"perturbation": perturbation},
+            "evaluation": Evaluation(evaluate, interval, best=best),
+            "checkpoint_interval": 5,
+            "log_interval": 3,
+            "progress": False,
+        } | options
+        buffer = make_replay_buffer(
+            transitions(64), batch_size=8, seed=0, transform=perturbation
+        )
+        optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2, fused=True)
+        update = fast_update(loss, optimizer, updater if targets else None, **tracing)
+        return OfflineTrainer(update, buffer, folder=folder, **options)
+
+    return make
+
+
+@pytest.fixture
+def undisturbed(make, tmp_path) -> OfflineTrainer:
+    """A whole run."""
+    trainer = make(tmp_path / "undisturbed")
+    trainer.train()
+    return trainer
+
+
+@pytest.fixture(scope="session")
 def runs() -> SimpleNamespace:
-    """What makes runs and compares them."""
+    """Losses, and what compares runs."""
     return SimpleNamespace(
-        make=build_run,
-        make_loss=build_loss,
-        make_data=make_data,
+        osr_loss=osr_loss,
+        inverse_dynamics_loss=inverse_dynamics_loss,
         state=state_of_run,
-        log_of=log_of,
         assert_same_bits=assert_same_bits,
+    )
+
+
+@pytest.fixture
+def logger() -> SimpleNamespace:
+    """Logger with ``numbers``: name, step and value of each."""
+    numbers = []
+    return SimpleNamespace(
+        numbers=numbers,
+        log_scalar=lambda name, value, step: numbers.append((name, step, value)),
     )

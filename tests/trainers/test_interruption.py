@@ -18,7 +18,7 @@ from torchrl_osr.trainers.interruption import (
     signals_noted,
 )
 
-STEPS = 12
+STEPS = 20
 
 
 @pytest.fixture(autouse=True)
@@ -40,45 +40,44 @@ def stop_in(trainer, step: int, number: int = signal.SIGTERM) -> None:
 
 
 def files(trainer) -> set[str]:
-    return {path.name for path in trainer.checkpoints.folder.iterdir()}
+    return {path.name for path in trainer.checkpoints.folder.glob("checkpoint-*")}
 
 
-@pytest.mark.parametrize("steps", [[1], [5], [6], [11], [2, 3, 9], [7, 8]])
-def test_interrupted_run_ends_as_an_undisturbed_one(tmp_path, runs, steps):
-    def make(folder, numbers):
-        loggers = [runs.log_of(numbers)]
-        return runs.make(tmp_path / folder, checkpoint_interval=5, loggers=loggers)
-
-    numbers, wanted = [], []
-    undisturbed = make("undisturbed", wanted)
-    undisturbed.train()
+@pytest.mark.parametrize("steps", [[1], [5], [19], [2, 3, 9], [7, 8]])
+def test_interrupted_run_ends_as_an_undisturbed_one(
+    tmp_path, make, runs, logger, undisturbed, steps
+):
     for step in steps:
-        trainer = make("run", numbers)
+        trainer = make(tmp_path / "run", loggers=[logger])
         stop_in(trainer, step)
         with pytest.raises(Interrupted, match=f"at step {step}; .*{step:012d}"):
             trainer.train()
         # Regular ones stay; of the extra ones only the newest does.
-        regular = {each for each in (5, 10) if each <= step}
-        names = {f"checkpoint-{each:012d}.torchrl" for each in regular | {step}}
+        regular = [each for each in (5, 10, 15) if each <= step][-2:]
+        names = {f"checkpoint-{each:012d}.torchrl" for each in {*regular, step}}
         assert files(trainer) == names
-    resumed = make("run", numbers)
+    resumed = make(tmp_path / "run", loggers=[logger])
     resumed.train()
     runs.assert_same_bits(runs.state(resumed), runs.state(undisturbed))
+    assert [row["step"] for row in resumed.history] == [0, 5, 10, 15, STEPS]
     assert files(resumed) == files(undisturbed)
-    assert [row[:2] for row in numbers] == [row[:2] for row in wanted]
+    logged = [step for name, step, _ in logger.numbers if name == "train/loss_qvalue"]
+    assert logged == [3, 5, 6, 9, 10, 12, 15, 18, 20]
 
 
 @pytest.mark.parametrize(("name", "code"), [("TERM", 75), ("HUP", 75), ("INT", 130)])
-def test_each_signal_has_its_exit_code(tmp_path, runs, caplog, name, code):
-    trainer = runs.make(tmp_path)
+def test_each_signal_has_its_exit_code(tmp_path, make, caplog, name, code):
+    trainer = make(tmp_path)
     stop_in(trainer, 3, signal.Signals[f"SIG{name}"])
     with pytest.raises(Interrupted, match=f"stopped by SIG{name} at step 3") as raised:
         trainer.train()
     assert raised.value.code == code
     assert raised.value.reason in caplog.text
+    again = pickle.loads(pickle.dumps(raised.value))  # from a worker process
+    assert (again.code, again.reason) == (code, raised.value.reason)
 
 
-def test_second_ctrl_c_interrupts_at_once(tmp_path, runs, capfd):
+def test_second_ctrl_c_interrupts_at_once(tmp_path, make, capfd):
     def evaluate():
         os.kill(os.getpid(), signal.SIGINT)
         assert "Ctrl-C again stops at once" in capfd.readouterr().err
@@ -86,31 +85,26 @@ def test_second_ctrl_c_interrupts_at_once(tmp_path, runs, capfd):
         pytest.fail("not reached")
 
     with pytest.raises(KeyboardInterrupt):
-        runs.make(tmp_path, evaluate=evaluate).train()
+        make(tmp_path, evaluate=evaluate).train()
 
 
-def test_evaluation_is_finished_first(tmp_path, runs):
-    def make(*steps: int):
-        def evaluate():
-            if trainer.step in steps:
-                os.kill(os.getpid(), signal.SIGTERM)
-            return {"score": 1.0}
-
-        trainer = runs.make(tmp_path, evaluate=evaluate)
-        return trainer
+def test_evaluation_is_finished_first(tmp_path, make):
+    def evaluate():
+        if trainer.step == stop:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return {"score": 1.0}
 
     # Before the first update there is nothing to continue from.
-    with pytest.raises(Interrupted, match="at step 0; the last checkpoint is None"):
-        make(0).train()
-    for step in (6, STEPS):
-        with pytest.raises(Interrupted, match=f"at step {step}"):
-            make(step).train()
-    finished = make(0, 6, STEPS)
-    finished.train()
-    assert [row["step"] for row in finished.history] == [0, 6, STEPS]
+    for stop, end in ((0, "; the last checkpoint is None"), (5, ""), (STEPS, "")):
+        trainer = make(tmp_path, evaluate=evaluate)
+        with pytest.raises(Interrupted, match=f"at step {stop}{end}"):
+            trainer.train()
+    stop, trainer = None, make(tmp_path, evaluate=evaluate)
+    trainer.train()
+    assert [row["step"] for row in trainer.history] == [0, 5, 10, 15, STEPS]
 
 
-def test_handlers_of_others_and_other_threads_are_left_alone(tmp_path, runs):
+def test_handlers_of_others_and_other_threads_are_left_alone(tmp_path, make):
     def of_submitit(number, frame): ...
 
     signal.signal(signal.SIGTERM, of_submitit)
@@ -119,7 +113,7 @@ def test_handlers_of_others_and_other_threads_are_left_alone(tmp_path, runs):
             assert signal.getsignal(signal.SIGTERM) is of_submitit
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    trainer, handlers = runs.make(tmp_path), []
+    trainer, handlers = make(tmp_path), []
     trainer.register_op(
         "post_optim", lambda: handlers.append(signal.getsignal(signal.SIGTERM))
     )
@@ -127,11 +121,6 @@ def test_handlers_of_others_and_other_threads_are_left_alone(tmp_path, runs):
     thread.start()
     thread.join()
     assert handlers == [signal.SIG_DFL] * STEPS
-
-
-def test_it_reaches_another_process_whole():
-    again = pickle.loads(pickle.dumps(Interrupted("saved at step 3", 75)))
-    assert (again.code, again.reason) == (75, "saved at step 3")
 
 
 @pytest.mark.parametrize("interrupt", [Interrupted("SIGTERM", 75), KeyboardInterrupt()])

@@ -54,9 +54,7 @@ class StopRequest:
 def signals_noted() -> Iterator[StopRequest]:
     """Note SIGTERM, SIGINT and SIGHUP in a :class:`StopRequest`.
 
-    A second Ctrl-C raises :class:`KeyboardInterrupt` at once. Handlers are installed in
-    the main thread only, since Python runs them there, and only in place of Python's
-    defaults and of :func:`signals_raised`: other handlers stay, such as submitit's.
+    A second Ctrl-C raises :class:`KeyboardInterrupt` at once.
     """
     request = StopRequest()
 
@@ -74,10 +72,7 @@ def signals_noted() -> Iterator[StopRequest]:
 
 @contextmanager
 def signals_raised() -> Iterator[None]:
-    """Raise :class:`Interrupted` at once on the signals, see :func:`signals_noted`.
-
-    For work that can be repeated, around trainings that note the signals.
-    """
+    """Raise :class:`Interrupted` at once, in work around trainings."""
 
     def stop(number: int, frame: FrameType | None) -> None:
         name = signal.Signals(number).name
@@ -108,17 +103,18 @@ def interrupts_kept() -> Iterator[None]:
 
 @contextmanager
 def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
-    """Handle the signals of :data:`EXIT_CODES`, unless somebody else's handler does."""
-    before: dict[signal.Signals, Any] = {}
+    """Handle the signals in place of Python's defaults and of this module's handlers.
+
+    Other handlers stay, such as submitit's. Python runs them in the main thread alone.
+    """
+    ours: dict[signal.Signals, Any] = {}
     if threading.current_thread() is threading.main_thread():
-        before = {number: signal.getsignal(number) for number in EXIT_CODES}
-    defaults = (signal.SIG_DFL, signal.default_int_handler)
-    ours = {
-        number: there for number, there in before.items()
-        if there in defaults or getattr(there, "__module__", None) == __name__
-    }  # fmt: skip
-    for number in ours:
-        signal.signal(number, handler)
+        defaults = (signal.SIG_DFL, signal.default_int_handler)
+        for number in EXIT_CODES:
+            there = signal.getsignal(number)
+            if there in defaults or getattr(there, "__module__", None) == __name__:
+                ours[number] = there
+                signal.signal(number, handler)
     try:
         yield
     finally:

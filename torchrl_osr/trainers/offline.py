@@ -23,7 +23,7 @@ from torchrl.data import PrioritizedSampler, ReplayBuffer
 from torchrl.record.loggers import CSVLogger, Logger
 from torchrl.trainers import OptimizationStepper, Trainer
 
-from torchrl_osr._files import finite_or_none, whole_file
+from torchrl_osr._files import finite_or_none
 from torchrl_osr.fast import NonfiniteError, Update
 from torchrl_osr.trainers.checkpoints import Checkpoints, SamplerState
 from torchrl_osr.trainers.interruption import (
@@ -32,9 +32,12 @@ from torchrl_osr.trainers.interruption import (
     StopRequest,
     signals_noted,
 )
-from torchrl_osr.trainers.progress import Progress
+from torchrl_osr.trainers.progress import progress_bar
 
 log = logging.getLogger(__name__)
+
+Hook = tuple[str, Callable[..., Any]]
+"""A place in TorchRL's loop and a function, see ``Trainer.register_op``."""
 
 
 @dataclass(frozen=True)
@@ -73,31 +76,27 @@ class OfflineTrainer(Trainer):
     Keyword Args:
         seed: of the sampling. Default 0.
         hooks: pairs of a place in TorchRL's loop and a function, see
-            :meth:`~torchrl.trainers.Trainer.register_op`. Default: none.
+            :meth:`~torchrl.trainers.Trainer.register_op`. They run before the
+            checkpoint (``post_steps``) and the evaluation (``post_steps_log``).
         components: more state to checkpoint, by name: a transform with a generator, a
             learning rate schedule, an average of the weights.
         evaluation: run before the first step, at its interval and at the end, after the
-            checkpoint. The results are in ``history``. One that fails later is in
-            ``failed_evaluations``, and the run goes on. Default: none.
+            checkpoint. The results are in ``history``. Default: none.
         checkpoint_interval: steps between checkpoints. Default: that of the evaluation,
             or 5000.
         checkpoints_kept: regular ones, beside the newest and the best. Default 2.
         loggers: TorchRL loggers; all get every number. Default: none.
         log_interval: steps between log entries, which are means over them. Default 200.
-        value_limits: largest plausible magnitude of a logged mean, by name; a larger
-            one is warned of once. Default: none.
         description: name of the phase in the progress bar and the logs. Default
             "train".
         progress: show a progress bar on a terminal; elsewhere a line is logged every
             half minute. Default ``True``.
 
     Raises:
-        ValueError: if the folder's checkpoint is beyond ``total_steps``, or the results
-            of the evaluation lack the metric.
+        ValueError: if the folder's checkpoint is beyond ``total_steps``.
         FloatingPointError: if a loss or a gradient is not finite; the batch is saved.
         Interrupted: after SIGTERM, SIGHUP or Ctrl-C, when a checkpoint is written.
         CheckpointError: if a checkpoint in ``folder`` does not fit.
-        OSError: if there is no room for the checkpoints, or their folder is removed.
     """
 
     def __init__(
@@ -108,14 +107,13 @@ class OfflineTrainer(Trainer):
         folder: Path | str,
         *,
         seed: int = 0,
-        hooks: Sequence[tuple[str, Callable[..., Any]]] = (),
+        hooks: Sequence[Hook] = (),
         components: Mapping[str, Any] | None = None,
         evaluation: Evaluation | None = None,
         checkpoint_interval: int | None = None,
         checkpoints_kept: int = 2,
         loggers: Sequence[Logger] = (),
         log_interval: int = 200,
-        value_limits: Mapping[str, float] | None = None,
         description: str = "train",
         progress: bool = True,
     ) -> None:
@@ -143,56 +141,28 @@ class OfflineTrainer(Trainer):
         self.update, self.buffer, self.evaluation = update, replay_buffer, evaluation
         self.loggers, self.description = loggers, description
         self.history: list[dict[str, Any]] = []
-        self.failed_evaluations: list[dict[str, Any]] = []
         self._saved = {"step": 0}
-        self._limits = dict(value_limits or {})
-        self._progress = Progress(description, total_steps, progress)
+        self._progress = progress
         self._stop_request = StopRequest()
-        components = dict(components or {})
-        self._model_components = ["loss_module", *components]
-        own = {
-            "loss_module": update.loss_module,
-            "optimizer": update.optimizer,
-            "sampler": SamplerState(replay_buffer, generator),
-            "global_rng": GlobalRNGState(),
-            "history": self.history,
-            "failed_evaluations": self.failed_evaluations,
-            "progress": self._saved,
-        }
-        if taken := sorted(own.keys() & components):
-            raise ValueError(f"components have names of the trainer's own: {taken}.")
-        self.checkpoints = Checkpoints(
-            folder,
-            own | components,
-            interval=checkpoint_interval,
-            kept=checkpoints_kept,
+        self._model = {"loss_module": update.loss_module, **(components or {})}
+        parts = dict(
+            **self._model,
+            optimizer=update.optimizer,
+            sampler=SamplerState(replay_buffer, generator),
+            global_rng=GlobalRNGState(),
+            history=self.history,
+            progress=self._saved,
         )
-        self._register(hooks)
-
-    def _register(self, hooks: Sequence[tuple[str, Callable[..., Any]]]) -> None:
-        """Register all hooks; they run in this order.
-
-        For each gradient step:
-
-        1. ``process_optim_batch``: draw a batch, then the caller's hooks on it.
-        2. The update: losses, gradients, optimizer, target networks.
-        3. ``post_optim``: the caller's, such as schedules and averages of weights.
-        4. ``post_optim_log``: the buffer's priorities.
-
-        Whenever something is due:
-
-        5. ``post_optim_complete_log``: log the means of the losses.
-        6. ``post_steps``: the caller's, then the checkpoint.
-        7. ``post_steps_log``: the evaluation, after the checkpoint: if it ends the
-           process, no step is lost.
-        """
+        self.checkpoints = Checkpoints(
+            folder, parts, checkpoint_interval, checkpoints_kept
+        )
         self.register_op("process_optim_batch", self._sample)
         self.register_op("post_optim_complete_log", self._log_losses)
         for place, hook in hooks:
             self.register_op(place, hook)
-        sampler = getattr(self.buffer, "sampler", None)
-        if isinstance(sampler, PrioritizedSampler):
-            self.register_op("post_optim_log", self.buffer.update_tensordict_priority)
+        if isinstance(getattr(replay_buffer, "sampler", None), PrioritizedSampler):
+            self.register_op("post_optim_log", replay_buffer.update_tensordict_priority)
+        # The checkpoint is first: if the evaluation ends the process, no step is lost.
         self.register_op("post_steps", self._save_if_due)
         self.register_op("post_steps_log", self._evaluate_if_due)
 
@@ -221,22 +191,18 @@ class OfflineTrainer(Trainer):
         self.resume()
         if self.step == self.total_frames and self._is_evaluated():
             return
-        self.checkpoints.check_room(self.loss_module, self.optimizer)
         # tensordict 0.14.3 searches the disk for pandas in every module call until that
         # is imported: 0.3 ms each, a tenth of a small update.
         with suppress(ImportError):
             import_module("pandas")
-        shown = self._progress.shown(self.step)
-        with shown, signals_noted() as self._stop_request:
+        shown = progress_bar(
+            self.description, self.total_frames, first=self.step, bar=self._progress
+        )
+        with shown as self._bar, signals_noted() as self._stop_request:
             self._evaluate_if_due()  # a kill may have come between both
             super().train()
         if self._stop_request.signal is not None:  # in the last evaluation
             raise self._interrupted(self.step)
-        for row in self.failed_evaluations:
-            log.error(
-                f"{self.description}: no evaluation of step {row['step']}: "
-                f"{row['error']}"
-            )
 
     def resume(self) -> Path | None:
         """Restore the newest whole checkpoint of the folder, if there is one.
@@ -264,9 +230,6 @@ class OfflineTrainer(Trainer):
         """Do as many updates as the counter's batch has rows."""
         self.optim_steps_per_batch = batch.numel()
         super().optim_steps(batch)
-
-    def save_trainer(self, force_save: bool = False) -> None:
-        """Do nothing: TorchRL's loop would save after the evaluation."""
 
     def _save_if_due(self) -> None:
         step = self.collected_frames
@@ -304,18 +267,14 @@ class OfflineTrainer(Trainer):
     def _log_losses(self, _: int, losses: TensorDictBase) -> None:
         """Log the means over a log interval; one copy to the host for all of them."""
         values = torch.stack([each.float() for each in losses.values()]).tolist()
-        means = dict(zip(losses.keys(), values, strict=True))
-        for name in self._limits.keys() & means:
-            if abs(means[name]) > self._limits[name]:
-                log.warning(
-                    f"{self.description}, step {self.collected_frames}: the mean "
-                    f"{name} is {means[name]:.4g}; a magnitude above "
-                    f"{self._limits.pop(name):.4g} means that the values diverge. "
-                    "Lower the critics' learning rate, or check the rewards and the "
-                    "discount. The run continues."
-                )
-        self._send(means)
-        self._progress.update(self.collected_frames)
+        self._log_numbers(dict(zip(losses.keys(), values, strict=True)))
+        self._bar.update(self.collected_frames - self._bar.n)
+
+    def _log_numbers(self, numbers: Mapping[str, float]) -> None:
+        for logger in self.loggers:
+            for name, value in numbers.items():
+                name = f"{self.description}/{name}"
+                logger.log_scalar(name, value, step=self.collected_frames)
 
     def _is_evaluated(self) -> bool:
         steps = [row["step"] for row in self.history]
@@ -323,86 +282,31 @@ class OfflineTrainer(Trainer):
 
     def _evaluate_if_due(self, _: TensorDictBase | None = None) -> None:
         """Evaluate at the interval and at the end, once; keep the best model."""
-        step = self.collected_frames
-        if self.evaluation is None or self._is_evaluated():
+        step, evaluation = self.collected_frames, self.evaluation
+        if evaluation is None or self._is_evaluated():
             return
-        if step % self.evaluation.interval and step != self.total_frames:
+        if step % evaluation.interval and step != self.total_frames:
             return
-        failed = [row for row in self.failed_evaluations if row["step"] != step]
-        try:
-            results = self._results(self.evaluation)
-        except Exception as error:
-            if not self.history:  # no work is lost yet, and the next would fail alike
-                raise
-            failed.append({"step": step, "error": f"{type(error).__name__}: {error}"})
-            log.exception(f"{self.description}: the evaluation of step {step} failed")
-        else:
-            self._keep(results, self.evaluation.metric)
-        self.failed_evaluations[:] = failed
-        if step and step == self._saved["step"]:
-            self.checkpoints.save(step)  # once more, with the result
-
-    def _results(self, evaluation: Evaluation) -> dict[str, Any]:
-        results = {"step": self.collected_frames, **evaluation.run()}
-        if evaluation.metric not in results:
-            raise ValueError(
-                f"the evaluation returned {', '.join(results.keys() - {'step'})}, "
-                f"without the metric {evaluation.metric!r} that decides the best "
-                "checkpoint."
-            )
+        results = finite_or_none({"step": step, **evaluation.run()})
         # As a checkpoint restores them: sorted, lists for tuples.
-        text = json.dumps(finite_or_none(results), sort_keys=True)
-        restored: dict[str, Any] = json.loads(text)
-        return restored
-
-    def _keep(self, results: dict[str, Any], name: str) -> None:
-        """Log an evaluation, and save the model if it is the best so far."""
-        step, metric = self.collected_frames, results[name]
+        results = json.loads(json.dumps(results, sort_keys=True))
+        metric = results[evaluation.metric]
         self.history.append(results)
         text = "-" if metric is None else f"{metric:.4g}"
-        self._progress.result(step, f"{name} {text}")
+        self._bar.set_postfix_str(f"{evaluation.metric} {text}")
         if self.best() is results:
-            metadata = {"step": step, name: metric}
-            self.checkpoints.save_best(self._model_components, metadata)
-        numbers = {
-            key: value for key, value in results.items()
-            if isinstance(value, (int, float)) and key != "step"
-        }  # fmt: skip
-        self._send(numbers)
-
-    def _send(self, numbers: Mapping[str, float]) -> None:
-        step = self.collected_frames
-        self.checkpoints.check_folder()
-        with self.checkpoints.write_errors_explained("the log"):
-            for logger in self.loggers:
-                for name, value in numbers.items():
-                    logger.log_scalar(f"{self.description}/{name}", value, step=step)
-
-    def do_update(self, batch: TensorDictBase) -> TensorDictBase:
-        """Do one update; a batch that gives NaN or infinity is saved."""
-        try:
-            return self.update(batch)
-        except NonfiniteError as error:
-            path = self.checkpoints.folder / "nonfinite" / f"step-{self.step:012d}.pt"
-            record = {
-                "step": self.step,
-                "batch": batch.cpu().to_dict(),
-                "losses": error.losses,
-                "gradients": error.gradients,
-                "loss_module": self.loss_module.state_dict(),
+            metadata = {"step": step, evaluation.metric: metric}
+            self.checkpoints.write(
+                self.checkpoints.best_path, components=self._model, metadata=metadata
+            )
+        self._log_numbers(
+            {
+                name: value for name, value in results.items()
+                if isinstance(value, (int, float)) and name != "step"
             }
-            saved = f"are in {path}: torch.load('{path}', weights_only=True)"
-            try:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                with whole_file(path) as file:
-                    torch.save(record, file)
-            except OSError as full:  # a full disk must not hide why the run stops
-                saved = f"could not be written: {full}"
-            raise FloatingPointError(
-                f"{self.description}: step {self.step}: {error}. The batch, the losses "
-                f"and the parameters before {saved}. Look at the batch, and lower the "
-                f"learning rates. The last checkpoint is {self.checkpoints.latest()}."
-            ) from error
+        )  # fmt: skip
+        if step and step == self._saved["step"]:
+            self.checkpoints.save(step)  # once more, with the result
 
 
 class _StepCounter:
@@ -414,12 +318,6 @@ class _StepCounter:
     init_random_frames = 0
 
     def __init__(self, total: int, intervals: Sequence[int]) -> None:
-        if total < 1 or min(intervals) < 1:
-            raise ValueError(
-                "total_steps and all intervals must be at least 1, got "
-                f"total_steps={total} and log, evaluation and checkpoint intervals "
-                f"{intervals}."
-            )
         self.total, self.intervals, self.step = total, intervals, 0
 
     def __iter__(self) -> Iterator[TensorDictBase]:
@@ -434,11 +332,29 @@ class _StepCounter:
 
 
 class _Stepper(OptimizationStepper):
-    """Pass a batch to the trainer's update."""
+    """Pass a batch to the trainer's update; save one that gives NaN or infinity."""
 
     def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
-        losses: TensorDictBase = trainer.do_update(sub_batch)
-        return losses
+        try:
+            losses: TensorDictBase = trainer.update(sub_batch)
+            return losses
+        except NonfiniteError as error:
+            step, folder = trainer.step, trainer.checkpoints.folder / "nonfinite"
+            folder.mkdir(exist_ok=True)
+            path = folder / f"step-{step:012d}.pt"
+            record = {
+                "step": step,
+                "batch": sub_batch.cpu().to_dict(),
+                "losses": error.losses,
+                "gradients": error.gradients,
+                "loss_module": trainer.loss_module.state_dict(),
+            }
+            torch.save(record, path)
+            raise FloatingPointError(
+                f"{trainer.description}: step {step}: {error}. The batch, the losses "
+                f"and the parameters before are in {path}: torch.load('{path}', "
+                "weights_only=True). Look at the batch, or lower the learning rates."
+            ) from error
 
 
 def cut_back(folder: Path, step: int) -> None:
@@ -458,11 +374,25 @@ def cut_back(folder: Path, step: int) -> None:
             file.truncate(kept)
 
 
-def largest_value(largest_reward: float, gamma: float) -> float:
-    r"""Magnitude that learned values exceed only where they diverge.
+def divergence_warning(largest_reward: float, gamma: float) -> Hook:
+    r"""Return a trainer's hook that warns once of values that diverge.
 
     No policy's value is above :math:`\max|r| / (1 - \gamma)`, the discounted sum of the
     largest reward for ever. Learned values may be: the conservative penalty pushes them
     down, and errors are bootstrapped. Ten times as much is neither.
     """
-    return 10 * largest_reward / (1 - gamma) if gamma < 1 else math.inf
+    limit = 10 * largest_reward / (1 - gamma) if gamma < 1 else math.inf
+    watched = {"pred_value", "target_value"}
+
+    def warn(step: int, losses: TensorDictBase) -> None:
+        for name in sorted(watched.intersection(losses.keys())):
+            value = float(losses[name])
+            if abs(value) > limit:
+                watched.remove(name)
+                log.warning(
+                    f"Step {step}: the mean {name} is {value:.4g}; a magnitude above "
+                    f"{limit:.4g} means that the values diverge. Lower the critics' "
+                    "learning rate, or check the rewards and the discount."
+                )
+
+    return "post_optim_complete_log", warn

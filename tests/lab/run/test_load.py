@@ -98,7 +98,7 @@ def test_the_policy_is_the_average_of_its_weights(tmp_path):
     ("key", "value", "shapes"),
     [
         ("env.observation_size", 17, [r"\(8, 11\)", r"\(8, 17\)"]),
-        ("network.num_cells", [9], [r"\(8, 11\)", r"\(9, 11\)"]),
+        ("network.num_cells", [9], [r"\(8,\)", r"\(9,\)"]),
         ("data.standardize", False, [r"\(11,\)", r"\(\)"]),
     ],
 )

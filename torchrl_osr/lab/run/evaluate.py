@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +47,7 @@ from torchrl_osr.lab.run.load import (
 )
 from torchrl_osr.lab.run.schema import DisturbanceConfig, EvaluateConfig, SuiteConfig
 from torchrl_osr.objectives.networks import head_of, is_categorical
-from torchrl_osr.trainers.progress import Progress
+from torchrl_osr.trainers.progress import progress_bar
 
 SEED_STRIDE = 1000
 """Between checkpoints: no two of them play the same episodes."""
@@ -143,9 +142,9 @@ def play_suite(config: EvaluateConfig, players: list[Player]) -> dict[str, Any]:
     levels = config.suite.disturbances
     suite = {name: levels[name] for name in levels if name not in left_out}
     plays = len(players) * (1 + len(suite))  # the clean episodes first
-    progress = Progress(config.suite.name, plays, bar=config.progress, unit="play")
-    evaluations, played = [], count(1)
-    with progress.shown(0):
+    shown = progress_bar(config.suite.name, plays, unit="play", bar=config.progress)
+    evaluations = []
+    with shown as bar:
         for number, (trained, policy) in enumerate(players):
             seed = config.seed + SEED_STRIDE * number
             paired = evaluate_paired(
@@ -156,7 +155,7 @@ def play_suite(config: EvaluateConfig, players: list[Player]) -> dict[str, Any]:
                 num_episodes=config.episodes,
                 seed=seed,
                 references=references_of(run.env),
-                advance=lambda: progress.update(next(played)),
+                advance=bar.update,
             )
             evaluations.append({"step": trained.step} | paired)
     return {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict
 from functools import partial
@@ -42,8 +42,6 @@ log = logging.getLogger(__name__)
 adam = partial(torch.optim.Adam, fused=True)
 
 EVALUATION_SEED = 10_000  # far from the seeds of the data's episodes
-
-Hook = tuple[str, Callable[..., Any]]
 
 
 def prepare_machine(run: Run) -> tuple[torch.device, torch.dtype | None]:
@@ -208,11 +206,6 @@ def report(run: Run, data_mean: float | None, trainer: OfflineTrainer) -> float:
             logger.experiment.finish()
     if rows:
         print("\n" + score_table(name, history, rows["best"], data_mean, folder))
-    if failed := trainer.failed_evaluations:
-        raise RuntimeError(
-            f"The run is finished, but {len(failed)} of its evaluations failed, the "
-            f"last at step {failed[-1]['step']}: {failed[-1]['error']}"
-        )
     if not rows:
         print(f"\n{name}: nothing was played, for {config.env.id} has no simulator")
         print(f"  {'files':<26}{folder}")

@@ -30,7 +30,6 @@ from torchrl_osr.lab.run.data import TrainingData, load_training_data
 from torchrl_osr.lab.run.folder import Run
 from torchrl_osr.lab.run.load import CHECKPOINTS
 from torchrl_osr.lab.run.parts import (
-    Hook,
     adam,
     averaged,
     evaluation,
@@ -40,7 +39,7 @@ from torchrl_osr.lab.run.parts import (
     save_policies,
     trainer_options,
 )
-from torchrl_osr.trainers import Evaluation, OfflineTrainer, largest_value
+from torchrl_osr.trainers import Evaluation, Hook, OfflineTrainer, divergence_warning
 
 NewTrainer = Callable[..., OfflineTrainer]
 """Makes the trainer of a phase, see :func:`trainer_maker`."""
@@ -220,6 +219,7 @@ def train_policy(
     average = averaged(actor, optim.policy_average)
     components = {"schedule": schedule, "policy_average": average}
     hooks: list[Hook] = [
+        divergence_warning(data.largest_reward, optim.gamma),
         ("post_optim", schedule.step),
         ("post_optim", partial(average.update_parameters, actor)),
     ]
@@ -233,7 +233,6 @@ def train_policy(
         hooks.append(("post_steps", lambda: _log_rollouts(trainer, rollouts)))
     elif optim.n_steps > 1:
         data.buffer.append_transform(take_multi_step)
-    limit = largest_value(data.largest_reward, optim.gamma)
     with evaluation(run, data.norm, average) as evaluate:
         trainer = new_trainer(
             objective,
@@ -248,7 +247,6 @@ def train_policy(
             policy_params=policy,
             evaluation=evaluate,
             description="policy",
-            value_limits={"pred_value": limit, "target_value": limit},
         )
         trainer.train()
     return trainer
