@@ -23,7 +23,6 @@ from torchrl_osr.modules import (
     tanh_gaussian_actor,
     tanh_gaussian_inverse_dynamics,
 )
-from torchrl_osr.objectives import ActorCriticLoss
 from torchrl_osr.trainers import ReplayBufferCollector
 
 OPTIONS: dict[tuple[str, str], Callable[..., Any]] = {
@@ -76,14 +75,19 @@ def option(part: Callable[..., Any]) -> dict[str, Any]:
     What only Python can give is ``null`` and handed over in the call of
     ``instantiate``; what has no default must be set.
     """
-    parameters = dict(inspect.signature(part).parameters)
-    if parameters.pop("options", None):
-        base = inspect.signature(ActorCriticLoss).parameters
-        parameters |= {name: base[name] for name in base if name not in parameters}
+    parameters = _parameters(part)
     defaults = {name: _default(name, each) for name, each in parameters.items()}
     path = f"{part.__module__}.{part.__qualname__}"
     here = f"{build.__module__}.{build.__qualname__}"
     return {"_target_": here, "_partial_": False, "part": path} | defaults
+
+
+def _parameters(part: Any) -> dict[str, inspect.Parameter]:
+    """Return the parameters of a part, and those that its ``**options`` reach."""
+    found = dict(inspect.signature(part).parameters)
+    if found.pop("options", None):
+        found = _parameters(part.__base__) | found
+    return found
 
 
 def _default(name: str, parameter: inspect.Parameter) -> Any:

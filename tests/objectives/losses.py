@@ -174,7 +174,7 @@ RECOVERY, FIT = {"loss_recovery": ACTOR}, {"loss_inverse_dynamics": MODEL}
 SMALL = {"alpha_init": 0.5, "num_random": 3}
 SAC_N = {"alpha_init": 0.5, "min_q_weight": 0.0, "deterministic_backup": False}
 EVERY_OPTION = SMALL | {"target_action_gap": 1.0, "max_q_backup": True}
-EVERY_OPTION |= {"temperature": 1.5, "delay_actor": True}
+EVERY_OPTION |= {"temperature": 1.5}
 LSE = SMALL | {"policy_values": "logsumexp", "recovery_weight": 0.5}
 RELEASED = {"recovery_direction": "reverse", "action_reduction": "mean"}
 RELEASED |= {"recovery_states": "perturbed"}
@@ -238,8 +238,6 @@ def make_loss(
     name: str, networks: Networks | None = None, **options: Any
 ) -> LossModule:
     """Return a loss of the table in float64; its target networks have an updater."""
-    if name in WITH_CRITICS and options.get("reduction") == "none":
-        options = {"scalar_output_mode": "exclude"} | options
     loss = LOSSES[name].build(networks or make_networks(name), **options).double()
     return update_targets(loss)
 

@@ -14,6 +14,7 @@ from objectives.losses import (
     make_batch,
     make_loss,
     record,
+    update_targets,
 )
 from objectives.plain import ALPHA, GAMMA, TARGET_SCALE, compare, following, prepare
 from tensordict import TensorDict
@@ -120,7 +121,7 @@ def test_two_states_and_two_actions_by_hand() -> None:
         table_of_values([[0.0, 5.0], [4.0, 2.0]]),
     ]
     options = {"recovery_weight": 0.0, "min_q_weight": 2.0, "alpha_init": 0.5}
-    loss = DiscreteOSRLoss(actor, critics, delay_qvalue=False, **options)
+    loss = update_targets(DiscreteOSRLoss(actor, critics, **options))
     loss.make_value_estimator(gamma=0.5)
     # s0 -a1-> s1 with reward 1; s1 -a0-> the end with reward 1/2.
     states, ends = torch.eye(2), torch.tensor([[False], [True]])

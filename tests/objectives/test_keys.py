@@ -145,11 +145,3 @@ def test_missing_entries_and_those_of_another_shape_are_named(name) -> None:
             loss(batch.exclude("perturbed"))
     with pytest.raises(ValueError, match="batch is empty .*at least one transition"):
         loss(make_batch(name, 4, 0))
-
-
-def test_what_the_actor_writes_is_not_read_as_a_state() -> None:
-    loss, batch = make_loss("td3-bc"), make_batch("td3-bc", 4)
-    loss.set_keys(action="torque")
-    batch["torque"] = batch["action"]
-    with pytest.raises(KeyError, match="'action' is what the actor writes"):
-        loss(batch)

@@ -168,8 +168,6 @@ OTHER_CRITICS = {
     "activation": lambda critic: critic.module.__setitem__(1, nn.ReLU()),
     "frozen": lambda critic: critic.requires_grad_(False),
     "class": lambda critic: setattr(critic.module, "__class__", Tenfold),
-    "forward": lambda critic: setattr(critic.module, "forward", lambda *x: x[0]),
-    "number": lambda critic: setattr(critic.module, "scale", 10.0),
 }
 
 

@@ -119,20 +119,6 @@ def test_targets_follow_and_are_missed_where_nothing_moves_them(name) -> None:
             torch.testing.assert_close(found, value.data + 0.25)
 
 
-@pytest.mark.parametrize("name", ["cql", "osr", "osr-v"])
-def test_a_delayed_actor_chooses_the_action_of_the_target_alone(name) -> None:
-    batch = make_batch(name, 10)
-    plain, delayed = make_loss(name), make_loss(name, delay_actor=True)
-    assert_same_bits(record(delayed, batch), record(plain, batch))
-    before = call(plain, batch)
-    for loss in (plain, delayed):
-        loss.actor_network_params.data.apply_(lambda each: each.mul_(1.5))
-    moved, held = call(plain, batch), call(delayed, batch)
-    assert torch.equal(held["target_value"], before["target_value"])
-    assert moved["target_value"] != before["target_value"]
-    assert torch.equal(held["loss_actor"], moved["loss_actor"])
-
-
 SCALED = {
     "osr": {"recovery_weight": "loss_actor", "min_q_weight": "loss_cql"},
     "osr-v": {"recovery_weight": "loss_qvalue"},

@@ -72,8 +72,8 @@ WAYS = [
     ("actor", "forward", "mean", "clean"),
     ("actor", "reverse", "mean", "perturbed"),
     ("delta", "reverse", "mean", "both"),
-    ("module", None, "sum", "perturbed"),
-    ("gaussian", None, "sum", "clean"),
+    ("module", "forward", "sum", "perturbed"),
+    ("gaussian", "forward", "sum", "clean"),
 ]
 
 
@@ -210,14 +210,6 @@ def test_states_that_only_the_model_reads_are_read() -> None:
     assert torch.equal(loss(batch.select(*loss.in_keys))[KEY], expected)
 
 
-@pytest.mark.parametrize("kind", ACTORS)
-def test_direction_follows_from_the_actor(kind) -> None:
-    networks = Networks()
-    pair = getattr(networks, kind), networks.model
-    found = StateRecoveryLoss(*pair).recovery_direction
-    assert found == ("forward" if kind == "actor" else "reverse")
-    if kind != "actor":
-        with pytest.raises(ValueError, match="Pass recovery_direction='reverse'"):
-            StateRecoveryLoss(*pair, recovery_direction="forward")
+def test_a_missing_model_is_asked_for() -> None:
     with pytest.raises(ValueError, match="needs an inverse_dynamics_network"):
-        StateRecoveryLoss(pair[0])
+        StateRecoveryLoss(Networks().actor)

@@ -16,18 +16,10 @@ from objectives.losses import (
     record,
 )
 from torchrl.data.postprocs import MultiStep
-from torchrl.objectives import ValueEstimators
-from torchrl.objectives.value import TD0Estimator
 
 with_critics = pytest.mark.parametrize(
     "name", [each for each in ONE_BASE if each in WITH_CRITICS]
 )
-
-
-def target(name: str, batch, *args, **options):
-    loss = make_loss(name)
-    loss.make_value_estimator(*args, **options)
-    return call(loss, batch)["target_value"]
 
 
 def test_target_is_the_reward_and_the_discounted_value() -> None:
@@ -41,34 +33,16 @@ def test_target_is_the_reward_and_the_discounted_value() -> None:
 
 
 @with_critics
-def test_kinds_of_target_agree_where_they_must(name) -> None:
-    batch = make_batch(name, 2, 5)
-    td0 = call(make_loss(name), batch)["target_value"]
-    assert td0 == target(name, batch, "td0", gamma=0.99)
-    assert td0 == target(name, batch, TD0Estimator(gamma=0.99, value_network=None))
-    td1 = target(name, batch, ValueEstimators.TD1)
-    assert td0 != td1
-    # The vectorised estimator of TorchRL 0.14.1 fails at lambda = 0.
-    for lmbda, wanted in {0.0: td0, 1.0: td1}.items():
-        options = {"lmbda": lmbda, "vectorized": False}
-        found = target(name, batch, ValueEstimators.TDLambda, **options)
-        torch.testing.assert_close(found, wanted)
-    zero, half, one = (target(name, batch, gamma=each) for each in (0.0, 0.5, 1.0))
+def test_target_follows_the_discount(name) -> None:
+    loss, batch, found = make_loss(name), make_batch(name, 2, 5), []
+    for gamma in (0.0, 0.5, 1.0):
+        loss.make_value_estimator(gamma=gamma)
+        found.append(call(loss, batch)["target_value"])
+    zero, half, one = found
     torch.testing.assert_close(zero, batch["next", "reward"].mean())
     torch.testing.assert_close(half, (zero + one) / 2)
     with pytest.raises(NotImplementedError):
-        make_loss(name).make_value_estimator(ValueEstimators.GAE)
-
-
-@with_critics
-def test_rows_are_not_taken_for_a_trajectory(name) -> None:
-    loss = make_loss(name)
-    loss.make_value_estimator(ValueEstimators.TDLambda)
-    with pytest.raises(
-        ValueError, match=r"a batch \[B, T\] of trajectories, got \[10\]"
-    ):
-        loss(make_batch(name, 10))
-    assert loss(make_batch(name, 2, 5))["loss_qvalue"].isfinite()
+        loss.make_value_estimator("tdlambda")
 
 
 @pytest.mark.parametrize("name", WRAPPED)

@@ -4,8 +4,8 @@ Shapes: ``B`` batch (any leading dimensions), ``R`` rows (all of ``B`` in one), 
 action, ``N`` critics, ``K`` sampled actions of a kind, ``D`` sets of states: 2 for
 D_tot (clean and perturbed), 1 for either alone.
 
-Networks are called as TorchRL's own losses call them, with one batch dimension: ``D``
-sets of ``R`` rows are ``D * R`` rows. Batch normalisation sees all sets together.
+Networks are called with one batch dimension, as by TorchRL's own losses: ``D`` sets of
+``R`` rows are ``D * R`` rows.
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ from torch import Tensor, nn
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import LossModule, ValueEstimators, distance_loss
 from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
-from torchrl.objectives.value import TD0Estimator
 
 from torchrl_osr import functional as F
 from torchrl_osr._checks import check_positive, check_weight
@@ -60,12 +59,7 @@ Losses = tuple[dict[str, Tensor], dict[str, Tensor]]
 
 
 class StatePolicy:
-    """The policy at all states of a batch: ``policy["both"]`` is a distribution.
-
-    Args:
-        network: the actor.
-        params: the parameters of its distribution at the stack of states.
-    """
+    """The policy at all states of a batch: ``policy["both"]`` is a distribution."""
 
     def __init__(
         self, network: ProbabilisticTensorDictSequential, params: TensorDictBase
@@ -104,10 +98,7 @@ class Critics:
     ) -> tuple[Tensor, Tensor]:
         """Return both terms of CQL(H) at ``s``, ``[N, R]`` each, in one pass.
 
-        Args:
-            batch: the batch.
-            action: sampled ones, ``[M, R, A]``.
-            log_prob: their log-densities, ``[M, R]``.
+        The sampled actions are ``[M, R, A]``, their log-densities ``[M, R]``.
         """
         action = torch.cat([batch.a.unsqueeze(0), action])
         params = self.loss.qvalue_network_params
@@ -123,9 +114,8 @@ class ActorCriticLoss(LossModule):
     """Abstract base of the losses.
 
     A loss registers its networks in its constructor, calls :meth:`declare`, and
-    computes :meth:`losses`. TorchRL 0.14.1 builds ``in_keys`` from sets, so that their
-    order, and with it the meaning of positional arguments, changes from one process to
-    the next; here the order is fixed.
+    computes :meth:`losses`. The order of ``in_keys`` is fixed; in TorchRL 0.14.1 it
+    changes from one process to the next.
 
     Coefficients (``min_q_weight``, ``recovery_weight``, ``gamma``) are options, not
     state: :meth:`load_state_dict` keeps those of the loss that it loads into.
@@ -135,14 +125,11 @@ class ActorCriticLoss(LossModule):
             which TorchRL copies; a list has its own length. Default 2.
         loss_function: distance of the TD error: ``"l2"`` (default), ``"l1"`` or
             ``"smooth_l1"``.
-        delay_qvalue: use target networks, to be moved by
-            :class:`~torchrl.objectives.SoftUpdate`. Default ``True``.
         deactivate_vmap: run the critics one by one. Default ``False``.
-        reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
-        use_prioritized_weights: weigh rows by ``"priority_weight"``; ``"auto"``
-            (default) does when the entry is there.
-        scalar_output_mode: with ``reduction="none"``, ``"exclude"`` (with a warning by
-            default) or ``"non_tensor"`` for the scalar metrics.
+        reduction: ``"mean"`` (default), ``"sum"``, or ``"none"``, which returns the
+            losses alone.
+        use_prioritized_weights: weigh rows by ``"priority_weight"``, if the entry is
+            there. Default ``True``.
     """
 
     default_value_estimator = ValueEstimators.TD0
@@ -164,7 +151,6 @@ class ActorCriticLoss(LossModule):
     # Losses without CQL's term.
     has_cql = max_q_backup = deterministic_backup = False
     target_action_gap: float | None = None
-    delay_actor = False
     reads_perturbed = False
 
     def __init__(
@@ -172,29 +158,16 @@ class ActorCriticLoss(LossModule):
         *,
         num_qvalue_nets: int = 2,
         loss_function: Literal["l2", "l1", "smooth_l1"] = "l2",
-        delay_qvalue: bool = True,
         deactivate_vmap: bool = False,
-        reduction: Literal["none", "mean", "sum"] | None = None,
-        use_prioritized_weights: bool | Literal["auto"] = "auto",
-        scalar_output_mode: Literal["exclude", "non_tensor"] | None = None,
+        reduction: Literal["none", "mean", "sum"] = "mean",
+        use_prioritized_weights: bool = True,
     ) -> None:
         super().__init__()
-        self._in_keys: list[NestedKey] | None = None
         self.num_qvalue_nets = num_qvalue_nets
         self.loss_function = loss_function
-        self.delay_qvalue = delay_qvalue
         self.deactivate_vmap = deactivate_vmap
         self.use_prioritized_weights = use_prioritized_weights
-        self.reduction = reduction or "mean"
-        if self.reduction == "none" and scalar_output_mode is None:
-            warnings.warn(
-                f"{type(self).__name__} with reduction='none' leaves its scalar "
-                "metrics out; pass scalar_output_mode='exclude' to say so, or "
-                "'non_tensor' to keep them.",
-                stacklevel=3,
-            )
-            scalar_output_mode = "exclude"
-        self.scalar_output_mode = scalar_output_mode
+        self.reduction = reduction
         self.critics = Critics(self)
         self._bounds_are_checked = False
 
@@ -208,17 +181,11 @@ class ActorCriticLoss(LossModule):
         self,
         actor_network: TensorDictModuleBase,
         qvalue_network: TensorDictModule | Sequence[TensorDictModule],
-        inverse_dynamics_network: TensorDictModuleBase | None = None,
         *,
         delay_actor: bool = False,
     ) -> None:
-        """Register an actor, critics (one to be copied, or a list), a frozen model."""
-        check_networks(
-            actor_network=actor_network,
-            qvalue_network=qvalue_network,
-            inverse_dynamics_network=inverse_dynamics_network,
-        )
-        self.delay_actor = delay_actor
+        """Register an actor, and critics: one to be copied, or a list."""
+        check_networks(actor_network=actor_network, qvalue_network=qvalue_network)
         self.convert_to_functional(
             actor_network, "actor_network", create_target_params=delay_actor
         )
@@ -229,7 +196,7 @@ class ActorCriticLoss(LossModule):
             qvalue_network,
             "qvalue_network",
             self.num_qvalue_nets,
-            create_target_params=self.delay_qvalue,
+            create_target_params=True,
         )
         if isinstance(qvalue_network, Sequence) and self.num_qvalue_nets == 1:
             # TorchRL 0.14.1 keeps a list of one as expanded views of its parameters,
@@ -243,8 +210,6 @@ class ActorCriticLoss(LossModule):
                 filter_empty=False,
             )
             self.qvalue_network_params = TensorDictParams(own, no_convert=True)
-        if inverse_dynamics_network is not None:
-            self.register_frozen("inverse_dynamics_network", inverse_dynamics_network)
         self._make_vmap()
 
     def register_frozen(self, name: str, network: nn.Module) -> None:
@@ -270,22 +235,21 @@ class ActorCriticLoss(LossModule):
         if any(True for _ in getattr(self, f"{module_name}_params").parameters()):
             super()._reset_module_parameters(module_name, module)
 
-    def register_action_bounds(
-        self,
-        actor_network: TensorDictModuleBase,
-        inverse_dynamics_network: TensorDictModuleBase | None = None,
-    ) -> None:
-        """Register the bounds of a tanh-Gaussian actor; a model must share them."""
-        bounds = action_bounds(actor_network, "actor_network")
-        self.register_bounds(*bounds)
-        if inverse_dynamics_network is not None:
-            name = "inverse_dynamics_network"
-            check_same_bounds(bounds, action_bounds(inverse_dynamics_network, name))
+    def register_action_bounds(self, actor_network: TensorDictModuleBase) -> None:
+        """Register the bounds of a tanh-Gaussian actor."""
+        self.register_bounds(action_bounds(actor_network, "actor_network"))
 
-    def register_bounds(self, low: Tensor, high: Tensor) -> None:
-        """Register bounds of the action, each a number or ``[A]``."""
-        self.register_buffer("action_low", low, persistent=False)
-        self.register_buffer("action_high", high, persistent=False)
+    def register_model(self, network: TensorDictModuleBase) -> None:
+        """Register a trained inverse dynamics model with the actor's bounds, frozen."""
+        name = "inverse_dynamics_network"
+        bounds = self.action_low, self.action_high
+        check_same_bounds(bounds, action_bounds(network, name))
+        self.register_frozen(name, network)
+
+    def register_bounds(self, bounds: Iterable[Tensor]) -> None:
+        """Register low and high of the action, each a number or ``[A]``, if any."""
+        for name, bound in zip(("action_low", "action_high"), bounds, strict=False):
+            self.register_buffer(name, bound, persistent=False)
 
     def register_coefficient(self, name: str, value: float) -> None:
         """Register the weight of a term, which may be assigned later."""
@@ -293,48 +257,12 @@ class ActorCriticLoss(LossModule):
         self.register_buffer(name, torch.tensor(float(value)), persistent=False)
 
     def register_temperature(
-        self,
-        alpha_init: float,
-        fixed_alpha: bool,
-        target_entropy: float | Literal["auto"],
+        self, alpha_init: float, target_entropy: float | Literal["auto"]
     ) -> None:
         """Register the logarithm of SAC's entropy temperature, ``log_alpha``."""
         check_positive("alpha_init", alpha_init)
         self.target_entropy = target_entropy
-        log_alpha = torch.tensor(math.log(alpha_init))
-        if fixed_alpha:
-            self.register_buffer("log_alpha", log_alpha)
-        else:
-            self.log_alpha = nn.Parameter(log_alpha)
-
-    def register_conservative_penalty(
-        self,
-        min_q_weight: float,
-        num_random: int,
-        temperature: float,
-        target_action_gap: float | None,
-        clip_diff_min: float,
-        max_q_backup: bool,
-        deterministic_backup: bool,
-    ) -> None:
-        """Register the options of CQL(H), see :class:`~torchrl_osr.CQLLoss`."""
-        check_positive("num_random", num_random, minimum=1)
-        check_positive("temperature", temperature)
-        self.register_coefficient("min_q_weight", min_q_weight)
-        self.has_cql = min_q_weight > 0
-        if target_action_gap is not None and not self.has_cql:
-            raise ValueError("target_action_gap needs min_q_weight above 0.")
-        if max_q_backup and not deterministic_backup:
-            raise ValueError(
-                "max_q_backup=True takes the best action's value without entropy, as "
-                "CQL does: leave deterministic_backup=True."
-            )
-        if target_action_gap is not None:
-            self.log_alpha_prime = nn.Parameter(torch.zeros(()))
-        self.num_random, self.temperature = num_random, temperature
-        self.target_action_gap, self.clip_diff_min = target_action_gap, clip_diff_min
-        self.max_q_backup = max_q_backup
-        self.deterministic_backup = deterministic_backup
+        self.log_alpha = nn.Parameter(torch.tensor(math.log(alpha_init)))
 
     def _make_vmap(self) -> None:
         if "qvalue_network" in self.__dict__:
@@ -343,27 +271,21 @@ class ActorCriticLoss(LossModule):
             )
 
     def make_value_estimator(
-        self, value_type: ValueEstimators | str | None = None, **hyperparams: Any
+        self,
+        value_type: ValueEstimators | str = ValueEstimators.TD0,
+        *,
+        gamma: float = 0.99,
     ) -> Self:
-        """Choose the TD target: TD(0) with ``gamma=0.99`` unless told otherwise."""
-        value_type, options = self._prepare_value_estimator_kwargs(
-            value_type, **hyperparams
+        """Choose the discount of the TD target, which is TD(0) alone."""
+        names = ("value", "reward", "done", "terminated", "steps_to_next_obs")
+        dispatch_value_estimator(
+            self,
+            value_type,
+            supported=(ValueEstimators.TD0,),
+            tensor_keys={name: getattr(self.tensor_keys, name) for name in names},
+            value_network=None,
+            gamma=gamma,
         )
-        if value_type is not None:
-            names = ("value", "reward", "done", "terminated", "steps_to_next_obs")
-            dispatch_value_estimator(
-                self,
-                value_type,
-                supported=(
-                    ValueEstimators.TD0,
-                    ValueEstimators.TD1,
-                    ValueEstimators.TDLambda,
-                ),
-                tensor_keys={name: getattr(self.tensor_keys, name) for name in names},
-                value_network=None,
-                deactivate_vmap=self.deactivate_vmap,
-                **options,
-            )
         for name, buffer in list(self.value_estimator.named_buffers(recurse=False)):
             self.value_estimator.register_buffer(name, buffer, persistent=False)
         return self
@@ -372,9 +294,8 @@ class ActorCriticLoss(LossModule):
 
     def declare(self, losses: Iterable[str], metrics: Iterable[str]) -> None:
         """Name what the loss writes, in this order."""
-        losses, metrics = list(losses), list(metrics)
-        kept = self.reduction != "none" or self.scalar_output_mode == "non_tensor"
-        self.out_keys = losses + metrics if kept else losses
+        self.out_keys = [*losses, *(metrics if self.reduction != "none" else ())]
+        self._set_in_keys()
 
     def declare_soft_actor_critic(self, *metrics: str) -> None:
         """Name what the losses with SAC's actor write, and further metrics."""
@@ -411,23 +332,8 @@ class ActorCriticLoss(LossModule):
         return found
 
     def _set_in_keys(self) -> None:
-        """Forget the keys: TorchRL calls this when one was renamed."""
-        self._in_keys = None
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """The entries that the loss reads."""
-        if self._in_keys is None:
-            keys = list(dict.fromkeys(self.input_keys()))
-            if torch.compiler.is_compiling():
-                # Kept, they would make torch.compile trace the second call anew.
-                return keys
-            self._in_keys = keys
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
+        """Name the entries that the loss reads; TorchRL calls this in ``set_keys``."""
+        self.in_keys = list(dict.fromkeys(self.input_keys()))
 
     # -- the call ---------------------------------------------------------------------
 
@@ -437,30 +343,16 @@ class ActorCriticLoss(LossModule):
 
         A loss with critics writes the largest absolute TD error of them under the
         ``priority`` key, ``[B]``; nothing else is written into ``tensordict``.
-
-        Args:
-            tensordict: a batch ``[B]`` with the entries of ``in_keys``.
-
-        Raises:
-            ValueError: if the batch is empty.
         """
-        # Not tensordict.numel(), which is at least 1.
         if not tensordict.batch_size.numel():
             raise ValueError(
                 f"The batch is empty (batch_size {tuple(tensordict.batch_size)}): the "
                 f"mean of {type(self).__name__} needs at least one transition."
             )
         losses, metrics = self.losses(self.unpack(tensordict))
-        scalar = losses | metrics
-        if self.reduction == "none":
-            out = TensorDict({}, batch_size=tensordict.batch_size)
-            for name in self.out_keys:
-                if name in losses:
-                    out.set(name, losses[name])
-                else:
-                    out.set_non_tensor(name, metrics[name])
-        else:
-            out = TensorDict({name: scalar[name] for name in self.out_keys}, [])
+        found = losses | metrics
+        size = tensordict.batch_size if self.reduction == "none" else []
+        out = TensorDict({name: found[name] for name in self.out_keys}, size)
         params = [name for name in self._modules if name.endswith("_params")]
         self._clear_weakrefs(tensordict, out, *params)
         return out
@@ -475,14 +367,7 @@ class ActorCriticLoss(LossModule):
         if action is not None and "action_low" in self._buffers:  # real, if integers
             batch.rows.set(self.tensor_keys.action, action.to(dtype))
         if "qvalue_network" in self.__dict__:
-            keys = self.observation_keys
-            if taken := set(keys) & set(self.actor_network.out_keys):
-                key = taken.pop()
-                raise KeyError(
-                    f"{key!r} is what the actor writes, and would be read as a state: "
-                    f"call set_keys(action={key!r})."
-                )
-            batch.stack_states(keys, perturbed=self.reads_perturbed)
+            batch.stack_states(self.observation_keys, perturbed=self.reads_perturbed)
         return batch
 
     # -- networks at states -----------------------------------------------------------
@@ -491,13 +376,6 @@ class ActorCriticLoss(LossModule):
         """Return the policy at all states of a batch, in one call of the actor."""
         network, params = self.actor_network, self.actor_network_params
         return StatePolicy(network, distribution_params(network, params, batch.states))
-
-    def target_policy(self, batch: Transitions, policy: StatePolicy) -> Any:
-        """Return the policy at the next states of the TD target, ``[1, R]``."""
-        if not self.delay_actor:
-            return policy["next"]
-        params = self.target_actor_network_params
-        return distribution(self.actor_network, params, batch.states[SETS["next"]])
 
     def act(self, states: TensorDictBase, params: TensorDictParams) -> Tensor:
         """Return the actions that a deterministic policy writes, ``[..., R, A]``."""
@@ -522,9 +400,6 @@ class ActorCriticLoss(LossModule):
         """Return what an inverse dynamics model reads, ``[D, R]``.
 
         The next state is never perturbed: it is the state to return to.
-
-        Raises:
-            ValueError: if next states are several steps ahead.
         """
         inputs = batch.states_of(state_keys(in_keys), states)
         after = [unravel_key(key[1:]) for key in in_keys if is_next(key)]
@@ -542,13 +417,9 @@ class ActorCriticLoss(LossModule):
         action: Tensor,
         params: TensorDictBase | None = None,
     ) -> Tensor:
-        """Return the values of all critics, ``[N, ..., R]``.
+        """Return the values of all critics, ``[N, ..., R]``, by default the trained.
 
-        Args:
-            states: ``[..., R]``.
-            action: ``[..., R, A]``.
-            params: of the critics. Default: those that are trained;
-                ``qvalue_network_params.detach()`` for the policy's own objective.
+        States are ``[..., R]``, actions ``[..., R, A]``.
         """
         if params is None:
             params = self.qvalue_network_params
@@ -589,11 +460,11 @@ class ActorCriticLoss(LossModule):
     def soft_policy_objective(
         self, batch: Transitions, policy: StatePolicy, states: States
     ) -> tuple[Tensor, Tensor]:
-        """Return SAC's objective of the policy on a set of states.
+        """Return SAC's objective of the policy on a set of states, to be minimised.
 
         Returns:
-            The objective, to be minimised, ``[R]``; the log-density of the policy's own
-            actions, ``[D, R]``.
+            The objective, ``[R]``, and the log-density of the policy's own actions,
+            ``[D, R]``.
         """
         action, log_prob = rsample_and_log_prob(policy[states])
         self.check_actions(batch, action.shape[1:])
@@ -612,12 +483,8 @@ class ActorCriticLoss(LossModule):
     ) -> Losses:
         """Return the losses of SAC's policy and temperature, and their metrics.
 
-        Args:
-            batch: the batch.
-            objective: of the policy, to be minimised, ``[R]``.
-            log_prob: log-density of the policy's own actions, ``[D, R]``.
-            auto: target of ``target_entropy="auto"``, in nats. Default: minus the
-                number of the action's dimensions.
+        The arguments are those of :meth:`soft_policy_objective`; ``auto`` is the target
+        entropy of ``"auto"``, by default minus the number of the action's dimensions.
         """
         wanted = self.target_entropy
         if wanted == "auto":
@@ -629,58 +496,6 @@ class ActorCriticLoss(LossModule):
         }
         entropy = -self.mean(log_prob, batch)
         return losses, {"alpha": self.alpha, "entropy": entropy}
-
-    def critic_losses(self, batch: Transitions, policy: StatePolicy) -> Losses:
-        """Return the TD error and CQL(H)'s penalty, weighted, and their metrics."""
-        losses: dict[str, Tensor] = {}
-        metrics: dict[str, Tensor] = {}
-        if self.has_cql:
-            q_data, gap = self.conservative_gap(batch, policy)
-            if self.target_action_gap is not None:
-                gap, multiplier = F.lagrange_terms(
-                    gap, self.log_alpha_prime, self.target_action_gap
-                )
-                reduced = self.reduce(multiplier.mean(0), batch)
-                losses["loss_alpha_prime"] = self.min_q_weight * reduced
-                metrics["alpha_prime"] = self.log_alpha_prime.detach().exp()
-            losses["loss_cql"] = self.min_q_weight * self.reduce(gap.sum(0), batch)
-        else:
-            q_data = self.q(batch.s, batch.a)
-        error, values = self.td_error(batch, q_data, self.soft_target(batch, policy))
-        losses["loss_qvalue"] = self.reduce(error, batch)
-        return losses, metrics | values
-
-    def conservative_gap(
-        self, batch: Transitions, policy: StatePolicy
-    ) -> tuple[Tensor, Tensor]:
-        """Return :math:`Q_i(s, a)` and CQL(H)'s gap, ``[N, R]`` each."""
-        action, log_prob = self.proposals(batch, policy)
-        q_data, soft_maximum = self.critics.values_and_soft_maximum(
-            batch, action, log_prob
-        )
-        gap = F.conservative_gap(soft_maximum, q_data)
-        if self.clip_diff_min > -math.inf:
-            gap = gap.clamp(min=self.clip_diff_min)
-        return q_data, gap
-
-    @torch.no_grad()
-    def proposals(
-        self, batch: Transitions, policy: StatePolicy
-    ) -> tuple[Tensor, Tensor]:
-        """Draw ``K`` actions each: uniform, from ``pi(s)`` and from ``pi(s')``.
-
-        Returns:
-            Actions ``[3K, R, A]`` and their log-densities ``[3K, R]``.
-        """
-        uniform, log_density = self.uniform_actions(batch.a)
-        # rsample also without gradient: torch's sample reads the scale back to the host
-        # to check its sign.
-        number = (self.num_random,)
-        action, log_prob = rsample_and_log_prob(policy["recorded"], number)
-        return (
-            torch.cat([uniform, action.flatten(0, 1)]),
-            torch.cat([log_density, log_prob.flatten(0, 1)]),
-        )
 
     def uniform_actions(self, like: Tensor) -> tuple[Tensor, Tensor]:
         """Draw ``K`` uniform actions ``[K, ..., A]``, with their log-densities."""
@@ -694,7 +509,7 @@ class ActorCriticLoss(LossModule):
     def soft_target(self, batch: Transitions, policy: StatePolicy) -> Tensor:
         """Return the TD target of an action of the policy at ``s'``, ``[R]``."""
         with torch.no_grad():  # as a decorator here, torch.compile cannot trace it
-            states, pi = batch.states[SETS["next"]], self.target_policy(batch, policy)
+            states, pi = batch.states[SETS["next"]], policy["next"]
             number = (self.num_random,) if self.max_q_backup else ()
             action, log_prob = rsample_and_log_prob(pi, number)
             params = self.target_qvalue_network_params
@@ -708,41 +523,23 @@ class ActorCriticLoss(LossModule):
     def td_target(self, batch: Transitions, next_value: Tensor) -> Tensor:
         r"""Return :math:`r + \gamma (1 - \text{terminated}) V(s')`, ``[R]``.
 
-        Computed by the value estimator that :meth:`make_value_estimator` chose; this is
-        TD(0), the default. The others need trajectories, ``[B, T]``. ``terminated``,
-        not ``done``: a time-out cuts the recording, not the task.
-
-        Args:
-            batch: the batch.
-            next_value: :math:`V(s')`, ``[R]``.
+        ``terminated``, not ``done``: a time-out cuts the recording, not the task. The
+        value :math:`V(s')` is ``[R]``.
         """
-        size, estimator = batch.tensordict.batch_size, self.value_estimator
-        if len(size) < 2 and not isinstance(estimator, TD0Estimator):
-            raise ValueError(
-                f"{type(estimator).__name__} reads the rows of a batch as one "
-                f"trajectory: expected a batch [B, T] of trajectories, got {[*size]}; "
-                "use the default, TD(0)."
-            )
+        estimator = self.value_estimator
         column(batch.rows, nested("next", self.tensor_keys.reward))
         key = nested("next", estimator.tensor_keys.value)
         own = batch.rows.copy().set(key, next_value.unsqueeze(-1))
-        if len(size) != 1:
-            own = own.reshape(size or (1,))
         target: Tensor = estimator.value_estimate(own)
         return target.reshape(-1)
 
     def td_error(
         self, batch: Transitions, pred_value: Tensor, target: Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the critics' summed distance from the TD target, ``[R]``; metrics.
+        """Return the distance of values ``[N, R]`` from a target ``[R]``, and metrics.
 
-        Squared with the default ``loss_function="l2"``. Writes the largest absolute
-        error of the critics into the batch, as priority.
-
-        Args:
-            batch: the batch.
-            pred_value: :math:`Q_i(s, a)`, ``[N, R]``.
-            target: ``[R]``.
+        It is summed over critics, ``[R]``. Writes the largest absolute error of the
+        critics into the batch, as priority.
         """
         error = (pred_value.detach() - target).abs().amax(0)
         given = batch.tensordict
@@ -758,9 +555,8 @@ class ActorCriticLoss(LossModule):
     def check_actions(self, batch: Transitions, shape: torch.Size) -> None:
         """Raise unless the data's actions fit; warn once if they leave the bounds."""
         check_action(batch.a, shape, self.tensor_keys.action)
-        if self._bounds_are_checked or torch.compiler.is_compiling():
-            return
-        if "action_low" not in self._buffers:  # a policy without bounds
+        bounded = "action_low" in self._buffers
+        if self._bounds_are_checked or not bounded or torch.compiler.is_compiling():
             return
         self._bounds_are_checked = True
         low, high = self.action_low, self.action_high
@@ -778,13 +574,10 @@ class ActorCriticLoss(LossModule):
     def reduce(
         self, value: Tensor, batch: Transitions, valid: Tensor | None = None
     ) -> Tensor:
-        """Return a loss reduced as asked, with the batch's masks and weights.
+        """Return a loss ``[R]`` reduced as asked, with the batch's masks and weights.
 
-        Args:
-            value: one number a row, ``[R]``.
-            batch: the batch.
-            valid: rows that count, bool ``[R]``; the others are 0 under ``"none"``.
-                Default: all. A mean over no row, or over weights of 0, is 0.
+        Only ``valid`` rows count, bool ``[R]``; the others are 0 under ``"none"``. A
+        mean over no row, or over weights of 0, is 0.
         """
         weights, counted = self._weights(batch), batch.counted(valid)
         if counted is not None:
@@ -817,7 +610,7 @@ class ActorCriticLoss(LossModule):
 
     def _weights(self, batch: Transitions) -> Tensor | None:
         """Return the rows' importance weights ``[R]``, if there and to be used."""
-        if self.use_prioritized_weights is False:
+        if not self.use_prioritized_weights:
             return None
         given, key = batch.tensordict, self.tensor_keys.priority_weight
         # Not TorchRL's _maybe_get_priority_weight, which fails with a nested key.

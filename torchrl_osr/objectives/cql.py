@@ -10,9 +10,14 @@ import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
+import torch
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from torch import Tensor, nn
+from torchrl.modules.distributions.utils import rsample_and_log_prob
 
-from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses
+from torchrl_osr import functional as F
+from torchrl_osr._checks import check_positive
+from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses, StatePolicy
 from torchrl_osr.objectives.transitions import States, Transitions
 
 
@@ -56,12 +61,8 @@ class CQLLoss(ActorCriticLoss):
             ``False``.
         deterministic_backup: leave the entropy out of the target. Default ``True``.
         alpha_init: initial entropy temperature :math:`\alpha_e`. Default 1.0.
-        fixed_alpha: keep the temperature. Default ``False``.
         target_entropy: in nats; ``"auto"`` (default) is minus the action's size.
-        delay_actor: the action in the TD target is that of a target actor. Default
-            ``False``.
-        options: of every loss, see
-            :class:`~torchrl_osr.objectives.ActorCriticLoss`.
+        options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
     Examples:
         >>> from torchrl_osr import CQLLoss
@@ -87,28 +88,87 @@ class CQLLoss(ActorCriticLoss):
         max_q_backup: bool = False,
         deterministic_backup: bool = True,
         alpha_init: float = 1.0,
-        fixed_alpha: bool = False,
         target_entropy: float | Literal["auto"] = "auto",
-        delay_actor: bool = False,
         **options: Any,
     ) -> None:
+        check_positive("num_random", num_random, minimum=1)
+        check_positive("temperature", temperature)
         super().__init__(**options)
         self.actor_states: States = actor_states
         self.reads_perturbed = actor_states != "clean"
         self.register_action_bounds(actor_network)
-        self.register_actor_critic(
-            actor_network, qvalue_network, delay_actor=delay_actor
-        )
-        self.register_temperature(alpha_init, fixed_alpha, target_entropy)
-        gap = temperature, target_action_gap, clip_diff_min
-        backup = max_q_backup, deterministic_backup
-        self.register_conservative_penalty(min_q_weight, num_random, *gap, *backup)
+        self.register_actor_critic(actor_network, qvalue_network)
+        self.register_temperature(alpha_init, target_entropy)
+        self.register_coefficient("min_q_weight", min_q_weight)
+        self.has_cql = min_q_weight > 0
+        if target_action_gap is not None and not self.has_cql:
+            raise ValueError("target_action_gap needs min_q_weight above 0.")
+        if max_q_backup and not deterministic_backup:
+            raise ValueError(
+                "max_q_backup=True takes the best action's value without entropy, as "
+                "CQL does: leave deterministic_backup=True."
+            )
+        if target_action_gap is not None:
+            self.log_alpha_prime = nn.Parameter(torch.zeros(()))
+        self.num_random, self.temperature = num_random, temperature
+        self.target_action_gap, self.clip_diff_min = target_action_gap, clip_diff_min
+        self.max_q_backup = max_q_backup
+        self.deterministic_backup = deterministic_backup
         self.declare_soft_actor_critic()
         self.make_value_estimator()
 
     def losses(self, batch: Transitions) -> Losses:
-        policy, states = self.policy(batch), self.actor_states
-        objective, log_prob = self.soft_policy_objective(batch, policy, states)
+        return self.cql_losses(batch, self.policy(batch))
+
+    def cql_losses(self, batch: Transitions, policy: StatePolicy) -> Losses:
+        """Return all losses of CQL(H), weighted, and their metrics."""
+        objective, log_prob = self.soft_policy_objective(
+            batch, policy, self.actor_states
+        )
         losses, metrics = self.soft_actor_losses(batch, objective, log_prob)
-        critics, values = self.critic_losses(batch, policy)
-        return losses | critics, metrics | values
+        if self.has_cql:
+            q_data, gap = self.conservative_gap(batch, policy)
+            if self.target_action_gap is not None:
+                gap, multiplier = F.lagrange_terms(
+                    gap, self.log_alpha_prime, self.target_action_gap
+                )
+                reduced = self.reduce(multiplier.mean(0), batch)
+                losses["loss_alpha_prime"] = self.min_q_weight * reduced
+                metrics["alpha_prime"] = self.log_alpha_prime.detach().exp()
+            losses["loss_cql"] = self.min_q_weight * self.reduce(gap.sum(0), batch)
+        else:
+            q_data = self.q(batch.s, batch.a)
+        error, values = self.td_error(batch, q_data, self.soft_target(batch, policy))
+        losses["loss_qvalue"] = self.reduce(error, batch)
+        return losses, metrics | values
+
+    def conservative_gap(
+        self, batch: Transitions, policy: StatePolicy
+    ) -> tuple[Tensor, Tensor]:
+        """Return :math:`Q_i(s, a)` and CQL(H)'s gap, ``[N, R]`` each."""
+        q_data, soft_maximum = self.critics.values_and_soft_maximum(
+            batch, *self.proposals(batch, policy)
+        )
+        gap = F.conservative_gap(soft_maximum, q_data)
+        if self.clip_diff_min > -math.inf:
+            gap = gap.clamp(min=self.clip_diff_min)
+        return q_data, gap
+
+    @torch.no_grad()
+    def proposals(
+        self, batch: Transitions, policy: StatePolicy
+    ) -> tuple[Tensor, Tensor]:
+        """Draw ``K`` actions each: uniform, from ``pi(s)`` and from ``pi(s')``.
+
+        Returns:
+            Actions ``[3K, R, A]`` and their log-densities ``[3K, R]``.
+        """
+        uniform, log_density = self.uniform_actions(batch.a)
+        # rsample also without gradient: torch's sample reads the scale back to the host
+        # to check its sign.
+        number = (self.num_random,)
+        action, log_prob = rsample_and_log_prob(policy["recorded"], number)
+        return (
+            torch.cat([uniform, action.flatten(0, 1)]),
+            torch.cat([log_density, log_prob.flatten(0, 1)]),
+        )

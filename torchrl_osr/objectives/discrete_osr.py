@@ -67,17 +67,9 @@ class DiscreteOSRLoss(ActorCriticLoss):
             be assigned later; 0 *here* leaves the term out.
         temperature: :math:`\tau`, in units of the value. Default 1.0.
         alpha_init: initial entropy temperature :math:`\alpha_e`. Default 1.0.
-        fixed_alpha: keep the temperature. Default ``False``.
         target_entropy: in nats; ``"auto"`` (default) is 0.98 times ``log(n)``, as in
             TorchRL's ``DiscreteSACLoss``: a policy that is nearly uniform.
-        options: of every loss, see
-            :class:`~torchrl_osr.objectives.ActorCriticLoss`.
-
-    Raises:
-        TypeError: if a distribution is not categorical.
-        ValueError: if the model is missing; in the call, if numbers of actions do not
-            match, or the batch is empty or holds several steps a row.
-        KeyError: in the call, if the batch has no perturbed entry.
+        options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
     Examples:
         >>> from torchrl_osr import DiscreteOSRLoss
@@ -95,11 +87,7 @@ class DiscreteOSRLoss(ActorCriticLoss):
 
     @dataclass
     class _AcceptedKeys(TransitionKeys):
-        """The tensordict entries that :meth:`set_keys` can rename.
-
-        Attributes:
-            action_value: what a critic writes. Default ``"action_value"``.
-        """
+        """Those of every loss, and ``action_value``: what a critic writes."""
 
         action_value: NestedKey = "action_value"
 
@@ -116,7 +104,6 @@ class DiscreteOSRLoss(ActorCriticLoss):
         min_q_weight: float = 5.0,
         temperature: float = 1.0,
         alpha_init: float = 1.0,
-        fixed_alpha: bool = False,
         target_entropy: float | Literal["auto"] = "auto",
         **options: Any,
     ) -> None:
@@ -136,8 +123,10 @@ class DiscreteOSRLoss(ActorCriticLoss):
                     "OneHotCategorical: torchrl_osr.modules builds such networks. For "
                     "continuous actions use OSRLoss."
                 )
-        self.register_actor_critic(actor_network, qvalue_network, model)
-        self.register_temperature(alpha_init, fixed_alpha, target_entropy)
+        self.register_actor_critic(actor_network, qvalue_network)
+        if model is not None:
+            self.register_frozen("inverse_dynamics_network", model)
+        self.register_temperature(alpha_init, target_entropy)
         self.register_coefficient("recovery_weight", recovery_weight)
         self.register_coefficient("min_q_weight", min_q_weight)
         self.has_cql, self.temperature = min_q_weight > 0, temperature
@@ -165,7 +154,11 @@ class DiscreteOSRLoss(ActorCriticLoss):
         error, values = self.td_error(batch, q_data, self.soft_target(batch, policy))
         losses["loss_qvalue"] = self.reduce(error, batch)
         if self.has_cql:
-            losses["loss_cql"] = self.min_q_weight * self.penalty(batch, qvalue, q_data)
+            # Exact: each action counts once, and for certain.
+            certain, tau = torch.zeros_like(qvalue), self.temperature
+            soft_maximum = F.soft_maximum(qvalue, certain, temperature=tau)
+            gap = F.conservative_gap(soft_maximum, q_data).sum(0)
+            losses["loss_cql"] = self.min_q_weight * self.reduce(gap, batch)
         return losses, metrics | values
 
     def action_values(
@@ -186,8 +179,8 @@ class DiscreteOSRLoss(ActorCriticLoss):
 
     def data_values(self, batch: Transitions, pi: Any) -> tuple[Tensor, Tensor]:
         """Return values at ``s`` of all actions, ``[N, R, n]``, and the data's."""
-        key, rows = self.tensor_keys.action, batch.rows.batch_size[0]
-        index = action_index(batch.a, pi, rows, key)
+        rows = batch.rows.batch_size[0]
+        index = action_index(batch.a, pi, rows, self.tensor_keys.action)
         qvalue = self.action_values(batch.s, self.qvalue_network_params, pi)
         index = index.expand(qvalue.shape[:-1]).unsqueeze(-1)
         return qvalue, qvalue.gather(-1, index).squeeze(-1)
@@ -197,12 +190,6 @@ class DiscreteOSRLoss(ActorCriticLoss):
         pi, model = policy["both"].logits, self.inverse_dynamics(batch, "both").logits
         check_num_actions("inverse_dynamics_network", model.shape[-1], pi.shape[-1])
         return F.categorical_kl(model, pi).mean(0)
-
-    def penalty(self, batch: Transitions, qvalue: Tensor, q_data: Tensor) -> Tensor:
-        """Return CQL(H)'s penalty, exact: each action once, and for certain."""
-        certain = torch.zeros_like(qvalue)
-        soft_maximum = F.soft_maximum(qvalue, certain, temperature=self.temperature)
-        return self.reduce(F.conservative_gap(soft_maximum, q_data).sum(0), batch)
 
     @torch.no_grad()
     def soft_target(self, batch: Transitions, policy: StatePolicy) -> Tensor:

@@ -74,13 +74,6 @@ class InverseDynamicsLoss(ActorCriticLoss):
         latent_weight: ``w``. Default 0.5, the authors'.
         reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
 
-    Raises:
-        TypeError: if the network ends in another distribution.
-        ValueError: in the call, if the batch is empty, holds several steps a row or
-            actions that are not the network's.
-        KeyError: in the call, if no perturbed entry is there, unless
-            ``states="clean"``.
-
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
@@ -103,22 +96,16 @@ class InverseDynamicsLoss(ActorCriticLoss):
         states: Literal["both", "clean"] = "both",
         loss_function: Literal["nll", "mse"] = "nll",
         latent_weight: float = 0.5,
-        reduction: Literal["none", "mean", "sum"] | None = None,
+        reduction: Literal["none", "mean", "sum"] = "mean",
     ) -> None:
         check_weight("latent_weight", latent_weight)
         # A likelihood of data, not of what a sampler found important.
-        super().__init__(
-            reduction=reduction,
-            use_prioritized_weights=False,
-            scalar_output_mode="exclude",
-        )
-        if is_categorical(inverse_dynamics_network):
-            if loss_function == "mse":
-                raise ValueError("loss_function='mse' needs actions with a distance.")
-        else:
-            bounds = action_bounds(inverse_dynamics_network, "inverse_dynamics_network")
-            for name, bound in zip(("low", "high"), bounds, strict=True):
-                self.register_buffer(f"action_{name}", bound, persistent=False)
+        super().__init__(reduction=reduction, use_prioritized_weights=False)
+        if not is_categorical(inverse_dynamics_network):
+            name = "inverse_dynamics_network"
+            self.register_bounds(action_bounds(inverse_dynamics_network, name))
+        elif loss_function == "mse":
+            raise ValueError("loss_function='mse' needs actions with a distance.")
         self.convert_to_functional(inverse_dynamics_network, "inverse_dynamics_network")
         self.states: Literal["both", "clean"] = states
         self.action_error, self.latent_weight = loss_function, latent_weight
@@ -133,33 +120,27 @@ class InverseDynamicsLoss(ActorCriticLoss):
         return in_keys
 
     def losses(self, batch: Transitions) -> Losses:
-        network, params = (
-            self.inverse_dynamics_network,
-            self.inverse_dynamics_network_params,
-        )
+        network = self.inverse_dynamics_network
         inputs = self.model_inputs(batch, network.in_keys, self.states)
         # A latent is drawn whatever the ambient interaction type.
         with set_interaction_type(InteractionType.RANDOM):
+            params = self.inverse_dynamics_network_params
             output = distribution_params(network, params, inputs)
         value = self.error(batch, output)
         if self.has_latent:
-            value = value + self.latent_weight * self.latent_kl(output)
+            loc, scale = (entry(output, key) for key in LATENT_KEYS)
+            prior = torch.zeros_like(loc), torch.ones_like(scale)
+            kl = F.gaussian_kl(loc, scale, *prior).mean(-1)
+            value = value + self.latent_weight * kl
         loss = self.reduce(value.mean(0), batch, ~batch.done)
         return {"loss_inverse_dynamics": loss}, {}
 
     def error(self, batch: Transitions, output: TensorDictBase) -> Tensor:
         """Return the negative log-likelihood or squared error, ``[D, R]``."""
         model = self.inverse_dynamics_network.build_dist_from_params(output)
-        if self.action_error == "mse":
-            self.check_actions(batch, model.loc.shape[1:])
-            sample: Tensor = model.rsample()
-            return (sample - batch.a).square().mean(-1)
         if not is_categorical(self.inverse_dynamics_network):
             self.check_actions(batch, model.loc.shape[1:])
+        if self.action_error == "mse":
+            sample: Tensor = model.rsample()
+            return (sample - batch.a).square().mean(-1)
         return cloning_distance(model, batch.a, self.tensor_keys.action)
-
-    def latent_kl(self, output: TensorDictBase) -> Tensor:
-        """Return the mean divergence of the latent from its prior, ``[D, R]``."""
-        loc, scale = (entry(output, key) for key in LATENT_KEYS)
-        prior = torch.zeros_like(loc), torch.ones_like(scale)
-        return F.gaussian_kl(loc, scale, *prior).mean(-1)

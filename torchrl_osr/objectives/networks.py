@@ -57,18 +57,20 @@ def is_deterministic(network: TensorDictModuleBase) -> bool:
     return head_of(network)[0] in (None, Delta, TanhDelta)
 
 
-def action_bounds(network: TensorDictModuleBase, name: str) -> tuple[Tensor, Tensor]:
-    """Return the bounds of a network's tanh-Gaussian, each a number or ``[A]``.
-
-    Args:
-        network: a probabilistic TorchRL module.
-        name: its name in an error.
-
-    Raises:
-        TypeError: if it does not end in a :class:`~torchrl.modules.TanhNormal`.
-    """
+def squashing_bounds(network: TensorDictModuleBase) -> tuple[Tensor, ...]:
+    """Return ``low`` and ``high`` of a network that ends in a tanh, or nothing."""
     head, options = head_of(network)
-    if not (isinstance(head, type) and issubclass(head, TanhNormal)):
+    if head not in (TanhNormal, TanhDelta):
+        return ()
+    dtype = torch.get_default_dtype()
+    low = torch.as_tensor(options.get("low", -1.0), dtype=dtype)
+    return low, torch.as_tensor(options.get("high", 1.0), dtype=dtype)
+
+
+def action_bounds(network: TensorDictModuleBase, name: str) -> tuple[Tensor, ...]:
+    """Return the bounds of a tanh-Gaussian; a TypeError names other networks."""
+    head, _ = head_of(network)
+    if head is not TanhNormal:
         cure = "torchrl_osr.modules builds such networks."
         if is_categorical(network):
             cure = "For discrete actions use DiscreteOSRLoss."
@@ -76,38 +78,21 @@ def action_bounds(network: TensorDictModuleBase, name: str) -> tuple[Tensor, Ten
             f"{name} must end in a TanhNormal distribution, got "
             f"{getattr(head, '__name__', head)}. {cure}"
         )
-    return bounds_of(options)
+    return squashing_bounds(network)
 
 
-def bounds_of(options: dict[str, Any]) -> tuple[Tensor, Tensor]:
-    """Return ``low`` and ``high`` of a squashing distribution, -1 and 1 by default."""
-    dtype = torch.get_default_dtype()
-    low = torch.as_tensor(options.get("low", -1.0), dtype=dtype)
-    high = torch.as_tensor(options.get("high", 1.0), dtype=dtype)
-    return low, high
-
-
-def squashing_bounds(network: TensorDictModuleBase) -> tuple[Tensor, ...]:
-    """Return ``low`` and ``high`` of a network that ends in a tanh, or nothing."""
-    head, options = head_of(network)
-    return bounds_of(options) if head in (TanhNormal, TanhDelta) else ()
-
-
-def check_same_bounds(
-    policy: tuple[Tensor, Tensor], inverse_dynamics: tuple[Tensor, Tensor]
-) -> None:
+def check_same_bounds(policy: Sequence[Tensor], model: Sequence[Tensor]) -> None:
     """Raise a ValueError unless policy and model squash to the same interval.
 
     The pre-tanh divergence is that of the actions only for one and the same bijection.
     """
-    pairs = zip(policy, inverse_dynamics, strict=True)
+    pairs = zip(policy, model, strict=True)
     if not all(bool((a.cpu() == b.cpu()).all()) for a, b in pairs):
-        (low, high), (other_low, other_high) = policy, inverse_dynamics
+        ours, theirs = ([bound.tolist() for bound in each] for each in (policy, model))
         raise ValueError(
             "actor_network and inverse_dynamics_network must share their action "
-            f"bounds: the actor has low={low.tolist()}, high={high.tolist()}, the "
-            f"inverse dynamics model low={other_low.tolist()}, "
-            f"high={other_high.tolist()}. Pass the same low= and high= to both."
+            f"bounds: the actor has {ours}, the inverse dynamics model {theirs}. Pass "
+            "the same low= and high= to both."
         )
 
 
@@ -121,10 +106,7 @@ def check_action(action: Tensor, shape: torch.Size, key: NestedKey) -> None:
 
 
 def check_num_actions(name: str, number: int, policy: int) -> None:
-    """Raise a ValueError unless a network's actions have the policy's size.
-
-    Broadcasting would compare a size of 1 with any other without an error.
-    """
+    """Raise a ValueError unless a network's actions have the policy's size."""
     if number != policy:
         raise ValueError(
             f"{name} has {number} actions, but actor_network has {policy}: build both "
@@ -137,14 +119,14 @@ def check_networks(**networks: nn.Module | Sequence[nn.Module] | None) -> None:
 
     Each needs parameters of its own: TorchRL 0.14.1 keeps what critics share as an
     expanded tensor that ``.to()`` and ``copy.deepcopy`` cut off from its source. The
-    critics of a list must be alike: TorchRL stacks their parameters, takes
-    ``requires_grad`` from the first, and calls the first one's ``forward`` for all.
+    critics of a list must be alike: the first one's ``forward`` computes all.
     """
     owners: dict[Tensor, str] = {}
     for name, network in networks.items():
         modules = list(network) if isinstance(network, Sequence) else [network]
-        for module in modules:
-            parameters = () if module is None else tuple(module.parameters())
+        kinds = set()
+        for module in (each for each in modules if each is not None):
+            parameters = tuple(module.parameters())
             for parameter in parameters:
                 if parameter in owners:
                     raise ValueError(
@@ -153,27 +135,13 @@ def check_networks(**networks: nn.Module | Sequence[nn.Module] | None) -> None:
                         "of a list, parameters of its own (copy.deepcopy the encoder)."
                     )
             owners |= dict.fromkeys(parameters, name)
-        kinds = [_kind(each) for each in modules if each is not None]
-        if any(kind != kinds[0] for kind in kinds):
+            trained = tuple(each.requires_grad for each in parameters)
+            kinds.add((repr(module), trained))
+        if len(kinds) > 1:
             raise ValueError(
-                f"the networks of {name} differ in layers, keys, numbers or frozen "
-                "parameters, and all are computed by the first one's: build them alike."
+                f"the networks of {name} differ in layers or frozen parameters, and "
+                "all are computed by the first one's: build them alike."
             )
-
-
-def _kind(network: nn.Module) -> list[Any]:
-    """Return what decides how a network computes, but for its weights."""
-    plain = (bool, int, float, str)
-    return [
-        repr(network),
-        [each.requires_grad for each in network.parameters()],
-        *(
-            (type(each), "forward" in vars(each), name, value)
-            for each in network.modules()
-            for name, value in {"": 0, **vars(each)}.items()
-            if isinstance(value, plain)
-        ),
-    ]
 
 
 def distribution_params(

@@ -6,20 +6,20 @@ equations are in :mod:`torchrl_osr.functional`.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor
 
 from torchrl_osr import functional as F
-from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses, StatePolicy
+from torchrl_osr.objectives.actor_critic import Losses, StatePolicy
+from torchrl_osr.objectives.cql import CQLLoss
 from torchrl_osr.objectives.networks import check_num_actions
-from torchrl_osr.objectives.transitions import Transitions
+from torchrl_osr.objectives.transitions import States, Transitions
 
 
-class OSRLoss(ActorCriticLoss):
+class OSRLoss(CQLLoss):
     r"""Out-of-sample State Recovery by a constraint on the policy (OSR).
 
     .. math::
@@ -37,8 +37,7 @@ class OSRLoss(ActorCriticLoss):
     The entries are those of :class:`~torchrl.objectives.CQLLoss` without warm-up:
     ``loss_actor`` (both terms of :math:`L_\pi`), ``loss_qvalue``, ``loss_cql`` and
     ``loss_alpha``. Each is weighted already and sends gradient to its own parameters
-    only: add them up for one backward and one optimizer step, or use separate
-    optimizers.
+    only: add them up for one backward, or use separate optimizers.
 
     Args:
         actor_network: ends in a :class:`~torchrl.modules.TanhNormal`.
@@ -50,33 +49,9 @@ class OSRLoss(ActorCriticLoss):
 
     Keyword Args:
         recovery_weight: :math:`\lambda`. Default 0.5. May be assigned later.
-        min_q_weight: :math:`\alpha`, weight of the conservative term. Default 5.0. May
-            be assigned later; 0 *here* leaves the term out.
-        num_random: ``K``, actions drawn of each kind (uniform, at ``s``, at ``s'``).
-            Default 10.
-        temperature: :math:`\tau` of the log-sum-exp, in units of the value. Default
-            1.0.
-        target_action_gap: learn a multiplier of the conservative term that holds the
-            gap at this value; adds ``loss_alpha_prime``. Default: none.
-        clip_diff_min: lower bound of the gap, per critic and row, in units of the
-            value. Default: none.
-        max_q_backup: the target takes the best of ``num_random`` actions. Default
-            ``False``.
-        deterministic_backup: leave the entropy out of the target, as CQL does and
-            SAC-N does not. Default ``True``.
-        alpha_init: initial entropy temperature :math:`\alpha_e`. Default 1.0.
-        fixed_alpha: keep the temperature. Default ``False``.
-        target_entropy: in nats; ``"auto"`` (default) is minus the action's size.
-        delay_actor: the action in the TD target is that of a target actor. Default
-            ``False``.
-        options: of every loss, see
-            :class:`~torchrl_osr.objectives.ActorCriticLoss`.
-
-    Raises:
-        TypeError: if a distribution is not a ``TanhNormal``.
-        ValueError: if bounds differ or a number is out of its range; in the call, if
-            the batch is empty or holds several steps a row.
-        KeyError: in the call, if the batch has no perturbed entry.
+        actor_states: where the policy seeks values: ``"both"`` (default) for D_tot, or
+            ``"clean"``.
+        options: of :class:`~torchrl_osr.CQLLoss`.
 
     Examples:
         >>> import torch
@@ -99,7 +74,6 @@ class OSRLoss(ActorCriticLoss):
     """
 
     _schedulable_buffers = frozenset({"recovery_weight", "min_q_weight"})
-    reads_perturbed = True
 
     def __init__(
         self,
@@ -108,41 +82,24 @@ class OSRLoss(ActorCriticLoss):
         inverse_dynamics_network: ProbabilisticTensorDictSequential,
         *,
         recovery_weight: float = 0.5,
-        min_q_weight: float = 5.0,
-        num_random: int = 10,
-        temperature: float = 1.0,
-        target_action_gap: float | None = None,
-        clip_diff_min: float = -math.inf,
-        max_q_backup: bool = False,
-        deterministic_backup: bool = True,
-        alpha_init: float = 1.0,
-        fixed_alpha: bool = False,
-        target_entropy: float | Literal["auto"] = "auto",
-        delay_actor: bool = False,
+        actor_states: States = "both",
         **options: Any,
     ) -> None:
-        super().__init__(**options)
-        networks = actor_network, qvalue_network, inverse_dynamics_network
-        self.register_action_bounds(actor_network, inverse_dynamics_network)
-        self.register_actor_critic(*networks, delay_actor=delay_actor)
-        self.register_temperature(alpha_init, fixed_alpha, target_entropy)
+        networks = actor_network, qvalue_network
+        super().__init__(*networks, actor_states=actor_states, **options)
+        self.reads_perturbed = True
+        self.register_model(inverse_dynamics_network)
         self.register_coefficient("recovery_weight", recovery_weight)
-        gap = temperature, target_action_gap, clip_diff_min
-        backup = max_q_backup, deterministic_backup
-        self.register_conservative_penalty(min_q_weight, num_random, *gap, *backup)
         self.declare_soft_actor_critic("recovery_kl")
-        self.make_value_estimator()
 
     def losses(self, batch: Transitions) -> Losses:
         policy = self.policy(batch)
-        objective, log_prob = self.soft_policy_objective(batch, policy, "both")
-        losses, metrics = self.soft_actor_losses(batch, objective, log_prob)
+        losses, metrics = self.cql_losses(batch, policy)
         recovery = self.recovery(batch, policy)
         term = self.reduce(recovery, batch, batch.has_next)
         losses["loss_actor"] = losses["loss_actor"] + self.recovery_weight * term
         metrics["recovery_kl"] = self.mean(recovery, batch, batch.has_next)
-        critics, values = self.critic_losses(batch, policy)
-        return losses | critics, metrics | values
+        return losses, metrics
 
     def recovery(self, batch: Transitions, policy: StatePolicy) -> Tensor:
         """Return the state-recovery term (11), the mean over D_tot, ``[R]``."""

@@ -58,18 +58,8 @@ class OSRVLoss(ActorCriticLoss):
         num_random: ``K``, actions drawn of each kind. Default 1.
         temperature: of the log-sum-exp. Default 1.0.
         alpha_init: initial entropy temperature :math:`\alpha_e`. Default 1.0.
-        fixed_alpha: keep the temperature. Default ``False``.
         target_entropy: in nats; ``"auto"`` (default) is minus the action's size.
-        delay_actor: the action in the TD target is that of a target actor. Default
-            ``False``.
-        options: of every loss, see
-            :class:`~torchrl_osr.objectives.ActorCriticLoss`.
-
-    Raises:
-        TypeError: if a distribution is not a ``TanhNormal``.
-        ValueError: if bounds differ, the model is missing or a number is out of its
-            range; in the call, if the batch is empty or holds several steps a row.
-        KeyError: in the call, if the batch has no perturbed entry.
+        options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
     Examples:
         >>> from torchrl_osr import OSRVLoss
@@ -96,27 +86,22 @@ class OSRVLoss(ActorCriticLoss):
         num_random: int = 1,
         temperature: float = 1.0,
         alpha_init: float = 1.0,
-        fixed_alpha: bool = False,
         target_entropy: float | Literal["auto"] = "auto",
-        delay_actor: bool = False,
         **options: Any,
     ) -> None:
         check_positive("num_random", num_random, minimum=1)
         check_positive("temperature", temperature)
-        model = {"inverse_dynamics": inverse_dynamics_network, "data": None}[
-            recovery_target
-        ]
-        if recovery_target != "data" and model is None:
+        if recovery_target != "data" and inverse_dynamics_network is None:
             raise ValueError(
                 "OSRVLoss needs an inverse_dynamics_network: pass one, or "
                 "recovery_target='data' for the data's own actions."
             )
         super().__init__(**options)
-        self.register_action_bounds(actor_network, model)
-        self.register_actor_critic(
-            actor_network, qvalue_network, model, delay_actor=delay_actor
-        )
-        self.register_temperature(alpha_init, fixed_alpha, target_entropy)
+        self.register_action_bounds(actor_network)
+        self.register_actor_critic(actor_network, qvalue_network)
+        if recovery_target != "data" and inverse_dynamics_network is not None:
+            self.register_model(inverse_dynamics_network)
+        self.register_temperature(alpha_init, target_entropy)
         self.register_coefficient("recovery_weight", recovery_weight)
         self.recovery_target = recovery_target
         self.policy_values = policy_values

@@ -23,7 +23,6 @@ from torchrl_osr.objectives.networks import (
     CATEGORICAL,
     ONE_HOT,
     action_bounds,
-    bounds_of,
     check_action,
     check_num_actions,
     check_same_bounds,
@@ -71,19 +70,13 @@ class StateRecoveryLoss(ActorCriticLoss):
         recovery_weight: :math:`\lambda`. Default 0.5. May be assigned later.
         recovery_target: what the policy is pulled to: ``"inverse_dynamics"`` (default)
             or ``"data"``, the data's action.
-        recovery_direction: ``"forward"`` is the paper's ``KL(I || pi)``, ``"reverse"``
-            the ``KL(pi || I)`` of the authors' code. ``None`` (default) is forward for
-            a tanh-Gaussian actor and reverse for others, which have no forward one.
+        recovery_direction: of a tanh-Gaussian actor: ``"forward"`` (default) is the
+            paper's ``KL(I || pi)``, ``"reverse"`` the ``KL(pi || I)`` of the authors'
+            code.
         action_reduction: ``"sum"`` (default) over action dimensions, or ``"mean"``.
         recovery_states: ``"both"`` (default) for D_tot, ``"perturbed"``, or
             ``"clean"``, which needs no perturbed entry.
-        options: of every loss, of which ``reduction`` and ``use_prioritized_weights``
-            matter here, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
-
-    Raises:
-        TypeError: if a distribution is another one.
-        ValueError: if bounds differ, the model is missing, or an actor has no forward
-            direction; in the call, if the batch holds several steps a row.
+        options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
     Examples:
         >>> import torch
@@ -112,52 +105,39 @@ class StateRecoveryLoss(ActorCriticLoss):
         *,
         recovery_weight: float = 0.5,
         recovery_target: Literal["inverse_dynamics", "data"] = "inverse_dynamics",
-        recovery_direction: Literal["forward", "reverse"] | None = None,
+        recovery_direction: Literal["forward", "reverse"] = "forward",
         recovery_states: States = "both",
         action_reduction: Literal["sum", "mean"] = "sum",
         **options: Any,
     ) -> None:
-        super().__init__(**({"scalar_output_mode": "exclude"} | options))
+        super().__init__(**options)
         self.recovery_target, self.recovery_states = recovery_target, recovery_states
+        self.recovery_direction: Literal["forward", "reverse"] = recovery_direction
         self.action_reduction: Literal["sum", "mean"] = action_reduction
-        head, settings = head_of(actor_network)
-        self.is_normal = head is IndependentNormal
+        self.is_normal = head_of(actor_network)[0] is IndependentNormal
         self.is_deterministic = is_deterministic(actor_network)
-        by_mean = self.is_deterministic or self.is_normal
-        if by_mean and recovery_direction == "forward":
-            raise ValueError(
-                "actor_network is deterministic, or a Gaussian without a tanh: the "
-                "forward divergence is infinite, or has no closed form. Pass "
-                "recovery_direction='reverse', or none: it pulls the action to the "
-                "mean of the inverse dynamics model."
-            )
-        default: Any = "reverse" if by_mean else "forward"
-        self.recovery_direction = recovery_direction or default
-        metric = "recovery_kl"
+        if self.is_deterministic or self.is_normal:
+            own = squashing_bounds(actor_network)
+        else:
+            own = action_bounds(actor_network, "actor_network")
+        self.metric = "recovery_kl"
         if recovery_target == "data":
-            metric = "recovery_error" if self.is_deterministic else "recovery_nll"
-            if not by_mean:
-                action_bounds(actor_network, "actor_network")
-            if bounds := squashing_bounds(actor_network):
-                self.register_bounds(*bounds)
+            self.metric = "recovery_error" if self.is_deterministic else "recovery_nll"
+            self.register_bounds(own)
         elif inverse_dynamics_network is None:
             raise ValueError(
-                f"recovery_target={recovery_target!r} needs an "
-                "inverse_dynamics_network: pass one, or recovery_target='data' for "
-                "noisy behaviour cloning."
+                "StateRecoveryLoss needs an inverse_dynamics_network: pass one, or "
+                "recovery_target='data' for noisy behaviour cloning."
             )
         else:
             name = "inverse_dynamics_network"
             bounds = action_bounds(inverse_dynamics_network, name)
-            self.register_bounds(*bounds)
-            if not by_mean:
-                check_same_bounds(action_bounds(actor_network, "actor_network"), bounds)
-            elif head is TanhDelta:
-                check_same_bounds(bounds_of(settings), bounds)
+            self.register_bounds(bounds)
+            check_same_bounds(own or bounds, bounds)
             self.register_frozen(name, inverse_dynamics_network)
         self.convert_to_functional(actor_network, "actor_network")
         self.register_coefficient("recovery_weight", recovery_weight)
-        self.declare(["loss_recovery"], [metric])
+        self.declare(["loss_recovery"], [self.metric])
 
     def input_keys(self) -> list[NestedKey]:
         states = state_keys(self.actor_network.in_keys)
@@ -173,14 +153,10 @@ class StateRecoveryLoss(ActorCriticLoss):
     def losses(self, batch: Transitions) -> Losses:
         states = state_keys(self.actor_network.in_keys)
         mixed = batch.states_of(states, self.recovery_states)
-        pi = policy_at(
-            self.actor_network,
-            self.actor_network_params,
-            mixed,
-            self.tensor_keys.action,
-        )
+        network, key = self.actor_network, self.tensor_keys.action
+        pi = policy_at(network, self.actor_network_params, mixed, key)
         if self.recovery_target == "data":
-            recovery = cloning_distance(pi, batch.a, self.tensor_keys.action).mean(0)
+            recovery = cloning_distance(pi, batch.a, key).mean(0)
             self.check_actions(batch, batch.a.shape)
             if self.action_reduction == "mean":
                 recovery = recovery / batch.a.shape[-1]
@@ -188,12 +164,8 @@ class StateRecoveryLoss(ActorCriticLoss):
             model = self.inverse_dynamics(batch, self.recovery_states)
             recovery = self.divergence(pi, model).mean(0)
         term = self.recovery_weight * self.reduce(recovery, batch, batch.has_next)
-        metric = {
-            name: self.mean(recovery, batch, batch.has_next)
-            for name in self.out_keys
-            if name != "loss_recovery"
-        }
-        return {"loss_recovery": term}, metric
+        metric = self.mean(recovery, batch, batch.has_next)
+        return {"loss_recovery": term}, {self.metric: metric}
 
     def divergence(self, pi: Any, model: Any) -> Tensor:
         """Return the recovery term (11) of a policy and a model, ``[D, R]``."""
@@ -235,10 +207,7 @@ class WithRecovery(LossModule):
 
     Args:
         loss: trains an actor, such as TorchRL's ``IQLLoss``.
-        recovery: of that very actor.
-
-    Raises:
-        ValueError: if ``recovery`` is of another actor.
+        recovery: of that very actor; another one is a ValueError.
 
     Examples:
         >>> from torchrl_osr import CQLLoss, StateRecoveryLoss
@@ -317,9 +286,6 @@ def cloning_distance(policy: Any, data_action: Tensor, key: NestedKey) -> Tensor
         policy: what :func:`policy_at` returns.
         data_action: ``[R, A]``; of a discrete policy one-hot or indices.
         key: name of the data's action in an error.
-
-    Raises:
-        ValueError: if the actions have another shape than the policy's.
     """
     if isinstance(policy, (Tensor, TanhDelta, Delta)):
         action = policy if isinstance(policy, Tensor) else policy.deterministic_sample
@@ -343,29 +309,20 @@ def action_index(
 ) -> Tensor:
     """Return a batch's discrete actions as indices, int64 ``[R]``.
 
-    Args:
-        action: one-hot ``[R, n]`` of any type if ``distribution`` is of one-hot
-            actions, or else integer indices ``[R]`` or ``[R, 1]``.
-        distribution: of the network that acts; its ``logits`` end in ``n``.
-        rows: ``R``.
-        key: name of the entry in an error.
-
-    Raises:
-        ValueError: naming the entry, its shape and what was expected.
+    They are one-hot ``[R, n]`` of any type if the distribution is of one-hot actions,
+    or else integer indices ``[R]`` or ``[R, 1]``; a ValueError names others.
     """
-    if isinstance(distribution, ONE_HOT):
+    if one_hot := isinstance(distribution, ONE_HOT):
         expected: Any = [(rows, distribution.logits.shape[-1])]
-        fits = action.shape in expected
     else:
         expected = [(rows,), (rows, 1)]
-        fits = action.shape in expected and not action.is_floating_point()
-    if not fits:
+    if action.shape not in expected or (not one_hot and action.is_floating_point()):
         raise ValueError(
             f"{key!r} has shape {tuple(action.shape)} and type {action.dtype}; the "
             f"actions of a {type(distribution).__name__} have one of {expected}, and "
             "indices are integers."
         )
-    if isinstance(distribution, ONE_HOT):
+    if one_hot:
         # In floating point: torch has no argmax of booleans.
         return action.to(torch.float32).argmax(-1)
     return action.long().reshape(rows)

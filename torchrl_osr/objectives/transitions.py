@@ -119,17 +119,15 @@ class Transitions:
     def stack_states(self, keys: Sequence[NestedKey], *, perturbed: bool) -> None:
         """Stack the states that actor and critics read, see ``states``."""
         ended = column(self.rows, nested("next", self.keys.terminated))
-        clean = self.states_of(keys, "clean")[0]
-        stack = [clean, next_states(self.rows, keys, ended)]
-        if perturbed:
-            stack.append(self.states_of(keys, "perturbed")[0])
-        self.states = torch.stack(stack)
+        sets = self.states_of(keys, "both" if perturbed else "clean")
+        clean, *others = sets.unbind(0)
+        after = next_states(self.rows, keys, ended)
+        self.states = torch.stack([clean, after, *others])
 
     def states_of(self, keys: Sequence[NestedKey], states: States) -> TensorDictBase:
         """Return the entries ``keys`` of D_tot or a half of it, ``[D, R]``.
 
-        The perturbed state is the entry ``("perturbed", key)`` of the same row, as the
-        next state is ``("next", key)``; section 4.1 stacks the two.
+        The perturbed state is the entry ``("perturbed", key)`` of the same row.
 
         Raises:
             KeyError: if no entry has a perturbed one.
@@ -140,19 +138,17 @@ class Transitions:
         )
         if states == "clean":
             return clean.unsqueeze(0)
-        prefix = self.keys.perturbed
-        found = {key: self.rows.get(nested(prefix, key), None) for key in keys}
-        if all(value is None for value in found.values()):
+        perturbed, names = clean.copy(), [nested(self.keys.perturbed, k) for k in keys]
+        if all(self.rows.get(name, None) is None for name in names):
             there = sorted(map(str, self.tensordict.keys(True, True)))
             raise KeyError(
-                f"No perturbed state in the batch: expected one of "
-                f"{[nested(prefix, key) for key in keys]}, the batch has {there}. "
-                "Append StatePerturbation(std=...) to the replay buffer."
+                f"No perturbed state in the batch: expected one of {names}, the batch "
+                f"has {there}. Append StatePerturbation(std=...) to the replay buffer."
             )
-        perturbed = clean.copy()
-        for key, value in found.items():
+        for key, name in zip(keys, names, strict=True):
+            value = self.rows.get(name, None)
             if value is not None:
-                perturbed.set(key, _same_shape(clean, key, nested(prefix, key), value))
+                perturbed.set(key, _same_shape(clean, key, name, value))
         return torch.stack([clean, perturbed][states == "perturbed" :])
 
     @property
@@ -182,6 +178,12 @@ class Transitions:
             return None
         return ~column(self.rows, self.keys.is_synthetic).bool()
 
+    @property
+    def has_next(self) -> Tensor:
+        """Rows of the data whose next state is one, bool ``[R]``."""
+        data = self.is_data
+        return ~self.done if data is None else ~self.done & data
+
     def of_data(self, value: Tensor) -> Tensor:
         """Return ``value``, ``[R]``, with 0 where the action is not the data's."""
         data = self.is_data
@@ -193,12 +195,6 @@ class Transitions:
             return self.unmasked if valid is None else valid
         return valid & self.unmasked
 
-    @property
-    def has_next(self) -> Tensor:
-        """Rows of the data whose next state is one, bool ``[R]``."""
-        data = self.is_data
-        return ~self.done if data is None else ~self.done & data
-
 
 def next_states(
     rows: TensorDictBase, keys: Sequence[NestedKey], absent: Tensor
@@ -208,11 +204,6 @@ def next_states(
     What a loader left as the next state of an ended trajectory may be zeros, the first
     state of the next episode or NaN. Selecting before the networks run keeps such
     values out of the gradient, too (``0 * nan`` is ``nan``).
-
-    Args:
-        rows: ``[R]``.
-        keys: state entries.
-        absent: rows without a true next state, bool ``[R]``.
     """
     found = {}
     for key in keys:
@@ -247,11 +238,8 @@ def _same_shape(
 
 
 def _in_dtype(rows: TensorDictBase, dtype: torch.dtype) -> TensorDictBase:
-    other = [
-        value.is_floating_point() and value.dtype != dtype
-        for value in rows.values(True, True)
-    ]
-    if not any(other):
+    floats = [each for each in rows.values(True, True) if each.is_floating_point()]
+    if all(each.dtype == dtype for each in floats):
         return rows
     return rows.apply(lambda each: each.to(dtype) if each.is_floating_point() else each)
 

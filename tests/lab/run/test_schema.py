@@ -87,13 +87,13 @@ def test_schema_has_the_names_and_defaults_of_the_constructor(name):
 
 @pytest.mark.parametrize(
     ("key", "wrong"),
-    [("recovery_weight", "many"), ("num_random", 1.5), ("delay_qvalue", "perhaps")],
+    [("recovery_weight", "many"), ("num_random", 1.5), ("max_q_backup", "perhaps")],
 )
 def test_types_are_those_of_the_constructor(key, wrong):
     structured = OmegaConf.structured(schema_of(OSRLoss))
     with pytest.raises(ValidationError, match=key):
         structured[key] = wrong
-    structured.target_entropy, structured.reduction = -3, None
+    structured.target_entropy, structured.target_action_gap = -3, None
 
 
 @pytest.mark.parametrize(

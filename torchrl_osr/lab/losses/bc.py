@@ -35,10 +35,9 @@ class BCLoss(ActorCriticLoss):
     """
 
     def __init__(self, actor_network: TensorDictModuleBase, **options: Any) -> None:
-        super().__init__(**({"scalar_output_mode": "exclude"} | options))
+        super().__init__(**options)
         self.convert_to_functional(actor_network, "actor_network")
-        if bounds := squashing_bounds(actor_network):
-            self.register_bounds(*bounds)
+        self.register_bounds(squashing_bounds(actor_network))
         self.declare(["loss_actor"], [])
 
     def input_keys(self) -> list[NestedKey]:

@@ -48,7 +48,7 @@ class EDACLoss(ActorCriticLoss):
 
     Keyword Args:
         diversity_weight: :math:`\eta`. Default 1.0. May be assigned later.
-        alpha_init, fixed_alpha, target_entropy: see :class:`~torchrl_osr.CQLLoss`.
+        alpha_init, target_entropy: see :class:`~torchrl_osr.CQLLoss`.
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
     Examples:
@@ -69,7 +69,6 @@ class EDACLoss(ActorCriticLoss):
         *,
         diversity_weight: float = 1.0,
         alpha_init: float = 1.0,
-        fixed_alpha: bool = False,
         target_entropy: float | Literal["auto"] = "auto",
         **options: Any,
     ) -> None:
@@ -77,7 +76,7 @@ class EDACLoss(ActorCriticLoss):
         self.register_action_bounds(actor_network)
         self.register_actor_critic(actor_network, qvalue_network)
         check_positive("num_qvalue_nets", self.num_qvalue_nets, minimum=2)
-        self.register_temperature(alpha_init, fixed_alpha, target_entropy)
+        self.register_temperature(alpha_init, target_entropy)
         self.register_coefficient("diversity_weight", diversity_weight)
         self.declare_soft_actor_critic("diversity")
         self.make_value_estimator()

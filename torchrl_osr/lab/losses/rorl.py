@@ -63,7 +63,7 @@ class RORLLoss(ActorCriticLoss):
         q_smooth_tau: weight of values that fall against those that rise.
         q_ood_uncertainty_reg, q_ood_uncertainty_reg_min, q_ood_uncertainty_decay:
             :math:`\lambda` at first, what it falls to, and by how much an update.
-        alpha_init, fixed_alpha, target_entropy: see :class:`~torchrl_osr.CQLLoss`.
+        alpha_init, target_entropy: see :class:`~torchrl_osr.CQLLoss`.
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
     Examples:
@@ -93,7 +93,6 @@ class RORLLoss(ActorCriticLoss):
         q_ood_uncertainty_reg_min: float = 0.0,
         q_ood_uncertainty_decay: float = 1e-6,
         alpha_init: float = 1.0,
-        fixed_alpha: bool = False,
         target_entropy: float | Literal["auto"] = "auto",
         **options: Any,
     ) -> None:
@@ -110,7 +109,7 @@ class RORLLoss(ActorCriticLoss):
         self.register_actor_critic(actor_network, qvalue_network)
         if q_ood_reg:  # one critic has no deviation
             check_positive("num_qvalue_nets", self.num_qvalue_nets, minimum=2)
-        self.register_temperature(alpha_init, fixed_alpha, target_entropy)
+        self.register_temperature(alpha_init, target_entropy)
         for name, value in given.items():
             setattr(self, name, value)
         self.num_samples, self.q_smooth_tau = num_samples, q_smooth_tau

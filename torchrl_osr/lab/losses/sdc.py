@@ -99,7 +99,7 @@ class StateDeviationLoss(ActorCriticLoss):
         check_positive("num_samples", num_samples, minimum=1)
         check_positive("kernel_width", kernel_width)
         check_weight("threshold", threshold)
-        super().__init__(**({"scalar_output_mode": "exclude"} | options))
+        super().__init__(**options)
         self.convert_to_functional(actor_network, "actor_network")
         self.register_frozen("dynamics_network", dynamics_network)
         self.register_frozen("transition_network", transition_network)

@@ -12,13 +12,12 @@ import torch
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
-from torchrl.modules import TanhDelta
 
 from torchrl_osr import functional as F
 from torchrl_osr._checks import check_weight
 from torchrl_osr._entries import column, entry, nested
 from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses
-from torchrl_osr.objectives.networks import bounds_of, check_action, head_of
+from torchrl_osr.objectives.networks import check_action, squashing_bounds
 from torchrl_osr.objectives.transitions import Transitions
 
 
@@ -59,18 +58,15 @@ class TD3Loss(ActorCriticLoss):
         check_weight("noise_clip", noise_clip)
         super().__init__(**options)
         self.policy_noise, self.noise_clip = policy_noise, noise_clip
-        head, found = head_of(actor_network)
-        own = bounds_of(found) if head is TanhDelta else None
-        if own is None and (low is None or high is None):
+        own = squashing_bounds(actor_network)
+        if not own and (low is None or high is None):
             raise ValueError(
                 "Pass low= and high= of the environment's actions: the actor's module "
                 "does not have them."
             )
         bounds = own or (torch.as_tensor(low).float(), torch.as_tensor(high).float())
-        self.register_bounds(*bounds)
-        self.register_actor_critic(
-            actor_network, qvalue_network, delay_actor=self.delay_qvalue
-        )
+        self.register_bounds(bounds)
+        self.register_actor_critic(actor_network, qvalue_network, delay_actor=True)
         self.make_value_estimator()
         metrics = [self.metric, "pred_value", "target_value"]
         self.declare(["loss_actor", "loss_qvalue"], metrics)
@@ -198,8 +194,9 @@ class ReBRACLoss(TD3Loss):
     ) -> None:
         check_weight("actor_bc_coef", actor_bc_coef)
         check_weight("critic_bc_coef", critic_bc_coef)
-        super().__init__(actor_network, qvalue_network, **options)
+        # First: input_keys, which the constructor calls, depends on them.
         self.actor_bc_coef, self.critic_bc_coef = actor_bc_coef, critic_bc_coef
+        super().__init__(actor_network, qvalue_network, **options)
 
     def input_keys(self) -> list[NestedKey]:
         keys = super().input_keys()

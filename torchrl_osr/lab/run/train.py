@@ -214,7 +214,7 @@ def train_policy(
     critics, policy = _parameters_of(learner)
     optimizer, schedule = optimizer_of(run, critics, policy)
     targets = None
-    if critics and loss.delay_qvalue:  # cloning has no critics
+    if critics:  # cloning has none
         targets = SoftUpdate(loss, tau=optim.tau)
     average = averaged(actor, optim.policy_average)
     components = {"schedule": schedule, "policy_average": average}
