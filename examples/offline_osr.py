@@ -92,8 +92,7 @@ def train(run: Run) -> float:
     # 2. Data: transitions with standardised states, and a perturbed state beside each
     # state. Both together are the paper's mixed data set D_tot.
     data = load_training_data(config, device)
-    noise = config.perturbation
-    perturbation = StatePerturbation(noise.std, noise=noise.noise, seed=config.seed)
+    perturbation = StatePerturbation(config.perturbation.std, seed=config.seed)
     data.buffer.append_transform(perturbation)
 
     # What all trainers share. A killed run continues from its last checkpoint.

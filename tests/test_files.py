@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
-import struct
-import zipfile
 from collections import namedtuple
 from pathlib import Path
 
@@ -15,7 +12,6 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import array_shapes, arrays, scalar_dtypes
 
 from torchrl_osr._files import (
     check_disk_space,
@@ -57,47 +53,24 @@ def test_a_file_is_written_whole_or_stays_as_it_was(tmp_path):
         (b"\xff{}", "is no text"),
         (b"[1]", "holds no object"),
         (b"{", "is no JSON"),
-        (b" " * 300, "has more than 256 bytes"),
     ],
 )
 def test_other_files_are_no_json(tmp_path, content, message):
     (tmp_path / "card.json").write_bytes(content)
     with pytest.raises(ValueError, match=rf"card\.json {message}"):
-        read_json(tmp_path / "card.json", max_bytes=256)
+        read_json(tmp_path / "card.json")
 
 
-@given(
-    st.dictionaries(
-        st.text("abc", min_size=1),
-        arrays(scalar_dtypes(), array_shapes(max_side=4)),
-        max_size=3,
-    )
-)
-def test_archives_are_read_as_numpy_reads_them(tmp_path_factory, columns):
-    path = tmp_path_factory.mktemp("archives") / "any.npz"
-    np.savez(path, **columns)
-    ours = read_arrays(path)
-    assert ours.keys() == columns.keys()
-    for name, value in columns.items():
-        np.testing.assert_array_equal(ours[name], value)
-
-
-def test_archives_of_objects_and_archives_that_unpack_to_more_are_refused(tmp_path):
-    path, marker = tmp_path / "log.npz", tmp_path / "marker"
+def test_archives_are_read_and_objects_are_not_unpickled(tmp_path):
+    path, marker, rows = tmp_path / "log.npz", tmp_path / "marker", np.arange(3)
+    np.savez(path, reward=rows)
+    assert (read_arrays(path)["reward"] == rows).all()
     np.savez(path, reward=np.array([Marker(marker)] * 3, dtype=object))
-    with pytest.raises(ValueError, match="no NumPy archive of plain arrays"):
-        read_arrays(path)
+    np.save(tmp_path / "one.npy", rows)
+    for each in (path, tmp_path / "one.npy"):
+        with pytest.raises(ValueError, match="no NumPy archive of plain arrays"):
+            read_arrays(each)
     assert not marker.exists()
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("a.npy", bytes(1000))
-        archive.writestr("b.npy", bytes(1000))
-    content = bytearray(path.read_bytes())
-    for place in re.finditer(b"PK\x01\x02", bytes(content)):
-        start = place.start() + 24  # the announced size
-        content[start : start + 4] = struct.pack("<I", 2**32 - 2)
-    path.write_bytes(content)
-    with pytest.raises(ValueError, match="would unpack to 8,589,934,588 bytes"):
-        read_arrays(path)
 
 
 def test_tensors_and_their_record_come_back(tmp_path):

@@ -9,7 +9,7 @@ import pickle
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
+from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import GymEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -27,17 +27,13 @@ def noise(transform: StatePerturbation, *size: int) -> torch.Tensor:
     return transform(observations(*size))[PERTURBED]
 
 
-@pytest.mark.parametrize("kind", ["gaussian", "uniform"])
-def test_noise_has_the_given_standard_deviation(kind) -> None:
+def test_noise_has_the_given_standard_deviation() -> None:
     size, std = 100_000, 1e-3
-    drawn = noise(StatePerturbation(std, noise=kind, seed=0), size) / std
-    # Var(x^2) is 2 for the Gaussian, 9/5 - 1 for the uniform of variance 1.
-    error = ((2.0 if kind == "gaussian" else 0.8) / drawn.numel()) ** 0.5
-    assert abs(drawn.square().mean().item() - 1) < 3 * error
+    drawn = noise(StatePerturbation(std, seed=0), size) / std
+    # Var(x^2) is 2 for the Gaussian.
+    assert abs(drawn.square().mean().item() - 1) < 3 * (2 / drawn.numel()) ** 0.5
     assert abs(drawn.mean().item()) < 3 / drawn.numel() ** 0.5
-    bound = drawn.abs().max().item()
-    # The half-width of that uniform is sqrt(3).
-    assert bound > 4 if kind == "gaussian" else 1.73 < bound < 3**0.5
+    assert drawn.abs().max().item() > 4
 
 
 def test_all_else_is_untouched_and_nothing_happens_in_place(make_batch) -> None:
@@ -48,13 +44,6 @@ def test_all_else_is_untouched_and_nothing_happens_in_place(make_batch) -> None:
     assert (out.select(*before.keys(True, True)) == before).all()
     assert out["observation"].data_ptr() == pointer != out[PERTURBED].data_ptr()
     assert not torch.equal(out[PERTURBED], out["observation"])
-
-
-def test_zero_noise_gives_identical_values() -> None:
-    batch = observations(7, value=0.1)
-    perturbed = StatePerturbation(0.0)(batch)[PERTURBED]
-    assert torch.equal(perturbed, batch["observation"])
-    assert perturbed is not batch["observation"]
 
 
 # -- streams --------------------------------------------------------------------------
@@ -120,11 +109,10 @@ def test_no_two_have_the_same_noise(draws) -> None:
         assert not (one == other).any()
 
 
-@pytest.mark.parametrize("kind", ["gaussian", "uniform"])
-def test_global_generator_is_neither_read_nor_moved(kind) -> None:
+def test_global_generator_is_neither_read_nor_moved() -> None:
     before = torch.get_rng_state()
-    first = StatePerturbation(0.1, noise=kind)
-    second = StatePerturbation(0.1, seed=first.seed, noise=kind)
+    first = StatePerturbation(0.1)
+    second = StatePerturbation(0.1, seed=first.seed)
     drawn = noise(first, 8)
     assert torch.equal(torch.get_rng_state(), before)
     torch.manual_seed(99)
@@ -144,10 +132,9 @@ def test_a_restored_one_continues_the_noise_to_the_bit(used) -> None:
 # -- where it is used -----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", [ReplayBuffer, TensorDictReplayBuffer])
-def test_buffers_sample_perturbed_states_and_keep_their_storage(kind) -> None:
-    transform = StatePerturbation(0.1, seed=0)
-    buffer = kind(storage=LazyTensorStorage(20), batch_size=6, transform=transform)
+def test_a_buffer_samples_perturbed_states_and_keeps_its_storage() -> None:
+    transform, storage = StatePerturbation(0.1, seed=0), LazyTensorStorage(20)
+    buffer = ReplayBuffer(storage=storage, batch_size=6, transform=transform)
     buffer.extend(observations(20, value=1.0).float())
     first, second = buffer.sample(), buffer.sample()
     assert first[PERTURBED].shape == (6, 11)
@@ -158,40 +145,22 @@ def test_buffers_sample_perturbed_states_and_keep_their_storage(kind) -> None:
     assert "perturbed" not in stored.keys()  # noqa: SIM118
 
 
-@pytest.mark.parametrize(
-    ("in_keys", "expected"),
-    [
-        ("observation", ["observation"]),
-        (["observation", ("agent", "pixels")], ["observation", ("agent", "pixels")]),
-        (("agent", "pixels"), [("agent", "pixels")]),
-        ([("agent", "pixels")], [("agent", "pixels")]),
-    ],
-)
-def test_nested_and_several_keys_draw_apart(in_keys, expected) -> None:
+def test_nested_and_several_keys_draw_apart() -> None:
     batch = TensorDict(
         {"observation": torch.ones(4, 3), "agent": {"pixels": torch.ones(4, 3)}}, [4]
     )
-    transform = StatePerturbation(1.0, in_keys=in_keys, perturbed=("noisy", "states"))
-    out = transform(batch)
-    assert transform.in_keys == expected
-    drawn = [out["noisy", "states"][key] for key in expected]
+    keys = ["observation", ("agent", "pixels")]
+    transform = StatePerturbation(1.0, in_keys=keys, perturbed=("noisy", "states"))
+    drawn = [transform(batch)["noisy", "states"][key] for key in keys]
     assert not any((each == 1).any() for each in drawn)
-    assert torch.cat(drawn).unique().numel() == 12 * len(drawn)
+    assert torch.cat(drawn).unique().numel() == 24
 
 
-@pytest.mark.parametrize(
-    ("dtype", "expected"),
-    [
-        (torch.float32, torch.float32),
-        (torch.float64, torch.float64),
-        (torch.uint8, torch.float32),
-        (torch.int64, torch.float32),
-    ],
-)
-def test_floats_keep_their_type_and_integers_become_floats(dtype, expected) -> None:
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.int64])
+def test_floats_keep_their_type_and_integers_become_floats(dtype) -> None:
     batch = TensorDict({"observation": torch.ones(4, 3).to(dtype)}, [4])
     found = StatePerturbation(0.1)(batch)[PERTURBED]
-    assert found.dtype == expected
+    assert found.dtype == (dtype if dtype.is_floating_point else torch.float32)
     assert 0 < (found - 1).abs().max() < 1
 
 
@@ -213,8 +182,6 @@ def test_environment_specs_hold_the_perturbed_state() -> None:
 def test_wrong_arguments_and_missing_states_are_named() -> None:
     with pytest.raises(ValueError, match="std must be at least 0, got nan"):
         StatePerturbation(float("nan"))
-    with pytest.raises(ValueError, match="got 'laplace'"):
-        StatePerturbation(0.1, noise="laplace")
     with pytest.raises(KeyError, match="'state'.*observation"):
         StatePerturbation(0.1, in_keys=["state"])(observations(4))
 

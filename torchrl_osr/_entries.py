@@ -28,11 +28,7 @@ def state_keys(in_keys: Iterable[NestedKey], *exclude: NestedKey) -> list[Nested
 
 
 def entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    """An entry that must be there.
-
-    Raises:
-        KeyError: naming the missing entry and those that are there.
-    """
+    """An entry that must be there; a KeyError names it and those that are there."""
     value: Tensor | None = tensordict.get(key, None)
     if value is None:
         there = sorted(map(str, tensordict.keys(True, True)))
@@ -41,12 +37,7 @@ def entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
 
 
 def column(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    """An entry with one number a row, ``[B, 1]``, as ``[B]``.
-
-    Raises:
-        KeyError: if it is missing.
-        ValueError: if it has another shape.
-    """
+    """An entry with one number a row, ``[B, 1]``, as ``[B]``."""
     value = entry(tensordict, key)
     expected = (*tensordict.batch_size, 1)
     if value.shape != expected:

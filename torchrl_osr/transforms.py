@@ -7,7 +7,7 @@ import itertools
 import multiprocessing
 import os
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
-from torchrl_osr._checks import check_choice, check_weight
+from torchrl_osr._checks import check_weight
 from torchrl_osr._entries import entry, nested
 
 _number = itertools.count()
@@ -29,30 +29,24 @@ class StatePerturbation(Transform):
 
     Appended to a replay buffer it makes the mixed data set D_tot of section 4.1: one
     freshly perturbed state for each clean one, the next state untouched. It works out
-    of place, needs no train mode, leaves the batch size alone and draws from a
-    generator of its own, so that the rest of a run stays the same bits with and without
-    it. In an environment it adds the same entry to observations and specs.
+    of place, leaves the batch size alone and draws from a generator of its own, so that
+    the rest of a run stays the same bits with and without it. In an environment it adds
+    the same entry to observations and specs.
 
     Each transform has noise of its own: one without a ``seed``, a copy, and what a
     worker process of a ``DataLoader`` inherits. ``load_state_dict`` continues the noise
     of the transform that was saved.
 
     Args:
-        std: :math:`\beta`, the noise's standard deviation per dimension, in units of
+        std: :math:`\beta`, the standard deviation of the Gaussian noise, in units of
             the observation.
 
     Keyword Args:
-        in_keys: the states to perturb, a list; a string or a tuple of strings is one
-            key. Integers become floats. Default ``["observation"]``.
-        noise: ``"gaussian"`` (default), or ``"uniform"`` with the same standard
-            deviation (half-width :math:`\sqrt 3\,\beta`).
+        in_keys: the states to perturb. Integers become floats. Default
+            ``["observation"]``.
         perturbed: where to write the perturbed states. Default ``"perturbed"``.
         seed: of the generator. Default: derived from torch's initial seed, the process
             and the number of transforms before this one.
-
-    Raises:
-        ValueError: if ``std`` is negative or infinite, or ``noise`` unknown.
-        KeyError: in the call, if a state is missing.
 
     Examples:
         >>> import torch
@@ -73,22 +67,14 @@ class StatePerturbation(Transform):
         std: float,
         *,
         in_keys: Sequence[NestedKey] = ("observation",),
-        noise: Literal["gaussian", "uniform"] = "gaussian",
         perturbed: NestedKey = "perturbed",
         seed: int | None = None,
     ) -> None:
         check_weight("std", std)
-        check_choice("noise", noise, ("gaussian", "uniform"))
-        is_one = isinstance(in_keys, str) or (
-            isinstance(in_keys, tuple) and all(isinstance(key, str) for key in in_keys)
-        )
-        keys: list[Any] = [in_keys] if is_one else list(in_keys)
-        keys = [key[0] if len(key) == 1 else key for key in keys]
-        super().__init__(
-            in_keys=keys, out_keys=[nested(perturbed, key) for key in keys]
-        )
+        keys = [in_keys] if isinstance(in_keys, str) else list(in_keys)
+        perturbed_keys = [nested(perturbed, key) for key in keys]
+        super().__init__(in_keys=keys, out_keys=perturbed_keys)
         self.register_buffer("std", torch.tensor(std, dtype=torch.float64))
-        self.noise = noise
         self.seed = _derived("new", next(_number)) if seed is None else seed
         self._copies, self._process = 0, _process[0]
         self._generator: torch.Generator | None = None
@@ -119,16 +105,6 @@ class StatePerturbation(Transform):
             generator.set_state(loaded)
             self._loaded = None
 
-    def _perturb(self, state: Tensor) -> Tensor:
-        generator = self._generator_on(state.device)
-        draw = torch.randn if self.noise == "gaussian" else torch.rand
-        noise = draw(
-            state.shape, generator=generator, dtype=state.dtype, device=state.device
-        )
-        if self.noise == "uniform":
-            noise = (2 * noise - 1) * 3**0.5
-        return torch.addcmul(state, noise, self.std.to(state))
-
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Add the perturbed states to a batch of any shape."""
         for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
@@ -136,7 +112,10 @@ class StatePerturbation(Transform):
             state = state.to(_floating(state.dtype))
             if self.std.device != state.device:
                 self.to(state.device)  # once: a copy at each draw keeps a GPU waiting
-            tensordict.set(out_key, self._perturb(state))
+            generator = self._generator_on(state.device)
+            options = {"dtype": state.dtype, "device": state.device}
+            noise = torch.randn(state.shape, generator=generator, **options)
+            tensordict.set(out_key, torch.addcmul(state, noise, self.std.to(state)))
         return tensordict
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:

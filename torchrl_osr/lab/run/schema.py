@@ -100,7 +100,6 @@ class PerturbationConfig:
     """Noise of the mixed data set, see StatePerturbation."""
 
     std: float = MISSING  # width of the noise, in deviations of the data
-    noise: str = MISSING  # gaussian or uniform
     # Options of Adversary, which chooses the policy's perturbed states instead.
     adversary: Any = None
 

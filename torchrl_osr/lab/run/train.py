@@ -61,10 +61,7 @@ def train(run: Run) -> float:
     # Transitions with standardised states. Each batch gets a perturbed state for every
     # state, which is the paper's mixed data set.
     data = load_training_data(config, device, learner.objective.in_keys)
-    noise: Any = config.perturbation.noise
-    perturbation = StatePerturbation(
-        config.perturbation.std, noise=noise, seed=config.seed
-    )
+    perturbation = StatePerturbation(config.perturbation.std, seed=config.seed)
     data.buffer.append_transform(perturbation)
 
     new_trainer = trainer_maker(run, data, perturbation, options, autocast)
