@@ -75,15 +75,6 @@ def test_equations_7_and_11_differ_by_the_mutual_information() -> None:
         assert (each - marginal).item() == pytest.approx(math.log(5) / 2, abs=1e-12)
 
 
-def test_recovery_at_clean_states_asks_for_the_behaviour_policy() -> None:
-    # Proposition 2: at s^ = s the model's mean over s' is the behaviour policy.
-    behaviour = [tensor.requires_grad_() for tensor in tensors(-0.3, 0.4)]
-    policy = [tensor.expand(2, 1) for tensor in behaviour]
-    value = functional.state_recovery(*policy, *MODEL).mean()
-    for gradient in torch.autograd.grad(value, behaviour):
-        assert gradient.item() == pytest.approx(0, abs=1e-12)
-
-
 # (.4 + .2)^2 / (2 * .5^2) and (1 - 0)^2 / (2 * 2^2), by hand.
 @pytest.mark.parametrize(("reduction", "expected"), [("sum", 0.845), ("mean", 0.4225)])
 def test_deterministic_recovery_matches_hand_computed_numbers(
@@ -146,17 +137,6 @@ def test_soft_maximum_of_draws_estimates_an_integral(temperature) -> None:
     estimate = value.item() - temperature * math.log(number)
     integral = temperature * math.sinh(2 / temperature)
     assert estimate == pytest.approx(temperature * math.log(integral), abs=1e-8)
-
-
-# The actions of SOFT_MAXIMUM, and a mean of 1 of the model's.
-@pytest.mark.parametrize(("temperature", "expected"), SOFT_MAXIMUM)
-def test_value_constraint_weighs_actions_by_density(temperature, expected) -> None:
-    policy, log_prob = torch.tensor([[2.0, 6.0], [0.5, 2.0]]).double().log()
-    model = torch.tensor([2.0, 0.0, 1.0]).double()
-    value = functional.value_constraint(
-        policy, model, log_prob=log_prob, temperature=temperature
-    )
-    assert value.item() == pytest.approx(expected - 1, abs=1e-6)
 
 
 def test_value_constraint_has_a_floor_with_the_logsumexp_alone() -> None:

@@ -1,10 +1,8 @@
 """What the paper proves, on random tabular problems: how far each statement holds.
 
-The losses work on continuous actions and are tested elsewhere. Here states and actions
-are few and every expectation is exact, so that a sentence of docs/method.md about a
-theorem can be counted: true in all problems, in some, or in none. Theorem 1 is about
-categorical distributions, for which the package has no function: that test checks the
-documentation alone. The others call ``functional.value_constraint``.
+States and actions are few and every expectation is exact, so that a sentence of
+docs/method.md about a theorem can be counted: true in all problems, in some, or in
+none. The test of theorem 1 checks the documentation alone.
 """
 
 from __future__ import annotations
@@ -131,18 +129,6 @@ def test_theorem_2_bounds_the_gap_to_the_behaviour_policy_for_positive_values() 
     signed = (gap(mdp.qvalue) > bound(mdp.qvalue).abs()).sum().item()
     assert 0.02 < signed / PROBLEMS < 0.2
     assert (gap(mdp.qvalue) <= bound(positive)).sum() == PROBLEMS
-
-
-def test_constraint_has_a_known_fixed_point_where_there_are_data() -> None:
-    """The squared error has no factor of a half here: hence the 2 below."""
-    mdp = problems()
-    wanted = torch.randn(PROBLEMS, ACTIONS, dtype=torch.float64)  # the target T
-    pull = mdp.policy - mdp.target
-    qvalue = (wanted - ALPHA * pull / (2 * mdp.off_behaviour)).requires_grad_()
-    error = (mdp.off_behaviour * (qvalue - wanted).square()).sum(-1)
-    loss = error + ALPHA * constraint(qvalue, mdp.policy, mdp.target)
-    (gradient,) = torch.autograd.grad(loss.sum(), qvalue)
-    torch.testing.assert_close(gradient, 0 * gradient, rtol=0, atol=1e-12)
 
 
 def test_off_the_data_values_may_rise_unlike_cqls() -> None:

@@ -5,8 +5,8 @@ Learning" (Jiang et al., NeurIPS 2023), https://openreview.net/forum?id=4gLWjSaw
 
 Shapes: ``B`` batch (any leading dimensions), ``A`` action, ``N`` critics, ``M``
 sampled actions of one state, ``n`` discrete actions. Every function returns one number
-a sample; the loss modules weigh and reduce. A comment marks each departure from the
-printed paper, and gives the reason.
+a sample, ``[B]`` unless it says otherwise; the loss modules weigh and reduce.
+Departures from the printed paper are marked, with the reason.
 
 Symbols: ``pi`` policy, ``I`` inverse dynamics model, ``s`` clean state, ``s^``
 perturbed state, ``s~`` a state of the mixed data set (clean and perturbed).
@@ -30,14 +30,8 @@ def gaussian_kl(
         + \frac{\sigma_p^2 + (\mu_p - \mu_q)^2}{2\sigma_q^2} - \frac12
 
     It is also the divergence of the two *tanh*-Gaussians with these pre-tanh
-    parameters and equal bounds, because a bijection leaves the KL unchanged.
-
-    Args:
-        loc_p, scale_p: mean and standard deviation of ``p``, ``[B, A]``.
-        loc_q, scale_q: mean and standard deviation of ``q``, ``[B, A]``.
-
-    Returns:
-        ``[B, A]``, each entry at least 0.
+    parameters and equal bounds, because a bijection leaves the KL unchanged. Means,
+    standard deviations and the result are ``[B, A]``.
 
     Examples:
         >>> p, q = torch.tensor([0.4]), torch.tensor([-0.2])
@@ -59,14 +53,8 @@ def categorical_kl(log_prob_p: Tensor, log_prob_q: Tensor) -> Tensor:
         \sum_a p(a) \, [\log p(a) - \log q(a)]
 
     An action that ``p`` never takes counts for nothing, whatever ``q`` says of it; one
-    that only ``q`` never takes makes the divergence infinite.
-
-    Args:
-        log_prob_p: normalised log-probabilities of ``p``, ``[B, n]``.
-        log_prob_q: normalised log-probabilities of ``q``, ``[B, n]``.
-
-    Returns:
-        ``[B]``, each entry at least 0.
+    that only ``q`` never takes makes the divergence infinite. Log-probabilities are
+    normalised, ``[B, n]``.
 
     Examples:
         >>> p, q = torch.tensor([0.5, 0.5, 0.0]), torch.tensor([0.25, 0.5, 0.25])
@@ -106,9 +94,6 @@ def state_recovery(
             ``KL(pi || I)`` of the authors' released code.
         action_reduction: ``"sum"`` over action dimensions as in (12), ``"mean"`` as
             in the released code.
-
-    Returns:
-        ``[B]``.
     """
     policy = (policy_loc, policy_scale)
     model = (inverse_dynamics_loc, inverse_dynamics_scale)
@@ -129,19 +114,11 @@ def deterministic_recovery(
     .. math::
         \sum_d \frac{(x_d - \mu_{I,d})^2}{2\sigma_{I,d}^2}
 
-    with :math:`x` the policy's action before the tanh. An addition, not in the paper,
-    whose divergence needs two densities: towards a point :math:`KL(I \,\|\, \pi)` is
-    infinite. This is the part of the reverse :math:`KL(\pi \,\|\, I)` that depends on
-    the mean of a Gaussian policy of fixed width.
-
-    Args:
-        policy_loc: pre-tanh action at ``s~``, ``[B, A]``.
-        inverse_dynamics_loc, inverse_dynamics_scale: pre-tanh inverse dynamics
-            model at ``(s~, s')``, ``[B, A]``.
-        action_reduction: ``"sum"`` or ``"mean"`` over action dimensions.
-
-    Returns:
-        ``[B]``, each entry at least 0; 0 where the action is the model's mean.
+    with :math:`x` the policy's action before the tanh, ``policy_loc``. An addition, not
+    in the paper, whose divergence needs two densities: towards a point
+    :math:`KL(I \,\|\, \pi)` is infinite. This is the part of the reverse
+    :math:`KL(\pi \,\|\, I)` that depends on the mean of a Gaussian policy of fixed
+    width. The arguments are those of :func:`state_recovery`.
 
     Examples:
         >>> action, loc = torch.tensor([0.4, 1.0]), torch.tensor([-0.2, 0.0])
@@ -170,9 +147,6 @@ def soft_policy_value(
         log_prob: log-density of the sampled action, ``[B]``.
         qvalue: values of that action, ``[N, B]``.
         alpha: entropy temperature, a scalar.
-
-    Returns:
-        ``[B]``.
     """
     return alpha * log_prob - qvalue.min(0).values
 
@@ -195,9 +169,6 @@ def bootstrap_value(
             entropy. Default ``None``, the paper's.
         alpha: entropy temperature, a scalar.
 
-    Returns:
-        ``[B]``.
-
     Examples:
         >>> bootstrap_value(torch.tensor([[1.0, 4.0], [2.0, 3.0]]))
         tensor([1., 3.])
@@ -216,15 +187,8 @@ def discrete_policy_value(
         \, [\alpha_e \log\pi(a \mid \tilde s) - \min_i Q_i(\tilde s, a)]
 
     "Soft Actor-Critic for Discrete Action Settings", https://arxiv.org/abs/1910.07207:
-    nothing is sampled. With ``alpha=0`` it is minus the value of the state.
-
-    Args:
-        log_prob: normalised log-probabilities of the policy, ``[B, n]``.
-        qvalue: values of every action, ``[N, B, n]``.
-        alpha: entropy temperature, a scalar.
-
-    Returns:
-        ``[B]``.
+    nothing is sampled. With ``alpha=0`` it is minus the value of the state. The
+    policy's log-probabilities are normalised, ``[B, n]``, the values ``[N, B, n]``.
 
     Examples:
         >>> qvalue = torch.tensor([[[2.0, 1.0]], [[3.0, 0.0]]])
@@ -245,30 +209,14 @@ def temperature_objective(
     .. math::
         -\log\alpha_e \, \big(\log\pi(\hat a \mid \tilde s) + \bar{\mathcal H}\big)
 
-    Args:
-        log_alpha: logarithm of the temperature, a scalar.
-        log_prob: log-density of the policy's own action, ``[B]``; treated as constant.
-        target_entropy: the entropy the policy should keep, in nats.
-
-    Returns:
-        ``[B]``.
+    The log-density of the policy's own action, ``[B]``, is treated as constant. The
+    policy should keep the target entropy, in nats.
     """
     return -log_alpha * (log_prob.detach() + target_entropy)
 
 
 def action_distance(action: Tensor, data_action: Tensor) -> Tensor:
-    r"""Squared distance of an action from the data's, in squared action units.
-
-    .. math::
-        \|a - a_D\|^2 = \sum_d (a_d - a_{D,d})^2
-
-    Args:
-        action: ``[B, A]``.
-        data_action: ``[B, A]``.
-
-    Returns:
-        ``[B]``.
-    """
+    r"""Squared distance :math:`\|a - a_D\|^2` of actions ``[B, A]`` from the data's."""
     return (action - data_action).square().sum(-1)
 
 
@@ -289,9 +237,6 @@ def soft_maximum(
         qvalue: values of the sampled actions, ``[B, M]``.
         log_prob: log-density of each action under what drew it, ``[B, M]``.
         temperature: :math:`\tau`, in units of the value.
-
-    Returns:
-        ``[B]``.
 
     Examples:
         >>> two_uniform_actions = torch.tensor([1.0, 3.0])
@@ -315,14 +260,8 @@ def conservative_gap(soft_maximum: Tensor, data_qvalue: Tensor) -> Tensor:
     sum is not divided by ``M``: a constant, without effect on the gradient.
 
     TorchRL 0.14.1 ``CQLLoss`` differs: it takes the log-sum-exp over three actions at
-    a time and scores the actions of ``pi(s')`` at ``s'``.
-
-    Args:
-        soft_maximum: the first term, see :func:`soft_maximum`, ``[B]``.
-        data_qvalue: value of the data's action, ``[B]``.
-
-    Returns:
-        ``[B]``.
+    a time and scores the actions of ``pi(s')`` at ``s'``. The first term is that of
+    :func:`soft_maximum`, ``[B]``, the second the value of the data's action, ``[B]``.
     """
     return soft_maximum - data_qvalue
 
@@ -346,7 +285,7 @@ def lagrange_terms(
         threshold: :math:`\tau`, the gap that is tolerated, in units of the value.
 
     Returns:
-        The critics' term and the multiplier's, each ``[B]``.
+        The critics' term and the multiplier's.
     """
     # The bound is that of the reference code: a gap that cannot be closed would let
     # the multiplier overflow.
@@ -381,9 +320,6 @@ def value_constraint(
         log_prob: log-density of each sampled action under what drew it, ``[B, M]``.
             Default ``None``, the paper's plain mean.
         temperature: of the log-sum-exp, in units of the value.
-
-    Returns:
-        ``[B]``.
     """
     target = inverse_dynamics_qvalue.mean(-1)
     if log_prob is None:

@@ -113,8 +113,7 @@ class StatePerturbation(Transform):
             if self.std.device != state.device:
                 self.to(state.device)  # once: a copy at each draw keeps a GPU waiting
             generator = self._generator_on(state.device)
-            options = {"dtype": state.dtype, "device": state.device}
-            noise = torch.randn(state.shape, generator=generator, **options)
+            noise = state.new_empty(state.shape).normal_(generator=generator)
             tensordict.set(out_key, torch.addcmul(state, noise, self.std.to(state)))
         return tensordict
 

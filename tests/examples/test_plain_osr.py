@@ -69,7 +69,7 @@ def draw_as_ours(*_):
     )
 
 
-def test_losses_and_gradients_equal_ours(both, make_batch, check):
+def test_losses_equal_ours(both, make_batch, check):
     loss, _, plain = both
     torch.manual_seed(5)
     ours = loss(make_batch(B))
@@ -78,22 +78,6 @@ def test_losses_and_gradients_equal_ours(both, make_batch, check):
     assert set(reference) == set(LOSSES)
     values = [[losses[key] for key in LOSSES] for losses in (ours, reference)]
     check("plain OSR", *values, tolerance=1e-12)
-
-    sum(values[0]).backward()
-    critic = reference["loss_qvalue"] + reference["loss_cql"]
-    wanted = [
-        *torch.autograd.grad(reference["loss_actor"], list(plain.actor.parameters())),
-        *torch.autograd.grad(reference["loss_alpha"], [plain.log_alpha]),
-    ]
-    each = [list(critic.parameters()) for critic in plain.critics]
-    gradients = torch.autograd.grad(critic, each[0] + each[1])
-    half = len(each[0])
-    pairs = zip(gradients[:half], gradients[half:], strict=True)
-    wanted += [torch.stack(pair) for pair in pairs]
-    got = [p.grad for p in loss.actor_network_params.values(True, True)]
-    got.append(loss.log_alpha.grad)
-    got += [p.grad for p in loss.qvalue_network_params.values(True, True)]
-    check("plain OSR", got, wanted, tolerance=1e-8)
 
 
 def test_update_moves_the_same_weights_as_ours(both, make_batch, check):

@@ -114,32 +114,15 @@ def test_a_loss_and_its_networks_from_a_file(composed, name, kind) -> None:
 def test_a_buffers_batches_are_a_collectors_frames() -> None:
     data = TensorDict({"row": torch.arange(50.0)}, [50])
 
-    def batches(frames: int, seed: int | None = None, after: int = 0):
-        buffer = make_replay_buffer(data, batch_size=5, seed=0)
-        collector = ReplayBufferCollector(buffer, total_frames=frames)
-        if seed is not None:
-            assert collector.set_seed(seed) == seed
-        collector.load_state_dict({"frames": after})
-        found = [batch["row"] for batch in collector]
-        assert collector.state_dict()["frames"] >= frames
-        return torch.stack(found)
-
-    assert batches(20).shape == (4, 5)
-    assert batches(20, after=10).shape == (2, 5)
-    assert torch.equal(batches(20, seed=3), batches(20, seed=3))
-    assert not torch.equal(batches(20, seed=3), batches(20, seed=4))
-
-
-def test_a_collector_goes_on_with_the_draws_that_come_next() -> None:
-    data = TensorDict({"row": torch.arange(50.0)}, [50])
-
-    def make() -> ReplayBufferCollector:
+    def make(seed: int = 7) -> ReplayBufferCollector:
         buffer = make_replay_buffer(data, batch_size=5, seed=0)
         collector = ReplayBufferCollector(buffer, total_frames=20)
-        collector.set_seed(7)
+        assert collector.set_seed(seed) == seed
         return collector
 
-    whole = torch.stack([batch["row"] for batch in make()])
+    whole, other = (torch.stack([b["row"] for b in make(seed)]) for seed in (7, 8))
+    assert whole.shape == (4, 5)
+    assert not torch.equal(whole, other)
     first, second = make(), make()
     draws = iter(first)
     assert torch.equal(torch.stack([next(draws)["row"] for _ in range(2)]), whole[:2])

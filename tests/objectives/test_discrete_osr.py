@@ -14,21 +14,16 @@ from objectives.losses import (
     make_batch,
     make_loss,
     record,
-    update_targets,
 )
 from objectives.plain import ALPHA, GAMMA, TARGET_SCALE, compare, following, prepare
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
-from torch import Tensor, nn
+from torch import Tensor
 from torch.distributions import Categorical, kl_divergence
 from torch.distributions import OneHotCategorical as TorchOneHotCategorical
-from torchrl.modules import OneHotCategorical, ProbabilisticActor
+from torchrl.modules import OneHotCategorical
 
-from torchrl_osr import DiscreteOSRLoss
-
-TEMPERATURE, WEIGHT, TARGET_ENTROPY = 1.7, 2.5, 0.4
+TEMPERATURE, WEIGHT, TARGET_ENTROPY = 1.7, 2.5, 0.98 * math.log(ACTIONS)
 OPTIONS = {"min_q_weight": WEIGHT, "temperature": TEMPERATURE}
-OPTIONS |= {"target_entropy": TARGET_ENTROPY}
 
 
 def restated(networks: Networks, batch: TensorDict, recovery_weight: float):
@@ -98,51 +93,6 @@ def test_losses_and_gradients_equal_the_restatement(
     loss = prepare(make_loss("discrete", networks, **options))
     label = "Discrete OSR" if recovery_weight else "Discrete CQL(H)"
     compare(check, label, loss, batch, *expected)
-
-
-def table_of_values(values: list[list[float]]) -> TensorDictModule:
-    """Return a critic whose weights are the values of all states and actions."""
-    layer = nn.Linear(len(values), len(values[0]), bias=False)
-    layer.weight.data = torch.tensor(values).T.clone()
-    return TensorDictModule(layer, ["observation"], ["action_value"])
-
-
-def test_two_states_and_two_actions_by_hand() -> None:
-    logits = nn.Linear(2, 2, bias=False)
-    # pi(s0) = (1/2, 1/2) and pi(s1) = (1/4, 3/4).
-    logits.weight.data = torch.tensor([[0.0, 0.0], [0.0, math.log(3.0)]])
-    actor = ProbabilisticActor(
-        TensorDictModule(logits, ["observation"], ["logits"]),
-        in_keys=["logits"],
-        distribution_class=OneHotCategorical,
-    )
-    critics = [
-        table_of_values([[1.0, 2.0], [0.0, 3.0]]),
-        table_of_values([[0.0, 5.0], [4.0, 2.0]]),
-    ]
-    options = {"recovery_weight": 0.0, "min_q_weight": 2.0, "alpha_init": 0.5}
-    loss = update_targets(DiscreteOSRLoss(actor, critics, **options))
-    loss.make_value_estimator(gamma=0.5)
-    # s0 -a1-> s1 with reward 1; s1 -a0-> the end with reward 1/2.
-    states, ends = torch.eye(2), torch.tensor([[False], [True]])
-    after = {"observation": states[[1, 0]], "reward": torch.tensor([[1.0], [0.5]])}
-    after |= {"done": ends, "terminated": ends}
-    rows = {"observation": states, "action": torch.eye(2)[[1, 0]], "next": after}
-    out = loss(TensorDict(rows, [2]))
-    # min Q = (0, 2) at s0 and (0, 2) at s1: V(s1) = 3/2, targets 1 + 3/4 and 1/2.
-    assert out["target_value"].item() == pytest.approx((1.75 + 0.5) / 2)
-    # Errors 2 - 1.75 and 0 - .5 of the first critic, 5 - 1.75 and 4 - .5 of the other.
-    td = (0.25**2 + 0.5**2 + 3.25**2 + 3.5**2) / 2
-    assert out["loss_qvalue"].item() == pytest.approx(td)
-    # log(1 + e^-1), 3 + log(1 + e^-3), log(1 + e^-5), log(1 + e^-2).
-    gap = (0.3132617 + 3.0485874 + 0.0067153 + 0.1269280) / 2
-    assert out["loss_cql"].item() == pytest.approx(2.0 * gap, abs=1e-6)
-    # log 2 and log(4) / 4 + 3 log(4/3) / 4, halved by alpha; values 1 and 3/2.
-    entropies = 0.6931472, 0.5623351
-    assert out["loss_actor"].item() == pytest.approx((-0.5 * sum(entropies) - 2.5) / 2)
-    # The default target is 0.98 of the uniform policy's entropy.
-    wanted = 0.6931472 * (0.98 * 0.6931472 - sum(entropies) / 2)
-    assert out["loss_alpha"].item() == pytest.approx(wanted, abs=1e-6)
 
 
 FORMS = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from objectives.losses import Networks, density, make_batch
+from objectives.losses import Networks, make_batch
 from objectives.plain import BOX, Plain
 from torch import Tensor
 from torch.distributions import Categorical, Normal, kl_divergence
@@ -31,34 +31,16 @@ def compare(check, label: str, loss, batch, expected: Tensor, network) -> None:
     check(label, found, [expected.detach(), *slopes], tolerance=1e-12)
 
 
-@pytest.mark.parametrize("states", STATES)
-def test_loss_and_gradients_equal_the_plain_likelihood(check, states) -> None:
-    networks, batch = Networks(**BOX), make_batch("model", 10)
-    plain = Plain(networks, actor="model")
-    pairs, valid = kept_pairs(batch, states)
-    log_prob = plain.log_prob(
-        density(plain.actor, *pairs.split(3, -1)), batch["action"]
-    )
-    expected = -log_prob.mean(0)[valid].mean()
-    loss = InverseDynamicsLoss(networks.model, states=states)
-    assert (("perturbed", "observation") in loss.in_keys) == (states == "both")
-    batch = batch.select(*loss.in_keys)
-    compare(check, "Inverse dynamics", loss, batch, expected, plain.actor)
-
-
-@pytest.mark.parametrize("states", STATES)
 @pytest.mark.parametrize("head", [None, Categorical])
-def test_discrete_loss_and_gradients_equal_the_cross_entropy(
-    check, states, head
-) -> None:
+def test_discrete_loss_and_gradients_equal_the_cross_entropy(check, head) -> None:
     networks = Networks(head=head) if head else Networks()
     plain, batch = Networks().choice_model, make_batch("choice-model", 10)
-    pairs, valid = kept_pairs(batch, states)
+    pairs, valid = kept_pairs(batch, "both")
     index = batch["action"].argmax(-1)
     log_prob = Categorical(logits=plain[0](*pairs.split(3, -1))).log_prob(index)
     if head:
         batch["action"] = index
-    loss = InverseDynamicsLoss(networks.choice_model, states=states)
+    loss = InverseDynamicsLoss(networks.choice_model)
     label, expected = "Discrete inverse dynamics", -log_prob.mean(0)[valid].mean()
     compare(check, label, loss, batch, expected, plain)
 
@@ -78,7 +60,7 @@ def plain_cvae(network, pairs: Tensor) -> tuple[Tensor, ...]:
 @pytest.mark.parametrize("states", STATES)
 @pytest.mark.parametrize("latent", [False, True])
 @pytest.mark.parametrize("function", ["mse", "nll"])
-def test_squared_error_and_latent_equal_the_plain_ones(
+def test_likelihood_squared_error_and_latent_equal_the_plain_ones(
     check, states, latent, function
 ) -> None:
     kind = "latent_model" if latent else "model"
@@ -86,6 +68,7 @@ def test_squared_error_and_latent_equal_the_plain_ones(
     batch = make_batch("model", 10)
     options = {"loss_function": function, "latent_weight": 3.0, "states": states}
     loss = InverseDynamicsLoss(network, **options)
+    assert (("perturbed", "observation") in loss.in_keys) == (states == "both")
     pairs, valid = kept_pairs(batch, states)
     helper = Plain(Networks(**BOX))
     torch.manual_seed(2)

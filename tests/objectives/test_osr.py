@@ -8,7 +8,6 @@ import pytest
 import torch
 from objectives.losses import (
     Networks,
-    call,
     density,
     make_batch,
     make_loss,
@@ -78,18 +77,3 @@ def test_released_variant_equals_the_restatement(check) -> None:
     loss = make_loss("official", networks, **(DEFAULTS | SOFT))
     loss.recovery.recovery_weight = RECOVERY_WEIGHT
     compare(check, "OSR, official variant", prepare(loss), batch, *expected)
-
-
-def test_metric_is_the_unweighted_recovery_term() -> None:
-    loss, batch = make_loss("osr", recovery_weight=2.0), make_batch("osr", 10)
-    out = call(loss, batch)
-    loss.recovery_weight = 0.0
-    added = out["loss_actor"] - call(loss, batch)["loss_actor"]
-    torch.testing.assert_close(added.detach(), 2 * out["recovery_kl"])
-
-
-def test_model_is_called_once() -> None:
-    networks, called = Networks(), []
-    networks.model[0].register_forward_pre_hook(lambda *_: called.append(1))
-    make_loss("osr", networks)(make_batch("osr", 10))
-    assert len(called) == 1

@@ -8,10 +8,8 @@ import pytest
 import torch
 from objectives.losses import (
     Networks,
-    call,
     density,
     make_batch,
-    make_loss,
     update_targets,
 )
 from objectives.plain import BOX, SOFT, Plain, compare, following, prepare
@@ -87,13 +85,3 @@ def test_losses_and_gradients_equal_the_restatement(
     loss = update_targets(loss.double())
     label = "OSR-v" + " on the data's actions" * (target == "data")
     compare(check, label, prepare(loss), batch, *expected)
-
-
-def test_metric_is_the_constraint_and_may_be_scheduled_from_zero() -> None:
-    loss, batch = make_loss("osr-v", recovery_weight=0.0), make_batch("osr-v", 10)
-    before = call(loss, batch)
-    loss.recovery_weight = WEIGHT
-    after = call(loss, batch)
-    assert torch.equal(before["recovery_gap"], after["recovery_gap"])
-    added = after["loss_qvalue"] - before["loss_qvalue"]
-    torch.testing.assert_close(added.detach(), WEIGHT * after["recovery_gap"])

@@ -120,10 +120,13 @@ def test_targets_follow_and_are_missed_where_nothing_moves_them(name) -> None:
 
 
 SCALED = {
-    "osr": {"recovery_weight": "loss_actor", "min_q_weight": "loss_cql"},
-    "osr-v": {"recovery_weight": "loss_qvalue"},
-    "discrete": {"recovery_weight": "loss_actor", "min_q_weight": "loss_cql"},
-    "edac": {"diversity_weight": "loss_qvalue"},
+    "osr": {
+        "recovery_weight": ("loss_actor", "recovery_kl"),
+        "min_q_weight": ("loss_cql", None),
+    },
+    "osr-v": {"recovery_weight": ("loss_qvalue", "recovery_gap")},
+    "discrete": {"recovery_weight": ("loss_actor", "recovery_kl")},
+    "edac": {"diversity_weight": ("loss_qvalue", "diversity")},
 }
 
 
@@ -131,7 +134,7 @@ SCALED = {
 def test_coefficients_scale_their_terms_and_may_be_assigned(name) -> None:
     batch, loss = make_batch(name, 10), make_loss(name)
     before = call(loss, batch)
-    for weight, key in SCALED[name].items():
+    for weight, (key, metric) in SCALED[name].items():
         buffer, old = getattr(loss, weight), getattr(loss, weight).item()
         setattr(loss, weight, 0.0)
         without = call(loss, batch)[key]
@@ -139,6 +142,8 @@ def test_coefficients_scale_their_terms_and_may_be_assigned(name) -> None:
         assert getattr(loss, weight) is buffer
         term = before[key] - without
         assert term != 0
+        if metric:  # the metric is the term without its weight
+            torch.testing.assert_close(term.detach(), old * before[metric])
         torch.testing.assert_close(call(loss, batch)[key], without + 3 * term)
         setattr(loss, weight, old)
 

@@ -17,14 +17,14 @@ from objectives.losses import (
 from objectives.plain import BOX, UNIT
 from torch import Tensor, nn
 from torch.distributions import kl_divergence
-from torchrl.modules import Actor
-from torchrl.objectives import IQLLoss, SACLoss, SoftUpdate, TD3BCLoss
+from torchrl.objectives import IQLLoss, SACLoss, TD3BCLoss
 
 from torchrl_osr import StateRecoveryLoss
 from torchrl_osr.objectives import WithRecovery
 
 KEY = "loss_recovery"
 ACTORS = ["actor", "delta", "module", "gaussian"]
+KINDS = {"iql": "actor", "sac": "actor", "td3-bc": "delta"}
 STATES = {"clean": [0], "perturbed": [1], "both": [0, 1]}
 
 
@@ -134,21 +134,16 @@ def test_gradient_is_finite_where_the_action_has_saturated(kind) -> None:
 
 
 def other_loss(kind: str, networks: Networks):
-    """Return a loss of TorchRL and the actor in it."""
-    networks.plain_actor = Actor(networks.module.module, in_keys=["observation"])
+    """Return a loss of TorchRL for an actor."""
+    actor, critics = getattr(networks, KINDS[kind]), networks.critics
     if kind == "iql":
-        loss = IQLLoss(networks.actor, networks.critics, networks.value)
+        loss = IQLLoss(actor, critics, networks.value)
     elif kind == "sac":
-        loss = SACLoss(networks.actor, networks.critics, target_entropy=-2.0)
+        loss = SACLoss(actor, critics, target_entropy=-2.0)
     else:
-        actor = getattr(networks, kind)
-        loss = TD3BCLoss(actor, networks.critics, bounds=(-1.0, 1.0))
+        loss = TD3BCLoss(actor, critics, bounds=(-1.0, 1.0))
     loss.make_value_estimator(gamma=0.9)
-    SoftUpdate(loss.double(), tau=0.1)
-    return loss, getattr(networks, kind) if kind not in (
-        "iql",
-        "sac",
-    ) else networks.actor
+    return update_targets(loss.double())
 
 
 def backward(losses, parameters) -> list[Tensor]:
@@ -161,10 +156,10 @@ def backward(losses, parameters) -> list[Tensor]:
     ]
 
 
-@pytest.mark.parametrize("kind", ["iql", "sac", "delta", "plain_actor"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_beside_torchrls_losses_the_actor_gets_both_gradients(kind) -> None:
     networks, batch = Networks(), make_batch("osr", 10)
-    other, actor = other_loss(kind, networks)
+    other, actor = other_loss(kind, networks), getattr(networks, KINDS[kind])
     recovery = StateRecoveryLoss(actor, networks.model).double()
     assert set(recovery.parameters()) == set(actor.parameters())
     names, parameters = zip(*other.named_parameters(), strict=True)
@@ -178,25 +173,16 @@ def test_beside_torchrls_losses_the_actor_gets_both_gradients(kind) -> None:
 
 
 def test_combined_losses_train_and_load_as_one() -> None:
-    def make():
-        networks = Networks()
-        loss = make_loss("td3-bc", networks)
-        term = StateRecoveryLoss(networks.module, networks.model).double()
-        return WithRecovery(loss, term)
-
-    first, second, batch = make(), make(), make_batch("osr", 10)
-    assert first.in_keys[-1] == PERTURBED
-    optimizer = torch.optim.SGD(first.parameters(), lr=0.1)
+    first, second = (make_loss("official") for _ in range(2))
+    batch = make_batch("official", 10)
     out = first(batch.select(*first.in_keys))
     assert list(out.keys()) == first.out_keys
     sum(out[key] for key in out.keys() if key.startswith("loss_")).backward()  # noqa: SIM118
-    optimizer.step()
-    assert update_targets(first)
+    torch.optim.SGD(first.parameters(), lr=0.1).step()
     second.load_state_dict(first.state_dict())
-    for ours, theirs in zip(second.parameters(), first.parameters(), strict=True):
-        assert torch.equal(ours, theirs)
+    assert all(map(torch.equal, second.parameters(), first.parameters()))
     with pytest.raises(ValueError, match="of another actor than the loss's"):
-        WithRecovery(make().loss, make().recovery)
+        WithRecovery(first.loss, second.recovery)
 
 
 def test_states_that_only_the_model_reads_are_read() -> None:

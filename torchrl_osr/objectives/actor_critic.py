@@ -235,9 +235,17 @@ class ActorCriticLoss(LossModule):
         if any(True for _ in getattr(self, f"{module_name}_params").parameters()):
             super()._reset_module_parameters(module_name, module)
 
-    def register_action_bounds(self, actor_network: TensorDictModuleBase) -> None:
-        """Register the bounds of a tanh-Gaussian actor."""
+    def register_soft_actor_critic(
+        self,
+        actor_network: TensorDictModuleBase,
+        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+        alpha_init: float,
+        target_entropy: float | Literal["auto"],
+    ) -> None:
+        """Register a tanh-Gaussian actor, critics, and SAC's entropy temperature."""
         self.register_bounds(action_bounds(actor_network, "actor_network"))
+        self.register_actor_critic(actor_network, qvalue_network)
+        self.register_temperature(alpha_init, target_entropy)
 
     def register_model(self, network: TensorDictModuleBase) -> None:
         """Register a trained inverse dynamics model with the actor's bounds, frozen."""

@@ -96,9 +96,8 @@ class CQLLoss(ActorCriticLoss):
         super().__init__(**options)
         self.actor_states: States = actor_states
         self.reads_perturbed = actor_states != "clean"
-        self.register_action_bounds(actor_network)
-        self.register_actor_critic(actor_network, qvalue_network)
-        self.register_temperature(alpha_init, target_entropy)
+        networks = actor_network, qvalue_network
+        self.register_soft_actor_critic(*networks, alpha_init, target_entropy)
         self.register_coefficient("min_q_weight", min_q_weight)
         self.has_cql = min_q_weight > 0
         if target_action_gap is not None and not self.has_cql:

@@ -97,11 +97,10 @@ class OSRVLoss(ActorCriticLoss):
                 "recovery_target='data' for the data's own actions."
             )
         super().__init__(**options)
-        self.register_action_bounds(actor_network)
-        self.register_actor_critic(actor_network, qvalue_network)
+        networks = actor_network, qvalue_network
+        self.register_soft_actor_critic(*networks, alpha_init, target_entropy)
         if recovery_target != "data" and inverse_dynamics_network is not None:
             self.register_model(inverse_dynamics_network)
-        self.register_temperature(alpha_init, target_entropy)
         self.register_coefficient("recovery_weight", recovery_weight)
         self.recovery_target = recovery_target
         self.policy_values = policy_values

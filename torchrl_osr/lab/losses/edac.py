@@ -73,10 +73,9 @@ class EDACLoss(ActorCriticLoss):
         **options: Any,
     ) -> None:
         super().__init__(**options)
-        self.register_action_bounds(actor_network)
-        self.register_actor_critic(actor_network, qvalue_network)
+        networks = actor_network, qvalue_network
+        self.register_soft_actor_critic(*networks, alpha_init, target_entropy)
         check_positive("num_qvalue_nets", self.num_qvalue_nets, minimum=2)
-        self.register_temperature(alpha_init, target_entropy)
         self.register_coefficient("diversity_weight", diversity_weight)
         self.declare_soft_actor_critic("diversity")
         self.make_value_estimator()

@@ -105,11 +105,10 @@ class RORLLoss(ActorCriticLoss):
             check_weight(name, value)
         check_positive("num_samples", num_samples, minimum=1)
         super().__init__(**options)
-        self.register_action_bounds(actor_network)
-        self.register_actor_critic(actor_network, qvalue_network)
+        networks = actor_network, qvalue_network
+        self.register_soft_actor_critic(*networks, alpha_init, target_entropy)
         if q_ood_reg:  # one critic has no deviation
             check_positive("num_qvalue_nets", self.num_qvalue_nets, minimum=2)
-        self.register_temperature(alpha_init, target_entropy)
         for name, value in given.items():
             setattr(self, name, value)
         self.num_samples, self.q_smooth_tau = num_samples, q_smooth_tau
