@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 from warm import Server
@@ -83,17 +81,3 @@ def run(tmp_path_factory, server) -> Callable[..., tuple[int, str]]:
         return server.ended(), output.read_text(encoding="utf-8")
 
     return run
-
-
-@pytest.fixture(scope="session")
-def load_example() -> Callable[[str], ModuleType]:
-    """Return a function that imports an example: no process for each case."""
-
-    def load(script: str) -> ModuleType:
-        name = f"{Path(script).stem}_example"
-        spec = importlib.util.spec_from_file_location(name, EXAMPLES / script)
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        return module
-
-    return load

@@ -31,12 +31,11 @@ class Server:
         )
 
     def start(self, *command: str, output: Path, folder: Path) -> int:
-        """Start a command or a script in a folder; return the process's id.
-
-        Both its streams are appended to ``output``.
-        """
-        request = {"command": command, "output": str(output), "folder": str(folder)}
-        request["environment"] = dict(os.environ)
+        """Start a command or a script; return its id. It prints into ``output``."""
+        request = {
+            "command": command, "output": str(output), "folder": str(folder),
+            "environment": dict(os.environ),
+        }  # fmt: skip
         self._process.stdin.write(json.dumps(request) + "\n")
         self._process.stdin.flush()
         return self.ended()
@@ -51,7 +50,7 @@ class Server:
 
 
 def run(command: list[str], output: str, folder: str, environment: dict) -> int:
-    """Run a command in this process, which is a new one; its exit code."""
+    """Run a command in this new process; its exit code."""
     stream = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     os.dup2(stream, 1)
     os.dup2(stream, 2)

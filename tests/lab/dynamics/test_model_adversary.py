@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import copy
 import math
+from types import SimpleNamespace
 
 import torch
 from torch import Tensor
 from torchrl.data import LazyTensorStorage
+from torchrl.modules import MLP, ValueOperator
 from torchrl.objectives import SoftUpdate
 from uneven_dynamics import plain_gaussian, uneven_dynamics
 
@@ -22,12 +24,23 @@ from torchrl_osr.lab.dynamics import (
     ModelAdversary,
     ModelData,
 )
+from torchrl_osr.modules import tanh_gaussian_actor
 
 GAMMA = 0.875
 
 
 def falls(state: Tensor) -> Tensor:
     return state[..., 0] > 0.5
+
+
+def make_networks(num_critics: int = 2) -> SimpleNamespace:
+    torch.manual_seed(0)
+    keys = {"in_keys": ["observation", "action"], "out_keys": ["state_action_value"]}
+    critics = [MLP(5, 1, num_cells=[8]) for _ in range(num_critics)]
+    return SimpleNamespace(
+        actor=tanh_gaussian_actor(3, 2, num_cells=[8]).double(),
+        critics=[ValueOperator(each, **keys).double() for each in critics],
+    )
 
 
 def make_adversary(networks, make_batch) -> ModelAdversary:
@@ -56,10 +69,7 @@ def restated(networks, model: DynamicsEnsemble, states: Tensor) -> Tensor:
     drawn = torch.randint(2, (rows,))
     noise = torch.randn(rows, 4, dtype=torch.float64)
     critics = [each.module for each in networks.critics]
-    advantage, log_density = [], []
-
-    def policy(state: Tensor) -> tuple[Tensor, Tensor]:
-        return networks.actor[0][1](networks.actor[0][0](state))
+    policy, advantage, log_density = networks.actor[0].module, [], []
 
     def value(state: Tensor, action: Tensor) -> Tensor:
         pair = torch.cat([state, action])
@@ -90,9 +100,7 @@ def restated(networks, model: DynamicsEnsemble, states: Tensor) -> Tensor:
     return standardized * torch.stack(log_density)
 
 
-def test_objective_and_gradients_equal_the_restatement(
-    make_networks, make_batch, check
-) -> None:
+def test_objective_and_gradients_equal_the_restatement(make_batch, check) -> None:
     networks = make_networks(num_critics=3)
     plain, model = copy.deepcopy(networks), uneven_dynamics()
     adversary = make_adversary(networks, make_batch)
@@ -109,9 +117,7 @@ def test_objective_and_gradients_equal_the_restatement(
     assert not any(each.grad is not None for each in adversary.loss.parameters())
 
 
-def test_equal_numbers_draw_equally_and_a_state_is_continued(
-    make_networks, make_batch
-) -> None:
+def test_equal_numbers_draw_equally_and_a_state_is_continued(make_batch) -> None:
     whole, broken, fresh = (
         make_adversary(make_networks(), make_batch) for _ in range(3)
     )

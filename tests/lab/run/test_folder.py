@@ -74,6 +74,15 @@ def test_other_settings_are_refused_by_key_unless_forced(tmp_path, caplog, resum
     assert "by force=true: seed: 0 there, 1 now" in caplog.text
 
 
+def test_a_foreign_run_imports_no_environment_of_its_own(tmp_path):
+    config = claim(tmp_path)
+    config["env"]["id"] = "antigravity:Hopper-v5"
+    OmegaConf.save(config, tmp_path / "config.yaml")
+    with pytest.raises(ValueError, match=r"allow it with trust=\[antigravity\]"):
+        claim(tmp_path, f"resume={tmp_path}")
+    assert "antigravity" not in sys.modules
+
+
 @pytest.mark.parametrize("error", [ValueError("why"), KeyboardInterrupt("why")])
 def test_status_says_failed_and_why(tmp_path, error):
     with pytest.raises(type(error)), opened(tmp_path):

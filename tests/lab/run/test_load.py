@@ -98,7 +98,6 @@ def test_the_policy_is_the_average_of_its_weights(tmp_path):
     ("key", "value", "shapes"),
     [
         ("env.observation_size", 17, [r"\(8, 11\)", r"\(8, 17\)"]),
-        ("network.num_cells", [9], [r"\(8,\)", r"\(9,\)"]),
         ("data.standardize", False, [r"\(11,\)", r"\(\)"]),
     ],
 )
@@ -108,7 +107,7 @@ def test_a_configuration_of_another_run_is_refused(tmp_path, key, value, shapes)
     cfg = OmegaConf.create(yaml.safe_load(path.read_text()))
     OmegaConf.update(cfg, key, value)
     OmegaConf.save(cfg, path)
-    wanted = rf"does not fit the config\.yaml.* is {shapes[0]} in the file, {shapes[1]}"
+    wanted = f"is {shapes[0]} in the file, {shapes[1]} here"
     with pytest.raises(CheckpointError, match=wanted):
         load_trained(folder)
 
@@ -229,9 +228,9 @@ def test_critics_may_judge_alone(folders) -> None:
     [
         ([LOSS], "does not exist"),
         (["loss=bc"], "no critics"),
-        ([LOSS, "optim.gamma=0.9"], "optim.gamma: .0.9, 0.99"),
-        ([LOSS, "data.reward_scale=100"], "data.reward_scale: .1.0, 100.0"),
-        ([LOSS, "env=walker2d"], "env.id: ..Hopper-v5., .Walker2d-v5"),
+        ([LOSS, "optim.gamma=0.9"], "differ in .*0.9, "),
+        ([LOSS, "data.reward_scale=100"], "differ in .*100.0"),
+        ([LOSS, "env=walker2d"], "differ in .*Walker2d-v5"),
     ],
 )
 def test_runs_that_do_not_fit_together_are_refused(folders, tmp_path, options, message):

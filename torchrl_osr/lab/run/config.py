@@ -6,7 +6,6 @@ Networks and loss are built by calling the functions that a configuration names 
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from importlib import import_module
@@ -46,7 +45,6 @@ CHOICES = {
     "data.storage": ("memory", "disk"),
     "logger.kind": ("csv", "tensorboard", "wandb"),
     "optim.actor_schedule": ("constant", "cosine"),
-    "optim.qvalue_schedule": ("constant", "cosine"),
     "trainer.precision": ("float32", "bfloat16"),
 }
 
@@ -54,9 +52,8 @@ CHOICES = {
 def checked(config: DictConfig, trust: Sequence[str] = ()) -> TrainConfig:
     """Check a run's configuration, of whatever origin; return it as plain objects.
 
-    Raises:
-        ValueError: naming the key, if there is no such key, one is missing, of the
-            wrong type or out of its range, or :func:`check_targets` refuses it.
+    A ValueError names a key that is unknown, missing, of the wrong type or out of its
+    range, or a target that :func:`check_targets` refuses.
     """
     plain: Any = OmegaConf.to_container(config, resolve=True)
     plain.pop("settings", None)  # interpolations have read them
@@ -77,16 +74,12 @@ def checked(config: DictConfig, trust: Sequence[str] = ()) -> TrainConfig:
 def _check_value(key: str, value: Any) -> None:
     """Raise a ValueError for a value that would train nonsense, or fail hours later."""
     wanted = ""
+    positive = key.startswith(("trainer.", "dynamics.")) and key not in MAY_BE_0
     if key in CHOICES and value not in CHOICES[key]:
         wanted = f"one of {', '.join(CHOICES[key])}"
     elif key in SHARES and not 0 <= value <= 1:
         wanted = "between 0 and 1"
-    elif (
-        key.startswith(("trainer.", "dynamics."))
-        and key not in MAY_BE_0
-        and type(value) is int
-        and value < 1
-    ):
+    elif positive and type(value) is int and value < 1:
         wanted = "at least 1"
     if wanted:
         raise ValueError(f"{key} must be {wanted}, got {value}.")
@@ -144,8 +137,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 def check_targets(config: Mapping[str, Any], trust: Sequence[str] = ()) -> None:
     """Raise a ValueError unless every ``_target_`` is one of our networks or losses.
 
-    Public names of the modules that the user trusts, those in ``__all__`` or defined in
-    the module itself, are allowed too.
+    Public names of the modules that the user trusts are allowed too.
     """
     allowed = {f"torchrl_osr.{name}" for name in objectives.__all__}
     for name in (*TARGET_PACKAGES, *trust):
@@ -161,11 +153,7 @@ def check_targets(config: Mapping[str, Any], trust: Sequence[str] = ()) -> None:
 
 
 def check_environment(env_id: str, trust: Sequence[str] = ()) -> None:
-    """Raise a ValueError if an id imports a module that is not trusted.
-
-    Gymnasium imports the module that an id begins with, as in ``"module:Name-v0"``, and
-    a run may come from somebody else.
-    """
+    """Refuse an id as ``"module:Name-v0"``, which Gymnasium imports, without trust."""
     module = env_id.rpartition(":")[0]
     if module and module not in trust:
         raise ValueError(
@@ -181,7 +169,7 @@ def _public_names(name: str) -> set[str]:
     except ImportError as error:
         raise ValueError(
             f"trust=[{name}] cannot be imported ({error}): give the name of a module "
-            f"that is installed, or of a file without its .py in {os.getcwd()}."
+            "that is installed or in the current folder."
         ) from error
     names = getattr(module, "__all__", None) or [
         name

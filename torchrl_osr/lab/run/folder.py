@@ -24,6 +24,7 @@ from torchrl_osr._files import read_json, write_atomically, write_json
 from torchrl_osr.lab.run.build import read_environment
 from torchrl_osr.lab.run.config import (
     CONFIG,
+    check_environment,
     checked,
     flatten,
     read_config,
@@ -46,35 +47,20 @@ PACKAGES = ("torchrl-osr", "torch", "torchrl", "tensordict", "gymnasium", "mujoc
 """Packages whose versions decide a run's numbers."""
 
 RESUMABLE = (
-    "data.download",
-    "logger.kind",
-    "logger.mode",
-    "logger.project",
-    "trainer.checkpoints_kept",
-    "trainer.eval_interval",
-    "trainer.log_interval",
-    "trainer.num_threads",
-    "trainer.progress",
-    "trainer.record",
-    "trainer.steps",
+    *("data.download", "logger.kind", "logger.mode", "logger.project"),
+    *("trainer.checkpoints_kept", "trainer.eval_interval", "trainer.log_interval"),
+    *("trainer.num_threads", "trainer.progress", "trainer.record", "trainer.steps"),
 )
 """Settings that may differ when a run continues: more ``trainer.steps``, and what
 decides where and how often something is written."""
 
 
 class Run(NamedTuple):
-    """A run that is open in its folder.
+    """A run that is open in its folder."""
 
-    Attributes:
-        config: its configuration, checked, with the sizes of its environment.
-        folder: where it writes.
-        simulated: whether its environment can be played.
-        method: name of its method.
-    """
-
-    config: TrainConfig
+    config: TrainConfig  # checked, with the sizes of its environment
     folder: Path
-    simulated: bool
+    simulated: bool  # whether its environment can be played
     method: str
 
 
@@ -82,19 +68,11 @@ class Run(NamedTuple):
 def open_run(
     cfg: DictConfig, folder: Path | None = None, job: HydraConf | None = None
 ) -> Iterator[Run]:
-    """Check a configuration, and hold the folder of its run while it is trained.
+    """Check a configuration, and lock the folder of its run while it is trained.
 
-    The folder is locked and gets ``config.yaml``. Its ``status.json`` is running, then
-    done, preempted or failed. With ``resume`` the run in that folder continues.
-
-    Args:
-        cfg: as Hydra has composed it.
-        folder: of the run. Default: the folder to resume, or that of Hydra's job.
-        job: Hydra's part of the configuration. Default: that of the running job.
-
-    Raises:
-        ValueError: if the configuration is refused, another process trains in the
-            folder, or it holds a run of other settings.
+    The folder gets ``config.yaml``. Its ``status.json`` is running, then done,
+    preempted or failed. With ``resume`` the run in that folder continues. Folder and
+    ``job``, Hydra's part of the configuration, are those of the running job by default.
     """
     job = job or HydraConfig.get()
     if folder is None:
@@ -105,7 +83,8 @@ def open_run(
             cfg.data.path = _absolute(cfg.data.path)
             cfg.dynamics.path = _absolute(cfg.dynamics.path)
         else:
-            cfg = _resumed(folder, cfg, list(job.overrides.task))
+            cfg = _resumed(folder, cfg, job.overrides.task)
+            check_environment(cfg.env.id, trust)
         config = checked(cfg, trust)
         spec = read_environment(config.env)
         if (folder / CONFIG).exists():
@@ -173,8 +152,7 @@ def _check_same(run: TrainConfig, config: TrainConfig, folder: Path) -> None:
     if different:
         log.warning(
             f"Continues with other settings, by force=true: {different}. What the "
-            "checkpoint restores stays: networks, learning rates, discount, weights of "
-            "the loss's terms, width of the noise."
+            "checkpoint restores stays, such as learning rates and loss weights."
         )
 
 
@@ -221,10 +199,6 @@ def read_status(folder: Path) -> dict[str, Any]:
     """Read ``status.json``; the status of a run whose process is gone is ``killed``.
 
     A run on another machine stays ``running``: its lock may not be seen from here.
-
-    Raises:
-        OSError: if the file cannot be read.
-        ValueError: if it is damaged.
     """
     found = read_json(folder / STATUS)
     if found.get("status") != "running" or found.get("host") != platform.node():

@@ -32,22 +32,12 @@ POLICY = "policy.safetensors"
 
 
 class TrainedRun(NamedTuple):
-    """One checkpoint of a run, on the CPU.
-
-    Attributes:
-        config: the run's configuration.
-        actor: the policy, with the average of its weights (``optim.policy_average``).
-        inverse_dynamics: the frozen model that taught the policy, or ``None``.
-        loss: holds the critics, too.
-        observation_norm: standardisation of the networks' observations.
-        step: gradient steps of the checkpoint.
-        path: of the checkpoint's file.
-    """
+    """One checkpoint of a run, on the CPU."""
 
     config: TrainConfig
-    actor: ProbabilisticTensorDictSequential
-    inverse_dynamics: ProbabilisticTensorDictSequential | None
-    loss: LossModule
+    actor: ProbabilisticTensorDictSequential  # with the average of its weights
+    inverse_dynamics: ProbabilisticTensorDictSequential | None  # frozen
+    loss: LossModule  # holds the critics, too
     observation_norm: ObservationNorm
     step: int
     path: Path
@@ -61,8 +51,7 @@ def run_folder_of(path: Path | str) -> Path:
     folder = path if path.is_dir() else path.absolute().parent.parent.parent
     if not (folder / CONFIG).exists():
         raise FileNotFoundError(
-            f"{path} is not of a run: there is no {CONFIG} in {folder}. Give the "
-            f"folder of a run, or a file in its {CHECKPOINTS}."
+            f"there is no {CONFIG} in {folder}: give a run's folder or checkpoint."
         )
     return folder
 
@@ -76,29 +65,15 @@ def checkpoints_of(folder: Path | str) -> list[Path]:
 
 
 def load_trained(path: Path | str, *, trust: Sequence[str] = ()) -> TrainedRun:
-    """Load one checkpoint, weights only: no code from the file is run.
+    """Load a checkpoint, or the newest of a run's folder; no code from it is run.
 
-    No environment is made, and torch's global generator is left as it was.
-
-    Args:
-        path: a checkpoint's file in its run's folder, or the folder for the newest.
-
-    Keyword Args:
-        trust: modules of your own that the run's configuration may name, see
-            :func:`~torchrl_osr.lab.run.config.check_targets`. Default: none.
-
-    Raises:
-        FileNotFoundError: if there is no run or no checkpoint.
-        CheckpointError: if the file is damaged, or does not fit the run's
-            configuration; tensors of another shape are named.
-        ValueError: if the configuration is refused.
+    No environment is made, and torch's global generator is left as it was. ``trust``
+    has the modules of your own that the run's configuration may name.
     """
     config = read_run(run_folder_of(path), trust)
     path = checkpoints_of(path)[-1] if Path(path).is_dir() else Path(path)
     if damage := find_damage(path):
-        raise CheckpointError(
-            f"checkpoint {path} is damaged: {damage}. Take another one of the run."
-        )
+        raise CheckpointError(f"{path} is damaged: {damage}. Take another checkpoint.")
     with torch.random.fork_rng(devices=[]):
         learner = make_learner(config)
     shape = [config.env.observation_size or 0] if config.data.standardize else []
@@ -117,14 +92,7 @@ def restore(
     checkpoint = safe_checkpoint(
         loss_module=learner.objective, observation_norm=norm, policy_average=average
     )
-    try:
-        manifest = checkpoint.load(path, map_location="cpu").manifest
-    except CheckpointError as error:
-        raise CheckpointError(
-            f"{path} does not fit the {CONFIG} of its run: {error} Take both from one "
-            "run.",
-            error.result,
-        ) from error
+    manifest = checkpoint.load(path, map_location="cpu").manifest
     learner.actor.load_state_dict(average.module.state_dict())
     numbered = re.fullmatch(r"checkpoint-(\d+)\.torchrl", path.name)
     step = int(numbered[1]) if numbered else int(manifest["metadata"]["step"])
@@ -180,38 +148,24 @@ def load_switching_policy(
 
     Args:
         runs: folders, or checkpoints in them.
-
-    Keyword Args:
         critics_only: use no models.
         trust: modules of your own that a run may name.
-        options: ``steps`` and ``hold`` of
-            :class:`~torchrl_osr.lab.dynamics.SwitchingPolicy`.
-
-    Raises:
-        FileNotFoundError: there is no such run, or it has no model.
-        ValueError: the runs differ in task, discount or units of reward, have discrete
-            actions, or lack critics.
+        options: those of :class:`~torchrl_osr.lab.dynamics.SwitchingPolicy`.
     """
     trained = [load_trained(each, trust=trust) for each in runs]
-    policies = [policy_of(run) for run in trained]
-    configs = [run.config for run in trained]
+    policies, configs = [*map(policy_of, trained)], [run.config for run in trained]
     for run, policy in zip(runs, policies, strict=True):
         if policy.discrete or not policy.critics:
-            raise ValueError(
-                f"{run} has discrete actions or no critics: choose other runs."
-            )
-    numbers: dict[str, set[Any]] = {
-        "env.id": {each.env.id for each in configs},
-        "optim.gamma": {each.optim.gamma for each in configs},
-        "data.reward_scale": {each.data.reward_scale for each in configs},
-        "data.reward_shift": {each.data.reward_shift for each in configs},
+            raise ValueError(f"{run} has discrete actions or no critics.")
+    shared = {
+        (each.env.id, each.optim.gamma, each.data.reward_scale, each.data.reward_shift)
+        for each in configs
     }
-    for name, found in numbers.items():
-        if len(found) > 1:
-            raise ValueError(
-                f"The runs differ in {name}: {sorted(found)}. Choose runs of one task, "
-                "with the same discount and units of reward."
-            )
+    if len(shared) > 1:
+        raise ValueError(
+            "The runs differ in task, discount, reward scale or reward shift: "
+            f"{sorted(shared)}. Choose runs in which they are equal."
+        )
 
     def value(state: Tensor, action: Tensor) -> Tensor:
         values = [each.smallest_value(state, action) for each in policies]
@@ -221,8 +175,7 @@ def load_switching_policy(
         file = run_folder_of(run) / FILE
         if not file.exists():
             raise FileNotFoundError(
-                f"{file} does not exist: train with loss=rim or dynamics=ensemble, or "
-                "choose with critics_only=True."
+                f"{file} does not exist: train with loss=rim or dynamics=ensemble."
             )
         model = load_dynamics(file)
         return EliteNetworks(model, policy.loc, policy.scale, policy.low, policy.high)

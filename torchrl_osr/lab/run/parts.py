@@ -112,7 +112,7 @@ def optimizer_of(
     factors = {"cosine": cosine, "constant": lambda _: 1.0}
     groups, schedules = [], []
     for params, rate, schedule in (
-        (critics, optim.qvalue_lr, optim.qvalue_schedule),
+        (critics, optim.qvalue_lr, "constant"),
         (policy, optim.actor_lr, optim.actor_schedule),
     ):
         if params:

@@ -1,8 +1,7 @@
 """Typed schema of the configuration: every key, its type and its meaning.
 
-Values are in ``conf/``. :func:`register` makes the schema known to Hydra, which then
-refuses a mistyped key or a value of the wrong type. The options of a loss are declared
-once, in its constructor: :func:`schema_of` derives their schema.
+Hydra refuses a mistyped key or a value of the wrong type. Values are in ``conf/``. The
+options of a loss are declared in its constructor: :func:`schema_of` reads them.
 """
 
 from __future__ import annotations
@@ -100,8 +99,7 @@ class PerturbationConfig:
     """Noise of the mixed data set, see StatePerturbation."""
 
     std: float = MISSING  # width of the noise, in deviations of the data
-    # Options of Adversary, which chooses the policy's perturbed states instead.
-    adversary: Any = None
+    adversary: Any = None  # options of Adversary, which chooses the policy's instead
 
 
 @dataclass
@@ -125,9 +123,7 @@ class OptimConfig:
     tau: float = MISSING  # step size of the target networks
     policy_delay: int = 1  # critic updates for each policy update
     actor_schedule: str = "constant"  # cosine: actor_lr falls to 0 over the run
-    qvalue_schedule: str = "constant"  # cosine: qvalue_lr falls to 0 over the run
-    # Weight of the new policy in its exponential average, which is evaluated and
-    # exported; 1: no average.
+    # Weight of the new policy in its average, which is evaluated; 1: no average.
     policy_average: float = 1.0
 
 
@@ -178,8 +174,7 @@ class TrainConfig:
     optim: OptimConfig = field(default_factory=OptimConfig)
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
     logger: LoggerConfig = field(default_factory=LoggerConfig)
-    # Values by data set: rows <env>-<source>, <env> or any, of dotted keys. A key with
-    # the value ${by_data:key} takes the most specific row, see by_data.
+    # Values by data set: rows <env>-<source>, <env> or any, read with ${by_data:key}.
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
     seed: int = MISSING  # random seed of networks, sampling and noise
     resume: str | None = None  # folder of a run to continue, or to extend
@@ -253,13 +248,7 @@ def schema_of(target: type) -> type:
     """Return a dataclass of the options of a loss, or of the adversary.
 
     Its fields are the keyword-only parameters of the class, and of the bases that its
-    ``**options`` reach. Its ``_target_`` is the public name of the class.
-
-    Examples:
-        >>> from torchrl_osr import OSRLoss
-        >>> schema = schema_of(OSRLoss)
-        >>> schema().recovery_weight, schema()._target_
-        (0.5, 'torchrl_osr.OSRLoss')
+    ``**options`` reach.
     """
     lab = target.__module__.startswith(losses.__name__)
     package = losses.__name__ if lab else "torchrl_osr"
@@ -291,13 +280,7 @@ def _config_type(annotation: Any) -> Any:
 
 @functools.cache
 def register() -> None:
-    """Make schemas and resolvers known to Hydra.
-
-    The schema of each command, and in the group ``schema`` one for each class of
-    :data:`CHOSEN`. Resolvers: :func:`by_data`, :func:`method_name`;
-    ``environment_name``, the short name of a task; ``run_dir``, the folder of a run;
-    and ``short``, a text as a part of a folder's name.
-    """
+    """Make the schemas of commands and of :data:`CHOSEN`, and resolvers, known."""
     store = ConfigStore.instance()
     store.store(name="train_schema", node=TrainConfig)
     store.store(name="check_data_schema", node=CheckDataConfig)
@@ -310,7 +293,7 @@ def register() -> None:
         "run_dir": _run_dir,
         "method_name": method_name,
         "by_data": by_data,
-        # File systems allow 255 bytes.
+        # A part of a folder's name; file systems allow 255 bytes.
         "short": lambda text: re.sub(r"[^\w.-]+", "-", text)[:200],
     }
     for name, resolver in resolvers.items():
@@ -318,10 +301,9 @@ def register() -> None:
 
 
 def by_data(key: str, *, _root_: DictConfig) -> Any:
-    """Return the value of a key for the data set of a configuration.
+    """Return the value of a key in the most specific row of ``settings``.
 
-    It is that of the most specific row of ``settings``, or else, of an option of the
-    loss, the default of the constructor.
+    Without a row it is, of an option of the loss, the default of the constructor.
     """
     rows, env, source = _root_.settings, _root_.env.name, _root_.data.source
     for name in (f"{env}-{source}", env, "any"):
