@@ -17,12 +17,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from torchrl_osr.lab.evaluation.statistics import (
-    mean_interval,
-    nested_resamples,
-    percentile_interval,
-    saved_share,
-)
+from torchrl_osr.lab.evaluation import statistics
+from torchrl_osr.lab.evaluation.statistics import Estimate, over_what, saved_share
 
 
 def read(folder: Path) -> pd.DataFrame:
@@ -45,21 +41,12 @@ def conditions(episodes: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
         yield suite, episodes[rows & (episodes["disturbance"] != "")]
 
 
-def shown(mean: float, low: float, high: float, seeds: int) -> str:
-    """Return a mean with its interval, marked if there are few seeds."""
-    mark = {1: " ᵉ", 2: " ²"}.get(seeds, "")
-    text = f"{mean:z.1f} [{low:z.1f}, {high:z.1f}]{mark}"
-    return text.replace("-", "\N{MINUS SIGN}")
-
-
 def estimate(episodes: pd.DataFrame) -> str:
     """Return the mean score over runs; episodes of one start state are averaged."""
     if episodes.empty:
         return ""
     means = episodes.groupby(["run", "episode"])["score"].mean()
-    runs = [run.to_numpy() for _, run in means.groupby("run")]
-    values = runs[0] if len(runs) == 1 else [run.mean() for run in runs]
-    return shown(*mean_interval(values), len(runs))
+    return str(statistics.estimate([run.to_numpy() for _, run in means.groupby("run")]))
 
 
 def differences(
@@ -81,14 +68,10 @@ def differences(
     if set(less.index.unique("data")) != set(episodes["data"]):
         return None
     data_sets = [
-        [run.to_numpy()[:, None] for _, run in group.groupby("seed")]
+        [run.to_numpy() for _, run in group.groupby("seed")]
         for _, group in less.groupby("data")
     ]
-    mean = np.mean([np.mean([run.mean() for run in each]) for each in data_sets])
-    resamples = [nested_resamples(each, seed=i) for i, each in enumerate(data_sets)]
-    low, high = percentile_interval(np.mean(resamples, axis=0).ravel())
-    seeds = min(map(len, data_sets))
-    return str(seeds), shown(float(mean), float(low), float(high), seeds)
+    return str(min(map(len, data_sets))), str(statistics.mean_difference(data_sets))
 
 
 def recoverable(folder: Path) -> dict[tuple[str, str], tuple[str, float]]:
@@ -107,7 +90,8 @@ def recoverable(folder: Path) -> dict[tuple[str, str], tuple[str, float]]:
         table = table[:, hard] / rows["checkpoints"].to_numpy()[:, None]
         share = [100 * x for x in saved_share(table, of_each["walk"].to_numpy()[hard])]
         # The held-out half comes first, and wins over the public one.
-        found.setdefault((data, method), (shown(*share, len(table)), share[0]))
+        shown = str(Estimate(*share, over_what(len(table))))
+        found.setdefault((data, method), (shown, share[0]))
     return found
 
 

@@ -14,7 +14,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from torchrl_osr import load_policy
 from torchrl_osr.lab.evaluation import deterministic_policy
-from torchrl_osr.lab.evaluation.training_summary import read_scalars
+from torchrl_osr.lab.evaluation.figures import read_scalars
 from torchrl_osr.lab.run.load import CHECKPOINTS, load_trained
 
 pytestmark = pytest.mark.usefixtures("own_cache")

@@ -27,8 +27,8 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl_osr.lab.cli.console import sentence, single_job
 from torchrl_osr.lab.evaluation import measure_of
 from torchrl_osr.lab.evaluation.recoverable import GROUPS
-from torchrl_osr.lab.evaluation.robustness import aligned_columns, robustness_table
 from torchrl_osr.lab.evaluation.statistics import saved_share
+from torchrl_osr.lab.evaluation.tables import aligned_columns, robustness_table
 from torchrl_osr.lab.report.runs import find_runs
 from torchrl_osr.lab.run import CONF
 from torchrl_osr.lab.run.evaluate import (

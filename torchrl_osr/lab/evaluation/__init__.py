@@ -1,6 +1,5 @@
 """Evaluation of trained policies: episodes, disturbances, statistics and figures."""
 
-from torchrl_osr.lab.evaluation.data_distance import DataDistance
 from torchrl_osr.lab.evaluation.episodes import (
     EpisodeEvaluator,
     Policy,
@@ -13,12 +12,13 @@ from torchrl_osr.lab.evaluation.inverse_dynamics_fit import (
     inverse_dynamics_report,
 )
 from torchrl_osr.lab.evaluation.recoverable import load_recoverable_states, recovers
+from torchrl_osr.lab.evaluation.recovery import DataDistance
 from torchrl_osr.lab.evaluation.robustness import (
     Disturbance,
     evaluate_paired,
     summarize_disturbances,
 )
-from torchrl_osr.lab.evaluation.statistics import mean_interval, wilson_interval
+from torchrl_osr.lab.evaluation.statistics import mean_interval
 
 __all__ = [
     "DataDistance",
@@ -35,5 +35,4 @@ __all__ = [
     "recovers",
     "summarize",
     "summarize_disturbances",
-    "wilson_interval",
 ]

@@ -20,7 +20,7 @@ from torchrl.envs import ObservationNorm
 from torchrl_osr._checks import check_positive
 from torchrl_osr.lab.data import ReferenceReturns
 from torchrl_osr.lab.data.environment import check_simulated, make_environment
-from torchrl_osr.lab.evaluation.statistics import mean_interval, wilson_interval
+from torchrl_osr.lab.evaluation.statistics import mean_interval
 from torchrl_osr.objectives.networks import ONE_HOT
 
 if TYPE_CHECKING:
@@ -41,10 +41,9 @@ Watch = Callable[[int, NDArray[Any], bool, dict[str, Any]], None]
 
 @dataclass(frozen=True)
 class EpisodeResults:
-    """Undiscounted returns, lengths and reset seeds of episodes, ``[E]`` each.
+    """Undiscounted returns, lengths, reset seeds and successes of episodes, ``[E]``.
 
-    ``successes`` has ``info["success"]`` of the last step, if the task has such an
-    entry.
+    A success is ``info["success"]`` of the last step, if the task has such an entry.
     """
 
     returns: NDArray[np.float64]
@@ -88,13 +87,9 @@ class EpisodeEvaluator:
         seed: the episodes are seeded ``seed, seed + 1, ...``. Default 0.
         device: of the policy. Default CPU.
         wrap: put around each environment. Default: nothing.
-        fixed_batch: call the policy with all ``E`` rows to the end, with the last
-            observation of finished episodes. torch's rounding depends on the number of
-            rows; with a fixed number, an episode does not depend on when others end.
-            Default ``False``.
-
-    Raises:
-        RuntimeError: the environment has no simulator.
+        fixed_batch: call the policy with all ``E`` rows to the end. torch's rounding
+            depends on the number of rows; with a fixed number, an episode does not
+            depend on when others end. Default ``False``.
 
     Examples:
         >>> evaluator = EpisodeEvaluator("Hopper-v5", num_episodes=2)
@@ -128,12 +123,13 @@ class EpisodeEvaluator:
         getattr(policy, "reset", lambda: None)()
         episodes = len(self.environments)
         returns, lengths = np.zeros(episodes), np.zeros(episodes, dtype=np.int64)
-        infos: list[dict[str, Any]] = [{} for _ in range(episodes)]
+        infos: list[dict[str, Any]] = []
         starts = []
         for episode, environment in enumerate(self.environments):
             start, info = environment.reset(seed=int(self.seeds[episode]))
             watch(episode, start, False, info)
             starts.append(start)
+            infos.append(info)
         observations = np.stack(starts).astype(np.float32)
         everyone = running = list(range(episodes))
         while running:
@@ -173,18 +169,15 @@ def summarize(
     """Summarise episodes, JSON-compatible.
 
     Returns:
-        ``"score"`` with its 95 % bootstrap interval ``"score_low"``, ``"score_high"``
-        over the episodes, or without references ``"return_low"`` and ``"return_high"``;
-        the means ``"return"`` and ``"length"``, and the lists ``"returns"``,
-        ``"lengths"`` and ``"seeds"``. If the task reports successes, also
-        ``"success_rate"`` with Wilson's 95 % interval ``"success_low"``,
-        ``"success_high"``, and the list ``"successes"``.
+        Means ``"return"``, ``"length"`` and, with references, ``"score"``; the 95 %
+        bootstrap interval of the latter, or of the return, as ``"score_low"`` and
+        ``"score_high"``; the lists ``"returns"``, ``"lengths"`` and ``"seeds"``.
     """
     measure, values = "return", results.returns
     if references is not None:
         measure, values = "score", references.score(results.returns)
     mean, low, high = mean_interval(values)
-    summary = {
+    return {
         measure: mean,
         f"{measure}_low": low,
         f"{measure}_high": high,
@@ -194,9 +187,3 @@ def summarize(
         "lengths": results.lengths.tolist(),
         "seeds": results.seeds.tolist(),
     }
-    if results.successes is not None:
-        count, total = int(results.successes.sum()), len(results.successes)
-        summary["success_rate"] = count / total
-        summary["success_low"], summary["success_high"] = wilson_interval(count, total)
-        summary["successes"] = results.successes.tolist()
-    return summary

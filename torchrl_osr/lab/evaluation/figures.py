@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -96,11 +97,7 @@ def learning_curve(
     title: str,
     data_mean: float | None,
 ) -> None:
-    """Draw the score, or return, of the evaluations, and the losses.
-
-    ``scalars`` are those of
-    :func:`~torchrl_osr.lab.evaluation.training_summary.read_scalars`.
-    """
+    """Draw the score, or return, of the evaluations, and the losses."""
     panels = [name for name in PANELS if scalars.get(name)]
     ratios = (2, 1) if history else (1,)
     figure = new_figure(9, 2.1 * sum(ratios))
@@ -129,6 +126,19 @@ def learning_curve(
         small.set_xlabel("gradient steps", fontsize=8)
         small.ticklabel_format(axis="x", style="sci", scilimits=(3, 3))
     save_figure(figure, path)
+
+
+def read_scalars(folder: Path) -> dict[str, list[tuple[int, float]]]:
+    """Read steps and values of each scalar that TorchRL's ``CSVLogger`` wrote.
+
+    A resumed run logs the steps since its checkpoint once more; the later row counts.
+    """
+    scalars = {}
+    for path in sorted(folder.glob("*.csv")):
+        with path.open(newline="") as file:
+            rows = {int(step): float(value) for step, value in csv.reader(file)}
+        scalars[path.stem] = sorted(rows.items())
+    return scalars
 
 
 def robustness_figure(

@@ -2,9 +2,7 @@
 
 A score under disturbances mixes states that every policy survives with states that no
 policy can. Here the states are sorted beforehand, and a policy starts from each.
-
-The files also have the planner's solutions. Shapes: ``M`` states, ``Q`` positions,
-``V`` velocities.
+Shapes: ``M`` states, ``Q`` positions, ``V`` velocities.
 """
 
 from __future__ import annotations
@@ -36,30 +34,18 @@ HALVES = ("public", "held-out")
 
 @dataclass(frozen=True, eq=False)
 class RecoverableStates:
-    """States of one task, ``[M]`` each.
-
-    Attributes:
-        env_name: short name of the task, ``"walker2d"`` for instance.
-        qpos, qvel: positions ``[M, Q]`` and velocities ``[M, V]`` of the simulation.
-        goal: in a maze, metres, ``[M, 2]``; elsewhere ``[M, 0]``.
-        group: of :data:`GROUPS`.
-        walk: number of the undisturbed walk a state comes from; states of one walk are
-            alike.
-        kind, strength: of the disturbance.
-        steps: a policy is played for so many from each state.
-        least_speed: that HalfCheetah must regain, m/s; elsewhere minus infinity.
-    """
+    """States of one task, ``[M]`` each, in one of :data:`GROUPS`."""
 
     env_name: str
-    qpos: NDArray[np.float64]
-    qvel: NDArray[np.float64]
-    goal: NDArray[np.float64]
+    qpos: NDArray[np.float64]  # [M, Q]
+    qvel: NDArray[np.float64]  # [M, V]
+    goal: NDArray[np.float64]  # in a maze, [M, 2]
     group: NDArray[Any]
-    walk: NDArray[np.int32]
-    kind: NDArray[Any]
+    walk: NDArray[np.int32]  # number of the walk it comes from; those of one are alike
+    kind: NDArray[Any]  # of disturbance
     strength: NDArray[np.float64]
-    steps: int
-    least_speed: float
+    steps: int  # to play from each state
+    least_speed: float  # that HalfCheetah must regain, m/s
 
     def __len__(self) -> int:
         return len(self.qpos)
@@ -82,13 +68,10 @@ def disturbances_of(names: Iterable[str]) -> list[str]:
 
 
 def load_recoverable_states(env_name: str, half: str = "public") -> RecoverableStates:
-    """Load the states of one task that ship with the package.
+    """Load the states of one task, ``"walker2d"`` for instance.
 
-    Args:
-        env_name: ``"hopper"``, ``"walker2d"``, ``"halfcheetah"`` or
-            ``"pointmaze-medium"``.
-        half: ``"public"``, to choose methods by, or ``"held-out"``, for one look at the
-            finished method. Default ``"public"``.
+    Choose methods by the ``"public"`` half. The ``"held-out"`` one is for one look at
+    the finished method.
 
     Examples:
         >>> states = load_recoverable_states("walker2d")
@@ -96,21 +79,13 @@ def load_recoverable_states(env_name: str, half: str = "public") -> RecoverableS
         (9, ['contested', 'easy', 'recoverable'])
     """
     check_choice("half", half, HALVES)
-    names = sorted(
-        path.stem.removesuffix(f"-{half}") for path in STATES.glob(f"*-{half}.npz")
-    )
-    check_choice("the task of recoverable states", env_name, tuple(names))
-    return read_recoverable_states(STATES / f"{env_name}-{half}.npz")
-
-
-def read_recoverable_states(path: Path | str) -> RecoverableStates:
-    """Read an ``.npz`` file with the arrays of :class:`RecoverableStates`."""
-    arrays = read_arrays(Path(path))
-    kinds = {"env_name": str, "steps": int, "least_speed": float}
-    kept: dict[str, Any] = {
-        name: kinds.get(name, np.asarray)(arrays[name])
-        for name in (field.name for field in fields(RecoverableStates))
-    }
+    files = STATES.glob(f"*-{half}.npz")
+    names = tuple(sorted(path.stem.removesuffix(f"-{half}") for path in files))
+    check_choice("the task of recoverable states", env_name, names)
+    arrays = read_arrays(STATES / f"{env_name}-{half}.npz")
+    # The files also have the planner's solutions.
+    kept: Any = {each.name: arrays[each.name] for each in fields(RecoverableStates)}
+    kept |= {name: kept[name].item() for name in ("env_name", "steps", "least_speed")}
     return RecoverableStates(**kept)
 
 
@@ -157,10 +132,7 @@ class _Start(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Begin each episode in the next of the states that wait, or in the first."""
 
     def __init__(
-        self,
-        env: gymnasium.Env[Any, Any],
-        states: RecoverableStates,
-        waiting: Iterator[int],
+        self, env: Any, states: RecoverableStates, waiting: Iterator[int]
     ) -> None:
         super().__init__(env)
         self.states, self.waiting = states, waiting

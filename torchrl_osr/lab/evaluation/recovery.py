@@ -1,6 +1,6 @@
-"""Survival and return to the data after a disturbance that ends.
+"""Distance to the data, survival, and return to the data after a disturbance.
 
-Entry 0 of a trajectory is the reset, entry ``i + 1`` is step ``i``.
+Shapes: ``N`` rows of the data, ``M`` states, ``S`` observation.
 """
 
 from __future__ import annotations
@@ -11,21 +11,80 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from torch import Tensor
 
-from torchrl_osr.lab.evaluation.data_distance import DataDistance
+from torchrl_osr.lab.data import observation_statistics
+
+NUM_NEIGHBORS = 10
+MAX_HELD_OUT = 2_000  # and at most a fifth of the data
+ROWS_AT_A_TIME = 64  # more do not fit into the processor's cache and are slower
 
 STEPS_AFTER = 100
 """An episode without a fall for so many steps after a disturbance counts as alive."""
 
 
+class DataDistance:
+    r"""Measure the mean distance to the ``K = 10`` nearest states of the data.
+
+    .. math::
+        d(s) = \frac{1}{K} \sum_{k=1}^{K} \lVert \sigma^{-1} (s - s_{(k)}) \rVert_2
+
+    with :math:`s_{(k)}` the ``k``-th nearest of a random subset of the states and
+    :math:`\sigma` the data's standard deviation in each dimension. A state counts as
+    in the data up to :attr:`threshold`, which 95 % of held-out states are within.
+
+    Args:
+        data: transitions ``[N]`` with raw ``observation`` ``[N, S]``.
+
+    Keyword Args:
+        max_reference: size of the subset, at most. Default 20,000.
+        seed: of the random subset and of the held-out states. Default 0.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> rows = torch.randn(1000, 3, generator=torch.Generator().manual_seed(0))
+        >>> distance = DataDistance(TensorDict({"observation": rows}, [1000]))
+        >>> far = torch.tensor([[0.0, 0.0, 0.0], [9.0, 9.0, 9.0]])
+        >>> (distance(far) <= distance.threshold).tolist()
+        [True, False]
+    """
+
+    def __init__(
+        self, data: TensorDictBase, *, max_reference: int = 20_000, seed: int = 0
+    ) -> None:
+        held_out = min(MAX_HELD_OUT, len(data) // 5)
+        if len(data) - held_out < NUM_NEIGHBORS or not held_out:
+            raise ValueError(f"{len(data)} rows are too few to measure distances to.")
+        loc, scale = observation_statistics(data)
+        self._loc, self._scale = loc.cpu().double(), scale.cpu().double()
+        generator = torch.Generator().manual_seed(seed)
+        order = torch.randperm(len(data), generator=generator)
+        # Of a set on disk, only these rows are read.
+        states, others = (
+            data[rows]["observation"].cpu()
+            for rows in (order[held_out:][:max_reference], order[:held_out])
+        )
+        self._states = self._standard(states)
+        self.threshold = float(torch.quantile(self(others).double(), 0.95))
+
+    def __call__(self, observation: Tensor) -> Tensor:
+        """Return the distances of raw observations ``[M, S]``, float32 ``[M]``."""
+        # Double: the difference of two near states cancels the digits of float32.
+        chunks = self._standard(observation.cpu()).split(ROWS_AT_A_TIME)
+        distances = (torch.cdist(each, self._states) for each in chunks)
+        nearest = [each.topk(NUM_NEIGHBORS, largest=False)[0] for each in distances]
+        return torch.cat(nearest).mean(-1).float()
+
+    def _standard(self, observation: Tensor) -> Tensor:
+        return (observation.double() - self._loc) / self._scale
+
+
 @dataclass
 class Trajectory:
-    """One recorded episode.
+    """Observations ``[S]`` and flags of one episode: of the reset, then of each step.
 
-    Attributes:
-        observations: of the reset and of each step, float32 ``[S]`` each.
-        disturbed: ``info["disturbed"]`` of each.
-        terminated: whether it ended by a fall: not at the time limit or a goal.
+    ``terminated`` is whether it ended by a fall: not at the time limit or a goal.
     """
 
     observations: list[NDArray[np.float32]] = field(default_factory=list)
@@ -44,8 +103,8 @@ class Trajectory:
         if True not in self.disturbed:
             return None
         first = self.disturbed.index(True)
-        rest = self.disturbed[first:]
-        return first, first + (rest.index(False) if False in rest else len(rest)) - 1
+        rest = [*self.disturbed[first:], False]
+        return first, first + rest.index(False) - 1
 
     def alive_after(self, end: int) -> bool | None:
         """Return whether it stands :data:`STEPS_AFTER` entries after ``end``.
@@ -57,45 +116,37 @@ class Trajectory:
             return False
         return True if later >= STEPS_AFTER else None
 
+    def steps_back(self, end: int, distance: DataDistance) -> int | None:
+        """Return the steps from ``end`` until it is in the data, if it comes back."""
+        # The state of a fall does not count.
+        rows = self.observations[end : -1 if self.terminated else None]
+        for first in range(0, len(rows), STEPS_AFTER):  # most are back soon
+            chunk = torch.from_numpy(np.stack(rows[first:][:STEPS_AFTER]))
+            within = distance(chunk).double() <= distance.threshold
+            if within.any():
+                return first + int(within.int().argmax())
+        return None
+
 
 def measure_recovery(
     disturbed: Trajectory, clean: Trajectory, distance: DataDistance
 ) -> dict[str, Any] | None:
-    """Measure survival and recovery of one pair of episodes.
+    """Measure survival and recovery after the first disturbance of an episode.
 
     Returns:
-        ``None`` if the disturbance never acted. Else the last step in which it acted,
-        ``"ended_at"``; whether the episode had not fallen by then,
-        ``"survived_knock"``, nor 100 steps later, ``"alive_after"`` (``None``: the time
-        limit came first); the same of the undisturbed episode,
-        ``"clean_alive_after"``; and the steps from the end of the disturbance until the
-        distance to the data is within the threshold, ``"recovery_steps"`` (``None``:
-        the episode ended before).
+        ``None`` if the disturbance never acted. Else whether the episode had not fallen
+        at its end, ``"survived_knock"``, nor 100 steps later, ``"alive_after"``
+        (``None``: the time limit came first); the latter of the undisturbed episode,
+        ``"clean_alive_after"``; and the steps until the state is in the data,
+        ``"recovery_steps"`` (``None``: the episode ended before).
     """
     block = disturbed.disturbance()
     if block is None:
         return None
     end, last = block[1], len(disturbed.disturbed) - 1
-    steps = _steps_back(disturbed.observations[end:], distance)
-    # The state of the fall itself does not count as recovered.
-    if disturbed.terminated and steps == last - end:
-        steps = None
     return {
-        "ended_at": max(end - 1, 0),
         "survived_knock": not (disturbed.terminated and last == end),
         "alive_after": disturbed.alive_after(end),
         "clean_alive_after": clean.alive_after(end),
-        "recovery_steps": steps,
+        "recovery_steps": disturbed.steps_back(end, distance),
     }
-
-
-def _steps_back(
-    observations: list[NDArray[np.float32]], distance: DataDistance
-) -> int | None:
-    """Return the number of the first observation within the threshold."""
-    for first in range(0, len(observations), STEPS_AFTER):  # most are back soon
-        rows = torch.from_numpy(np.stack(observations[first:][:STEPS_AFTER]))
-        within = distance(rows).double() <= distance.threshold
-        if within.any():
-            return first + int(within.int().argmax())
-    return None

@@ -15,15 +15,9 @@ import numpy as np
 import pandas as pd
 
 from torchrl_osr.lab.data import ReferenceReturns
-from torchrl_osr.lab.evaluation.data_distance import DataDistance
-from torchrl_osr.lab.evaluation.episodes import (
-    EpisodeEvaluator,
-    Policy,
-    Wrap,
-    measure_of,
-)
+from torchrl_osr.lab.evaluation.episodes import EpisodeEvaluator, Policy, Wrap
 from torchrl_osr.lab.evaluation.recovery import (
-    STEPS_AFTER,
+    DataDistance,
     Trajectory,
     measure_recovery,
 )
@@ -32,10 +26,7 @@ from torchrl_osr.lab.evaluation.statistics import decrease_interval, mean_interv
 TRANSIENT = ("knock", "push", "start")
 """Kinds of disturbance that end, so that there is something to recover from."""
 
-RECOVERY = (
-    *("ended_at", "survived_knock", "alive_after", "clean_alive_after"),
-    "recovery_steps",
-)
+RECOVERY = ("survived_knock", "alive_after", "clean_alive_after", "recovery_steps")
 """Entries of each episode after a disturbance that ends."""
 
 
@@ -98,7 +89,7 @@ def evaluate_paired(
         evaluator = EpisodeEvaluator(
             env_id, num_episodes=num_episodes, seed=seed, wrap=wrap, fixed_batch=True
         )
-        trajectories = [Trajectory() for _ in range(num_episodes)]
+        played = [Trajectory() for _ in range(num_episodes)]
         with closing(evaluator):
             if wrap is None:
                 first = evaluator.environments[0]
@@ -109,28 +100,26 @@ def evaluate_paired(
                         "different observations, and the pairs are not pairs.",
                         stacklevel=3,
                     )
-            results = evaluator(
-                policy, lambda at, *entry: trajectories[at].record(*entry)
-            )
+            results = evaluator(policy, lambda at, *entry: played[at].record(*entry))
         advance()
         names = ("returns", "lengths", "seeds")
         raw = {name: getattr(results, name).tolist() for name in names}
         if references is not None:
             raw["scores"] = references.score(results.returns).tolist()
-        return raw, trajectories
+        return raw, played
 
     clean, undisturbed = play(policy, None)
     levels = []
     for each in disturbances:
-        results, trajectories = play(each.policy or policy, each.wrap)
-        blocks = [trajectory.disturbance() for trajectory in trajectories]
+        results, played = play(each.policy or policy, each.wrap)
         moments: list[int | None] = [0] * num_episodes  # an attack: in every step
         if each.policy is None:
+            blocks = [trajectory.disturbance() for trajectory in played]
             # A disturbance of the start state counts as step 0.
             moments = [block and max(block[0] - 1, 0) for block in blocks]
         recovery: dict[str, Any] = dict.fromkeys(RECOVERY)
         if each.kind in TRANSIENT:
-            pairs = zip(trajectories, undisturbed, strict=True)
+            pairs = zip(played, undisturbed, strict=True)
             found = [measure_recovery(*pair, distance) for pair in pairs]
             recovery = {key: [row and row[key] for row in found] for key in RECOVERY}
         level = {"name": each.name, "kind": each.kind, "strength": each.strength}
@@ -162,103 +151,46 @@ def summarize_disturbances(
         evaluations: see :func:`evaluate_paired`; the same disturbances in all.
 
     Returns:
-        A row for each disturbance. Over all pairs of episodes: ``"clean_score"``,
-        ``"score"`` and ``"decrease"`` (see
-        :func:`~torchrl_osr.lab.evaluation.statistics.decrease_interval`), and
+        A row for each disturbance, with means over all pairs of episodes:
+        ``"clean_score"``, ``"score"``, ``"decrease"`` in percent, and
         ``"disturbed_share"``, the share that the disturbance acted in. Over those
-        alone: ``"clean_score_disturbed"``, ``"score_disturbed"``,
-        ``"decrease_disturbed"``, the shares alive at its end (``"survived"``) and 100
-        steps later (``"survival"``; ``"clean_survival"`` of the undisturbed ones),
-        ``"recovered_share"`` and ``"recovery_median"``, steps until back in the data.
-        ``None`` where there is nothing to average, no episode met the disturbance, or
-        the median is infinite. If evaluations have no scores, ``"clean_return"``,
-        ``"return"`` and so on.
+        alone: the share alive 100 steps after its end (``"survival"``, and
+        ``"clean_survival"`` of the undisturbed ones), ``"recovered_share"`` and
+        ``"recovery_median"``, steps until back in the data. ``None`` where there is
+        nothing to average, or the median is infinite. If evaluations have no scores,
+        ``"clean_return"``, ``"return"`` and so on.
     """
     rows = []
     measure = "score" if "scores" in evaluations[0]["clean"] else "return"
     clean = np.concatenate([each["clean"][f"{measure}s"] for each in evaluations])
+    keys = ("disturbed_at", f"{measure}s", *RECOVERY)
     for levels in zip(*(each["levels"] for each in evaluations), strict=True):
         entries = pd.concat(
-            pd.DataFrame(
-                {
-                    key: level[key]
-                    for key in ("disturbed_at", f"{measure}s", *RECOVERY[1:])
-                },
-                dtype=float,
-            )
+            pd.DataFrame({key: level[key] for key in keys}, dtype=float)
             for level in levels
         )
         values = entries[f"{measure}s"].to_numpy()
         hit = entries["disturbed_at"].notna().to_numpy()
-        mean, low, high = mean_interval(values)
         row = {key: levels[0][key] for key in ("name", "kind", "strength")}
-        row |= {f"clean_{measure}": float(clean.mean()), measure: mean}
-        row |= {f"{measure}_low": low, f"{measure}_high": high}
-        row |= {
-            "disturbed_share": float(hit.mean()),
-            f"clean_{measure}_disturbed": _mean(clean[hit]),
-            f"{measure}_disturbed": _mean(values[hit]),
-        }
-        every = np.full(len(hit), hit.any())  # an unmet one has no loss
-        for name, met in (("decrease", every), ("decrease_disturbed", hit)):
-            names = (name, f"{name}_low", f"{name}_high")
-            found = decrease_interval(clean[met], values[met])
-            row |= dict(zip(names, found, strict=True))
-        for name, key in (
-            ("survived", "survived_knock"),
-            ("survival", "alive_after"),
-            ("clean_survival", "clean_alive_after"),
-        ):
-            row[name] = _mean(entries[key].dropna())
-        row |= {"recovered_share": None, "recovery_median": None}
+        mean, low, high = mean_interval(values)
+        row |= {measure: mean, f"{measure}_low": low, f"{measure}_high": high}
+        row[f"clean_{measure}"] = float(clean.mean())
+        lost = (None, None, None)
+        if hit.any():  # an unmet one has no loss
+            lost = decrease_interval(clean, values)
+        row["decrease"], row["decrease_low"], row["decrease_high"] = lost
+        row["disturbed_share"] = float(hit.mean())
+        row["survival"] = _mean(entries["alive_after"].dropna())
+        row["clean_survival"] = _mean(entries["clean_alive_after"].dropna())
+        row["recovered_share"] = row["recovery_median"] = None
         if levels[0]["recovery_steps"] is not None and hit.any():
             steps = entries["recovery_steps"][hit].fillna(np.inf)
-            row["recovered_share"] = float(np.isfinite(steps).mean())
-            if np.isfinite(median := steps.median()):
-                row["recovery_median"] = float(median)
+            row["recovered_share"] = _mean(np.isfinite(steps))
+            median = float(steps.median())
+            row["recovery_median"] = median if np.isfinite(median) else None
         rows.append(row)
     return rows
 
 
 def _mean(values: Any) -> float | None:
     return float(values.mean()) if len(values) else None
-
-
-def robustness_table(title: str, summary: Sequence[Mapping[str, Any]]) -> str:
-    """Format a summary, see :func:`summarize_disturbances`, as a text table."""
-
-    def number(value: float | None) -> str:
-        return "-" if value is None else f"{value:.1f}"
-
-    def percent(value: float | None) -> str:
-        return "-" if value is None else f"{100 * value:.0f} %"
-
-    measure = measure_of(summary[0])
-    header = (
-        *("disturbance", "clean", measure, "loss %", "[95 %]", "met it"),
-        *(f"alive +{STEPS_AFTER}", "(clean)", "back", "steps back"),
-    )
-    rows = [
-        (
-            row["name"],
-            *(number(row[key]) for key in (f"clean_{measure}", measure, "decrease")),
-            f"[{number(row['decrease_low'])}, {number(row['decrease_high'])}]",
-            *map(percent, (row["disturbed_share"], row["survival"])),
-            *map(percent, (row["clean_survival"], row["recovered_share"])),
-            number(row["recovery_median"]),
-        )
-        for row in summary
-    ]
-    lines = [title, *aligned_columns([header, *rows])]
-    if unmet := [row["name"] for row in summary if not row["disturbed_share"]]:
-        lines.append(f"  {', '.join(unmet)}: every episode ended before it came.")
-    return "\n".join(lines)
-
-
-def aligned_columns(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Format rows as lines, the first column to the left, the others to the right."""
-    columns = []
-    for number, cells in enumerate(zip(*rows, strict=True)):
-        width = max(map(len, cells))
-        columns.append([f"{cell:{'>' if number else '<'}{width}}" for cell in cells])
-    return ["  ".join(["", *line]) for line in zip(*columns, strict=True)]

@@ -16,12 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 
 Array: TypeAlias = NDArray[np.float64]
 
-NUM_RESAMPLES, NUM_SHARE_RESAMPLES = 2000, 10_000
-"""Bootstrap resamples of means, and of shares of states."""
+NUM_RESAMPLES = 2000
+"""Of bootstraps of means; those of shares of states have 10,000."""
 
 NORMAL_QUANTILE_975 = 1.959963984540054
-TAIL = 50 * (1 - 0.95)
-"""Percentage of the resamples below an interval, and above it."""
 
 
 class Estimate(NamedTuple):
@@ -51,28 +49,19 @@ def decimal(value: float, sign: str = "") -> str:
     return f"{value:{sign}z.1f}".replace("-", "\N{MINUS SIGN}")
 
 
-def over_what(groups: Sequence[Sequence[object]], alone: str = "episodes") -> str:
-    """Return an estimate's ``over`` for the runs of each data set."""
-    return {1: alone, 2: "two seeds"}.get(min(map(len, groups)), "seeds")
-
-
-def percentile_interval(resamples: Array) -> tuple[Array, Array]:
-    """Return both ends of the 95 % interval of resamples ``[R, ...]``."""
-    low, high = np.percentile(resamples, [TAIL, 100 - TAIL], axis=0)
-    return low, high
+def over_what(seeds: int, alone: str = "episodes") -> str:
+    """Return an estimate's ``over``; of a single seed it is ``alone``."""
+    return {1: alone, 2: "two seeds"}.get(seeds, "seeds")
 
 
 def interval(point: float, resamples: ArrayLike, over: str = "seeds") -> Estimate:
     """Return a number with the interval of its resamples ``[R]``."""
-    low, high = percentile_interval(np.asarray(resamples, np.float64))
+    low, high = np.percentile(np.asarray(resamples, np.float64), [2.5, 97.5])
     return Estimate(float(point), float(low), float(high), over)
 
 
 def mean_interval(values: ArrayLike) -> tuple[float, float, float]:
     """Return the mean of ``[E]`` values and its 95 % percentile-bootstrap interval.
-
-    Raises:
-        ValueError: if there are no values, or some are not finite.
 
     Examples:
         >>> mean, low, high = mean_interval([1.0, 2.0, 3.0, 4.0])
@@ -82,20 +71,13 @@ def mean_interval(values: ArrayLike) -> tuple[float, float, float]:
     sample = np.asarray(values, np.float64).ravel()
     if not sample.size or not np.isfinite(sample).all():
         raise ValueError(f"mean_interval needs finite values, got {sample}.")
-    rows = np.random.default_rng(0).integers(
-        sample.size, size=(NUM_RESAMPLES, sample.size)
-    )
+    rng, size = np.random.default_rng(0), sample.size
+    rows = rng.integers(size, size=(NUM_RESAMPLES, size))
     return interval(sample.mean(), sample[rows].mean(1))[:3]
 
 
 def wilson_interval(count: int, total: int) -> tuple[float, float]:
-    """Return Wilson's 95 % interval of a share, which is also right near 0 and 1.
-
-    Examples:
-        >>> low, high = wilson_interval(20, 20)
-        >>> round(low, 3), round(high, 3)
-        (0.839, 1.0)
-    """
+    """Return Wilson's 95 % interval of a share, which is also right near 0 and 1."""
     square = NORMAL_QUANTILE_975**2
     centre = (count + square / 2) / (total + square)
     spread = math.sqrt(count * (total - count) / total + square / 4)
@@ -104,10 +86,9 @@ def wilson_interval(count: int, total: int) -> tuple[float, float]:
 
 
 def nested_resamples(runs: Sequence[ArrayLike], *, seed: int = 0) -> Array:
-    """Resample runs and then their episodes, and return the means ``[R, K]``.
+    """Resample runs ``[E, K]`` and then their episodes; return the means ``[R, K]``.
 
-    Each run ``[E, K]`` has its own ``E`` and equal weight. The numbers of an episode
-    stay together, so that their ratios and differences are paired.
+    Runs have equal weight. The numbers of an episode stay together.
     """
     tables = [np.asarray(run, dtype=np.float64) for run in runs]
     rng = np.random.default_rng(seed)
@@ -125,9 +106,8 @@ def nested_resamples(runs: Sequence[ArrayLike], *, seed: int = 0) -> Array:
 
 def estimate(runs: Sequence[Array]) -> Estimate:
     """Return the mean over runs ``[E]``; a single run's interval is over episodes."""
-    over = over_what([runs])
-    values = runs[0] if over == "episodes" else [run.mean() for run in runs]
-    return Estimate(*mean_interval(values), over)
+    values = runs[0] if len(runs) == 1 else [run.mean() for run in runs]
+    return Estimate(*mean_interval(values), over_what(len(runs)))
 
 
 def mean_difference(data_sets: Sequence[Sequence[Array]]) -> Estimate:
@@ -141,8 +121,8 @@ def mean_difference(data_sets: Sequence[Sequence[Array]]) -> Estimate:
         nested_resamples([run[:, None] for run in each], seed=index)
         for index, each in enumerate(data_sets)
     ]
-    mean = np.mean(resamples, axis=0).ravel()
-    return interval(float(point), mean, over_what(data_sets))
+    over = over_what(min(map(len, data_sets)))
+    return interval(float(point), np.mean(resamples, axis=0).ravel(), over)
 
 
 def decrease_interval(
@@ -152,10 +132,6 @@ def decrease_interval(
 
     All three are ``None`` for fewer than two pairs, or if the clean mean is not above
     0; both ends are ``None`` if it is not above 0 in a resample.
-
-    Examples:
-        >>> decrease_interval([40.0, 60.0], [20.0, 30.0])
-        (50.0, 50.0, 50.0)
     """
     pairs = np.stack([np.asarray(clean, float), np.asarray(disturbed, float)])
     if pairs.shape[1] < 2 or pairs[0].mean() <= 0:
@@ -177,84 +153,59 @@ def scores_and_decreases(
 
     Runs are ``[E, K]``. Decreases are ``None`` if a clean mean is not above 0.
     """
-    over = over_what([runs])
+    over = over_what(len(runs))
     means = np.mean([np.mean(np.asarray(run, float), axis=0) for run in runs], axis=0)
     resamples = nested_resamples(runs)
     positive = means[0] > 0 and (resamples[:, 0] > 0).all()
     found: list[tuple[Estimate, Estimate | None]] = []
     for mean, column in zip(means, resamples.T, strict=True):
-        lost = (100 * (1 - mean / means[0]), 100 * (1 - column / resamples[:, 0]), over)
-        found.append(
-            (interval(mean, column, over), interval(*lost) if positive else None)
-        )
+        lost = None
+        if positive:
+            shares = 100 * (1 - column / resamples[:, 0])
+            lost = interval(100 * (1 - mean / means[0]), shares, over)
+        found.append((interval(mean, column, over), lost))
     return found
 
 
-def saved_share(back: ArrayLike, walk: ArrayLike) -> tuple[float, float, float]:
+def saved_share(
+    back: ArrayLike, walk: ArrayLike, baseline: ArrayLike | None = None
+) -> tuple[float, float, float]:
     """Return the recovery rate over states, with its 95 % interval.
 
     ``back`` ``[N, M]`` has the rate of each seed and state. Seeds are resampled, and
     walks with all of their states. If the rate is 0 or 1 everywhere, the interval is
     Wilson's, with the walks as trials.
 
-    Examples:
-        >>> saved_share([[1, 0, 1, 0]], walk=[0, 0, 1, 1])
-        (0.5, 0.5, 0.5)
-        >>> share, low, high = saved_share([[0, 0, 0, 0]], walk=[0, 1, 2, 3])
-        >>> share, low, round(high, 2)
-        (0.0, 0.0, 0.49)
-    """
-    table, sizes = _by_walk(back, walk)
-    for share, whole in ((0.0, 0.0 * sizes), (1.0, sizes)):
-        if (table == whole).all():
-            return (share, *wilson_interval(round(share * len(sizes)), len(sizes)))
-    seeds, walks = _weights(len(table), len(sizes))
-    shares = ((seeds @ table) * walks).sum(-1) / len(table) / (walks @ sizes)
-    return interval(shares[0], shares[1:])[:3]
-
-
-def recovered_share(
-    method: ArrayLike, baseline: ArrayLike, walk: ArrayLike
-) -> tuple[float, float, float]:
-    r"""Return R, the share of the baseline's failures that a method avoids.
-
-    .. math::
-        R = \frac{p_{method} - p_{baseline}}{1 - p_{baseline}}
-
-    with the recovery rates :math:`p`, see :func:`saved_share`. Rows ``[N, M]`` of
-    method and baseline have the same seed.
+    With the rates of a ``baseline``, of the same seeds, return R instead: the share of
+    the baseline's failures that is avoided.
 
     Raises:
         ValueError: if the baseline saves all states, in the data or in a resample.
 
     Examples:
-        >>> recovered_share([[1, 1, 1, 0]], [[1, 0, 0, 0]], walk=[5, 5, 5, 5])[0]
-        0.6666666666666666
+        >>> saved_share([[1, 0, 1, 0]], walk=[0, 0, 1, 1])
+        (0.5, 0.5, 0.5)
     """
-    ours, sizes = _by_walk(method, walk)
-    theirs, _ = _by_walk(baseline, walk)
-    seeds, walks = _weights(len(ours), len(sizes))
-    saved, before = (((seeds @ of) * walks).sum(-1) / len(of) for of in (ours, theirs))
-    lost = walks @ sizes - before
+    walks, number = np.unique(np.asarray(walk), return_inverse=True)
+    member = np.eye(len(walks))[number]
+    sizes, ours = member.sum(0), np.asarray(back, np.float64) @ member
+    theirs = 0 * ours
+    if baseline is not None:
+        theirs = np.asarray(baseline, np.float64) @ member
+    elif not ours.any() or (ours == sizes).all():
+        share = float(ours.any())
+        return (share, *wilson_interval(round(share * len(sizes)), len(sizes)))
+    rng = np.random.default_rng(0)
+    # How often each seed and walk is drawn: once, then in each resample.
+    by_seed, by_walk = (
+        np.vstack([np.ones(size), rng.multinomial(size, [1 / size] * size, 10_000)])
+        for size in ours.shape
+    )
+    saved, before = (
+        ((by_seed @ each) * by_walk).sum(-1) / len(each) for each in (ours, theirs)
+    )
+    lost = by_walk @ sizes - before
     if (lost <= 0).any():
         raise ValueError("The baseline saves all states: R is not defined.")
     shares = (saved - before) / lost
     return interval(shares[0], shares[1:])[:3]
-
-
-def _by_walk(table: ArrayLike, walk: ArrayLike) -> tuple[Array, Array]:
-    """Return sums over the states of each walk ``[N, W]``, and their number ``[W]``."""
-    walks, number = np.unique(np.asarray(walk), return_inverse=True)
-    member = np.eye(len(walks))[number]
-    return np.asarray(table, np.float64) @ member, member.sum(0)
-
-
-def _weights(*sizes: int) -> list[Array]:
-    """Return how often each is drawn: once, then per resample, ``[1 + R, size]``."""
-    rng = np.random.default_rng(0)
-    draws = (
-        rng.multinomial(size, np.full(size, 1 / size), NUM_SHARE_RESAMPLES)
-        for size in sizes
-    )
-    # In floating point: products of integers are slow.
-    return [np.concatenate([np.ones((1, each.shape[1])), each]) for each in draws]

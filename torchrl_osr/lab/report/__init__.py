@@ -1,18 +1,6 @@
 """One page about any number of runs: verdict, tables, figures, differences."""
 
-from torchrl_osr.lab.report.comparisons import compare, quantities
 from torchrl_osr.lab.report.page import write_report
-from torchrl_osr.lab.report.runs import (
-    RunTables,
-    comparison_notes,
-    read_runs,
-)
+from torchrl_osr.lab.report.runs import RunTables, comparison_notes, read_runs
 
-__all__ = [
-    "RunTables",
-    "compare",
-    "comparison_notes",
-    "quantities",
-    "read_runs",
-    "write_report",
-]
+__all__ = ["RunTables", "comparison_notes", "read_runs", "write_report"]

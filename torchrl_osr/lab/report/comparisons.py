@@ -57,8 +57,8 @@ class Difference(NamedTuple):
     method: str
     quantity: Quantity
     estimate: Estimate | None
-    seeds: int = 0
-    note: str = ""
+    seeds: int
+    note: str
 
     @property
     def verdict(self) -> str:
@@ -130,20 +130,14 @@ def pair(rows: pd.DataFrame, method: str, reference: str) -> tuple[list[Array], 
         return [], "no disturbance was met by both: their episodes ended before"
     notes = [f"without {', '.join(unmet)}, not met by both"] if unmet else []
     rows = rows[~rows["disturbance"].isin(unmet)]
-    both = rows.groupby(EPISODE[1:])["value"].mean().unstack("method")
-    seeds = (both.groupby("seed").count() > 0).all(axis=1)
-    if not seeds.any():
-        return [], "they have no seed in common"
-    both = both[both.index.get_level_values("seed").isin(seeds.index[seeds])]
-    if alone := int(both.isna().any(axis=1).sum()):
-        return (
-            [],
-            f"{alone} episodes of one have no partner: other checkpoints or seeds",
-        )
-    if not seeds.all():
-        notes.append("only seeds that both have")
+    each = rows.groupby(EPISODE[1:])["value"].mean().unstack("method")
+    both = each.dropna()
+    if both.empty:
+        return [], "they have no episode in common: other seeds or checkpoints"
+    if len(both) < len(each):
+        notes.append("only episodes that both have")
     less = (both[method] - both[reference]).groupby(["seed", "episode"]).mean()
-    return [each.to_numpy() for _, each in less.groupby("seed")], "; ".join(notes)
+    return [run.to_numpy() for _, run in less.groupby("seed")], "; ".join(notes)
 
 
 def compare_all(tables: RunTables, reference: str) -> list[Difference]:

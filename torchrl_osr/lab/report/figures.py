@@ -1,25 +1,22 @@
-"""The report's three figures: learning curves, differences, and recovery."""
+"""The report's figures: learning curves and differences."""
 
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from torchrl_osr.lab.evaluation.figures import BLUE, GREEN, GREY, ORANGE, new_figure
-from torchrl_osr.lab.evaluation.statistics import Array, estimate
+from torchrl_osr.lab.evaluation.statistics import estimate
 from torchrl_osr.lab.report.comparisons import Difference
 from torchrl_osr.lab.report.runs import RunTables
-from torchrl_osr.lab.report.tables import by_run, recovery_curve, undisturbed
+from torchrl_osr.lab.report.tables import by_run, undisturbed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-Band: TypeAlias = tuple[Array, Array, Array, Array]
-"""Places along the axis, means, and both ends of their 95 % bands, ``[T]`` each."""
 
 # Each method has its own combination.
 COLORS = (BLUE, ORANGE, GREEN, "#CC79A7", "#E69F00", "#56B4E9")
@@ -32,31 +29,40 @@ VERDICTS = {"better": BLUE, "worse": ORANGE, "no significant difference": "black
 
 def learning_curves(tables: RunTables) -> Figure:
     """Draw scores over updates, and the mean score of the data's episodes."""
-    panels: dict[str, dict[str, Band]] = {}
-    levels = {}
-    for (data, method), rows in undisturbed(tables.episodes).groupby(
-        ["data", "method"], sort=False
-    ):
-        steps = rows.groupby("step")
+    columns = min(3, len(tables.data))
+    rows = -(-len(tables.data) // columns)
+    figure = new_figure(WIDTH, 2.8 * rows + 1)
+    grid = figure.subplots(rows, columns, squeeze=False, sharex="col")
+    panels = dict(zip(tables.data, grid.flat, strict=False))
+    for data, axes in panels.items():
+        level = tables.runs["data_score"][tables.runs["data"] == data].mean()
+        axes.axhline(level, color=GREY, linewidth=1, linestyle=":")
+        _plain(axes, "y")
+        axes.set_title(_wrapped(data, 100 // columns), fontsize=10)
+    for axes in grid.flat[len(panels) :]:
+        axes.set_visible(False)
+    lines = {}
+    groups = undisturbed(tables.episodes).groupby(["data", "method"], sort=False)
+    for (data, method), played in groups:
+        steps = played.groupby("step")
         found = np.array([estimate(by_run(each))[:3] for _, each in steps])
-        if rows["run"].nunique() == 1:
-            found[:, 1:] = np.nan
-        x = np.array(list(steps.groups)) / 1000
-        panels.setdefault(data, {})[method] = (x, *found.T)
-        levels[data] = tables.runs["data_score"][tables.runs["data"] == data].mean()
-    return _panels(panels, tables, "thousand updates", tables.measure, levels)
-
-
-def recovery(tables: RunTables) -> Figure | None:
-    """Draw the share of disturbed episodes that have been back in the data."""
-    ended = tables.episodes[tables.episodes["stood"].notna()]
-    panels: dict[str, dict[str, Band]] = {}
-    for (data, suite, method), there in ended.groupby(
-        ["data", "suite", "method"], sort=False
-    ):
-        panels.setdefault(f"{data}, {suite}", {})[method] = recovery_curve(there)
-    xlabel, ylabel = "steps after the disturbance", "share back in the data"
-    return _panels(panels, tables, xlabel, ylabel, {}) if panels else None
+        x, (mean, low, high) = np.array(list(steps.groups)) / 1000, found.T
+        number = tables.methods.index(method)
+        color = COLORS[number % len(COLORS)]
+        line = LINES[number // len(COLORS) % len(LINES)]
+        (lines[method],) = panels[data].plot(x, mean, line, color=color, linewidth=1.6)
+        if played["run"].nunique() > 1:
+            panels[data].fill_between(
+                x, low, high, color=color, alpha=0.15, linewidth=0
+            )
+    figure.legend(
+        list(lines.values()), [_wrapped(name, 100) for name in lines],
+        loc="outside upper center", frameon=False, fontsize=8,
+        ncols=max(1, 100 // (max(map(len, lines)) + 8)),
+    )  # fmt: skip
+    figure.supxlabel("thousand updates", fontsize=10)
+    figure.supylabel(tables.measure, fontsize=10)
+    return figure
 
 
 def differences(found: Sequence[Difference], reference: str) -> Figure | None:
@@ -91,58 +97,16 @@ def differences(found: Sequence[Difference], reference: str) -> Figure | None:
     for each in found:
         assert each.estimate is not None
         mean, low, high, _ = each.estimate
-        axes = grid[list(methods).index(each.data)][
-            list(signs).index(each.quantity.name)
-        ]
-        y, color = (
-            list(methods[each.data]).index(each.method),
-            VERDICTS.get(each.verdict),
-        )
-        axes.hlines(y, low, high, color=color or GREY, linewidth=1.4)
-        face = "white" if color == "black" else color or GREY
-        axes.plot(
-            mean, y, "o", color=color or GREY, markersize=4.5, markerfacecolor=face
-        )
+        row = grid[list(methods).index(each.data)]
+        axes = row[list(signs).index(each.quantity.name)]
+        y = list(methods[each.data]).index(each.method)
+        color = VERDICTS.get(each.verdict, GREY)
+        face = "white" if color == "black" else color
+        axes.hlines(y, low, high, color=color, linewidth=1.4)
+        axes.plot(mean, y, "o", color=color, markersize=4.5, markerfacecolor=face)
     for axes, (name, sign) in zip(grid[-1], signs.items(), strict=True):
         better = "more is better" if sign > 0 else "less is better"
         axes.set_xlabel(f"{_wrapped(name, 30)}\n({better})", fontsize=8)
-    return figure
-
-
-def _panels(
-    panels: Mapping[str, Mapping[str, Band]],
-    tables: RunTables,
-    xlabel: str,
-    ylabel: str,
-    levels: Mapping[str, float],
-) -> Figure:
-    """Draw a panel for each data set, with all methods."""
-    methods = tables.methods  # a method has the same line in all figures
-    columns = min(3, len(panels))
-    rows = -(-len(panels) // columns)
-    figure = new_figure(WIDTH, 2.8 * rows + 1)
-    grid = figure.subplots(rows, columns, squeeze=False, sharey="col")
-    lines = {}
-    for axes, (title, bands) in zip(grid.flat, panels.items(), strict=False):
-        for name, (x, mean, low, high) in bands.items():
-            number = methods.index(name)
-            color = COLORS[number % len(COLORS)]
-            line = LINES[number // len(COLORS) % len(LINES)]
-            lines[name] = axes.plot(x, mean, line, color=color, linewidth=1.6)[0]
-            axes.fill_between(x, low, high, color=color, alpha=0.15, linewidth=0)
-        if title in levels:
-            axes.axhline(levels[title], color=GREY, linewidth=1, linestyle=":")
-        _plain(axes, "y")
-        axes.set_title(_wrapped(title, 100 // columns), fontsize=10)
-    for axes in grid.flat[len(panels) :]:
-        axes.set_visible(False)
-    figure.legend(
-        list(lines.values()), [_wrapped(name, 100) for name in lines],
-        loc="outside upper center", frameon=False, fontsize=8,
-        ncols=max(1, 100 // (max(map(len, methods)) + 8)),
-    )  # fmt: skip
-    figure.supxlabel(xlabel, fontsize=10)
-    figure.supylabel(ylabel, fontsize=10)
     return figure
 
 

@@ -33,22 +33,12 @@ with needed_by("the report needs", "train"):
 
 
 def write_report(
-    tables: RunTables,
-    folder: Path,
-    *,
-    reference: str | None = None,
-    command: str = "",
+    tables: RunTables, folder: Path, *, reference: str | None = None, command: str = ""
 ) -> Path:
-    """Write ``report.html``, and each table and figure by itself.
+    """Write ``report.html``, and each table and figure by itself; return its path.
 
     Methods are compared with the ``reference``. Default: the first method. The page
     prints the ``command``.
-
-    Returns:
-        The page's path.
-
-    Raises:
-        ValueError: if there is no such method.
     """
     methods = tables.methods
     reference = methods[0] if reference is None else reference
@@ -60,17 +50,14 @@ def write_report(
         "scores": score_table(tables),
         "differences": difference_table(found),
         "recoverable": saved_table(tables, reference),
-        **{
-            f"robustness-{suite}": robustness_table(tables, suite)
-            for suite in tables.suites
-        },
-        "runs": runs.assign(versions=runs["versions"].map(", ".join)),
     }
+    for suite in tables.suites:
+        frames[f"robustness-{suite}"] = robustness_table(tables, suite)
+    frames["runs"] = runs.assign(versions=runs["versions"].map(", ".join))
     frames = {name: frame for name, frame in frames.items() if not frame.empty}
     drawn = {
         "curves": figures.learning_curves(tables),
         "differences": figures.differences(found, reference),
-        "recovery": figures.recovery(tables),
     }
     folder.mkdir(parents=True, exist_ok=True)
     pictures = {}
@@ -82,12 +69,9 @@ def write_report(
     for name, frame in frames.items():
         file = re.sub(r"[^\w.-]+", "-", name)  # suites have any name
         write_atomically(folder / f"{file}.csv", numbers(frame).to_csv())
-    environment = Environment(
-        loader=PackageLoader("torchrl_osr.lab.report", "."),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    loader = PackageLoader("torchrl_osr.lab.report", ".")
+    blocks = {"trim_blocks": True, "lstrip_blocks": True}
+    environment = Environment(loader=loader, autoescape=True, **blocks)
     page = environment.get_template("page.html.j2").render(
         tables=tables,
         frames={name: frame.map(text) for name, frame in frames.items()},
@@ -107,15 +91,10 @@ def numbers(frame: pd.DataFrame) -> pd.DataFrame:
     """Return a table with columns of mean, low and high for each one of estimates."""
     columns: dict[str, Any] = {}
     for name, cells in frame.items():
-        estimates = [cell for cell in cells if isinstance(cell, Estimate)]
-        ends = ("", " low", " high") if estimates else ("",)
-        for place, end in enumerate(ends):
-            columns[f"{name}{end}"] = [
-                cell[place]
-                if isinstance(cell, Estimate)
-                else None
-                if estimates
-                else cell
-                for cell in cells
-            ]
+        estimates = [cell if isinstance(cell, Estimate) else None for cell in cells]
+        if not any(estimates):
+            columns[str(name)] = cells
+            continue
+        for place, end in enumerate(("", " low", " high")):
+            columns[f"{name}{end}"] = [each and each[place] for each in estimates]
     return pd.DataFrame(columns, index=frame.index)

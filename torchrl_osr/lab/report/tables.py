@@ -20,14 +20,13 @@ from torchrl_osr.lab.evaluation.statistics import (
     Estimate,
     decimal,
     estimate,
+    interval,
     nested_resamples,
     over_what,
-    percentile_interval,
-    recovered_share,
     saved_share,
     scores_and_decreases,
 )
-from torchrl_osr.lab.evaluation.training_summary import NUM_RECENT
+from torchrl_osr.lab.evaluation.tables import NUM_RECENT
 from torchrl_osr.lab.report.runs import RunTables
 
 
@@ -110,30 +109,21 @@ def _recovery(there: pd.DataFrame) -> dict[str, Any]:
         return {}
     columns = ["stood", "alive_after", "undisturbed_alive"]
     shares = there.groupby("run")[columns].mean().mean()  # a run, a vote
-    mean, low, high = (100 * float(line[-1]) for line in recovery_curve(there)[1:])
-    over = over_what([there["run"].unique()])
+    # A column, whose numbers are percentages.
+    back = 100.0 * (there["recovery_steps"] <= STEPS_AFTER)
+    runs = [
+        run.to_numpy()[:, None] for _, run in back.groupby(there["run"], sort=False)
+    ]
+    over = over_what(len(runs))
+    mean = np.mean([run.mean() for run in runs])
     median = there["recovery_steps"].fillna(np.inf).median()
     return {
         "stood %": 100 * shares["stood"],
         f"stood +{STEPS_AFTER} %": 100 * shares["alive_after"],
         "(undisturbed) %": 100 * shares["undisturbed_alive"],
-        "recovered %": Estimate(mean, low, high, over),
+        "recovered %": interval(mean, nested_resamples(runs), over),
         "median steps": median if np.isfinite(median) else "most never",
     }
-
-
-def recovery_curve(there: pd.DataFrame) -> tuple[Array, Array, Array, Array]:
-    """Return the share of disturbed episodes that have been back in the data by a step.
-
-    Steps, share and both ends of its 95 % band, ``[T]`` each.
-    """
-    steps = np.arange(STEPS_AFTER + 1.0)
-    within = [
-        run["recovery_steps"].to_numpy()[:, None] <= steps
-        for _, run in there.groupby("run", sort=False)
-    ]
-    share = np.mean([each.mean(0) for each in within], axis=0)
-    return (steps, share, *percentile_interval(nested_resamples(within)))
 
 
 def saved_table(tables: RunTables, reference: str) -> pd.DataFrame:
@@ -167,18 +157,16 @@ def saved_table(tables: RunTables, reference: str) -> pd.DataFrame:
                 row["R %"] = None
                 if len(both):
                     with contextlib.suppress(ValueError):  # the reference saves all
-                        share = recovered_share(ours, theirs, walk[hard])
-                        row["R %"] = _percent(share, len(both))
+                        row["R %"] = _percent(ours, walk[hard], theirs)
             for name, which in chosen.items():
-                share = saved_share(table.loc[:, which], walk[which])
-                row[name] = _percent(share, len(table))
+                row[name] = _percent(table.loc[:, which], walk[which])
             cells[f"{data}, {states}", method] = row
     return frame_of(cells, "data", "method")
 
 
-def _percent(found: tuple[float, float, float], seeds: int) -> Estimate:
-    mean, low, high = (100 * each for each in found)
-    return Estimate(mean, low, high, over_what([range(seeds)], alone="walks"))
+def _percent(back: Any, walk: Any, baseline: Any = None) -> Estimate:
+    mean, low, high = (100 * each for each in saved_share(back, walk, baseline))
+    return Estimate(mean, low, high, over_what(len(back), alone="walks"))
 
 
 def text(cell: Any) -> str:

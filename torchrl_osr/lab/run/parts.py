@@ -29,8 +29,8 @@ from torchrl_osr.lab.evaluation import (
     deterministic_policy,
     summarize,
 )
-from torchrl_osr.lab.evaluation.figures import learning_curve
-from torchrl_osr.lab.evaluation.training_summary import read_scalars, score_table
+from torchrl_osr.lab.evaluation.figures import learning_curve, read_scalars
+from torchrl_osr.lab.evaluation.tables import score_table
 from torchrl_osr.lab.run.build import Learner
 from torchrl_osr.lab.run.data import references_of
 from torchrl_osr.lab.run.folder import Run, package_versions
