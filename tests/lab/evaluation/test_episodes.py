@@ -18,8 +18,6 @@ from torchrl_osr.lab.evaluation import (
 from torchrl_osr.lab.evaluation.episodes import EpisodeResults
 from torchrl_osr.modules import tanh_gaussian_actor
 
-HOPPER = reference_returns("hopper")
-
 
 def linear_policy(observation: torch.Tensor) -> torch.Tensor:
     """A policy under which episodes end at different times; rows do not mix."""
@@ -41,11 +39,9 @@ def play_alone(seed: int) -> tuple[float, int]:
 def test_each_episode_is_what_it_would_be_alone():
     evaluator = EpisodeEvaluator("Hopper-v5", num_episodes=4, seed=5)
     results = evaluator(linear_policy)
-    alone = [play_alone(seed) for seed in (5, 6, 7, 8)]
-    np.testing.assert_allclose(
-        results.returns, [total for total, _ in alone], rtol=1e-6
-    )
-    assert results.lengths.tolist() == [steps for _, steps in alone]
+    returns, lengths = zip(*map(play_alone, (5, 6, 7, 8)), strict=True)
+    np.testing.assert_allclose(results.returns, returns, rtol=1e-6)
+    assert results.lengths.tolist() == list(lengths)
     assert len(set(results.lengths)) > 1, "episodes shall end at different times here"
     again = evaluator(linear_policy)
     np.testing.assert_array_equal(results.returns, again.returns)
@@ -55,35 +51,23 @@ def test_policy_sees_standardised_observations():
     actor = tanh_gaussian_actor(2, 1, num_cells=[4])
     loc, scale = torch.tensor([1.0, 2.0]), torch.tensor([3.0, 4.0])
     norm = ObservationNorm(loc, scale, in_keys=["observation"], standard_normal=True)
-    raw = torch.tensor([[4.0, -2.0]])
     # By hand: (4 - 1) / 3 = 1 and (-2 - 2) / 4 = -1.
-    standard = torch.tensor([[1.0, -1.0]])
-    torch.testing.assert_close(
-        deterministic_policy(actor, norm)(raw), deterministic_policy(actor)(standard)
-    )
-    head = actor[0].module(standard)[0]
-    torch.testing.assert_close(deterministic_policy(actor)(standard), head.tanh())
+    raw, standard = torch.tensor([[4.0, -2.0]]), torch.tensor([[1.0, -1.0]])
+    expected = actor[0].module(standard)[0].tanh()
+    torch.testing.assert_close(deterministic_policy(actor, norm)(raw), expected)
+    torch.testing.assert_close(deterministic_policy(actor)(standard), expected)
 
 
-def test_summary_is_json_and_normalised():
-    results = EpisodeResults(
-        np.array([3234.3, -20.272305]), np.array([1000, 20]), np.array([0, 1])
-    )
-    summary = summarize(results, HOPPER)
-    assert summary["score"] == pytest.approx(50)
-    assert summary["score_low"] == pytest.approx(0)
-    assert summary["score_high"] == pytest.approx(100)
-    assert summary["returns"] == [3234.3, -20.272305]
-    assert summary["length"] == 510
-
-
-def test_without_references_there_is_no_score():
-    returns = np.array([-900.0, -1100.0])
-    results = EpisodeResults(returns, np.full(2, 200), np.arange(2))
+def test_summary_has_scores_only_with_references():
+    returns = np.array([3234.3, -20.272305])
+    results = EpisodeResults(returns, np.array([1000, 20]), np.array([0, 1]))
+    summary = summarize(results, reference_returns("hopper"))
+    ends = [summary[f"score{end}"] for end in ("", "_low", "_high")]
+    assert ends == pytest.approx([50, 0, 100])
+    assert (summary["returns"], summary["length"]) == (returns.tolist(), 510)
     summary = summarize(results, None)
     assert measure_of(summary) == "return"
-    assert summary["return"] == -1000
-    assert (summary["return_low"], summary["return_high"]) == (-1100, -900)
+    assert (summary["return_low"], summary["return_high"]) == (returns[1], returns[0])
     assert not [key for key in summary if "score" in key]
 
 

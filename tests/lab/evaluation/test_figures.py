@@ -1,27 +1,15 @@
-"""Figures are drawn."""
+"""Figures are drawn, from scalars as logged."""
 
 from __future__ import annotations
 
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.record.loggers import CSVLogger
 
-from torchrl_osr.lab.evaluation.figures import (
-    data_figure,
-    learning_curve,
-    robustness_figure,
-)
+from torchrl_osr.lab.evaluation.figures import data_figure, learning_curve, read_scalars
 
 PNG = b"\x89PNG"
-
-
-def test_robustness_figure_is_drawn(tmp_path):
-    numbers = {"return": 5, "return_low": 4, "return_high": 7, "clean_return": 9}
-    summary = [{"name": "a", "disturbed_share": 1} | numbers]
-    summary.append({"name": "b", "disturbed_share": 0} | numbers)
-    path = tmp_path / "figure.png"
-    robustness_figure(summary, path, title="hopper")
-    assert path.read_bytes().startswith(PNG)
 
 
 @pytest.mark.parametrize("evaluations", [0, 3])
@@ -34,6 +22,15 @@ def test_learning_curve_is_drawn(tmp_path, evaluations):
     path = tmp_path / "curve.png"
     learning_curve(history, scalars, path, title="osr", data_mean=5.0)
     assert path.read_bytes().startswith(PNG)
+
+
+def test_scalars_are_read_as_logged_and_the_later_row_counts(tmp_path):
+    for values in ({1: 5.0, 2: 6.0, 3: 7.0}, {2: 6.5, 3: 7.5}):  # killed, then resumed
+        logger = CSVLogger("csv", log_dir=str(tmp_path))
+        for step, value in values.items():
+            logger.log_scalar("policy/loss_x", value, step=step)
+    scalars = read_scalars(tmp_path / "csv" / "scalars" / "policy")
+    assert scalars == {"loss_x": [(1, 5.0), (2, 6.5), (3, 7.5)]}
 
 
 def test_data_figure_is_drawn_although_entries_are_many(tmp_path):

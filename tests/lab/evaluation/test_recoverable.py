@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,52 +19,19 @@ from torchrl_osr.lab.evaluation.recoverable import (
     STATES,
     RecoverableStates,
     load_recoverable_states,
-    read_recoverable_states,
     recovers,
 )
 
 
-def states_of(env_name: str, states: list[tuple], **others) -> dict[str, np.ndarray]:
-    """Arrays of a file with the given positions and velocities."""
-    count = len(states)
-    arrays = {
-        "env_name": env_name,
-        "qpos": np.stack([np.asarray(qpos, float) for qpos, _ in states]),
-        "qvel": np.stack([np.asarray(qvel, float) for _, qvel in states]),
-        "goal": np.zeros((count, 0)),
-        "group": ["recoverable"] * count,
-        "walk": np.arange(count),
-        "kind": ["kick"] * count,
-        "strength": np.ones(count),
-        "steps": 60,
-        "least_speed": -np.inf,
-    }
-    return {name: np.asarray(value) for name, value in (arrays | others).items()}
+def states_of(env_name: str, states: list[tuple], **others) -> RecoverableStates:
+    """States with the given positions and velocities."""
+    qpos, qvel = (np.array(each, float) for each in zip(*states, strict=True))
+    rest = {"goal": qpos[:, :0], "steps": 60, "least_speed": -np.inf} | others
+    unused = dict.fromkeys(("group", "walk", "kind", "strength"))
+    return RecoverableStates(env_name, qpos, qvel, **rest, **unused)
 
 
-@pytest.fixture
-def load(tmp_path: Path):
-    """Write arrays and read them as states."""
-
-    def load(arrays: dict[str, np.ndarray]) -> RecoverableStates:
-        np.savez(tmp_path / "states.npz", **arrays)
-        return read_recoverable_states(tmp_path / "states.npz")
-
-    return load
-
-
-def expert(env_name: str):
-    policy = load_behavior_policy(env_name, "expert")
-    return lambda observation: torch.from_numpy(
-        policy.deterministic(observation.numpy())
-    )
-
-
-def still(size: int):
-    return lambda observation: torch.zeros(len(observation), size)
-
-
-def test_who_falls_from_each_state_is_what_the_environment_says(load) -> None:
+def test_who_falls_from_each_state_is_what_the_environment_says() -> None:
     env = make_environment("Walker2d-v5")
     env.reset(seed=0)
     bare = env.unwrapped
@@ -92,21 +59,27 @@ def test_who_falls_from_each_state_is_what_the_environment_says(load) -> None:
         return True
 
     expected = [stands(*state) for state in states]
-    back = recovers(load(states_of("walker2d", states)), policy)
+    back = recovers(states_of("walker2d", states), policy)
     assert back.tolist() == expected
     assert 2 < sum(expected) < 18
 
 
-def test_halfcheetah_has_to_regain_its_speed(load) -> None:
+def test_halfcheetah_has_to_regain_its_speed() -> None:
     state = np.zeros(9), np.zeros(9)
-    arrays = states_of("halfcheetah", [state, state], least_speed=2.0, steps=100)
-    assert recovers(load(arrays), expert("halfcheetah")).tolist() == [True, True]
-    assert recovers(load(arrays), still(6)).tolist() == [False, False]
-    arrays["least_speed"] = np.array(100.0)
-    assert recovers(load(arrays), expert("halfcheetah")).tolist() == [False, False]
+    states = states_of("halfcheetah", [state, state], least_speed=2.0, steps=100)
+    behavior = load_behavior_policy("halfcheetah", "expert")
+
+    def expert(observation: Tensor) -> Tensor:
+        return torch.from_numpy(behavior.deterministic(observation.numpy()))
+
+    assert recovers(states, expert).tolist() == [True, True]
+    still = recovers(states, lambda rows: torch.zeros(len(rows), 6))
+    assert still.tolist() == [False, False]
+    fast = replace(states, least_speed=100.0)
+    assert recovers(fast, expert).tolist() == [False, False]
 
 
-def test_in_a_maze_the_goal_of_each_state_counts(load) -> None:
+def test_in_a_maze_the_goal_of_each_state_counts() -> None:
     pytest.importorskip("gymnasium_robotics")
     env = make_environment(environment_id("pointmaze-umaze"))
     start, _ = env.reset(seed=0)
@@ -121,8 +94,8 @@ def test_in_a_maze_the_goal_of_each_state_counts(load) -> None:
         seen.append(observation)
         return torch.zeros(len(observation), 2)
 
-    arrays = states_of("pointmaze-umaze", states, goal=goals)
-    assert recovers(load(arrays), policy).tolist() == [True, True, False]
+    back = recovers(states_of("pointmaze-umaze", states, goal=goals), policy)
+    assert back.tolist() == [True, True, False]
     np.testing.assert_allclose(seen[0][:, 2:4], goals, atol=1e-6)
     np.testing.assert_allclose(seen[0][:, 4:6], np.stack([here] * 3), atol=1e-6)
 

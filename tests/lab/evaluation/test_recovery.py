@@ -1,12 +1,43 @@
-"""Survival and recovery, on trajectories by hand."""
+"""Distances to the data by brute force; survival and recovery by hand."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
+from torchrl_osr.lab.evaluation import DataDistance
 from torchrl_osr.lab.evaluation.recovery import Trajectory, measure_recovery
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e3])
+def test_small_distances_keep_their_digits(offset):
+    """Far from zero and close together, a float32 product would lose them."""
+    generator = torch.Generator().manual_seed(0)
+    centres = 30 * torch.randn(40, 11, generator=generator)
+    rows = centres.repeat(100, 1) + 1e-3 * torch.randn(4000, 11, generator=generator)
+    rows = rows + offset
+    data = TensorDict({"observation": rows}, [4000])
+    distance = DataDistance(data, max_reference=3000)
+    assert len(distance._states) == 3000
+    scale = rows.double().std(0, correction=0).float().double()
+    far = rows[:300] + 5 * torch.randn(300, 11, generator=generator)
+    for asked in (far, rows[:300]):  # some of these find themselves, at distance 0
+        standard = (asked.double() - distance._loc) / scale
+        exact = (standard[:, None] - distance._states).square().sum(-1).sqrt()
+        nearest = exact.sort().values[:, :10].mean(1)
+        found = distance(asked).double()
+        torch.testing.assert_close(found, nearest, rtol=1e-5, atol=5e-8)
+    assert nearest.max() < 1e-3
+    assert (distance(far) > 10 * distance.threshold).all()
+
+
+def test_threshold_is_the_quantile_of_states_that_were_left_out():
+    rows, fresh = torch.randn(2, 5000, 4, generator=torch.Generator().manual_seed(1))
+    distance = DataDistance(TensorDict({"observation": rows}, [5000]))
+    share = (distance(fresh) <= distance.threshold).float().mean()
+    assert share == pytest.approx(0.95, abs=0.015)
 
 
 class Distance:
@@ -34,7 +65,7 @@ def measure(disturbed: Trajectory, clean: Trajectory | None = None):
         ([2.0, 3.0], False, True, None, 0),  # at the threshold is within
         ([3.0, 2.1, 1.9, 5.0], False, True, None, 2),
         ([3.0] * 50, False, True, None, None),  # never back before the end
-        ([3.0] * 120 + [1.0], False, True, True, 120),  # later than the curve
+        ([3.0] * 120 + [1.0], False, True, True, 120),
         ([3.0], True, False, False, None),  # fell in the disturbance
         ([1.0], True, False, False, None),  # and where it lies is in the data
         ([3.0, 3.0, 1.0], True, True, False, None),  # the same, a little later
@@ -48,19 +79,14 @@ def measure(disturbed: Trajectory, clean: Trajectory | None = None):
 def test_one_episode(after, fell, survived, alive, steps):
     before = [1.0, 1.0, 4.0]
     recovery = measure(trajectory([*before, *after], {2, 3}, fell=fell))
-    assert recovery["ended_at"] == 2
     assert recovery["survived_knock"] == survived
     assert recovery["alive_after"] == alive
     assert recovery["recovery_steps"] == steps
 
 
-def test_episodes_without_the_disturbance_have_no_recovery():
+def test_the_first_disturbance_counts_if_there_is_one():
     assert measure(trajectory([1.0, 9.0, 9.0], fell=True)) is None
-
-
-def test_the_first_of_two_disturbances_counts():
     recovery = measure(trajectory([1, 1, 4, 3, 1, 1, 8, 8], {2, 6}))
-    assert recovery["ended_at"] == 1
     assert recovery["recovery_steps"] == 2
 
 

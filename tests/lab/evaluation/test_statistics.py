@@ -11,10 +11,8 @@ from torchrl_osr.lab.evaluation.statistics import (
     mean_difference,
     mean_interval,
     nested_resamples,
-    recovered_share,
     saved_share,
     scores_and_decreases,
-    wilson_interval,
 )
 
 
@@ -22,10 +20,6 @@ from torchrl_osr.lab.evaluation.statistics import (
 def test_no_or_non_finite_values_are_an_error(values):
     with pytest.raises(ValueError, match="finite"):
         mean_interval(values)
-
-
-def many_resamples(runs) -> np.ndarray:
-    return np.concatenate([nested_resamples(runs, seed=seed) for seed in range(5)])
 
 
 def test_nested_resamples_are_those_of_a_loop_over_draws():
@@ -39,7 +33,7 @@ def test_nested_resamples_are_those_of_a_loop_over_draws():
         ])
         for _ in range(8000)
     ]  # fmt: skip
-    ours = many_resamples(runs)[:, 0]
+    ours = np.ravel([nested_resamples(runs, seed=seed) for seed in range(5)])
     below, wanted = (
         np.searchsorted(np.sort(each), np.unique(loop) + 1e-9) / len(each)
         for each in (ours, loop)
@@ -52,13 +46,6 @@ def test_numbers_of_an_episode_stay_together():
     first = np.random.default_rng(0).normal(size=(30, 1))
     resamples = nested_resamples([np.hstack([first, 3 - first])] * 2)
     np.testing.assert_allclose(resamples.sum(1), 3)
-
-
-def test_wilson_interval_is_that_of_the_formula():
-    # p = 0.5, n = 4, z^2 = 3.8415: 0.5 -+ 1.95996 * sqrt(1 + 0.96036) / 7.84146.
-    low, high = wilson_interval(2, 4)
-    assert (low, high) == pytest.approx((0.15004, 0.84996), abs=1e-5)
-    assert wilson_interval(0, 20)[0] == pytest.approx(0, abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -102,24 +89,7 @@ def test_nothing_to_lose_is_no_number():
     assert low is high is None
 
 
-def test_the_recovered_share_of_known_tables() -> None:
-    baseline = [[1, 0, 0, 0, 0, 0, 0, 0], [0, 0, 1, 0, 0, 0, 0, 0]]
-    method = [[1, 1, 0, 0, 0, 0, 0, 0], [1, 1, 1, 0, 0, 0, 0, 0]]
-    walk = [0, 0, 1, 1, 2, 2, 3, 3]
-    assert recovered_share(np.ones((2, 8)), baseline, walk) == (1, 1, 1)
-    assert recovered_share(baseline, baseline, walk) == (0, 0, 0)
-    # 5 of 16 against 2 of 16.
-    assert recovered_share(method, baseline, walk)[0] == pytest.approx(3 / 14)
-    # With one walk the seeds alone vary: (2 - 1) / 7, (3 - 1) / 7, or between.
-    one = recovered_share(method, baseline, [7] * 8)
-    assert one == pytest.approx((3 / 14, 1 / 7, 2 / 7))
-    # With one seed the walks alone vary, the states of one together.
-    two = [0, 0, 0, 0, 1, 1, 1, 1]
-    single = recovered_share(method[:1], np.zeros((1, 8)), two)
-    assert single == pytest.approx((1 / 4, 0, 1 / 2))
-
-
-def test_the_saved_share_of_known_tables() -> None:
+def test_the_saved_share_of_known_tables():
     back, walk = [[1, 1, 0, 0], [1, 0, 0, 0]], [0, 0, 1, 1]
     # All walks alike: with one of them the seeds alone vary, from 1 / 4 to 2 / 4.
     assert saved_share(back, [7] * 4) == pytest.approx((3 / 8, 1 / 4, 1 / 2))
@@ -134,6 +104,14 @@ def test_the_saved_share_of_known_tables() -> None:
     assert saved_share([[1, 1, 1, 0]], [0, 0, 0, 1])[0] == 3 / 4
 
 
-def test_a_baseline_that_saves_all_leaves_nothing_to_share():
+def test_the_share_of_a_baselines_failures_of_known_tables():
+    baseline = [[1, 0, 0, 0, 0, 0, 0, 0], [0, 0, 1, 0, 0, 0, 0, 0]]
+    method = [[1, 1, 0, 0, 0, 0, 0, 0], [1, 1, 1, 0, 0, 0, 0, 0]]
+    walk = [0, 0, 1, 1, 2, 2, 3, 3]
+    assert saved_share(np.ones((2, 8)), walk, baseline) == (1, 1, 1)
+    assert saved_share(baseline, walk, baseline) == (0, 0, 0)
+    # With one walk the seeds alone vary: (2 - 1) / 7, (3 - 1) / 7, or between.
+    one = saved_share(method, [7] * 8, baseline)
+    assert one == pytest.approx((3 / 14, 1 / 7, 2 / 7))
     with pytest.raises(ValueError, match="saves all states"):
-        recovered_share([[1, 0]], [[1, 1]], [0, 1])
+        saved_share([[1, 0]], [0, 1], [[1, 1]])

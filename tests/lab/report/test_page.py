@@ -33,7 +33,7 @@ def test_page_of_two_data_sets_stands_alone(tmp_path):
     # The figures and tables are files, too.
     embedded = [each.split(",")[1] for each in sources if each.startswith("data:")]
     files = {path.name: path.read_bytes() for path in folder.glob("*.png")}
-    assert files.keys() == {"curves.png", "differences.png", "recovery.png"}
+    assert files.keys() == {"curves.png", "differences.png"}
     assert sorted(files.values()) == sorted(map(base64.b64decode, embedded))
     scores = pd.read_csv(folder / "scores.csv", index_col=["data", "method"])
     row = scores.loc["hopper medium-replay", "cql"]

@@ -5,7 +5,7 @@
     torchrl-osr evaluate sweep=multirun/20260101-120000 jobs=4
     torchrl-osr evaluate sweep=<folder above runs> switching=true suite=recoverable
 
-A run's folder gets ``robustness-<suite>.json`` with all raw results and a figure, or
+A run's folder gets ``robustness-<suite>.json`` with all raw results, or
 ``recoverable-<half>.json``. See docs/robustness.md.
 """
 

@@ -1,4 +1,4 @@
-"""Figures of data sets, training runs and evaluations under disturbances."""
+"""Figures of data sets and training runs."""
 
 from __future__ import annotations
 
@@ -139,29 +139,3 @@ def read_scalars(folder: Path) -> dict[str, list[tuple[int, float]]]:
             rows = {int(step): float(value) for step, value in csv.reader(file)}
         scalars[path.stem] = sorted(rows.items())
     return scalars
-
-
-def robustness_figure(
-    summary: Sequence[Mapping[str, Any]], path: Path | str, *, title: str
-) -> None:
-    """Draw the scores of a summary of disturbances with their intervals."""
-    figure = new_figure(6.5, 4.6)
-    figure.suptitle(title)
-    axes, measure, rows = figure.subplots(), measure_of(summary[0]), summary[::-1]
-    mean, low, high = (
-        np.array([row[f"{measure}{end}"] for row in rows])
-        for end in ("", "_low", "_high")
-    )
-    axes.errorbar(
-        mean, range(len(rows)), xerr=np.abs([low - mean, high - mean]), fmt="o",
-        color=BLUE, capsize=3, label="disturbed (mean, 95 % interval)",
-    )  # fmt: skip
-    clean = rows[0][f"clean_{measure}"]
-    axes.axvline(clean, color=GREY, linestyle="--", linewidth=1, label="undisturbed")
-    names = [
-        row["name"] + ("" if row["disturbed_share"] else " (not met)") for row in rows
-    ]
-    axes.set_yticks(range(len(rows)), names)
-    axes.set(xlabel=IN_WORDS[measure], xlim=(0, None) if low.min() >= 0 else None)
-    axes.legend(frameon=False, fontsize=8)
-    save_figure(figure, path)

@@ -71,7 +71,7 @@ class DataDistance:
     def __call__(self, observation: Tensor) -> Tensor:
         """Return the distances of raw observations ``[M, S]``, float32 ``[M]``."""
         # Double: the difference of two near states cancels the digits of float32.
-        chunks = self._standard(observation.cpu()).split(ROWS_AT_A_TIME)
+        chunks = torch.split(self._standard(observation.cpu()), ROWS_AT_A_TIME)
         distances = (torch.cdist(each, self._states) for each in chunks)
         nearest = [each.topk(NUM_NEIGHBORS, largest=False)[0] for each in distances]
         return torch.cat(nearest).mean(-1).float()

@@ -175,10 +175,10 @@ def summarize_disturbances(
         mean, low, high = mean_interval(values)
         row |= {measure: mean, f"{measure}_low": low, f"{measure}_high": high}
         row[f"clean_{measure}"] = float(clean.mean())
-        lost = (None, None, None)
+        names = ("decrease", "decrease_low", "decrease_high")
+        row |= dict.fromkeys(names)
         if hit.any():  # an unmet one has no loss
-            lost = decrease_interval(clean, values)
-        row["decrease"], row["decrease_low"], row["decrease_high"] = lost
+            row |= zip(names, decrease_interval(clean, values), strict=True)
         row["disturbed_share"] = float(hit.mean())
         row["survival"] = _mean(entries["alive_after"].dropna())
         row["clean_survival"] = _mean(entries["clean_alive_after"].dropna())

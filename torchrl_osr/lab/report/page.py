@@ -70,9 +70,8 @@ def write_report(
         file = re.sub(r"[^\w.-]+", "-", name)  # suites have any name
         write_atomically(folder / f"{file}.csv", numbers(frame).to_csv())
     loader = PackageLoader("torchrl_osr.lab.report", ".")
-    blocks = {"trim_blocks": True, "lstrip_blocks": True}
-    environment = Environment(loader=loader, autoescape=True, **blocks)
-    page = environment.get_template("page.html.j2").render(
+    template = Environment(loader=loader, autoescape=True).get_template("page.html.j2")
+    page = template.render(
         tables=tables,
         frames={name: frame.map(text) for name, frame in frames.items()},
         reference=reference,

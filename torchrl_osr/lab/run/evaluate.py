@@ -31,7 +31,6 @@ from torchrl_osr.lab.evaluation import (
     evaluate_paired,
     summarize_disturbances,
 )
-from torchrl_osr.lab.evaluation.figures import robustness_figure
 from torchrl_osr.lab.evaluation.recoverable import load_recoverable_states, recovers
 from torchrl_osr.lab.evaluation.robustness import impossible_disturbances
 from torchrl_osr.lab.run.build import read_environment
@@ -100,14 +99,11 @@ def evaluate_files(
         write_json(path, results)
     for name, reason in results.get("left_out", {}).items():
         print(f"left out: {name}: {reason}")
-    if config.suite.half is None:
-        figure = path.with_suffix(".png")
-        robustness_figure(results["summary"], figure, title=title_of(results))
     return path, results
 
 
 def title_of(results: Mapping[str, Any]) -> str:
-    """Return what was played, for tables and figures."""
+    """Return what was played, for tables."""
     return (
         f"{results['env']} {results['data']}, suite {results['suite']}: "
         f"{len(results['evaluations'])} x {results['episodes']} pairs of episodes"
