@@ -45,6 +45,10 @@ def test_a_sound_log_gives_no_reason_to_complain():
         ({"reward": np.full(1200, 2.0)}, "reward is 2 in every row: all policies"),
         ({"action": np.sign(make_log()["action"])}, "at one of its bounds in 100%"),
         (
+            {"observation": 1.7e9 + np.c_[np.zeros(1200), np.arange(1200)] / 50},
+            "1,199 changes of observation[1] from one row",
+        ),
+        (
             {"terminated": make_log()["truncated"], "truncated": np.zeros(1200)},
             "all 30 episodes are terminated after 40 steps, like at a time limit",
         ),
@@ -55,8 +59,7 @@ def test_a_sound_log_gives_no_reason_to_complain():
     ],
 )
 def test_findings_name_what_looks_wrong(changes, message):
-    (found,) = said(make_log(**changes))
-    assert message in found
+    assert any(message in found for found in said(make_log(**changes)))
 
 
 def test_columns_are_in_the_units_of_the_recording():

@@ -1,8 +1,6 @@
-"""Behaviour policies: small tanh-Gaussian actors stored as plain arrays.
+"""Behaviour policies: small tanh-Gaussian actors in NumPy.
 
-The forward pass is NumPy: for a single observation it costs a quarter of a torch call,
-and a roll-out makes hundreds of thousands of them.
-
+For a single observation NumPy costs a quarter of a torch call.
 Shapes: ``B`` batch, ``S`` observation, ``A`` action, ``H`` hidden width.
 """
 
@@ -20,7 +18,6 @@ from torchrl_osr._files import read_arrays, read_json
 FloatArray = NDArray[np.float32]
 
 BEHAVIOR_POLICIES_DIR = Path(__file__).parent / "behavior_policies"
-"""Folder of the policies that ship with the package."""
 
 # The bounds that the actors were trained with.
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
@@ -38,12 +35,7 @@ class Affine(NamedTuple):
 
 @dataclass(frozen=True)
 class BehaviorPolicy:
-    r"""A tanh-Gaussian actor evaluated in NumPy.
-
-    .. math::
-        a = \tanh(\mu(s) + \sigma(s)\,\epsilon), \quad \epsilon \sim N(0, I)
-
-    Layers have weights ``[H, S]``, ``[H, H]`` and twice ``[A, H]``.
+    """A tanh-Gaussian actor; weights ``[H, S]``, ``[H, H]`` and twice ``[A, H]``.
 
     Examples:
         >>> import numpy as np
@@ -84,7 +76,7 @@ def load_behavior_card(folder: Path | str | None = None) -> dict[str, Any]:
 def behavior_policy_path(
     env_name: str, policy_name: str, folder: Path | str | None = None
 ) -> Path:
-    """File of a policy that the card names, see :func:`load_behavior_policy`."""
+    """File of a policy that the card names."""
     card = load_behavior_card(folder)
     there = card.get(env_name, {}).get("policies", {})
     if policy_name not in there:
@@ -105,10 +97,7 @@ def load_behavior_policy(
         policy_name: ``"medium"``, ``"expert"``, ``"replay_1"`` ... ``"replay_8"``.
 
     Keyword Args:
-        folder: with ``card.json`` and ``<env_name>/<policy_name>.npz``, as
-            ``examples/train_behavior.py`` writes it. Default: the policies of the
-            package.
-
+        folder: written by ``examples/train_behavior.py``. Default: the package's.
     """
     arrays = read_arrays(behavior_policy_path(env_name, policy_name, folder))
     arrays = {name: array.astype(np.float32) for name, array in arrays.items()}

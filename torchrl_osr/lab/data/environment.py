@@ -1,8 +1,4 @@
-"""Gymnasium tasks, as data are collected on them and policies are played in them.
-
-Those of gymnasium-robotics too (``torchrl-osr[mazes]``), which are registered when one
-is asked for.
-"""
+"""Gymnasium tasks, as data are collected on them and policies are played in them."""
 
 from __future__ import annotations
 
@@ -44,19 +40,20 @@ MAX_EPISODE = 100_000
 Leaves = dict[tuple[str | int, ...], "spaces.Space[Any]"]
 
 
+def known_ids() -> dict[str, str]:
+    """Gymnasium ids of the mazes and of the tasks with behaviour policies, by name."""
+    return {name: str(e["env"]) for name, e in load_behavior_card().items()} | MAZE_IDS
+
+
 def environment_id(env_name: str) -> str:
-    """Gymnasium id of a maze, or of a task with behaviour policies, by short name."""
-    return _known_ids()[env_name]
+    """Gymnasium id of a known task by its short name."""
+    return known_ids()[env_name]
 
 
 def environment_name(env_id: str) -> str:
     """Short name of a known task; of another one its id, as a folder can be called."""
-    names = {known: name for name, known in _known_ids().items()}
+    names = {known: name for name, known in known_ids().items()}
     return names.get(env_id) or re.sub(r"[^\w.-]", "-", env_id.split(":")[-1])
-
-
-def _known_ids() -> dict[str, str]:
-    return {name: str(e["env"]) for name, e in load_behavior_card().items()} | MAZE_IDS
 
 
 class EnvironmentSpec(NamedTuple):
@@ -79,7 +76,7 @@ class EnvironmentSpec(NamedTuple):
 
 
 def environment_spec(env_id: str) -> EnvironmentSpec:
-    """Sizes and action bounds of a task, see :func:`open_environment`.
+    """Sizes and action bounds of a task.
 
     Examples:
         >>> from torchrl_osr.lab.data import environment_spec
@@ -97,7 +94,7 @@ def environment_spec(env_id: str) -> EnvironmentSpec:
 
 
 def is_simulated(env: gymnasium.Env[Any, Any]) -> bool:
-    """Whether an environment can be played, see :class:`EnvironmentSpec`."""
+    """Whether an environment can be played."""
     return type(env.unwrapped).step is not gymnasium.Env.step
 
 
@@ -121,17 +118,10 @@ def open_environment(env_id: str) -> gymnasium.Env[Any, Any]:
     """Make a Gymnasium task with actions in its own units.
 
     Observations that are dictionaries or tuples become one vector, in the order of
-    :func:`observation_leaves`. Mazes end (``terminated``) at their goal.
-
-    Args:
-        env_id: Gymnasium id, such as ``"Hopper-v5"``, or ``"my_package:MyRobot-v0"``,
-            which imports ``my_package`` first.
-
-    Raises:
-        ValueError: there is no such task, its observations are no real vectors, or its
-            actions neither real vectors with finite bounds nor numbered from 0.
+    :func:`observation_leaves`. Mazes end (``terminated``) at their goal. The id
+    ``"my_package:MyRobot-v0"`` imports ``my_package`` first.
     """
-    env = _found(env_id)
+    env = _registered(env_id)
     if isinstance(env.observation_space, (spaces.Dict, spaces.Tuple)):
         leaves = observation_leaves(env.observation_space)
         parts = spaces.Tuple([*leaves.values()])
@@ -162,19 +152,14 @@ def observation_leaves(space: spaces.Space[Any]) -> Leaves:
 
     Environments, data and policies have this order: the keys of a dictionary
     alphabetically on every level, the parts of a tuple as they are.
-
-    Examples:
-        >>> from gymnasium.spaces import Box, Dict
-        >>> from torchrl_osr.lab.data.environment import observation_leaves
-        >>> [*observation_leaves(Dict(speed=Box(0, 1, (2,)), angle=Box(0, 1, (1,))))]
-        [('angle',), ('speed',)]
     """
     if isinstance(space, (spaces.Dict, spaces.Tuple)):
         inner: Any = space
         keys = sorted(inner) if isinstance(space, spaces.Dict) else range(len(inner))
-        parts = {key: observation_leaves(inner[key]) for key in keys}
         return {
-            (k, *name): leaf for k, part in parts.items() for name, leaf in part.items()
+            (key, *name): leaf
+            for key in keys
+            for name, leaf in observation_leaves(inner[key]).items()
         }
     if not space.is_np_flattenable or (
         space.dtype == np.uint8 and len(space.shape or ()) > 1
@@ -188,18 +173,29 @@ def _is_real_vector(space: gymnasium.Space[Any]) -> TypeGuard[spaces.Box]:
     return vector and np.issubdtype(space.dtype, np.floating)
 
 
-def _found(env_id: str) -> gymnasium.Env[Any, Any]:
+def _registered(env_id: str) -> gymnasium.Env[Any, Any]:
     """Make the task as it is registered, with clear errors."""
+
+    def make() -> gymnasium.Env[Any, Any]:
+        spec = gymnasium.registry.get(env_id)
+        # Without it an episode never ends at the goal, and the return is no success.
+        maze = spec is not None and "maze_map" in spec.kwargs
+        options = {"continuing_task": False} if maze else {}
+        with _silent_model_loading(), warnings.catch_warnings():
+            old_ant = r".*AntMaze_\w+-v4 is out of date"  # on purpose, see MAZE_IDS
+            warnings.filterwarnings("ignore", old_ant, DeprecationWarning)
+            return gymnasium.make(env_id, **options)
+
     try:
         try:
-            return _make(env_id)
+            env = make()
         except gymnasium.error.NameNotFound as error:
             what = f"Gymnasium has no {env_id!r} ({error}); gymnasium-robotics needs"
             # Importing it prints a note on hands to standard error.
             with needed_by(what, "mazes"), redirect_stderr(io.StringIO()):
                 import gymnasium_robotics
             gymnasium.register_envs(gymnasium_robotics)
-            return _make(env_id)
+            env = make()
     except (gymnasium.error.Error, ModuleNotFoundError) as error:
         missing = gymnasium.error.DependencyNotInstalled, ModuleNotFoundError
         kind = ImportError if isinstance(error, missing) else ValueError
@@ -207,16 +203,6 @@ def _found(env_id: str) -> gymnasium.Env[Any, Any]:
             f"env.id={env_id} cannot be made: {error.__cause__ or error} A task of "
             "your own is env.id=<package>:<name>, where that can be imported."
         ) from error
-
-
-def _make(env_id: str) -> gymnasium.Env[Any, Any]:
-    spec = gymnasium.registry.get(env_id)
-    # Without it an episode never ends at the goal, and the return is no success.
-    options = {"continuing_task": False} if spec and "maze_map" in spec.kwargs else {}
-    with _silent_model_loading(), warnings.catch_warnings():
-        old_ant = r".*AntMaze_\w+-v4 is out of date"  # on purpose, see MAZE_IDS
-        warnings.filterwarnings("ignore", old_ant, DeprecationWarning)
-        env: gymnasium.Env[Any, Any] = gymnasium.make(env_id, **options)
     if env_id in MAZE_IDS.values():
         # The model's file, which is loaded now and would be left for ever.
         Path(env.get_wrapper_attr("tmp_xml_file_path")).unlink(missing_ok=True)

@@ -21,9 +21,9 @@ from tqdm.auto import tqdm
 from torchrl_osr._extras import needed_by
 from torchrl_osr._files import read_json
 from torchrl_osr.lab.data.environment import Leaves, observation_leaves
-from torchrl_osr.lab.data.recording import Recording
+from torchrl_osr.lab.data.recording import Columns, Reading, Recording
 from torchrl_osr.lab.data.store import CHUNK_ROWS
-from torchrl_osr.lab.data.transitions import Array, Columns, Reading
+from torchrl_osr.lab.data.transitions import Array
 
 with needed_by("Minari data sets need", "minari"):
     import minari
@@ -37,7 +37,21 @@ def open_minari(
 
     Bounds of ``None`` are the set's own.
     """
-    opened = _open(str(path), download)
+    places = Path(path).expanduser() / "data", get_dataset_path(str(path)) / "data"
+    if download and not any(place.is_dir() for place in places):
+        hosting.download_dataset(str(path))
+    here = next((place for place in places if place.is_dir()), None)
+    if here is None:
+        raise FileNotFoundError(
+            f"Minari set {str(path)!r} is not on this machine: fetch it with "
+            "data.download=true, or give its folder."
+        )
+    # Without its spaces Minari makes the environment of the metadata to ask for them,
+    # which can be any function of any package.
+    metadata = read_json(here / "metadata.json")
+    if not {"observation_space", "action_space"} <= metadata.keys():
+        raise ValueError(f"{here / 'metadata.json'} names no spaces.")
+    opened = minari.MinariDataset(here)
     actions: Any = opened.action_space
     if isinstance(actions, spaces.Discrete):
         options = replace(options, num_actions=int(actions.n), action_bounds=(-1, 1))
@@ -47,15 +61,16 @@ def open_minari(
         bounds = actions.low.ravel(), actions.high.ravel()
         options = replace(options, action_bounds=bounds)
     leaves = observation_leaves(opened.observation_space)
-    names = ["/".join(map(str, name)) for name in leaves]
-    sizes = [spaces.flatdim(leaf) for leaf in leaves.values()]
     about = {
         "source": "minari",
         "path": str(path),
         "dataset_id": opened.id,
         "env_id": opened.env_spec and opened.env_spec.id,
         "minari_version": opened.minari_version,
-        "observation_layout": [[*each] for each in zip(names, sizes, strict=True)],
+        "observation_layout": [
+            ["/".join(map(str, name)), spaces.flatdim(leaf)]
+            for name, leaf in leaves.items()
+        ],
     }
 
     def parts() -> Iterator[Columns]:
@@ -69,28 +84,8 @@ def open_minari(
                 yield {n: np.concatenate([e[n] for e in waiting]) for n in waiting[0]}
                 waiting, rows = [], 0
 
-    paths = sorted(Path(opened.storage.data_path).rglob("*"))
-    files = [path for path in paths if path.is_file()]
+    files = sorted(path for path in here.rglob("*") if path.is_file())
     return Recording(parts, options, about, files)
-
-
-def _open(dataset: str, download: bool) -> minari.MinariDataset:
-    path, home = Path(dataset).expanduser(), get_dataset_path(dataset) / "data"
-    places = [path / "data", path, home]
-    if download and not any(place.exists() for place in places):
-        hosting.download_dataset(dataset)
-    here = next((p for p in places if (p / "metadata.json").is_file()), None)
-    if here is None:
-        raise FileNotFoundError(
-            f"Minari set {dataset!r} is not on this machine: fetch it with "
-            "data.download=true, or give its folder."
-        )
-    # Without its spaces Minari makes the environment of the metadata to ask for them,
-    # which can be any function of any package.
-    metadata = read_json(here / "metadata.json")
-    if not {"observation_space", "action_space"} <= metadata.keys():
-        raise ValueError(f"{here / 'metadata.json'} names no spaces.")
-    return minari.MinariDataset(here)
 
 
 def _read(

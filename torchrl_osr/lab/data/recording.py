@@ -1,4 +1,7 @@
-"""Recorded steps become transitions, in memory or on disk."""
+"""Recorded columns become transitions, in memory or on disk.
+
+Shapes: ``N`` rows, ``E`` trajectories, ``S`` observation, ``A`` action.
+"""
 
 from __future__ import annotations
 
@@ -12,20 +15,29 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from tensordict import TensorDict
 from torchrl import torchrl_logger
 
+from torchrl_osr._checks import check_choice
 from torchrl_osr._files import sha256_of
 from torchrl_osr.lab.data.statistics import describe_episodes
 from torchrl_osr.lab.data.store import Dataset, cache_root, load_or_write
 from torchrl_osr.lab.data.transitions import (
-    ActionBounds,
-    Columns,
-    Part,
-    Reading,
+    ACTION_LIMIT,
+    SAME_STATE,
+    Array,
+    as_transitions,
     check_dataset,
-    trajectories,
 )
+
+ActionBounds = tuple[ArrayLike, ArrayLike]
+"""Lowest and highest action, numbers or ``[A]``."""
+
+Columns = Mapping[str, Any]
+
+REQUIRED = ("observation", "action", "reward", "terminated")
+OPTIONAL = ("truncated", "episode", "next_observation")
 
 # Raise it whenever other rows or another manifest are made of a source: recordings in
 # the cache are then converted anew.
@@ -38,8 +50,21 @@ WARNINGS = {
     "0, as a vector environment records its resets",
 }
 
-# Changes that float32 loses, of all changes of an entry, before a warning is due.
-VANISHED_SHARE = 0.01
+# A bound may be exceeded by float32 arithmetic, not by an unclipped policy.
+ROUNDING = 1e-5
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Options for recorded columns, see :func:`transitions_from_columns`."""
+
+    action_bounds: Any = (-1.0, 1.0)
+    clip_actions: bool = False
+    num_actions: int | None = None
+    missing: str = "error"
+
+    def __post_init__(self) -> None:
+        check_choice("data.missing", self.missing, ("error", "row", "episode"))
 
 
 @dataclass
@@ -54,80 +79,78 @@ class Recording:
     options: Reading
     about: dict[str, Any] = field(default_factory=dict)
     files: list[Path] = field(default_factory=list)
-    _parts: list[Part] = field(default_factory=list, init=False)
+    _counts: Counter[str] = field(default_factory=Counter, init=False)
+    _episodes: list[Array] = field(default_factory=list, init=False)
+    _warnings: dict[str, None] = field(default_factory=dict, init=False)
 
     def load(self, *, on_disk: bool = False) -> Dataset:
         """Transitions ``[N]`` and their manifest; on disk, converted in parts."""
+        bounds = [np.asarray(b, np.float64).tolist() for b in self.options.action_bounds]
+        options = asdict(self.options) | {"action_bounds": bounds}
         if on_disk:
             # Sizes and times: to read a large source at each start is slow.
             states = [(str(file.resolve()), file.stat()) for file in self.files]
-            request = self.about | {
+            request = self.about | options | {
                 "reader_version": READER_VERSION,
                 "source_files": [[n, s.st_size, s.st_mtime_ns] for n, s in states],
-                "options": asdict(self.options) | {"action_bounds": self._bounds()},
             }
             text = json.dumps(request, sort_keys=True)
             digest = hashlib.sha256(text.encode()).hexdigest()[:16]
             folder = cache_root() / "recorded" / f"{self.about['source']}-{digest}"
             data, manifest = load_or_write(
-                folder, request, self._transitions, describe=self._manifest
+                folder, request, self._transitions, describe=self._facts
             )
         else:
             data = torch.cat([*self._transitions()])
             check_dataset(data)
-            manifest = {"num_transitions": len(data)} | self._manifest()
+            known = self.about | options | {"num_transitions": len(data)}
+            manifest = known | self._facts()
         for warning in manifest["warnings"]:
             torchrl_logger.warning(warning)
         return data, manifest
 
-    def _bounds(self) -> list[Any]:
-        return [np.asarray(b, np.float64).tolist() for b in self.options.action_bounds]
-
     def _transitions(self) -> Iterator[TensorDict]:
         kept = 0
         for columns in self.parts():
-            part = trajectories(columns, self.options)
-            kept += len(part.data)
-            self._parts.append(part._replace(data=TensorDict()))  # not the rows
-            if len(part.data):
-                yield part.data
+            data, counts, episodes = trajectories(columns, self.options)
+            self._warnings |= dict.fromkeys(_vanishing(columns))
+            self._counts.update(counts)
+            self._episodes.append(episodes)
+            kept += len(data)
+            if len(data):
+                yield data
         if not kept:
             raise ValueError("no row has a true next state: give next_observation.")
 
-    def _manifest(self) -> dict[str, Any]:
+    def _facts(self) -> dict[str, Any]:
         """Facts about the transitions once all have been read."""
-        counts: Counter[str] = Counter()
-        for part in self._parts:
-            counts.update(part.counts)
-        episodes = np.concatenate([part.episodes for part in self._parts])
-        whole = episodes[:, 2] == 1
-        returns, lengths = episodes[:, 0], episodes[:, 1].astype(int)
+        returns, lengths, complete = np.concatenate(self._episodes).T
+        whole, lengths = complete == 1, lengths.astype(int)
+        for name, flaw in WARNINGS.items():
+            if number := self._counts[name]:
+                self._warnings[f"{number:,} rows {flaw}."] = None
         return {
-            **self.about,
             "data_sha256": [sha256_of(file) for file in self.files],
-            **counts,
-            "num_actions": self.options.num_actions,
-            "action_bounds": self._bounds(),
+            **self._counts,
             **describe_episodes(returns[whole], lengths[whole]),
             "incomplete_returns": returns[~whole].tolist(),
             "incomplete_lengths": lengths[~whole].tolist(),
-            "warnings": [*self._warnings(counts)],
+            "warnings": [*self._warnings],
         }
 
-    def _warnings(self, counts: Mapping[str, int]) -> Iterator[str]:
-        total: Any = sum(part.changes for part in self._parts)
-        moved, lost = total
-        for entry in np.flatnonzero(lost > VANISHED_SHARE * moved):
-            reward = entry == len(moved) - 1
+
+def _vanishing(columns: Columns) -> Iterator[str]:
+    """Yield a warning for each entry with changes that float32 loses."""
+    for name in ("observation", "reward"):
+        array = np.reshape(columns[name], (len(columns["reward"]), -1))
+        moved = np.diff(array, axis=0) != 0
+        lost = moved & (np.diff(array.astype(np.float32), axis=0) == 0)
+        for entry in np.flatnonzero(lost.sum(0) > 0.01 * moved.sum(0)):
             yield (
-                f"{'reward' if reward else f'observation[{entry}]'} changes "
-                f"{moved[entry]:,} times from one row to the next, and {lost[entry]:,} "
-                "of these changes vanish in float32: subtract a constant (of a clock, "
-                "its first value), or leave the entry out."
+                f"{lost.sum(0)[entry]:,} changes of {name}[{entry}] from one row to the "
+                "next vanish in float32: subtract a constant (of a clock, its first "
+                "value), or leave the entry out."
             )
-        for name, flaw in WARNINGS.items():
-            if counts[name]:
-                yield f"{counts[name]:,} rows {flaw}."
 
 
 def transitions_from_columns(
@@ -186,3 +209,224 @@ def transitions_from_columns(
     """
     options = Reading(action_bounds, clip_actions, num_actions, missing)
     return Recording(lambda: [columns], options).load()
+
+
+def trajectories(
+    rows: Columns, options: Reading
+) -> tuple[TensorDict, dict[str, int], Array]:
+    """Transitions of whole trajectories, perhaps none, and facts about them.
+
+    These are counts of rows, and of each trajectory ``[E, 3]`` the return, the length,
+    and whether it is complete.
+    """
+    columns = _arrays(rows, options.num_actions)
+    lost = _missing(columns, options.missing)
+    flagged, ends = _ends(columns)
+    trajectory = np.cumsum(np.r_[False, ends[:-1]])
+    broken = np.isin(trajectory, trajectory[lost])  # recorded in part
+    if options.missing == "episode":
+        lost = broken
+    resets = _reset_rows(columns, flagged) & ~lost
+    ends[:-1] |= lost[1:]
+    keep = ~(lost | resets)
+    if not keep.any():
+        raise ValueError("no row has a value in every column.")
+    if not keep.all():
+        columns = {name: array[keep] for name, array in columns.items()}
+        flagged, ends, broken = flagged[keep], ends[keep], broken[keep]
+    ends[-1] = True
+    reward = columns["reward"].astype(np.float64)
+    columns = _cast(columns, options.num_actions)
+    columns["action"], clipped, outside = _unit_actions(columns["action"], options)
+    episode = columns.pop("episode", None)
+    terminated = columns["terminated"]
+    truncated = columns.get("truncated", np.zeros_like(terminated))
+    stops = np.flatnonzero(ends)
+    starts = np.r_[0, stops[:-1] + 1]
+    complete = flagged[stops] & ~broken[stops]
+    if "next_observation" in columns and episode is None:
+        # Rows that do not follow one another have no sum of rewards.
+        reached, after = columns["next_observation"][:-1], columns["observation"][1:]
+        slack = SAME_STATE * np.maximum(1, np.abs(after))
+        jumps = np.r_[(np.abs(reached - after) > slack).any(1) & ~ends[:-1], False]
+        complete &= ~np.logical_or.reduceat(jumps, starts)
+    returns = np.add.reduceat(reward, starts)
+    keep, filled = np.ones_like(ends), 0
+    if "next_observation" not in columns:
+        observation = columns["observation"]
+        columns["next_observation"] = np.roll(observation, -1, axis=0)
+        columns["next_observation"][terminated] = observation[terminated]
+        keep, filled = ~ends | terminated, int(terminated.sum())
+    # Only an end is dropped: its trajectory is then cut at the row before.
+    last = ends.copy()
+    last[:-1] |= ~keep[1:]
+    columns["truncated"] = truncated | (last & ~terminated)
+    if not keep.all():
+        columns = {name: column[keep] for name, column in columns.items()}
+    counts = {
+        "dropped_rows": int((~keep).sum()),
+        "terminal_rows_filled": filled,
+        "missing_rows": int(lost.sum()),
+        "reset_rows": int(resets.sum()),
+        "clipped_actions": clipped,
+        "actions_outside": outside,
+        "terminated_ends": int(terminated[stops].sum()),
+        "truncated_ends": int((truncated & ~terminated)[stops].sum()),
+        "unmarked_ends": int((~flagged)[stops].sum()),
+    }
+    episodes = np.c_[returns, stops - starts + 1, complete]
+    return as_transitions(columns), counts, episodes
+
+
+def _arrays(rows: Columns, num_actions: int | None) -> dict[str, Array]:
+    """Columns as arrays of numbers with one row a step; masked entries become NaN."""
+    flaws = [f"no {name}" for name in REQUIRED if name not in rows]
+    if not {"truncated", "episode"} & rows.keys():
+        flaws.append("neither truncated nor episode")
+    # A misspelt optional column would otherwise be overlooked.
+    flaws += [f"an unknown {n!r}" for n in rows if n not in REQUIRED + OPTIONAL]
+    if flaws:
+        raise ValueError(f"the columns have {', '.join(flaws)}.")
+    columns: dict[str, Array] = {}
+    count = np.size(rows["reward"])
+    for name, values in rows.items():
+        if np.ma.is_masked(values):
+            values = np.ma.asarray(values, np.float64).filled(np.nan)
+        array = np.asarray(values)
+        size = int(np.size(array) / max(count, 1))
+        if name == "next_observation":
+            size = np.shape(rows["observation"])[-1]
+        vector = name.endswith("observation") or (name, num_actions) == ("action", None)
+        shapes = [(count, max(size, 1))] if vector else [(count,), (count, 1)]
+        if array.shape not in shapes or array.dtype.kind not in "biuf":
+            raise ValueError(
+                f"{name!r} has shape {[*array.shape]} and type {array.dtype}; expected "
+                f"numbers {' or '.join(str([*shape]) for shape in shapes)}."
+            )
+        columns[name] = array if vector else array.reshape(-1)
+    if not count:
+        raise ValueError("the data hold no rows; expected at least one transition.")
+    return columns
+
+
+def _missing(columns: Mapping[str, Array], missing: str) -> Array:
+    """Rows ``[N]`` without a value in some column."""
+    lost = np.zeros(len(columns["reward"]), np.bool_)
+    for name, array in columns.items():
+        wrong = (array != array).reshape(len(array), -1).any(1)  # NaN alone
+        if wrong.any() and missing == "error":
+            raise ValueError(
+                f"{name!r} has no value in row {wrong.argmax()} of {len(array)}, "
+                f"one of {wrong.sum()}: repair them, or leave out such rows or their "
+                "episodes (data.missing=row, data.missing=episode)."
+            )
+        lost |= wrong
+    return lost
+
+
+def _ends(columns: Mapping[str, Array]) -> tuple[Array, Array]:
+    """Rows ``[N]`` whose flags end a trajectory, and all rows that end one."""
+    flagged = np.zeros(len(columns["reward"]), np.bool_)
+    for name in {"terminated", "truncated"} & columns.keys():
+        flagged |= np.nan_to_num(columns[name]).astype(np.bool_)
+    ends = flagged.copy()
+    ends[-1] = True
+    if "episode" in columns:
+        same = np.r_[np.diff(columns["episode"]) == 0, False]
+        if (wrong := flagged & same).any():
+            row = int(wrong.argmax())
+            raise ValueError(
+                f"row {row} ends its episode, and row {row + 1} belongs to the same "
+                f"'episode' {columns['episode'][row]:g}, as in {wrong.sum()} rows: the "
+                "flags may be late, or the rows in another order."
+            )
+        ends |= ~same
+        numbers, times = np.unique(columns["episode"][ends], return_counts=True)
+        if (times > 1).any():
+            raise ValueError(
+                f"'episode' {numbers[times > 1][0]:g} comes back; expected its rows "
+                "together. data.columns.step sorts them."
+            )
+    return flagged, ends
+
+
+def _reset_rows(columns: Mapping[str, Array], flagged: Array) -> Array:
+    """Rows ``[N]`` in which a vector environment was reset: no action was executed.
+
+    They begin in the state that an episode ended in, and have a reward of 0.
+    """
+    if "next_observation" not in columns:
+        return np.zeros_like(flagged)
+    reached = np.roll(columns["next_observation"], 1, axis=0)
+    same = (reached == columns["observation"]).all(1) & (columns["reward"] == 0)
+    return np.asarray(same & np.r_[False, flagged[:-1]])
+
+
+def _cast(columns: Mapping[str, Array], num_actions: int | None) -> dict[str, Array]:
+    """Columns as they are trained on; actions may still have other bounds."""
+    cast: dict[str, Array] = {}
+    for name, array in columns.items():
+        if name == "episode":
+            _refuse(name, array, array != np.floor(array), "whole numbers")
+            cast[name] = array
+        elif name in ("terminated", "truncated"):
+            _refuse(name, array, (array != 0) & (array != 1), "bool, or 0 and 1")
+            cast[name] = array.astype(np.bool_)
+        elif name == "action" and num_actions is not None:
+            known = np.isin(array, range(num_actions))
+            _refuse(name, array, ~known, f"discrete actions, 0 to {num_actions - 1}")
+            cast[name] = np.eye(num_actions, dtype=np.float32)[array.astype(int)]
+        else:
+            with np.errstate(over="ignore"):
+                cast[name] = array.astype(np.float32)
+            _refuse(name, array, ~np.isfinite(cast[name]), "finite float32")
+            if name == "action" and array.dtype != np.float32:
+                cast[name] = array.astype(np.float64)  # to be mapped exactly
+    return cast
+
+
+def _refuse(name: str, array: Array, wrong: Array, expected: str) -> None:
+    if wrong.any():
+        index = tuple(np.argwhere(wrong)[0])
+        raise ValueError(
+            f"{name!r} holds {array[index]} in row {index[0]} of {len(array)}; "
+            f"expected {expected}."
+        )
+
+
+def _unit_actions(action: Array, options: Reading) -> tuple[Array, int, int]:
+    """Actions from -1 to 1, clipped; how many rows were, and how many outside."""
+    if options.num_actions is not None:
+        return action, 0, 0
+    size = action.shape[1]
+    low, high = (np.broadcast_to(np.float64(b), size) for b in options.action_bounds)
+    if not (np.isfinite([low, high]).all() and (low < high).all()):
+        raise ValueError(
+            f"action_bounds={options.action_bounds}; expected the lowest and the "
+            "highest action, finite numbers (data.action_bounds)."
+        )
+    whole = ((action >= 0) & (action == np.round(action))).all()
+    alone = size == 1 or (action.sum(1) == 1).all()
+    if whole and alone and (low < 0).all() and np.ptp(action) > 0:
+        raise ValueError(
+            f"'action' holds only the whole numbers {action.min():g} to "
+            f"{action.max():g}, which look like discrete actions: name the environment "
+            "(env.id=...), or give the bounds of forces (data.action_bounds=[0,high])."
+        )
+    unit = action
+    # Bounds of -1 and 1 leave the numbers as they are, bit by bit.
+    if np.any(low != -1) or np.any(high != 1):
+        unit = (action.astype(np.float64) - low) / (high - low) * 2 - 1
+    unit = unit.astype(np.float32)
+    outside = (np.abs(unit) > 1 + ROUNDING).any(1)
+    if outside.any() and not options.clip_actions:
+        row = int(outside.argmax())
+        raise ValueError(
+            f"'action' leaves its bounds in {outside.sum()} of {len(action)} rows, "
+            f"first in row {row}: {action[row].tolist()}, where they are "
+            f"{low.tolist()} and {high.tolist()}. Give the true ones "
+            "(data.action_bounds=[low,high]), or data.clip_actions=true if the "
+            "environment clipped them."
+        )
+    clipped = np.clip(unit, -ACTION_LIMIT, ACTION_LIMIT)
+    return clipped, int((clipped != unit).any(1).sum()), int(outside.sum())

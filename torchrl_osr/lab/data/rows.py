@@ -113,22 +113,14 @@ def multi_step(
 ) -> TensorDict:
     r"""Entries of ``"next"`` after at most ``n_steps`` steps of the data.
 
-    The reward is :math:`\sum_{k<m} \gamma^k (a\,r_k + b)`. State and flags are those
-    after the last of the m steps. m is less than ``n_steps`` where an episode ends, or
-    where the next row did not come next in time.
+    The reward is :math:`\sum_{k<m} \gamma^k (a\,r_k + b)`, with ``reward_scale`` a and
+    ``reward_shift`` b. State and flags are those after the last of the m steps. m,
+    ``"steps"`` ``[B, 1]``, is less than ``n_steps`` where an episode ends, or where the
+    next row did not come next in time. ``with_next_action`` adds the data's
+    ``"action"`` at the state that the steps lead to, see :func:`next_action`.
 
     TorchRL 0.14.1's ``MultiStep`` keeps the flags of the first step: it bootstraps
     returns that have reached a terminal state.
-
-    Keyword Args:
-        n_steps: the largest m.
-        gamma: discount factor.
-        reward_scale, reward_shift: a and b.
-        with_next_action: add the data's ``"action"`` at the state that the steps lead
-            to, see :func:`next_action`.
-
-    Returns:
-        The entries of ``"next"``, and ``"steps"``, m, ``[B, 1]``.
     """
 
     def reward_of(rows: Tensor) -> Tensor:

@@ -13,15 +13,15 @@ from torchrl import torchrl_logger
 
 from torchrl_osr import __version__
 from torchrl_osr._extras import needed_by
-from torchrl_osr.lab.data.behavior import load_behavior_card
 from torchrl_osr.lab.data.environment import (
     MAZE_IDS,
     EnvironmentSpec,
     environment_id,
     environment_name,
     environment_spec,
+    known_ids,
 )
-from torchrl_osr.lab.data.recording import Recording
+from torchrl_osr.lab.data.recording import ActionBounds, Reading, Recording
 from torchrl_osr.lab.data.rollout import behavior_of, collect_source
 from torchrl_osr.lab.data.rows import mix_datasets
 from torchrl_osr.lab.data.statistics import (
@@ -36,7 +36,6 @@ from torchrl_osr.lab.data.store import (
     load_memmap,
     load_or_write,
 )
-from torchrl_osr.lab.data.transitions import ActionBounds, Reading
 
 RECORDED = ("minari", "d4rl", "file")
 """Sources that are recorded; the others are rolled out."""
@@ -133,7 +132,7 @@ def load_dataset(
                 "memory: choose another source, and leave out data.storage=disk."
             )
         name = env_name if env_id is None else environment_name(env_id)
-        known = [*load_behavior_card(), *MAZE_IDS]
+        known = known_ids()
         if name not in known or name != env_name:
             raise ValueError(
                 f"data={source} is rolled out for env.name={', '.join(known)}, not for "

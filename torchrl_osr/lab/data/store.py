@@ -27,7 +27,7 @@ from torchrl.envs.transforms import Transform
 
 from torchrl_osr._extras import needed_by
 from torchrl_osr._files import check_disk_space, read_json, sha256_of, write_json
-from torchrl_osr.lab.data.transitions import DATASET_KEYS, check_filled, check_rows
+from torchrl_osr.lab.data.transitions import DATASET_KEYS, check_dataset
 
 Dataset = tuple[TensorDict, dict[str, Any]]
 """Transitions ``[N]`` and their manifest."""
@@ -93,7 +93,6 @@ def write_memmap(
     try:
         parts: list[TensorDict] = []
         for chunk in chunks:
-            check_rows(chunk)
             # For this copy and the one of all parts.
             check_disk_space(partial, 2 * chunk.bytes(), "the data set")
             chunk = chunk.select(*DATASET_KEYS)
@@ -103,7 +102,7 @@ def write_memmap(
         rows = sum(len(part) for part in parts)
         stored = parts[0][:1].expand(rows).memmap_like(partial / ROWS)
         torch.cat(parts, out=stored)
-        check_filled(stored)
+        check_dataset(stored)
         for number in range(len(parts)):
             shutil.rmtree(partial / f"part{number}")
         manifest = dict(describe()) | {"format": FORMAT, "num_transitions": rows}

@@ -19,8 +19,8 @@ import numpy as np
 
 from torchrl_osr._extras import needed_by
 from torchrl_osr._files import read_arrays
-from torchrl_osr.lab.data.recording import Recording
-from torchrl_osr.lab.data.transitions import Array, Reading
+from torchrl_osr.lab.data.recording import Reading, Recording
+from torchrl_osr.lab.data.transitions import Array
 
 with needed_by("tables need", "train"):
     import pandas as pd
