@@ -46,7 +46,7 @@ def test_a_sound_log_gives_no_reason_to_complain():
         ({"action": np.sign(make_log()["action"])}, "at one of its bounds in 100%"),
         (
             {"observation": 1.7e9 + np.c_[np.zeros(1200), np.arange(1200)] / 50},
-            "1,199 changes of observation[1] from one row",
+            "1,199 changes of observation[1] from row to row",
         ),
         (
             {"terminated": make_log()["truncated"], "truncated": np.zeros(1200)},

@@ -85,15 +85,21 @@ class Recording:
 
     def load(self, *, on_disk: bool = False) -> Dataset:
         """Transitions ``[N]`` and their manifest; on disk, converted in parts."""
-        bounds = [np.asarray(b, np.float64).tolist() for b in self.options.action_bounds]
+        bounds = [
+            np.asarray(b, np.float64).tolist() for b in self.options.action_bounds
+        ]
         options = asdict(self.options) | {"action_bounds": bounds}
         if on_disk:
             # Sizes and times: to read a large source at each start is slow.
             states = [(str(file.resolve()), file.stat()) for file in self.files]
-            request = self.about | options | {
-                "reader_version": READER_VERSION,
-                "source_files": [[n, s.st_size, s.st_mtime_ns] for n, s in states],
-            }
+            request = (
+                self.about
+                | options
+                | {
+                    "reader_version": READER_VERSION,
+                    "source_files": [[n, s.st_size, s.st_mtime_ns] for n, s in states],
+                }
+            )
             text = json.dumps(request, sort_keys=True)
             digest = hashlib.sha256(text.encode()).hexdigest()[:16]
             folder = cache_root() / "recorded" / f"{self.about['source']}-{digest}"
@@ -147,8 +153,8 @@ def _vanishing(columns: Columns) -> Iterator[str]:
         lost = moved & (np.diff(array.astype(np.float32), axis=0) == 0)
         for entry in np.flatnonzero(lost.sum(0) > 0.01 * moved.sum(0)):
             yield (
-                f"{lost.sum(0)[entry]:,} changes of {name}[{entry}] from one row to the "
-                "next vanish in float32: subtract a constant (of a clock, its first "
+                f"{lost.sum(0)[entry]:,} changes of {name}[{entry}] from row to row "
+                "vanish in float32: subtract a constant (of a clock, its first "
                 "value), or leave the entry out."
             )
 

@@ -33,6 +33,7 @@ from torchrl_osr.lab.data.store import (
     Dataset,
     cache_root,
     is_memmap_folder,
+    is_memory_mapped,
     load_memmap,
     load_or_write,
 )
@@ -69,27 +70,23 @@ def load_dataset(
     machine and one set of library versions: contact dynamics are chaotic.
 
     Args:
-        env_name: short name of the task: ``"hopper"``, ``"walker2d"``,
-            ``"halfcheetah"``, ``"pointmaze-umaze"``, ``-medium`` or ``-large``; any, or
-            ``None``, for recorded data.
-        source: ``"random"``, ``"medium"``, ``"medium-replay"``, ``"medium-expert"`` or
-            ``"expert"``; of a maze ``"diverse"`` or ``"play"``; ``"minari"``,
-            ``"d4rl"`` or ``"file"`` (default).
+        env_name: short name of the task, such as ``"hopper"``; any, or ``None``, for
+            recorded data.
+        source: behaviour policy, such as ``"medium-replay"``, of a maze ``"diverse"``
+            or ``"play"``; or ``"minari"``, ``"d4rl"`` or ``"file"`` (default).
 
     Keyword Args:
         env_id: Gymnasium id of the task. The actions of a ``"file"`` are then in its
             units, and data that do not fit it are refused. Default: actions within -1
             and 1, not compared.
         references: scale of the scores. Default: D4RL's, if there are any.
-        path: ``"file"``: CSV, Parquet, HDF5 or NumPy archive, a list or a pattern
-            (``"logs/*.csv"``) of files that make one log, or a folder of
-            :func:`~torchrl_osr.lab.data.write_memmap`. ``"minari"``: a name, such as
-            ``"mujoco/hopper/medium-v0"``, or a folder. ``"d4rl"``: an HDF5 file.
+        path: file of a log, a list or a pattern of files, or a folder of
+            :func:`~torchrl_osr.lab.data.write_memmap`; name or folder of a Minari set.
         columns: of a ``"file"``, names of columns by their part: those of
             :func:`~torchrl_osr.lab.data.transitions_from_columns`, and ``step``, by
-            which the rows of an episode are sorted: numbers, or time stamps in ISO
-            format. Names may be patterns (``"obs_*"``), or lists, one name an entry.
-            ``terminated=False``: nothing ends the task. Default: the usual names.
+            which the rows of an episode are sorted. Names may be patterns
+            (``"obs_*"``), or lists. ``terminated=False``: nothing ends the task.
+            Default: the usual names.
         action_bounds: lowest and highest action of the recording. Default: of
             ``"minari"`` its action space; otherwise the task's own bounds.
         clip_actions, missing: see
@@ -107,77 +104,67 @@ def load_dataset(
         The transitions ``[N]`` and their manifest; ``"normalized_score"`` in it is
         ``None`` without reference returns or without a complete episode.
 
-    Raises:
-        ValueError: an option has no effect, or the data do not fit the task.
-
     Examples:
         >>> from torchrl_osr.lab.data import load_dataset
         >>> data, manifest = load_dataset("hopper", "random", num_transitions=500)
         >>> data["observation"].shape, manifest["env_id"]
         (torch.Size([500, 11]), 'Hopper-v5')
     """
-    reading: dict[str, Any] = {
+    log: dict[str, Any] = {
         "columns": {k: name for k, name in (columns or {}).items() if name is not None},
         "action_bounds": action_bounds,
         "clip_actions": clip_actions,
         "missing": missing,
         "download": download,
     }
-    references = references or REFERENCE_RETURNS.get(str(env_name))
-    if source not in RECORDED:
-        _refuse(reading | {"path": path}, f"data={source}, which is rolled out")
+    spec = None
+    if source in RECORDED:
+        _refuse({"random_share": random_share}, f"data={source}")
+        spec = None if env_id is None else environment_spec(env_id)
+        if path is None:
+            raise ValueError(f"data={source} needs data.path=...")
+        if (
+            source == "file"
+            and isinstance(path, (str, Path))
+            and is_memmap_folder(path)
+        ):
+            _refuse(log, f"{path}, which is converted")
+            data, manifest = load_memmap(path)
+        else:
+            recording = _opened(source, path, spec, progress=progress, **log)
+            data, manifest = recording.load(on_disk=on_disk)
+    else:
+        _refuse(log | {"path": path}, f"data={source}, which is rolled out")
         if random_share and (source == "random" or on_disk):
             raise ValueError(
                 f"data.random_share={random_share} mixes a source with random rows, in "
                 "memory: choose another source, and leave out data.storage=disk."
             )
         name = env_name if env_id is None else environment_name(env_id)
-        known = known_ids()
-        if name not in known or name != env_name:
+        if name not in known_ids() or name != env_name:
             raise ValueError(
-                f"data={source} is rolled out for env.name={', '.join(known)}, not for "
-                f"{env_id or env_name} as {env_name}: record data with 'torchrl-osr "
-                f"collect env.id={env_id} path={name}.npz', then add data=file "
-                f"data.path={name}.npz."
+                f"data={source} is rolled out for env.name={', '.join(known_ids())}, "
+                f"not for {env_id or env_name} as {env_name}: record data with "
+                f"'torchrl-osr collect env.id={env_id} path={name}.npz', then add "
+                f"data=file data.path={name}.npz."
             )
         recipe = {"num_transitions": num_transitions, "seed": seed}
         data, manifest = rolled_out(name, source, recipe, progress=progress)
-        score = _score(manifest, references)
-        if random_share:
-            random, about = rolled_out(name, "random", recipe, progress=progress)
-            data = mix_datasets(data, random, random_share=random_share, seed=seed)
-            number = round(random_share * len(data))
-            scores: Any = [score, _score(about, references)]
-            score = None
-            if None not in scores:
-                score = float(np.average(scores, weights=[len(data) - number, number]))
-            manifest = recipe | {
-                "random_share": random_share,
-                "env_id": about["env_id"],
-            }
-        elif not on_disk:
-            data = data.clone()
-    else:
-        if path is None:
-            raise ValueError(f"data={source} needs data.path=...")
-        _refuse({"random_share": random_share}, f"data={source}")
-        spec = None if env_id is None else environment_spec(env_id)
-        if (
-            source == "file"
-            and isinstance(path, (str, Path))
-            and is_memmap_folder(path)
-        ):
-            _refuse(reading, f"{path}, which is converted")
-            data, manifest = load_memmap(path)
-            data = data if on_disk else data.clone()
-        else:
-            recording = open_recorded(
-                source, path, spec=spec, progress=progress, **reading
-            )
-            data, manifest = recording.load(on_disk=on_disk)
-        if spec is not None:
-            _check_fit(data, manifest, str(env_id), spec)
-        score = _score(manifest, references)
+    if is_memory_mapped(data) and not on_disk:
+        data = data.clone()
+    if spec is not None:
+        _check_fit(data, manifest, str(env_id), spec)
+    references = references or REFERENCE_RETURNS.get(str(env_name))
+    score = _score(manifest, references)
+    if random_share:
+        random, about = rolled_out(str(name), "random", recipe, progress=progress)
+        data = mix_datasets(data, random, random_share=random_share, seed=seed)
+        number = round(random_share * len(data))
+        scores: Any = [score, _score(about, references)]
+        known = None not in scores
+        weights = [len(data) - number, number]
+        score = float(np.average(scores, weights=weights)) if known else None
+        manifest = recipe | {"random_share": random_share, "env_id": about["env_id"]}
     added = {"env_name": env_name, "source": source, "normalized_score": score}
     return data, manifest | added
 
@@ -228,11 +215,11 @@ def rolled_out(
     return load_or_write(folder, request, collect, describe=lambda: about)
 
 
-def open_recorded(
+def _opened(
     source: str,
     path: str | Path | Sequence[str],
-    *,
     spec: EnvironmentSpec | None,
+    *,
     columns: Mapping[str, Any],
     action_bounds: ActionBounds | None,
     clip_actions: bool,
@@ -240,13 +227,13 @@ def open_recorded(
     download: bool,
     progress: bool,
 ) -> Recording:
-    """Open recorded data without reading a row; see :func:`load_dataset`.
+    """Open recorded data without reading a row.
 
-    Each reader is a function that returns a :class:`Recording`; add yours at the end.
+    A reader is a function that returns a :class:`Recording`. Each needs a library of
+    its own.
     """
     if source != "file":
-        given = {f"columns.{part}": name for part, name in columns.items()}
-        _refuse(given, f"data={source}")
+        _refuse({"columns": columns}, f"data={source}")
     number = spec.action_size if spec is not None and spec.discrete else None
     if number is not None:
         _refuse({"action_bounds": action_bounds}, "discrete actions")
@@ -257,7 +244,6 @@ def open_recorded(
             if len({*low}) == len({*high}) == 1:  # they fit data of another size
                 action_bounds = low[0], high[0]
     options = Reading(action_bounds, clip_actions, number, missing)
-    # Each reader needs a library of its own.
     if source == "minari":
         from torchrl_osr.lab.data.minari import open_minari
 
@@ -275,10 +261,8 @@ def _check_fit(
     """Raise unless the data have the task's observations and actions."""
     ours = [data[name].shape[-1] for name in ("observation", "action")]
     action = data["action"]
-    hot = not spec.discrete or bool(
-        (action.sum(1) == 1).all() & (action * (1 - action) == 0).all()
-    )
-    if ours != [spec.observation_size, spec.action_size] or not hot:
+    hot = ((action == 0) | (action == 1)).all() and (action.sum(1) == 1).all()
+    if ours != [spec.observation_size, spec.action_size] or spec.discrete > bool(hot):
         kind = "discrete" if spec.discrete else "real"
         raise ValueError(
             f"the data have {ours[0]} observation and {ours[1]} action entries, "
