@@ -46,17 +46,15 @@ EVALUATION_SEED = 10_000  # far from the seeds of the data's episodes
 
 def prepare_machine(run: Run) -> tuple[torch.device, torch.dtype | None]:
     """Log what is trained where, and set torch's threads; device and autocast type."""
-    config = run.config
+    config, options = run.config, run.config.trainer
     torchrl_logger.setLevel("WARNING")
+    name = f"{config.env.name} {config.data.source}, seed {config.seed}"
     versions = ", ".join(f"{name} {each}" for name, each in package_versions().items())
-    log.info(
-        f"{config.env.name} {config.data.source}, seed {config.seed}, in {run.folder}"
-    )
-    log.info(versions)
-    torch.set_num_threads(config.trainer.num_threads)
-    torch.set_float32_matmul_precision(config.trainer.matmul_precision)
-    precisions = {"float32": None, "bfloat16": torch.bfloat16}
-    return torch.device(config.trainer.device), precisions[config.trainer.precision]
+    log.info(f"{name}, in {run.folder}\n{versions}")
+    torch.set_num_threads(options.num_threads)
+    torch.set_float32_matmul_precision(options.matmul_precision)
+    autocast = torch.bfloat16 if options.precision == "bfloat16" else None
+    return torch.device(options.device), autocast
 
 
 def make_loggers(run: Run) -> list[Logger]:
@@ -90,14 +88,9 @@ def make_loggers(run: Run) -> list[Logger]:
 
 def trainer_options(run: Run) -> dict[str, Any]:
     """Return the options that the trainers of all phases share, loggers among them."""
-    options = run.config.trainer
-    return {
-        "loggers": make_loggers(run),
-        "log_interval": options.log_interval,
-        "checkpoint_interval": options.checkpoint_interval,
-        "checkpoints_kept": options.checkpoints_kept,
-        "progress": options.progress,
-    }
+    names = "log_interval", "checkpoint_interval", "checkpoints_kept", "progress"
+    options = {name: getattr(run.config.trainer, name) for name in names}
+    return options | {"loggers": make_loggers(run)}
 
 
 def optimizer_of(
@@ -204,10 +197,8 @@ def report(run: Run, data_mean: float | None, trainer: OfflineTrainer) -> float:
 
             logger.experiment.log({"curve": wandb.Image(str(folder / "curve.png"))})
             logger.experiment.finish()
-    if rows:
-        print("\n" + score_table(name, history, rows["best"], data_mean, folder))
-    if not rows:
-        print(f"\n{name}: nothing was played, for {config.env.id} has no simulator")
-        print(f"  {'files':<26}{folder}")
+    if not history:
+        print(f"\n{name}, in {folder}: {config.env.id} has no simulator to play in")
         return math.nan
+    print("\n" + score_table(name, history, rows["best"], data_mean, folder))
     return float(history[-1][measure])
