@@ -96,10 +96,7 @@ class Critics:
     def values_and_soft_maximum(
         self, batch: Transitions, action: Tensor, log_prob: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return both terms of CQL(H) at ``s``, ``[N, R]`` each, in one pass.
-
-        The sampled actions are ``[M, R, A]``, their log-densities ``[M, R]``.
-        """
+        """Return both terms of CQL(H) for actions ``[M, R, A]`` at ``s``."""
         action = torch.cat([batch.a.unsqueeze(0), action])
         params = self.loss.qvalue_network_params
         qvalue = self.values(batch.s.expand(action.shape[:-1]), action, params)
@@ -354,8 +351,8 @@ class ActorCriticLoss(LossModule):
         """
         if not tensordict.batch_size.numel():
             raise ValueError(
-                f"The batch is empty (batch_size {tuple(tensordict.batch_size)}): the "
-                f"mean of {type(self).__name__} needs at least one transition."
+                f"The batch is empty (batch_size {tuple(tensordict.batch_size)}): its "
+                "mean needs at least one transition."
             )
         losses, metrics = self.losses(self.unpack(tensordict))
         found = losses | metrics
@@ -393,8 +390,7 @@ class ActorCriticLoss(LossModule):
     def inverse_dynamics(self, batch: Transitions, states: States) -> Any:
         """Return the frozen model ``I(a | s~, s')``, ``[D, R]``, without gradient.
 
-        A latent variable stays at its mean, so that the label does not jitter from one
-        call to the next.
+        A latent variable stays at its mean, so that the label does not jitter.
         """
         network = self.inverse_dynamics_network
         inputs = self.model_inputs(batch, network.in_keys, states)
@@ -405,10 +401,7 @@ class ActorCriticLoss(LossModule):
     def model_inputs(
         self, batch: Transitions, in_keys: Sequence[NestedKey], states: States
     ) -> TensorDictBase:
-        """Return what an inverse dynamics model reads, ``[D, R]``.
-
-        The next state is never perturbed: it is the state to return to.
-        """
+        """Return what an inverse dynamics model reads; ``s'`` is never perturbed."""
         inputs = batch.states_of(state_keys(in_keys), states)
         after = [unravel_key(key[1:]) for key in in_keys if is_next(key)]
         if after:
@@ -425,10 +418,7 @@ class ActorCriticLoss(LossModule):
         action: Tensor,
         params: TensorDictBase | None = None,
     ) -> Tensor:
-        """Return the values of all critics, ``[N, ..., R]``, by default the trained.
-
-        States are ``[..., R]``, actions ``[..., R, A]``.
-        """
+        """Return the values of all critics, ``[N, ..., R]``, by default the trained."""
         if params is None:
             params = self.qvalue_network_params
         return self.critics.values(states, action, params)
@@ -468,11 +458,9 @@ class ActorCriticLoss(LossModule):
     def soft_policy_objective(
         self, batch: Transitions, policy: StatePolicy, states: States
     ) -> tuple[Tensor, Tensor]:
-        """Return SAC's objective of the policy on a set of states, to be minimised.
+        """Return SAC's objective on a set of states, to be minimised, ``[R]``.
 
-        Returns:
-            The objective, ``[R]``, and the log-density of the policy's own actions,
-            ``[D, R]``.
+        Also the log-density of the policy's own actions, ``[D, R]``.
         """
         action, log_prob = rsample_and_log_prob(policy[states])
         self.check_actions(batch, action.shape[1:])
@@ -546,8 +534,7 @@ class ActorCriticLoss(LossModule):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the distance of values ``[N, R]`` from a target ``[R]``, and metrics.
 
-        It is summed over critics, ``[R]``. Writes the largest absolute error of the
-        critics into the batch, as priority.
+        It is summed over critics. The largest absolute error is written as priority.
         """
         error = (pred_value.detach() - target).abs().amax(0)
         given = batch.tensordict

@@ -102,11 +102,6 @@ class CQLLoss(ActorCriticLoss):
         self.has_cql = min_q_weight > 0
         if target_action_gap is not None and not self.has_cql:
             raise ValueError("target_action_gap needs min_q_weight above 0.")
-        if max_q_backup and not deterministic_backup:
-            raise ValueError(
-                "max_q_backup=True takes the best action's value without entropy, as "
-                "CQL does: leave deterministic_backup=True."
-            )
         if target_action_gap is not None:
             self.log_alpha_prime = nn.Parameter(torch.zeros(()))
         self.num_random, self.temperature = num_random, temperature
@@ -159,15 +154,12 @@ class CQLLoss(ActorCriticLoss):
     ) -> tuple[Tensor, Tensor]:
         """Draw ``K`` actions each: uniform, from ``pi(s)`` and from ``pi(s')``.
 
-        Returns:
-            Actions ``[3K, R, A]`` and their log-densities ``[3K, R]``.
+        Also return their log-densities, ``[3K, R]``.
         """
         uniform, log_density = self.uniform_actions(batch.a)
         # rsample also without gradient: torch's sample reads the scale back to the host
         # to check its sign.
         number = (self.num_random,)
         action, log_prob = rsample_and_log_prob(policy["recorded"], number)
-        return (
-            torch.cat([uniform, action.flatten(0, 1)]),
-            torch.cat([log_density, log_prob.flatten(0, 1)]),
-        )
+        action = torch.cat([uniform, action.flatten(0, 1)])
+        return action, torch.cat([log_density, log_prob.flatten(0, 1)])

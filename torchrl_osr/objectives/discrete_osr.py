@@ -47,8 +47,6 @@ class DiscreteOSRLoss(ActorCriticLoss):
     (https://arxiv.org/abs/2006.04779). The paper has continuous actions only. With
     ``recovery_weight=0`` it is discrete CQL(H): no model, no perturbed states.
 
-    Each entry is weighted already and sends gradient to its own parameters only.
-
     Args:
         actor_network: ends in a :class:`~torchrl.modules.OneHotCategorical`, and then
             reads one-hot actions ``[B, n]`` from the batch, or in a
@@ -61,12 +59,11 @@ class DiscreteOSRLoss(ActorCriticLoss):
             frozen here. Needed unless ``recovery_weight=0``.
 
     Keyword Args:
-        recovery_weight: :math:`\lambda`. Default 0.5. May be assigned later; 0 *here*
-            is discrete CQL(H).
+        recovery_weight: :math:`\lambda`. Default 0.5. May be assigned later.
         min_q_weight: :math:`\alpha`, weight of the conservative term. Default 5.0. May
             be assigned later; 0 *here* leaves the term out.
         temperature: :math:`\tau`, in units of the value. Default 1.0.
-        alpha_init: initial entropy temperature :math:`\alpha_e`. Default 1.0.
+        alpha_init: see :class:`~torchrl_osr.CQLLoss`.
         target_entropy: in nats; ``"auto"`` (default) is 0.98 times ``log(n)``, as in
             TorchRL's ``DiscreteSACLoss``: a policy that is nearly uniform.
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
@@ -165,12 +162,6 @@ class DiscreteOSRLoss(ActorCriticLoss):
         self, states: TensorDictBase, params: TensorDictParams, pi: Any
     ) -> Tensor:
         """Return the values of all actions, ``[N, ..., n]``; ``pi`` gives ``n``."""
-        if self.tensor_keys.action in self.qvalue_network.in_keys:
-            raise ValueError(
-                f"The critics read {self.tensor_keys.action!r}: for discrete actions a "
-                "critic reads the state alone and values every action, see "
-                "torchrl_osr.modules.discrete_critic_ensemble."
-            )
         keys = state_keys(self.qvalue_network.in_keys)
         rows = states.select(*keys, strict=False).reshape(-1)
         qvalue = self.critic_output(rows, params, self.tensor_keys.action_value)

@@ -47,15 +47,10 @@ class InverseDynamicsLoss(ActorCriticLoss):
     :func:`~torchrl_osr.modules.cvae_inverse_dynamics` on clean states and on the
     squared error of a sampled action: ``states="clean"``, ``loss_function="mse"``.
 
-    A network that writes ``"latent_loc"`` and ``"latent_scale"`` has a latent ``z``:
-    it is drawn whatever the ambient interaction type, and its divergence from the prior
-    is added,
-
-    .. math::
-        L + w\,\frac1Z \sum_{i=1}^{Z} KL(q_i(z \mid \tilde s, s') \,\|\, N(0, 1)).
-
-    With ``"nll"`` and ``latent_weight=Z`` that is a conditional VAE's negative evidence
-    lower bound, estimated from one ``z``.
+    If a network writes ``"latent_loc"`` and ``"latent_scale"``, its latent ``z`` is
+    drawn whatever the ambient interaction type, and ``latent_weight`` times the mean of
+    its entries' divergence from ``N(0, 1)`` is added. With ``"nll"`` and the weight
+    ``Z`` that is a conditional VAE's negative evidence lower bound, from one ``z``.
 
     Args:
         inverse_dynamics_network: reads states and next states. Ends in a
@@ -71,22 +66,15 @@ class InverseDynamicsLoss(ActorCriticLoss):
             dimensions; ``"mse"``: the squared error of one reparametrised action,
             averaged over its dimensions. It punishes the model's own noise as well, so
             that the scale shrinks to its floor.
-        latent_weight: ``w``. Default 0.5, the authors'.
+        latent_weight: of a latent's divergence. Default 0.5, the authors'.
         reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_osr import InverseDynamicsLoss, StatePerturbation
+        >>> from torchrl_osr import InverseDynamicsLoss
         >>> from torchrl_osr.modules import tanh_gaussian_inverse_dynamics
         >>> loss = InverseDynamicsLoss(tanh_gaussian_inverse_dynamics(11, 3))
-        >>> batch = TensorDict({
-        ...     "observation": torch.randn(4, 11), "action": torch.rand(4, 3),
-        ...     "next": {"observation": torch.randn(4, 11),
-        ...              "done": torch.zeros(4, 1, dtype=torch.bool)}}, [4])
-        >>> batch = StatePerturbation(std=1e-3)(batch)
-        >>> loss(batch)["loss_inverse_dynamics"].shape
-        torch.Size([])
+        >>> loss.in_keys[-1], loss.out_keys
+        (('perturbed', 'observation'), ['loss_inverse_dynamics'])
     """
 
     def __init__(

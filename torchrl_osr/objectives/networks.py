@@ -36,11 +36,8 @@ CATEGORICAL = (Categorical, *ONE_HOT)
 
 def head_of(network: TensorDictModuleBase) -> tuple[Any, dict[str, Any]]:
     """Return the class of a network's distribution, or ``None``, and its options."""
-    heads = [
-        module
-        for module in network.modules()
-        if isinstance(module, ProbabilisticTensorDictModule)
-    ]
+    kind = ProbabilisticTensorDictModule
+    heads = [each for each in network.modules() if isinstance(each, kind)]
     if not heads:
         return None, {}
     return heads[-1].distribution_class, heads[-1].distribution_kwargs

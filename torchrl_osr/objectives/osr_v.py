@@ -36,8 +36,7 @@ class OSRVLoss(ActorCriticLoss):
     replaces CQL's: with the defaults the critics score 16 actions a row instead of 68.
     Off the data the constraint may be negative, so it gives no lower bound as CQL does.
 
-    ``loss_qvalue`` holds both terms of :math:`L_Q`. Each entry is weighted already and
-    sends gradient to its own parameters only.
+    ``loss_qvalue`` holds both terms of :math:`L_Q`.
 
     Args:
         actor_network: ends in a :class:`~torchrl.modules.TanhNormal`.
@@ -57,8 +56,7 @@ class OSRVLoss(ActorCriticLoss):
             the policy and ``K`` uniform ones, weighted by their densities.
         num_random: ``K``, actions drawn of each kind. Default 1.
         temperature: of the log-sum-exp. Default 1.0.
-        alpha_init: initial entropy temperature :math:`\alpha_e`. Default 1.0.
-        target_entropy: in nats; ``"auto"`` (default) is minus the action's size.
+        alpha_init, target_entropy: see :class:`~torchrl_osr.CQLLoss`.
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
     Examples:
@@ -125,8 +123,7 @@ class OSRVLoss(ActorCriticLoss):
     ) -> tuple[Tensor, Tensor]:
         """Return :math:`Q_i(s, a)`, ``[N, R]``, and the gap of (8), ``[R]``.
 
-        The gap is the mean over both halves of D_tot, summed over critics, as the TD
-        error is.
+        The gap is the mean over both halves of D_tot, summed over critics.
         """
         target, action, log_prob = self.candidates(batch, policy)
         candidates = torch.cat([action, target])
@@ -167,8 +164,5 @@ class OSRVLoss(ActorCriticLoss):
         if self.policy_values == "mean":
             return target, action, None
         uniform, log_density = self.uniform_actions(pi.loc)
-        return (
-            target,
-            torch.cat([uniform, action]),
-            torch.cat([log_density, log_prob]),
-        )
+        action = torch.cat([uniform, action])
+        return target, action, torch.cat([log_density, log_prob])

@@ -73,24 +73,19 @@ class StateRecoveryLoss(ActorCriticLoss):
         recovery_direction: of a tanh-Gaussian actor: ``"forward"`` (default) is the
             paper's ``KL(I || pi)``, ``"reverse"`` the ``KL(pi || I)`` of the authors'
             code.
-        action_reduction: ``"sum"`` (default) over action dimensions, or ``"mean"``.
+        action_reduction: of the divergence over action dimensions: ``"sum"`` (default)
+            or ``"mean"``.
         recovery_states: ``"both"`` (default) for D_tot, ``"perturbed"``, or
             ``"clean"``, which needs no perturbed entry.
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_osr import StatePerturbation, StateRecoveryLoss
+        >>> from torchrl_osr import StateRecoveryLoss
         >>> from torchrl_osr.modules import (
         ...     tanh_gaussian_actor, tanh_gaussian_inverse_dynamics)
         >>> actor = tanh_gaussian_actor(11, 3)  # the one given to IQLLoss, for instance
         >>> recovery = StateRecoveryLoss(actor, tanh_gaussian_inverse_dynamics(11, 3))
-        >>> batch = TensorDict({
-        ...     "observation": torch.randn(4, 11),
-        ...     "next": {"observation": torch.randn(4, 11),
-        ...              "done": torch.zeros(4, 1, dtype=torch.bool)}}, [4])
-        >>> sorted(recovery(StatePerturbation(std=1e-3)(batch)).keys())
+        >>> recovery.out_keys
         ['loss_recovery', 'recovery_kl']
         >>> set(recovery.parameters()) == set(actor.parameters())
         True
@@ -158,8 +153,6 @@ class StateRecoveryLoss(ActorCriticLoss):
         if self.recovery_target == "data":
             recovery = cloning_distance(pi, batch.a, key).mean(0)
             self.check_actions(batch, batch.a.shape)
-            if self.action_reduction == "mean":
-                recovery = recovery / batch.a.shape[-1]
         else:
             model = self.inverse_dynamics(batch, self.recovery_states)
             recovery = self.divergence(pi, model).mean(0)
@@ -280,12 +273,7 @@ def cloning_distance(policy: Any, data_action: Tensor, key: NestedKey) -> Tensor
     r"""Return what behaviour cloning minimises, ``[D, R]``.
 
     :math:`-\log\pi(a \mid s)`; for a policy without a density the squared distance
-    :math:`\|\pi(s) - a\|^2`.
-
-    Args:
-        policy: what :func:`policy_at` returns.
-        data_action: ``[R, A]``; of a discrete policy one-hot or indices.
-        key: name of the data's action in an error.
+    :math:`\|\pi(s) - a\|^2`. The policy is what :func:`policy_at` returns.
     """
     if isinstance(policy, (Tensor, TanhDelta, Delta)):
         action = policy if isinstance(policy, Tensor) else policy.deterministic_sample

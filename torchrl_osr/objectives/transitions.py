@@ -31,22 +31,12 @@ SETS = {
 
 @dataclass
 class TransitionKeys:
-    """The entries of a batch that a loss reads or writes.
+    """The entries of a batch that a loss reads or writes; ``set_keys`` renames them.
 
-    Attributes:
-        action: the data's action. Default ``"action"``.
-        value: what the value estimator reads. Default ``"state_value"``.
-        reward, done, terminated: below ``"next"``. Default: their own names.
-        priority: written to the batch, ``[B]``. Default ``"td_error"``.
-        priority_weight: importance weight of a row. Default ``"priority_weight"``.
-        perturbed: where the perturbed states are. Default ``"perturbed"``.
-        state_action_value: what a critic writes. Default ``"state_action_value"``.
-        is_synthetic: marks rows whose action is not the data's, ``[B, 1]``; read if
-            present. Default ``"is_synthetic"``.
-        one_step: the single step of an n-step row, as ``"next"``; read if present.
-            Default ``"one_step"``.
-        steps_to_next_obs: number of steps of an n-step row; read if present. Default
-            ``"steps_to_next_obs"``.
+    ``reward``, ``done`` and ``terminated`` are below ``"next"``. The last three entries
+    are read if they are there: ``is_synthetic`` marks rows whose action is not the
+    data's, ``[B, 1]``; ``one_step`` is the single step of a row of several, as
+    ``"next"``; ``steps_to_next_obs`` counts a row's steps.
     """
 
     action: NestedKey = "action"
@@ -67,14 +57,8 @@ class Transitions:
     """A batch, unpacked once for everything downstream.
 
     Rows are flattened. Flags are bool, whatever they were. Floating-point entries have
-    the networks' type. Masked rows are zeros, for they may hold NaN.
-
-    Args:
-        tensordict: the batch ``[B]``.
-        read: the entries that the loss reads.
-        keys: names of the entries.
-        masks: entries that mark the rows that count, ``[B]`` or ``[B, 1]``.
-        dtype: of the networks.
+    the networks' ``dtype``. Rows that one of ``masks`` leaves out are zeros, for they
+    may hold NaN.
 
     Attributes:
         tensordict: the batch as it was given.
@@ -127,11 +111,7 @@ class Transitions:
     def states_of(self, keys: Sequence[NestedKey], states: States) -> TensorDictBase:
         """Return the entries ``keys`` of D_tot or a half of it, ``[D, R]``.
 
-        The perturbed state is the entry ``("perturbed", key)`` of the same row.
-
-        Raises:
-            KeyError: if no entry has a perturbed one.
-            ValueError: if a perturbed entry has another shape than its clean one.
+        An entry without a perturbed one is the same in both halves.
         """
         clean = TensorDict(
             {key: entry(self.rows, key) for key in keys}, self.rows.batch_size
