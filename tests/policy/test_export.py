@@ -62,7 +62,7 @@ def test_torch_export(tmp_path, make_policy, kind, output):
 
 def test_what_cannot_be_exported(tmp_path, make_policy, monkeypatch):
     policy = make_policy("osr")
-    with pytest.raises(ValueError, match=r"end in \.onnx or \.pt2, got .*policy\.pt"):
+    with pytest.raises(ValueError, match="suffix of the path must be one of .*pt2"):
         policy.export(tmp_path / "policy.pt")
     with pytest.raises(ValueError, match="output must be one of"):
         policy.export(tmp_path / "policy.onnx", "state")

@@ -1,13 +1,9 @@
-"""A policy that copies the networks of a loss.
-
-Shapes: ``S`` observation, ``A`` action.
-"""
+"""A policy that copies the networks of a loss."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -44,8 +40,8 @@ def policy_from_loss(
     Keyword Args:
         low, high: bounds of the environment's actions, which the networks' -1 and 1
             stand for; a number or ``[A]``. Default -1 and 1.
-        source: JSON-compatible, kept in ``policy.record["source"]``; of absolute paths
-            in it, only the name is kept. Default: the name of the loss's class.
+        source: JSON-compatible, kept in ``policy.record["source"]``. Default: the name
+            of the loss's class.
 
     Raises:
         ValueError: the networks are of another kind, or the bounds are not finite or
@@ -76,7 +72,9 @@ def policy_from_loss(
             "(observation - loc) / scale; this transform is the other way round."
         )
     actor, prefix = _mlp(network)
-    size = actor.out_features // (2 if distribution == "TanhNormal" else 1)
+    inputs, size = actor.in_features, actor.out_features
+    if distribution == "TanhNormal":
+        size //= 2
     tensors = _weights(loss.actor_network_params, prefix, "actor")
     critics = {"number": 0} | _sizes(actor)
     if hasattr(loss, "qvalue_network"):
@@ -85,24 +83,26 @@ def policy_from_loss(
         critics = {"number": len(each)} | _sizes(critic)
         for number, params in enumerate(each):
             tensors |= _weights(params, prefix, f"critics.{number}")
-    for name, default in (("loc", 0.0), ("scale", 1.0)):
-        value = torch.as_tensor(getattr(observation_norm, name, default))
-        tensors[name] = value.cpu().float().expand(actor.in_features).clone()
-    shape = (0,) if distribution == "OneHotCategorical" else (size,)
-    for name, given in (("low", low), ("high", high)):
-        tensors[name] = torch.as_tensor(given).float().expand(shape).clone()
-    if (
-        not ((width := tensors["high"] - tensors["low"]) > 0).all()
-        or width.isinf().any()
+    loc = getattr(observation_norm, "loc", 0.0)
+    scale = getattr(observation_norm, "scale", 1.0)
+    bounded = 0 if distribution == "OneHotCategorical" else size
+    for name, given, length in (
+        ("loc", loc, inputs),
+        ("scale", scale, inputs),
+        ("low", low, bounded),
+        ("high", high, bounded),
     ):
+        tensors[name] = torch.as_tensor(given).cpu().float().expand(length).clone()
+    width = tensors["high"] - tensors["low"]
+    if not (width > 0).all() or width.isinf().any():
         raise ValueError(f"low={low!r} must be below high={high!r}, and both finite.")
     record = {
         "distribution": distribution,
-        "observation_size": actor.in_features,
+        "observation_size": inputs,
         "action_size": size,
         "actor": _sizes(actor),
         "critics": critics,
-        "source": {"loss": type(loss).__name__} | _without_paths(dict(source or {})),
+        "source": {"loss": type(loss).__name__} | dict(source or {}),
         "versions": {name.replace("-", "_"): version(name) for name in PACKAGES},
     }
     policy = Policy(record, tensors)
@@ -110,21 +110,10 @@ def policy_from_loss(
     return policy
 
 
-def _without_paths(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _without_paths(each) for key, each in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_without_paths(each) for each in value]
-    if isinstance(value, (str, Path)) and Path(value).is_absolute():
-        return Path(value).name
-    return value
-
-
 def _mlp(network: nn.Module) -> tuple[MLP, str]:
     """Return the only MLP in a network, and how its parameters' names begin."""
-    found = [
-        (each, name) for name, each in network.named_modules() if isinstance(each, MLP)
-    ]
+    modules = network.named_modules()
+    found = [(each, f"{name}.") for name, each in modules if isinstance(each, MLP)]
     if len(found) != 1:
         raise ValueError(
             "a network of a policy has one torchrl.modules.MLP, as those of "
@@ -142,12 +131,10 @@ def _sizes(mlp: MLP) -> dict[str, Any]:
 
 
 def _weights(params: TensorDict, prefix: str, name: str) -> dict[str, Tensor]:
-    flat = params.detach().flatten_keys(".").items()
-    start = f"{prefix}." if prefix else ""
     return {
-        f"{name}.{key.removeprefix(start)}": value.cpu().float().clone()
-        for key, value in flat
-        if key.startswith(start)
+        f"{name}.{key.removeprefix(prefix)}": value.cpu().float().clone()
+        for key, value in params.detach().flatten_keys(".").items()
+        if key.startswith(prefix)
     }
 
 
@@ -173,12 +160,12 @@ def _check_same(policy: Policy, loss: LossModule) -> None:
     elif policy.distribution == "TanhNormal":
         pairs += zip(policy.extractor(raw), (theirs.loc, theirs.scale), strict=True)
     states.set(loss.tensor_keys.action, theirs.deterministic_sample)
+    given = (rows,) if policy.discrete else (rows, policy.mode(raw))
     for number, critic in enumerate(policy.critics):
         with loss.qvalue_network_params[number].to_module(
             loss.qvalue_network, preserve_module_state=False
         ):
             value = loss.qvalue_network(states)[loss.qvalue_network.out_keys[-1]]
-        given = (rows,) if policy.discrete else (rows, policy.mode(raw))
         pairs.append((critic(*given), value))
     for ours, wanted in pairs:
         if not torch.allclose(ours, wanted.cpu().float(), rtol=1e-4, atol=1e-5):

@@ -1,12 +1,15 @@
 """A trained policy by itself: observations in, actions out, in the environment's units.
 
-Shapes: ``B`` batch (any leading dimensions, or none), ``S`` observation, ``A`` action,
-or the number of actions where they are discrete.
+Shapes: ``B`` batch (any leading dimensions, or none), ``S`` observation, ``A`` action.
 """
 
 from __future__ import annotations
 
 import copy
+import io
+import json
+import logging
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -18,9 +21,9 @@ from torch import Tensor, nn
 from torchrl.modules import NormalParamExtractor
 
 from torchrl_osr._checks import check_choice
-from torchrl_osr._files import read_tensors, write_tensors
+from torchrl_osr._extras import needed_by
+from torchrl_osr._files import RECORD, read_tensors, write_atomically, write_tensors
 from torchrl_osr.modules.actor import SCALE_MAPPING, mlp
-from torchrl_osr.policy.export import write_graph
 
 DISTRIBUTIONS = ("TanhNormal", "TanhDelta", "OneHotCategorical")
 """Distributions that an actor may end in, by TorchRL's names."""
@@ -31,12 +34,8 @@ ACTIVATIONS = {
 }
 """Activations that a network in a file may have."""
 
-SUFFIX = ".safetensors"
-"""How the name of a saved policy ends."""
-
-# How far an action may be out of its bounds, as a share of half their distance: a
-# caller's own arithmetic rounds.
-ROUNDING = 1e-5
+SUFFIX, GRAPHS = ".safetensors", (".onnx", ".pt2")
+"""How the names of saved and of exported policies end."""
 
 Array = TypeVar("Array", NDArray[Any], Tensor)
 
@@ -49,12 +48,8 @@ class Policy(nn.Module):
     module it maps observations ``[B, S]`` to deterministic actions and checks nothing:
     ``TensorDictModule(policy, ["observation"], ["action"])`` is a TorchRL policy.
 
-    Args:
-        record: JSON-compatible: sizes of the networks, and the origin.
-        tensors: weights, and statistics and bounds by the names of the attributes.
-
     Attributes:
-        record: see there; ``record["source"]`` has what is known of the run.
+        record: sizes of the networks, and what is known of the run in ``"source"``.
         loc, scale: of the training observations, ``[S]``.
         low, high: bounds of the actions, ``[A]``; empty where actions are discrete.
     """
@@ -105,10 +100,6 @@ class Policy(nn.Module):
         Returns:
             Actions as the environment takes them: float32, ``[A]`` or ``[B, A]``,
             within the bounds; of a discrete policy int64 indices, ``[]`` or ``[B]``.
-
-        Raises:
-            ValueError: the observation has another size, or entries that are NaN or
-                infinite.
         """
         rows = self._numbers("observation", observation, self.observation_size)
         action = self(rows) if generator is None else self._sample(rows, generator)
@@ -116,24 +107,15 @@ class Policy(nn.Module):
 
     @torch.no_grad()
     def value(self, observation: Array, action: Array | None = None) -> Array:
-        """Return the smallest of the critics' values, for gates and alarms.
+        """Return the smallest of the critics' values, float32, ``[]`` or ``[B]``.
 
         It estimates the discounted sum of the rewards that the run was trained on.
-        The minimum is what the losses' own targets take. Conservative losses keep
-        values low on purpose: set thresholds by values of states that are known to be
-        good.
+        Conservative losses keep values low on purpose: set thresholds by values of
+        states that are known to be good.
 
         Args:
             observation: as for :meth:`act`.
-            action: in the environment's units, as :meth:`act` returns it. Default: the
-                policy's deterministic one.
-
-        Returns:
-            float32, ``[]`` or ``[B]``.
-
-        Raises:
-            ValueError: there are no critics, a size or an entry of the observation or
-                of the action is wrong, or the action is out of its bounds.
+            action: as :meth:`act` returns it. Default: the policy's deterministic one.
         """
         self._check_critics()
         rows = self._numbers("observation", observation, self.observation_size)
@@ -145,10 +127,6 @@ class Policy(nn.Module):
 
         :func:`~torchrl_osr.load_policy` reads it. Weights, statistics and bounds are
         tensors; sizes, origin and versions are JSON in the file's metadata.
-
-        Raises:
-            ImportError: safetensors is not installed.
-            OSError: the file cannot be written.
         """
         write_tensors(Path(path), self.state_dict(), self.record)
 
@@ -164,13 +142,10 @@ class Policy(nn.Module):
         Args:
             path: ends in ``.onnx`` for ONNX, or in ``.pt2`` for :mod:`torch.export`.
             output: what it computes, as :meth:`act` or as :meth:`value`.
-
-        Raises:
-            ImportError: for ONNX, if onnx or onnxscript is not installed.
-            OSError: the file cannot be written.
-            ValueError: an argument is none of those, or there are no critics.
         """
+        path = Path(path)
         check_choice("output", output, ("action", "value"))
+        check_choice("the suffix of the path", path.suffix, GRAPHS)
         inputs = {"observation": self.loc.repeat(2, 1)}
         part = copy.deepcopy(self)  # a graph keeps all weights, needed or not
         graph: nn.Module = part
@@ -180,7 +155,17 @@ class Policy(nn.Module):
             self._check_critics()
             inputs["action"] = self(inputs["observation"])
             part.actor, graph = nn.Identity(), _Value(part)
-        write_graph(Path(path), graph, inputs, output, self.record)
+        rows = torch.export.Dim("batch")
+        given: dict[str, Any] = {"args": (), "kwargs": inputs}
+        given["dynamic_shapes"] = {name: {0: rows} for name in inputs}
+        record = json.dumps(self.record)
+        if path.suffix == ".onnx":
+            content = _onnx(graph, given, output, record)
+        else:
+            file, program = io.BytesIO(), torch.export.export(graph, **given)
+            torch.export.save(program, file, extra_files={RECORD: record})
+            content = file.getvalue()
+        write_atomically(path, content)
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return deterministic actions, see :meth:`act`; nothing is checked."""
@@ -245,22 +230,19 @@ class Policy(nn.Module):
     def _actions(self, value: Any, observation: Tensor) -> Tensor:
         """Return the value as actions that were taken in these observations."""
         if self.discrete:
-            action, expected = (
-                _tensor(value).to(self.loc.device),
-                observation.shape[:-1],
-            )
-            within = (action >= 0) & (action < self.action_size) & (action % 1 == 0)
+            action = _tensor(value).to(self.loc.device)
+            shape = observation.shape[:-1]
+            least, most = torch.tensor(0), torch.tensor(self.action_size - 1)
         else:
             action = self._numbers("action", value, self.action_size)
-            expected = torch.Size([*observation.shape[:-1], self.action_size])
-            margin = ROUNDING * (self.high - self.low) / 2
-            within = (action >= self.low - margin) & (action <= self.high + margin)
-        if action.shape != expected or not within.all():
-            bounds = [each.tolist() for each in (self.low, self.high)]
+            shape = torch.Size([*observation.shape[:-1], self.action_size])
+            margin = 5e-6 * (self.high - self.low)  # a caller's own arithmetic rounds
+            least, most = self.low - margin, self.high + margin
+        if action.shape != shape or not ((action >= least) & (action <= most)).all():
             raise ValueError(
-                f"the action must have shape {tuple(expected)} and lie within "
-                f"{[0, self.action_size - 1] if self.discrete else bounds}; it has "
-                f"shape {tuple(action.shape)}."
+                f"the action must have shape {tuple(shape)} and lie within "
+                f"{least.tolist()} and {most.tolist()}; its shape is "
+                f"{tuple(action.shape)}."
             )
         return action.long() if self.discrete else action
 
@@ -275,11 +257,6 @@ def load_policy(path: Path | str) -> Policy:
     Args:
         path: a ``.safetensors`` file of :meth:`~torchrl_osr.policy.Policy.save` or
             ``torchrl-osr export``.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ImportError: safetensors is not installed.
-        ValueError: the file is no policy, or damaged.
 
     Examples:
         >>> import tempfile
@@ -317,6 +294,25 @@ class _Value(nn.Module):
 
     def forward(self, observation: Tensor, action: Tensor) -> Tensor:
         return self.policy.smallest_value(observation, action)
+
+
+def _onnx(graph: nn.Module, given: dict[str, Any], output: str, record: str) -> bytes:
+    with needed_by("ONNX needs", "export"):
+        import onnxscript  # noqa: F401
+    given = given | {"input_names": list(given["kwargs"]), "output_names": [output]}
+    # torch 2.13's exporter calls what torch deprecates, and misses torchvision.
+    log = logging.getLogger("torch.onnx")
+    level = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            onnx: Any = torch.onnx.export(graph, **given, dynamo=True, verbose=False)
+    finally:
+        log.setLevel(level)
+    onnx.model.metadata_props[RECORD] = record
+    content: bytes = onnx.model_proto.SerializeToString()
+    return content
 
 
 def _tensor(value: Any) -> Tensor:

@@ -21,8 +21,7 @@ from torch import Tensor
 from torchrl_osr._extras import needed_by
 from torchrl_osr.lab.run.load import load_run_policy
 from torchrl_osr.policy import Policy, load_policy
-from torchrl_osr.policy.export import SUFFIXES
-from torchrl_osr.policy.policy import SUFFIX
+from torchrl_osr.policy.policy import GRAPHS, SUFFIX
 
 ROWS, TOLERANCE = 256, 1e-5
 """Random observations that a file is checked on, and its largest deviation, relative to
@@ -39,8 +38,8 @@ def main() -> None:
     add("--output", choices=("action", "value"), default="action", help="of a graph")
     add("--trust", action="append", default=[], metavar="MODULE", help="see train")
     options = parser.parse_args()
-    if options.path.suffix not in (SUFFIX, *SUFFIXES):
-        parser.error(f"the path must end in {SUFFIX}, {' or '.join(SUFFIXES)}.")
+    if options.path.suffix not in (SUFFIX, *GRAPHS):
+        parser.error(f"the path must end in {SUFFIX}, {' or '.join(GRAPHS)}.")
     policy = load_run_policy(options.source, options.trust)
     if options.path.suffix == SUFFIX:
         policy.save(options.path)
