@@ -13,7 +13,6 @@ from tensordict import TensorDict
 from torchrl_osr.lab.data import make_replay_buffer, write_memmap
 from torchrl_osr.lab.data.rows import (
     check_order,
-    consecutive_rows,
     mix_datasets,
     multi_step,
     next_action,
@@ -97,12 +96,6 @@ def test_rows_in_no_order_are_refused_by_number() -> None:
     with pytest.raises(ValueError, match="1 of the 8 rows, row 7 the first"):
         check_order(data[:-1])
     check_order(data[4:])
-
-
-def test_consecutive_rows_are_of_one_trajectory() -> None:
-    data = episodes([2, 3])
-    pieces = consecutive_rows(data, torch.arange(5), 2)["observation"][..., 0]
-    assert pieces.tolist() == [[1, 2], [4, 5], [5, 6]]
 
 
 @tried(30)

@@ -10,7 +10,7 @@ from torchrl_osr.lab.dynamics import DynamicsOptions
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"num_elites": 9}, "num_elites must be between 1 and num_networks=7"),
+        ({"num_elites": 9}, "num_elites=. must be between 1 and num_networks=7"),
         ({"real_ratio": 0.01}, "real_ratio=0.01: 0 of 8 rows"),
         ({"unknown": "halt"}, "needs optim.gamma below 1"),
         ({"unknown": "halts"}, "dynamics.unknown must be one of"),

@@ -88,14 +88,6 @@ def test_a_continued_buffer_draws_the_same_batches(data, stop) -> None:
         assert (whole.sample() == resumed.sample()).all()
 
 
-def test_a_rollout_without_rows_is_an_error(data) -> None:
-    buffer = make_buffer(data)
-    rows, _ = buffer.roll_out(buffer.policy)
-    buffer.roll_out = lambda copied: (rows[:0], 9)
-    with pytest.raises(ValueError, match="rejects all rows"):
-        buffer.sample()
-
-
 def buffer_of(data: ModelData, options: DynamicsOptions, **batches):
     """Return a buffer of roll-outs, a batch, the untrained model and the actor."""
     torch.manual_seed(0)

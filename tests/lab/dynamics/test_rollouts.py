@@ -72,14 +72,6 @@ def test_each_row_is_drawn_from_the_gaussian_of_an_elite() -> None:
         assert found == pytest.approx([mean, 0.5], abs=0.02)
 
 
-def test_uncertainty_is_of_all_networks_and_in_the_given_units() -> None:
-    world = linear_world(log_variance=math.log(4.0))
-    units = torch.tensor([10.0, 0.5])
-    rows, _ = rollout(world, one, torch.zeros(3, 1), steps=1, units=units)
-    wanted = math.hypot(2 * 10.0, 2 * 0.5)  # deviations of 2 in both entries
-    torch.testing.assert_close(rows["uncertainty"], torch.full([3, 1], wanted))
-
-
 def test_perturbed_starts_are_where_random_actions_lead_in_the_task() -> None:
     states = perturbed_starts(linear_world(), torch.zeros(60_000, 1), steps=3)
     assert states.abs().max() <= 3

@@ -1,4 +1,4 @@
-"""Switching in worlds in which the best policy is known."""
+"""Elites for acting, and switching in worlds in which the best policy is known."""
 
 from __future__ import annotations
 
@@ -70,3 +70,31 @@ def test_a_model_that_breaks_down_ends_the_task() -> None:
     model = EliteNetworks(cart(torch.inf))
     switching = SwitchingPolicy([left], model, lambda state, action: state[:, 1])
     torch.testing.assert_close(switching.returns(torch.ones(1, 2)), torch.zeros(1, 1))
+
+
+def ensemble(*elites: int) -> DynamicsEnsemble:
+    sizes = {"num_networks": 4, "num_elites": len(elites), "num_cells": [8, 8]}
+    model = DynamicsEnsemble(3, 2, **sizes)
+    model.elites.copy_(torch.tensor(elites))
+    for name in ("input", "target"):
+        getattr(model, f"{name}_loc").normal_()
+        getattr(model, f"{name}_scale").uniform_(0.5, 2.0)
+    return model
+
+
+def test_elite_networks_predict_means_in_the_environments_units() -> None:
+    model, loc = ensemble(1, 3), torch.tensor([1.0, -2.0, 300.0])
+    scale = torch.tensor([2.0, 0.5, 40.0])
+    low, high = torch.tensor([-2.0, 0.5]), torch.tensor([4.0, 1.5])
+    networks = EliteNetworks(model, loc, scale, low, high)
+    seen, unit = torch.randn(5, 3), 2 * torch.rand(5, 2) - 1
+    mean = model.predict(seen, unit)[0][[1, 3]]
+    wanted = torch.cat([mean[..., :3] * scale, mean[..., 3:]], -1)
+    state, action = seen * scale + loc, low + (unit + 1) / 2 * (high - low)
+    found = networks(state.expand(2, -1, -1), action.expand(2, -1, -1))
+    torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-4)
+    other = EliteNetworks(ensemble(0))
+    both = EliteNetworks.join([other, networks])
+    state, action = torch.randn(3, 5, 3), torch.randn(3, 5, 2)
+    wanted = torch.cat([other(state[:1], action[:1]), networks(state[1:], action[1:])])
+    torch.testing.assert_close(both(state, action), wanted)

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import csv
+import math
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from tensordict import TensorDict
+from uneven_dynamics import linear_dynamics
 
 from torchrl_osr.fast import fast_update
 from torchrl_osr.lab.__main__ import main
 from torchrl_osr.lab.dynamics import DynamicsOptions, ModelData
-from torchrl_osr.lab.dynamics.fit import dynamics_report
-from torchrl_osr.lab.dynamics.training import FILE, dynamics_model, load_dynamics
+from torchrl_osr.lab.dynamics.training import (
+    FILE,
+    dynamics_model,
+    dynamics_report,
+    load_dynamics,
+)
 from torchrl_osr.trainers import OfflineTrainer
 
 TINY = DynamicsOptions(
@@ -112,3 +119,45 @@ def test_rambo_is_continued_with_the_same_bits(tmp_path) -> None:
     for name in ("loss_qvalue", "loss_recovery", "rollout_reward"):
         assert found[name] == whole[name], name
     assert found["adversary_objective"] == whole["adversary_objective"]
+
+
+NOISE = 0.3
+
+
+def make_model():
+    """s' = s + a up to noise, reward = s up to noise; two networks that agree."""
+    return linear_dynamics((1, 1), {(1, 0): 1, (0, 1): 1}, (2, 2), 2 * math.log(NOISE))
+
+
+def make_data(rows: int = 20_000, noise: float = NOISE) -> TensorDict:
+    """One trajectory."""
+    action = torch.randn(rows, 1)
+    steps = action + noise * torch.randn(rows, 1)
+    path = torch.cat([torch.zeros(1, 1), steps.cumsum(0)])
+    no = torch.zeros(rows, 1, dtype=torch.bool)
+    reward = path[:-1] + noise * torch.randn(rows, 1)
+    after = {"observation": path[1:].clone(), "reward": reward, "done": no}
+    after["terminated"] = no.clone()
+    found = {"observation": path[:-1], "action": action, "next": after}
+    return TensorDict(found, [rows])
+
+
+def test_report_of_the_true_model() -> None:
+    report = dynamics_report(make_model(), make_data())
+    entropy = 2 * (0.5 * math.log(2 * math.pi * math.e) + math.log(NOISE))
+    assert report["nll"] == pytest.approx(entropy, abs=0.02)
+    assert report["within_1_sigma"] == pytest.approx(0.6827, abs=0.01)
+    assert report["within_2_sigma"] == pytest.approx(0.9545, abs=0.01)
+    assert report["mse"] == pytest.approx(NOISE**2, abs=2e-3)
+    # The change has a variance of 1 + .09, of which the noise is .09.
+    assert report["r2"][0] == pytest.approx(1 / 1.09, abs=0.01)
+
+
+def test_disagreement_that_knows_the_error_has_rank_one() -> None:
+    model, data = make_model(), make_data(500, noise=0.0)
+    model.layers[0].weight[0, 1, 0] = 1.5  # one network errs with the action's size
+    data["next", "reward"].zero_()
+    data["observation"].zero_()
+    data["next", "observation"] = data["action"].clone()
+    report = dynamics_report(model, data)
+    assert report["disagreement_rank"] == pytest.approx(1.0)

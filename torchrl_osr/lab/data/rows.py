@@ -1,4 +1,4 @@
-"""Rows of a data set: held out, mixed, consecutive, and several steps together.
+"""Rows of a data set: held out, mixed, and several steps together.
 
 Shapes: ``N`` transitions, ``B`` rows of them, ``A`` action.
 """
@@ -89,16 +89,6 @@ def check_order(data: TensorDictBase) -> None:
             "no episode and are not followed by the row that came next in time. Give "
             "the rows in order, and mark ends of episodes as truncated."
         )
-
-
-def consecutive_rows(data: TensorDictBase, starts: Tensor, length: int) -> TensorDict:
-    """Transitions ``[n, L]``; starts without L rows of one trajectory are left out."""
-    starts = starts[starts + length <= len(data)]
-    rows = starts.unsqueeze(-1) + torch.arange(length, device=starts.device)
-    followed = is_followed(data, rows[:, :-1].flatten())
-    rows = rows[followed.view(len(starts), length - 1).all(1)]
-    pieces: TensorDict = data[rows.flatten()].view(len(rows), length)
-    return pieces
 
 
 def multi_step(

@@ -11,16 +11,13 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict
-from tensordict.nn import (
-    InteractionType,
-    ProbabilisticTensorDictSequential,
-    set_interaction_type,
-)
+from tensordict.nn import InteractionType, ProbabilisticTensorDictSequential
 from torch import Tensor
 from torch.distributions import Normal
 
-from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble, DynamicsLoss
+from torchrl_osr.lab.dynamics.models import DynamicsEnsemble, DynamicsLoss
 from torchrl_osr.lab.dynamics.options import DynamicsOptions, ModelData
+from torchrl_osr.lab.dynamics.rollouts import action_of
 from torchrl_osr.objectives import ActorCriticLoss
 
 SEED = 2**40
@@ -70,7 +67,7 @@ class ModelAdversary:
             for step in range(steps):
                 if step % length == 0:
                     rows = self.real.sample(options.batch_size)
-                    state = rows[self.model.in_keys[0]]
+                    state = rows["observation"]
                 rows = self.real.sample(self.model.num_networks * options.batch_size)
                 likelihood = sum(self.likelihood(rows).values())
                 objectives, state = self.objective(state)
@@ -86,13 +83,13 @@ class ModelAdversary:
         r"""Return the term with :math:`\lambda`, ``[B]``, and next states."""
         model = self.model
         with torch.no_grad():
-            action = self._action(state, InteractionType.RANDOM)
+            action = action_of(self.actor, state, InteractionType.RANDOM)
         mean, scale = model.predict(state, action)
         with torch.no_grad():
             sample = model.sample(mean, scale)
             following, reward = state + sample[..., :-1], sample[..., -1]
             goes_on = ~self.terminated(following)
-            after = self._action(following, InteractionType.DETERMINISTIC)
+            after = action_of(self.actor, following, InteractionType.DETERMINISTIC)
             value = self._value(following, after)
             advantage = reward + self.data.gamma * goes_on * value
             advantage = advantage - self._value(state, action)
@@ -103,14 +100,8 @@ class ModelAdversary:
         standardized = (advantage - advantage.mean()) / (advantage.std() + 1e-6)
         return standardized * log_density, following
 
-    def _action(self, state: Tensor, kind: InteractionType) -> Tensor:
-        batch = TensorDict({self.model.in_keys[0]: state}, state.shape[:-1])
-        with set_interaction_type(kind):
-            action: Tensor = self.actor(batch)[self.model.in_keys[1]]
-        return action
-
     def _value(self, state: Tensor, action: Tensor) -> Tensor:
-        batch = TensorDict({self.model.in_keys[0]: state}, state.shape[:-1])
+        batch = TensorDict({"observation": state}, state.shape[:-1])
         return self.loss.q(batch, action).amin(0)
 
     def state_dict(self) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, ReplayBuffer, Storage
 
 from torchrl_osr._checks import check_choice
-from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
+from torchrl_osr.lab.dynamics.models import DynamicsEnsemble
 from torchrl_osr.lab.dynamics.rollouts import Termination, never, termination
 
 
@@ -21,7 +21,6 @@ class ModelData:
     Attributes:
         storage: rows to train on.
         held_out: rows to evaluate models on.
-        pieces: of trajectories, ``[n, L]``, to evaluate roll-outs on.
         loc, scale: observations are ``(s - loc) / scale``.
         reward_scale, reward_shift: rewards are ``scale * r + shift``.
         gamma: discount factor.
@@ -29,7 +28,6 @@ class ModelData:
 
     storage: Storage
     held_out: TensorDict
-    pieces: TensorDict | None
     loc: Tensor
     scale: Tensor
     reward_scale: float

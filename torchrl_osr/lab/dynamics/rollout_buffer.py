@@ -8,34 +8,32 @@ from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import InteractionType, set_interaction_type
+from tensordict.nn import InteractionType
 from torch import Tensor, nn
 
 from torchrl_osr.lab.data.rows import take_multi_step
 from torchrl_osr.lab.data.transitions import DATASET_KEYS
-from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
 from torchrl_osr.lab.dynamics.model_adversary import ModelAdversary
+from torchrl_osr.lab.dynamics.models import DynamicsEnsemble
 from torchrl_osr.lab.dynamics.options import DynamicsOptions, ModelData
-from torchrl_osr.lab.dynamics.rollouts import Rollout, perturbed_starts, rollout
+from torchrl_osr.lab.dynamics.rollouts import (
+    Rollout,
+    action_of,
+    perturbed_starts,
+    rollout,
+)
 
 
 class RolloutReplayBuffer:
     """Mix recorded rows with roll-outs of the policy's newest copies.
 
     Before the first batch, and after every ``options.rollout_interval`` batches, a copy
-    of the policy is rolled out; the last ``options.generations`` of roll-outs are
-    sampled from. Each has its own seed and leaves torch's global generator alone. The
-    state dict holds policies instead of rows; loading it repeats the roll-outs.
+    of the policy is rolled out, after the adversary has trained the model. The last
+    ``options.generations`` of roll-outs, ``synthetic``, are sampled from. Recorded rows
+    come first in a batch and may be of ``n_steps``; synthetic ones are single steps.
 
-    Args:
-        data: the recorded rows, which come first in a batch.
-        adversary: trains the model before each further roll-out.
-
-    Keyword Args:
-        n_steps: of the recorded rows; synthetic ones are single steps.
-
-    Attributes:
-        synthetic: rows of the newest roll-outs, oldest first, ``[n]``.
+    Each roll-out has its own seed and leaves torch's global generator alone. The state
+    dict holds policies instead of rows; loading it repeats the roll-outs.
     """
 
     def __init__(
@@ -116,9 +114,7 @@ class RolloutReplayBuffer:
             policy, model = cast(tuple[nn.Module, DynamicsEnsemble], copied.children())
 
         def act(state: Tensor) -> Tensor:
-            batch = TensorDict({"observation": state}, state.shape[:-1])
-            with set_interaction_type(InteractionType.RANDOM):
-                action: Tensor = policy(batch)["action"]
+            action = action_of(policy, state, InteractionType.RANDOM)
             if noise := options.action_noise:
                 scale = noise * torch.rand(len(action), 1, device=action.device)
                 action = (action + scale * torch.randn_like(action)).clamp(-1, 1)

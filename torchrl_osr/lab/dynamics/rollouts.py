@@ -12,9 +12,10 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict
-from torch import Tensor
+from tensordict.nn import InteractionType, set_interaction_type
+from torch import Tensor, nn
 
-from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
+from torchrl_osr.lab.dynamics.models import DynamicsEnsemble
 
 Termination = Callable[[Tensor], Tensor]
 """Maps next observations ``[B, S]`` to bool ``[B]``."""
@@ -24,7 +25,7 @@ Rollout = tuple[TensorDict, int]
 
 
 def never(observation: Tensor) -> Tensor:
-    """Return ``False`` for each of ``[B, S]``."""
+    """Return ``False``."""
     return torch.zeros_like(observation[..., 0], dtype=torch.bool)
 
 
@@ -41,8 +42,8 @@ def walker2d(observation: Tensor) -> Tensor:
     return ~((height > 0.8) & (height < 2) & (angle.abs() < 1))
 
 
+# The versions 2 to 5 of Gymnasium's tasks agree.
 RULES = {"HalfCheetah": never, "Hopper": hopper, "Walker2d": walker2d}
-"""For the versions 2 to 5 of Gymnasium, which agree."""
 
 
 def termination(env_id: str) -> Termination:
@@ -54,6 +55,14 @@ def termination(env_id: str) -> Termination:
             "time limit alone ends it, set dynamics.terminations=never."
         )
     return RULES[found[1]]
+
+
+def action_of(actor: nn.Module, state: Tensor, kind: InteractionType) -> Tensor:
+    """Return the actions of an actor at states ``[B, S]``, ``[B, A]``."""
+    with set_interaction_type(kind):
+        batch = actor(TensorDict({"observation": state}, state.shape[:-1]))
+    action: Tensor = batch["action"]
+    return action
 
 
 @torch.no_grad()

@@ -11,16 +11,16 @@ from copy import copy
 import torch
 from torch import Tensor
 
-from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
+from torchrl_osr.lab.dynamics.models import DynamicsEnsemble
 from torchrl_osr.lab.dynamics.rollouts import Termination, never
 
 
 class EliteNetworks:
     """Predict mean changes of the state and rewards with a model's frozen elites.
 
-    States and actions are in the environment's units, rewards in the model's. The
-    model's states are ``(s - loc) / scale``, its actions -1 and 1 are ``low`` and
-    ``high``. All scaling is folded into two layers, for speed at action time.
+    States and actions are in the environment's units: the model's states are
+    ``(s - loc) / scale``, its actions -1 and 1 are ``low`` and ``high``. All scaling is
+    folded into two layers, for speed at action time.
     """
 
     @torch.no_grad()
@@ -91,9 +91,6 @@ class SwitchingPolicy:
         terminated: of next observations.
         steps: :math:`T`.
         hold: calls for which the chosen policy acts.
-
-    Attributes:
-        chosen: number of the acting policy in each state, ``[B]``; ``None`` at first.
 
     Examples:
         >>> rest, push = torch.zeros_like, torch.ones_like

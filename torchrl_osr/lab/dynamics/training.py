@@ -1,22 +1,29 @@
-"""Train the dynamics models of a run, and roll its policy out in them."""
+"""Train the dynamics models of a run, judge them, and roll its policy out in them."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import nn
 
 from torchrl_osr._files import read_tensors, write_json, write_tensors
-from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble, DynamicsLoss
-from torchrl_osr.lab.dynamics.fit import describe_dynamics, dynamics_report
 from torchrl_osr.lab.dynamics.model_adversary import ModelAdversary
+from torchrl_osr.lab.dynamics.models import (
+    DynamicsEnsemble,
+    DynamicsLoss,
+    TransitionVAE,
+    TransitionVAELoss,
+    gaussian_error,
+    has_next_state,
+)
 from torchrl_osr.lab.dynamics.options import DynamicsOptions, ModelData
 from torchrl_osr.lab.dynamics.rollout_buffer import RolloutReplayBuffer
-from torchrl_osr.lab.dynamics.transition_vae import TransitionVAE, TransitionVAELoss
 from torchrl_osr.objectives import ActorCriticLoss
 from torchrl_osr.trainers import Evaluation, OfflineTrainer
 from torchrl_osr.trainers.checkpoints import safe_checkpoint
@@ -77,9 +84,13 @@ def dynamics_model(
     # From the file in any case, so that a continued run has the very same model.
     model = load_dynamics(file, units)
     model.to(data.held_out.device or "cpu").requires_grad_(False)
-    report = dynamics_report(model, data.held_out, data.pieces)
+    report = dynamics_report(model, data.held_out)
     write_json(folder / REPORT, report)
-    print(describe_dynamics(report))
+    print(
+        "dynamics, {rows} held-out rows: NLL {nll:.2f}, R2 {r2_mean:.2f}, within 1 and "
+        "2 sigma {within_1_sigma:.0%} and {within_2_sigma:.0%}, disagreement and error "
+        "{disagreement_rank:.2f}".format(**report)
+    )
     return model
 
 
@@ -137,6 +148,42 @@ def _standardize(model: DynamicsEnsemble | TransitionVAE, data: ModelData) -> No
     rows, device = data.buffer(), data.held_out.device or "cpu"
     rows.set_rng(torch.Generator(device).manual_seed(data.seed))
     model.to(device).standardize_(rows.sample(ROWS_FOR_STATISTICS))
+
+
+@torch.no_grad()
+def dynamics_report(model: DynamicsEnsemble, data: TensorDictBase) -> dict[str, Any]:
+    """Measure an ensemble's errors on rows ``[N]``, and how well it predicts them.
+
+    Returns:
+        ``"nll"`` of the elites, in nats, summed over entries; ``"mse"`` of all
+        networks, in standardised targets; ``"r2"`` of the elites' mean for each entry,
+        the reward last; the shares of errors ``"within_1_sigma"`` and
+        ``"within_2_sigma"``, 0.683 and 0.954 if calibrated; Spearman's correlation of
+        disagreement and error, ``"disagreement_rank"``.
+    """
+    rows = data[has_next_state(data, model.in_keys[0])]
+    _, targets = model.inputs_and_targets(rows)
+    mean, scale = model.predict(*(rows[key] for key in model.in_keys))
+    unit = model.target_scale
+    mse = ((mean - targets) / unit).square().mean().item()
+    disagreement = model.disagreement(mean)
+    mean, scale = mean[model.elites], scale[model.elites]
+    deviation = (mean - targets).abs() / scale
+    error = mean.mean(0) - targets
+    r2 = 1 - error.square().sum(0) / (targets - targets.mean(0)).square().sum(0)
+    twice_nll = gaussian_error(mean, 2 * scale.log(), targets) + math.log(2 * math.pi)
+    both = torch.stack([disagreement, (error / unit).norm(dim=-1)])
+    ranks = both.argsort().argsort().double()
+    return {
+        "nll": targets.shape[-1] * twice_nll.mean().item() / 2,
+        "mse": mse,
+        "r2_mean": r2.mean().item(),
+        "r2": r2.tolist(),
+        "within_1_sigma": (deviation < 1).float().mean().item(),
+        "within_2_sigma": (deviation < 2).float().mean().item(),
+        "disagreement_rank": torch.corrcoef(ranks)[0, 1].item(),
+        "rows": len(rows),
+    }
 
 
 def write_dynamics(

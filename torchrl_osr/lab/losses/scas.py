@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchrl_osr._checks import check_weight
 from torchrl_osr._entries import entry, nested
-from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
+from torchrl_osr.lab.dynamics.models import DynamicsEnsemble
 from torchrl_osr.lab.losses.td3 import TD3Loss
 from torchrl_osr.objectives.actor_critic import Losses
 from torchrl_osr.objectives.transitions import (

@@ -16,8 +16,7 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl_osr import functional as F
 from torchrl_osr._checks import check_positive, check_weight
 from torchrl_osr._entries import entry, nested, state_keys
-from torchrl_osr.lab.dynamics.ensemble import DynamicsEnsemble
-from torchrl_osr.lab.dynamics.transition_vae import TransitionVAE
+from torchrl_osr.lab.dynamics.models import DynamicsEnsemble, TransitionVAE
 from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses
 from torchrl_osr.objectives.networks import distribution
 from torchrl_osr.objectives.transitions import Transitions

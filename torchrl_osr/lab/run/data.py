@@ -23,7 +23,6 @@ from torchrl_osr.lab.data import (
 )
 from torchrl_osr.lab.data.rows import (
     check_order,
-    consecutive_rows,
     held_out_rows,
     multi_step,
     next_action,
@@ -37,9 +36,6 @@ OF_TRAINING = ("storage", "held_out", "standardize", "reward_scale", "reward_shi
 MAX_HELD_OUT = 50_000
 """Held-out rows of a set on disk that are read into memory, at most."""
 
-NUM_PIECES, PIECE = 500, 20
-"""Pieces of trajectories to judge a dynamics model by, at most, and their rows."""
-
 
 class TrainingData(NamedTuple):
     """The rows to train on and to judge by, prepared and on the device."""
@@ -49,9 +45,6 @@ class TrainingData(NamedTuple):
     norm: ObservationNorm  # standardises observations
     largest_reward: float  # the largest absolute one, held-out rows included
     mean: float | None  # score of the behaviour, or return without scores, if known
-    # For models of the dynamics: pieces of trajectories, each from a held-out row on,
-    # [n, 20]; the rows that follow may be trained on.
-    pieces: TensorDict | None
 
 
 def references_of(env: EnvConfig) -> ReferenceReturns | None:
@@ -134,12 +127,8 @@ def load_training_data(
 
     size = config.trainer.batch_size
     sampling: dict[str, Any] = {"batch_size": size, "seed": 0, "device": device}
-    chosen = held_out_rows(len(data), options.held_out, seed=options.seed)
-    pieces = None
-    if config.dynamics.use:
-        starts = chosen[:NUM_PIECES]
-        pieces = prepare(consecutive_rows(data, starts, PIECE)).to(device)
     if options.storage == "disk":
+        chosen = held_out_rows(len(data), options.held_out, seed=options.seed)
         held_out = read(data, chosen[:MAX_HELD_OUT].sort().values)
         left_out = chosen.sort().values
         buffer = make_replay_buffer(data, left_out=left_out, read=read, **sampling)
@@ -150,5 +139,5 @@ def load_training_data(
     if references_of(env) is None:
         mean = (manifest.get("return") or {}).get("mean")
     return TrainingData(
-        buffer, held_out.to(device), norm(*states).to(device), largest, mean, pieces
+        buffer, held_out.to(device), norm(*states).to(device), largest, mean
     )

@@ -143,7 +143,6 @@ class Phases:
         model_data = ModelData(
             data.buffer.storage,
             data.held_out,
-            data.pieces,
             data.norm.loc,
             data.norm.scale,
             config.data.reward_scale,

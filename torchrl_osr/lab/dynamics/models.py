@@ -1,7 +1,8 @@
-"""Ensemble of probabilistic dynamics models, and its loss.
+"""Ensemble of probabilistic dynamics models, autoencoder of next states; their losses.
 
 Shapes: ``B`` batch (any leading dimensions), ``S`` observation, ``A`` action, ``E``
-networks, ``D = S + 1`` predicted entries: the change of the state, and the reward.
+networks, ``D = S + 1`` predicted entries: the change of the state, and the reward;
+``Z`` latent.
 """
 
 from __future__ import annotations
@@ -14,18 +15,19 @@ import torch
 from tensordict import NestedKey, TensorDictBase, TensorDictParams
 from torch import Tensor, nn
 from torch.nn.functional import softplus
+from torchrl.modules import MLP
 
 from torchrl_osr._entries import column, entry, nested
+from torchrl_osr.functional import gaussian_kl
+from torchrl_osr.modules.inverse_dynamics import LATENT_LOG_SCALE_BOUNDS
 from torchrl_osr.objectives import ActorCriticLoss
 from torchrl_osr.objectives.actor_critic import Losses
 from torchrl_osr.objectives.transitions import Transitions, check_single_steps
 
-LOG_VARIANCE_BOUNDS = (-10.0, 0.5)
-"""Initial values of the learned bounds, as in PETS and MOPO."""
+LOG_VARIANCE_BOUNDS = (-10.0, 0.5)  # at first, as in PETS and MOPO
 
-WEIGHT_DECAY = (2.5e-5, 5e-5, 7.5e-5, 7.5e-5)
-OUTPUT_WEIGHT_DECAY = 1e-4
-"""Of MOPO's four hidden layers and its last one; further layers use the fourth's."""
+# Of MOPO's four hidden layers and its last one; further layers use the fourth's.
+WEIGHT_DECAY, OUTPUT_WEIGHT_DECAY = (2.5e-5, 5e-5, 7.5e-5, 7.5e-5), 1e-4
 
 
 class DynamicsEnsemble(nn.Module):
@@ -37,10 +39,9 @@ class DynamicsEnsemble(nn.Module):
         \quad i = 1 \dots E
 
     as in PETS (https://arxiv.org/abs/1805.12114) and MOPO
-    (https://arxiv.org/abs/2005.13239), which sets the defaults. Inputs and
-    targets are standardised: the entries' units do not matter.
-
-    Roll-outs use the ``num_elites`` best networks, see :meth:`calibrate_`.
+    (https://arxiv.org/abs/2005.13239), which sets the defaults. Inputs and targets are
+    standardised. Roll-outs use the ``num_elites`` best networks, see
+    :meth:`calibrate_`.
 
     Examples:
         >>> model = DynamicsEnsemble(11, 3, num_networks=3, num_elites=2)
@@ -69,16 +70,17 @@ class DynamicsEnsemble(nn.Module):
     ) -> None:
         super().__init__()
         if not 1 <= num_elites <= num_networks:
-            limits = f"between 1 and num_networks={num_networks}"
-            raise ValueError(f"num_elites must be {limits}, got {num_elites}.")
+            limit = f"num_networks={num_networks}"
+            raise ValueError(f"num_elites={num_elites} must be between 1 and {limit}.")
         self.observation_dim, self.action_dim = observation_dim, action_dim
         self.num_networks, self.num_elites = num_networks, num_elites
         self.num_cells = list(num_cells)
         self.in_keys = [observation_key, action_key]
         inputs, outputs = observation_dim + action_dim, observation_dim + 1
         widths = [inputs, *num_cells, 2 * outputs]
-        layers = [_StackedLinear(num_networks, *sizes) for sizes in pairwise(widths)]
-        self.layers = nn.ModuleList(layers)
+        self.layers = nn.ModuleList(
+            _StackedLinear(num_networks, *sizes) for sizes in pairwise(widths)
+        )
         self.activation = nn.SiLU()
         lowest, highest = LOG_VARIANCE_BOUNDS
         self.lowest_log_variance = nn.Parameter(torch.full([outputs], lowest))
@@ -144,16 +146,16 @@ class DynamicsEnsemble(nn.Module):
     @torch.no_grad()
     def standardize_(self, data: TensorDictBase) -> None:
         """Take mean and standard deviation of inputs and targets from rows ``[N]``."""
-        rows = data[has_next_state(data, self.in_keys[0])]
-        inputs, targets = self.inputs_and_targets(rows)
+        known = has_next_state(data, self.in_keys[0])
+        inputs, targets = self.inputs_and_targets(data[known])
         copy_statistics(inputs, self.input_loc, self.input_scale)
         copy_statistics(targets, self.target_loc, self.target_scale)
 
     @torch.no_grad()
     def calibrate_(self, held_out: TensorDictBase) -> None:
         """Choose the networks with the smallest error on held-out rows as elites."""
-        rows = held_out[has_next_state(held_out, self.in_keys[0])]
-        inputs, targets = self.inputs_and_targets(rows)
+        known = has_next_state(held_out, self.in_keys[0])
+        inputs, targets = self.inputs_and_targets(held_out[known])
         mean, _ = self.standardized(inputs)
         wanted = (targets - self.target_loc) / self.target_scale
         error = (mean - wanted).square().mean((-2, -1))
@@ -215,16 +217,9 @@ class DynamicsLoss(ActorCriticLoss):
             + w \sum_d \big( v^{max}_d - v^{min}_d \big)
 
     with the standardised targets :math:`y = (s' - s, r)` and the learned bounds
-    :math:`v` of the log-variance, as in MOPO's code (tianheyu927/mopo), whose weight
-    decay is in :meth:`DynamicsEnsemble.parameter_groups`. The batch is divided among
-    the networks, where MOPO draws bootstrap samples. Rows without a next state do not
-    count.
-
-    Args:
-        dynamics_network: to be trained, standardised already.
-
-    Keyword Args:
-        bound_weight: ``w``. Default 0.01, MOPO's.
+    :math:`v` of the log-variance, as in MOPO's code (tianheyu927/mopo), whose
+    ``bound_weight`` :math:`w` is 0.01. The batch is divided among the networks, where
+    MOPO draws bootstrap samples. Rows without a next state do not count.
     """
 
     dynamics_network: DynamicsEnsemble
@@ -265,3 +260,96 @@ class DynamicsLoss(ActorCriticLoss):
         valid = has_next_state(rows, model.in_keys[0])
         loss = self.reduce(error, batch, valid)
         return {"loss_dynamics": loss, "loss_bounds": bounds}, {}
+
+
+class TransitionVAE(nn.Module):
+    r"""Generate the states that follow a state in the data, whatever the action.
+
+    .. math::
+        z \sim q(z \mid s, s') = \mathcal N(\mu, \sigma^2) \text{ in training}, \quad
+        z \sim \mathcal N(0, 1) \text{ in use}, \quad
+        s' = s + m + w\, f(s, z)
+
+    with mean :math:`m` and standard deviation :math:`w` of the change. Sizes are those
+    of BCQ (https://arxiv.org/abs/1812.02900): ``Z`` is ``2 * S``.
+    """
+
+    target_loc: Tensor
+    target_scale: Tensor
+
+    def __init__(
+        self,
+        observation_dim: int,
+        *,
+        num_cells: Sequence[int] = (750, 750),
+        observation_key: NestedKey = "observation",
+    ) -> None:
+        super().__init__()
+        self.observation_key = observation_key
+        self.latent_dim = 2 * observation_dim
+        options = {"num_cells": list(num_cells), "activation_class": nn.ReLU}
+        self.encoder = MLP(2 * observation_dim, 2 * self.latent_dim, **options)
+        inputs = observation_dim + self.latent_dim
+        self.decoder = MLP(inputs, observation_dim, **options)
+        self.register_buffer("target_loc", torch.zeros(observation_dim))
+        self.register_buffer("target_scale", torch.ones(observation_dim))
+
+    def sample(self, state: Tensor) -> Tensor:
+        """Draw a next state for each state, ``[B, S]``."""
+        size = *state.shape[:-1], self.latent_dim
+        latent = torch.randn(size, dtype=state.dtype, device=state.device)
+        change: Tensor = self.decoder(state, latent)
+        return state + self.target_loc + self.target_scale * change
+
+    @torch.no_grad()
+    def standardize_(self, data: TensorDictBase) -> None:
+        """Take mean and standard deviation of the change from rows ``[N]``."""
+        key = self.observation_key
+        rows = data[has_next_state(data, key)]
+        change = entry(rows, nested("next", key)) - entry(rows, key)
+        copy_statistics(change, self.target_loc, self.target_scale)
+
+
+class TransitionVAELoss(ActorCriticLoss):
+    r"""Squared error of the next state, and the latent's divergence from its prior.
+
+    .. math::
+        L = \mathbb E_D\Big[ \frac1S \|f(s, z) - y\|^2
+            + w\,\frac1Z \sum_i KL(q_i(z \mid s, s') \,\|\, N(0, 1)) \Big], \quad
+            z \sim q
+
+    with the standardised change :math:`y`, as in BCQ's code, whose ``latent_weight``
+    :math:`w` is 0.5. Rows without a next state do not count.
+    """
+
+    vae_network: TransitionVAE
+    vae_network_params: TensorDictParams
+    target_vae_network_params: TensorDictParams
+
+    def __init__(
+        self, vae_network: TransitionVAE, *, latent_weight: float = 0.5
+    ) -> None:
+        super().__init__(use_prioritized_weights=False)
+        self.convert_to_functional(vae_network, "vae_network")
+        self.latent_weight = latent_weight
+        self.declare(["loss_vae"], [])
+
+    def input_keys(self) -> list[NestedKey]:
+        key = self.vae_network.observation_key
+        return [key, nested("next", key), ("next", "terminated")]
+
+    def losses(self, batch: Transitions) -> Losses:
+        check_single_steps(batch, "the autoencoder")
+        rows, model = batch.one_step, self.vae_network
+        state = entry(rows, model.observation_key)
+        target = entry(rows, nested("next", model.observation_key))
+        with self.vae_network_params.to_module(model):
+            target = (target - state - model.target_loc) / model.target_scale
+            loc, log_scale = model.encoder(state, target).chunk(2, -1)
+            scale = log_scale.clamp(*LATENT_LOG_SCALE_BOUNDS).exp()
+            output = model.decoder(state, loc + scale * torch.randn_like(scale))
+        prior = torch.zeros_like(loc), torch.ones_like(scale)
+        divergence = gaussian_kl(loc, scale, *prior).mean(-1)
+        value = (output - target).square().mean(-1) + self.latent_weight * divergence
+        valid = has_next_state(rows, model.observation_key)
+        return {"loss_vae": self.reduce(value, batch, valid)}, {}

@@ -1,4 +1,4 @@
-"""The ensemble of dynamics models, its loss, and its elites for acting."""
+"""The models of the dynamics and their losses, each against its equation."""
 
 from __future__ import annotations
 
@@ -8,8 +8,13 @@ from tensordict import TensorDict
 from torch import nn
 from uneven_dynamics import linear_dynamics, plain_gaussian
 
-from torchrl_osr.lab.dynamics import DynamicsEnsemble, DynamicsLoss, EliteNetworks
-from torchrl_osr.lab.dynamics.ensemble import has_next_state
+from torchrl_osr.lab.dynamics import (
+    DynamicsEnsemble,
+    DynamicsLoss,
+    TransitionVAE,
+    TransitionVAELoss,
+)
+from torchrl_osr.lab.dynamics.models import has_next_state
 
 
 def rows_of(state, action, change, reward) -> TensorDict:
@@ -29,7 +34,7 @@ def test_elites_are_the_best_on_held_out_rows() -> None:
     # Their mean is .95, and both are .15 from it.
     apart = model.disagreement(model.predict(zeros, zeros)[0])
     assert apart.max().item() == pytest.approx(0.15)
-    with pytest.raises(ValueError, match="num_elites must be between 1 and"):
+    with pytest.raises(ValueError, match="num_elites=. must be between 1 and"):
         DynamicsEnsemble(1, 1, num_networks=3, num_elites=4)
 
 
@@ -45,34 +50,6 @@ def test_rows_without_a_next_state_and_constant_entries() -> None:
     assert model.input_scale[1] == 1
     assert model.target_scale.tolist() == [1, 1, 1]
     assert model.target_loc.tolist() == [0, 0, 1]
-
-
-def ensemble(*elites: int) -> DynamicsEnsemble:
-    sizes = {"num_networks": 4, "num_elites": len(elites), "num_cells": [8, 8]}
-    model = DynamicsEnsemble(3, 2, **sizes)
-    model.elites.copy_(torch.tensor(elites))
-    for name in ("input", "target"):
-        getattr(model, f"{name}_loc").normal_()
-        getattr(model, f"{name}_scale").uniform_(0.5, 2.0)
-    return model
-
-
-def test_elite_networks_predict_means_in_the_environments_units() -> None:
-    model, loc = ensemble(1, 3), torch.tensor([1.0, -2.0, 300.0])
-    scale = torch.tensor([2.0, 0.5, 40.0])
-    low, high = torch.tensor([-2.0, 0.5]), torch.tensor([4.0, 1.5])
-    networks = EliteNetworks(model, loc, scale, low, high)
-    seen, unit = torch.randn(5, 3), 2 * torch.rand(5, 2) - 1
-    mean = model.predict(seen, unit)[0][[1, 3]]
-    wanted = torch.cat([mean[..., :3] * scale, mean[..., 3:]], -1)
-    state, action = seen * scale + loc, low + (unit + 1) / 2 * (high - low)
-    found = networks(state.expand(2, -1, -1), action.expand(2, -1, -1))
-    torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-4)
-    other = EliteNetworks(ensemble(0))
-    both = EliteNetworks.join([other, networks])
-    state, action = torch.randn(3, 5, 3), torch.randn(3, 5, 2)
-    wanted = torch.cat([other(state[:1], action[:1]), networks(state[1:], action[1:])])
-    torch.testing.assert_close(both(state, action), wanted)
 
 
 def make_model(num_cells=(6, 5)) -> DynamicsEnsemble:
@@ -139,14 +116,61 @@ def test_weights_alone_decay_and_by_their_layer() -> None:
     assert {each: decay for each, decay in decays.items() if decay} == wanted
 
 
-def test_a_model_learns_single_steps_and_divides_the_batch(make_batch) -> None:
+def make_vae() -> TransitionVAE:
+    torch.manual_seed(0)
+    model = TransitionVAE(3, num_cells=[6])
+    for each in model.parameters():
+        nn.init.normal_(each, std=0.5)
+    return model.double()
+
+
+def test_loss_of_the_autoencoder_equals_the_plain_objective(make_batch, check) -> None:
+    batch = make_batch(10, twin=False)
+    batch["next", "observation"][1] = batch["observation"][1]  # terminated: no next
+    model, plain = make_vae(), make_vae()
+    model.standardize_(batch)
+    loss = TransitionVAELoss(model, latent_weight=0.3)
+    torch.manual_seed(3)
+    value = loss(batch)["loss_vae"]
+    torch.manual_seed(3)
+    noise = torch.randn(10, 6, dtype=torch.float64)
+    total, kept = 0.0, [row for row in range(10) if row != 1]
+    change = (batch["next", "observation"] - batch["observation"])[kept]
+    targets = (change - change.mean(0)) / change.std(0, correction=0)
+    for row, target in zip(kept, targets, strict=True):
+        state = batch["observation"][row]
+        first, last = plain.encoder[0], plain.encoder[2]
+        hidden = (first.weight @ torch.cat([state, target]) + first.bias).relu()
+        mean, log_scale = (last.weight @ hidden + last.bias).split(6)
+        latent = mean + log_scale.exp() * noise[row]
+        first, last = plain.decoder[0], plain.decoder[2]
+        hidden = (first.weight @ torch.cat([state, latent]) + first.bias).relu()
+        out = last.weight @ hidden + last.bias
+        variance = (2 * log_scale).exp()
+        divergence = (variance + mean**2 - 1 - 2 * log_scale).sum() / 2
+        total = total + ((out - target) ** 2).mean() + 0.3 * divergence / 6
+    wanted = total / len(kept)
+    check(
+        "Transition VAE",
+        [value.detach(), *torch.autograd.grad(value, list(model.parameters()))],
+        [wanted.detach(), *torch.autograd.grad(wanted, list(plain.parameters()))],
+        tolerance=1e-10,
+    )
+
+
+@pytest.mark.parametrize("build", [make_model, make_vae])
+def test_models_learn_single_steps_and_divide_the_batch(make_batch, build) -> None:
     single = make_batch(10, twin=False)
     several = single.clone().set("next", single["next"].roll(1, 0))
     several["steps_to_next_obs"] = torch.full((10, 1), 5)
-    loss = DynamicsLoss(make_model())
-    with pytest.raises(ValueError, match="5 steps.*the model of the dynamics reads"):
+    loss = (DynamicsLoss if build is make_model else TransitionVAELoss)(build())
+    with pytest.raises(ValueError, match="5 steps.* reads the state one step ahead"):
         loss(several)
-    kept = several.set("one_step", single["next"])
-    assert torch.equal(loss(kept)["loss_dynamics"], loss(single)["loss_dynamics"])
-    with pytest.raises(ValueError, match="9 rows cannot be divided among 2"):
-        loss(make_batch(9, twin=False))
+    found = []
+    for batch in (single, several.set("one_step", single["next"])):
+        torch.manual_seed(0)
+        found.append(sum(loss(batch).values()))
+    assert torch.equal(*found)
+    if build is make_model:
+        with pytest.raises(ValueError, match="9 rows cannot be divided among 2"):
+            loss(make_batch(9, twin=False))
