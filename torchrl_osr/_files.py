@@ -91,7 +91,7 @@ def read_json(path: Path) -> dict[str, Any]:
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """Return the arrays of a NumPy archive (``.npz``) by name; nothing is unpickled."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             return {name: np.asarray(archive[name]) for name in archive}
     except (
         *(EOFError, MemoryError, NotImplementedError, OverflowError, TypeError),

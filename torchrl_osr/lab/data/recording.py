@@ -109,8 +109,7 @@ class Recording:
         else:
             data = torch.cat([*self._transitions()])
             check_dataset(data)
-            known = self.about | options | {"num_transitions": len(data)}
-            manifest = known | self._facts()
+            manifest = options | {"num_transitions": len(data)} | self._facts()
         for warning in manifest["warnings"]:
             torchrl_logger.warning(warning)
         return data, manifest
@@ -136,6 +135,7 @@ class Recording:
             if number := self._counts[name]:
                 self._warnings[f"{number:,} rows {flaw}."] = None
         return {
+            **self.about,
             "data_sha256": [sha256_of(file) for file in self.files],
             **self._counts,
             **describe_episodes(returns[whole], lengths[whole]),

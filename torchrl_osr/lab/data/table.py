@@ -13,7 +13,7 @@ from fnmatch import fnmatchcase
 from glob import glob
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -51,13 +51,6 @@ ColumnNames = Mapping[str, str | Sequence[str] | bool | None]
 """
 
 
-class Table(NamedTuple):
-    """A file with named columns, of which ``read`` returns some."""
-
-    names: list[str]
-    read: Callable[[list[str]], Arrays]
-
-
 def open_log(
     path: str | Path | Sequence[str],
     columns: ColumnNames,
@@ -65,28 +58,33 @@ def open_log(
     source: str = "file",
 ) -> Recording:
     """Open a log without reading a row."""
-    tables = {file: _table(file) for file in _files(path)}
-    first = next(iter(tables.values()))
-    layout = find_columns(first.names, columns)
-    names = [*chain(*layout.values())]
+    files = _files(path)
+    paths = [str(file) for file in files]
+    about: dict[str, Any] = {"source": source, "column_names": {**columns}}
+    about["path"] = paths[0] if len(paths) == 1 else paths
+
+    def chosen(names: list[str]) -> list[str]:
+        """Names of the columns to read; those of the first file are looked for."""
+        if "columns" not in about:
+            about["columns"] = find_columns(names, columns)
+            used = {*chain(*about["columns"].values())}
+            about["unused_columns"] = [name for name in names if name not in used]
+        return [*chain(*about["columns"].values())]
 
     def parts() -> Iterator[Arrays]:
         codes: dict[Any, int] = {}
-        for file, table in tables.items():
-            if lacking := {*names} - {*table.names}:
-                raise ValueError(f"{file} lacks {', '.join(lacking)}.")
-            several = file if len(tables) > 1 else None
-            rows = assemble(layout, table.read(names), codes, several)
-            yield _sorted(rows, layout["step"][0]) if "step" in layout else rows
+        for file in files:
+            try:
+                arrays = _read(file, chosen)
+                several = file if len(files) > 1 else None
+                rows = assemble(about["columns"], arrays, codes, several)
+                if step := about["columns"].get("step"):
+                    rows = _sorted(rows, step[0])
+            except (KeyError, OSError, ValueError) as error:
+                raise ValueError(f"{file}: {error}") from error
+            yield rows
 
-    files = [str(file) for file in tables]
-    about = {
-        "source": source,
-        "path": files[0] if len(files) == 1 else files,
-        "columns": layout,
-        "unused_columns": [name for name in first.names if name not in names],
-    }
-    return Recording(parts, options, about, [*tables])
+    return Recording(parts, options, about, files)
 
 
 def _files(path: str | Path | Sequence[str]) -> list[Path]:
@@ -94,79 +92,47 @@ def _files(path: str | Path | Sequence[str]) -> list[Path]:
     for each in [path] if isinstance(path, (str, Path)) else path:
         whole = Path(each).expanduser().absolute()
         # A name that looks like a pattern is a name.
-        found = [whole] if whole.is_file() else map(Path, sorted(glob(str(whole))))
-        files += found
+        files += [whole] if whole.is_file() else map(Path, sorted(glob(str(whole))))
         if not files:
             raise FileNotFoundError(f"there is no file {whole}: give a log's path.")
     return files
 
 
-def _table(path: Path) -> Table:
-    readers = {".parquet": _parquet, ".hdf5": _hdf5, ".h5": _hdf5, ".npz": _npz}
-    readers |= {".csv": _csv, ".gz": _csv}
-    if path.suffix not in readers:
-        raise ValueError(f"{path} must end in one of {', '.join(readers)}.")
-    try:
-        return readers[path.suffix](path)
-    except (EOFError, OSError, ValueError) as error:
-        raise ValueError(f"{path} cannot be read: {error!r}. Is it whole?") from error
+def _read(path: Path, chosen: Callable[[list[str]], list[str]]) -> Arrays:
+    """Columns of a file; ``chosen`` says which of its names."""
+    if path.suffix == ".npz":
+        arrays = read_arrays(path)
+        return {name: arrays[name] for name in chosen([*arrays])}
+    if path.suffix in (".hdf5", ".h5"):
+        with needed_by("HDF5 files need", "minari"):
+            import h5py
+        with h5py.File(path, "r") as file:
+            names = [n for n, each in file.items() if isinstance(each, h5py.Dataset)]
+            return {name: np.asarray(file[name]) for name in chosen(names)}
+    if path.suffix == ".parquet":
+        with needed_by("Parquet files need", "minari"):
+            from pyarrow import parquet
+        names = chosen(parquet.read_schema(path).names)
+        frame = pd.read_parquet(path, columns=names)
+    elif path.suffix in (".csv", ".gz"):
+        frame = _read_csv(path)
+        names = chosen([*frame])
+    else:
+        raise ValueError("its name must end in .csv, .csv.gz, .parquet, .hdf5 or .npz")
+    return {name: frame[name].to_numpy() for name in names}
 
 
-def _npz(path: Path) -> Table:
-    arrays = read_arrays(path)
-    return Table([*arrays], lambda names: {name: arrays[name] for name in names})
-
-
-def _csv(path: Path) -> Table:
+def _read_csv(path: Path) -> pd.DataFrame:
     opened = gzip.open if path.suffix == ".gz" else open
     with opened(path, "rt", encoding="utf-8-sig") as file:
         header, *lines = file.read(2**16).splitlines() or [""]
     separator = max(",;\t", key=header.count)
     comma = separator != "," and any(re.search(r"\d,\d", line) for line in lines)
-    form: Any = {"sep": separator, "decimal": "," if comma else "."}
-    names = [name.strip() for name in pd.read_csv(path, nrows=0, **form).columns]
-
-    def read(chosen: list[str]) -> Arrays:
-        frame = pd.read_csv(path, header=0, names=names, low_memory=False, **form)
-        if not isinstance(frame.index, pd.RangeIndex):
-            raise ValueError(f"{path}: lines have more values than the header names.")
-        return {name: frame[name].to_numpy() for name in chosen}
-
-    return Table(names, read)
-
-
-def _parquet(path: Path) -> Table:
-    with needed_by("Parquet files need", "minari"):
-        from pyarrow import parquet
-
-    def read(chosen: list[str]) -> Arrays:
-        table = parquet.read_table(path, columns=chosen)
-        return {name: _from_arrow(name, table[name]) for name in chosen}
-
-    return Table(parquet.read_schema(path).names, read)
-
-
-def _from_arrow(name: str, column: Any) -> Array:
-    """Column ``[N]``, or ``[N, D]`` if it holds lists."""
-    array = column.to_numpy()
-    if array.dtype.kind == "O" and len(array) and isinstance(array[0], np.ndarray):
-        if len(lengths := {np.size(each) for each in array}) > 1:
-            raise ValueError(f"{name!r} holds lists of the lengths {lengths}.")
-        array = np.stack(array)
-    return np.asarray(array)
-
-
-def _hdf5(path: Path) -> Table:
-    with needed_by("HDF5 files need", "minari"):
-        import h5py
-    with h5py.File(path, "r") as file:
-        names = [n for n, each in file.items() if isinstance(each, h5py.Dataset)]
-
-    def read(chosen: list[str]) -> Arrays:
-        with h5py.File(path, "r") as file:
-            return {name: np.asarray(file[name]) for name in chosen}
-
-    return Table(names, read)
+    decimal = "," if comma else "."
+    frame = pd.read_csv(path, sep=separator, decimal=decimal, low_memory=False)
+    if not isinstance(frame.index, pd.RangeIndex):
+        raise ValueError("lines have more values than the header has names.")
+    return frame.rename(columns=str.strip)
 
 
 def find_columns(names: Sequence[str], wanted: ColumnNames) -> dict[str, list[str]]:
@@ -257,7 +223,7 @@ def assemble(
             columns[part] = first.reshape(-1)
         elif part != "episode":
             found = [_numbers(name, arrays[name]) for name in names]
-            vector = len(found) > 1 or (part in VECTORS and first.ndim == 1)
+            vector = len(found) > 1 or (part in VECTORS and found[0].ndim == 1)
             columns[part] = np.column_stack(found) if vector else found[0]
         elif first.dtype.kind in "biuf" and file is None:
             columns[part] = first.reshape(-1)
@@ -274,6 +240,8 @@ def _numbers(name: str, array: Array) -> Array:
     if array.dtype.kind in "biuf":
         return array
     try:
+        if len(array) and isinstance(array[0], np.ndarray):
+            return np.stack([*array])  # lists of one length
         numbers = pd.to_numeric(pd.Series([*array], dtype=object))
     except ValueError as error:
         raise ValueError(f"{name!r} holds other than numbers: {error}.") from error
