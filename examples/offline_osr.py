@@ -172,7 +172,6 @@ def check_scope(config: TrainConfig) -> None:
         or config.perturbation.adversary is not None
         or config.dynamics.use
         or config.trainer.compile
-        or model.shuffle_next
     ):
         raise ValueError("this page trains loss=osr or osr_v: use torchrl-osr train.")
 

@@ -86,8 +86,8 @@ def test_recovery_is_added_to_a_loss_without_it(name, recovery, batch) -> None:
         (["loss=rebrac", "dynamics=ensemble"], "choose dynamics=none"),
         (["loss=scas", "dynamics=none"], "choose dynamics=ensemble"),
         (["loss=rambo", "dynamics.real_ratio=1.0"], "set it to 0"),
-        (["loss=bc", "perturbation=adversarial"], "needs critics, which BCLoss lacks"),
-        (["loss=td3_bc", "perturbation=adversarial"], "tanh-Gaussian"),
+        (["loss=bc", "perturbation=adversarial"], "critics .*, which BCLoss lacks"),
+        (["loss=td3_bc", "perturbation=adversarial"], "which TD3BCLoss lacks"),
     ],
 )
 def test_options_that_do_not_fit_each_other_are_refused(overrides, message) -> None:
@@ -139,6 +139,6 @@ class Broken(gymnasium.Env):
 @pytest.mark.parametrize("how", ["raise", "nan", "array", "four"])
 def test_a_broken_environment_is_found_by_one_step(how):
     gymnasium.register("Broken-v0", Broken, kwargs={"how": how}, max_episode_steps=5)
-    with pytest.raises(RuntimeError, match="^Broken-v0 (cannot be played|has obs)"):
+    with pytest.raises(RuntimeError, match="^Broken-v0 cannot be played"):
         try_out("Broken-v0")
     del gymnasium.registry["Broken-v0"]

@@ -118,16 +118,11 @@ def _check_combination(config: TrainConfig, learner: Learner) -> None:
     adversary, modules = config.perturbation.adversary, learner.objective.modules()
     rolled_out = dynamics.use and dynamics.real_ratio < 1
     reads_data = ("next", "action") in learner.objective.in_keys
+    attacked = isinstance(loss, ActorCriticLoss) and learner.has_critics
     why = ""
-    if adversary and not (isinstance(loss, ActorCriticLoss) and learner.has_critics):
-        why = f"perturbation=adversarial needs critics, which {name} lacks"
-    elif (
-        adversary
-        and adversary.get("objective") == "action_diff"
-        and head_of(learner.actor)[0] is not TanhNormal
-    ):
-        why = f"perturbation=adversarial needs the tanh-Gaussian policy that {name}"
-        why += " lacks, or perturbation.adversary.objective=min_Q"
+    if adversary and not (attacked and head_of(learner.actor)[0] is TanhNormal):
+        why = "perturbation=adversarial needs critics and a tanh-Gaussian policy, which"
+        why += f" {name} lacks"
     elif not dynamics.use and any(hasattr(m, "dynamics_network") for m in modules):
         why = f"{name} needs a model of the dynamics: choose dynamics=ensemble"
     elif rolled_out and (reads_data or isinstance(loss, IQLLoss)):
@@ -171,16 +166,14 @@ def try_out(env_id: str) -> None:
 
     with closing(make_environment(env_id)) as env:
         try:
-            observation, _ = env.reset(seed=0)
-            after, reward, terminated, truncated, _ = env.step(
-                env.action_space.sample()
-            )
-            flags = bool(terminated), bool(truncated)
-            numbers = [*observation, *after, float(reward), *flags]
+            first, _ = env.reset(seed=0)
+            after, reward, *flags, _ = env.step(env.action_space.sample())
+            terminated, truncated = map(bool, flags)
+            numbers = [*first, *after, float(reward), terminated, truncated]
+            if not np.isfinite(numbers).all():
+                raise ArithmeticError("observations or rewards are not finite")
         except Exception as error:
             raise RuntimeError(
                 f"{env_id} cannot be played: a reset and a step ended with "
                 f"{type(error).__name__}: {error}"
             ) from error
-    if not np.isfinite(numbers).all():
-        raise RuntimeError(f"{env_id} has observations or rewards that are not finite.")

@@ -108,7 +108,6 @@ class InverseDynamicsConfig:
 
     network: dict[str, Any] = MISSING  # builder (_target_) and its options
     loss: Any = MISSING  # options of InverseDynamicsLoss
-    shuffle_next: bool = False  # ablation: train with another row's next state
 
 
 @dataclass

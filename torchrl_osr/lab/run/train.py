@@ -11,7 +11,6 @@ from typing import Any
 
 import torch
 from hydra.utils import instantiate
-from tensordict import TensorDict
 from torch.nn import Parameter
 from torchrl.objectives import LossModule, SoftUpdate, TargetNetUpdater
 
@@ -122,7 +121,6 @@ class Phases:
         assert model is not None
         steps = config.trainer.inverse_dynamics_steps
         loss = instantiate(config.inverse_dynamics.loss, _partial_=True)(model)
-        shuffled = config.inverse_dynamics.shuffle_next
         trainer = self.fit(
             config.optim.inverse_dynamics_lr,
             "inverse_dynamics",
@@ -132,7 +130,6 @@ class Phases:
             evaluation=Evaluation(
                 lambda: inverse_dynamics_report(model, rows), steps, "nll", "min"
             ),
-            hooks=[("process_optim_batch", _shuffle_next)] * shuffled,
         )
         write_json(self.run.folder / "inverse_dynamics.json", trainer.history[-1])
         print(describe_inverse_dynamics(trainer.history[-1]))
@@ -218,9 +215,3 @@ def _log_rollouts(trainer: OfflineTrainer, rollouts: RolloutReplayBuffer) -> Non
     for name, value in rollouts.metrics().items():
         for logger in trainer.loggers:
             logger.log_scalar(f"policy/{name}", value, step=trainer.step)
-
-
-def _shuffle_next(batch: TensorDict) -> TensorDict:
-    """Give every row the next state of another: an ablation of the model."""
-    key = ("next", "observation")
-    return batch.set(key, batch[key].roll(1, 0))  # the rows came in random order
