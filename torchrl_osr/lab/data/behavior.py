@@ -35,15 +35,7 @@ class Affine(NamedTuple):
 
 @dataclass(frozen=True)
 class BehaviorPolicy:
-    """A tanh-Gaussian actor; weights ``[H, S]``, ``[H, H]`` and twice ``[A, H]``.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_osr.lab.data import load_behavior_policy
-        >>> policy = load_behavior_policy("hopper", "medium")
-        >>> policy.sample(np.zeros(11), np.random.default_rng(0)).shape
-        (3,)
-    """
+    """A tanh-Gaussian actor; weights ``[H, S]``, ``[H, H]`` and twice ``[A, H]``."""
 
     hidden0: Affine
     hidden1: Affine
@@ -90,14 +82,9 @@ def behavior_policy_path(
 def load_behavior_policy(
     env_name: str, policy_name: str, *, folder: Path | str | None = None
 ) -> BehaviorPolicy:
-    """Load a behaviour policy by name, in float32.
+    """Load ``"medium"``, ``"expert"``, or ``"replay_1"`` to ``"replay_8"`` in float32.
 
-    Args:
-        env_name: short environment name, such as ``"hopper"``.
-        policy_name: ``"medium"``, ``"expert"``, ``"replay_1"`` ... ``"replay_8"``.
-
-    Keyword Args:
-        folder: written by ``examples/train_behavior.py``. Default: the package's.
+    ``examples/train_behavior.py`` writes a ``folder`` of your own.
     """
     arrays = read_arrays(behavior_policy_path(env_name, policy_name, folder))
     arrays = {name: array.astype(np.float32) for name, array in arrays.items()}

@@ -57,11 +57,7 @@ def environment_name(env_id: str) -> str:
 
 
 class EnvironmentSpec(NamedTuple):
-    """Sizes and action bounds of a task, which data and networks must fit.
-
-    ``action_size`` numbers are an action, or discrete ones are numbered below it; these
-    have no bounds. A task that is not ``simulated`` cannot be played.
-    """
+    """Sizes and action bounds of a task; discrete actions have no bounds."""
 
     observation_size: int
     action_size: int
@@ -76,13 +72,7 @@ class EnvironmentSpec(NamedTuple):
 
 
 def environment_spec(env_id: str) -> EnvironmentSpec:
-    """Sizes and action bounds of a task.
-
-    Examples:
-        >>> from torchrl_osr.lab.data import environment_spec
-        >>> environment_spec("Pendulum-v1")[:4]
-        (3, 1, [-2.0], [2.0])
-    """
+    """Sizes and action bounds of a task."""
     with closing(open_environment(env_id)) as env:
         size = spaces.flatdim(env.observation_space)
         actions: Any = env.action_space

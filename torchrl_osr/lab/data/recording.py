@@ -36,9 +36,6 @@ ActionBounds = tuple[ArrayLike, ArrayLike]
 
 Columns = Mapping[str, Any]
 
-REQUIRED = ("observation", "action", "reward", "terminated")
-OPTIONAL = ("truncated", "episode", "next_observation")
-
 # Raise it whenever other rows or another manifest are made of a source: recordings in
 # the cache are then converted anew.
 READER_VERSION = 4
@@ -92,14 +89,12 @@ class Recording:
         if on_disk:
             # Sizes and times: to read a large source at each start is slow.
             states = [(str(file.resolve()), file.stat()) for file in self.files]
-            request = (
-                self.about
-                | options
-                | {
-                    "reader_version": READER_VERSION,
-                    "source_files": [[n, s.st_size, s.st_mtime_ns] for n, s in states],
-                }
-            )
+            request = {
+                **self.about,
+                **options,
+                "reader_version": READER_VERSION,
+                "source_files": [[n, s.st_size, s.st_mtime_ns] for n, s in states],
+            }
             text = json.dumps(request, sort_keys=True)
             digest = hashlib.sha256(text.encode()).hexdigest()[:16]
             folder = cache_root() / "recorded" / f"{self.about['source']}-{digest}"
@@ -131,9 +126,8 @@ class Recording:
         """Facts about the transitions once all have been read."""
         returns, lengths, complete = np.concatenate(self._episodes).T
         whole, lengths = complete == 1, lengths.astype(int)
-        for name, flaw in WARNINGS.items():
-            if number := self._counts[name]:
-                self._warnings[f"{number:,} rows {flaw}."] = None
+        left_out = {name: self._counts[name] for name in WARNINGS if self._counts[name]}
+        warnings = [f"{rows:,} rows {WARNINGS[n]}." for n, rows in left_out.items()]
         return {
             **self.about,
             "data_sha256": [sha256_of(file) for file in self.files],
@@ -141,7 +135,7 @@ class Recording:
             **describe_episodes(returns[whole], lengths[whole]),
             "incomplete_returns": returns[~whole].tolist(),
             "incomplete_lengths": lengths[~whole].tolist(),
-            "warnings": [*self._warnings],
+            "warnings": [*self._warnings, *warnings],
         }
 
 
@@ -167,7 +161,7 @@ def transitions_from_columns(
     num_actions: int | None = None,
     missing: str = "error",
 ) -> Dataset:
-    """Turn recorded steps, in order of time, into a data set.
+    """Turn recorded steps, in order of time, into transitions and their manifest.
 
     A trajectory ends where a row is terminated or truncated, where the episode number
     changes, and at the last row; an end without a flag becomes ``truncated``. Without
@@ -183,19 +177,14 @@ def transitions_from_columns(
             ``[N, S]``. Flags are bool, or 0 and 1 of any type.
 
     Keyword Args:
-        action_bounds: lowest and highest action, mapped to -1 and 1. Default: -1 and 1.
-            The actions are then clipped to ±0.999.
-        clip_actions: clip actions outside their bounds, as MuJoCo does, rather than
-            raise. Default: ``False``.
+        action_bounds: lowest and highest action, mapped to -1 and 1. The actions are
+            then clipped to ±0.999.
+        clip_actions: clip actions outside their bounds rather than raise.
         num_actions: number of discrete actions: ``action`` then holds their numbers
             from 0, ``[N]``, and becomes one-hot. Default: actions are real.
-        missing: ``"row"`` leaves out rows with missing values (NaN or masked) and cuts
-            their trajectories there, ``"episode"`` leaves out their trajectories,
+        missing: ``"row"`` leaves out rows with missing values (NaN) and cuts their
+            trajectories there, ``"episode"`` leaves out their trajectories,
             ``"error"`` raises. Default: ``"error"``.
-
-    Returns:
-        The transitions in float32, and a manifest: counts of rows and ends, returns and
-        lengths of the complete and the incomplete episodes, and ``warnings``.
 
     Examples:
         >>> import numpy as np
@@ -232,7 +221,13 @@ def trajectories(
     broken = np.isin(trajectory, trajectory[lost])  # recorded in part
     if options.missing == "episode":
         lost = broken
-    resets = _reset_rows(columns, flagged) & ~lost
+    resets = np.zeros_like(lost)
+    if "next_observation" in columns:
+        # Where a vector environment was reset, no action was executed: the row begins
+        # in the state that an episode ended in, and has a reward of 0.
+        reached = columns["next_observation"][:-1]
+        begun = (reached == columns["observation"][1:]).all(1) & flagged[:-1]
+        resets[1:] = begun & (columns["reward"][1:] == 0) & ~lost[1:]
     ends[:-1] |= lost[1:]
     keep = ~(lost | resets)
     if not keep.any():
@@ -243,7 +238,7 @@ def trajectories(
     ends[-1] = True
     reward = columns["reward"].astype(np.float64)
     columns = _cast(columns, options.num_actions)
-    columns["action"], clipped, outside = _unit_actions(columns["action"], options)
+    columns["action"], outside = _unit_actions(columns["action"], options)
     episode = columns.pop("episode", None)
     terminated = columns["terminated"]
     truncated = columns.get("truncated", np.zeros_like(terminated))
@@ -257,12 +252,12 @@ def trajectories(
         jumps = np.r_[(np.abs(reached - after) > slack).any(1) & ~ends[:-1], False]
         complete &= ~np.logical_or.reduceat(jumps, starts)
     returns = np.add.reduceat(reward, starts)
-    keep, filled = np.ones_like(ends), 0
+    keep = np.ones_like(ends)
     if "next_observation" not in columns:
         observation = columns["observation"]
         columns["next_observation"] = np.roll(observation, -1, axis=0)
         columns["next_observation"][terminated] = observation[terminated]
-        keep, filled = ~ends | terminated, int(terminated.sum())
+        keep = ~ends | terminated
     # Only an end is dropped: its trajectory is then cut at the row before.
     last = ends.copy()
     last[:-1] |= ~keep[1:]
@@ -271,10 +266,8 @@ def trajectories(
         columns = {name: column[keep] for name, column in columns.items()}
     counts = {
         "dropped_rows": int((~keep).sum()),
-        "terminal_rows_filled": filled,
         "missing_rows": int(lost.sum()),
         "reset_rows": int(resets.sum()),
-        "clipped_actions": clipped,
         "actions_outside": outside,
         "terminated_ends": int(terminated[stops].sum()),
         "truncated_ends": int((truncated & ~terminated)[stops].sum()),
@@ -285,19 +278,19 @@ def trajectories(
 
 
 def _arrays(rows: Columns, num_actions: int | None) -> dict[str, Array]:
-    """Columns as arrays of numbers with one row a step; masked entries become NaN."""
-    flaws = [f"no {name}" for name in REQUIRED if name not in rows]
+    """Columns as arrays of numbers with one row a step."""
+    required = ("observation", "action", "reward", "terminated")
+    flaws = [f"no {name}" for name in required if name not in rows]
     if not {"truncated", "episode"} & rows.keys():
         flaws.append("neither truncated nor episode")
     # A misspelt optional column would otherwise be overlooked.
-    flaws += [f"an unknown {n!r}" for n in rows if n not in REQUIRED + OPTIONAL]
+    known = {*required, "truncated", "episode", "next_observation"}
+    flaws += [f"an unknown {name!r}" for name in rows if name not in known]
     if flaws:
         raise ValueError(f"the columns have {', '.join(flaws)}.")
     columns: dict[str, Array] = {}
     count = np.size(rows["reward"])
     for name, values in rows.items():
-        if np.ma.is_masked(values):
-            values = np.ma.asarray(values, np.float64).filled(np.nan)
         array = np.asarray(values)
         size = int(np.size(array) / max(count, 1))
         if name == "next_observation":
@@ -323,8 +316,8 @@ def _missing(columns: Mapping[str, Array], missing: str) -> Array:
         if wrong.any() and missing == "error":
             raise ValueError(
                 f"{name!r} has no value in row {wrong.argmax()} of {len(array)}, "
-                f"one of {wrong.sum()}: repair them, or leave out such rows or their "
-                "episodes (data.missing=row, data.missing=episode)."
+                f"one of {wrong.sum()}: leave out such rows or their episodes "
+                "(data.missing=row, data.missing=episode)."
             )
         lost |= wrong
     return lost
@@ -354,18 +347,6 @@ def _ends(columns: Mapping[str, Array]) -> tuple[Array, Array]:
                 "together. data.columns.step sorts them."
             )
     return flagged, ends
-
-
-def _reset_rows(columns: Mapping[str, Array], flagged: Array) -> Array:
-    """Rows ``[N]`` in which a vector environment was reset: no action was executed.
-
-    They begin in the state that an episode ended in, and have a reward of 0.
-    """
-    if "next_observation" not in columns:
-        return np.zeros_like(flagged)
-    reached = np.roll(columns["next_observation"], 1, axis=0)
-    same = (reached == columns["observation"]).all(1) & (columns["reward"] == 0)
-    return np.asarray(same & np.r_[False, flagged[:-1]])
 
 
 def _cast(columns: Mapping[str, Array], num_actions: int | None) -> dict[str, Array]:
@@ -400,10 +381,10 @@ def _refuse(name: str, array: Array, wrong: Array, expected: str) -> None:
         )
 
 
-def _unit_actions(action: Array, options: Reading) -> tuple[Array, int, int]:
-    """Actions from -1 to 1, clipped; how many rows were, and how many outside."""
+def _unit_actions(action: Array, options: Reading) -> tuple[Array, int]:
+    """Actions from -1 to 1, clipped, and the number of rows outside."""
     if options.num_actions is not None:
-        return action, 0, 0
+        return action, 0
     size = action.shape[1]
     low, high = (np.broadcast_to(np.float64(b), size) for b in options.action_bounds)
     if not (np.isfinite([low, high]).all() and (low < high).all()):
@@ -430,9 +411,7 @@ def _unit_actions(action: Array, options: Reading) -> tuple[Array, int, int]:
         raise ValueError(
             f"'action' leaves its bounds in {outside.sum()} of {len(action)} rows, "
             f"first in row {row}: {action[row].tolist()}, where they are "
-            f"{low.tolist()} and {high.tolist()}. Give the true ones "
-            "(data.action_bounds=[low,high]), or data.clip_actions=true if the "
-            "environment clipped them."
+            f"{low.tolist()} and {high.tolist()}. Give data.action_bounds=[low,high], "
+            "or data.clip_actions=true if the environment clipped them."
         )
-    clipped = np.clip(unit, -ACTION_LIMIT, ACTION_LIMIT)
-    return clipped, int((clipped != unit).any(1).sum()), int(outside.sum())
+    return np.clip(unit, -ACTION_LIMIT, ACTION_LIMIT), int(outside.sum())

@@ -1,9 +1,7 @@
 """Roll out named data sets from the behaviour policies of the package.
 
-``random`` draws uniform actions; ``medium-replay`` stands for a replay buffer: eight
-snapshots on the way to the medium policy. Mixtures have equal shares. In the mazes, a
-planner gives the next of the four cells beside a cell, and a controller pushes the
-point towards it. Both see only the observation: the behaviour has no memory.
+In the mazes, a planner gives the next of the four cells beside a cell, and a controller
+pushes the point towards it. Both see only the observation: the behaviour has no memory.
 
 One environment, one process and NumPy policies: on one core this is faster than
 vectorised environments or torch policies.
@@ -64,13 +62,11 @@ PLAY_CELLS: dict[str, list[tuple[Cell, Cell]]] = {
 """Pairs of start and goal of source ``play``; the umaze has too few cells for it."""
 
 # Force for a metre of distance, and for a metre a second of speed. They let the point
-# reach its goal in almost every episode at about 3 m/s, with every fifth number of its
-# actions at a bound; stiffer ones leave hardly an action that is not.
+# reach its goal in almost every episode, with every fifth of its actions at a bound.
 STIFFNESS, DAMPING = 2.0, 0.4
 
 # Standard deviation of the noise on the force, whose bounds are -1 and 1.
 ACTION_NOISE = 0.5
-
 
 Collection = tuple[TensorDict, NDArray[np.float64], NDArray[np.int64]]
 """Transitions ``[N]``; returns and lengths ``[E]`` of complete episodes."""
@@ -156,11 +152,6 @@ def collect_transitions(
     Returns:
         The transitions ``[N]``; returns and lengths ``[E]`` of complete episodes.
     """
-    if not 0 < len(samplers) <= num_transitions:
-        raise ValueError(
-            f"num_transitions={num_transitions} for {len(samplers)} policies; "
-            "expected at least one transition each."
-        )
     spaces = env.observation_space, env.action_space
     state, action = ((num_transitions, flatdim(space)) for space in spaces)
     columns: dict[str, NDArray[Any]] = {
@@ -224,8 +215,6 @@ def waypoint_sampler(maze: Any) -> ActionSampler:
 
     with the middle :math:`w` of the next cell on a shortest way, or the goal itself
     once it is in this cell or the next.
-
-    ``maze`` is gymnasium-robotics' ``Maze`` of the environment.
     """
     rows = enumerate(maze.maze_map)
     free = {(i, j) for i, row in rows for j, cell in enumerate(row) if cell != 1}
@@ -250,10 +239,7 @@ def waypoint_sampler(maze: Any) -> ActionSampler:
 
 
 def shortest_path(free: set[Cell], start: Cell, goal: Cell) -> list[Cell]:
-    """Free cells of a shortest way from ``start`` to ``goal``, both included.
-
-    Of several it is always the same one: up goes before down, left and right.
-    """
+    """Free cells of a shortest way, both ends included; up before down, left, right."""
     # From the goal, so that each cell that is reached knows the next one on its way.
     next_cell: dict[Cell, Cell] = {goal: goal}
     waiting = deque([goal])

@@ -5,13 +5,11 @@ Shapes: ``N`` transitions, ``B`` rows of them, ``A`` action.
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from torchrl_osr.lab.data.transitions import ROWS_AT_A_TIME, SAME_STATE
+from torchrl_osr.lab.data.transitions import SAME_STATE
 
 
 def held_out_rows(rows: int, held_out: int | float, *, seed: int) -> Tensor:
@@ -39,21 +37,14 @@ def split_held_out(
 def mix_datasets(
     valuable: TensorDict, random: TensorDict, *, random_share: float, seed: int
 ) -> TensorDict:
-    """Replace a share of the rows by rows of another set: section 5.3 of the paper.
-
-    Rows are drawn without replacement; those kept of ``valuable`` come first.
-    """
+    """Replace a share of the rows by rows of another set, which come last."""
+    if not 0 <= random_share <= 1:
+        raise ValueError(f"random_share={random_share}; expected a share from 0 to 1.")
     number = round(random_share * len(valuable))
-    if not 0 <= random_share <= 1 or number > len(random):
-        raise ValueError(
-            f"random_share={random_share} of {len(valuable)} rows, with {len(random)} "
-            "random rows; expected a share from 0 to 1 and enough random rows."
-        )
     generator = torch.Generator().manual_seed(seed)
     kept = torch.randperm(len(valuable), generator=generator)[number:].sort().values
     taken = torch.randperm(len(random), generator=generator)[:number].sort().values
-    mixed: TensorDict = torch.cat([valuable[kept], random[taken]])
-    return mixed
+    return torch.cat([valuable[kept], random[taken]])
 
 
 def is_followed(data: TensorDictBase, rows: Tensor | None = None) -> Tensor:
@@ -78,12 +69,8 @@ def next_action(data: TensorDictBase, rows: Tensor | None = None) -> Tensor:
 
 def check_order(data: TensorDictBase) -> None:
     """Raise unless every row that does not end an episode is followed by its next."""
-    wrong = []
-    every: Any = torch.arange(len(data))
-    for rows in every.split(ROWS_AT_A_TIME):
-        done = data["next", "done"][rows].squeeze(-1)
-        wrong += rows[~(done | is_followed(data, rows))].tolist()
-    if wrong:
+    followed = data["next", "done"].squeeze(-1) | is_followed(data)
+    if wrong := (~followed).nonzero()[:, 0].tolist():
         raise ValueError(
             f"{len(wrong):,} of the {len(data):,} rows, row {wrong[0]} the first, end "
             "no episode and are not followed by the row that came next in time. Give "

@@ -3,8 +3,6 @@
 A normalised score is 0 for the return of D4RL's uniformly random policy and 100 for
 the return of its expert (``d4rl/infos.py``), measured on the v2 tasks of ``mujoco-py``.
 In the mazes it is the success rate in percent.
-
-Shapes: ``N`` transitions, ``S`` observation, ``E`` complete episodes.
 """
 
 from __future__ import annotations
@@ -33,14 +31,6 @@ def observation_statistics(data: TensorDictBase) -> tuple[Tensor, Tensor]:
     Returns:
         ``loc`` ``[S]`` and ``scale`` ``[S]``. The scale is at least 0.001; a logged
         warning names entries that vary less.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_osr.lab.data import observation_statistics
-        >>> rows = torch.tensor([[1.0, 5.0], [3.0, 5.0]])
-        >>> observation_statistics(TensorDict({"observation": rows}, [2]))
-        (tensor([2., 5.]), tensor([1.0000, 0.0010]))
     """
     observation = data.get("observation")
     # Chan's formula for the variance of two sets together.
@@ -115,11 +105,6 @@ def reference_returns(
 
     The arguments are for a task that has none of D4RL's: both returns, or neither for
     raw returns.
-
-    Examples:
-        >>> from torchrl_osr.lab.data import reference_returns
-        >>> reference_returns("halfcheetah").score(12135.0)
-        100.0
     """
     low, high = random_return, expert_return
     if low is None and high is None:

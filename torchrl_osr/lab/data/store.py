@@ -69,19 +69,14 @@ def write_memmap(
 ) -> Dataset:
     """Write transitions to a folder, chunk by chunk, and open them.
 
-    They are written to a hidden folder, ``.<name>.partial``, which is renamed at the
-    end: an interrupted call leaves no data set.
+    An interrupted call leaves no data set.
 
     Args:
         chunks: transitions ``[n]`` each, float32. Only one is in memory at a time.
         folder: of the data set, which is made, or replaced.
 
     Keyword Args:
-        describe: called when all chunks are written; returns JSON-compatible entries of
-            the manifest.
-
-    Raises:
-        FileExistsError: the folder holds something else, which is not touched.
+        describe: called at the end; returns JSON-compatible entries of the manifest.
     """
     folder = Path(folder).expanduser()
     if folder.exists() and not {p.name for p in folder.iterdir()} <= {MANIFEST, ROWS}:
@@ -117,14 +112,9 @@ def write_memmap(
 
 
 def load_memmap(folder: Path | str) -> Dataset:
-    """Open a data set that :func:`write_memmap` has written.
+    """Open a data set that :func:`write_memmap` has written, and check its checksum.
 
-    Its files are read once, to compare their checksum; rows are read when asked for.
-
-    Returns:
-        The transitions ``[N]``, memory-mapped, and the manifest. Change a ``clone()``:
-        writing to these tensors writes to the files.
-
+    Change a ``clone()`` of the rows: writing to these tensors writes to the files.
     """
     folder = Path(folder).expanduser()
     try:
@@ -186,10 +176,7 @@ Reader = Callable[[TensorDictBase, Tensor], TensorDictBase]
 
 
 class MemmapStorage(Storage):
-    """Rows of a memory-mapped set as the storage of a replay buffer, read-only.
-
-    Draws are made on the device of the batches, like those of a buffer in memory.
-    """
+    """Rows of a memory-mapped set as the storage of a replay buffer, read-only."""
 
     def __init__(
         self,
@@ -236,19 +223,8 @@ def make_replay_buffer(
 
     The batches depend on ``seed`` alone: the buffer has a generator of its own, and
     does not prefetch, because threads would make the order of the draws depend on time.
-
-    Args:
-        data: transitions ``[N]``. Memory-mapped ones (:func:`load_memmap`) stay on
-            disk, and the same seed draws the same rows.
-
-    Keyword Args:
-        batch_size: rows per ``sample()``.
-        seed: of the sampling.
-        left_out: sorted numbers of memory-mapped rows that are not drawn.
-        transform: applied to each sampled batch.
-        device: of the rows and the sampling, or, of a memory-mapped set, of the
-            batches. Default: the device of ``data``, or CPU if it has none.
-        read: returns rows of memory-mapped data by their numbers.
+    Memory-mapped rows stay on disk; ``read`` returns them by their numbers, and those
+    ``left_out``, sorted, are not drawn.
 
     Examples:
         >>> import torch
