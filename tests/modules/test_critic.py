@@ -50,20 +50,3 @@ def test_critics_keep_torchs_default_initialisation_in_the_loss() -> None:
     weight = loss.qvalue_network_params["module", "2", "weight"]
     for kept, critic in zip(weight, critics, strict=True):
         assert torch.equal(kept, critic.module[2].weight)
-
-
-def test_layer_norm_normalises_each_hidden_layer_before_its_activation() -> None:
-    options = {"num_qvalue_nets": 1, "num_cells": [16, 8], "layer_norm": True}
-    (critic,) = critic_ensemble(3, 2, **options)
-    state, action = torch.randn(5, 3), torch.randn(5, 2)
-    batch = TensorDict({"observation": state, "action": action}, [5])
-    # The same network restated layer by layer from its weights.
-    first, second, last = (
-        m for m in critic.modules() if isinstance(m, torch.nn.Linear)
-    )
-    hidden = torch.cat([state, action], -1)
-    for layer in (first, second):
-        hidden = layer(hidden)
-        spread, mean = torch.std_mean(hidden, -1, keepdim=True, correction=0)
-        hidden = ((hidden - mean) / (spread.square() + 1e-5).sqrt()).relu()
-    torch.testing.assert_close(critic(batch)["state_action_value"], last(hidden))

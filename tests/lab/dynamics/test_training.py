@@ -151,13 +151,3 @@ def test_report_of_the_true_model() -> None:
     assert report["mse"] == pytest.approx(NOISE**2, abs=2e-3)
     # The change has a variance of 1 + .09, of which the noise is .09.
     assert report["r2"][0] == pytest.approx(1 / 1.09, abs=0.01)
-
-
-def test_disagreement_that_knows_the_error_has_rank_one() -> None:
-    model, data = make_model(), make_data(500, noise=0.0)
-    model.layers[0].weight[0, 1, 0] = 1.5  # one network errs with the action's size
-    data["next", "reward"].zero_()
-    data["observation"].zero_()
-    data["next", "observation"] = data["action"].clone()
-    report = dynamics_report(model, data)
-    assert report["disagreement_rank"] == pytest.approx(1.0)

@@ -11,7 +11,7 @@ import torch
 from objectives.losses import Networks, make_batch, update_targets
 from objectives.plain import Plain, compare, prepare
 from torch import Tensor
-from uneven_dynamics import uneven_dynamics
+from uneven_dynamics import plain_gaussian, uneven_dynamics
 
 from torchrl_osr.lab.dynamics import DynamicsEnsemble
 from torchrl_osr.lab.losses import SCASLoss
@@ -28,15 +28,8 @@ VERSIONS = {
 
 def next_state(model: DynamicsEnsemble, state: Tensor, action: Tensor) -> Tensor:
     """Return the elites' mean, network by network."""
-    inputs = (torch.cat([state, action]) - model.input_loc) / model.input_scale
-    changes = []
-    for number in (0, 2):
-        first, last = model.layers
-        hidden = first.weight[number].T @ inputs + first.bias[number, 0]
-        hidden = hidden * torch.sigmoid(hidden)
-        out = (last.weight[number].T @ hidden + last.bias[number, 0])[:4]
-        changes.append((out * model.target_scale + model.target_loc)[:3])
-    return state + sum(changes) / 2
+    mean = sum(plain_gaussian(model, number, state, action)[0] for number in (0, 2)) / 2
+    return state + (mean * model.target_scale + model.target_loc)[:3]
 
 
 def restated(plain: Plain, model, batch, version: str) -> dict[str, Tensor]:

@@ -6,13 +6,12 @@ import math
 
 import pytest
 import torch
-from objectives.losses import Networks, assert_same_bits, call, make_batch, make_loss
+from objectives.losses import Networks, make_batch
 from objectives.plain import Plain, compare
 from torch import Tensor
 from uneven_dynamics import plain_gaussian, uneven_dynamics
 
 from torchrl_osr.lab.losses import StateDeviationLoss
-from torchrl_osr.lab.losses.sdc import maximum_mean_discrepancy
 
 SAMPLES, WIDTH, THRESHOLD, MULTIPLIER = 3, 0.7, 0.02, 1.7
 
@@ -86,17 +85,3 @@ def test_losses_and_gradients_equal_the_restatement(check) -> None:
     }
     out = compare(check, "SDC", loss, batch, losses, trained, 1e-10)
     assert out["multiplier"].item() == pytest.approx(MULTIPLIER)
-
-
-def test_it_adds_to_cql_and_draws_after_it() -> None:
-    batch = make_batch("sdc", 10)
-    cql, both = call(make_loss("cql"), batch), call(make_loss("sdc"), batch)
-    assert_same_bits([both[key] for key in cql.keys()], [*cql.values()])  # noqa: SIM118
-
-
-@pytest.mark.parametrize("distance", [0.0, 0.5, 2.0])
-def test_discrepancy_of_two_points_by_hand(distance) -> None:
-    here, there = torch.zeros(3, 1, 2), torch.full((4, 1, 2), distance)
-    value = maximum_mean_discrepancy(here, there, width=0.5)
-    expected = 2 - 2 * math.exp(-(distance**2) / (2 * 0.5**2))
-    assert value.item() == pytest.approx(expected, abs=1e-6)

@@ -118,8 +118,6 @@ class DynamicsOptions:
             why = f"real_ratio={self.real_ratio}: {real} of {batch_size} rows are real"
         elif self.unknown == "halt" and gamma == 1:
             why = "unknown=halt needs optim.gamma below 1"
-        elif self.adversarial_steps and self.batch_size < 2:
-            why = "batch_size must be at least 2: advantages are standardised"
         else:
             return
         raise ValueError(f"dynamics.{why}.")
