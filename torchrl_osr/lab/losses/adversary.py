@@ -20,7 +20,7 @@ from torchrl.modules import TanhNormal
 
 from torchrl_osr._checks import check_choice, check_positive, check_weight
 from torchrl_osr._entries import entry, nested, select
-from torchrl_osr.lab.losses.rorl import jeffreys_divergence
+from torchrl_osr.lab.losses.ensembles import jeffreys_divergence
 from torchrl_osr.objectives.actor_critic import ActorCriticLoss
 from torchrl_osr.objectives.networks import distribution
 

@@ -1,0 +1,258 @@
+r"""SCAS and SDC: a model of the dynamics leads the policy back to the data.
+
+Shapes: ``R`` rows, ``S`` observation, ``A`` action, ``N`` critics, ``n`` samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import torch
+from tensordict import NestedKey
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+    TensorDictParams,
+)
+from torch import Tensor, nn
+from torchrl.modules.distributions.utils import rsample_and_log_prob
+
+from torchrl_osr import functional as F
+from torchrl_osr._checks import check_positive, check_weight
+from torchrl_osr._entries import entry, nested, state_keys
+from torchrl_osr.lab.dynamics.models import DynamicsEnsemble, TransitionVAE
+from torchrl_osr.lab.losses.td3 import TD3Loss
+from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses
+from torchrl_osr.objectives.networks import distribution
+from torchrl_osr.objectives.transitions import (
+    Transitions,
+    check_single_steps,
+    next_states,
+)
+
+
+class SCASLoss(TD3Loss):
+    r"""State Correction and OOD Action Suppression (SCAS).
+
+    .. math::
+        L_\pi &= (1 - \lambda)\,\mathbb E_D \Big[
+            - \frac{\min_i Q_i(s, \pi(s))}{\mathbb E_D |\min_i Q_i(s, \pi(s))|} \Big]
+            + \lambda\,\mathbb E_D \Big[
+            w(s, s')\,\frac1S \big\| M(\hat s, \pi(\tilde s)) - s' \big\|^2 \Big]
+            \\
+        w(s, s') &= \min\big(e^{\tau (V(s') - V(s))}, w_{max}\big), \quad
+        V(s) = \frac1N \sum_i Q_i(s, \pi(s))
+
+    with a perturbed state :math:`\hat s`, a frozen model :math:`M` of the dynamics, and
+    the critics of :class:`~torchrl_osr.lab.losses.td3.TD3Loss`, of which the authors
+    have four. "Offline Reinforcement Learning with OOD State Correction and OOD Action
+    Suppression", https://arxiv.org/abs/2410.19400. It prints :math:`\tilde s = \hat s`;
+    its released code (MAOYIXIU/SCAS) has :math:`\tilde s = s`, the default here.
+
+    Differences from that code: :math:`M` is the mean of an ensemble's elites, trained
+    by likelihood (there one network, by squared error); rows that are ``done`` have no
+    correction; the target is the critics' minimum in mazes, too (there their mean).
+
+    Keyword Args:
+        correction_weight: :math:`\lambda`, between 0 and 1. Default 0.25.
+        correction_action: the state :math:`\tilde s`, ``"clean"`` (default) or
+            ``"perturbed"``.
+        gain_temperature: :math:`\tau`. Default 5.0.
+        largest_weight: :math:`w_{max}`. Default 50.0.
+        options: of :class:`~torchrl_osr.lab.losses.td3.TD3Loss`.
+
+    Examples:
+        >>> from torchrl_osr.lab.dynamics import DynamicsEnsemble
+        >>> from torchrl_osr.lab.losses import SCASLoss
+        >>> from torchrl_osr.modules import critic_ensemble, deterministic_actor
+        >>> loss = SCASLoss(
+        ...     deterministic_actor(11, 3), critic_ensemble(11, 3, num_qvalue_nets=4),
+        ...     DynamicsEnsemble(11, 3))
+        >>> loss.out_keys
+        ['loss_actor', 'loss_qvalue', 'correction_error', 'pred_value', 'target_value']
+    """
+
+    reads_perturbed, metric = True, "correction_error"
+    dynamics_network: DynamicsEnsemble
+    dynamics_network_params: TensorDictParams
+    target_dynamics_network_params: TensorDictParams
+
+    def __init__(
+        self,
+        actor_network: TensorDictModuleBase,
+        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+        dynamics_network: DynamicsEnsemble,
+        *,
+        correction_weight: float = 0.25,
+        correction_action: Literal["clean", "perturbed"] = "clean",
+        gain_temperature: float = 5.0,
+        largest_weight: float = 50.0,
+        **options: Any,
+    ) -> None:
+        check_weight("correction_weight", correction_weight)
+        check_weight("1 - correction_weight", 1 - correction_weight)
+        check_weight("gain_temperature", gain_temperature)
+        super().__init__(actor_network, qvalue_network, **options)
+        self.register_frozen("dynamics_network", dynamics_network)
+        self.correction_weight = correction_weight
+        self.correction_action = correction_action
+        self.gain_temperature, self.largest_weight = gain_temperature, largest_weight
+
+    def losses(self, batch: Transitions) -> Losses:
+        share = self.correction_weight
+        action, qvalues = self.policy_values(batch)
+        lowest = qvalues.min(0).values
+        weight = self.weight(batch, qvalues.detach().mean(0))
+        error = weight * self.deviation(batch, action)
+        sought = self.reduce(-lowest / self.magnitude(batch, lowest), batch)
+        correction = self.reduce(error, batch, batch.has_next)
+        actor = (1 - share) * sought + share * correction
+        qvalue, metrics = self.critic_loss(batch)
+        metrics["correction_error"] = self.mean(error, batch, batch.has_next)
+        return {"loss_actor": actor, "loss_qvalue": qvalue}, metrics
+
+    @torch.no_grad()
+    def weight(self, batch: Transitions, value: Tensor) -> Tensor:
+        """Return the weight of each row's correction, ``[R]``, from its value."""
+        # Of single steps, as the correction.
+        after = next_states(batch.one_step, self.observation_keys, batch.done)
+        action = self.act(after, self.actor_network_params)
+        gain = self.q(after, action).mean(0) - value
+        return (self.gain_temperature * gain).exp().clamp(max=self.largest_weight)
+
+    def deviation(self, batch: Transitions, action: Tensor) -> Tensor:
+        """Return the squared distance from the data's next state, ``[R]``.
+
+        Of where the model says that the policy's action leads from the perturbed state.
+        """
+        check_single_steps(batch, "the model of the dynamics")
+        perturbed, model = batch.states[2], self.dynamics_network
+        if self.correction_action == "perturbed":
+            action = self.act(perturbed, self.actor_network_params)
+        key = model.in_keys[0]
+        state, after = entry(perturbed, key), entry(batch.one_step, nested("next", key))
+        with self.dynamics_network_params.to_module(model, preserve_module_state=False):
+            mean, _ = model.predict(state, action)
+            reached = state + mean[model.elites].mean(0)[..., :-1]
+        # What follows an end may be anything, and 0 * nan is nan in the backward pass.
+        after = torch.where(batch.done.unsqueeze(-1), torch.zeros_like(after), after)
+        return (reached - after).square().mean(-1)
+
+
+def maximum_mean_discrepancy(first: Tensor, second: Tensor, width: float) -> Tensor:
+    r"""Squared maximum mean discrepancy of two samples, with a Gaussian kernel.
+
+    The biased estimate of https://jmlr.org/papers/v13/gretton12a.html, with the kernel
+    :math:`\exp(-\|x - y\|^2 / (2 h^2 S))` of width :math:`h`, in units of one entry.
+    ``[n, R, S]`` and ``[m, R, S]`` give ``[R]``, between 0 and 2.
+    """
+
+    def kernel(x: Tensor, y: Tensor) -> Tensor:
+        """Return the mean over all pairs, ``[R]``."""
+        distance = (x.unsqueeze(1) - y.unsqueeze(0)).square().mean(-1)
+        return (distance / (-2 * width**2)).exp().mean((0, 1))
+
+    return kernel(first, first) + kernel(second, second) - 2 * kernel(first, second)
+
+
+class StateDeviationLoss(ActorCriticLoss):
+    r"""State Deviation Correction (SDC): a constraint on the actor of another loss.
+
+    .. math::
+        \mathbb E_D\, MMD^2\big( M(\cdot \mid \hat s, \pi(\cdot \mid \hat s)),\,
+        U(\cdot \mid s) \big) \le \eta
+
+    with perturbed states :math:`\hat s`, a frozen model :math:`M` of the dynamics and a
+    frozen model :math:`U` of the data's next states. ``loss_deviation`` moves the
+    policy, ``loss_multiplier`` a Lagrange multiplier. "State Deviation Correction for
+    Offline Reinforcement Learning" (AAAI 2022,
+    https://doi.org/10.1609/aaai.v36i8.20886) adds it to CQL(H), see
+    :class:`~torchrl_osr.objectives.WithRecovery`.
+
+    **This is our reading**: the authors have published no code and no settings that we
+    could find. Kernel, its width, :math:`\eta` and the number of samples are ours.
+
+    Keyword Args:
+        num_samples: ``n`` of :math:`M` and of :math:`U`. Default 4.
+        kernel_width: in units of the observation. Default 1.
+        threshold: :math:`\eta`. Default 0.05.
+        options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
+
+    Examples:
+        >>> from torchrl_osr.lab.dynamics import DynamicsEnsemble, TransitionVAE
+        >>> from torchrl_osr.lab.losses import StateDeviationLoss
+        >>> from torchrl_osr.modules import tanh_gaussian_actor
+        >>> loss = StateDeviationLoss(
+        ...     tanh_gaussian_actor(11, 3), DynamicsEnsemble(11, 3), TransitionVAE(11))
+        >>> loss.out_keys
+        ['loss_deviation', 'loss_multiplier', 'deviation', 'multiplier']
+    """
+
+    reads_perturbed = True
+    dynamics_network: DynamicsEnsemble
+    dynamics_network_params: TensorDictParams
+    target_dynamics_network_params: TensorDictParams
+    transition_network: TransitionVAE
+    transition_network_params: TensorDictParams
+    target_transition_network_params: TensorDictParams
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        dynamics_network: DynamicsEnsemble,
+        transition_network: TransitionVAE,
+        *,
+        num_samples: int = 4,
+        kernel_width: float = 1.0,
+        threshold: float = 0.05,
+        **options: Any,
+    ) -> None:
+        check_positive("num_samples", num_samples, minimum=1)
+        check_positive("kernel_width", kernel_width)
+        check_weight("threshold", threshold)
+        super().__init__(**options)
+        self.convert_to_functional(actor_network, "actor_network")
+        self.register_frozen("dynamics_network", dynamics_network)
+        self.register_frozen("transition_network", transition_network)
+        self.num_samples, self.kernel_width = num_samples, kernel_width
+        self.threshold = threshold
+        self.log_multiplier = nn.Parameter(torch.zeros(()))
+        losses = ["loss_deviation", "loss_multiplier"]
+        self.declare(losses, ["deviation", "multiplier"])
+
+    def input_keys(self) -> list[NestedKey]:
+        keys = [*self.actor_network.in_keys, *self.dynamics_network.in_keys]
+        states = state_keys(keys, self.tensor_keys.action)
+        perturbed = [nested(self.tensor_keys.perturbed, key) for key in states]
+        return [*states, *perturbed]
+
+    def losses(self, batch: Transitions) -> Losses:
+        value, valid = self.deviation(batch), batch.is_data
+        policy, dual = F.lagrange_terms(value, self.log_multiplier, self.threshold)
+        return {
+            "loss_deviation": self.reduce(policy, batch, valid),
+            "loss_multiplier": self.reduce(dual, batch, valid),
+        }, {
+            "deviation": self.mean(value, batch, valid),
+            "multiplier": self.log_multiplier.detach().exp(),
+        }
+
+    def deviation(self, batch: Transitions) -> Tensor:
+        """Return the discrepancy of where policy and data lead, ``[R]``."""
+        model, aims = self.dynamics_network, self.transition_network
+        number, keys = self.num_samples, state_keys(self.actor_network.in_keys)
+        states = batch.states_of(keys, "perturbed")
+        pi = distribution(self.actor_network, self.actor_network_params, states)
+        action, _ = rsample_and_log_prob(pi, (number,))
+        action = action.squeeze(1)  # of the one set of states
+        key = model.in_keys[0]
+        clean = entry(batch.rows, aims.observation_key).expand(number, -1, -1)
+        start = batch.states_of([key], "perturbed")[0].get(key).expand(number, -1, -1)
+        with self.dynamics_network_params.to_module(model, preserve_module_state=False):
+            change = model.sample(*model.predict(start, action))[..., :-1]
+        held = self.transition_network_params
+        with torch.no_grad(), held.to_module(aims, preserve_module_state=False):
+            aim = aims.sample(clean)
+        return maximum_mean_discrepancy(start + change, aim, self.kernel_width)
