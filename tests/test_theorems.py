@@ -129,19 +129,3 @@ def test_theorem_2_bounds_the_gap_to_the_behaviour_policy_for_positive_values() 
     signed = (gap(mdp.qvalue) > bound(mdp.qvalue).abs()).sum().item()
     assert 0.02 < signed / PROBLEMS < 0.2
     assert (gap(mdp.qvalue) <= bound(positive)).sum() == PROBLEMS
-
-
-def test_off_the_data_values_may_rise_unlike_cqls() -> None:
-    """At the fixed point the policy's value differs from its target's by this.
-
-    CQL's is never above 0: a lower bound. With the model's mean instead of the
-    behaviour policy some values rise, so the same argument proves nothing at ``s^``.
-    """
-    mdp = problems()
-
-    def rise(target: Tensor) -> Tensor:
-        step = -ALPHA * (mdp.policy - target) / (2 * mdp.off_behaviour)
-        return (mdp.policy * step).sum(-1)
-
-    assert (rise(mdp.off_behaviour) > 0).sum() == 0
-    assert 0 < (rise(mdp.target) > 0).sum() < 0.05 * PROBLEMS

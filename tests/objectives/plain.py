@@ -215,15 +215,9 @@ def compare(
 ) -> TensorDict:
     """Compare a loss with its restatement: values, and gradients of their sums.
 
-    Args:
-        check: compares sequences of tensors.
-        label: of the loss.
-        loss: is called with the batch.
-        batch: the batch.
-        restated: returns the losses anew, from the same draws.
-        networks: restated networks (a list of critics), by the losses that train them
-            and the name in the loss: ``{"loss_qvalue loss_cql qvalue": critics}``.
-        tolerance: relative.
+    ``restated`` returns the losses anew, from the same draws. The restated networks (a
+    list of critics) are named by the losses that train them and the name in the loss:
+    ``{"loss_qvalue loss_cql qvalue": critics}``.
     """
     torch.manual_seed(5)
     out = loss(batch)

@@ -1,9 +1,8 @@
-"""Recovery where the answer is known: a linear-Gaussian world, end to end.
+"""What the recovery term teaches in a linear-Gaussian world, where it is known.
 
 ``s' = A s + B a + w`` with ``w ~ N(0, w^2)`` and behaviour ``a ~ N(k s, b^2)``. Given
 ``(s, s')`` the action is Gaussian with mean ``k s + G (s' - (A + B k) s)``, gain
-``G = B b^2 / (w^2 + B^2 b^2)``. At a pushed state the recovering policy undoes a share
-``B G`` of the push: what is left of the deviation is ``w^2 / (w^2 + B^2 b^2)``.
+``G = B b^2 / (w^2 + B^2 b^2)``.
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ from torchrl_osr import InverseDynamicsLoss, StateRecoveryLoss
 A, B, GAIN, BEHAVIOR_STD, NOISE_STD = 0.9, 0.5, -0.3, 0.4, 0.1
 # So wide that the tanh is a straight line where the actions are, to 1 %.
 BOUND = 20.0
-STATE, PUSHED = 1.0, 1.4
 
 
 def linear_gaussian(*inputs) -> ProbabilisticActor:
@@ -49,60 +47,6 @@ def exact_draws(*size: int) -> Tensor:
     return torch.linalg.solve_triangular(factor, draws.T, upper=False).T
 
 
-def transitions(state: Tensor, draws: Tensor, behavior_std: float) -> TensorDict:
-    """Return behaviour and dynamics at states ``[R, 1]``, with draws ``[R, 2]``."""
-    action = GAIN * state + behavior_std * draws[:, :1]
-    after = A * state + B * action + NOISE_STD * draws[:, 1:]
-    done = torch.zeros_like(state, dtype=torch.bool)
-    rows = {"observation": state, "action": action}
-    rows["next"] = {"observation": after, "done": done}
-    return TensorDict(rows, [len(state)])
-
-
-def minimize(loss, batch: TensorDict) -> None:
-    optimizer = torch.optim.LBFGS(
-        list(loss.parameters()), max_iter=200, line_search_fn="strong_wolfe"
-    )
-    (key,) = (key for key in loss.out_keys if key.startswith("loss_"))
-
-    def closure() -> Tensor:
-        optimizer.zero_grad()
-        value = loss(batch)[key]
-        value.backward()
-        return value
-
-    optimizer.step(closure)
-
-
-@pytest.mark.parametrize("behavior_std", [BEHAVIOR_STD, 0.04])
-def test_what_is_left_of_a_push_is_the_closed_form(behavior_std) -> None:
-    variance = NOISE_STD**2 + B**2 * behavior_std**2
-    actor = linear_gaussian("observation")
-    model = linear_gaussian("observation", ("next", "observation"))
-    draws = exact_draws(2_000, 3)
-    data = transitions(draws[:, :1], draws[:, 1:], behavior_std)
-    minimize(InverseDynamicsLoss(model, states="clean"), data)
-    by_state, by_next = BOUND * model[0][0].module[0].weight[0]
-    gain = B * behavior_std**2 / variance
-    assert by_next.item() == pytest.approx(gain, rel=0.02)
-    assert by_state.item() == pytest.approx(GAIN - gain * (A + B * GAIN), abs=0.02)
-
-    # One state and one push, so that the policy can know where it came from.
-    state = torch.full((2_000, 1), STATE, dtype=torch.float64)
-    batch = transitions(state, exact_draws(2_000, 2), behavior_std)
-    batch["perturbed", "observation"] = torch.full_like(state, PUSHED)
-    options = {"recovery_weight": 1.0, "recovery_states": "perturbed"}
-    minimize(StateRecoveryLoss(actor, model, **options).double(), batch)
-    policy = actor.get_dist(batch["perturbed"].auto_batch_size_(1))
-    action, std = BOUND * policy.loc[0].item(), BOUND * policy.scale[0].item()
-    reached, undisturbed = A * PUSHED + B * action, (A + B * GAIN) * STATE
-    left = (reached - undisturbed) / ((A + B * GAIN) * (PUSHED - STATE))
-    # 0.2 for the wide behaviour; hardly any recovery (0.96) where it is nearly
-    # deterministic: there the data do not show how to come back.
-    assert left == pytest.approx(NOISE_STD**2 / variance, abs=0.02)
-    assert std == pytest.approx(behavior_std, abs=0.01)
-
-
 def pushed_rows(push: float, width: float = 1.0) -> TensorDict:
     """Return 64 rows of this world and pushed states, second moments exact.
 
@@ -110,8 +54,13 @@ def pushed_rows(push: float, width: float = 1.0) -> TensorDict:
     networks are of the right class.
     """
     draws = exact_draws(64, 4)
-    rows = transitions(width * draws[:, :1], draws[:, 1:3], BEHAVIOR_STD)
-    rows["action"] = BOUND * rows["action"].tanh()
+    state = width * draws[:, :1]
+    action = GAIN * state + BEHAVIOR_STD * draws[:, 1:2]
+    after = A * state + B * action + NOISE_STD * draws[:, 2:3]
+    done = torch.zeros_like(state, dtype=torch.bool)
+    rows = {"observation": state, "action": BOUND * action.tanh()}
+    rows["next"] = {"observation": after, "done": done}
+    rows = TensorDict(rows, [64])
     rows["perturbed", "observation"] = rows["observation"] + push * draws[:, 3:]
     return rows
 

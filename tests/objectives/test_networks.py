@@ -12,7 +12,6 @@ from objectives.losses import (
     NEXT,
     PERTURBED,
     WITH_CRITICS,
-    A,
     Networks,
     S,
     assert_same,
@@ -25,16 +24,9 @@ from objectives.losses import (
 )
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
-from torch.distributions import Categorical, Normal
 from torchrl.modules import (
     MLP,
-    Delta,
-    NormalParamExtractor,
-    OneHotCategorical,
-    ProbabilisticActor,
 )
-
-from torchrl_osr.lab.losses import BCLoss
 
 with_critics = pytest.mark.parametrize("name", WITH_CRITICS)
 
@@ -197,37 +189,3 @@ def test_td3_needs_the_bounds_of_a_plain_actor() -> None:
     for name in ("td3-bc", "rebrac", "scas"):
         with pytest.raises(ValueError, match="Pass low= and high="):
             make_loss(name, low=None)
-
-
-HEADS = {"normal": Normal, "delta": Delta}
-HEADS |= {"index": Categorical, "one-hot": OneHotCategorical}
-
-
-@pytest.mark.parametrize("kind", HEADS)
-def test_any_policy_can_be_cloned(kind) -> None:
-    mlp, names = MLP(S, A, num_cells=[8]).double(), ["logits"]
-    if kind == "normal":
-        mlp = nn.Sequential(
-            MLP(S, 2 * A, num_cells=[8]).double(), NormalParamExtractor()
-        )
-        names = ["loc", "scale"]
-    elif kind == "delta":
-        names = ["param"]
-    actor = ProbabilisticActor(
-        TensorDictModule(mlp, ["observation"], names),
-        in_keys=names,
-        distribution_class=HEADS[kind],
-    )
-    batch = make_batch("bc", 2, 3)
-    states, action = batch["observation"], batch["action"]
-    index = (action[..., 0] > 0).long()
-    if kind == "delta":
-        expected = (mlp(states) - action).square().sum(-1).mean()
-    elif kind == "normal":
-        expected = -Normal(*mlp(states)).log_prob(action).sum(-1).mean()
-    else:
-        expected = nn.functional.cross_entropy(
-            mlp(states).flatten(0, 1), index.flatten()
-        )
-        batch["action"] = index if kind == "index" else nn.functional.one_hot(index, A)
-    torch.testing.assert_close(BCLoss(actor)(batch)["loss_actor"], expected)

@@ -43,6 +43,7 @@ from torchrl_osr.objectives.networks import (
     distribution,
     distribution_params,
     full_precision,
+    squashing_bounds,
     written_action,
 )
 from torchrl_osr.objectives.transitions import (
@@ -181,8 +182,9 @@ class ActorCriticLoss(LossModule):
         *,
         delay_actor: bool = False,
     ) -> None:
-        """Register an actor, and critics: one to be copied, or a list."""
+        """Register an actor, its bounds, and critics: one to be copied, or a list."""
         check_networks(actor_network=actor_network, qvalue_network=qvalue_network)
+        self.register_bounds(squashing_bounds(actor_network))
         self.convert_to_functional(
             actor_network, "actor_network", create_target_params=delay_actor
         )
@@ -240,7 +242,7 @@ class ActorCriticLoss(LossModule):
         target_entropy: float | Literal["auto"],
     ) -> None:
         """Register a tanh-Gaussian actor, critics, and SAC's entropy temperature."""
-        self.register_bounds(action_bounds(actor_network, "actor_network"))
+        action_bounds(actor_network, "actor_network")  # or a TypeError
         self.register_actor_critic(actor_network, qvalue_network)
         self.register_temperature(alpha_init, target_entropy)
 
