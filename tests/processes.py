@@ -24,21 +24,15 @@ def own_cache(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def tiny() -> Callable[..., list[str]]:
-    """Return a maker of the main example's overrides, for a run of seconds."""
+    """Return a maker of a command's overrides, for a run of seconds."""
 
     def overrides(data: str = "random", **trainer: object) -> list[str]:
-        sizes: dict[str, object] = {
-            "batch_size": 8,
-            "inverse_dynamics_steps": 10,
-            "steps": 10,
-            "log_interval": 10,
-            "eval_interval": 10,
-            "eval_episodes": 1,
-            "checkpoint_interval": 10,
-        }
-        rows = [f"data={data}", "data.num_transitions=600", "data.held_out=0.1"]
-        values = [f"trainer.{key}={value}" for key, value in (sizes | trainer).items()]
-        return [*rows, "network.num_cells=[8]", *values]
+        from composed import SMALL  # imports the laboratory
+
+        given = {f"trainer.{key}": str(value) for key, value in trainer.items()}
+        sizes = dict(each.split("=") for each in SMALL)
+        sizes |= {"data": data, "trainer.progress": "true"} | given
+        return [f"{key}={value}" for key, value in sizes.items()]
 
     return overrides
 

@@ -48,12 +48,10 @@ def test_from_nothing_to_a_report(env_id, loss, bounds, left_out, tmp_path, caps
     assert hint in capsys.readouterr().out
     trained(run, f"env.id={env_id}", f"loss={loss}", f"data.path={log}")
     env = read_run(run).env
-    assert (env.name, env.id) == (env_id, env_id)
-    assert (env.action_low, env.action_high) == bounds
-    returns = json.loads((run / "returns.json").read_text())
-    assert returns["last"]["return"] == np.mean(returns["last"]["returns"])
-    assert returns["data_return"] is not None
-    assert not [key for key in returns["last"] if "score" in key]
+    assert (env.name, env.action_low, env.action_high) == (env_id, *bounds)
+    last = json.loads((run / "returns.json").read_text())["last"]
+    assert last["return"] == np.mean(last["returns"])
+    assert not [key for key in last if "score" in key]
     assert "return [95 % interval]" in capsys.readouterr().out
 
     results = disturbed(run)
@@ -63,7 +61,6 @@ def test_from_nothing_to_a_report(env_id, loss, bounds, left_out, tmp_path, caps
     assert capsys.readouterr().out.count("left out: ") == left_out
     page = write_report(read_runs([tmp_path]), tmp_path / "page").read_text()
     assert f"return of {env_id}" in page
-    assert "normalised score" not in page
 
     better = tmp_path / "better.npz"
     record(better, f"policy={run}", "episodes=2", "noise=0.1")
@@ -78,19 +75,12 @@ def test_from_nothing_to_a_report(env_id, loss, bounds, left_out, tmp_path, caps
     record(tmp_path / "x.npz", f"policy={saved}", f"env.id={env_id}", "episodes=1")
 
 
-def test_own_references_make_scores_and_pages_are_not_mixed(tmp_path):
-    log = tmp_path / "log.npz"
-    record(log, "env.id=Pendulum-v1", "episodes=3")
-    given = ("env.id=Pendulum-v1", f"data.path={log}")
-    scale = ("env.random_return=-1200", "env.expert_return=-200")
-    run = trained(tmp_path / "scored", *given, *scale)
+def test_own_references_make_scores(tmp_path):
+    record(log := tmp_path / "log.npz", "env.id=Pendulum-v1", "episodes=3")
+    given = ("env.id=Pendulum-v1", f"data.path={log}", "env.random_return=-1200")
+    run = trained(tmp_path / "scored", *given, "env.expert_return=-200")
     last = json.loads((run / "returns.json").read_text())["last"]
     assert last["score"] == pytest.approx((last["return"] + 1200) / 10)
-    trained(tmp_path / "raw", *given, "seed=1")
-    tables = read_runs([tmp_path / "scored", tmp_path / "raw"])
-    assert tables.measure == "normalised score"
-    ((_, reason),) = tables.left_out
-    assert "return of Pendulum-v1" in reason
 
 
 class Machine(gymnasium.Env):
@@ -107,10 +97,7 @@ def test_without_a_simulator_a_log_still_makes_a_policy(tmp_path, capsys):
     run = trained(tmp_path / "run", machine, f"data.path={log}")
     assert "Machine-v0 has no simulator to play in" in capsys.readouterr().out
     assert (run / "curve.png").exists()
-    returns = json.loads((run / "returns.json").read_text())
-    assert returns["evaluations"] == []
-    saved = sorted(path.name for path in (run / "checkpoint" / "policy").iterdir())
-    assert saved == ["checkpoint-000000000010.torchrl"]
+    assert json.loads((run / "returns.json").read_text())["evaluations"] == []
     action = load_run_policy(run).act(np.zeros((2, 3), np.float32))
     assert action.shape == (2, 1)
     assert (abs(action) < 2).all()
@@ -120,26 +107,19 @@ def test_without_a_simulator_a_log_still_makes_a_policy(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("overrides", "error", "message"),
+    ("overrides", "message"),
     [
-        (["env.id=Pendulum-v1", "path=log.txt"], ValueError, "must end in .npz"),
-        (["env.id=Pendulum-v1", "path=there.npz"], FileExistsError, "there.npz exists"),
-        (["path=log.npz"], ValueError, "env.id is not given"),
-        (["env=hopper", "path=a.npz", "policy=good"], ValueError, "neither random"),
-        (["env=hopper", "path=a.npz", "policy=no:act"], ValueError, "cannot be imp"),
-        (["env=hopper", "path=a.npz", "policy=own:act"], ValueError, "is not in Box"),
-        (["env=hopper", "path=a.npz", "noise=0.1"], ValueError, "random has none"),
-        (["env=hopper", "path=a.npz", "seed=-1"], ValueError, "seed"),
+        (["env.id=Pendulum-v1", "path=there.npz"], "there.npz exists"),
+        (["path=log.npz"], "env.id is not given"),
+        (["env=hopper", "path=a.npz", "policy=good"], "neither random"),
+        (["env=hopper", "path=a.npz", "policy=no:act"], "cannot be imported"),
+        (["env=hopper", "path=a.npz", "noise=0.1"], "random has none"),
     ],
 )
-def test_collect_refuses_in_a_sentence(
-    overrides, error, message, tmp_path, monkeypatch
-):
+def test_collect_refuses_in_a_sentence(overrides, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "there.npz").write_bytes(b"mine")
-    (tmp_path / "own.py").write_text("def act(observation): return [0.5]")
-    with pytest.raises(error, match=message):
+    with pytest.raises((ValueError, FileExistsError), match=message):
         collect.main(composed("collect", *overrides))
     assert (tmp_path / "there.npz").read_bytes() == b"mine"
 

@@ -19,11 +19,10 @@ def test_help_lists_every_command(capsys):
     assert re.findall(r"(?m)^  (\w+)  +[a-z]", printed) == list(COMMANDS)
 
 
-def test_version_names_the_packages_that_decide_the_numbers(capsys):
+def test_version_begins_with_the_package(capsys):
     main(["--version"])
-    printed = capsys.readouterr().out
-    assert printed.startswith(f"torchrl-osr {__version__}, python 3.")
-    assert {"torch", "torchrl", "mujoco"} <= set(printed.replace(",", "").split())
+    start = f"torchrl-osr {__version__}, python 3."
+    assert capsys.readouterr().out.startswith(start)
 
 
 def test_unknown_command_lists_commands():

@@ -19,9 +19,8 @@ CODES = {signal.SIGINT: 130, signal.SIGTERM: 75, signal.SIGHUP: 75}
 class Runs:
     """Starts commands; ``output`` is what the last one printed."""
 
-    def __init__(self, server, folder: Path, sizes: list[str]) -> None:
-        self.server, self.folder, self.sizes = server, folder, sizes
-        self.path = folder / "output.txt"
+    def __init__(self, server, path: Path, sizes: list[str]) -> None:
+        self.server, self.path, self.sizes = server, path, sizes
 
     @property
     def output(self) -> str:
@@ -29,9 +28,8 @@ class Runs:
 
     def start(self, *arguments: str) -> int:
         self.path.unlink(missing_ok=True)
-        return self.server.start(
-            "train", *arguments, output=self.path, folder=self.folder
-        )
+        place = {"output": self.path, "folder": self.path.parent}
+        return self.server.start("train", *arguments, **place)
 
     def train(self, folder: Path, *more: str) -> int:
         self.start(*self.sizes, f"hydra.run.dir={folder}", *more)
@@ -72,7 +70,7 @@ def results(folder: Path) -> dict:
 def runs(tmp_path_factory, server, tiny) -> Runs:
     sizes = tiny(steps=20, eval_interval=20, checkpoints_kept=1)
     sizes += ["optim.policy_average=0.1"]  # has a state of its own
-    return Runs(server, tmp_path_factory.mktemp("outputs"), sizes)
+    return Runs(server, tmp_path_factory.mktemp("outputs") / "output.txt", sizes)
 
 
 @pytest.fixture(scope="module")

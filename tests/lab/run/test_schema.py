@@ -17,7 +17,7 @@ from torchrl_osr.lab.data.environment import MAZE_IDS
 from torchrl_osr.lab.data.rollout import BEHAVIORS, MAZE_SOURCES
 from torchrl_osr.lab.data.sources import RECORDED
 from torchrl_osr.lab.run.config import checked
-from torchrl_osr.lab.run.schema import CHOSEN, TrainConfig, method_name, schema_of
+from torchrl_osr.lab.run.schema import CHOSEN, TrainConfig, schema_of
 
 GROUPS = ("env", "data", "inverse_dynamics", "dynamics", "loss", "recovery", "logger")
 GROUPS += ("perturbation", "preset")
@@ -60,11 +60,6 @@ def test_an_id_alone_is_enough():
         "Walker2d-v5": "walker2d",
     }.items():  # fmt: skip
         assert composed("train", f"env.id={env_id}").env.name == name
-
-
-def test_the_command_line_wins_over_a_preset():
-    trainer = composed("train", "preset=paper", "trainer.steps=7").trainer
-    assert (trainer.steps, trainer.batch_size) == (7, 256)
 
 
 @pytest.mark.parametrize("name", sorted(CHOSEN))
@@ -138,7 +133,3 @@ def test_a_sweeps_folder_is_named_by_its_overrides_within_bounds():
     name = OmegaConf.create({"hydra": {"job": job}, "name": subdir}).name
     assert name.startswith("3_loss-cql-data.path-a-b-c.csv-x")
     assert len(name) < 255
-
-
-def test_method_has_the_name_of_its_loss_and_its_recovery():
-    assert [method_name("cql"), method_name("iql", "osr")] == ["cql", "iql+osr"]
