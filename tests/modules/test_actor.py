@@ -11,7 +11,6 @@ from torchrl.envs import GymEnv
 from torchrl_osr.modules import (
     categorical_actor,
     categorical_inverse_dynamics,
-    critic_ensemble,
     deterministic_actor,
     gaussian_actor,
     tanh_gaussian_actor,
@@ -85,15 +84,6 @@ def test_mean_of_a_gaussian_is_bounded_and_its_scale_is_learned() -> None:
     assert (out["loc"].abs() <= 1).all()
     assert (out["scale"] == 1).all()
     assert out["scale"].requires_grad
-
-
-@pytest.mark.parametrize("build", [*BOUNDED, *CATEGORICAL, critic_ensemble])
-def test_width_depth_and_activation_are_as_asked(build) -> None:
-    network = build(5, 2, num_cells=[6, 4], activation_class=torch.nn.Tanh)
-    network = network[0] if isinstance(network, list) else network
-    layers = [m for m in network.modules() if isinstance(m, torch.nn.Linear)]
-    assert [layer.out_features for layer in layers[:2]] == [6, 4]
-    assert sum(isinstance(m, torch.nn.Tanh) for m in network.modules()) == 2
 
 
 def test_categorical_actor_plays_a_gymnasium_task_as_torchrl_gives_it() -> None:

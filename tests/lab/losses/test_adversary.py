@@ -94,34 +94,6 @@ def test_gradient_steps_are_those_of_the_released_attack(
 
 @both_objectives
 @both_methods
-def test_several_nested_observations_of_any_batch_size(objective, method) -> None:
-    keys = [("agent", "joints"), "camera"]
-    agent = {"joints": torch.randn(4, 5, 2), "goal": torch.randn(4, 5, 1)}
-    states = TensorDict({"agent": agent, "camera": torch.randn(4, 5, 2, 3)}, [4, 5])
-
-    def policy(states: TensorDict) -> TanhNormal:
-        camera = states["camera"].flatten(-2).tanh().sum(-1, keepdim=True)
-        loc = states[keys[0]] * camera + states["agent", "goal"]
-        return TanhNormal(loc, torch.ones_like(loc))
-
-    clean = states.clone()
-    adversary = Adversary(objective, method, epsilon=0.1, num_samples=3)
-    perturbed = adversary.perturb(
-        states.lock_(), keys, policy, lambda states, action: action.movedim(-1, 0)
-    )
-    for key in keys:
-        noise = perturbed[key] - states[key]
-        assert 0 < noise.abs().max() <= 0.1 + 1e-6
-        if (objective, method) == ("action_diff", "sample"):
-            # Each number of each row has a noise of its own.
-            assert noise.unique().numel() > 0.9 * noise.numel()
-    assert torch.equal(perturbed["agent", "goal"], states["agent", "goal"])
-    assert set(perturbed.keys(True, True)) == set(states.keys(True, True))
-    assert (states == clean).all()
-
-
-@both_objectives
-@both_methods
 def test_a_loss_is_given_the_worst_states_of_its_own_networks(
     objective, method
 ) -> None:
