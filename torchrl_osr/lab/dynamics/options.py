@@ -16,23 +16,15 @@ from torchrl_osr.lab.dynamics.rollouts import Termination, never, termination
 
 @dataclass(frozen=True)
 class ModelData:
-    """The data of a run as its models see them, and what rewards and values mean.
+    """The data of a run as its models see them, and what rewards and values mean."""
 
-    Attributes:
-        storage: rows to train on.
-        held_out: rows to evaluate models on.
-        loc, scale: observations are ``(s - loc) / scale``.
-        reward_scale, reward_shift: rewards are ``scale * r + shift``.
-        gamma: discount factor.
-    """
-
-    storage: Storage
-    held_out: TensorDict
-    loc: Tensor
+    storage: Storage  # rows to train on
+    held_out: TensorDict  # rows to evaluate models on
+    loc: Tensor  # observations are (s - loc) / scale
     scale: Tensor
-    reward_scale: float
+    reward_scale: float  # rewards are scale * r + shift
     reward_shift: float
-    gamma: float
+    gamma: float  # discount factor
     env_id: str
     seed: int
 

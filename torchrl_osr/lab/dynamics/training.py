@@ -31,8 +31,6 @@ from torchrl_osr.trainers.checkpoints import safe_checkpoint
 FILE, REPORT = "dynamics.safetensors", "dynamics.json"
 """The model and its errors, in the folder of a run."""
 
-ROWS_FOR_STATISTICS = 50_000  # a model's inputs and targets are standardised by them
-
 Fit = Callable[..., OfflineTrainer]
 """Trains a phase: ``fit(name, loss, parameters, **options of the trainer)``."""
 
@@ -144,10 +142,10 @@ def _trained_vae(options: DynamicsOptions, data: ModelData, fit: Fit) -> Transit
 
 
 def _standardize(model: DynamicsEnsemble | TransitionVAE, data: ModelData) -> None:
-    """Move a model to the data, and take their statistics."""
+    """Move a model to the data, and standardise by 50,000 of their rows."""
     rows, device = data.buffer(), data.held_out.device or "cpu"
     rows.set_rng(torch.Generator(device).manual_seed(data.seed))
-    model.to(device).standardize_(rows.sample(ROWS_FOR_STATISTICS))
+    model.to(device).standardize_(rows.sample(50_000))
 
 
 @torch.no_grad()

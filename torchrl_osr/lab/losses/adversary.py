@@ -69,8 +69,6 @@ class Adversary:
         check_choice("method", self.method, ("sample", "gradient"))
         check_weight("epsilon", self.epsilon)
         check_positive("num_samples", self.num_samples, minimum=1)
-        check_positive("num_steps", self.num_steps, minimum=1)
-        check_positive("step_size", self.step_size)
 
     def __call__(
         self, loss: ActorCriticLoss, tensordict: TensorDictBase

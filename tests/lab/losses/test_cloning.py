@@ -1,4 +1,4 @@
-"""IQLLoss against a plain restatement of its equations, and TorchRL's.
+"""BCLoss and IQLLoss against plain restatements of their equations, and TorchRL's.
 
 "Offline Reinforcement Learning with Implicit Q-Learning" (Kostrikov et al. 2021,
 https://arxiv.org/abs/2110.06169).
@@ -11,11 +11,11 @@ import copy
 import pytest
 import torch
 from objectives.losses import Networks, make_batch, update_targets
-from objectives.plain import GAMMA, Plain, compare, following, prepare
+from objectives.plain import BOX, GAMMA, Plain, compare, following, prepare
 from torch import Tensor
 from torchrl import objectives
 
-from torchrl_osr.lab.losses import IQLLoss
+from torchrl_osr.lab.losses import BCLoss, IQLLoss
 
 BETA, TAU = 2.0, 0.8
 OPTIONS = {"temperature": BETA, "expectile": TAU}
@@ -30,7 +30,7 @@ def make_loss(networks: Networks, loss_class: type = IQLLoss, **options):
 
 @pytest.mark.parametrize("loop", [True, False])
 @pytest.mark.parametrize("number", [2, 3])
-def test_losses_and_gradients_equal_the_restatement(check, loop, number) -> None:
+def test_iql_equals_the_restatement(check, loop, number) -> None:
     networks, batch = Networks(number=number), make_batch("iql", 20)
     plain, value = Plain(networks, actor="gaussian"), copy.deepcopy(networks.value)
 
@@ -66,3 +66,25 @@ def test_losses_are_torchrls_but_for_the_sum_over_critics() -> None:
     out, wanted = ours(batch), theirs(batch.clone())
     for key in ("loss_actor", "loss_qvalue", "loss_value"):
         torch.testing.assert_close(out[key], wanted[key])
+
+
+@pytest.mark.parametrize("kind", ["actor", "delta", "module"])
+def test_cloning_equals_the_restatement(check, kind) -> None:
+    networks, batch = Networks(**BOX), make_batch("bc", 10)
+    actor, plain = copy.deepcopy(getattr(networks, kind)), Plain(networks, kind)
+    s, a = batch["observation"], batch["action"]
+    if kind == "actor":
+        expected = -plain.log_prob(plain.policy(s), a).mean()
+    else:
+        # TorchRL moves a TanhDelta's parameter by the center.
+        x = plain.actor[0].module(s) + plain.center if kind == "delta" else None
+        x = plain.actor.module[0](s) if x is None else x
+        action = plain.center + plain.half * torch.tanh(x)
+        expected = (action - a).square().sum(-1).mean()
+    slopes = torch.autograd.grad(expected, [*plain.actor.parameters()])
+    loss = BCLoss(actor).double()
+    value = loss(batch)["loss_actor"]
+    value.backward()
+    found = [value.detach(), *(each.grad for each in loss.parameters())]
+    wanted = [expected.detach(), *slopes]
+    check("Behaviour cloning", found, wanted, tolerance=1e-10)
