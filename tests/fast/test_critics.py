@@ -24,12 +24,7 @@ def normalised(norm_class: type[nn.Module] = nn.LayerNorm, *, cells=CELLS, **opt
 
 
 # An eps that is not the default, and large enough to count.
-PLAIN = {
-    "linear": {},
-    "one layer": {"num_cells": [7]},
-    "normalised": normalised(eps=1e-2),
-    "one normalised layer": normalised(cells=[7], eps=1e-2),
-}
+PLAIN = {"one layer": {"num_cells": [7]}, "normalised": normalised(eps=1e-2)}
 OTHERS = {
     "tanh": {"activation_class": nn.Tanh},
     "no hidden layer": {"num_cells": []},
@@ -88,7 +83,7 @@ def calls(monkeypatch) -> list[int]:
 
 
 @pytest.mark.parametrize("options", PLAIN.values(), ids=PLAIN)
-@pytest.mark.parametrize("rows", [12, 1024])
+@pytest.mark.parametrize("rows", [12, 1024])  # 12: two states, which do not divide 7
 @pytest.mark.parametrize(
     ("size", "loss_options"),
     [
@@ -102,10 +97,8 @@ def test_losses_and_gradients_are_those_of_the_modules(
     make_batch, monkeypatch, calls, options, rows, size, loss_options
 ):
     monkeypatch.setattr(critics, "CHUNK_ROWS", rows)
-    loss, batch = (
-        make_loss(options=options, num_random=2, **loss_options),
-        make_batch(*size),
-    )
+    loss = make_loss(options=options, num_random=2, **loss_options)
+    batch = make_batch(*size)
     wanted = results(loss, batch)
     fuse_critics(loss)
     assert_close(results(loss, batch), wanted)
@@ -164,23 +157,17 @@ def test_autocast_rounds_products_alone(make_batch, options):
     assert 0 < (found - wanted).norm() < 0.4 * wanted.norm()
 
 
-def random_layers(number: int) -> list:
-    """Layers of critics with four hidden cells."""
-    shapes = [(4, 5), (4,)], [(1, 4), (1,)]
-    return [tuple(torch.randn(number, *each) for each in layer) for layer in shapes]
-
-
 def test_second_derivatives_and_broken_promises_are_refused():
+    shapes = [(1, 4, 5), (1, 4)], [(1, 1, 4), (1, 1)]
     layers = [
-        (torch.randn(1, 4, 5), torch.randn(1, 4)),
-        (torch.randn(1, 1, 4), torch.randn(1, 1)),
+        tuple(torch.randn(each, requires_grad=True) for each in layer)
+        for layer in shapes
     ]
-    layers = [tuple(each.requires_grad_() for each in layer) for layer in layers]
     rows = torch.randn(6, 3), torch.randn(2, 6, 2), torch.randn(2, 6)
-    value = critics.soft_maximum(layers, [], *rows, temperature=1.0, equal_rows=True)
+    value = critics.soft_maximum(True, ([2, 2], [], 1.0, None, *rows), layers)
     with pytest.raises(RuntimeError, match="no second derivatives"):
         torch.autograd.grad(value.sum(), layers[0][0], create_graph=True)
-    with pytest.raises(RuntimeError, match="against equal_rows"):
+    with pytest.raises(RuntimeError, match="do not weigh alike"):
         (value * torch.arange(6)).sum().backward()
 
 
@@ -203,7 +190,7 @@ class Doubled(MLP):
 def test_critics_with_a_forward_or_a_hook_of_their_own_go_as_modules(make_batch, calls):
     network = Doubled(5, 1, num_cells=CELLS, activation_class=nn.ReLU).double()
     doubled = ValueOperator(network, in_keys=["observation", "action"])
-    loss = make_loss(networks=[doubled, doubled][:1], num_random=2)
+    loss = make_loss(networks=[doubled], num_random=2)
     fuse_critics(loss)
     loss(make_batch(7))
     assert not calls
@@ -216,21 +203,3 @@ def test_critics_with_a_forward_or_a_hook_of_their_own_go_as_modules(make_batch,
         handle.remove()
     loss(make_batch(7))
     assert calls
-
-
-def test_no_row_is_left_out_where_chunks_do_not_divide(monkeypatch):
-    layers = [
-        (torch.randn(2, 4, 5), torch.randn(2, 4)),
-        (torch.randn(2, 1, 4), torch.randn(2, 1)),
-    ]
-    state, action, log_prob = torch.randn(7, 3), torch.rand(3, 7, 2), torch.randn(3, 7)
-    values = critics._values(
-        layers, [], torch.cat([state.expand(3, -1, -1), action], -1)
-    )
-    wanted = 2 * (values / 2 - log_prob).logsumexp(1)
-    for rows in (1, 6, 9, 10**6):
-        monkeypatch.setattr(critics, "CHUNK_ROWS", rows)
-        found = critics.soft_maximum(
-            layers, [], state, action, log_prob, temperature=2.0
-        )
-        torch.testing.assert_close(found, wanted)

@@ -62,17 +62,18 @@ class FusedCritics(Critics):
             or any(value.requires_grad for value in batch.s.values(True, True))
         ):
             return super().values_and_soft_maximum(batch, action, log_prob)
-        params = loss.qvalue_network_params
+        params, state = loss.qvalue_network_params, self._joined(batch.s)
+        layers = self._layers(params)
         alike = loss.clip_diff_min == -math.inf and loss.rows_weigh_alike(batch)
-        return self.values(batch.s, batch.a, params), soft_maximum(
-            self._layers(params),
+        autocast = torch.is_autocast_enabled("cpu")
+        given = (
+            [len(each) for each in layers],
             eps,
-            self._joined(batch.s),
-            action,
-            log_prob,
-            temperature=loss.temperature,
-            equal_rows=alike,
+            loss.temperature,
+            torch.get_autocast_dtype("cpu") if autocast else None,
+            *(state, action, log_prob),
         )
+        return self.values(batch.s, batch.a, params), soft_maximum(alike, given, layers)
 
     def _eps(self) -> list[float] | None:
         """Return the ``eps`` of each normalisation, or ``None`` for other networks.
@@ -92,11 +93,10 @@ class FusedCritics(Critics):
         norms = [each for each in module if type(each) is nn.LayerNorm]
         linear = [each for each in module if type(each) is nn.Linear]
         hidden = [nn.Linear, *[nn.LayerNorm] * bool(norms), nn.ReLU]
-        kinds = [*hidden * (len(linear) - 1), nn.Linear]
         widths = [(each.out_features,) for each in linear][: len(norms)]
         is_plain = (
             len(linear) > 1
-            and [type(each) for each in module] == kinds
+            and list(map(type, module)) == [*hidden * (len(linear) - 1), nn.Linear]
             and linear[-1].out_features == 1
             and [each.normalized_shape for each in norms] == widths
             and not any(None in (each.weight, each.bias) for each in (*linear, *norms))
@@ -106,9 +106,9 @@ class FusedCritics(Critics):
     def _layers(self, params: TensorDictBase) -> Layers:
         layers: Layers = []
         for name, each in self.loss.qvalue_network.module.named_children():
-            own = params.get(("module", name), None)
-            if own is not None and len(own.keys()):
-                pair = own.get("weight"), own.get("bias")
+            if type(each) is not nn.ReLU:
+                own = params["module", name]
+                pair = own["weight"], own["bias"]
                 if type(each) is nn.Linear:
                     layers.append(pair)
                 else:
@@ -161,52 +161,23 @@ def _values(layers: Layers, eps: Sequence[float], rows: Tensor) -> Tensor:
     return hidden.reshape(-1, *batch).to(rows.dtype)
 
 
-def soft_maximum(
-    layers: Layers,
-    eps: Sequence[float],
-    state: Tensor,
-    action: Tensor,
-    log_prob: Tensor,
-    *,
-    temperature: float,
-    equal_rows: bool = False,
-) -> Tensor:
+def soft_maximum(alike: bool, given: tuple[Any, ...], layers: Layers) -> Tensor:
     """Return :func:`~torchrl_osr.functional.soft_maximum` of the critics' values.
 
-    Differentiable by the critics' parameters, once. The gradient is exact for every use
-    of the result. In a mean or a sum all rows weigh the same: the forward pass then
-    computes the gradient, too. With masks or importance weights the backward pass
-    computes the chunks once more.
-
-    Args:
-        layers: of all critics.
-        eps: of the layer normalisations.
-        state: ``[B, S]``.
-        action: ``[M, B, A]``.
-        log_prob: log-density of each action, ``[M, B]``.
-        temperature: of the log-sum-exp.
-        equal_rows: the caller knows that all rows weigh the same, so that nothing has
-            to be decided by their weights; where they do not, the backward pass raises.
-
-    Returns:
-        ``[N, B]``.
+    Differentiable by the critics' parameters, once. If all rows weigh ``alike`` in the
+    loss, as in a mean or a sum, the forward pass computes the gradient, too. Otherwise
+    the backward pass computes the chunks once more. The result is ``[N, B]``.
     """
-    autocast = torch.is_autocast_enabled("cpu")
-    dtype = torch.get_autocast_dtype("cpu") if autocast else None
-    sizes = [len(layer) for layer in layers]
-    # Any batch dimensions as one.
-    rows = state.flatten(0, -2), action.flatten(1, -2), log_prob.flatten(1)
-    value: Tensor = _SoftMaximum.apply(  # type: ignore[no-untyped-call]
-        equal_rows, (sizes, eps, temperature, dtype, *rows), *sum(layers, ())
-    )
-    return value.reshape(-1, *state.shape[:-1])
+    value: Tensor = _SoftMaximum.apply(alike, given, *sum(layers, ()))  # type: ignore[no-untyped-call]
+    return value
 
 
 class _SoftMaximum(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, equal_rows: bool, given: tuple[Any, ...], *flat: Any) -> Any:
-        ctx.equal_rows, ctx.given, ctx.flat = equal_rows, given, flat
-        value, gradient = _evaluate(None, flat, *given)
+    def forward(ctx: Any, alike: bool, given: tuple[Any, ...], *flat: Tensor) -> Tensor:
+        ctx.alike, ctx.given, ctx.flat = alike, given, flat
+        ones = flat[0].new_ones(len(flat[0]), given[-1].shape[1]) if alike else None
+        value, gradient = _evaluate(ones, flat, *given)
         ctx.save_for_backward(*gradient)
         return value
 
@@ -216,11 +187,10 @@ class _SoftMaximum(torch.autograd.Function):
         # has a gradient itself, which that of a mean has not.
         if torch.is_grad_enabled():
             raise RuntimeError("Fused critics have no second derivatives.")
-        weight = upstream.flatten()[0]
-        equal = (upstream == weight).all() | weight.isnan()  # NaN is no equal
-        if ctx.equal_rows:
-            torch._assert_async(equal, "The rows have weights, against equal_rows.")
-        if ctx.equal_rows or bool(equal):
+        if ctx.alike:
+            weight = upstream.flatten()[0]
+            equal = (upstream == weight).all() | weight.isnan()  # NaN is no equal
+            torch._assert_async(equal, "The rows of the loss do not weigh alike.")
             gradient = list(torch._foreach_mul(ctx.saved_tensors, weight))
         else:
             _, gradient = _evaluate(upstream, ctx.flat, *ctx.given)
@@ -228,7 +198,7 @@ class _SoftMaximum(torch.autograd.Function):
 
 
 def _evaluate(
-    upstream: Tensor | None,
+    weights: Tensor | None,
     flat: Sequence[Tensor],
     sizes: list[int],
     eps: Sequence[float],
@@ -238,7 +208,7 @@ def _evaluate(
     action: Tensor,
     log_prob: Tensor,
 ) -> tuple[Tensor, list[Tensor]]:
-    """Return the values and the gradient of their sum, weighted by ``upstream``."""
+    """Return the values, and the gradient of their sum with these weights, if any."""
     number, chunk = len(flat[0]), max(1, CHUNK_ROWS // len(action))
     value = state.new_empty(number, len(state))
     gradient = [torch.zeros_like(each) for each in flat]
@@ -249,17 +219,13 @@ def _evaluate(
         for start in range(0, len(state), chunk):
             rows = slice(start, start + chunk)
             pairs = state[rows].expand(len(action), -1, -1), action[:, rows]
-            with (
-                torch.enable_grad(),
-                torch.autocast("cpu", dtype, enabled=dtype is not None),
-            ):
-                found = _values(layers, eps, torch.cat(pairs, -1)).squeeze(0)
-            with torch.enable_grad():
+            with torch.set_grad_enabled(weights is not None):
+                with torch.autocast("cpu", dtype, enabled=dtype is not None):
+                    found = _values(layers, eps, torch.cat(pairs, -1)).squeeze(0)
                 logits = found / temperature - log_prob[:, rows]
                 soft = temperature * logits.logsumexp(0)
-            weight = (
-                torch.ones_like(soft) if upstream is None else upstream[critic, rows]
-            )
-            torch._foreach_add_(totals, torch.autograd.grad(soft, own, weight))
+            if weights is not None:
+                more = torch.autograd.grad(soft, own, weights[critic, rows])
+                torch._foreach_add_(totals, more)
             value[critic, rows] = soft.detach()
     return value, gradient

@@ -1,23 +1,20 @@
 """Losses and gradients as a traced list of tensor operations.
 
 An update of small networks is some hundreds of short operations, and around each of
-them Python, TorchRL and autograd take longer than the operation itself. The operations
-are the same for each batch. So they are traced once, by
-:func:`torch.fx.experimental.proxy_tensor.make_fx`, forward and backward, and repeated
-with the next batches: the same operations on the same numbers in the same order, hence
-the same bits, without a compiler.
+them Python, TorchRL and autograd take longer than the operation itself. So they are
+traced once, by :func:`torch.fx.experimental.proxy_tensor.make_fx`, forward and
+backward, and repeated with the next batches: the same operations on the same numbers in
+the same order, hence the same bits, without a compiler.
 
-TorchScript's interpreter repeats them: without Python in between they take two thirds
-of the time. It is deprecated in PyTorch 2.13, in which nothing else repeats operations
-from C++ without a compiler. Where it is missing, the same graph runs from Python, as
-the :class:`torch.fx.GraphModule` that the tracer returns.
+TorchScript's interpreter repeats them in two thirds of Python's time. It is deprecated
+in PyTorch 2.13, in which nothing else repeats operations from C++ without a compiler.
+Where it is missing, the tracer's :class:`torch.fx.GraphModule` runs from Python.
 """
 
 from __future__ import annotations
 
 import enum
 import logging
-import operator
 import types
 import warnings
 from collections.abc import Callable, Sequence
@@ -47,13 +44,8 @@ CHECK_INTERVAL = 1000
 class LossGradients:
     """Losses of a batch; the gradients of their sum go where an optimizer looks.
 
-    Args:
-        loss_module: whose entries ``loss_*`` are summed.
-        autocast_dtype: of the matrix products. Default: that of the parameters.
-        parameters: that get a gradient; losses and metrics stay the same. Default: all
-            of the loss module.
-        trace: repeat a trace, on a CPU, unless the loss is compiled.
-        warm_up: updates before the trace, at least 1.
+    See :func:`~torchrl_osr.fast.fast_update` for the options. ``parameters`` get a
+    gradient, by default all of the loss module.
     """
 
     def __init__(
@@ -71,23 +63,18 @@ class LossGradients:
         self.may_trace = trace and self.device.type == "cpu"
         self._countdown, self._changes, self._replays = self.warm_up, -1, 0
         self._state: _State | None = None
-        self._trace: _Trace | None = None
-
-    @property
-    def is_traced(self) -> bool:
-        """Whether there is a trace to repeat."""
-        return self._trace is not None
+        self.trace: _Trace | None = None
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
         """Detached losses and metrics of a batch; adds to the parameters' ``grad``."""
         if self.may_trace:
             self._look_for_changes()
-            if self._trace is None:
+            if self.trace is None:
                 self._countdown -= 1
                 if self._countdown < 0:
                     self._try_to_trace(batch)
-            elif self._trace.fits(batch):
-                return self._replay(self._trace, batch)
+            elif self.trace.fits(batch):
+                return self._replay(self.trace, batch)
         losses = self._losses(batch)
         _total(losses).backward(inputs=self.parameters)
         return losses.detach()
@@ -102,7 +89,7 @@ class LossGradients:
         """Forget the trace, and wait again, if the loss is not what it was."""
         if self._state is not None and self._state.holds():
             return
-        self._state, self._trace = _State(self.loss_module), None
+        self._state, self.trace = _State(self.loss_module), None
         self._countdown, self._changes = self.warm_up, self._changes + 1
         if self.loss_module._compiled_call_impl is not None:
             self.may_trace = False
@@ -116,14 +103,14 @@ class LossGradients:
         try:
             trace = _Trace(self._losses, self.loss_module, batch, self.parameters)
             if all(map(torch.equal, tensors, before)) and self._state.holds():
-                self._trace = trace
+                self.trace = trace
             else:
                 self._give_up("it writes into its own tensors")
         except Exception as error:  # whatever a loss does that cannot be traced
             self._give_up(f"{type(error).__name__}: {str(error).splitlines()[0]}")
         finally:
             torch.set_rng_state(generator)
-            if self._trace is None:
+            if self.trace is None:
                 for tensor, value in zip(tensors, before, strict=True):
                     tensor.data.copy_(value)
 
@@ -146,7 +133,7 @@ class LossGradients:
         return trace.spread(outputs, batch)
 
     def _give_up(self, why: str) -> None:
-        self.may_trace, self._trace = False, None
+        self.may_trace, self.trace = False, None
         name = type(self.loss_module).__name__
         log.warning(f"{name} runs without a trace, slower: {why}")
 
@@ -159,8 +146,6 @@ _OPAQUE = (
     *(type, types.FunctionType, types.MethodType, types.ModuleType),
     *(enum.Enum, TensorSpec),
 )
-_INERT = (nn.Linear, nn.ReLU)  # no state but tensors and hooks; networks have many
-_USUAL = {key for key, value in vars(nn.Module()).items() if value in ({}, set())}
 
 
 class _State:
@@ -172,7 +157,7 @@ class _State:
 
     def __init__(self, loss_module: LossModule) -> None:
         self.tensors: list[Tensor] = []
-        self._attributes: list[tuple[dict[str, Any], int, Callable[..., Any], Any]] = []
+        self._attributes: list[tuple[dict[str, Any], Any]] = []
         seen: set[int] = set()
         stack: list[Any] = [loss_module]
         while stack:
@@ -190,27 +175,16 @@ class _State:
                 stack += each
             elif hasattr(each, "__dict__") and not isinstance(each, _OPAQUE):
                 stack += vars(each).values()
-                if type(each) not in _INERT:
-                    self._remember(vars(each))
+                self._attributes.append((vars(each), _copied(vars(each))))
         self._traits = self._traits_now()
-
-    def _remember(self, attributes: dict[str, Any]) -> None:
-        # Most of what a module has are empty dictionaries. What comes into them also
-        # changes the length, or the number of the next hook.
-        names = [key for key in attributes if attributes[key] or key not in _USUAL]
-        if len(names) > 1:
-            get = operator.itemgetter(*names)
-            row = attributes, len(attributes), get, _copied(get(attributes))
-            self._attributes.append(row)
 
     def holds(self) -> bool:
         """Whether everything is as it was."""
         try:
             return self._traits == self._traits_now() and all(
-                len(attributes) == length and get(attributes) == before
-                for attributes, length, get, before in self._attributes
+                now == before for now, before in self._attributes
             )
-        except (KeyError, RuntimeError, ValueError):  # for arrays == has no answer
+        except (RuntimeError, ValueError):  # for arrays == has no answer
             return False
 
     def _traits_now(self) -> list[Any]:
@@ -247,9 +221,7 @@ class _Trace:
         given = loss_module.parameters() if parameters is None else parameters
         self._losses = losses
         self._parameters = [each for each in given if each.requires_grad]
-        self._trained: list[nn.Parameter] = []
         self._keys: list[NestedKey] = list(batch.keys(True, True))
-        self._names: list[str] = []
         self._written: list[NestedKey] = []
         self._kind = self._kind_of(batch)
         self._empty = TensorDict({}, batch.batch_size, device=batch.device)
@@ -259,9 +231,7 @@ class _Trace:
     def update(self, *tensors: Tensor) -> list[Tensor]:
         """Return losses, entries written to the batch, and gradients."""
         inputs = dict(zip(self._keys, tensors, strict=True))
-        batch = self._empty.copy()
-        for key, value in inputs.items():
-            batch.set(key, value)
+        batch = self._empty.copy().update(inputs)
         losses = self._losses(batch)
         found = torch.autograd.grad(_total(losses), self._parameters, allow_unused=True)
         pairs = zip(self._parameters, found, strict=True)
@@ -309,7 +279,7 @@ class _Trace:
 
 
 def _laid_out(gradient: Tensor, like: Tensor) -> Tensor:
-    """The gradient with the strides of its parameter, as ``backward`` leaves it.
+    """Give a gradient the strides of its parameter, as ``backward`` does.
 
     Fused optimizers go through both by address and do not look at strides (torch 2.13).
     """

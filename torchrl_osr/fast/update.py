@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -24,10 +25,9 @@ class NonfiniteError(FloatingPointError):
 
     def __init__(self, losses: dict[str, float], gradients: list[str]) -> None:
         bad = [name for name, value in losses.items() if not math.isfinite(value)]
-        more = f" and {len(gradients) - 5} more" if len(gradients) > 5 else ""
         super().__init__(
             f"not finite: losses {', '.join(bad) or 'none'}; gradients "
-            f"{', '.join(gradients[:5]) or 'none'}{more}"
+            f"{', '.join(gradients[:5]) or 'none'}"
         )
         self.losses, self.gradients = losses, gradients
 
@@ -71,13 +71,6 @@ def fast_update(
         trace: on a CPU, unless the loss is compiled. Default ``True``.
         warm_up: updates before the trace, which takes about a second. Default 100.
 
-    Returns:
-        ``update(batch)``, which returns the detached losses and metrics and raises
-        :class:`NonfiniteError` instead of a step with NaN or infinite gradients.
-
-    Raises:
-        ValueError: if ``policy_delay`` lacks the parameters to delay, or leaves none.
-
     Examples:
         >>> import torch
         >>> from torchrl.objectives import SoftUpdate
@@ -99,14 +92,12 @@ def fast_update(
         if not delayed or not rest:
             raise ValueError(
                 f"policy_delay={policy_delay} needs policy_params to delay, and other "
-                f"parameters to train in between; there are {len(delayed)} and "
-                f"{len(rest)}."
+                "parameters to train in between."
             )
         parameters.append(rest)
+    options: dict[str, Any] = {"trace": trace, "warm_up": warm_up}
     gradients = [
-        LossGradients(
-            loss_module, autocast_dtype, parameters=each, trace=trace, warm_up=warm_up
-        )
+        LossGradients(loss_module, autocast_dtype, parameters=each, **options)
         for each in parameters
     ]
     return Update(gradients, optimizer, _mover(target_updater), policy_delay)
@@ -133,7 +124,11 @@ class Update:
         self._move_targets, self._delay = move_targets, delay
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
-        """Do one update; return the detached losses and metrics."""
+        """Return the detached losses and metrics.
+
+        Raises:
+            NonfiniteError: instead of a step with NaN or infinite gradients.
+        """
         self.count += 1
         whole = self.count % self._delay == 0
         try:
