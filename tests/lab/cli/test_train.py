@@ -57,7 +57,7 @@ def test_run_leaves_table_figure_returns_and_checkpoints(finished):
 def test_log_has_a_line_for_each_evaluation(finished):
     folder, output = finished
     log = (folder / "train.log").read_text()
-    lines = re.findall(r"policy: step (\d+) of 40.*, score [\d.-]+$", log, re.MULTILINE)
+    lines = re.findall(r"policy: (\d+)/40 \[.*, score [\d.-]+\]$", log, re.MULTILINE)
     assert lines == ["0", "20", "40"]
     assert all(line in output for line in log.splitlines())
 
@@ -150,7 +150,7 @@ def test_action_that_is_constant_trains_through(tmp_path, run, sizes):
     )
     results = json.loads((tmp_path / "run" / "inverse_dynamics.json").read_text())
     assert results["r2"][1] is None
-    assert re.search(r"R2 -?\d\.\d\d, -, -?\d\.\d\d,", output)
+    assert re.search(r"R2 -?\d\.\d\d, -, -?\d\.\d\d\n", output)
 
 
 def test_help_lists_the_options_of_every_group(tmp_path, run):
