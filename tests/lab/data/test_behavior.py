@@ -57,15 +57,3 @@ def test_forward_pass_agrees_with_torch(env_name: str, policy_name: str) -> None
         rtol=0,
         atol=5e-6,
     )
-
-
-def test_one_observation_is_a_batch_without_its_axis() -> None:
-    policy = load_behavior_policy("halfcheetah", "expert")
-    observation = np.random.default_rng(0).standard_normal(
-        policy.hidden0.weight.shape[1]
-    )
-    single = policy.sample(observation, np.random.default_rng(1))
-    batched = policy.sample(observation[None], np.random.default_rng(1))
-    assert single.shape == (6,)
-    assert single.dtype == np.float32
-    np.testing.assert_allclose(single, batched[0], atol=1e-6)

@@ -6,7 +6,6 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from numbered_episodes import LENGTHS, episodes
 from property_settings import tried
 from tensordict import TensorDict
 
@@ -20,6 +19,30 @@ from torchrl_osr.lab.data.rows import (
     take_multi_step,
 )
 
+LENGTHS = st.lists(st.integers(1, 6), min_size=1, max_size=6)
+
+
+def episodes(lengths) -> TensorDict:
+    """Episodes that terminate or are cut off in turns, with random rewards.
+
+    States are numbered from 1 on, and actions after them.
+    """
+    rows, at = [], 0
+    for episode, length in enumerate(lengths):
+        state = torch.arange(at, at + length + 1.0).unsqueeze(-1) + 1
+        done = torch.arange(length).unsqueeze(-1) == length - 1
+        terminated = done & (episode % 2 == 0)
+        after = {"observation": state[1:], "reward": torch.randn(length, 1)}
+        after |= {
+            "done": done,
+            "terminated": terminated,
+            "truncated": done ^ terminated,
+        }
+        columns = {"observation": state[:-1], "action": 0.001 * state[:-1]}
+        rows.append(TensorDict(columns | {"next": after}, [length]))
+        at += length + 1
+    return torch.cat(rows)
+
 
 def numbered(rows: int, start: int = 0) -> TensorDict:
     return TensorDict({"row": torch.arange(start, start + rows)}, [rows])
@@ -27,18 +50,15 @@ def numbered(rows: int, start: int = 0) -> TensorDict:
 
 @given(rows=st.integers(1, 50), share=st.floats(0, 1), seed=st.integers(0, 1000))
 def test_rows_are_drawn_without_replacement_in_exact_shares(rows, share, seed) -> None:
-    mixed = mix_datasets(
-        numbered(rows), numbered(60, 100), random_share=share, seed=seed
+    sets = numbered(rows), numbered(60, 100)
+    mixed, again = (
+        mix_datasets(*sets, random_share=share, seed=seed)["row"].tolist()
+        for _ in range(2)
     )
-    mixed = mixed["row"].tolist()
-    number = round(share * rows)
+    assert mixed == again
     assert len(mixed) == len(set(mixed)) == rows
-    assert sum(row >= 100 for row in mixed) == number
-    assert all(row < rows for row in mixed[: rows - number])
-    again = mix_datasets(
-        numbered(rows), numbered(60, 100), random_share=share, seed=seed
-    )
-    assert again["row"].tolist() == mixed
+    kept = mixed[: rows - round(share * rows)]
+    assert [row for row in mixed if row < 100] == kept
 
 
 @pytest.mark.parametrize(("held_out", "expected"), [(7, 7), (0.2, 10)])
@@ -137,14 +157,6 @@ def test_some_rows_are_those_of_all(lengths, random) -> None:
     assert (
         multi_step(data, rows, **options) == multi_step(data, **options)[rows]
     ).all()
-
-
-def test_rows_in_no_order_are_single_steps() -> None:
-    data = episodes([4, 4])[[0, 2, 4, 6, 7]]
-    found = multi_step(data, n_steps=3, gamma=0.9)
-    assert found["steps"].flatten().tolist() == [1, 1, 1, 2, 1]
-    alone = found.exclude("steps")[:3]
-    assert (alone == data["next"][:3]).all()
 
 
 def test_a_batch_takes_them_and_keeps_its_single_steps() -> None:

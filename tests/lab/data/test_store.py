@@ -7,10 +7,17 @@ from collections import namedtuple
 
 import pytest
 import torch
+from recorded_logs import make_columns
 from tensordict import TensorDict
 from torchrl import torchrl_logger
 
-from torchrl_osr.lab.data import load_memmap, make_replay_buffer, store, write_memmap
+from torchrl_osr.lab.data import (
+    load_memmap,
+    make_replay_buffer,
+    store,
+    transitions_from_columns,
+    write_memmap,
+)
 from torchrl_osr.lab.data.rows import held_out_rows, split_held_out
 from torchrl_osr.lab.data.store import is_memory_mapped, load_or_write
 
@@ -22,8 +29,8 @@ def write(data, folder, size=25, **options):
 
 
 @pytest.fixture
-def data(make_transitions):
-    return make_transitions(ROWS)
+def data():
+    return transitions_from_columns(make_columns(ROWS + 1))[0]
 
 
 @pytest.mark.parametrize("size", [1, 25, ROWS + 1])
@@ -147,9 +154,8 @@ def test_sampling_is_uniform_with_replacement_and_depends_on_the_seed_alone() ->
 
 
 @pytest.fixture
-def both(make_transitions, tmp_path):
+def both(data, tmp_path):
     """The same rows in memory and memory-mapped."""
-    data = make_transitions(200)
     return data, write_memmap([data], tmp_path / "set")[0]
 
 
@@ -158,15 +164,15 @@ def test_the_same_seed_draws_the_same_rows_from_disk(both) -> None:
     for _ in range(10):
         here, there = (buffer.sample() for buffer in buffers)
         assert (here == there).all()
-    assert len(buffers[1]) == 200
+    assert len(buffers[1]) == ROWS
     with pytest.raises(RuntimeError):
         buffers[1].extend(both[0])
 
 
-@pytest.mark.parametrize("held_out", [1, 7, 0.2, 199])
+@pytest.mark.parametrize("held_out", [1, 7, 0.2, ROWS - 1])
 def test_rows_on_disk_that_are_left_out(both, held_out) -> None:
     data, stored = both
-    left_out = held_out_rows(200, held_out, seed=1).sort().values
+    left_out = held_out_rows(ROWS, held_out, seed=1).sort().values
     train, rest = split_held_out(data, held_out, seed=1)
     assert (stored[left_out] == rest).all()
     buffer = make_replay_buffer(stored, batch_size=32, seed=3, left_out=left_out)
