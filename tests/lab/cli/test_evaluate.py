@@ -89,7 +89,7 @@ def test_runs_of_a_sweep_are_one_policy_that_switches(folder, tmp_path, capsys):
         shutil.copytree(folder, run)
         torch.manual_seed(len(run.parts))
         model = DynamicsEnsemble(11, 3, num_networks=2, num_elites=1, num_cells=[4])
-        write_dynamics(run / FILE, model, {})
+        write_dynamics(run / FILE, model)
     for file in (runs[1] / "checkpoint" / "policy").glob("checkpoint-*20.torchrl"):
         file.unlink()  # so that they differ: its last step is 10
     sweep = [f"sweep={tmp_path}", "switching=true"]

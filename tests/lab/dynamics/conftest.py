@@ -17,6 +17,6 @@ def data(transitions) -> ModelData:
     loc, scale = torch.zeros(11), torch.full([11], 0.1)
     loc[0] = 1.2  # upright
     return ModelData(
-        storage, held_out, loc, scale, reward_scale=2.0, reward_shift=0.0, gamma=0.99,
+        storage, held_out, loc, scale, reward_scale=2.0, gamma=0.99,
         env_id="Hopper-v5", seed=0,
     )  # fmt: skip

@@ -49,8 +49,8 @@ def make_adversary(networks, make_batch) -> ModelAdversary:
     rows, storage = make_batch(50, twin=False), LazyTensorStorage(50)
     storage.set(range(50), rows)
     data = ModelData(
-        storage, rows, torch.zeros(3), torch.ones(3), reward_scale=1.0,
-        reward_shift=0.0, gamma=GAMMA, env_id="Hopper-v5", seed=0,
+        storage, rows, torch.zeros(3), torch.ones(3), reward_scale=1.0, gamma=GAMMA,
+        env_id="Hopper-v5", seed=0,
     )  # fmt: skip
     options = DynamicsOptions(
         adversarial_steps=5, adversarial_weight=0.5, adversarial_lr=1e-2,

@@ -16,10 +16,8 @@ from torchrl_osr.fast import fast_update
 from torchrl_osr.lab.__main__ import main
 from torchrl_osr.lab.dynamics import DynamicsOptions, ModelData
 from torchrl_osr.lab.dynamics.training import (
-    FILE,
     dynamics_model,
     dynamics_report,
-    load_dynamics,
 )
 from torchrl_osr.trainers import OfflineTrainer
 
@@ -56,21 +54,6 @@ def test_the_best_model_is_kept_and_trained_once(data, tmp_path) -> None:
     assert best == pytest.approx(min(errors))
     (again,) = modelled(tmp_path / "a", data, options)
     assert all(map(torch.equal, first.parameters(), again.parameters()))
-
-
-def test_a_given_model_must_be_one_of_the_same_data(data, tmp_path) -> None:
-    modelled(tmp_path / "first", data, TINY)
-    given = replace(TINY, path=str(tmp_path / "first" / FILE), num_cells=[5])
-    (model,) = modelled(tmp_path / "same", data, given)
-    assert model.layers[0].weight.shape[-1] == 8
-    other = replace(data, reward_scale=1.0, loc=data.loc + 1)
-    named = "observation mean, reward scale"
-    with pytest.raises(ValueError, match=f"other data; these differ: {named}"):
-        modelled(tmp_path / "other", other, given)
-    path = tmp_path / "model.safetensors"
-    path.write_bytes(b"no tensors at all")
-    with pytest.raises(ValueError, match=r"model\.safetensors holds no dynamics model"):
-        load_dynamics(path)
 
 
 SMALL = [

@@ -182,7 +182,7 @@ def folders(tmp_path_factory) -> list[Path]:
         torch.manual_seed(seed)
         make_run(folder := top / f"seed{seed}", LOSS, *BOUNDS)
         model = DynamicsEnsemble(11, 3, num_networks=2, num_elites=1, num_cells=[4])
-        write_dynamics(folder / FILE, model, {})
+        write_dynamics(folder / FILE, model)
         found.append(folder)
     return found
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 from tensordict import TensorDict
 from torch import Tensor
@@ -22,8 +21,7 @@ class ModelData:
     held_out: TensorDict  # rows to evaluate models on
     loc: Tensor  # observations are (s - loc) / scale
     scale: Tensor
-    reward_scale: float  # rewards are scale * r + shift
-    reward_shift: float
+    reward_scale: float  # factor of the task's own rewards
     gamma: float  # discount factor
     env_id: str
     seed: int
@@ -36,16 +34,6 @@ class ModelData:
             collate_fn=lambda batch: batch,
             batch_size=batch_size,
         )
-
-    def units(self) -> dict[str, Any]:
-        """Return the units in which a model predicts, JSON-compatible."""
-        return {
-            "environment": self.env_id,
-            "observation mean": self.loc.tolist(),
-            "observation scale": self.scale.tolist(),
-            "reward scale": self.reward_scale,
-            "reward shift": self.reward_shift,
-        }
 
 
 @dataclass
@@ -60,7 +48,6 @@ class DynamicsOptions:
     lr: float = 1e-3  # learning rate of the model
     batch_size: int = 256  # rows of a gradient step, for each network
     steps: int = 40_000  # gradient steps of the model; the best evaluation counts
-    path: str | None = None  # model to use: dynamics.safetensors of another run
     # The autoencoder of loss=sdc.
     vae_num_cells: list[int] = field(default_factory=lambda: [750, 750])
     vae_steps: int = 100_000  # gradient steps of the autoencoder

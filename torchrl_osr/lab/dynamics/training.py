@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -70,17 +70,13 @@ def dynamics_model(
     options: DynamicsOptions, data: ModelData, fit: Fit, folder: Path
 ) -> DynamicsEnsemble:
     """Train a run's ensemble or load it; write file and report to the run's folder."""
-    units, file = data.units(), folder / FILE
+    file = folder / FILE
     if not file.exists():
-        if options.path is not None:
-            model = load_dynamics(options.path, units)
-        else:
-            # The rest of the run draws the same numbers with a model from a file.
-            with torch.random.fork_rng(devices=[]):
-                model = _trained(options, data, fit)
-        write_dynamics(file, model, units)
+        # The rest of the run draws the same numbers with a model from a file.
+        with torch.random.fork_rng(devices=[]):
+            write_dynamics(file, _trained(options, data, fit))
     # From the file in any case, so that a continued run has the very same model.
-    model = load_dynamics(file, units)
+    model = load_dynamics(file)
     model.to(data.held_out.device or "cpu").requires_grad_(False)
     report = dynamics_report(model, data.held_out)
     write_json(folder / REPORT, report)
@@ -184,35 +180,17 @@ def dynamics_report(model: DynamicsEnsemble, data: TensorDictBase) -> dict[str, 
     }
 
 
-def write_dynamics(
-    path: Path, model: DynamicsEnsemble, units: Mapping[str, Any]
-) -> None:
-    """Write a model and the units of its data to one file of tensors."""
+def write_dynamics(path: Path, model: DynamicsEnsemble) -> None:
+    """Write a model to one file of tensors."""
     names = "observation_dim", "action_dim", "num_networks", "num_elites", "num_cells"
     sizes = {name: getattr(model, name) for name in names}
-    write_tensors(path, model.state_dict(), {"sizes": sizes, "units": dict(units)})
+    write_tensors(path, model.state_dict(), {"sizes": sizes})
 
 
-def load_dynamics(
-    path: Path | str, units: Mapping[str, Any] | None = None
-) -> DynamicsEnsemble:
-    """Load ``dynamics.safetensors`` of a run; raise unless these units agree.
-
-    Torch's global generator stays.
-    """
-    try:
-        tensors, record = read_tensors(Path(path))
-        with torch.random.fork_rng(devices=[]):
-            model = DynamicsEnsemble(**record["sizes"])
-        model.load_state_dict(tensors)
-        there = record["units"]
-    except (KeyError, TypeError, RuntimeError, ValueError) as error:
-        what = f"{path} holds no dynamics model: {error}"
-        raise ValueError(f"{what}. Take {FILE} from the folder of a run.") from error
-    others = [name for name, value in (units or {}).items() if there.get(name) != value]
-    if others:
-        raise ValueError(
-            f"{path} was trained on other data; these differ: {', '.join(others)}. "
-            "Take a model of the same data, or leave dynamics.path out to train one."
-        )
+def load_dynamics(path: Path) -> DynamicsEnsemble:
+    """Load ``dynamics.safetensors`` of a run; torch's global generator stays."""
+    tensors, record = read_tensors(path)
+    with torch.random.fork_rng(devices=[]):
+        model = DynamicsEnsemble(**record["sizes"])
+    model.load_state_dict(tensors)
     return model

@@ -81,7 +81,6 @@ def open_run(
     with _lock(folder):
         if cfg.resume is None:
             cfg.data.path = _absolute(cfg.data.path)
-            cfg.dynamics.path = _absolute(cfg.dynamics.path)
         else:
             cfg = _resumed(folder, cfg, job.overrides.task)
             check_environment(cfg.env.id, trust)

@@ -61,8 +61,6 @@ class Phases:
         self.learner = make_learner(config, device)
         if run.simulated:
             try_out(config.env.id)
-        if config.dynamics.use and config.dynamics.path:
-            training.load_dynamics(config.dynamics.path)
         self.options = trainer_options(run)
         # Transitions with standardised states. Each batch gets a perturbed state for
         # every state, which is the paper's mixed data set.
@@ -143,7 +141,6 @@ class Phases:
             data.norm.loc,
             data.norm.scale,
             config.data.reward_scale,
-            config.data.reward_shift,
             config.optim.gamma,
             config.env.id,
             config.seed,
