@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -38,24 +36,6 @@ def tiny() -> Callable[..., list[str]]:
 
 
 @pytest.fixture(scope="session")
-def run_fresh() -> Callable[..., tuple[int, str]]:
-    """Return a function that runs a command: its exit code and what it printed.
-
-    It imports everything itself, which takes seconds: for what is read or said then.
-    """
-
-    def run(cwd: Path, name: str, *arguments: str) -> tuple[int, str]:
-        done = subprocess.run(
-            [sys.executable, "-m", "torchrl_osr.lab", name, *arguments],
-            cwd=cwd, timeout=240, check=False, text=True,
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-        )  # fmt: skip
-        return done.returncode, done.stdout
-
-    return run
-
-
-@pytest.fixture(scope="session")
 def server() -> Iterator[Server]:
     """A process that has imported everything and forks commands."""
     server = Server()
@@ -65,7 +45,10 @@ def server() -> Iterator[Server]:
 
 @pytest.fixture(scope="session")
 def run(tmp_path_factory, server) -> Callable[..., tuple[int, str]]:
-    """Return the same function for forked processes, also of an example's file."""
+    """Return a function that runs a command, or an example's file.
+
+    It returns the exit code, and what was printed.
+    """
     outputs = tmp_path_factory.mktemp("outputs")
 
     def run(cwd: Path, name: str, *arguments: str) -> tuple[int, str]:

@@ -112,17 +112,6 @@ def test_a_configuration_of_another_run_is_refused(tmp_path, key, value, shapes)
         load_trained(folder)
 
 
-def test_a_foreign_run_calls_nothing_of_theirs(tmp_path):
-    make_run(folder := tmp_path / "run")
-    config = read_run(folder)
-    crafted = {"_target_": "os.mkdir", "path": str(tmp_path / "marker")}
-    config.inverse_dynamics.network["more"] = crafted
-    write_config(folder, config)
-    with pytest.raises(ValueError, match=r"_target_=os\.mkdir, which is no"):
-        load_trained(folder)
-    assert not (tmp_path / "marker").exists()
-
-
 def test_damage_and_absence_are_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no checkpoint at .*nowhere"):
         load_trained(tmp_path / "nowhere")
