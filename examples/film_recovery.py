@@ -104,7 +104,7 @@ def main(arguments=None):
         env = gymnasium.make(task.id, render_mode="rgb_array", **view)
         if given.video and push:
             env = RecordVideo(env, given.video, name_prefix=controller.__name__)
-        options = {"duration": DURATION, "unit": "body_weight", "at": BEGIN}
+        options = {"duration": DURATION, "at": BEGIN}
         with ExternalPush(env, push, **options) as env, torch.no_grad():
             return play(env, behaviour, controller, given.seed)
 

@@ -1,27 +1,32 @@
-"""Noisy, late and repeated actions, and noisy observations, against numbers by hand."""
+"""Actuators and sensors against numbers by hand; simulations against MuJoCo's own."""
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+import copy
 
+import gymnasium
+import mujoco
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from torchrl_osr.lab.data import make_environment
 from torchrl_osr.lab.envs import (
     ActionDelay,
     ActionNoise,
+    DynamicsChange,
     ObservationNoise,
+    StartStateNoise,
     StickyAction,
 )
 
 DRAWS = 20_000
 
 
-def executed(env, actions, *, seed=0):
+def executed(env, actions):
     """What arrives at the recorder when the agent sends ``actions``."""
-    env.reset(seed=seed)
+    env.reset(seed=0)
     for action in actions:
         env.step(np.full(2, action, np.float32))
     return [float(action[0]) for action in env.unwrapped.actions]
@@ -60,20 +65,20 @@ def test_actions_are_copied(make, strength, recorder):
     assert (env.unwrapped.actions[1] == 0.5).all()
 
 
-def test_sticky_by_hand(recorder):
-    env = StickyAction(recorder(), 0.5)
+def test_sticky_is_that_of_gymnasium(recorder):
+    ours, theirs = recorder(), recorder()
+    env, other = StickyAction(ours, 0.4), gymnasium.wrappers.StickyAction(theirs, 0.4)
     env.reset(seed=0)
-    draws = iter([0.4, 0.6, 0.1, 0.499, 0.5])
-    env.sticky.env.np_random = SimpleNamespace(
-        uniform=lambda: next(draws), integers=lambda low, high: low
-    )
-    # The first is the agent's without a draw; draws below 0.5 stick, and what sticks is
-    # what was executed, 0.3, not what the agent sent in between.
-    sent = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
-    flags = [env.step(np.full(2, each))[-1]["disturbed"] for each in sent]
-    executed = [float(action[0]) for action in env.unwrapped.actions]
-    assert executed == [0.1, 0.1, 0.3, 0.3, 0.3, 0.6]
-    assert flags == [False, True, False, True, True, False]
+    other.reset()
+    theirs.np_random = copy.deepcopy(env.generator)
+    flags = []
+    for number in range(50):
+        flags.append(env.step(np.full(2, number / 50))[-1]["disturbed"])
+        other.step(np.full(2, number / 50))
+    np.testing.assert_array_equal(ours.actions, theirs.actions)
+    own = np.array(ours.actions)[:, 0] == np.arange(50) / 50
+    assert flags == (~own).tolist()
+    assert 0 < sum(flags) < 50
 
 
 def test_observation_noise_has_the_stated_deviation(play, recorder):
@@ -87,3 +92,61 @@ def test_observation_noise_has_the_stated_deviation(play, recorder):
     np.testing.assert_allclose(noise.mean(0), 0, atol=5 * 0.2 / DRAWS**0.5)
     assert abs(np.corrcoef(noise[:, 0], noise[:, 1])[0, 1]) < 5 / DRAWS**0.5
     assert abs(np.corrcoef(noise[1:, 0], noise[:-1, 0])[0, 1]) < 5 / DRAWS**0.5
+
+
+@pytest.mark.parametrize("factor", [0.05, 0.7, 20.0])
+def test_masses_and_inertia_are_those_of_mujocos_total_mass(factor):
+    witness = copy.deepcopy(make_environment("Walker2d-v5").unwrapped.model)
+    env = DynamicsChange(make_environment("Walker2d-v5"), mass=factor)
+    mujoco.mj_setTotalmass(witness, factor * witness.body_mass.sum())
+    mujoco.mj_setConst(witness, mujoco.MjData(witness))
+    names = ["body_mass", "body_inertia", "body_subtreemass", "body_invweight0"]
+    for name in (*names, "dof_invweight0", "dof_M0"):
+        ours, theirs = getattr(env.unwrapped.model, name), getattr(witness, name)
+        np.testing.assert_allclose(ours, theirs, rtol=1e-9, err_msg=name)
+
+
+def test_factors_do_not_accumulate_and_concern_one_environment():
+    bare = make_environment("Walker2d-v5").unwrapped.model
+    env = DynamicsChange(make_environment("Walker2d-v5"), mass=2.0, gravity=0.5)
+    for seed in range(3):
+        env.reset(seed=seed)
+        env.step(env.action_space.low)
+        assert (env.unwrapped.model.body_mass == 2 * bare.body_mass).all()
+        assert (env.unwrapped.model.opt.gravity == 0.5 * bare.opt.gravity).all()
+    other = make_environment("Walker2d-v5").unwrapped.model
+    assert (other.body_mass == bare.body_mass).all()
+
+
+def starts(env, number):
+    """Positions and velocities of ``number`` start states, ``[number, nq + nv]``."""
+    states = []
+    for seed in range(number):
+        env.reset(seed=seed)
+        states.append(env.unwrapped.state_vector())
+    return np.array(states)
+
+
+def test_noise_has_the_stated_deviation_around_the_bare_start():
+    noisy = starts(StartStateNoise(make_environment("Hopper-v5"), 0.1), 400)
+    noise = noisy - starts(make_environment("Hopper-v5"), 400)
+    # 4,800 draws: the standard error of a standard deviation is 1 %, take four; that of
+    # one of 12 means is 0.1/20.
+    assert noise.std() == pytest.approx(0.1, rel=0.04)
+    assert np.abs(noise.mean(0)).max() < 4 * 0.1 / 20
+    covariance = np.corrcoef(noise.T) - np.eye(12)
+    assert np.abs(covariance).max() < 4.5 / 20
+
+
+@pytest.mark.parametrize("name", ["Hopper-v5", "Ant-v5"])
+def test_everything_follows_from_the_new_state(name):
+    env = StartStateNoise(make_environment(name), 0.1)
+    observation, info = env.reset(seed=0)
+    bare = env.unwrapped
+    assert (observation == bare._get_obs()).all()
+    assert info["x_position"] == bare.data.qpos[0]
+    fresh = mujoco.MjData(bare.model)
+    fresh.qpos[:], fresh.qvel[:] = bare.data.qpos, bare.data.qvel
+    mujoco.mj_forward(bare.model, fresh)
+    np.testing.assert_allclose(bare.data.xpos, fresh.xpos, atol=1e-12)
+    np.testing.assert_allclose(bare.data.qacc, fresh.qacc, rtol=1e-4, atol=1e-4)

@@ -19,7 +19,6 @@ from torchrl_osr.lab.evaluation import deterministic_policy
 from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
 
 KINDS = ["random", "action_diff", "min_Q"]
-EPSILON = 0.2
 each_kind = pytest.mark.parametrize("kind", KINDS)
 
 
@@ -56,16 +55,15 @@ def shown(trained, observation, **arguments):
 
 @given(
     st.sampled_from(KINDS),
-    st.sampled_from(["sample", "gradient"]),
     st.floats(0, 3),
     st.integers(1, 5),
     st.integers(0, 2**32),
 )
 @settings(deadline=None, max_examples=40)
-def test_observations_stay_in_the_box(trained, kind, method, epsilon, episodes, seed):
+def test_observations_stay_in_the_box(trained, kind, epsilon, episodes, seed):
     clean = torch.randn(episodes, 11, generator=torch.Generator().manual_seed(seed))
     arguments = {"epsilon": epsilon, "num_samples": 3, "seed": seed}
-    observation = shown(trained, clean, kind=kind, method=method, **arguments)
+    observation = shown(trained, clean, kind=kind, **arguments)
     # The sum of state and perturbation is rounded.
     unit = torch.finfo(clean.dtype).eps * (clean.abs() + epsilon)
     assert ((observation - clean).abs() <= epsilon + 2 * unit).all()
@@ -87,10 +85,9 @@ def test_epsilon_0_is_the_bare_policy(trained, kind):
 
 def test_random_is_uniform(trained):
     clean = torch.randn(2000, 11)
-    noise = shown(trained, clean, kind="random", epsilon=EPSILON) - clean
-    assert (noise.abs() <= EPSILON + 1e-6).all()
+    noise = shown(trained, clean, kind="random", epsilon=0.2) - clean
     # 22,000 draws of variance 1/3, five standard errors.
-    assert (noise / EPSILON).square().mean().item() == pytest.approx(1 / 3, abs=0.011)
+    assert (noise / 0.2).square().mean().item() == pytest.approx(1 / 3, abs=0.011)
 
 
 def test_critics_of_a_loss_are_its_trained_ones():

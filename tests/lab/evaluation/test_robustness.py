@@ -171,7 +171,7 @@ def test_an_episode_depends_on_its_own_disturbance_alone():
         return torch.from_numpy(behavior.deterministic(observation.numpy()))
 
     # Who is knocked early falls while the others, some never knocked, walk on.
-    wrap = partial(ActionKnock, steps=20, mode="torque", at="random", window=(9, 900))
+    wrap = partial(ActionKnock, steps=20, mode="torque", at=(9, 900))
     results = play(Disturbance("knock", "knock", 20, wrap), policy=policy, episodes=8)
     (knocked,) = results["levels"]
     met = [moment is not None for moment in knocked["disturbed_at"]]

@@ -6,8 +6,7 @@
 * ``info["disturbed"]`` is true in each step in which a disturbance acted.
 
 To combine several, wrap the task first in changes of dynamics and start state, then in
-knocks and pushes, actuators, and sensors. Attacks on observations need the networks,
-see :func:`attacked_policy`.
+knocks and pushes, actuators, and sensors.
 """
 
 from torchrl_osr._extras import needed_by
@@ -20,11 +19,12 @@ from torchrl_osr.lab.envs.disturbance import NotPossible
 from torchrl_osr.lab.envs.faults import (
     ActionDelay,
     ActionNoise,
+    DynamicsChange,
     ObservationNoise,
+    StartStateNoise,
     StickyAction,
 )
 from torchrl_osr.lab.envs.observation_attack import attacked_policy, critics_of
-from torchrl_osr.lab.envs.simulation import DynamicsChange, StartStateNoise
 from torchrl_osr.lab.envs.timed import ActionKnock, ExternalPush
 
 __all__ = [

@@ -20,17 +20,14 @@ Step: TypeAlias = tuple[Vector, Any, bool, bool, dict[str, Any]]
 
 
 class NotPossible(TypeError):
-    """The environment lacks what a disturbance needs: MuJoCo, or real actions."""
+    """The environment lacks MuJoCo, or real actions, which a disturbance needs."""
 
 
-def box_of(
-    space: gymnasium.Space[Any], name: str, *, bounded: bool = False
-) -> gymnasium.spaces.Box:
-    """Return the space; raise NotPossible unless it is a (bounded) Box."""
-    if isinstance(space, gymnasium.spaces.Box) and (space.is_bounded() or not bounded):
+def box_of(space: gymnasium.Space[Any], name: str) -> gymnasium.spaces.Box:
+    """Return the space; raise NotPossible unless it is a Box."""
+    if isinstance(space, gymnasium.spaces.Box):
         return space
-    wanted = "finite bounds" if bounded else "real numbers"
-    raise NotPossible(f"The {name} are {space}; expected a Box of {wanted}.")
+    raise NotPossible(f"The {name} are {space}; expected a Box of real numbers.")
 
 
 def mujoco_task(env: gymnasium.Env[Any, Any]) -> Any:
@@ -53,8 +50,7 @@ def flag(info: dict[str, Any], disturbed: bool) -> dict[str, Any]:
 class DisturbanceWrapper(gymnasium.Wrapper[Vector, Vector, Vector, Vector]):
     """Base of the disturbances: override :meth:`begin`, :meth:`act` or :meth:`observe`.
 
-    A reset with a seed also seeds :attr:`generator`, which differs by class and by the
-    number of wrappers of that class inside; a reset without a seed continues it. An
+    A reset with a seed also seeds :attr:`generator`, which differs by class. An
     ``always`` disturbance acts in every step and at the reset.
     """
 
@@ -62,11 +58,6 @@ class DisturbanceWrapper(gymnasium.Wrapper[Vector, Vector, Vector, Vector]):
         super().__init__(env)
         self.always, self.acted = always, False
         self.generator = np.random.default_rng()
-        inside = 0
-        while isinstance(env, gymnasium.Wrapper):
-            inside += type(env) is type(self)
-            env = env.env
-        self.key = zlib.crc32(type(self).__name__.encode()), inside
 
     def begin(self) -> None:
         """Draw what an episode needs."""
@@ -84,8 +75,8 @@ class DisturbanceWrapper(gymnasium.Wrapper[Vector, Vector, Vector, Vector]):
     ) -> tuple[Vector, dict[str, Any]]:
         observation, info = super().reset(seed=seed, options=options)
         if seed is not None:
-            sequence = np.random.SeedSequence([seed, *self.key])
-            self.generator = np.random.default_rng(sequence)
+            key = zlib.crc32(type(self).__name__.encode())
+            self.generator = np.random.default_rng([seed, key, 0])
         self.begin()
         return self.observe(observation), flag(info, self.always)
 

@@ -1,28 +1,35 @@
-"""Faulty actuators and sensors: noisy, late and repeated actions, noisy readings."""
+"""Faulty actuators and sensors, other dynamics and start states."""
 
 from __future__ import annotations
 
 from collections import deque
+from typing import Any
 
-import gymnasium
+import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
 from torchrl_osr._checks import check_positive, check_weight
-from torchrl_osr.lab.envs.disturbance import DisturbanceWrapper, Env, Vector, box_of
+from torchrl_osr.lab.envs.disturbance import (
+    DisturbanceWrapper,
+    Env,
+    Vector,
+    box_of,
+    flag,
+    mujoco_task,
+)
 
 
 class ActionNoise(DisturbanceWrapper):
-    """Add Gaussian noise to every action and clip it to the action box.
+    """Add Gaussian noise, ``std`` half-widths of the action box, to every action.
 
-    The random perturbation of "Robust Gymnasium" (https://arxiv.org/abs/2502.19652).
-    The standard deviation ``std`` is in half-widths of the box.
+    From "Robust Gymnasium" (https://arxiv.org/abs/2502.19652).
     """
 
     def __init__(self, env: Env, std: float) -> None:
         check_weight("std", std)
         super().__init__(env, always=std > 0)
-        self.box = box_of(env.action_space, "actions", bounded=True)
+        self.box = box_of(env.action_space, "actions")
         low, high = (each.astype(np.float64) for each in (self.box.low, self.box.high))
         self.scale = std * (high - low) / 2
 
@@ -31,16 +38,11 @@ class ActionNoise(DisturbanceWrapper):
             return action
         noise = self.scale * self.generator.standard_normal(self.scale.shape)
         noisy = (action + noise).astype(self.box.dtype)
-        # np.clip is three times slower on a few numbers.
-        return np.minimum(np.maximum(noisy, self.box.low), self.box.high)
+        return np.clip(noisy, self.box.low, self.box.high)
 
 
 class ActionDelay(DisturbanceWrapper):
-    """Delay every action by some steps; execute zeros until the first one arrives.
-
-    Constant delays of "Reinforcement Learning with Random Delays"
-    (https://arxiv.org/abs/2010.02966).
-    """
+    """Delay every action by some steps; execute zeros until the first one arrives."""
 
     def __init__(self, env: Env, steps: int) -> None:
         check_positive("steps", steps, minimum=0)
@@ -60,42 +62,34 @@ class ActionDelay(DisturbanceWrapper):
 class StickyAction(DisturbanceWrapper):
     """Execute the previous action once more, with some probability in each step.
 
-    :class:`gymnasium.wrappers.StickyAction` with a random stream of its own, from
-    "Revisiting the Arcade Learning Environment" (https://arxiv.org/abs/1709.06009),
-    where the probability is 0.25.
+    As :class:`gymnasium.wrappers.StickyAction`, which draws from the environment's own
+    generator and sets no flag.
     """
 
     def __init__(self, env: Env, probability: float) -> None:
+        check_weight("probability", probability)
         super().__init__(env)
-        # Around an empty environment, whose random stream becomes that of the wrapper.
-        self.sticky = gymnasium.wrappers.StickyAction(gymnasium.Env(), probability)
+        self.probability = probability
+        self.previous: Vector | None = None
 
     def begin(self) -> None:
-        self.sticky.np_random = self.generator
-        self.sticky.last_action = None
+        self.previous = None
 
     def act(self, action: Vector) -> Vector:
-        previous = self.sticky.last_action
-        # A copy: the caller may write the next action into the same array.
-        executed: Vector = self.sticky.action(np.array(action))
-        self.acted = executed is previous
-        return executed
+        if self.previous is not None and self.generator.random() < self.probability:
+            self.acted = True
+        else:
+            # A copy: the caller may write the next action into the same array.
+            self.previous = np.array(action)
+        return self.previous
 
 
 class ObservationNoise(DisturbanceWrapper):
-    """Add Gaussian noise to every observation; the simulated state is unchanged.
+    """Add Gaussian noise of ``std`` units to every observation, also the first.
 
-    Absolute noise is that of DMBP (Yang and Xu, ICLR 2024), noise relative to the data
-    that of RORL, https://arxiv.org/abs/2206.02829. The first observation of an episode
-    is noisy, too. Noisy observations may leave the observation space.
-
-    Args:
-        env: the environment, with real observations.
-        std: standard deviation, in ``unit``.
-
-    Keyword Args:
-        unit: the data's standard deviation of each entry of an observation, ``[S]``.
-            Default: 1, so that ``std`` is in the observation's own units.
+    The ``unit`` is the data's standard deviation of each entry, ``[S]``, as in RORL
+    (https://arxiv.org/abs/2206.02829), or 1 (default). Noisy observations may leave the
+    observation space.
     """
 
     def __init__(self, env: Env, std: float, *, unit: ArrayLike = 1.0) -> None:
@@ -109,3 +103,65 @@ class ObservationNoise(DisturbanceWrapper):
             return observation
         noise = self.generator.standard_normal(observation.shape)
         return (observation + self.scale * noise).astype(observation.dtype)
+
+
+class DynamicsChange(DisturbanceWrapper):
+    """Multiply masses, friction and gravity of the environment's model by factors.
+
+    A factor of mass is also that of the moments of inertia; MuJoCo's armature and the
+    motors' strength stay. As in ODRL (https://arxiv.org/abs/2410.20750).
+
+    Examples:
+        >>> from torchrl_osr.lab.data import make_environment
+        >>> env = DynamicsChange(make_environment("Hopper-v5"), gravity=0.5)
+        >>> float(env.unwrapped.model.opt.gravity[2])
+        -4.905
+    """
+
+    def __init__(
+        self,
+        env: Env,
+        *,
+        mass: float = 1.0,
+        friction: float = 1.0,
+        gravity: float = 1.0,
+    ) -> None:
+        check_positive("mass", mass)
+        super().__init__(env, always=(mass, friction, gravity) != (1, 1, 1))
+        model = mujoco_task(env).model
+        model.body_mass *= mass
+        model.body_inertia *= mass
+        model.geom_friction *= friction
+        model.pair_friction *= friction
+        model.opt.gravity *= gravity
+        if mass != 1:
+            # Constants that MuJoCo derives from the masses, such as the softness of
+            # contacts; with new data: the environment's may be in mid-episode.
+            mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+class StartStateNoise(DisturbanceWrapper):
+    """Add Gaussian noise to the start state; put this around the bare task.
+
+    ``std`` is in metres or radians, and in metres or radians a second. After strong
+    noise an episode may start fallen, or with a foot in the ground.
+    """
+
+    def __init__(self, env: Env, std: float) -> None:
+        check_weight("std", std)
+        super().__init__(env)
+        self.std = std
+        self.bare = mujoco_task(env)
+
+    def reset(self, **options: Any) -> tuple[Vector, dict[str, Any]]:
+        observation, info = super().reset(**options)
+        if self.std == 0:
+            return observation, info
+        model, data = self.bare.model, self.bare.data
+        position, velocity = self.std * self.generator.standard_normal((2, model.nv))
+        qpos = np.array(data.qpos)
+        mujoco.mj_integratePos(model, qpos, position, 1.0)
+        # Calls mj_forward: everything that depends on the state is up to date.
+        self.bare.set_state(qpos, data.qvel + velocity)
+        info |= self.bare._get_reset_info()
+        return self.bare._get_obs(), flag(info, True)

@@ -18,30 +18,24 @@ from torchrl_osr.lab.envs.disturbance import (
     mujoco_task,
 )
 
-EARTH_GRAVITY = 9.81
 SMALL = 1e-3  # of the benchmark's random actions, in units of the action
 
-At: TypeAlias = int | Literal["random"]
-"""Steps of the agent before a disturbance; ``"random"`` averages over the gait."""
+At: TypeAlias = int | tuple[int, int]
+"""Steps of the agent before a disturbance; of a range they are drawn each episode."""
 
 
 class TimedDisturbance(DisturbanceWrapper):
     """Base of the disturbances that act once an episode, at the earliest ``first``."""
 
-    def __init__(
-        self, env: Env, at: At, window: tuple[int, int], *, first: int = 0
-    ) -> None:
-        check_positive("the length of window", window[1] - window[0], minimum=1)
-        earliest = window[0] if at == "random" else at
-        check_positive("at, or the start of window,", earliest, minimum=first)
+    def __init__(self, env: Env, at: At, first: int = 0) -> None:
+        self.low, self.high = (at, at + 1) if isinstance(at, int) else at
+        if not first <= self.low < self.high:
+            raise ValueError(f"at must be at least {first}, or a range, got {at}.")
         super().__init__(env)
-        self.at, self.window, self.next_step = at, window, 0
+        self.next_step = 0
 
     def begin(self) -> None:
-        drawn = self.at == "random"
-        self.next_step = -int(
-            self.generator.integers(*self.window) if drawn else self.at
-        )
+        self.next_step = -int(self.generator.integers(self.low, self.high))
 
     def count(self) -> int:
         """Count a step; return its number, 0 at the disturbance, negative before."""
@@ -65,9 +59,8 @@ class ActionKnock(TimedDisturbance):
       upper bound with probability 1/2. Discrete actions are drawn uniformly.
 
     The agent's last step before the official knock returns the observation after the
-    knock, with the reward and end of the agent's own action; a fall in the knock ends
-    the episode only after the agent's next step. Neither the time limit nor other
-    wrappers see the extra steps. Put this around the bare task.
+    knock, with the reward and end of the agent's own action. Neither the time limit nor
+    other wrappers see the extra steps. Put this around the bare task.
 
     Args:
         env: the environment, with real actions, or in ``"torque"`` mode discrete ones.
@@ -75,10 +68,8 @@ class ActionKnock(TimedDisturbance):
 
     Keyword Args:
         mode: ``"official"``, ``"paper"`` or ``"torque"``.
-        at: steps of the agent before it (at least 1 in ``"official"`` mode), or
-            ``"random"``. Default 500.
-        window: ``"random"`` draws for each episode from ``window[0]`` to below
-            ``window[1]``. Default ``(100, 600)``.
+        at: steps of the agent before it; of a range ``(low, high)``, a number from
+            ``low`` to below ``high`` is drawn for each episode. Default 500.
 
     Examples:
         >>> from torchrl_osr.lab.data import make_environment
@@ -97,16 +88,15 @@ class ActionKnock(TimedDisturbance):
         *,
         mode: Literal["official", "paper", "torque"],
         at: At = 500,
-        window: tuple[int, int] = (100, 600),
     ) -> None:
         check_choice("mode", mode, ("official", "paper", "torque"))
         check_positive("steps", steps, minimum=1)
         # The sampler knocks between two steps of the agent, never before the first.
-        super().__init__(env, at, window, first=int(mode == "official"))
+        super().__init__(env, at, first=int(mode == "official"))
         self.steps, self.mode = steps, mode
         actions = env.action_space
         if mode != "torque" or not isinstance(actions, gymnasium.spaces.Discrete):
-            actions = box_of(actions, "actions", bounded=mode == "torque")
+            actions = box_of(actions, "actions")
         self.actions, self.due = actions, False
 
     def act(self, action: Vector) -> Vector:
@@ -141,59 +131,42 @@ class ActionKnock(TimedDisturbance):
 
 
 class ExternalPush(TimedDisturbance):
-    """Push the torso forwards or backwards, once an episode.
+    """Push the torso, or the heaviest body, forwards or backwards, once an episode.
 
     The arrow in the figures of the OSR paper, see :class:`ActionKnock`: a force along
-    the world's x axis at the torso's centre of mass, or that of the heaviest body. The
-    sign is drawn for each episode.
+    the world's x axis, whose sign is drawn for each episode.
 
     Args:
         env: one of Gymnasium's MuJoCo tasks.
-        force: in ``unit``; 0 is off.
+        force: in weights of all bodies: 155 N for hopper, 232 N for walker2d, 137 N for
+            halfcheetah.
 
     Keyword Args:
         duration: in steps of the agent: 0.008 s each for hopper and walker2d, 0.05 s
             for halfcheetah.
-        at, window: moment, as in :class:`ActionKnock`. Default ``"random"``.
-        unit: ``"newton"`` (default) or ``"body_weight"``, the weight of all bodies:
-            155 N for hopper, 232 N for walker2d, 137 N for halfcheetah.
+        at: moment, as in :class:`ActionKnock`. Default ``(100, 600)``.
     """
 
     def __init__(
-        self,
-        env: Env,
-        force: float,
-        *,
-        duration: int,
-        at: At = "random",
-        window: tuple[int, int] = (100, 600),
-        unit: Literal["newton", "body_weight"] = "newton",
+        self, env: Env, force: float, *, duration: int, at: At = (100, 600)
     ) -> None:
         check_weight("force", force)
         check_positive("duration", duration, minimum=1)
-        check_choice("unit", unit, ("newton", "body_weight"))
-        super().__init__(env, at, window)
+        super().__init__(env, at)
         self.bare = mujoco_task(env)
         model = self.bare.model
         names = [model.body(number).name for number in range(model.nbody)]
         heaviest = int(model.body_mass.argmax())
         self.body = names.index("torso") if "torso" in names else heaviest
-        if unit == "body_weight":
-            gravity = np.linalg.norm(model.opt.gravity) or EARTH_GRAVITY
-            force *= model.body_mass.sum() * gravity
-        self.force, self.duration, self.sign = float(force), duration, 1.0
+        weight = model.body_mass.sum() * np.linalg.norm(model.opt.gravity)
+        self.force, self.duration, self.sign = force * weight, duration, 1.0
 
     def begin(self) -> None:
         super().begin()
         self.sign = 1.0 if self.generator.random() < 0.5 else -1.0
 
-    def step(self, action: Vector) -> Step:
-        pushed = 0 <= self.count() < self.duration and self.force > 0
-        applied = self.bare.data.xfrc_applied[self.body]
-        before = applied[0]
-        applied[0] = before + pushed * self.sign * self.force
-        result = super().step(action)
-        # Restored, not subtracted: a rounding error would stay as a force.
-        applied[0] = before
-        flag(result[-1], pushed)
-        return result
+    def act(self, action: Vector) -> Vector:
+        self.acted = 0 <= self.count() < self.duration and self.force > 0
+        force = self.acted * self.sign * self.force
+        self.bare.data.xfrc_applied[self.body, 0] = force
+        return action
