@@ -15,8 +15,7 @@ from torchrl_osr._files import RECORD
 
 def inputs(policy, rows: int, output: str) -> dict[str, torch.Tensor]:
     observation = policy.loc + 3 * policy.scale * torch.randn(rows, 3)
-    generator = torch.Generator().manual_seed(rows)
-    action = policy.act(observation, generator=generator)
+    action = policy.act(observation.flip(0))
     both = {"observation": observation, "action": action}
     return both if output == "value" else {"observation": observation}
 

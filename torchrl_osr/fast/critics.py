@@ -36,9 +36,9 @@ shift ``[N, out]`` of the layer normalisation that follows, if one does."""
 class FusedCritics(Critics):
     """Evaluate plain MLP critics without their modules, and CQL(H)'s actions in chunks.
 
-    Plain is a :class:`~torchrl.modules.MLP` with one output that reads observations and
-    then the action, of linear layers and ReLUs in between; before the ReLUs there may
-    be layer normalisations. Other critics, those with hooks, and those on a GPU are
+    Plain is a :class:`~torchrl.modules.MLP` with one output that reads an observation
+    and then the action, of linear layers and ReLUs in between; before the ReLUs there
+    may be layer normalisations. Other critics, those with hooks, and those on a GPU are
     evaluated as usual.
     """
 
@@ -47,7 +47,7 @@ class FusedCritics(Critics):
     ) -> Tensor:
         if (eps := self._eps()) is None:
             return super().values(states, action, params)
-        rows = torch.cat([self._joined(states), action], -1)
+        rows = torch.cat([self._state(states), action], -1)
         return _values(self._layers(params), eps, rows)
 
     def values_and_soft_maximum(
@@ -62,7 +62,7 @@ class FusedCritics(Critics):
             or any(value.requires_grad for value in batch.s.values(True, True))
         ):
             return super().values_and_soft_maximum(batch, action, log_prob)
-        params, state = loss.qvalue_network_params, self._joined(batch.s)
+        params, state = loss.qvalue_network_params, self._state(batch.s)
         layers = self._layers(params)
         alike = loss.clip_diff_min == -math.inf and loss.rows_weigh_alike(batch)
         autocast = torch.is_autocast_enabled("cpu")
@@ -85,6 +85,7 @@ class FusedCritics(Critics):
         if (
             type(network) not in (TensorDictModule, ValueOperator)
             or type(module) is not MLP
+            or len(network.in_keys) != 2
             or network.in_keys[-1] != keys.action
             or keys.state_action_value not in network.out_keys
             or any(_has_hook(each) for each in (network, module, *module))
@@ -115,9 +116,9 @@ class FusedCritics(Critics):
                     layers[-1] += pair
         return layers
 
-    def _joined(self, states: TensorDictBase) -> Tensor:
-        keys = self.loss.qvalue_network.in_keys[:-1]
-        return torch.cat([states.get(key) for key in keys], -1)
+    def _state(self, states: TensorDictBase) -> Tensor:
+        state: Tensor = states.get(self.loss.qvalue_network.in_keys[0])
+        return state
 
 
 def fuse_critics(loss: nn.Module) -> None:

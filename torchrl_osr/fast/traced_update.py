@@ -6,9 +6,8 @@ traced once, by :func:`torch.fx.experimental.proxy_tensor.make_fx`, forward and
 backward, and repeated with the next batches: the same operations on the same numbers in
 the same order, hence the same bits, without a compiler.
 
-TorchScript's interpreter repeats them in two thirds of Python's time. It is deprecated
-in PyTorch 2.13, in which nothing else repeats operations from C++ without a compiler.
-Where it is missing, the tracer's :class:`torch.fx.GraphModule` runs from Python.
+TorchScript's interpreter repeats them. It is deprecated in PyTorch 2.13, in which
+nothing else repeats operations from C++ without a compiler.
 """
 
 from __future__ import annotations
@@ -303,26 +302,17 @@ def layer_norm_backward(
 """)
 
 
-def _without_python(
-    graph: GraphModule, tensors: list[Tensor]
-) -> Callable[..., Sequence[Tensor]]:
-    """The graph as TorchScript, or as it is where that cannot be had."""
-    try:
-        unit = _layer_norm_backward()
+def _without_python(graph: GraphModule, tensors: list[Tensor]) -> Any:
+    """Return the graph as TorchScript."""
+    unit = _layer_norm_backward()
 
-        def layer_norm_backward(*arguments: Any) -> Any:
-            return unit.layer_norm_backward(*arguments[:-1])
+    def layer_norm_backward(*arguments: Any) -> Any:
+        return unit.layer_norm_backward(*arguments[:-1])
 
-        for node in graph.graph.nodes:
-            if node.target is torch.ops.aten.native_layer_norm_backward.default:
-                node.target = layer_norm_backward
-        with warnings.catch_warnings(), torch.no_grad():
-            warnings.simplefilter("ignore")  # of deprecation, and of fixed shapes
-            graph.recompile()
-            run: Callable[..., Sequence[Tensor]] = torch.jit.trace(  # type: ignore[no-untyped-call]
-                graph, tuple(tensors), check_trace=False
-            )
-        return run
-    except Exception as error:
-        log.info(f"updates are repeated from Python, which is slower: {error}")
-        return graph
+    for node in graph.graph.nodes:
+        if node.target is torch.ops.aten.native_layer_norm_backward.default:
+            node.target = layer_norm_backward
+    with warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("ignore")  # of deprecation, and of fixed shapes
+        graph.recompile()
+        return torch.jit.trace(graph, tuple(tensors), check_trace=False)  # type: ignore[no-untyped-call]

@@ -18,12 +18,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torchrl.modules import NormalParamExtractor
 
 from torchrl_osr._checks import check_choice
 from torchrl_osr._extras import needed_by
 from torchrl_osr._files import RECORD, read_tensors, write_atomically, write_tensors
-from torchrl_osr.modules.actor import SCALE_MAPPING, mlp
+from torchrl_osr.modules.actor import mlp
 
 DISTRIBUTIONS = ("TanhNormal", "TanhDelta", "OneHotCategorical")
 """Distributions that an actor may end in, by TorchRL's names."""
@@ -68,7 +67,6 @@ class Policy(nn.Module):
         self.discrete = self.distribution == "OneHotCategorical"
         self.observation_size = inputs = record["observation_size"]
         self.action_size = actions = record["action_size"]
-        self.extractor = NormalParamExtractor(SCALE_MAPPING)
         outputs = actions * (2 if self.distribution == "TanhNormal" else 1)
         pair = (inputs, actions) if self.discrete else (inputs + actions, 1)
         numbers = {"loc": inputs, "scale": inputs}
@@ -85,25 +83,18 @@ class Policy(nn.Module):
         self.requires_grad_(False).eval()
 
     @torch.no_grad()
-    def act(
-        self, observation: Array, *, generator: torch.Generator | None = None
-    ) -> Array:
-        """Return actions for observations, NumPy for NumPy and torch for torch.
+    def act(self, observation: Array) -> Array:
+        """Return deterministic actions, NumPy for NumPy and torch for torch.
 
         Args:
             observation: as the environment gives it, one ``[S]`` or many ``[B, S]``.
-
-        Keyword Args:
-            generator: draw from the policy's distribution with it. Default: the
-                deterministic action, which is the only one of a TD3+BC policy.
 
         Returns:
             Actions as the environment takes them: float32, ``[A]`` or ``[B, A]``,
             within the bounds; of a discrete policy int64 indices, ``[]`` or ``[B]``.
         """
         rows = self._numbers("observation", observation, self.observation_size)
-        action = self(rows) if generator is None else self._sample(rows, generator)
-        return _like(observation, action)
+        return _like(observation, self(rows))
 
     @torch.no_grad()
     def value(self, observation: Array, action: Array | None = None) -> Array:
@@ -189,20 +180,6 @@ class Policy(nn.Module):
             return raw.argmax(-1)
         loc = raw.chunk(2, -1)[0] if self.distribution == "TanhNormal" else raw
         return loc.tanh()
-
-    def _sample(self, observation: Tensor, generator: torch.Generator) -> Tensor:
-        raw: Tensor = self.actor(self._standardized(observation))
-        if self.distribution == "TanhDelta":
-            return self._in_units(self.mode(raw))
-        if self.discrete:
-            # The largest of logits with Gumbel noise has their softmax's distribution.
-            noise = torch.empty(raw.shape, device=generator.device)
-            noise.exponential_(generator=generator)
-            return (raw - noise.log().to(raw.device)).argmax(-1)
-        loc, scale = self.extractor(raw)
-        noise = torch.empty(loc.shape, device=generator.device)
-        noise.normal_(generator=generator)
-        return self._in_units((loc + scale * noise.to(raw.device)).tanh())
 
     def _standardized(self, observation: Tensor) -> Tensor:
         # Gymnasium's MuJoCo tasks have float64.
