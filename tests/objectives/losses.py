@@ -58,13 +58,9 @@ def _module(
     return TensorDictModule(layers, [observation_key], [action_key])
 
 
-def _dynamics(size: int, number: int, **keys: Any) -> DynamicsEnsemble:
-    options = {"num_networks": 2, "num_elites": 2, "num_cells": [6]}
-    return DynamicsEnsemble(size, number, **options, **keys)
-
-
 MLPS, LIMITS = {"num_cells": [8], "activation_class": nn.Tanh}, ("low", "high")
-LATENT = MLPS | {"latent_dim": 2}
+LATENT, CELLS = MLPS | {"latent_dim": 2}, {"num_cells": [6]}
+ENSEMBLE = CELLS | {"num_networks": 2, "num_elites": 2}
 STATE, COUNT = ("observation_key",), ("num_qvalue_nets",)
 BOTH = (*STATE, "action_key")
 # How each network is built, its sizes and fixed options, and what may be chosen.
@@ -82,8 +78,8 @@ BUILDERS: dict[str, tuple[Callable[..., Any], tuple[int, ...], dict, tuple]] = {
         modules.discrete_critic_ensemble, (S, ACTIONS), MLPS, STATE + COUNT
     ),
     "choice_model": (modules.categorical_inverse_dynamics, (S, ACTIONS), MLPS, BOTH),
-    "dynamics": (_dynamics, (S, A), {}, BOTH),
-    "vae": (TransitionVAE, (S,), {"num_cells": [6]}, STATE),
+    "dynamics": (DynamicsEnsemble, (S, A), ENSEMBLE, BOTH),
+    "vae": (TransitionVAE, (S,), CELLS, STATE),
 }  # fmt: skip
 
 

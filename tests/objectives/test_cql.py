@@ -70,12 +70,6 @@ def test_losses_and_gradients_equal_the_restatement(check, variant, number) -> N
     )
 
 
-def test_perturbed_states_in_the_batch_change_no_bit() -> None:
-    batch, loss = make_batch("osr", 10), make_loss("cql")
-    found = call(loss, batch), call(loss, batch.exclude("perturbed"))
-    assert (found[0] == found[1]).all()
-
-
 def test_metrics_and_priorities_are_what_they_are_called() -> None:
     networks, batch = Networks(), make_batch("cql", 10)
     loss, plain = make_loss("cql", networks, **SOFT), Plain(networks)

@@ -185,17 +185,6 @@ def test_combined_losses_train_and_load_as_one() -> None:
         WithRecovery(first.loss, second.recovery)
 
 
-def test_states_that_only_the_model_reads_are_read() -> None:
-    networks, batch = Networks(), make_batch("recovery", 10)
-    expected = make_loss("recovery", networks)(batch)[KEY]
-    networks.model = Networks(observation="goal").model
-    for group in (batch, batch["next"], batch["perturbed"]):
-        group["goal"] = group["observation"]
-    loss = make_loss("recovery", networks)
-    assert ("perturbed", "goal") in loss.in_keys
-    assert torch.equal(loss(batch.select(*loss.in_keys))[KEY], expected)
-
-
 def test_a_missing_model_is_asked_for() -> None:
     with pytest.raises(ValueError, match="needs an inverse_dynamics_network"):
         StateRecoveryLoss(Networks().actor)

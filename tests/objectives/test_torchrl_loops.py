@@ -16,7 +16,7 @@ from torch.optim import Adam
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import GymEnv
-from torchrl.objectives import CQLLoss, SoftUpdate
+from torchrl.objectives import SoftUpdate
 from torchrl.objectives.utils import group_optimizers
 from torchrl.trainers.algorithms import CQLTrainer
 
@@ -114,16 +114,3 @@ def test_cql_trainer_steps_along_the_gradient_of_all_losses(batch, kind) -> None
     assert_same_bits(stepped, expected)
     assert not any(map(torch.equal, before, loss.parameters()))
     trainer.collector.shutdown()
-
-
-@pytest.mark.parametrize("gap", [None, 1.0])
-def test_entries_are_torchrls_without_that_of_the_first_steps(gap) -> None:
-    ours = make_loss(target_action_gap=gap)
-    networks = tanh_gaussian_actor(3, 1, **BOUNDS), critic_ensemble(3, 1, num_cells=[8])
-    theirs = CQLLoss(*networks, target_entropy=-1.0, with_lagrange=gap is not None)
-    assert ours.with_lagrange == theirs.with_lagrange
-    found, wanted = (
-        {key for key in loss.out_keys if key.startswith("loss_")}
-        for loss in (ours, theirs)
-    )
-    assert found == wanted - {"loss_actor_bc"}

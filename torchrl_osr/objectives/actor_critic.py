@@ -87,10 +87,9 @@ class Critics:
     ) -> Tensor:
         """Return the values of all critics, ``[N, ..., R]``, of actions at states."""
         keys = self.loss.tensor_keys
-        rows = states.select(
-            *state_keys(self.loss.qvalue_network.in_keys), strict=False
-        )
-        rows = rows.reshape(-1).set(keys.action, action.flatten(0, -2))
+        read = state_keys(self.loss.qvalue_network.in_keys)
+        rows = states.select(*read, strict=False).reshape(-1)
+        rows = rows.set(keys.action, action.flatten(0, -2))
         value = self.loss.critic_output(rows, params, keys.state_action_value)
         return value.reshape(-1, *action.shape[:-1])
 
@@ -112,8 +111,7 @@ class ActorCriticLoss(LossModule):
     """Abstract base of the losses.
 
     A loss registers its networks in its constructor, calls :meth:`declare`, and
-    computes :meth:`losses`. The order of ``in_keys`` is fixed; in TorchRL 0.14.1 it
-    changes from one process to the next.
+    computes :meth:`losses`. The order of ``in_keys`` is fixed, unlike TorchRL 0.14.1's.
 
     Coefficients (``min_q_weight``, ``recovery_weight``, ``gamma``) are options, not
     state: :meth:`load_state_dict` keeps those of the loss that it loads into.
@@ -249,8 +247,8 @@ class ActorCriticLoss(LossModule):
     def register_model(self, network: TensorDictModuleBase) -> None:
         """Register a trained inverse dynamics model with the actor's bounds, frozen."""
         name = "inverse_dynamics_network"
-        bounds = self.action_low, self.action_high
-        check_same_bounds(bounds, action_bounds(network, name))
+        own = self.action_low, self.action_high
+        check_same_bounds(own, action_bounds(network, name))
         self.register_frozen(name, network)
 
     def register_bounds(self, bounds: Iterable[Tensor]) -> None:

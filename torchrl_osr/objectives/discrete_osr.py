@@ -144,7 +144,10 @@ class DiscreteOSRLoss(ActorCriticLoss):
             batch, objective.mean(0), log_prob, auto
         )
         if self.has_recovery:
-            recovery = self.recovery(batch, policy)
+            model = self.inverse_dynamics(batch, "both").logits
+            sizes = model.shape[-1], pi.logits.shape[-1]
+            check_num_actions("inverse_dynamics_network", *sizes)
+            recovery = F.categorical_kl(model, pi.logits).mean(0)
             term = self.reduce(recovery, batch, batch.has_next)
             losses["loss_actor"] = losses["loss_actor"] + self.recovery_weight * term
             metrics["recovery_kl"] = self.mean(recovery, batch, batch.has_next)
@@ -175,12 +178,6 @@ class DiscreteOSRLoss(ActorCriticLoss):
         qvalue = self.action_values(batch.s, self.qvalue_network_params, pi)
         index = index.expand(qvalue.shape[:-1]).unsqueeze(-1)
         return qvalue, qvalue.gather(-1, index).squeeze(-1)
-
-    def recovery(self, batch: Transitions, policy: StatePolicy) -> Tensor:
-        """Return the divergence of model and policy, the mean over D_tot, ``[R]``."""
-        pi, model = policy["both"].logits, self.inverse_dynamics(batch, "both").logits
-        check_num_actions("inverse_dynamics_network", model.shape[-1], pi.shape[-1])
-        return F.categorical_kl(model, pi).mean(0)
 
     @torch.no_grad()
     def soft_target(self, batch: Transitions, policy: StatePolicy) -> Tensor:

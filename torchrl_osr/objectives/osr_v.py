@@ -40,8 +40,7 @@ class OSRVLoss(ActorCriticLoss):
 
     Args:
         actor_network: ends in a :class:`~torchrl.modules.TanhNormal`.
-        qvalue_network: one critic, copied by TorchRL, or a list of critics that keep
-            their own weights (:func:`~torchrl_osr.modules.critic_ensemble`).
+        qvalue_network: one critic or a list, see :class:`~torchrl_osr.CQLLoss`.
         inverse_dynamics_network: a *trained* model of ``I(a | s, s')`` with the
             actor's bounds, frozen here. Not needed with ``recovery_target="data"``.
 
