@@ -12,7 +12,10 @@ from torchrl import torchrl_logger
 from torchrl_osr.lab.data import check_dataset, load_dataset
 
 # Minari asks for an author's address, and more, whenever a set is made.
-pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:minari")
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::UserWarning:minari"),
+    pytest.mark.usefixtures("cache"),
+]
 
 FORMATS = ["hdf5", "arrow", "parquet"]
 LENGTHS = [5, 1, 12, 3, 2, 4, 1, 2, 3, 6, 2, 5]  # more than ten: 10 sorts before 2
@@ -30,12 +33,6 @@ NESTED = spaces.Dict(
 UNIT = spaces.Box(-1, 1, (2,))
 
 
-@pytest.fixture(autouse=True)
-def _home(tmp_path, monkeypatch):
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
-    monkeypatch.setenv("TORCHRL_OSR_CACHE", str(tmp_path / "cache"))
-
-
 def load(path, **options):
     return load_dataset(None, "minari", path=path, progress=False, **options)
 
@@ -46,29 +43,25 @@ def stacked(space, rows):
     return np.stack(rows)
 
 
-def make(name, observations=VECTOR, actions=UNIT, data_format="hdf5", **buffer):
+def make(name, observations=VECTOR, actions=UNIT, data_format="hdf5"):
     observations.seed(0)
     actions.seed(0)
     buffers = []
     for number, steps in enumerate(LENGTHS):
         fell = number % 3 == 0
         end = np.arange(steps) == steps - 1
-        columns = {
-            "observations": stacked(
-                observations, [observations.sample() for _ in range(steps + 1)]
-            ),
-            "actions": np.stack([actions.sample() for _ in range(steps)]),
-            "rewards": np.random.default_rng(number).normal(size=steps),
-            "terminations": end & fell,
-            "truncations": end & (not fell),
-        }
-        buffers.append(EpisodeBuffer(**(columns | buffer)))
+        rows = [observations.sample() for _ in range(steps + 1)]
+        buffer = EpisodeBuffer(
+            observations=stacked(observations, rows),
+            actions=np.stack([actions.sample() for _ in range(steps)]),
+            rewards=np.random.default_rng(number).normal(size=steps),
+            terminations=end & fell,
+            truncations=end & (not fell),
+        )
+        buffers.append(buffer)
+    known = {"observation_space": observations, "action_space": actions}
     return minari.create_dataset_from_buffers(
-        name,
-        buffers,
-        observation_space=observations,
-        action_space=actions,
-        data_format=data_format,
+        name, buffers, data_format=data_format, **known
     )
 
 
@@ -79,7 +72,7 @@ def test_every_row_is_minaris_own(space, data_format, monkeypatch):
     data, manifest = load("test/set-v0")
     check_dataset(data)
     episodes = [*minari.load_dataset("test/set-v0").iterate_episodes()]
-    states = [flat(space, each.observations, len(each) + 1) for each in episodes]
+    states = [flat(space, each.observations) for each in episodes]
     columns = {
         "observation": [each[:-1] for each in states],
         ("next", "observation"): [each[1:] for each in states],
@@ -101,13 +94,11 @@ def test_every_row_is_minaris_own(space, data_format, monkeypatch):
     assert (again == data).all()
 
 
-def flat(space, observations, steps):
-    def at(node, step):
-        if isinstance(node, dict):
-            return {key: at(value, step) for key, value in node.items()}
-        return node[step]
-
-    return np.stack([spaces.flatten(space, at(observations, t)) for t in range(steps)])
+def flat(space, observations):
+    if isinstance(space, spaces.Dict):
+        parts = [flat(space[key], observations[key]) for key in sorted(space)]
+        return np.concatenate(parts, 1)
+    return observations.reshape(len(observations), -1)
 
 
 def test_the_action_space_is_mapped_to_the_unit_box():

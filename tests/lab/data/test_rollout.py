@@ -115,11 +115,9 @@ def test_same_seed_same_data_whatever_the_global_generators() -> None:
     assert not torch.equal(first[0]["observation"], other[0]["observation"])
 
 
-@pytest.mark.parametrize(
-    ("env_name", "rows"), [("hopper", 4000), ("halfcheetah", 3000)]
-)
-def test_returns_are_near_the_card(env_name: str, rows: int) -> None:
-    _, returns, _ = collect_source(env_name, "expert", rows, progress=False)
+@pytest.mark.parametrize("env_name", ["hopper", "halfcheetah"])
+def test_returns_are_near_the_card(env_name: str) -> None:
+    _, returns, _ = collect_source(env_name, "expert", 4000, progress=False)
     card = load_behavior_card()[env_name]["policies"]["expert"]
     # Loose: few episodes of chaotic dynamics, of which a rare one falls early.
     assert np.median(returns) == pytest.approx(card["stochastic_return"][0], rel=0.2)
@@ -191,7 +189,8 @@ def test_ways_are_valid_and_as_short_as_a_matrix_says(free, random):
     cells = [tuple(map(int, cell)) for cell in np.argwhere(free)]
     if not cells:
         return
-    beside = np.abs(np.subtract.outer(cells, cells).diagonal(0, 1, 3)).sum(-1) == 1
+    places = np.array(cells)
+    beside = np.abs(places[:, None] - places).sum(-1) == 1
     start, goal = (random.randrange(len(cells)) for _ in range(2))
     # Cells that can be reached within 0, 1, 2, ... steps.
     reached, steps = np.arange(len(cells)) == start, 0

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from property_settings import tried
 from tensordict import TensorDict
 
-from torchrl_osr.lab.data import make_replay_buffer, write_memmap
 from torchrl_osr.lab.data.rows import (
     check_order,
     mix_datasets,
@@ -84,28 +83,6 @@ def test_it_is_what_the_episode_did_next(lengths) -> None:
         wanted += [data["action"][row + step].item() for step in range(1, length)] + [0]
         row += length
     assert next_action(data).squeeze(-1).tolist() == wanted
-
-
-@tried(20)
-@given(LENGTHS, st.randoms(use_true_random=False))
-def test_drawn_from_disk_it_is_the_same(tmp_path_factory, lengths, random) -> None:
-    data = episodes([*lengths, 3])
-    chosen = random.sample(range(len(data)), k=random.randrange(len(data)))
-    left_out = torch.tensor(sorted(chosen), dtype=torch.long)
-    stored, _ = write_memmap([data], tmp_path_factory.mktemp("set") / "data")
-
-    def read(data, rows):
-        batch = data[rows]
-        batch["next", "action"] = next_action(data, rows)
-        return batch
-
-    options = {"batch_size": 64, "seed": 0, "read": read}
-    buffer = make_replay_buffer(stored, left_out=left_out, **options)
-    data["next", "action"] = next_action(data)
-    batch = buffer.sample()
-    rows = (batch["observation"] == data["observation"].squeeze(-1)).int().argmax(-1)
-    assert not set(rows.tolist()) & set(chosen)
-    assert (batch == data[rows]).all()
 
 
 def test_rows_in_no_order_are_refused_by_number() -> None:

@@ -114,15 +114,10 @@ def test_recorded_data_are_read(source, on_disk, tmp_path):
     assert other["normalized_score"] is None
     with pytest.raises(ValueError, match=r"11 observation and 3 .*Walker2d-v5 has 17"):
         load_dataset("walker2d", source, env_id="Walker2d-v5", **options)
-
-
-def test_a_set_that_was_written_by_hand(tmp_path):
-    rows, _ = roll_out("medium")
-    write_memmap([rows], tmp_path / "mine")
-    for on_disk in (False, True):
-        data, _ = load_dataset("hopper", path=str(tmp_path / "mine"), on_disk=on_disk)
-        assert is_memory_mapped(data) == on_disk
-        assert (data == rows).all()
+    write_memmap([rows], tmp_path / "mine")  # a set of one's own
+    data, _ = load_dataset("hopper", path=str(tmp_path / "mine"), on_disk=on_disk)
+    assert is_memory_mapped(data) == on_disk
+    assert (data == rows).all()
 
 
 def test_a_converted_log_is_kept_until_the_file_or_an_option_changes(cache, tmp_path):
@@ -138,17 +133,13 @@ def test_a_converted_log_is_kept_until_the_file_or_an_option_changes(cache, tmp_
     assert len(load_dataset(path=path, on_disk=True)[0]) < 100
 
 
-def test_bounds_come_from_the_environment_unless_given(tmp_path):
+@pytest.mark.parametrize(("bounds", "high"), [(None, 2), ([[-4.0], [4.0]], 4)])
+def test_bounds_come_from_the_environment_unless_given(tmp_path, bounds, high):
     columns = make_columns()
     columns["action"] = 2 * columns["action"][:, :1]
-    path = str(save(tmp_path / "log.npz", columns))
-    data, _ = load_dataset(path=path, env_id="Pendulum-v1")
-    expected, _ = transitions_from_columns(columns, action_bounds=(-2, 2))
-    assert (data == expected).all()
-    options = {"env_id": "Pendulum-v1", "action_bounds": [[-4.0], [4.0]]}
-    data, manifest = load_dataset(path=path, **options)
-    assert manifest["action_bounds"] == [[-4.0], [4.0]]
-    expected, _ = transitions_from_columns(columns, action_bounds=(-4, 4))
+    path = save(tmp_path / "log.npz", columns)
+    data, _ = load_dataset(path=path, env_id="Pendulum-v1", action_bounds=bounds)
+    expected, _ = transitions_from_columns(columns, action_bounds=(-high, high))
     assert (data == expected).all()
 
 

@@ -69,19 +69,15 @@ def test_a_set_is_replaced_and_other_folders_are_not(data, tmp_path):
 
 
 def test_bad_rows_are_not_written(tmp_path, data, monkeypatch):
-    with pytest.raises(ValueError, match="there is no row to write"):
-        write_memmap([], tmp_path / "set")
     usage = namedtuple("usage", "free")
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "disk_usage", lambda _: usage(2 * 39 * 25 - 1))
         with pytest.raises(OSError, match="not enough disk space"):
             write(data, tmp_path / "set")
-    data["action"][:20] = 0  # one chunk of it may be zero
-    assert len(write(data, tmp_path / "zero", 10)[0]) == ROWS
     data["observation"][37] = torch.nan
-    with pytest.raises(ValueError, match="'observation' holds NaN"):
+    with pytest.raises(ValueError, match="'observation'.* holds NaN"):
         write(data, tmp_path / "set")
-    assert [path.name for path in tmp_path.iterdir()] == ["zero"]
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.fixture

@@ -17,18 +17,6 @@ NAMED = {"observation": ["x", "theta", "v"], "action": ["u", "w"], "episode": "r
 WANTED = NAMED | {"reward": "cost", "terminated": "fell"}
 
 
-def flat(columns):
-    """Return a frame with one column for each number."""
-    frame = {}
-    for name, column in columns.items():
-        wide = column.reshape(len(column), -1)
-        names = (
-            [f"{name}_{i}" for i in range(wide.shape[1])] if column.ndim > 1 else [name]
-        )
-        frame |= dict(zip(names, wide.T, strict=True))
-    return pd.DataFrame(frame)
-
-
 def robot(**changes):
     """Return a robot's log, whose columns are called as its driver calls them."""
     columns = make_columns(120)
@@ -64,13 +52,6 @@ def test_all_kinds_of_files_hold_the_same(tmp_path, ending):
     path.write_bytes(path.read_bytes()[:2000])
     with pytest.raises(ValueError, match=r"log\.\w+"):
         load_dataset(path=path)
-
-
-def test_usual_names_need_no_word(write):
-    data, manifest = load_dataset(path=write(flat(make_columns())))
-    assert (data == transitions_from_columns(make_columns())[0]).all()
-    names = ["observation_0", "observation_1", "observation_2"]
-    assert manifest["columns"]["observation"] == names
 
 
 @pytest.mark.parametrize(
@@ -134,24 +115,18 @@ def test_steps_bring_the_rows_of_an_episode_into_order(write, clock):
 
 
 def test_several_files_are_one_log(tmp_path):
-    columns = make_columns(120)
-    halves = [
-        {n: c[part] for n, c in columns.items()} for part in (slice(60), slice(60, 120))
-    ]
+    columns = make_columns(120) | {"episode": np.arange(120) % 60 // 40}
+    del columns["truncated"], columns["terminated"]
+    halves = [{n: c[i : i + 60] for n, c in columns.items()} for i in (0, 60)]
     paths = [str(save(tmp_path / f"{i}.npz", half)) for i, half in enumerate(halves)]
-    parts = [transitions_from_columns(half)[0] for half in halves]
+    names = {"terminated": False}
+    parts = [load_dataset(path=path, columns=names)[0] for path in paths]
     for path in (paths, str(tmp_path / "*.npz")):
-        data, manifest = load_dataset(path=path)
+        data, manifest = load_dataset(path=path, columns=names)
         assert (data == torch.cat(parts)).all()
         assert manifest["path"] == paths
     # Episodes are numbered anew in each file.
-    numbered = [half | {"episode": np.arange(60) // 40} for half in halves]
-    for path, half in zip(paths, numbered, strict=True):
-        del half["truncated"]
-        save(tmp_path / path, half | {"terminated": np.zeros(60)})
-    _, manifest = load_dataset(path=paths)
-    lengths = manifest["episode_lengths"] + manifest["incomplete_lengths"]
-    assert sorted(lengths) == [20, 20, 40, 40]
+    assert manifest["incomplete_lengths"] == [40, 20, 40, 20]
 
 
 def test_rows_without_ends_and_values(write):
@@ -165,45 +140,38 @@ def test_rows_without_ends_and_values(write):
     assert manifest["unmarked_ends"] == 3
 
 
+USUAL = ["obs_10", "obs_2", "action", "reward", "terminated", "episode"]
+
+
+def test_names_are_found_in_the_order_of_their_numbers():
+    columns = find_columns(USUAL, {})
+    assert columns["observation"] == ["obs_2", "obs_10"]
+    assert [*columns] == ["observation", "action", "reward", "terminated", "episode"]
+    named = {"observation": "obs_*", "action": "action"}
+    assert find_columns([*USUAL, "note"], named) == columns
+    named["observation"] = USUAL[:2]
+    assert find_columns(USUAL, named)["observation"] == USUAL[:2]
+
+
 @pytest.mark.parametrize(
-    ("changes", "columns", "message"),
+    ("names", "wanted", "message"),
     [
-        ({"u": "fast"}, {}, "'u' holds other than numbers: .*fast"),
-        ({"fell": [0.0] * 119 + [0.5]}, {}, "'terminated' holds 0.5 in row 119"),
-        (
-            {},
-            {"action": "force"},
-            r"columns\.action=force names 0 columns; there are x",
-        ),
-        ({}, {"action": "x"}, "column 'x' is read twice"),
-        ({}, {"episode": None}, "the data lack truncated or episode; there"),
-        ({}, {"terminated": None}, "lack terminated; .*terminated=false if noth"),
+        (USUAL, {"action": "force"}, r"action=force names 0 columns; there are obs_10"),
+        (USUAL, dict.fromkeys(("action", "reward"), "obs_2"), "'obs_2' is read twice"),
+        (USUAL[:-1], {}, "the data lack truncated or episode; there"),
+        (USUAL[:4], {}, "lack terminated.*terminated=false if noth"),
+        ([*USUAL, "note"], {}, "unknown columns note"),
     ],
 )
-def test_a_wrong_log_is_one_sentence(write, changes, columns, message):
-    wanted = WANTED | columns
+def test_wrong_columns_are_named(names, wanted, message):
     with pytest.raises(ValueError, match=message):
-        load_dataset(path=write(robot(**changes)), columns=wanted)
-
-
-def test_unknown_columns_are_refused_unless_some_are_named(write):
-    with pytest.raises(ValueError, match="unknown columns note"):
-        load_dataset(path=write(flat(make_columns()).assign(note=1)))
-
-
-def test_entries_are_in_the_order_of_their_numbers():
-    names = [f"q{number}" for number in (10, 2, 0, 11)]
-    others = ["action_x", "reward", "terminated", "episode"]
-    columns = find_columns([*others, *names], {"observation": "q*"})
-    assert columns["observation"] == ["q0", "q2", "q10", "q11"]
-    asked = find_columns([*others, *names], {"observation": names})
-    assert asked["observation"] == names
+        find_columns(names, wanted)
 
 
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
-        ("obs_0,action,reward,reward\n1,2,3,4\n", "lack terminated"),
+        ("obs_0,action,reward,terminated,episode\n1,a,3,0,0\n", "'action' holds other"),
         ("obs_0,action,reward,terminated,episode\n1,.2,3,0,0,9\n", "more values than"),
         ("obs_0,action,reward,terminated,episode\n1,.2,3\n", "no value in row 0"),
     ],

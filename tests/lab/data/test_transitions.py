@@ -49,11 +49,6 @@ def test_recorded_next_observation_keeps_every_row():
     assert (len(data), manifest["dropped_rows"]) == (6, 0)
     # These rows do not follow one another, so that no sum of rewards is a return.
     assert manifest["return"] is None
-    observation = log()["observation"]
-    following = np.r_[observation[1:], [[99.0, 99.0]]]
-    following[4] = 0.0
-    _, manifest = transitions_from_columns(log(next_observation=following))
-    assert manifest["episode_returns"] == [7.0]
 
 
 def test_episode_numbers_are_ends_and_cuts_become_truncated():
@@ -63,9 +58,6 @@ def test_episode_numbers_are_ends_and_cuts_become_truncated():
     assert data["observation"][:, 0].tolist() == [1, 3, 5, 7]
     assert flags(data, "truncated") == [0, 0, 0, 1]
     assert (manifest["dropped_rows"], manifest["episode_returns"]) == (2, [7.0])
-    following = rows["observation"] + 1
-    data, manifest = transitions_from_columns(rows | {"next_observation": following})
-    assert flags(data, "truncated") == [0, 0, 0, 0, 1, 1]
 
 
 def test_actions_are_mapped_to_the_unit_box_and_clipped():

@@ -1,8 +1,6 @@
 """Minari data sets, HDF5 or Arrow, read through the ``minari`` library.
 
-TorchRL 0.11 to 0.14.1 has a reader whose every field is zero
-(``MinariExperienceReplay``). Minari stores ``T + 1`` observations of an
-episode: every row has its true next observation.
+TorchRL 0.11 to 0.14.1 has a reader whose every field is zero.
 """
 
 from __future__ import annotations
@@ -103,11 +101,6 @@ def _read(
         steps += count
         states = [_leaf(episode.observations, *leaf) for leaf in leaves.items()]
         observation = np.concatenate(states, axis=1)
-        if len(observation) != count + 1:
-            raise ValueError(
-                f"episode {number} has {count} rewards and {len(observation)} "
-                "observations; expected one more observation."
-            )
         yield {
             "observation": observation[:-1],
             "next_observation": observation[1:],

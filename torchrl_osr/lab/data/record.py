@@ -1,7 +1,4 @@
-"""Record episodes of any policy in any environment as a log.
-
-Shapes: ``N`` steps, ``S`` observation, ``A`` action.
-"""
+"""Record episodes of any policy in any environment as a log."""
 
 from __future__ import annotations
 
@@ -31,18 +28,11 @@ def record_episodes(
     seed: int = 0,
     progress: bool = True,
 ) -> dict[str, NDArray[Any]]:
-    """Play whole episodes and keep every step.
+    """Play whole episodes, seeded ``seed, seed + 1, ...``, and keep every step.
 
-    Args:
-        env: the environment, in its own units.
-        act: the policy; ``None`` draws actions uniformly.
-        num_episodes: number of episodes, at least 1.
-
-    Keyword Args:
-        noise: standard deviation of Gaussian noise on actions, in half-widths of their
-            bounds, which they are clipped to; of discrete actions the share that is
-            drawn uniformly instead.
-        seed: the episodes are seeded ``seed, seed + 1, ...``, and the draws by it.
+    Without ``act`` actions are drawn uniformly. ``noise`` is the standard deviation of
+    Gaussian noise on actions, in half-widths of their bounds, which they are clipped
+    to; of discrete actions the share that is drawn uniformly instead.
     """
     most = 1.0 if isinstance(env.action_space, spaces.Discrete) else math.inf
     if num_episodes < 1 or not 0 <= noise <= most:

@@ -69,7 +69,6 @@ STIFFNESS, DAMPING = 2.0, 0.4
 ACTION_NOISE = 0.5
 
 Collection = tuple[TensorDict, NDArray[np.float64], NDArray[np.int64]]
-"""Transitions ``[N]``; returns and lengths ``[E]`` of complete episodes."""
 
 
 def behavior_of(env_name: str, source: str) -> dict[str, Any]:

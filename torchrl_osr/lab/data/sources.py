@@ -65,9 +65,8 @@ def load_dataset(
 ) -> Dataset:
     """Load a data set that is rolled out on this machine, or a recorded one.
 
-    A rolled-out set is collected at first use, about 10,000 transitions a second, and
-    read from the cache folder ever after. The same seed gives the same data on one
-    machine and one set of library versions: contact dynamics are chaotic.
+    A rolled-out set is collected at first use and read from the cache folder ever
+    after.
 
     Args:
         env_name: short name of the task, such as ``"hopper"``; any, or ``None``, for
@@ -82,27 +81,18 @@ def load_dataset(
         references: scale of the scores. Default: D4RL's, if there are any.
         path: file of a log, a list or a pattern of files, or a folder of
             :func:`~torchrl_osr.lab.data.write_memmap`; name or folder of a Minari set.
-        columns: of a ``"file"``, names of columns by their part: those of
-            :func:`~torchrl_osr.lab.data.transitions_from_columns`, and ``step``, by
-            which the rows of an episode are sorted. Names may be patterns
-            (``"obs_*"``), or lists. ``terminated=False``: nothing ends the task.
-            Default: the usual names.
+        columns: of a ``"file"``, names, patterns or lists of columns by their part,
+            see ``docs/your_data.md``. Default: the usual names.
         action_bounds: lowest and highest action of the recording. Default: of
             ``"minari"`` its action space; otherwise the task's own bounds.
         clip_actions, missing: see
             :func:`~torchrl_osr.lab.data.transitions_from_columns`.
         download: fetch the Minari set of that name.
-        num_transitions: exact number of rolled-out transitions.
-        random_share: share of the rolled-out rows that are random instead: limited
-            valuable data, section 5.3 of the paper. They are mixed in memory.
-        seed: of the roll-outs, and of the choice of random rows.
+        num_transitions, seed: exact number of rolled-out rows, and their seed.
+        random_share: share of the rolled-out rows that are random instead.
         on_disk: leave the rows memory-mapped. They are converted in parts: a file of
             a log, or many episodes of Minari, at a time.
         progress: show a progress bar when on a terminal.
-
-    Returns:
-        The transitions ``[N]`` and their manifest; ``"normalized_score"`` in it is
-        ``None`` without reference returns or without a complete episode.
 
     Examples:
         >>> from torchrl_osr.lab.data import load_dataset

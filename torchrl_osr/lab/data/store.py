@@ -158,11 +158,7 @@ def load_or_write(
         except (OSError, ValueError) as flaw:
             if folder.exists():
                 torchrl_logger.warning(f"Making {folder} anew: {flaw}")
-
-        def described() -> dict[str, Any]:
-            return {**wanted, **describe()}
-
-        return write_memmap(chunks(), folder, describe=described)
+        return write_memmap(chunks(), folder, describe=lambda: {**wanted, **describe()})
 
 
 def _checksum(folder: Path) -> str:
@@ -185,7 +181,7 @@ class MemmapStorage(Storage):
         device: torch.device,
         read: Reader | None,
     ) -> None:
-        left_out = torch.empty(0, dtype=torch.long) if left_out is None else left_out
+        left_out = torch.arange(0) if left_out is None else left_out
         super().__init__(len(data) - len(left_out))
         self.data, self.device, self.read = data, device, read or operator.getitem
         # Before row i of the rest lie as many of the left-out ones as have no more than
@@ -225,18 +221,7 @@ def make_replay_buffer(
     does not prefetch, because threads would make the order of the draws depend on time.
     Memory-mapped rows stay on disk; ``read`` returns them by their numbers, and those
     ``left_out``, sorted, are not drawn.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_osr.lab.data import make_replay_buffer
-        >>> data = TensorDict({"observation": torch.rand(100, 3)}, batch_size=[100])
-        >>> buffer = make_replay_buffer(data, batch_size=8, seed=0)
-        >>> buffer.sample()["observation"].shape
-        torch.Size([8, 3])
     """
-    if data.ndim != 1 or not len(data):
-        raise ValueError(f"data has batch size {[*data.shape]}; expected [N], N > 0.")
     device = torch.device(device or data.device or "cpu")
     options: dict[str, Any] = {
         "batch_size": batch_size,

@@ -1,8 +1,4 @@
-"""Logs of your own as tables: CSV, Parquet, HDF5 or NumPy archives.
-
-The parts of a log are columns that you name, or those with the usual names. A vector is
-a column of rows ``[N, D]``, or several columns.
-"""
+"""Logs of your own as tables: CSV, Parquet, HDF5 or NumPy archives."""
 
 from __future__ import annotations
 
@@ -44,20 +40,14 @@ USUAL_NAMES = {
 
 VECTORS = ("observation", "action", "next_observation")
 
-ColumnNames = Mapping[str, str | Sequence[str] | bool | None]
-"""Names or patterns (``obs_*``) of columns, by the keys of ``USUAL_NAMES``.
-
-``None`` stands for the usual names; ``terminated=False`` for a task that never ends.
-"""
-
 
 def open_log(
     path: str | Path | Sequence[str],
-    columns: ColumnNames,
+    columns: Mapping[str, Any],
     options: Reading,
     source: str = "file",
 ) -> Recording:
-    """Open a log without reading a row."""
+    """Open a log without reading a row; ``columns`` names its parts."""
     files = _files(path)
     paths = [str(file) for file in files]
     about: dict[str, Any] = {"source": source, "column_names": {**columns}}
@@ -135,7 +125,9 @@ def _read_csv(path: Path) -> pd.DataFrame:
     return frame.rename(columns=str.strip)
 
 
-def find_columns(names: Sequence[str], wanted: ColumnNames) -> dict[str, list[str]]:
+def find_columns(
+    names: Sequence[str], wanted: Mapping[str, Any]
+) -> dict[str, list[str]]:
     """Names of the columns of each part; without ``wanted``, all must be known."""
     if unknown := wanted.keys() - USUAL_NAMES.keys():
         raise ValueError(
