@@ -5,7 +5,7 @@ Shapes: ``B`` batch (any leading dimensions).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
@@ -46,10 +46,3 @@ def column(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
             "size and a last dimension of 1."
         )
     return value.squeeze(-1)
-
-
-def select(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> TensorDictBase:
-    """The entries ``keys``, all of which must be there (see :func:`entry`)."""
-    for key in keys:
-        entry(tensordict, key)
-    return tensordict.select(*keys)

@@ -21,9 +21,6 @@ from torch import Tensor
 
 from torchrl_osr._extras import needed_by
 
-CHECKSUM = "checksum"
-"""Where the record of a file of tensors has their SHA-256."""
-
 RECORD = "torchrl_osr"
 """Where a file of tensors, or a graph, has its record."""
 
@@ -110,7 +107,7 @@ def write_tensors(
     with needed_by("files of tensors need", "export"):
         from safetensors.torch import save
     there = {name: each.detach().cpu().contiguous() for name, each in tensors.items()}
-    record = dict(record) | {CHECKSUM: _digest(there)}
+    record = dict(record) | {"checksum": _digest(there)}
     write_atomically(path, save(there, {RECORD: json.dumps(record)}))
 
 
@@ -123,7 +120,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             # Copies: what is mapped changes with the file.
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
             record = json.loads((file.metadata() or {})[RECORD])
-        damaged = record.pop(CHECKSUM) != _digest(tensors)
+        damaged = record.pop("checksum") != _digest(tensors)
     except (SafetensorError, KeyError, ValueError, AttributeError) as error:
         raise ValueError(
             f"{path} is no file of tensors of torchrl-osr, or damaged: {error!r}"

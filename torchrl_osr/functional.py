@@ -55,11 +55,6 @@ def categorical_kl(log_prob_p: Tensor, log_prob_q: Tensor) -> Tensor:
     An action that ``p`` never takes counts for nothing, whatever ``q`` says of it; one
     that only ``q`` never takes makes the divergence infinite. Log-probabilities are
     normalised, ``[B, n]``.
-
-    Examples:
-        >>> p, q = torch.tensor([0.5, 0.5, 0.0]), torch.tensor([0.25, 0.5, 0.25])
-        >>> round(categorical_kl(p.log(), q.log()).item(), 6)
-        0.346574
     """
     prob = log_prob_p.exp()
     # Selected before the product, not after: the gradient of 0 * inf would be nan.
@@ -119,11 +114,6 @@ def deterministic_recovery(
     :math:`KL(I \,\|\, \pi)` is infinite. This is the part of the reverse
     :math:`KL(\pi \,\|\, I)` that depends on the mean of a Gaussian policy of fixed
     width. The arguments are those of :func:`state_recovery`.
-
-    Examples:
-        >>> action, loc = torch.tensor([0.4, 1.0]), torch.tensor([-0.2, 0.0])
-        >>> round(deterministic_recovery(action, loc, torch.tensor(0.5)).item(), 6)
-        2.72
     """
     # Of equal widths, only the means are left in the divergence.
     scale = inverse_dynamics_scale
@@ -168,10 +158,6 @@ def bootstrap_value(
         log_prob: log-density of the action, ``[B]``, for SAC's target with its
             entropy. Default ``None``, the paper's.
         alpha: entropy temperature, a scalar.
-
-    Examples:
-        >>> bootstrap_value(torch.tensor([[1.0, 4.0], [2.0, 3.0]]))
-        tensor([1., 3.])
     """
     value = qvalue.min(0).values
     return value if log_prob is None else value - alpha * log_prob
@@ -189,11 +175,6 @@ def discrete_policy_value(
     "Soft Actor-Critic for Discrete Action Settings", https://arxiv.org/abs/1910.07207:
     nothing is sampled. With ``alpha=0`` it is minus the value of the state. The
     policy's log-probabilities are normalised, ``[B, n]``, the values ``[N, B, n]``.
-
-    Examples:
-        >>> qvalue = torch.tensor([[[2.0, 1.0]], [[3.0, 0.0]]])
-        >>> discrete_policy_value(torch.tensor([[0.25, 0.75]]).log(), qvalue, 0.0)
-        tensor([-0.5000])
     """
     prob = log_prob.exp()
     # 0 log 0 = 0, as in categorical_kl.

@@ -19,7 +19,7 @@ from torch import Tensor
 from torchrl.modules import TanhNormal
 
 from torchrl_osr._checks import check_choice, check_positive, check_weight
-from torchrl_osr._entries import entry, nested, select
+from torchrl_osr._entries import entry, nested
 from torchrl_osr.lab.losses.ensembles import jeffreys_divergence
 from torchrl_osr.objectives.actor_critic import ActorCriticLoss
 from torchrl_osr.objectives.networks import distribution
@@ -87,7 +87,7 @@ class Adversary:
         def qvalue(states: TensorDictBase, action: Tensor) -> Tensor:
             return loss.q(states, action, critics)
 
-        worst = self.perturb(select(tensordict, keys), keys, policy, qvalue)
+        worst = self.perturb(tensordict.select(*keys), keys, policy, qvalue)
         tensordict = tensordict.copy()
         for key in keys:
             tensordict.set(nested(loss.tensor_keys.perturbed, key), worst.get(key))
