@@ -69,9 +69,6 @@ class DynamicsEnsemble(nn.Module):
         action_key: NestedKey = "action",
     ) -> None:
         super().__init__()
-        if not 1 <= num_elites <= num_networks:
-            limit = f"num_networks={num_networks}"
-            raise ValueError(f"num_elites={num_elites} must be between 1 and {limit}.")
         self.observation_dim, self.action_dim = observation_dim, action_dim
         self.num_networks, self.num_elites = num_networks, num_elites
         self.num_cells = list(num_cells)

@@ -83,19 +83,19 @@ class DynamicsOptions:
 
     def check(self, env_id: str, *, batch_size: int, gamma: float) -> None:
         """Raise a ValueError if the options contradict each other or the task."""
-        self.ensemble(1, 1)
         for name, known in (
             ("terminations", ("auto", "never")),
             ("unknown", ("refuse", "halt", "take")),
         ):
             check_choice(f"dynamics.{name}", getattr(self, name), known)
-        if self.real_ratio == 1:
-            return
-        self.termination(env_id)
-        real = round(self.real_ratio * batch_size)
-        if not 0 < real < batch_size:
+        rolled_out, real = self.real_ratio != 1, round(self.real_ratio * batch_size)
+        if rolled_out:
+            self.termination(env_id)
+        if not 1 <= self.num_elites <= self.num_networks:
+            why = f"num_elites={self.num_elites} must be between 1 and num_networks"
+        elif rolled_out and not 0 < real < batch_size:
             why = f"real_ratio={self.real_ratio}: {real} of {batch_size} rows are real"
-        elif self.unknown == "halt" and gamma == 1:
+        elif rolled_out and self.unknown == "halt" and gamma == 1:
             why = "unknown=halt needs optim.gamma below 1"
         else:
             return

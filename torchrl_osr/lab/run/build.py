@@ -138,8 +138,7 @@ def _check_combination(config: TrainConfig, learner: Learner) -> None:
         raise ValueError(f"{why}.")
     if dynamics.use:
         batch_size, gamma = config.trainer.batch_size, config.optim.gamma
-        with torch.random.fork_rng(devices=[]):  # it builds a model to try it
-            dynamics.check(config.env.id, batch_size=batch_size, gamma=gamma)
+        dynamics.check(config.env.id, batch_size=batch_size, gamma=gamma)
 
 
 def read_environment(env: EnvConfig) -> EnvironmentSpec:
