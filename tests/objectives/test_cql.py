@@ -1,4 +1,4 @@
-"""CQLLoss against a plain restatement of its equations, and SAC-N.
+"""CQLLoss, OSRLoss and the authors' released variant against plain restatements.
 
 "Conservative Q-Learning" (Kumar et al. 2020, https://arxiv.org/abs/2006.04779) and its
 common implementations for the options, "Uncertainty-Based Offline Reinforcement
@@ -8,11 +8,19 @@ https://arxiv.org/abs/2110.01548) for SAC-N.
 
 from __future__ import annotations
 
+import copy
 import math
 
 import pytest
 import torch
-from objectives.losses import Networks, call, make_batch, make_loss, update_targets
+from objectives.losses import (
+    Networks,
+    call,
+    density,
+    make_batch,
+    make_loss,
+    update_targets,
+)
 from objectives.plain import (
     ALPHA,
     BOX,
@@ -25,10 +33,13 @@ from objectives.plain import (
     compare,
     prepare,
 )
+from torch import Tensor
+from torch.distributions import kl_divergence
 
-from torchrl_osr import CQLLoss
+from torchrl_osr import CQLLoss, OSRLoss
 
-LAGRANGE = {"target_action_gap": 2.0}
+RECOVERY_WEIGHT = 0.75
+ENSEMBLE = {"min_q_weight": 0.0, "deterministic_backup": False}
 VARIANTS = {
     "CQL(H)": {},
     "CQL(H) on D_tot": {"actor_states": "both"},
@@ -36,15 +47,32 @@ VARIANTS = {
     "CQL(H) with its options: clipped": {"clip_diff_min": 5.9},
     "CQL(H) with its options: max backup": {"max_q_backup": True},
     "CQL(H) with its options: entropy": {"deterministic_backup": False},
-    "CQL(H) with its options: gap": LAGRANGE,
+    "CQL(H) with its options: gap": {"target_action_gap": 2.0},
     "CQL(H) with its options: all": {
         "clip_diff_min": 5.9,
         "target_action_gap": -1.0,
         "max_q_backup": True,
     },
-    "SAC-N": {"min_q_weight": 0.0, "deterministic_backup": False},
+    "SAC-N": ENSEMBLE,
+    "OSR": {},
+    "OSR: temperature 1": {"temperature": 1.0},
+    "OSR-10": ENSEMBLE,
 }
-STATES = {"clean": slice(0, 1), "perturbed": slice(1, 2), "both": slice(0, 2)}
+
+
+def recovery(plain: PlainCQL, model, batch, *, released: bool = False) -> Tensor:
+    """Return the weighted recovery term, over rows with a next state."""
+    pushed, valid = (
+        batch["perturbed", "observation"],
+        ~batch["next", "done"].squeeze(-1),
+    )
+    s = torch.stack([pushed] if released else [batch["observation"], pushed])
+    with torch.no_grad():
+        wanted = density(model, s, batch["next", "observation"].expand_as(s))
+    pair = [wanted, plain.policy(s)]
+    each = kl_divergence(*(pair[::-1] if released else pair)).sum(-1)
+    each = each / 2 if released else each
+    return RECOVERY_WEIGHT * each.mean(0)[valid].mean()
 
 
 @pytest.mark.parametrize("number", [1, 3])
@@ -52,22 +80,44 @@ STATES = {"clean": slice(0, 1), "perturbed": slice(1, 2), "both": slice(0, 2)}
 def test_losses_and_gradients_equal_the_restatement(check, variant, number) -> None:
     bounds = UNIT if number == 1 else BOX
     networks, batch = Networks(number=number, **bounds), make_batch("osr", 10)
-    options = VARIANTS[variant]
-    loss = CQLLoss(networks.actor, networks.critics, **(DEFAULTS | SOFT | options))
+    options, recovers = VARIANTS[variant], variant.startswith("OSR")
+    plain, model = PlainCQL(networks, **options), copy.deepcopy(networks.model)
+    states = torch.stack([batch["observation"], batch["perturbed", "observation"]])
+    if not recovers and "actor_states" not in options:
+        states = states[:1]
+
+    def restated() -> dict[str, Tensor]:
+        found = plain.losses(batch, states)
+        if recovers:
+            found["loss_actor"] = found["loss_actor"] + recovery(plain, model, batch)
+        return found
+
+    given = DEFAULTS | SOFT | options
+    parts = networks.actor, networks.critics
+    if recovers:
+        loss = OSRLoss(*parts, networks.model, recovery_weight=RECOVERY_WEIGHT, **given)
+    else:
+        loss = CQLLoss(*parts, **given)
     loss = update_targets(loss.double())
     if "target_action_gap" in options:
         loss.log_alpha_prime.data.fill_(LOG_PRIME)
-    states = options.get("actor_states", "clean")
-    plain = PlainCQL(networks, **options)
-    both = torch.stack([batch["observation"], batch["perturbed", "observation"]])
-    compare(
-        check,
-        variant.partition(":")[0],
-        prepare(loss),
-        batch,
-        lambda: plain.losses(batch, both[STATES[states]]),
-        plain.networks,
-    )
+    label = variant.partition(":")[0]
+    compare(check, label, prepare(loss), batch, restated, plain.networks)
+
+
+def test_released_variant_equals_the_restatement(check) -> None:
+    networks, batch = Networks(**BOX), make_batch("osr", 10)
+    plain, model = PlainCQL(networks), copy.deepcopy(networks.model)
+    loss = make_loss("official", networks, **(DEFAULTS | SOFT))
+    loss.recovery.recovery_weight = RECOVERY_WEIGHT
+
+    def restated() -> dict[str, Tensor]:
+        term = recovery(plain, model, batch, released=True)
+        clean = batch["observation"].unsqueeze(0)
+        return plain.losses(batch, clean) | {"loss_recovery": term}
+
+    label = "OSR, official variant"
+    compare(check, label, prepare(loss), batch, restated, plain.networks)
 
 
 def test_metrics_and_priorities_are_what_they_are_called() -> None:

@@ -146,14 +146,10 @@ def other_loss(kind: str, networks: Networks):
     return update_targets(loss.double())
 
 
-def backward(losses, parameters) -> list[Tensor]:
+def backward(losses, parameters) -> tuple[Tensor, ...]:
     """Return the gradients of one backward over the sum of all losses."""
     total = sum(value for key, value in losses.items() if key.startswith("loss_"))
-    slopes = torch.autograd.grad(total, parameters, allow_unused=True)
-    return [
-        torch.zeros_like(parameter) if slope is None else slope
-        for parameter, slope in zip(parameters, slopes, strict=True)
-    ]
+    return torch.autograd.grad(total, parameters, materialize_grads=True)
 
 
 @pytest.mark.parametrize("kind", KINDS)
