@@ -34,7 +34,8 @@ from torchrl_osr.lab.run.build import Learner
 from torchrl_osr.lab.run.data import load_training_data
 from torchrl_osr.lab.run.folder import Run, open_run
 from torchrl_osr.lab.run.load import CHECKPOINTS
-from torchrl_osr.lab.run.parts import (
+from torchrl_osr.lab.run.schema import TrainConfig, register
+from torchrl_osr.lab.run.train import (
     adam,
     averaged,
     evaluation,
@@ -44,7 +45,6 @@ from torchrl_osr.lab.run.parts import (
     save_policies,
     trainer_options,
 )
-from torchrl_osr.lab.run.schema import TrainConfig, register
 from torchrl_osr.modules import (
     critic_ensemble,
     tanh_gaussian_actor,

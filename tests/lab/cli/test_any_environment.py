@@ -111,15 +111,14 @@ def test_without_a_simulator_a_log_still_makes_a_policy(tmp_path, capsys):
     [
         (["env.id=Pendulum-v1", "path=there.npz"], "there.npz exists"),
         (["path=log.npz"], "env.id is not given"),
-        (["env=hopper", "path=a.npz", "policy=good"], "neither random"),
-        (["env=hopper", "path=a.npz", "policy=no:act"], "cannot be imported"),
-        (["env=hopper", "path=a.npz", "noise=0.1"], "random has none"),
+        (["env=hopper", "path=a.npz", "policy=good"], "no run .* at good"),
+        (["env=hopper", "path=a.npz", "policy=no:act"], "No module named 'no'"),
     ],
 )
 def test_collect_refuses_in_a_sentence(overrides, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "there.npz").write_bytes(b"mine")
-    with pytest.raises((ValueError, FileExistsError), match=message):
+    with pytest.raises((ValueError, OSError, ImportError), match=message):
         collect.main(composed("collect", *overrides))
     assert (tmp_path / "there.npz").read_bytes() == b"mine"
 

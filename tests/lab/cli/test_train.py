@@ -7,9 +7,7 @@ import re
 import subprocess
 import sys
 from importlib.metadata import version
-from pathlib import Path
 
-import numpy as np
 import pytest
 from composed import CONF
 
@@ -24,28 +22,17 @@ def sizes(tiny) -> list[str]:
     )  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory, sizes) -> tuple[Path, str]:
-    cwd = tmp_path_factory.mktemp("finished")
-    with pytest.MonkeyPatch.context() as patch:
-        # GNU's OpenMP says what it has read, when torch is imported.
-        patch.setenv("OMP_DISPLAY_ENV", "true")
-        patch.delenv("OMP_WAIT_POLICY", raising=False)
-        # A process that imports torch itself.
-        command = [sys.executable, "-m", "torchrl_osr.lab", SCRIPT, *sizes]
-        output = subprocess.check_output(
-            [*command, "hydra.run.dir=run"],
-            cwd=cwd, text=True, stderr=subprocess.STDOUT,
-        )  # fmt: skip
-    return cwd / "run", output
-
-
-def test_run_leaves_table_figure_returns_and_checkpoints(finished):
-    folder, output = finished
+def test_run_leaves_table_figure_returns_and_checkpoints(tmp_path, sizes):
+    # A process that imports torch itself.
+    command = [sys.executable, "-m", "torchrl_osr.lab", SCRIPT, *sizes]
+    output = subprocess.check_output(
+        [*command, "hydra.run.dir=run"],
+        cwd=tmp_path, text=True, stderr=subprocess.STDOUT,
+    )  # fmt: skip
+    folder = tmp_path / "run"
     assert "held-out rows: NLL" in output
     for label in ("data, mean episode", "policy, last", "policy, best evaluation"):
         assert label in output
-    assert str(folder) in output
     assert json.loads((folder / "status.json").read_text()) == {"status": "done"}
     returns = json.loads((folder / "returns.json").read_text())
     assert returns["versions"]["torchrl"] == version("torchrl")
@@ -58,24 +45,17 @@ def test_run_leaves_table_figure_returns_and_checkpoints(finished):
         assert (folder / name).exists()
     assert "Warning" not in output
     assert "Traceback" not in output
-
-
-def test_log_has_a_line_for_each_evaluation(finished):
-    folder, output = finished
     log = (folder / "train.log").read_text()
     lines = re.findall(r"policy: (\d+)/40 \[.*, score [\d.-]+\]$", log, re.MULTILINE)
     assert lines == ["0", "20", "40"]
     assert all(line in output for line in log.splitlines())
 
 
-def test_waiting_threads_do_not_spin(finished):
-    assert "OMP_WAIT_POLICY = 'PASSIVE'" in finished[1]
-
-
 def test_the_flag_of_a_sweep_may_come_last_and_a_failed_job_is_named(
     tmp_path, run, tiny
 ):
-    arguments = [*tiny(steps="0,20"), "loss=cql", "hydra.sweep.dir=sweep", "-m"]
+    chosen = ["loss=cql", "perturbation=adversarial"]
+    arguments = [*tiny(steps="0,20"), *chosen, "hydra.sweep.dir=sweep", "-m"]
     code, output = run(tmp_path, SCRIPT, *arguments)
     assert code != 0, output
     assert "trainer.steps must be at least 1" in output
@@ -121,42 +101,10 @@ def test_recovery_is_added_to_another_loss_from_training_to_the_page(
 def test_official_preset_with_its_model_runs_in_half_precision(tmp_path, run, sizes):
     arguments = [*sizes, "preset=official", "trainer.precision=bfloat16"]
     code, output = run(tmp_path, SCRIPT, *arguments, "hydra.run.dir=run")
-    if "has no bfloat16" in output:
-        assert code != 0
-        return
     assert code == 0, output
     config = (tmp_path / "run" / "config.yaml").read_text()
     assert "standardize: false" in config
     assert "cvae_inverse_dynamics" in config
-
-
-def test_action_that_is_constant_trains_through(tmp_path, run, sizes):
-    """Its R2 does not exist: null in the file, a dash on the screen.
-
-    An adversary chooses the perturbed states meanwhile.
-    """
-    rng = np.random.default_rng(0)
-    action = rng.uniform(-0.9, 0.9, (600, 3))
-    action[:, 1] = 0.5
-    ends = np.arange(600) % 50 == 49
-    np.savez(
-        tmp_path / "log.npz",
-        observation=rng.normal(size=(600, 11)),
-        action=action,
-        reward=rng.normal(size=600),
-        terminated=np.zeros(600, bool),
-        truncated=ends,
-    )
-    arguments = [*sizes, "data=file", "data.path=log.npz", "hydra.run.dir=run"]
-    code, output = run(tmp_path, SCRIPT, *arguments, "perturbation=adversarial")
-    assert code == 0, output
-    assert (
-        "torchrl_osr.lab.losses.Adversary"
-        in (tmp_path / "run" / "config.yaml").read_text()
-    )
-    results = json.loads((tmp_path / "run" / "inverse_dynamics.json").read_text())
-    assert results["r2"][1] is None
-    assert re.search(r"R2 -?\d\.\d\d, -, -?\d\.\d\d\n", output)
 
 
 def test_help_lists_the_options_of_every_group(tmp_path, run):

@@ -54,7 +54,7 @@ def test_the_next_action_is_there_for_losses_that_read_it():
 
 def test_without_an_order_the_next_action_is_refused():
     mixed = ["data=medium", "data.random_share=0.5"]
-    with pytest.raises(ValueError, match="reads the data's next action"):
+    with pytest.raises(ValueError, match="not followed by the row that came next"):
         load(*mixed, in_keys=[("next", "action")])
 
 

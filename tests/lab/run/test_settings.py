@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 from composed import composed
-from omegaconf.errors import InterpolationResolutionError
 
 from torchrl_osr.lab.cli.settings import KEYS, main, methods, settings_of
 from torchrl_osr.lab.data.environment import environment_id
@@ -40,27 +39,11 @@ def test_every_method_has_the_settings_of_the_table(method):
         assert settings_of(cfg) == {key: row[key] for key in KEYS}, (env, source)
 
 
-def test_the_command_line_wins():
-    given = ["env=hopper", "data=medium-expert"]
-    assert composed("train", *given).loss.min_q_weight == 20
-    cfg = composed("train", *given, "loss.min_q_weight=7", "preset=paper")
-    assert (cfg.loss.min_q_weight, cfg.trainer.batch_size) == (7, 256)
-
-
 def test_settings_are_those_of_the_task_not_of_the_group():
     given = ["loss=rebrac", "data=medium-expert", "env.id=Walker2d-v5"]
     assert composed("train", *given).loss.actor_bc_coef == 0.01
     # Of data without a row they are the constructor's.
     assert composed("train", "loss=rorl", "env.id=Pendulum-v1").loss.num_samples == 20
-
-
-def test_a_setting_without_a_value_is_named():
-    cfg = composed("train", "+settings={any: {}}")
-    cfg.settings = {}
-    with pytest.raises(
-        InterpolationResolutionError, match="no value of optim.actor_lr"
-    ):
-        _ = cfg.optim.actor_lr
 
 
 def test_the_command_prints_a_row_for_each_method(capsys, monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from types import SimpleNamespace
 
@@ -53,6 +54,22 @@ def test_tensorboard_has_the_numbers_of_the_csv_files(folder):
     events.Reload()
     found = {each.step: each.value for each in events.Scalars("policy/score")}
     assert found == pytest.approx(dict(scalars["score"]))
+
+
+def test_r2_of_a_constant_action_is_null_in_the_file_and_a_dash(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    np.savez(
+        tmp_path / "log.npz",
+        observation=rng.normal(size=(600, 11)),
+        action=rng.uniform(-0.9, 0.9, (600, 3)) * [1, 0, 1],
+        reward=rng.normal(size=600),
+        terminated=np.zeros(600, bool),
+        truncated=np.arange(600) % 50 == 49,
+    )
+    folder = trained(tmp_path / "run", "data=file", f"data.path={tmp_path}/log.npz")
+    results = json.loads((folder / "inverse_dynamics.json").read_text())
+    assert results["r2"][1] is None
+    assert re.search(r"R2 -?\d\.\d\d, -, -?\d\.\d\d\n", capsys.readouterr().out)
 
 
 class FakeRun:

@@ -10,14 +10,13 @@ The log is what ``torchrl-osr train data=file`` reads. See docs/any_environment.
 from __future__ import annotations
 
 from contextlib import closing
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 
 import hydra
 import numpy as np
 import torch
 from gymnasium.spaces import Discrete
-from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_osr.lab.cli.console import single_job
@@ -40,33 +39,20 @@ register()
 @single_job
 def main(cfg: DictConfig) -> None:
     """Play the episodes, write the log, and say what is in it."""
-    if cfg.episodes < 1 or cfg.seed < 0:
-        raise ValueError("episodes must be at least 1, and seed at least 0.")
     torch.set_num_threads(1)
     path = Path(cfg.path).expanduser()
     check_log_path(path)
     env_id = None if OmegaConf.is_missing(cfg.env, "id") else str(cfg.env.id)
     act: Act | None = None
-    if cfg.policy == "random":
-        if cfg.noise:
-            raise ValueError(
-                f"noise={cfg.noise} is added to a policy's actions, and policy=random "
-                "has none of its own: leave it out."
-            )
-    elif Path(cfg.policy).exists():
+    if ":" in cfg.policy:
+        act = resolve_name(cfg.policy)
+    elif cfg.policy != "random":
         policy = load_run_policy(cfg.policy, cfg.trust)
         known = policy.record["source"].get("env_id")
         if env_id is None and known:
             check_environment(known, cfg.trust)  # the policy may come with it
             env_id = known
         act = policy.act
-    elif ":" in cfg.policy:
-        act = imported(cfg.policy)
-    else:
-        raise ValueError(
-            f"policy={cfg.policy} is neither random, nor the folder of a run, nor a "
-            "function as in policy=my_package:act."
-        )
     if env_id is None:
         raise ValueError("env.id is not given: say which environment to play.")
     with closing(open_environment(env_id)) as env:
@@ -81,27 +67,9 @@ def main(cfg: DictConfig) -> None:
             progress=cfg.progress,
         )
     write_log(path, columns)
-    print(description(path, columns))
-    print(f"  torchrl-osr train env.id={env_id} {loss}data=file data.path={path}")
-
-
-def imported(name: str) -> Act:
-    """Function of a module, as in ``"my_package:act"``."""
-    module, _, function = name.partition(":")
-    try:
-        act: Act = getattr(import_module(module), function)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(
-            f"policy={name} cannot be imported: {error}. Give a function of a module "
-            "that is installed or in the current folder, as in policy=my_package:act."
-        ) from error
-    return act
-
-
-def description(path: Path, columns: dict[str, NDArray[np.generic]]) -> str:
-    """Text of what was recorded: steps, episodes and their returns."""
     returns = np.bincount(columns["episode"], weights=columns["reward"])
-    return (
+    print(
         f"{path}: {len(columns['reward']):,} steps, {len(returns)} episodes, "
         f"return {returns.mean():.1f} ({returns.min():.1f} to {returns.max():.1f})"
     )
+    print(f"  torchrl-osr train env.id={env_id} {loss}data=file data.path={path}")

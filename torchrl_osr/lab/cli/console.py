@@ -76,7 +76,7 @@ def sentence(error: BaseException) -> str:
     if type(error).__module__.startswith(("hydra.", "omegaconf.")):
         return _configuration_error(error)
     if isinstance(error, ModuleNotFoundError):
-        return f"{error}: pip install 'torchrl-osr[train]' has what commands need."
+        return f"{error}. Commands need what 'torchrl-osr[train]' installs."
     if isinstance(error, OURS) and str(error):
         return str(error)
     return f"{type(error).__name__}: {error}\nIts traceback: add --debug."

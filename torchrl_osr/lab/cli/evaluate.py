@@ -31,12 +31,7 @@ from torchrl_osr.lab.evaluation.statistics import saved_share
 from torchrl_osr.lab.evaluation.tables import aligned_columns, robustness_table
 from torchrl_osr.lab.report.runs import find_runs
 from torchrl_osr.lab.run import CONF
-from torchrl_osr.lab.run.evaluate import (
-    evaluate_files,
-    evaluate_run,
-    file_name,
-    title_of,
-)
+from torchrl_osr.lab.run.evaluate import evaluate_files, evaluate_run, file_name
 from torchrl_osr.lab.run.folder import read_status
 from torchrl_osr.lab.run.load import checkpoints_of
 from torchrl_osr.lab.run.schema import EvaluateConfig, register
@@ -70,7 +65,11 @@ def main(cfg: DictConfig) -> None:
     else:
         path, results = evaluate_run(config)
     if config.suite.half is None:
-        print("\n" + robustness_table(title_of(results), results["summary"]))
+        title = (
+            f"{results['env']} {results['data']}, suite {results['suite']}: "
+            f"{len(results['evaluations'])} x {config.episodes} pairs of episodes"
+        )
+        print("\n" + robustness_table(title, results["summary"]))
     else:
         print("\n" + recoverable_table(results))
     print(f"  files  {path}")

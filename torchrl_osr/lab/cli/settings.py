@@ -16,6 +16,7 @@ from pathlib import Path
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_osr.lab.evaluation.tables import aligned_columns
 from torchrl_osr.lab.run import CONF
 from torchrl_osr.lab.run.schema import register
 
@@ -58,7 +59,4 @@ def main() -> None:
         for name in names:
             config = compose("train", [f"loss={name}", *rest])
             rows.append((name, *settings_of(config).values()))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        cells = zip(row, widths, strict=True)
-        print("  ".join(cell.rjust(width) for cell, width in cells))
+    print("\n".join(aligned_columns(rows)))

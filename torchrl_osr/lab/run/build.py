@@ -32,11 +32,6 @@ class Learner(NamedTuple):
     loss: LossModule  # holds the tensors of the actor, and of the critics if any
     objective: LossModule  # what is trained: the loss, with a recovery term added to it
 
-    @property
-    def has_critics(self) -> bool:
-        """Whether the loss trains critics."""
-        return hasattr(self.loss, "qvalue_network")
-
 
 def make_learner(config: TrainConfig, device: torch.device | str = "cpu") -> Learner:
     """Build networks and loss, drawn from torch's global generator.
@@ -45,12 +40,8 @@ def make_learner(config: TrainConfig, device: torch.device | str = "cpu") -> Lea
     ``qvalue_network``, ``value_network``, ``inverse_dynamics_network``,
     ``dynamics_network``, ``transition_network``.
 
-    Args:
-        config: a checked configuration with the sizes of its environment.
-        device: of the networks. Default CPU.
-
-    Raises:
-        ValueError: if options do not fit each other or the environment.
+    The configuration is checked and has the sizes of its environment. A ValueError
+    names options that do not fit each other or the environment.
     """
     env, cells = config.env, list(config.network.num_cells)
     assert env.observation_size is not None
@@ -118,9 +109,9 @@ def _check_combination(config: TrainConfig, learner: Learner) -> None:
     adversary, modules = config.perturbation.adversary, learner.objective.modules()
     rolled_out = dynamics.use and dynamics.real_ratio < 1
     reads_data = ("next", "action") in learner.objective.in_keys
-    attacked = isinstance(loss, ActorCriticLoss) and learner.has_critics
+    critics = isinstance(loss, ActorCriticLoss) and hasattr(loss, "qvalue_network")
     why = ""
-    if adversary and not (attacked and head_of(learner.actor)[0] is TanhNormal):
+    if adversary and not (critics and head_of(learner.actor)[0] is TanhNormal):
         why = "perturbation=adversarial needs critics and a tanh-Gaussian policy, which"
         why += f" {name} lacks"
     elif not dynamics.use and any(hasattr(m, "dynamics_network") for m in modules):
@@ -128,11 +119,7 @@ def _check_combination(config: TrainConfig, learner: Learner) -> None:
     elif rolled_out and (reads_data or isinstance(loss, IQLLoss)):
         why = f"{name} learns from actions of the data alone, which roll-outs lack:"
         why += " choose dynamics=none"
-    elif (
-        dynamics.use
-        and dynamics.adversarial_steps
-        and not (rolled_out and learner.has_critics)
-    ):
+    elif dynamics.use and dynamics.adversarial_steps and not (rolled_out and critics):
         why = "dynamics.adversarial_steps needs roll-outs and critics: set it to 0"
     if why:
         raise ValueError(f"{why}.")
@@ -144,9 +131,7 @@ def _check_combination(config: TrainConfig, learner: Learner) -> None:
 def read_environment(env: EnvConfig) -> EnvironmentSpec:
     """Set sizes and action bounds of a configuration from its environment.
 
-    Raises:
-        ValueError: there is no such environment, its spaces are not supported, or a
-            number was another one when the run was trained.
+    A ValueError says which of them was another one when the run was trained.
     """
     from torchrl_osr.lab.data import environment_spec  # needs Gymnasium
 

@@ -86,13 +86,7 @@ def load_training_data(
     env, options, optim = config.env, config.data, config.optim
     data, manifest = load_data(env, options, progress=config.trainer.progress)
     if with_next_action := ("next", "action") in in_keys:
-        try:
-            check_order(data)
-        except ValueError as error:
-            raise ValueError(
-                f"the loss reads the data's next action, which data={options.source} "
-                f"does not have: {error}"
-            ) from error
+        check_order(data)
     loc, scale = observation_statistics(data) if options.standardize else (0.0, 1.0)
     factor, addend = options.reward_scale, options.reward_shift
     extremes = torch.stack(data["next", "reward"].aminmax())

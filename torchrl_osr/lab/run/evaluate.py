@@ -102,14 +102,6 @@ def evaluate_files(
     return path, results
 
 
-def title_of(results: Mapping[str, Any]) -> str:
-    """Return what was played, for tables."""
-    return (
-        f"{results['env']} {results['data']}, suite {results['suite']}: "
-        f"{len(results['evaluations'])} x {results['episodes']} pairs of episodes"
-    )
-
-
 def players_of(config: EvaluateConfig, files: list[Path]) -> list[Player]:
     """Load what plays: the policy of each checkpoint, or one that switches between all.
 
@@ -169,11 +161,8 @@ def play_states(config: EvaluateConfig, players: list[Player]) -> dict[str, Any]
     run, half = players[0][0].config, config.suite.half
     assert half is not None
     states = load_recoverable_states(run.env.name, half)
-    if run.env.id != (of := environment_id(run.env.name)):
-        raise ValueError(
-            f"the recoverable states of {run.env.name} are of {of}, and the run is of "
-            f"{run.env.id}."
-        )
+    if run.env.id != (wanted := environment_id(run.env.name)):
+        raise ValueError(f"the states are of {wanted}, the run is of {run.env.id}.")
     return {
         "env": run.env.name,
         "data": run.data.source,
@@ -264,12 +253,14 @@ def _requested(
     config: EvaluateConfig, files: list[Path], folder: Path
 ) -> dict[str, Any]:
     """Everything that decides the results: settings, checkpoints' digests, versions."""
-    folder = folder.absolute()
-    names = [each.absolute().relative_to(folder).as_posix() for each in files]
+    names = [each.absolute().relative_to(folder.absolute()) for each in files]
     request: dict[str, Any] = {
         "versions": package_versions(),
         "suite": config.suite.name,
-        "checkpoints": dict(zip(names, map(sha256_of, files), strict=True)),
+        "checkpoints": {
+            name.as_posix(): sha256_of(file)
+            for name, file in zip(names, files, strict=True)
+        },
     }
     if config.suite.half is None:  # each recoverable state is played once
         levels = asdict(config.suite)["disturbances"]
