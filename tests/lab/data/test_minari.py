@@ -86,9 +86,6 @@ def test_every_row_is_minaris_own(space, data_format, monkeypatch):
         assert np.array_equal(column, np.concatenate(parts).astype(column.dtype))
     assert manifest["episode_lengths"] == LENGTHS
     assert manifest["dropped_rows"] == 0
-    layout = [("achieved/place", 3), ("achieved/speed", 1), ("desired_goal", 4)]
-    layout = [*layout, ("observation", 2)] if space is NESTED else [("", 3)]
-    assert [*map(tuple, manifest["observation_layout"])] == layout
     monkeypatch.setattr("torchrl_osr.lab.data.minari.CHUNK_ROWS", 10)
     again, _ = load(made.storage.data_path.parent, on_disk=True)
     assert (again == data).all()

@@ -7,8 +7,7 @@ import re
 import warnings
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, redirect_stderr
-from functools import reduce
-from operator import getitem
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeGuard
 
@@ -36,8 +35,6 @@ MAZE_IDS = {
 
 MAX_EPISODE = 100_000
 """Time limit of tasks that have none, in steps."""
-
-Leaves = dict[tuple[str | int, ...], "spaces.Space[Any]"]
 
 
 def known_ids() -> dict[str, str]:
@@ -108,19 +105,14 @@ def open_environment(env_id: str) -> gymnasium.Env[Any, Any]:
     """Make a Gymnasium task with actions in its own units.
 
     Observations that are dictionaries or tuples become one vector, in the order of
-    :func:`observation_leaves`. Mazes end (``terminated``) at their goal. The id
+    :func:`sorted_space`. Mazes end (``terminated``) at their goal. The id
     ``"my_package:MyRobot-v0"`` imports ``my_package`` first.
     """
     env = _registered(env_id)
     if isinstance(env.observation_space, (spaces.Dict, spaces.Tuple)):
-        leaves = observation_leaves(env.observation_space)
-        parts = spaces.Tuple([*leaves.values()])
-
-        def flatten(state: Any) -> Any:
-            entries = (reduce(getitem, name, state) for name in leaves)
-            return spaces.flatten(parts, tuple(entries))
-
+        parts = sorted_space(env.observation_space)
         flat = spaces.flatten_space(parts)
+        flatten = partial(spaces.flatten, parts)
         env = gymnasium.wrappers.TransformObservation(env, flatten, flat)
     actions: Any = env.action_space
     bounded = _is_real_vector(actions) and actions.is_bounded()
@@ -137,25 +129,19 @@ def open_environment(env_id: str) -> gymnasium.Env[Any, Any]:
     )
 
 
-def observation_leaves(space: spaces.Space[Any]) -> Leaves:
-    """Space of each entry of an observation, by its path of keys.
+def sorted_space(space: spaces.Space[Any]) -> spaces.Space[Any]:
+    """Space of an observation with the keys of dictionaries in alphabetical order.
 
-    Environments, data and policies have this order: the keys of a dictionary
-    alphabetically on every level, the parts of a tuple as they are.
+    Environments, data and policies have this order.
     """
-    if isinstance(space, (spaces.Dict, spaces.Tuple)):
-        inner: Any = space
-        keys = sorted(inner) if isinstance(space, spaces.Dict) else range(len(inner))
-        return {
-            (key, *name): leaf
-            for key in keys
-            for name, leaf in observation_leaves(inner[key]).items()
-        }
-    if not space.is_np_flattenable or (
-        space.dtype == np.uint8 and len(space.shape or ()) > 1
-    ):
+    if isinstance(space, spaces.Dict):
+        return spaces.Dict({key: sorted_space(space[key]) for key in sorted(space)})
+    if isinstance(space, spaces.Tuple):
+        return spaces.Tuple([sorted_space(part) for part in space])
+    image = space.dtype == np.uint8 and len(space.shape or ()) > 1
+    if image or not space.is_np_flattenable:
         raise ValueError(f"an observation is {space}; expected real vectors.")
-    return {(): space}
+    return space
 
 
 def _is_real_vector(space: gymnasium.Space[Any]) -> TypeGuard[spaces.Box]:

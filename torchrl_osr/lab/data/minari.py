@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import reduce
-from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +16,7 @@ from tqdm.auto import tqdm
 
 from torchrl_osr._extras import needed_by
 from torchrl_osr._files import read_json
-from torchrl_osr.lab.data.environment import Leaves, observation_leaves
+from torchrl_osr.lab.data.environment import sorted_space
 from torchrl_osr.lab.data.recording import Columns, Reading, Recording
 from torchrl_osr.lab.data.store import CHUNK_ROWS
 from torchrl_osr.lab.data.transitions import Array
@@ -58,23 +56,19 @@ def open_minari(
     elif options.action_bounds is None:
         bounds = actions.low.ravel(), actions.high.ravel()
         options = replace(options, action_bounds=bounds)
-    leaves = observation_leaves(opened.observation_space)
+    space = sorted_space(opened.observation_space)
     about = {
         "source": "minari",
         "path": str(path),
         "dataset_id": opened.id,
         "env_id": opened.env_spec and opened.env_spec.id,
         "minari_version": opened.minari_version,
-        "observation_layout": [
-            ["/".join(map(str, name)), spaces.flatdim(leaf)]
-            for name, leaf in leaves.items()
-        ],
     }
 
     def parts() -> Iterator[Columns]:
         waiting: list[dict[str, Array]] = []
         rows, left = 0, opened.total_steps
-        for episode in _read(opened, leaves, progress):
+        for episode in _read(opened, space, progress):
             waiting.append(episode)
             rows += len(episode["reward"])
             left -= len(episode["reward"])
@@ -87,7 +81,7 @@ def open_minari(
 
 
 def _read(
-    opened: minari.MinariDataset, leaves: Leaves, progress: bool
+    opened: minari.MinariDataset, space: spaces.Space[Any], progress: bool
 ) -> Iterator[dict[str, Array]]:
     """Columns of each episode; raise if some of what the set announces is missing."""
     steps, first = 0, getattr(opened.action_space, "start", 0)
@@ -99,8 +93,7 @@ def _read(
         if not count:
             continue
         steps += count
-        states = [_leaf(episode.observations, *leaf) for leaf in leaves.items()]
-        observation = np.concatenate(states, axis=1)
+        observation = _flattened(space, episode.observations)
         yield {
             "observation": observation[:-1],
             "next_observation": observation[1:],
@@ -118,9 +111,14 @@ def _read(
         )
 
 
-def _leaf(observations: Any, name: tuple[Any, ...], space: spaces.Space[Any]) -> Any:
-    """Rows ``[T + 1, D]`` of an entry of the observations."""
-    array = np.asarray(reduce(getitem, name, observations))
+def _flattened(space: Any, observations: Any) -> Any:
+    """Rows ``[T + 1, S]`` of observations, in the order of their space."""
+    if isinstance(space, (spaces.Dict, spaces.Tuple)):
+        parted: Any = space
+        keys = parted if isinstance(space, spaces.Dict) else range(len(space))
+        parts = [_flattened(parted[key], observations[key]) for key in keys]
+        return np.concatenate(parts, axis=1)
+    array = np.asarray(observations)
     if isinstance(space, spaces.Box):
         return array.reshape(len(array), -1)
     rows: list[Any] = [spaces.flatten(space, each) for each in array]
