@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import json
 import math
-import shutil
 import zipfile
 from pathlib import Path
 
@@ -267,23 +266,6 @@ def test_damaged_newest_checkpoint_falls_back_to_the_one_before(
         damage(path)
     with pytest.raises(CheckpointError, match="All 2 checkpoints"):
         make(folder).train()
-
-
-def test_checkpoint_of_another_network_is_refused(make, undisturbed):
-    with pytest.raises(CheckpointError, match=r"is \(8,\) in the file, \(16,\) here"):
-        make(undisturbed.checkpoints.folder, cells=16).train()
-
-
-def test_leftovers_of_a_kill_are_removed(make, undisturbed):
-    folder = undisturbed.checkpoints.folder
-    wanted = {path.name for path in folder.iterdir()}
-    folder.joinpath(".checkpoint-000000000005.torchrl.stage-ab").mkdir()
-    folder.joinpath(".checkpoint-000000000005.torchrl.archive-ab").touch()
-    shutil.copy(
-        undisturbed.checkpoints.latest(), folder / "checkpoint-000000000010.torchrl"
-    )
-    make(folder).resume()
-    assert {path.name for path in folder.iterdir()} == wanted
 
 
 # -- logs and hooks -------------------------------------------------------------------

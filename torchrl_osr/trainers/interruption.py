@@ -44,22 +44,16 @@ class Interrupted(SystemExit):
         return type(self), (self.reason, int(self.code or 0))
 
 
-class StopRequest:
-    """Request to end the process: the first signal that came, or ``None``."""
-
-    signal: signal.Signals | None = None
-
-
 @contextmanager
-def signals_noted() -> Iterator[StopRequest]:
-    """Note SIGTERM, SIGINT and SIGHUP in a :class:`StopRequest`.
+def signals_noted() -> Iterator[list[signal.Signals]]:
+    """Collect SIGTERM, SIGINT and SIGHUP in a list.
 
     A second Ctrl-C raises :class:`KeyboardInterrupt` at once.
     """
-    request = StopRequest()
+    came: list[signal.Signals] = []
 
     def note(number: int, frame: FrameType | None) -> None:
-        request.signal = request.signal or signal.Signals(number)
+        came.append(signal.Signals(number))
         if number == signal.SIGINT:
             signal.signal(signal.SIGINT, signal.default_int_handler)
             # A print could interrupt another one halfway, which Python refuses.
@@ -67,7 +61,7 @@ def signals_noted() -> Iterator[StopRequest]:
             os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, message.encode())
 
     with _handled_by(note):
-        yield request
+        yield came
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
+from signal import Signals
 from typing import Any, Literal
 
 import torch
@@ -26,12 +27,7 @@ from torchrl.trainers import OptimizationStepper, Trainer
 from torchrl_osr._files import finite_or_none
 from torchrl_osr.fast import NonfiniteError, Update
 from torchrl_osr.trainers.checkpoints import Checkpoints, SamplerState
-from torchrl_osr.trainers.interruption import (
-    EXIT_CODES,
-    Interrupted,
-    StopRequest,
-    signals_noted,
-)
+from torchrl_osr.trainers.interruption import EXIT_CODES, Interrupted, signals_noted
 from torchrl_osr.trainers.progress import progress_bar
 
 log = logging.getLogger(__name__)
@@ -143,7 +139,7 @@ class OfflineTrainer(Trainer):
         self.history: list[dict[str, Any]] = []
         self._saved = {"step": 0}
         self._progress = progress
-        self._stop_request = StopRequest()
+        self._signals: list[Signals] = []
         self._model = {"loss_module": update.loss_module, **(components or {})}
         parts = dict(
             **self._model,
@@ -198,10 +194,10 @@ class OfflineTrainer(Trainer):
         shown = progress_bar(
             self.description, self.total_frames, first=self.step, bar=self._progress
         )
-        with shown as self._bar, signals_noted() as self._stop_request:
+        with shown as self._bar, signals_noted() as self._signals:
             self._evaluate_if_due()  # a kill may have come between both
             super().train()
-        if self._stop_request.signal is not None:  # in the last evaluation
+        if self._signals:  # in the last evaluation
             raise self._interrupted(self.step)
 
     def resume(self) -> Path | None:
@@ -242,7 +238,7 @@ class OfflineTrainer(Trainer):
 
     def _sample(self, _: TensorDictBase) -> TensorDictBase:
         """Next batch; TorchRL's loop begins an update here, having counted it."""
-        if self._stop_request.signal is not None:
+        if self._signals:
             raise self._interrupted(self.step - 1)
         batch: TensorDictBase = self.buffer.sample()
         return batch
@@ -252,8 +248,7 @@ class OfflineTrainer(Trainer):
 
         The continued run logs means over the rest of the log interval.
         """
-        number = self._stop_request.signal
-        assert number is not None
+        number = self._signals[0]
         self._optim_count = self.collected_frames = step
         if step != self._saved["step"]:
             self._save(step)

@@ -17,12 +17,8 @@ class ReplayBufferCollector(BaseCollector):
 
     TorchRL 0.14.1's trainers take every frame from an environment. With this collector
     they train on recorded data alone: every batch is one ``replay_buffer.sample()``,
-    and frames count its rows. Such a trainer gets ``optim_steps_per_batch=1`` and no
-    ``replay_buffer`` of its own. ``examples/torchrl_trainer.py`` is one.
-
-    Args:
-        replay_buffer: has a batch size; is not written to.
-        total_frames: rows to draw, ``B`` for each gradient step.
+    and ``total_frames`` count its rows. Such a trainer gets ``optim_steps_per_batch=1``
+    and no ``replay_buffer`` of its own, see ``examples/torchrl_trainer.py``.
     """
 
     init_random_frames = 0
