@@ -17,7 +17,6 @@ from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import GymEnv
 from torchrl.objectives import SoftUpdate
-from torchrl.objectives.utils import group_optimizers
 from torchrl.trainers.algorithms import CQLTrainer
 
 from torchrl_osr import OSRLoss, OSRVLoss, StatePerturbation
@@ -49,18 +48,6 @@ def make_loss(loss_class: type = OSRLoss, **options: Any):
         tanh_gaussian_inverse_dynamics(3, 1, **BOUNDS),
         **options,
     )
-
-
-def make_optimizer(loss) -> Adam:
-    """Return one optimizer for each group of parameters, as TorchRL's scripts do."""
-    optimizers = [
-        Adam(list(loss.actor_network_params.flatten_keys().values()), lr=1e-2),
-        Adam(list(loss.qvalue_network_params.flatten_keys().values()), lr=1e-2),
-        Adam([loss.log_alpha], lr=1e-2),
-    ]
-    if loss.with_lagrange:
-        optimizers.append(Adam([loss.log_alpha_prime], lr=1e-2))
-    return group_optimizers(*optimizers)
 
 
 def make_trainer(loss, optimizer) -> CQLTrainer:
@@ -103,7 +90,7 @@ def test_cql_trainer_steps_along_the_gradient_of_all_losses(batch, kind) -> None
     out = reference(batch.clone())
     total = sum(out[key] for key in out.keys() if key.startswith("loss_"))  # noqa: SIM118
     expected = [*torch.autograd.grad(total, [*reference.parameters()])]
-    optimizer, stepped = make_optimizer(loss), []
+    optimizer, stepped = Adam(loss.parameters(), lr=1e-2), []
     trainer = make_trainer(loss, optimizer)
     optimizer.register_step_pre_hook(
         lambda *_: stepped.extend(each.grad.clone() for each in loss.parameters())
