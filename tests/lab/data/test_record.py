@@ -48,7 +48,7 @@ def test_what_is_written_is_read_in_the_units_of_the_losses(tmp_path):
         data["action"], (columns["action"] / 2).clip(-0.999, 0.999), atol=1e-7
     )
     np.testing.assert_array_equal(data["observation"], columns["observation"])
-    assert (manifest["num_complete_episodes"], manifest["dropped_rows"]) == (2, 0)
+    assert (manifest["episode_lengths"], manifest["dropped_rows"]) == ([200, 200], 0)
     assert manifest["normalized_score"] is None
     assert list(path.parent.iterdir()) == [path], "nothing is left beside it"
     with pytest.raises(FileExistsError, match="exists"):

@@ -63,11 +63,11 @@ def test_manifest_describes_the_set(cache):
     _, manifest = roll_out(seed=3)
     folder = cache / "collected" / "hopper-random-300-seed3"
     stored = json.loads((folder / "manifest.json").read_text())
-    assert manifest == stored | {"normalized_score": manifest["normalized_score"]}
+    assert stored.items() <= manifest.items()
     returns = np.array(manifest["episode_returns"])
     assert manifest["env_id"] == "Hopper-v5"
-    assert manifest["num_complete_episodes"] == len(returns) > 3
-    assert manifest["return"]["mean"] == pytest.approx(returns.mean())
+    assert len(returns) > 3
+    assert manifest["mean_return"] == pytest.approx(returns.mean())
     # (mean - random) / (expert - random), the constants of D4RL.
     expected = 100 * (returns.mean() + 20.272305) / (3234.3 + 20.272305)
     assert manifest["normalized_score"] == pytest.approx(expected)
@@ -108,7 +108,7 @@ def test_recorded_data_are_read(source, on_disk, tmp_path):
     data, manifest = load_dataset("hopper", source, env_id="Hopper-v5", **options)
     assert (data == rows).all()
     assert is_memory_mapped(data) == on_disk
-    score = REFERENCE_RETURNS["hopper"].score(manifest["return"]["mean"])
+    score = REFERENCE_RETURNS["hopper"].score(manifest["mean_return"])
     assert (manifest["source"], manifest["normalized_score"]) == (source, score)
     _, other = load_dataset("another", source, **options)
     assert other["normalized_score"] is None

@@ -20,8 +20,6 @@ from tensordict import TensorDict
 from torchrl import torchrl_logger
 
 from torchrl_osr._checks import check_choice
-from torchrl_osr._files import sha256_of
-from torchrl_osr.lab.data.statistics import describe_episodes
 from torchrl_osr.lab.data.store import Dataset, cache_root, load_or_write
 from torchrl_osr.lab.data.transitions import (
     ACTION_LIMIT,
@@ -130,9 +128,9 @@ class Recording:
         warnings = [f"{rows:,} rows {WARNINGS[n]}." for n, rows in left_out.items()]
         return {
             **self.about,
-            "data_sha256": [sha256_of(file) for file in self.files],
             **self._counts,
-            **describe_episodes(returns[whole], lengths[whole]),
+            "episode_returns": returns[whole].tolist(),
+            "episode_lengths": lengths[whole].tolist(),
             "incomplete_returns": returns[~whole].tolist(),
             "incomplete_lengths": lengths[~whole].tolist(),
             "warnings": [*self._warnings, *warnings],

@@ -24,11 +24,7 @@ from torchrl_osr.lab.data.environment import (
 from torchrl_osr.lab.data.recording import ActionBounds, Reading, Recording
 from torchrl_osr.lab.data.rollout import behavior_of, collect_source
 from torchrl_osr.lab.data.rows import mix_datasets
-from torchrl_osr.lab.data.statistics import (
-    REFERENCE_RETURNS,
-    ReferenceReturns,
-    describe_episodes,
-)
+from torchrl_osr.lab.data.statistics import REFERENCE_RETURNS, ReferenceReturns
 from torchrl_osr.lab.data.store import (
     Dataset,
     cache_root,
@@ -145,18 +141,18 @@ def load_dataset(
     if spec is not None:
         _check_fit(data, manifest, str(env_id), spec)
     references = references or REFERENCE_RETURNS.get(str(env_name))
-    score = _score(manifest, references)
+    mean, score = _mean_and_score(manifest, references)
     if random_share:
         random, about = rolled_out(str(name), "random", recipe, progress=progress)
         data = mix_datasets(data, random, random_share=random_share, seed=seed)
         number = round(random_share * len(data))
-        scores: Any = [score, _score(about, references)]
+        scores: Any = [score, _mean_and_score(about, references)[1]]
         known = None not in scores
         weights = [len(data) - number, number]
         score = float(np.average(scores, weights=weights)) if known else None
         manifest = recipe | {"random_share": random_share, "env_id": about["env_id"]}
-    added = {"env_name": env_name, "source": source, "normalized_score": score}
-    return data, manifest | added
+    facts = {"mean_return": mean, "normalized_score": score}
+    return data, manifest | {"env_name": env_name, "source": source} | facts
 
 
 def _refuse(options: Mapping[str, Any], source: str) -> None:
@@ -166,11 +162,14 @@ def _refuse(options: Mapping[str, Any], source: str) -> None:
             raise ValueError(f"data.{name}={value} has no effect with {source}.")
 
 
-def _score(
+def _mean_and_score(
     manifest: Mapping[str, Any], references: ReferenceReturns | None
-) -> float | None:
-    mean = (manifest.get("return") or {}).get("mean")
-    return None if mean is None or references is None else references.score(mean)
+) -> tuple[float | None, float | None]:
+    """Mean return of the complete episodes, and its score, where they are known."""
+    if not manifest.get("episode_returns"):
+        return None, None
+    mean = float(np.mean(manifest["episode_returns"]))
+    return mean, None if references is None else references.score(mean)
 
 
 def rolled_out(
@@ -198,7 +197,8 @@ def rolled_out(
         data, returns, lengths = collect_source(
             env_name, source, rows, seed=seed, progress=progress
         )
-        about.update(describe_episodes(returns, lengths))
+        about["episode_returns"] = returns.tolist()
+        about["episode_lengths"] = lengths.tolist()
         yield data
 
     folder = cache_root() / "collected" / f"{env_name}-{source}-{rows}-seed{seed}"

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl import torchrl_logger
@@ -52,23 +51,6 @@ def observation_statistics(data: TensorDictBase) -> tuple[Tensor, Tensor]:
         )
     scale = scale.clamp_min(MIN_OBSERVATION_SCALE)
     return loc.to(observation.dtype), scale.to(observation.dtype)
-
-
-def describe_episodes(returns: ArrayLike, lengths: ArrayLike) -> dict[str, Any]:
-    """Entries of a manifest about complete episodes, by return and length ``[E]``."""
-    returns, lengths = np.asarray(returns), np.asarray(lengths)
-    return {
-        "num_complete_episodes": len(returns),
-        "return": _summary(returns),
-        "episode_length": _summary(lengths),
-        "episode_returns": returns.tolist(),
-        "episode_lengths": lengths.tolist(),
-    }
-
-
-def _summary(values: NDArray[Any]) -> dict[str, float] | None:
-    names = ("mean", "std", "min", "max")
-    return {n: float(getattr(values, n)()) for n in names} if len(values) else None
 
 
 class ReferenceReturns(NamedTuple):

@@ -131,7 +131,7 @@ def load_training_data(
         buffer = make_replay_buffer(rows, **sampling)
     mean = manifest["normalized_score"]
     if references_of(env) is None:
-        mean = (manifest.get("return") or {}).get("mean")
+        mean = manifest["mean_return"]
     return TrainingData(
         buffer, held_out.to(device), norm(*states).to(device), largest, mean
     )
