@@ -215,7 +215,7 @@ def test_critics_may_judge_alone(folders) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ([LOSS], "does not exist"),
+        ([LOSS], "dynamics.safetensors"),
         (["loss=bc"], "no critics"),
         ([LOSS, "optim.gamma=0.9"], "differ in .*0.9, "),
         ([LOSS, "data.reward_scale=100"], "differ in .*100.0"),

@@ -171,18 +171,16 @@ def load_switching_policy(
         values = [each.smallest_value(state, action) for each in policies]
         return torch.stack(values).mean(0)
 
-    def networks(run: Path | str, policy: Policy) -> EliteNetworks:
-        file = run_folder_of(run) / FILE
-        if not file.exists():
-            raise FileNotFoundError(
-                f"{file} does not exist: train with loss=rim or dynamics=ensemble."
-            )
-        model = load_dynamics(file)
-        return EliteNetworks(model, policy.loc, policy.scale, policy.low, policy.high)
-
     models = None
     if not critics_only:
-        models = EliteNetworks.join([*map(networks, runs, policies)])
+        files = [run_folder_of(run) / FILE for run in runs]
+        parts = [
+            EliteNetworks(
+                load_dynamics(file), each.loc, each.scale, each.low, each.high
+            )
+            for file, each in zip(files, policies, strict=True)
+        ]
+        models = EliteNetworks.join(parts)
     config = configs[0]
     return SwitchingPolicy(
         policies,
