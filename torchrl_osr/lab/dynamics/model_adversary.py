@@ -55,29 +55,22 @@ class ModelAdversary:
         self.optimizer = torch.optim.Adam(groups, lr=rate, fused=True)
         self.terminated = options.termination(data.env_id, data.loc, data.scale)
         self.real, self.likelihood = data.buffer(), DynamicsLoss(model)
-        self.metrics: dict[str, float] = {}
 
     def __call__(self, number: int) -> None:
         """Train the model with the seed of this number; torch's generator stays."""
         options, device = self.options, self.model.elites.device
-        steps, length = options.adversarial_steps, options.rollout_steps
-        totals = torch.zeros(2, device=device)
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
             torch.manual_seed(SEED + self.data.seed + number)
-            for step in range(steps):
-                if step % length == 0:
+            for step in range(options.adversarial_steps):
+                if step % options.rollout_steps == 0:
                     rows = self.real.sample(options.batch_size)
                     state = rows["observation"]
                 rows = self.real.sample(self.model.num_networks * options.batch_size)
                 likelihood = sum(self.likelihood(rows).values())
-                objectives, state = self.objective(state)
-                objective = objectives.mean()
-                (likelihood + options.adversarial_weight * objective).backward()
+                objective, state = self.objective(state)
+                (likelihood + options.adversarial_weight * objective.mean()).backward()
                 self.optimizer.step()
                 self.optimizer.zero_grad()
-                totals += torch.stack([likelihood, objective]).detach()
-        names = ("adversary_likelihood", "adversary_objective")
-        self.metrics = dict(zip(names, (totals / steps).tolist(), strict=True))
 
     def objective(self, state: Tensor) -> tuple[Tensor, Tensor]:
         r"""Return the term with :math:`\lambda`, ``[B]``, and next states."""
@@ -107,10 +100,9 @@ class ModelAdversary:
     def state_dict(self) -> dict[str, Any]:
         """Return what a continued run needs."""
         model, optimizer = self.model.state_dict(), self.optimizer.state_dict()
-        return {"model": model, "optimizer": optimizer, "metrics": self.metrics}
+        return {"model": model, "optimizer": optimizer}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Continue from a state."""
         self.model.load_state_dict(state_dict["model"])
         self.optimizer.load_state_dict(state_dict["optimizer"])
-        self.metrics = dict(state_dict["metrics"])

@@ -162,12 +162,11 @@ class RolloutReplayBuffer:
         """Return the share of rejected rows, and numbers of the others."""
         rejected = sum(number for _, number in self._rollouts)
         following = self.synthetic["next"]
-        found = {
+        return {
             "rollout_rejected": rejected / (rejected + len(following)),
             "rollout_terminated": following["terminated"].float().mean().item(),
             "rollout_reward": following["reward"].mean().item(),
         }
-        return found if self.adversary is None else found | self.adversary.metrics
 
     def state_dict(self) -> dict[str, Any]:
         """Return the number of batches and the policies that were rolled out."""

@@ -81,9 +81,9 @@ def dynamics_model(
     report = dynamics_report(model, data.held_out)
     write_json(folder / REPORT, report)
     print(
-        "dynamics, {rows} held-out rows: NLL {nll:.2f}, R2 {r2_mean:.2f}, within 1 and "
-        "2 sigma {within_1_sigma:.0%} and {within_2_sigma:.0%}, disagreement and error "
-        "{disagreement_rank:.2f}".format(**report)
+        "dynamics, {rows} held-out rows: NLL {nll:.2f}, R2 {r2_mean:.2f}, within one "
+        "sigma {within_1_sigma:.0%}, disagreement and error {disagreement_rank:.2f}"
+        "".format(**report)
     )
     return model
 
@@ -151,9 +151,8 @@ def dynamics_report(model: DynamicsEnsemble, data: TensorDictBase) -> dict[str, 
     Returns:
         ``"nll"`` of the elites, in nats, summed over entries; ``"mse"`` of all
         networks, in standardised targets; ``"r2"`` of the elites' mean for each entry,
-        the reward last; the shares of errors ``"within_1_sigma"`` and
-        ``"within_2_sigma"``, 0.683 and 0.954 if calibrated; Spearman's correlation of
-        disagreement and error, ``"disagreement_rank"``.
+        the reward last; the share of errors ``"within_1_sigma"``, 0.683 if calibrated;
+        Spearman's correlation of disagreement and error, ``"disagreement_rank"``.
     """
     rows = data[has_next_state(data, model.in_keys[0])]
     _, targets = model.inputs_and_targets(rows)
@@ -174,7 +173,6 @@ def dynamics_report(model: DynamicsEnsemble, data: TensorDictBase) -> dict[str, 
         "r2_mean": r2.mean().item(),
         "r2": r2.tolist(),
         "within_1_sigma": (deviation < 1).float().mean().item(),
-        "within_2_sigma": (deviation < 2).float().mean().item(),
         "disagreement_rank": torch.corrcoef(ranks)[0, 1].item(),
         "rows": len(rows),
     }
