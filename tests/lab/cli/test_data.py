@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +12,6 @@ from composed import composed
 from PIL import Image
 
 from torchrl_osr.lab.cli import data
-from torchrl_osr.lab.data import (
-    make_environment,
-    transitions_from_columns,
-    write_memmap,
-)
-from torchrl_osr.lab.data.record import record_episodes
 
 
 @pytest.fixture
@@ -49,14 +42,6 @@ NAMED = [
     "data.columns.action=torque",
     "data.columns.terminated=false",
 ]
-
-
-def test_discrete_actions_of_a_converted_set_are_drawn(look):
-    with closing(make_environment("CartPole-v1")) as env:
-        log = record_episodes(env, None, 3, progress=False)
-    data, manifest = transitions_from_columns(log, num_actions=2)
-    write_memmap([data], "set", describe=lambda: manifest)
-    assert "Picture: " in look("data.path=set", "env.id=CartPole-v1")
 
 
 def test_a_log_is_described_and_drawn(look, tmp_path):

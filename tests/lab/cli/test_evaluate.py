@@ -29,17 +29,6 @@ def evaluate(*overrides: str) -> None:
     main(composed("evaluate", "progress=false", "episodes=2", *overrides))
 
 
-def test_a_table_is_printed_and_files_are_left_in_the_runs_folder(folder, run):
-    options = ["checkpoint=run", "episodes=2", "suite=push"]
-    code, output = run(folder.parent, "evaluate", *options)
-    assert code == 0, output
-    for name in composed("evaluate", "suite=push").suite.disturbances:
-        assert name in output
-    assert "run/robustness-push.json" in output
-    assert "Warning" not in output
-    assert [path.name for path in folder.parent.iterdir()] == ["run"]
-
-
 @pytest.mark.parametrize(
     ("overrides", "named"),
     [

@@ -2,15 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
-import pytest
 from lab.report.fakes import write_run
-
-from torchrl_osr.lab.__main__ import main
-
-ROOT = Path(__file__).parents[3]
 
 
 def test_report_of_several_folders(tmp_path, run):
@@ -28,11 +20,5 @@ def test_report_of_several_folders(tmp_path, run):
     assert "cql is worse than" not in page
     assert "too few seeds (1 of 5)" in page
     assert "a b --reference osr --output new/report" in page
-
-
-def test_what_cannot_be_reported_is_one_line(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(os, "environ", dict(os.environ))  # it asks Hydra for errors
-    with pytest.raises(SystemExit) as stopped:
-        main(["report", "nowhere"])
-    assert stopped.value.code == "nowhere does not exist."  # printed, and code 1
+    code, output = run(tmp_path, "report", "nowhere")
+    assert (code, output) == (1, "nowhere does not exist.\n")
