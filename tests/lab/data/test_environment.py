@@ -67,22 +67,6 @@ def test_mazes_observe_a_vector_with_the_goal_in_front(name, tmp_path, monkeypat
     assert list(tmp_path.iterdir()) == [], "the model's file is not left"
 
 
-def test_an_episode_ends_at_the_goal_with_its_only_reward():
-    with closing(make_environment("PointMaze_UMaze-v3")) as env:
-        observation, _ = env.reset(seed=0, options={"reset_cell": np.array([1, 1])})
-        env.unwrapped.goal[:] = observation[:2] + np.array([0.6, 0])
-        rewards = []
-        for _ in range(100):
-            _, reward, terminated, truncated, info = env.step(np.float32([0.3, 0]))
-            rewards.append(float(reward))
-            assert info["success"] is bool(terminated) is bool(reward)
-            if terminated:
-                break
-    assert not truncated
-    assert rewards == [0.0] * (len(rewards) - 1) + [1.0]
-    assert len(rewards) > 1
-
-
 @pytest.mark.parametrize(
     ("env_id", "error", "message"),
     [

@@ -68,13 +68,8 @@ def test_columns_are_in_the_units_of_the_recording():
     data, manifest = transitions_from_columns(log, action_bounds=([-5, -10], [5, 10]))
     manifest["columns"] = {"observation": ["x", "y"]}
     columns = recorded_columns(data, manifest)
-    assert [name for _, name in columns] == [
-        "x",
-        "y",
-        "action[0]",
-        "action[1]",
-        "reward",
-    ]
+    names = ["x", "y", "action[0]", "action[1]", "reward"]
+    assert [name for _, name in columns] == names
     recorded = np.c_[log["observation"], log["action"], log["reward"]]
     np.testing.assert_allclose(columns, recorded, atol=1e-5)
 

