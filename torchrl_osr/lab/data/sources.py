@@ -117,7 +117,7 @@ def load_dataset(
             _refuse(log, f"{path}, which is converted")
             data, manifest = load_memmap(path)
         else:
-            recording = _opened(source, path, spec, progress=progress, **log)
+            recording = _opened(source, path, spec, log, progress)
             data, manifest = recording.load(on_disk=on_disk)
     else:
         _refuse(log | {"path": path}, f"data={source}, which is rolled out")
@@ -209,12 +209,7 @@ def _opened(
     source: str,
     path: str | Path | Sequence[str],
     spec: EnvironmentSpec | None,
-    *,
-    columns: Mapping[str, Any],
-    action_bounds: ActionBounds | None,
-    clip_actions: bool,
-    missing: str,
-    download: bool,
+    log: Mapping[str, Any],
     progress: bool,
 ) -> Recording:
     """Open recorded data without reading a row.
@@ -222,27 +217,28 @@ def _opened(
     A reader is a function that returns a :class:`Recording`. Each needs a library of
     its own.
     """
+    bounds, number = log["action_bounds"], None
     if source != "file":
-        _refuse({"columns": columns}, f"data={source}")
-    number = spec.action_size if spec is not None and spec.discrete else None
-    if number is not None:
-        _refuse({"action_bounds": action_bounds}, "discrete actions")
-    if action_bounds is None and source != "minari":
-        action_bounds = -1.0, 1.0
+        _refuse({"columns": log["columns"]}, f"data={source}")
+    if spec is not None and spec.discrete:
+        _refuse({"action_bounds": bounds}, "discrete actions")
+        number = spec.action_size
+    if bounds is None and source != "minari":
+        bounds = -1.0, 1.0
         if spec is not None and spec.action_low and spec.action_high:
-            low, high = action_bounds = spec.action_low, spec.action_high
+            low, high = bounds = spec.action_low, spec.action_high
             if len({*low}) == len({*high}) == 1:  # they fit data of another size
-                action_bounds = low[0], high[0]
-    options = Reading(action_bounds, clip_actions, number, missing)
+                bounds = low[0], high[0]
+    options = Reading(bounds, log["clip_actions"], number, log["missing"])
     if source == "minari":
         from torchrl_osr.lab.data.minari import open_minari
 
-        return open_minari(path, options, download=download, progress=progress)
+        return open_minari(path, options, download=log["download"], progress=progress)
     from torchrl_osr.lab.data.table import open_log
 
-    _refuse({"download": download}, f"data={source}")
-    names = {"observation": "observations"} if source == "d4rl" else columns
-    return open_log(path, names, options, source)
+    _refuse({"download": log["download"]}, f"data={source}")
+    d4rl = {"observation": "observations"}  # others have their usual names
+    return open_log(path, d4rl if source == "d4rl" else log["columns"], options, source)
 
 
 def _check_fit(

@@ -62,12 +62,10 @@ def open_log(
         return [*chain(*about["columns"].values())]
 
     def parts() -> Iterator[Arrays]:
-        codes: dict[Any, int] = {}
         for file in files:
             try:
                 arrays = _read(file, chosen)
-                several = file if len(files) > 1 else None
-                rows = assemble(about["columns"], arrays, codes, several)
+                rows = assemble(about["columns"], arrays)
                 if step := about["columns"].get("step"):
                     rows = _sorted(rows, step[0])
             except (KeyError, OSError, ValueError) as error:
@@ -198,31 +196,20 @@ def _in_order(names: list[str]) -> list[str]:
     return [match[0] for match in sorted(found, key=lambda match: int(match[2]))]
 
 
-def assemble(
-    layout: Mapping[str, list[str]],
-    arrays: Mapping[str, Array],
-    codes: dict[Any, int],
-    file: Path | None = None,
-) -> Arrays:
-    """Columns of a log, from those of a file; ``codes`` number named episodes."""
-    lengths = {name: len(array) if array.ndim else 0 for name, array in arrays.items()}
-    if len({*lengths.values()}) > 1:
-        raise ValueError(f"the columns have {lengths} rows; expected equally many.")
+def assemble(layout: Mapping[str, list[str]], arrays: Arrays) -> Arrays:
+    """Columns of a log, from those of a file."""
     columns: Arrays = {}
     for part, names in layout.items():
-        first = arrays[names[0]]
-        if part == "step":
-            columns[part] = first.reshape(-1)
-        elif part != "episode":
+        first = arrays[names[0]].reshape(-1)
+        if part not in ("step", "episode"):
             found = [_numbers(name, arrays[name]) for name in names]
             vector = len(found) > 1 or (part in VECTORS and found[0].ndim == 1)
             columns[part] = np.column_stack(found) if vector else found[0]
-        elif first.dtype.kind in "biuf" and file is None:
-            columns[part] = first.reshape(-1)
-        else:  # numbered in order of appearance
-            places, ids = pd.factorize(first.reshape(-1))
-            numbers = [float(codes.setdefault((file, i), len(codes))) for i in ids]
-            columns[part] = np.array([*numbers, np.nan])[places]  # -1 if missing
+        elif part == "step" or first.dtype.kind in "biuf":
+            columns[part] = first
+        else:  # names, numbered in order of appearance
+            numbers = pd.factorize(first)[0].astype(np.float64)
+            columns[part] = np.where(numbers < 0, np.nan, numbers)
     columns.setdefault("terminated", np.zeros(len(columns["reward"]), np.bool_))
     return columns
 
