@@ -14,7 +14,6 @@ def test_report_of_several_folders(tmp_path, run):
     code, output = run(tmp_path, "report", *options)
     assert code == 0, output
     assert "left out: b/1: not finished, its status is running\n" in output
-    assert "note: Every method has one seed a data set" in output
     assert output.endswith("2 runs in new/report/report.html\n")
     page = (tmp_path / "new" / "report" / "report.html").read_text(encoding="utf-8")
     assert "cql is worse than" not in page

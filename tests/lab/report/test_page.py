@@ -33,7 +33,7 @@ def test_page_of_two_data_sets_stands_alone(tmp_path):
     # The figures and tables are files, too.
     embedded = [each.split(",")[1] for each in sources if each.startswith("data:")]
     files = {path.name: path.read_bytes() for path in folder.glob("*.png")}
-    assert files.keys() == {"curves.png", "differences.png"}
+    assert files.keys() == {"curves.png"}
     assert sorted(files.values()) == sorted(map(base64.b64decode, embedded))
     scores = pd.read_csv(folder / "scores.csv", index_col=["data", "method"])
     row = scores.loc["hopper medium-replay", "cql"]
@@ -70,4 +70,4 @@ def test_a_single_run_has_nothing_to_compare_with(tmp_path):
     fakes.write_run(tmp_path / "runs" / "a", {1: [1.0, 2.0]})
     markup = write_report(read_runs([tmp_path / "runs"]), tmp_path).read_text()
     assert "There is nothing to compare with osr" in markup
-    assert not (tmp_path / "differences.png").exists()
+    assert not (tmp_path / "differences.csv").exists()

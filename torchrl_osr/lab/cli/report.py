@@ -3,8 +3,8 @@
     torchrl-osr report outputs/oos
     torchrl-osr report multirun outputs --reference cql --output page
 
-The page is <output>/report.html, with a CSV file for each table and a PNG file for each
-figure beside it. docs/robustness.md says how to read it.
+The page is <output>/report.html, with a CSV file for each table and the learning
+curves as PNG beside it. docs/robustness.md says how to read it.
 """
 
 from __future__ import annotations

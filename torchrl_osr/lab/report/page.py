@@ -1,19 +1,20 @@
-"""The page: verdict, tables and figures of all runs, as HTML, CSV and PNG."""
+"""The page: verdict, tables and learning curves of all runs."""
 
 from __future__ import annotations
 
 import base64
 import re
+import textwrap
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pandas as pd
 
 from torchrl_osr._extras import needed_by
 from torchrl_osr._files import write_atomically
-from torchrl_osr.lab.evaluation.figures import save_figure
-from torchrl_osr.lab.evaluation.statistics import NUM_RESAMPLES, Estimate
-from torchrl_osr.lab.report import figures
+from torchrl_osr.lab.evaluation.figures import GREY, new_figure, save_figure
+from torchrl_osr.lab.evaluation.statistics import NUM_RESAMPLES, Estimate, estimate
 from torchrl_osr.lab.report.comparisons import (
     MIN_SEEDS,
     compare_all,
@@ -22,20 +23,29 @@ from torchrl_osr.lab.report.comparisons import (
 )
 from torchrl_osr.lab.report.runs import RunTables, comparison_notes
 from torchrl_osr.lab.report.tables import (
+    by_run,
     robustness_table,
     saved_table,
     score_table,
     text,
+    undisturbed,
 )
 
 with needed_by("the report needs", "train"):
     from jinja2 import Environment, PackageLoader
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# Each method has its own combination. The palette is Okabe and Ito's.
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+LINES = ("-", "--", ":", "-.")
+
 
 def write_report(
     tables: RunTables, folder: Path, *, reference: str | None = None, command: str = ""
 ) -> Path:
-    """Write ``report.html``, and each table and figure by itself; return its path.
+    """Write ``report.html``, its tables and its figure; return its path.
 
     Methods are compared with the ``reference``. Default: the first method. The page
     prints the ``command``.
@@ -55,17 +65,9 @@ def write_report(
         frames[f"robustness-{suite}"] = robustness_table(tables, suite)
     frames["runs"] = runs.assign(versions=runs["versions"].map(", ".join))
     frames = {name: frame for name, frame in frames.items() if not frame.empty}
-    drawn = {
-        "curves": figures.learning_curves(tables),
-        "differences": figures.differences(found, reference),
-    }
     folder.mkdir(parents=True, exist_ok=True)
-    pictures = {}
-    for name, figure in drawn.items():
-        if figure is not None:
-            path = folder / f"{name}.png"
-            save_figure(figure, path, dpi=130)
-            pictures[name] = base64.b64encode(path.read_bytes()).decode()
+    curves = folder / "curves.png"
+    save_figure(learning_curves(tables), curves, dpi=130)
     for name, frame in frames.items():
         file = re.sub(r"[^\w.-]+", "-", name)  # suites have any name
         write_atomically(folder / f"{file}.csv", numbers(frame).to_csv())
@@ -75,7 +77,7 @@ def write_report(
         tables=tables,
         frames={name: frame.map(text) for name, frame in frames.items()},
         reference=reference,
-        pictures=pictures,
+        curves=base64.b64encode(curves.read_bytes()).decode(),
         verdict=verdict(found, reference),
         notes=comparison_notes(tables),
         command=command,
@@ -97,3 +99,48 @@ def numbers(frame: pd.DataFrame) -> pd.DataFrame:
         for place, end in enumerate(("", " low", " high")):
             columns[f"{name}{end}"] = [each and each[place] for each in estimates]
     return pd.DataFrame(columns, index=frame.index)
+
+
+def learning_curves(tables: RunTables) -> Figure:
+    """Draw scores over updates, and the mean score of the data's episodes."""
+    columns = min(3, len(tables.data))
+    rows = -(-len(tables.data) // columns)
+    figure = new_figure(9.6, 2.8 * rows + 1)
+    grid = figure.subplots(rows, columns, squeeze=False, sharex="col")
+    panels = dict(zip(tables.data, grid.flat, strict=False))
+    for data, axes in panels.items():
+        level = tables.runs["data_score"][tables.runs["data"] == data].mean()
+        axes.axhline(level, color=GREY, linewidth=1, linestyle=":")
+        axes.grid(axis="y", color="#DDDDDD", linewidth=0.6)
+        axes.set_axisbelow(True)
+        axes.tick_params(labelsize=7.5)
+        axes.set_title(_wrapped(data, 100 // columns), fontsize=10)
+    for axes in grid.flat[len(panels) :]:
+        axes.set_visible(False)
+    lines = {}
+    groups = undisturbed(tables.episodes).groupby(["data", "method"], sort=False)
+    for (data, method), played in groups:
+        steps = played.groupby("step")
+        found = np.array([estimate(by_run(each))[:3] for _, each in steps])
+        x, (mean, low, high) = np.array(list(steps.groups)) / 1000, found.T
+        number = tables.methods.index(method)
+        color = COLORS[number % len(COLORS)]
+        line = LINES[number // len(COLORS) % len(LINES)]
+        (lines[method],) = panels[data].plot(x, mean, line, color=color, linewidth=1.6)
+        if played["run"].nunique() > 1:
+            panels[data].fill_between(
+                x, low, high, color=color, alpha=0.15, linewidth=0
+            )
+    figure.legend(
+        list(lines.values()), [_wrapped(name, 100) for name in lines],
+        loc="outside upper center", frameon=False, fontsize=8,
+        ncols=max(1, 100 // (max(map(len, lines)) + 8)),
+    )  # fmt: skip
+    figure.supxlabel("thousand updates", fontsize=10)
+    figure.supylabel(tables.measure, fontsize=10)
+    return figure
+
+
+def _wrapped(text: str, width: int) -> str:
+    """Wrap a name; Matplotlib must not take a part of it for a formula."""
+    return "\n".join(textwrap.wrap(text, width)).replace("$", r"\$")

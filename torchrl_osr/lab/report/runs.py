@@ -51,21 +51,14 @@ class RunTables:
     """All runs of a report.
 
     Attributes:
-        runs: a row for each run: ``folder``, ``method``, ``data``, ``seed``, ``steps``,
-            ``measure`` (score, or return of an environment without references),
-            ``data_score`` (mean of the data's episodes), ``overrides`` of the command
-            line and ``versions`` of the packages.
+        runs: a row for each run; ``data_score`` is the mean of the data's episodes.
         settings: its configuration as texts, a column for each dotted key.
-        episodes: a row for each episode: ``run``, ``data``, ``method``, ``seed``,
-            ``suite`` (``""``: the training's own evaluations), ``disturbance`` (``""``:
-            none), ``step`` of the checkpoint, ``episode`` (its seed), ``score``, and
-            the step at which it was ``disturbed_at`` (NaN: never). For disturbances
-            that end whether it ``stood`` at its end, whether it was ``alive_after``, or
-            without it ``undisturbed_alive``, and its ``recovery_steps`` (NaN: never).
-        saved: a row for each run and recoverable state, in the order of the states:
-            ``run``, ``data``, ``method``, ``seed``; ``states``, the half and a digest
-            of the states; ``group``, ``disturbance``, ``walk``; and ``back``, the share
-            of the checkpoints that came back from it.
+        episodes: a row for each episode. ``suite`` is ``""`` for the training's own
+            evaluations, ``disturbance`` for undisturbed episodes. NaN: an episode was
+            never ``disturbed_at`` a step, or the disturbance does not end.
+        saved: a row for each run and recoverable state, in the order of the states.
+            ``states`` is the half and a digest, ``back`` the share of the checkpoints
+            that came back from it.
         left_out: folder of each run that is not in the tables, and the reason.
     """
 
@@ -115,10 +108,6 @@ def read_runs(folders: Sequence[Path]) -> RunTables:
     Runs of one method differ in nothing but the seed, and what is chosen by the data
     set. If other settings differ, the name of the method says in which. Of two runs of
     one method, data set and seed the later one counts.
-
-    Raises:
-        FileNotFoundError: if a folder does not exist.
-        ValueError: if there is no finished run, with the reasons.
     """
     found: list[_Run] = []
     left_out: list[tuple[str, str]] = []
@@ -323,20 +312,7 @@ def comparison_notes(tables: RunTables) -> list[str]:
     settings = comparable(tables.settings)
     for data, group in runs.groupby("data", sort=False):
         kinds = settings.loc[group.index].nunique()
-        if keys := [
-            key for key in kinds.index[kinds > 1] if not key.startswith(METHOD)
-        ]:
+        keys = [key for key in kinds.index[kinds > 1] if not key.startswith(METHOD)]
+        if keys:
             notes.append(f"{data}: its runs differ in {', '.join(keys)}.")
-        seeds = group.groupby("method", sort=False)["seed"].agg(
-            lambda each: ", ".join(map(str, sorted(each)))
-        )
-        if seeds.nunique() > 1:
-            alike = seeds.index.to_series().groupby(seeds, sort=False).agg(", ".join)
-            each = "; ".join(f"{of} ({names})" for of, names in alike.items())
-            notes.append(f"{data}: methods have different seeds: {each}.")
-    if not runs.duplicated(["data", "method"]).any():
-        notes.append(
-            "Every method has one seed a data set: intervals are over the episodes of "
-            "one training and say nothing about another."
-        )
     return notes
