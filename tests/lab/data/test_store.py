@@ -147,25 +147,20 @@ def test_sampling_is_uniform_with_replacement_and_depends_on_the_seed_alone() ->
     assert not torch.equal(draws(1), rows)
 
 
-@pytest.fixture
-def both(data, tmp_path):
-    """The same rows in memory and memory-mapped."""
-    return data, write_memmap([data], tmp_path / "set")[0]
-
-
-def test_the_same_seed_draws_the_same_rows_from_disk(both) -> None:
+def test_the_same_seed_draws_the_same_rows_from_disk(data, tmp_path) -> None:
+    both = data, write(data, tmp_path / "set")[0]
     buffers = [make_replay_buffer(each, batch_size=32, seed=3) for each in both]
     for _ in range(10):
         here, there = (buffer.sample() for buffer in buffers)
         assert (here == there).all()
     assert len(buffers[1]) == ROWS
     with pytest.raises(RuntimeError):
-        buffers[1].extend(both[0])
+        buffers[1].extend(data)
 
 
 @pytest.mark.parametrize("held_out", [1, 7, 0.2, ROWS - 1])
-def test_rows_on_disk_that_are_left_out(both, held_out) -> None:
-    data, stored = both
+def test_rows_on_disk_that_are_left_out(data, tmp_path, held_out) -> None:
+    stored, _ = write(data, tmp_path / "set")
     left_out = held_out_rows(ROWS, held_out, seed=1).sort().values
     train, rest = split_held_out(data, held_out, seed=1)
     assert (stored[left_out] == rest).all()
