@@ -83,13 +83,6 @@ def test_epsilon_0_is_the_bare_policy(trained, kind):
     assert torch.equal(policy(observation), bare(observation))
 
 
-def test_random_is_uniform(trained):
-    clean = torch.randn(2000, 11)
-    noise = shown(trained, clean, kind="random", epsilon=0.2) - clean
-    # 22,000 draws of variance 1/3, five standard errors.
-    assert (noise / 0.2).square().mean().item() == pytest.approx(1 / 3, abs=0.011)
-
-
 def test_critics_of_a_loss_are_its_trained_ones():
     head = MLP(14, 1, num_cells=[16])
     critic = ValueOperator(head, ["observation", "a"], ["q"])

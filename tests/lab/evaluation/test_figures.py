@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import pytest
-import torch
-from tensordict import TensorDict
 from torchrl.record.loggers import CSVLogger
 
-from torchrl_osr.lab.evaluation.figures import data_figure, learning_curve, read_scalars
+from torchrl_osr.lab.evaluation.figures import learning_curve, read_scalars
 
 PNG = b"\x89PNG"
 
@@ -31,13 +29,3 @@ def test_scalars_are_read_as_logged_and_the_later_row_counts(tmp_path):
             logger.log_scalar("policy/loss_x", value, step=step)
     scalars = read_scalars(tmp_path / "csv" / "scalars" / "policy")
     assert scalars == {"loss_x": [(1, 5.0), (2, 6.5), (3, 7.5)]}
-
-
-def test_data_figure_is_drawn_although_entries_are_many(tmp_path):
-    rows = {"observation": torch.randn(50, 40), "action": torch.rand(50, 2) * 2 - 1}
-    after = {"reward": torch.randn(50, 1), "observation": torch.randn(50, 40)}
-    names = {"observation": [f"s{i}" for i in range(40)], "action": ["a", "b"]}
-    path = tmp_path / "data.png"
-    data = TensorDict(rows | {"next": after}, [50])
-    data_figure(data, {"episode_returns": [1.0]}, names, path, title="log")
-    assert path.read_bytes().startswith(PNG)

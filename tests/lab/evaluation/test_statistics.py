@@ -42,12 +42,6 @@ def test_nested_resamples_are_those_of_a_loop_over_draws():
     assert np.abs(below - wanted).max() < 1.63 * (1 / len(ours) + 1 / len(loop)) ** 0.5
 
 
-def test_numbers_of_an_episode_stay_together():
-    first = np.random.default_rng(0).normal(size=(30, 1))
-    resamples = nested_resamples([np.hstack([first, 3 - first])] * 2)
-    np.testing.assert_allclose(resamples.sum(1), 3)
-
-
 @pytest.mark.parametrize(
     ("runs", "over"), [(1, "episodes"), (2, "two seeds"), (3, "seeds")]
 )

@@ -143,11 +143,3 @@ def test_suites_played_differently_are_not_one_suite(tmp_path):
     assert [name.partition(", seeds")[0] for name in tables.suites] == [
         "hand (checkpoints=last 2", "hand (checkpoints=[7000]"
     ]  # fmt: skip
-
-
-def test_long_values_still_keep_runs_apart(tmp_path):
-    for seed in (0, 1):
-        changes = {"optim.a": "x" * 50 + str(seed)}
-        fakes.write_run(tmp_path / str(seed), CURVE, seed=seed, changes=changes)
-    text = f"osr (optim.a={'x' * 40}, kind "
-    assert fakes.read_all(tmp_path).methods == [f"{text}1)", f"{text}2)"]

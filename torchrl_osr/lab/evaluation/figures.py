@@ -38,11 +38,8 @@ MOST_ROWS = 200_000  # of a data set, in a histogram
 def new_figure(width: float, height: float) -> Figure:
     """Return a figure of ``width`` x ``height`` inches that needs no display."""
     with needed_by("figures need", "train"):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
+    return Figure(figsize=(width, height), layout="constrained")
 
 
 def save_figure(figure: Figure, path: Path | str, *, dpi: int = 150) -> None:
@@ -54,11 +51,7 @@ def save_figure(figure: Figure, path: Path | str, *, dpi: int = 150) -> None:
 
 
 def data_figure(
-    columns: pd.DataFrame,
-    manifest: Mapping[str, Any],
-    path: Path | str,
-    *,
-    title: str,
+    columns: pd.DataFrame, manifest: Mapping[str, Any], path: Path | str, *, title: str
 ) -> None:
     """Draw histograms of the episodes' returns and lengths and of every entry.
 
