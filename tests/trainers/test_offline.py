@@ -31,14 +31,12 @@ STEPS = 20
 
 def stop_at(trainer: OfflineTrainer, step: int) -> None:
     """Run ``trainer`` and break it off in the middle of an update, as a kill does."""
-    original = trainer.loss_module.forward
 
-    def forward(batch):
+    def kill(batch):
         if trainer.step > step:
             raise RuntimeError("killed")
-        return original(batch)
 
-    trainer.loss_module.forward = forward
+    trainer.register_op("process_optim_batch", kill)
     with pytest.raises(RuntimeError, match="killed"):
         trainer.train()
 
