@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import math
+import shutil
 import zipfile
 from pathlib import Path
 
@@ -264,6 +265,14 @@ def test_damaged_newest_checkpoint_falls_back_to_the_one_before(
         damage(path)
     with pytest.raises(CheckpointError, match="All 2 checkpoints"):
         make(folder).train()
+
+
+def test_folder_that_is_removed_is_not_made_anew(tmp_path, make):
+    folder = tmp_path / "run"
+    hooks = [("post_steps", lambda: shutil.rmtree(folder))]
+    with pytest.raises(FileNotFoundError, match=f"{folder} was removed"):
+        make(folder, hooks=hooks).train()
+    assert not folder.exists()
 
 
 # -- logs and hooks -------------------------------------------------------------------

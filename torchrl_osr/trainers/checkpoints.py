@@ -155,6 +155,8 @@ class Checkpoints:
 
     def write(self, path: Path, **options: Any) -> None:
         """Write a checkpoint with these options of TorchRL's ``Checkpoint.save``."""
+        if not self.folder.is_dir():  # TorchRL would make it again
+            raise FileNotFoundError(f"{self.folder} was removed or renamed.")
         beside = path.with_name(f".{path.name}.new")
         self._checkpoint.save(beside, **options)
         with beside.open("rb") as file:
