@@ -269,7 +269,7 @@ def test_damaged_newest_checkpoint_falls_back_to_the_one_before(
 
 def test_folder_that_is_removed_is_not_made_anew(tmp_path, make):
     folder = tmp_path / "run"
-    hooks = [("post_steps", lambda: shutil.rmtree(folder))]
+    hooks = [("post_steps", lambda: shutil.rmtree(folder, True))]
     with pytest.raises(FileNotFoundError, match=f"{folder} was removed"):
         make(folder, hooks=hooks).train()
     assert not folder.exists()
