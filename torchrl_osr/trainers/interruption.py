@@ -81,17 +81,19 @@ def signals_raised() -> Iterator[None]:
 
 @contextmanager
 def interrupts_kept() -> Iterator[None]:
-    """Raise the interrupt that tensordict has replaced by an error of its own.
+    """Raise the interrupt that a library has replaced by an error of its own.
 
-    ``with tensordict.view(...)``, ``params.to_module(...)`` and their like answer what
-    is no :class:`Exception` with "Converting a tensordict to boolean value is not
-    permitted" (tensordict 0.14.3).
+    In ``with params.to_module(...)`` tensordict 0.14.3 answers what is no
+    :class:`Exception` with a RuntimeError; OmegaConf 2.3 fails to restore its flags.
     """
     try:
         yield
-    except RuntimeError as error:
-        if isinstance(error.__context__, (Interrupted, KeyboardInterrupt)):
-            raise error.__context__ from None
+    except Exception as error:
+        first: BaseException = error
+        while first.__context__ is not None:
+            first = first.__context__
+            if isinstance(first, (Interrupted, KeyboardInterrupt)):
+                raise first from None
         raise
 
 
