@@ -14,6 +14,7 @@ import pandas as pd
 
 from torchrl_osr._files import read_json
 from torchrl_osr.lab.data import reference_returns
+from torchrl_osr.lab.evaluation.robustness import RECOVERY
 from torchrl_osr.lab.run.config import CONFIG, flatten, read_config, read_yaml
 from torchrl_osr.lab.run.folder import RESUMABLE, read_status
 from torchrl_osr.lab.run.schema import method_name
@@ -33,15 +34,6 @@ METHOD = (
 
 NUM_NAMED, NAMED_WIDTH = 3, 40
 """At most so many differences are in a name, with so many characters of each value."""
-
-RECOVERY = {
-    "disturbed_at": "disturbed_at",
-    "survived_knock": "stood",
-    "alive_after": "alive_after",
-    "clean_alive_after": "undisturbed_alive",
-    "recovery_steps": "recovery_steps",
-}
-"""Entries of a disturbance, a number an episode, and their columns."""
 
 SAVED = ["states", "group", "disturbance", "walk", "back"]
 
@@ -246,7 +238,7 @@ def _episodes(
     suite: str, step: int, seeds: list[int], scores: Any, level: Mapping[str, Any]
 ) -> pd.DataFrame:
     """Return the rows of one evaluation under a disturbance."""
-    entries = {name: level.get(key) for key, name in RECOVERY.items()}
+    entries = {key: level.get(key) for key in ("disturbed_at", *RECOVERY)}
     numbers = {"step": step, "episode": seeds, "score": scores} | entries
     frame = pd.DataFrame(numbers, dtype=float)
     return frame.assign(suite=suite, disturbance=level["name"])

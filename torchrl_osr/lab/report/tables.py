@@ -105,9 +105,9 @@ def robustness_table(tables: RunTables, suite: str) -> pd.DataFrame:
 
 def _recovery(there: pd.DataFrame) -> dict[str, Any]:
     """Return the percentages of the episodes that met a disturbance that ends."""
-    if not there["stood"].notna().any():
+    if not there["survived_knock"].notna().any():
         return {}
-    columns = ["stood", "alive_after", "undisturbed_alive"]
+    columns = ["survived_knock", "alive_after", "clean_alive_after"]
     shares = there.groupby("run")[columns].mean().mean()  # a run, a vote
     # A column, whose numbers are percentages.
     back = 100.0 * (there["recovery_steps"] <= STEPS_AFTER)
@@ -118,9 +118,9 @@ def _recovery(there: pd.DataFrame) -> dict[str, Any]:
     mean = np.mean([run.mean() for run in runs])
     median = there["recovery_steps"].fillna(np.inf).median()
     return {
-        "stood %": 100 * shares["stood"],
+        "stood %": 100 * shares["survived_knock"],
         f"stood +{STEPS_AFTER} %": 100 * shares["alive_after"],
-        "(undisturbed) %": 100 * shares["undisturbed_alive"],
+        "(undisturbed) %": 100 * shares["clean_alive_after"],
         "recovered %": interval(mean, nested_resamples(runs), over),
         "median steps": median if np.isfinite(median) else "most never",
     }
