@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import json
 import math
 import shutil
@@ -126,36 +125,10 @@ def test_a_sampler_without_replacement_goes_on_in_its_epoch(
     assert assert_resumes(make_run, runs, tmp_path).best() is None
 
 
-class Tree:
-    """A segment tree of TorchRL's extension, which one of torch's versions lacks."""
-
-    def __init__(self, capacity: int, reduce, empty: float) -> None:
-        self.values, self.reduce = torch.full((capacity,), empty), reduce
-
-    def __getitem__(self, index):
-        return self.values[index]
-
-    def __setitem__(self, index, value):
-        self.values[index] = torch.as_tensor(value, dtype=torch.float32)
-
-    def query(self, start: int, end: int) -> float:
-        return self.reduce(self.values[start:end]).item()
-
-    def scan_lower_bound(self, mass):
-        return torch.searchsorted(self.values.cumsum(0), torch.as_tensor(mass))
-
-
 @pytest.mark.parametrize("trace", [False, True])
 def test_priorities_follow_the_errors_and_are_restored(
-    tmp_path, runs, transitions, monkeypatch, trace
+    tmp_path, runs, transitions, trace
 ):
-    module = "torchrl.data.replay_buffers.samplers.prioritized"
-    trees = {"Sum": (torch.sum, 0.0), "Min": (torch.min, math.inf)}
-    for kind, (reduce, empty) in trees.items():
-        tree = functools.partial(Tree, reduce=reduce, empty=empty)
-        for bits in (32, 64):
-            monkeypatch.setattr(f"{module}.{kind}SegmentTreeFp{bits}", tree)
-
     def make_run(folder):
         loss = runs.osr_loss()
         buffer = TensorDictReplayBuffer(
@@ -234,6 +207,20 @@ def test_an_evaluation_that_kills_the_process_loses_no_step(
     trainer.train()
     assert trainer.history == undisturbed.history
     runs.assert_same_bits(runs.state(trainer), runs.state(undisturbed))
+
+
+def test_a_failing_evaluation_costs_itself_alone(tmp_path, make, runs, undisturbed):
+    def evaluate():
+        if trainer.step == 10:
+            raise RuntimeError("motor driver lost connection")
+        return {"score": trainer.step / 5, "raw": [1]}
+
+    trainer = make(tmp_path, evaluate=evaluate)
+    trainer.train()
+    assert list(trainer.failed_evaluations) == [10]
+    assert steps_of(trainer) == [0, 5, 15, 20]
+    networks = (each.loss_module.state_dict() for each in (trainer, undisturbed))
+    runs.assert_same_bits(*(each.values() for each in networks))
 
 
 # -- checkpoints ----------------------------------------------------------------------

@@ -169,7 +169,7 @@ def soft_maximum(alike: bool, given: tuple[Any, ...], layers: Layers) -> Tensor:
     loss, as in a mean or a sum, the forward pass computes the gradient, too. Otherwise
     the backward pass computes the chunks once more. The result is ``[N, B]``.
     """
-    value: Tensor = _SoftMaximum.apply(alike, given, *sum(layers, ()))  # type: ignore[no-untyped-call]
+    value: Tensor = _SoftMaximum.apply(alike, given, *sum(layers, ()))
     return value
 
 

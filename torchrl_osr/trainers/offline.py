@@ -137,6 +137,7 @@ class OfflineTrainer(Trainer):
         self.update, self.buffer, self.evaluation = update, replay_buffer, evaluation
         self.loggers, self.description = loggers, description
         self.history: list[dict[str, Any]] = []
+        self.failed_evaluations: dict[int, str] = {}
         self._saved = {"step": 0}
         self._progress = progress
         self._signals: list[Signals] = []
@@ -282,7 +283,14 @@ class OfflineTrainer(Trainer):
             return
         if step % evaluation.interval and step != self.total_frames:
             return
-        results = finite_or_none({"step": step, **evaluation.run()})
+        try:
+            results = finite_or_none({"step": step, **evaluation.run()})
+        except Exception as error:
+            if not self.history:  # no work is lost yet, and the next would fail alike
+                raise
+            self.failed_evaluations[step] = f"{type(error).__name__}: {error}"
+            log.exception(f"{self.description}: the evaluation of step {step} failed")
+            return
         # As a checkpoint restores them: sorted, lists for tuples.
         results = json.loads(json.dumps(results, sort_keys=True))
         metric = results[evaluation.metric]

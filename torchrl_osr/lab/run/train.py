@@ -64,7 +64,13 @@ def train(run: Run) -> float:
     rollouts = phases.train_dynamics() if run.config.dynamics.use else None
     trainer = phases.train_policy(rollouts)
     save_policies(run, phases.learner, phases.data.norm)
-    return report(run, phases.data.mean, trainer)
+    score = report(run, phases.data.mean, trainer)
+    if trainer.failed_evaluations:
+        raise RuntimeError(
+            "The training is complete and the policy is saved, but evaluations failed: "
+            + "; ".join(f"step {n}: {e}" for n, e in trainer.failed_evaluations.items())
+        )
+    return score
 
 
 class Phases:
