@@ -177,3 +177,11 @@ def test_compiled_transform_draws_the_same_noise() -> None:
     noise(eager, 4)
     compiled = torch.compile(traced, backend="eager")
     assert torch.equal(compiled(observations(4))[PERTURBED], noise(eager, 4))
+
+
+def test_each_entry_has_its_own_standard_deviation():
+    data = TensorDict({"observation": torch.zeros(5000, 2)}, [5000])
+    noise = StatePerturbation(std=[0.1, 3.0], seed=0)(data)["perturbed", "observation"]
+    assert noise.std(0).tolist() == pytest.approx([0.1, 3.0], rel=0.05)
+    with pytest.raises(ValueError, match=r"std must be at least 0, got -1\.0"):
+        StatePerturbation(std=[0.1, -1.0])

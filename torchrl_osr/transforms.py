@@ -39,7 +39,7 @@ class StatePerturbation(Transform):
 
     Args:
         std: :math:`\beta`, the standard deviation of the Gaussian noise, in units of
-            the observation.
+            the observation: a number, or one for each entry of the observation.
 
     Keyword Args:
         in_keys: the states to perturb. Integers become floats. Default
@@ -64,17 +64,18 @@ class StatePerturbation(Transform):
 
     def __init__(
         self,
-        std: float,
+        std: float | Sequence[float],
         *,
         in_keys: Sequence[NestedKey] = ("observation",),
         perturbed: NestedKey = "perturbed",
         seed: int | None = None,
     ) -> None:
-        check_weight("std", std)
+        for each in [std] if isinstance(std, (int, float)) else std:
+            check_weight("std", each)
         keys = [in_keys] if isinstance(in_keys, str) else list(in_keys)
         perturbed_keys = [nested(perturbed, key) for key in keys]
         super().__init__(in_keys=keys, out_keys=perturbed_keys)
-        self.register_buffer("std", torch.tensor(std, dtype=torch.float64))
+        self.register_buffer("std", torch.as_tensor(std, dtype=torch.float64))
         self.seed = _derived("new", next(_number)) if seed is None else seed
         self._copies, self._process = 0, _process[0]
         self._generator: torch.Generator | None = None

@@ -58,6 +58,14 @@ def test_against_hand_calculation():
     assert given == pytest.approx([-4.0, -6.0])
 
 
+def test_a_dictionary_is_joined_in_alphabetical_order(make_policy):
+    policy, rows = make_policy("osr"), np.linspace(-1, 1, 12).reshape(4, 3)
+    many = {"velocity": {"b": rows[:, 2:], "a": rows[:, 1:2]}, "angle": rows[:, :1]}
+    assert policy.act(many) == pytest.approx(policy.act(rows))
+    one = {"velocity": torch.tensor(rows[0, 1:]), "angle": torch.tensor(rows[0, :1])}
+    assert policy.value(one).item() == pytest.approx(policy.value(rows[0]), abs=1e-6)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_results_have_the_kind_of_the_observation(make_policy, kind):
     policy = make_policy(kind)

@@ -83,21 +83,27 @@ class Policy(nn.Module):
         self.requires_grad_(False).eval()
 
     @torch.no_grad()
-    def act(self, observation: Array) -> Array:
+    def act(self, observation: Array | Mapping[str, Any]) -> Array:
         """Return deterministic actions, NumPy for NumPy and torch for torch.
 
         Args:
-            observation: as the environment gives it, one ``[S]`` or many ``[B, S]``.
+            observation: as the environment gives it, one ``[S]`` or many ``[B, S]``. A
+                dictionary is joined in the alphabetical order of its keys, as the data
+                were.
 
         Returns:
             Actions as the environment takes them: float32, ``[A]`` or ``[B, A]``,
             within the bounds; of a discrete policy int64 indices, ``[]`` or ``[B]``.
         """
-        rows = self._numbers("observation", observation, self.observation_size)
-        return _like(observation, self(rows))
+        given = joined(observation)
+        rows = self._numbers("observation", given, self.observation_size)
+        result: Array = _like(given, self(rows))
+        return result
 
     @torch.no_grad()
-    def value(self, observation: Array, action: Array | None = None) -> Array:
+    def value(
+        self, observation: Array | Mapping[str, Any], action: Array | None = None
+    ) -> Array:
         """Return the smallest of the critics' values, float32, ``[]`` or ``[B]``.
 
         It estimates the discounted sum of the rewards that the run was trained on.
@@ -109,9 +115,11 @@ class Policy(nn.Module):
             action: as :meth:`act` returns it. Default: the policy's deterministic one.
         """
         self._check_critics()
-        rows = self._numbers("observation", observation, self.observation_size)
+        given = joined(observation)
+        rows = self._numbers("observation", given, self.observation_size)
         actions = self(rows) if action is None else self._actions(action, rows)
-        return _like(observation, self.smallest_value(rows, actions))
+        result: Array = _like(given, self.smallest_value(rows, actions))
+        return result
 
     def save(self, path: Path | str) -> None:
         """Write everything to one file, ``policy.safetensors`` for instance.
@@ -232,8 +240,8 @@ def load_policy(path: Path | str) -> Policy:
     """Load a policy that was saved or exported, on the CPU; nothing is unpickled.
 
     Args:
-        path: a ``.safetensors`` file of :meth:`~torchrl_osr.policy.Policy.save` or
-            ``torchrl-osr export``.
+        path: a ``.safetensors`` file of :meth:`~torchrl_osr.policy.Policy.save`, or
+            the folder of a run, whose last policy it is.
 
     Examples:
         >>> import tempfile
@@ -248,7 +256,9 @@ def load_policy(path: Path | str) -> Policy:
         >>> policy.act(np.zeros(3)).shape
         (1,)
     """
-    tensors, record = read_tensors(Path(path))
+    if (path := Path(path)).is_dir():
+        path /= f"policy{SUFFIX}"
+    tensors, record = read_tensors(path)
     try:
         return Policy(record, tensors)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
@@ -290,6 +300,16 @@ def _onnx(graph: nn.Module, given: dict[str, Any], output: str, record: str) -> 
     onnx.model.metadata_props[RECORD] = record
     content: bytes = onnx.model_proto.SerializeToString()
     return content
+
+
+def joined(observation: Any) -> Any:
+    """Return a dictionary's vectors as one, in the alphabetical order of its keys."""
+    if not isinstance(observation, Mapping):
+        return observation
+    parts = [joined(observation[key]) for key in sorted(observation)]
+    if all(isinstance(part, Tensor) for part in parts):
+        return torch.cat(parts, -1)
+    return np.concatenate([np.atleast_1d(part) for part in parts], -1)
 
 
 def _tensor(value: Any) -> Tensor:
