@@ -44,14 +44,14 @@ GIVEN_IN_THE_CALL = {
     "inverse_dynamics_network",
     "replay_buffer",
 }
-"""Arguments that are objects which several parts share."""
+"""Arguments that are objects shared by several parts."""
 
 
 def build(part: str, **options: Any) -> Any:
-    """Build a part of :data:`OPTIONS` from what a configuration has.
+    """Build a part of :data:`OPTIONS` from the values of a configuration.
 
-    Lists become keys where keys are meant, and ``gamma`` goes to a loss's value
-    estimator, as TorchRL's own configurations of losses do it.
+    Lists become keys where keys are expected. ``gamma`` goes to a loss's value
+    estimator, as in TorchRL's own configurations of losses.
     """
     for name, value in options.items():
         if name == "perturbed" or name.endswith("_key"):
@@ -70,10 +70,10 @@ def _key(value: Any) -> Any:
 
 
 def option(part: Callable[..., Any]) -> dict[str, Any]:
-    """A node of the config store: every argument of a part with its default.
+    """Return a node of the config store: every argument of a part with its default.
 
-    What only Python can give is ``null`` and handed over in the call of
-    ``instantiate``; what has no default must be set.
+    Objects are ``null`` and handed over in the call of ``instantiate``. Arguments
+    without a default must be set.
     """
     parameters = _parameters(part)
     defaults = {name: _default(name, each) for name, each in parameters.items()}
@@ -103,10 +103,10 @@ def _default(name: str, parameter: inspect.Parameter) -> Any:
 
 
 def register() -> None:
-    """Make TorchRL's options and these known to Hydra.
+    """Register TorchRL's options and these with Hydra.
 
-    In a process of its own: Hydra holds a file ``loss/osr.yaml``, such as that of
-    ``torchrl-osr train``, against a registered option of the same name.
+    Call it in a process of its own: Hydra refuses a registered option with the name of
+    a file, such as ``loss/osr.yaml`` of ``torchrl-osr train``.
     """
     # TorchRL's own are registered when they are imported.
     from torchrl.trainers.algorithms import configs  # noqa: F401

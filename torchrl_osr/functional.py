@@ -52,9 +52,8 @@ def categorical_kl(log_prob_p: Tensor, log_prob_q: Tensor) -> Tensor:
     .. math::
         \sum_a p(a) \, [\log p(a) - \log q(a)]
 
-    An action that ``p`` never takes counts for nothing, whatever ``q`` says of it; one
-    that only ``q`` never takes makes the divergence infinite. Log-probabilities are
-    normalised, ``[B, n]``.
+    An action with ``p = 0`` adds nothing, whatever its ``q``. An action with ``q = 0``
+    alone makes the divergence infinite. Log-probabilities are normalised, ``[B, n]``.
     """
     prob = log_prob_p.exp()
     # Selected before the product, not after: the gradient of 0 * inf would be nan.
@@ -292,7 +291,7 @@ def value_constraint(
     lead to ``s'``. With ``log_prob`` the first expectation is a log-sum-exp over
     importance-weighted actions instead (:func:`soft_maximum`): our addition, which
     puts the weight on the actions that Q overrates. The paper's difference is linear
-    in Q, so that it has no minimum. Ours estimates, up to the constant :math:`\log M`,
+    in Q and has no minimum. Ours estimates, up to the constant :math:`\log M`,
     :math:`\log\int e^{Q} da - \mathbb E_I Q`, which is never below the model's entropy.
 
     Args:

@@ -29,13 +29,13 @@ class StatePerturbation(Transform):
 
     Appended to a replay buffer it makes the mixed data set D_tot of section 4.1: one
     freshly perturbed state for each clean one, the next state untouched. It works out
-    of place, leaves the batch size alone and draws from a generator of its own, so that
-    the rest of a run stays the same bits with and without it. In an environment it adds
-    the same entry to observations and specs.
+    of place, keeps the batch size and has its own random generator, which leaves the
+    other draws of a run unchanged. In an environment it adds the same entry to
+    observations and specs.
 
-    Each transform has noise of its own: one without a ``seed``, a copy, and what a
-    worker process of a ``DataLoader`` inherits. ``load_state_dict`` continues the noise
-    of the transform that was saved.
+    Each transform draws its own noise, also without a ``seed``, as a copy, or in a
+    worker process of a ``DataLoader``. ``load_state_dict`` continues the noise of the
+    saved transform.
 
     Args:
         std: :math:`\beta`, the standard deviation of the Gaussian noise, in units of
@@ -82,7 +82,7 @@ class StatePerturbation(Transform):
         self._loaded: Tensor | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy starts with: a seed of its own, and no draws."""
+        """Return the state of a copy: a seed of its own, and no draws."""
         self._copies += 1
         state: dict[str, Any] = super().__getstate__()
         own = {"seed": _derived("copy", self.seed, self._copies), "_copies": 0}
@@ -144,7 +144,7 @@ class StatePerturbation(Transform):
         return generator.get_state()
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Continue the noise from a saved state; on another device it starts anew."""
+        """Continue the noise from a saved state; another device starts it again."""
         self._loaded, self._process = state.cpu(), _process[0]
         if self._generator is not None:
             self._continue(self._generator)

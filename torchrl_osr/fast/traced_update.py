@@ -1,13 +1,13 @@
 """Losses and gradients as a traced list of tensor operations.
 
-An update of small networks is some hundreds of short operations, and around each of
-them Python, TorchRL and autograd take longer than the operation itself. So they are
+An update of small networks has some hundreds of short operations. Python, TorchRL and
+autograd take longer around each of them than the operation itself. Therefore they are
 traced once, by :func:`torch.fx.experimental.proxy_tensor.make_fx`, forward and
-backward, and repeated with the next batches: the same operations on the same numbers in
-the same order, hence the same bits, without a compiler.
+backward, and repeated with the next batches. The same operations on the same numbers in
+the same order give the same bits, without a compiler.
 
-TorchScript's interpreter repeats them. It is deprecated in PyTorch 2.13, in which
-nothing else repeats operations from C++ without a compiler.
+TorchScript's interpreter repeats them. PyTorch deprecates it, but offers nothing else
+that repeats operations from C++ without a compiler.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ CHECK_INTERVAL = 1000
 
 
 class LossGradients:
-    """Losses of a batch; the gradients of their sum go where an optimizer looks.
+    """Compute the losses of a batch, and add the gradients of their sum to ``grad``.
 
     See :func:`~torchrl_osr.fast.fast_update` for the options. ``parameters`` get a
     gradient, by default all of the loss module.
@@ -65,7 +65,7 @@ class LossGradients:
         self.trace: _Trace | None = None
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
-        """Detached losses and metrics of a batch; adds to the parameters' ``grad``."""
+        """Return detached losses and metrics; add to the parameters' ``grad``."""
         if self.may_trace:
             self._look_for_changes()
             if self.trace is None:
@@ -85,7 +85,7 @@ class LossGradients:
         return losses
 
     def _look_for_changes(self) -> None:
-        """Forget the trace, and wait again, if the loss is not what it was."""
+        """Forget the trace, and wait again, if the loss has changed."""
         if self._state is not None and self._state.holds():
             return
         self._state, self.trace = _State(self.loss_module), None
@@ -148,10 +148,10 @@ _OPAQUE = (
 
 
 class _State:
-    """All that a loss may decide by: attributes of it and its parts, and torch's modes.
+    """Attributes of a loss and its parts, and torch's modes: they decide what it does.
 
     Its parts are the modules and other objects that it refers to. Numbers in the
-    tensors do not count: a trace reads them anew.
+    tensors do not count, because a trace reads them each time.
     """
 
     def __init__(self, loss_module: LossModule) -> None:

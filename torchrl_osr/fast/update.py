@@ -51,11 +51,11 @@ def fast_update(
     losses are evaluated in fewer, larger products. After ``warm_up`` updates it repeats
     a trace of the tensor operations, with the same bits.
 
-    The trace follows everything that the loss keeps in attributes: change a weight,
-    ``gamma``, ``requires_grad`` or a hook, or call ``eval()``, and the loss itself runs
-    and is traced again later. A loss that cannot be traced runs untraced, with a
-    warning. Pass ``trace=False`` for a loss that reads numbers from elsewhere, such as
-    a global variable.
+    The trace follows all attributes of the loss. After you change a weight, ``gamma``,
+    ``requires_grad`` or a hook, or call ``eval()``, the loss itself runs and is traced
+    again later. A loss that cannot be traced runs untraced, with a warning. Pass
+    ``trace=False`` for a loss that reads numbers from elsewhere, such as a global
+    variable.
 
     Args:
         loss_module: any loss module whose ``loss_*`` entries may be summed.
@@ -108,8 +108,7 @@ class Update:
 
     Attributes:
         loss_module, optimizer: what is trained, and what trains it.
-        count: updates so far, of which every ``policy_delay``-th moves the policy; set
-            it when a run is resumed.
+        count: number of updates so far; set it when a run is resumed.
     """
 
     def __init__(

@@ -147,10 +147,10 @@ def gaussian_actor(
 ) -> ProbabilisticActor:
     """Return a Gaussian actor: IQL's.
 
-    Its mean ends in a tanh, between -1 and 1; its samples do not. So the density is
-    moderate at actions on the bounds, of which data have many. The standard deviation
-    is learned, the same for all states. It writes ``"loc"`` (the mean), ``"scale"`` and
-    the action, each ``[B, A]``.
+    Its mean ends in a tanh, between -1 and 1; its samples do not. The density is
+    therefore moderate at the bounds, where data have many actions. The standard
+    deviation is learned, the same for all states. It writes ``"loc"`` (the mean),
+    ``"scale"`` and the action, each ``[B, A]``.
     """
     network = nn.Sequential(
         mlp(observation_dim, action_dim, num_cells, activation_class),

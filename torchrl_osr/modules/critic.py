@@ -25,9 +25,9 @@ def critic_ensemble(
 ) -> list[ValueOperator]:
     """Return Q networks of one observation and the action.
 
-    A list, not one network to be copied by the loss: TorchRL 0.14.1 re-draws copies
-    uniformly between the smallest and the largest weight, which is another
-    distribution than the one the layers were initialised from.
+    They are a list, not one network that the loss copies: TorchRL 0.14.1 redraws copies
+    uniformly between the smallest and the largest weight. That is not the distribution
+    of the layers' initialisation.
 
     Each of the ``num_qvalue_nets`` writes ``"state_action_value"``, ``[B, 1]``. With
     ``layer_norm`` each hidden layer is normalised before its activation, which bounds

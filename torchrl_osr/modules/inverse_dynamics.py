@@ -42,9 +42,9 @@ def tanh_gaussian_inverse_dynamics(
 ) -> ProbabilisticActor:
     r"""Return a tanh-Gaussian model of :math:`I(a \mid s, s')`, section 4.2.
 
-    It has the policy's distribution family and bounds, so that the divergence between
-    the two is exact (:func:`~torchrl_osr.functional.gaussian_kl`). It writes ``"loc"``,
-    ``"scale"`` (before the tanh), ``"action"`` and ``"action_log_prob"``.
+    It has the policy's distribution family and bounds, which makes the divergence
+    between the two exact (:func:`~torchrl_osr.functional.gaussian_kl`). It writes
+    ``"loc"``, ``"scale"`` (before the tanh), ``"action"`` and ``"action_log_prob"``.
 
     Examples:
         >>> import torch
@@ -101,20 +101,20 @@ def cvae_inverse_dynamics(
         z \sim q(z \mid s, s') = \mathcal N(\mu_z, \sigma_z^2), \quad
         I(a \mid s, s', z) = \tanh \mathcal N(\mu, \sigma^2)
 
-    It stands in for :func:`tanh_gaussian_inverse_dynamics` and writes the latent's
-    parameters besides, ``"latent_loc"`` and ``"latent_scale"``, ``[B, Z]``, from which
+    It replaces :func:`tanh_gaussian_inverse_dynamics` and also writes the latent's
+    parameters, ``"latent_loc"`` and ``"latent_scale"``, ``[B, Z]``. From these,
     :class:`~torchrl_osr.InverseDynamicsLoss` adds :math:`KL(q(z) \,\|\, N(0, 1))`.
     ``z`` is drawn under ``set_interaction_type(InteractionType.RANDOM)``, as in
-    training, and is its mean under every other type, hence in the policy's losses.
+    training. Under every other type, as in the policy's losses, it is its mean.
 
-    A known limit, of the original too: the encoder does not see the action, so ``z``
+    A known limit, also of the original: the encoder does not see the action, and ``z``
     tells the decoder nothing new. Training teaches the decoder to ignore it.
 
-    Departures from the released code (https://github.com/Jack10843/OSR): the action's
-    log standard deviation has columns of its own (there those of the mean) and the map
-    and floor of the policy's, ``SCALE_MAPPING``; the latent's is kept in
-    ``LATENT_LOG_SCALE_BOUNDS``. By default sizes are the authors'; the encoder has one
-    layer more than ``num_cells``, the decoder's.
+    Differences from the released code (https://github.com/Jack10843/OSR): the action's
+    log standard deviation has columns of its own (there those of the mean), and the map
+    and floor of the policy's, ``SCALE_MAPPING``. The latent's is kept in
+    ``LATENT_LOG_SCALE_BOUNDS``. Default sizes are the authors'; the encoder has one
+    layer more than the decoder's ``num_cells``.
     """
     pair = 2 * observation_dim
     encoder_cells = [*num_cells, *num_cells[-1:]]

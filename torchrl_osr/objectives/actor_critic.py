@@ -1,7 +1,7 @@
 r"""The base of the losses: keys, networks, the unpacked batch, targets, reduction.
 
 Shapes: ``B`` batch (any leading dimensions), ``R`` rows (all of ``B`` in one), ``A``
-action, ``N`` critics, ``K`` sampled actions of a kind, ``D`` sets of states: 2 for
+action, ``N`` critics, ``K`` sampled actions of a kind. ``D`` sets of states are 2 for
 D_tot (clean and perturbed), 1 for either alone.
 
 Networks are called with one batch dimension, as by TorchRL's own losses: ``D`` sets of
@@ -212,8 +212,8 @@ class ActorCriticLoss(LossModule):
     def register_frozen(self, name: str, network: nn.Module) -> None:
         """Register a trained network frozen: in the state dict, moved by ``.to()``.
 
-        Its parameters become buffers, so that no optimizer that takes
-        ``loss.parameters()`` can move them; they share the network's memory.
+        Its parameters become buffers, which an optimizer of ``loss.parameters()``
+        cannot move. They share the network's memory.
         """
         self.convert_to_functional(network, name)
         frozen = getattr(self, f"{name}_params").apply(
@@ -626,5 +626,5 @@ class ActorCriticLoss(LossModule):
 
 
 def _mean(value: Tensor, counted: Tensor | None) -> Tensor:
-    """Return the mean of rows ``[R]``, of which those not counted are 0."""
+    """Return the mean of rows ``[R]``; rows that do not count are 0."""
     return value.mean() if counted is None else value.sum() / counted.sum().clamp(min=1)

@@ -48,9 +48,9 @@ class InverseDynamicsLoss(ActorCriticLoss):
     squared error of a sampled action: ``states="clean"``, ``loss_function="mse"``.
 
     If a network writes ``"latent_loc"`` and ``"latent_scale"``, its latent ``z`` is
-    drawn whatever the ambient interaction type, and ``latent_weight`` times the mean of
-    its entries' divergence from ``N(0, 1)`` is added. With ``"nll"`` and the weight
-    ``Z`` that is a conditional VAE's negative evidence lower bound, from one ``z``.
+    drawn under every interaction type. The loss adds ``latent_weight`` times the mean
+    divergence of its entries from ``N(0, 1)``. With ``"nll"`` and the weight ``Z`` this
+    is the negative evidence lower bound of a conditional VAE, from one ``z``.
 
     Args:
         inverse_dynamics_network: reads states and next states. Ends in a
@@ -64,8 +64,8 @@ class InverseDynamicsLoss(ActorCriticLoss):
             of :class:`~torchrl_osr.StatePerturbation`; ``"clean"`` for the data alone.
         loss_function: ``"nll"`` (default), in nats and summed over the action's
             dimensions; ``"mse"``: the squared error of one reparametrised action,
-            averaged over its dimensions. It punishes the model's own noise as well, so
-            that the scale shrinks to its floor.
+            averaged over its dimensions. It punishes the model's own noise as well:
+            the scale shrinks to its floor.
         latent_weight: of a latent's divergence. Default 0.5, the authors'.
         reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
 

@@ -1,4 +1,4 @@
-r"""OSR: conservative Q-learning whose policy learns to come back to the data.
+r"""OSR: conservative Q-learning with a policy that learns to return to the data.
 
 Shapes: ``R`` rows, ``A`` action, ``N`` critics, ``K`` sampled actions of a kind. The
 equations are in :mod:`torchrl_osr.functional`.

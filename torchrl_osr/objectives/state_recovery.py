@@ -1,4 +1,4 @@
-r"""The state-recovery term by itself, to be added to any loss that trains an actor.
+r"""The state-recovery term alone, as an addition to any loss that trains an actor.
 
 Shapes: ``R`` rows, ``A`` action, ``D`` sets of states (2 for D_tot, 1 for either half).
 """
@@ -44,8 +44,8 @@ class StateRecoveryLoss(ActorCriticLoss):
 
     Give it the actor of an IQLLoss, SACLoss, TD3BCLoss or another TorchRL loss and add
     ``"loss_recovery"`` to that loss's entries, or join both by :class:`WithRecovery`.
-    Its parameters are the very tensors of that loss, whose optimizer is enough; its
-    gradient reaches nothing but the actor. Rows that are ``done`` do not count.
+    The two share the actor's tensors, and the optimizer of that loss is enough. The
+    gradient reaches the actor only. Rows that are ``done`` do not count.
     "Recovering from Out-of-sample States via Inverse Dynamics in Offline Reinforcement
     Learning", equations (11) and (12), https://openreview.net/forum?id=4gLWjSaw4o.
 
@@ -193,14 +193,14 @@ class StateRecoveryLoss(ActorCriticLoss):
 
 
 class WithRecovery(LossModule):
-    """A loss and a term of its actor, as one loss.
+    """Join a loss and a term of its actor to one loss.
 
-    What trains, checkpoints or logs a loss does so with both. Parameters that the two
-    share count once. Reduction, masks and weights are each one's own.
+    Trainers, checkpoints and loggers treat the two as one. Shared parameters count
+    once. Each part has its own reduction, masks and weights.
 
     Args:
         loss: trains an actor, such as TorchRL's ``IQLLoss``.
-        recovery: of that very actor; another one is a ValueError.
+        recovery: a term of the same actor; another actor is a ValueError.
 
     Examples:
         >>> from torchrl_osr import CQLLoss, StateRecoveryLoss
@@ -270,10 +270,10 @@ def policy_at(
 
 
 def cloning_distance(policy: Any, data_action: Tensor, key: NestedKey) -> Tensor:
-    r"""Return what behaviour cloning minimises, ``[D, R]``.
+    r"""Return the objective of behaviour cloning, ``[D, R]``.
 
     :math:`-\log\pi(a \mid s)`; for a policy without a density the squared distance
-    :math:`\|\pi(s) - a\|^2`. The policy is what :func:`policy_at` returns.
+    :math:`\|\pi(s) - a\|^2`. The policy is one of :func:`policy_at`.
     """
     if isinstance(policy, (Tensor, TanhDelta, Delta)):
         action = policy if isinstance(policy, Tensor) else policy.deterministic_sample

@@ -34,9 +34,9 @@ class TransitionKeys:
     """The entries of a batch that a loss reads or writes; ``set_keys`` renames them.
 
     ``reward``, ``done`` and ``terminated`` are below ``"next"``. The last three entries
-    are read if they are there: ``is_synthetic`` marks rows whose action is not the
-    data's, ``[B, 1]``; ``one_step`` is the single step of a row of several, as
-    ``"next"``; ``steps_to_next_obs`` counts a row's steps.
+    are optional. ``is_synthetic`` marks rows with an action that is not the data's,
+    ``[B, 1]``. ``one_step`` is the single step of a row of several, like ``"next"``.
+    ``steps_to_next_obs`` counts a row's steps.
     """
 
     action: NestedKey = "action"
@@ -66,7 +66,7 @@ class Transitions:
         unmasked: rows that count, bool ``[R]``; ``None`` if all do.
         one_step: the same rows with the single step as ``"next"``, see
             :class:`TransitionKeys`.
-        states: ``[s, s']`` or ``[s, s', s^]``, ``[2 or 3, R]``, of a loss with critics.
+        states: ``[s, s']`` or ``[s, s', s^]``, ``[2 or 3, R]``; only with critics.
     """
 
     states: TensorDictBase
@@ -181,9 +181,9 @@ def next_states(
 ) -> TensorDictBase:
     """Return ``("next", key)`` for each key, the current state where ``absent``.
 
-    What a loader left as the next state of an ended trajectory may be zeros, the first
-    state of the next episode or NaN. Selecting before the networks run keeps such
-    values out of the gradient, too (``0 * nan`` is ``nan``).
+    A loader may leave zeros, the first state of the next episode or NaN as the next
+    state of an ended trajectory. Selecting before the networks run keeps such values
+    out of the gradient, too (``0 * nan`` is ``nan``).
     """
     found = {}
     for key in keys:

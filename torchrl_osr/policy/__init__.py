@@ -1,4 +1,4 @@
-"""A trained policy by itself: loaded, called, saved to one file, exported."""
+"""A trained policy alone: load it, call it, save it to one file, export it."""
 
 from torchrl_osr.policy.from_loss import policy_from_loss
 from torchrl_osr.policy.policy import Policy, load_policy

@@ -1,4 +1,4 @@
-"""A trained policy by itself: observations in, actions out, in the environment's units.
+"""A trained policy alone: observations in, actions out, in the environment's units.
 
 Shapes: ``B`` batch (any leading dimensions, or none), ``S`` observation, ``A`` action.
 """
@@ -88,8 +88,8 @@ class Policy(nn.Module):
 
         Args:
             observation: as the environment gives it, one ``[S]`` or many ``[B, S]``. A
-                dictionary is joined in the alphabetical order of its keys, as the data
-                were.
+                dictionary is joined in the alphabetical order of its keys, like the
+                data.
 
         Returns:
             Actions as the environment takes them: float32, ``[A]`` or ``[B, A]``,
@@ -106,9 +106,9 @@ class Policy(nn.Module):
     ) -> Array:
         """Return the smallest of the critics' values, float32, ``[]`` or ``[B]``.
 
-        It estimates the discounted sum of the rewards that the run was trained on.
-        Conservative losses keep values low on purpose: set thresholds by values of
-        states that are known to be good.
+        It estimates the discounted sum of the training rewards. Conservative losses
+        keep values low on purpose: set thresholds by values of states that are known
+        to be good.
 
         Args:
             observation: as for :meth:`act`.
@@ -132,7 +132,7 @@ class Policy(nn.Module):
     def export(
         self, path: Path | str, output: Literal["action", "value"] = "action"
     ) -> None:
-        """Write a graph that needs none of this package, for batches of any size.
+        """Write a graph that works without this package, for batches of any size.
 
         It maps ``observation`` ``[B, S]`` to the deterministic ``action`` ``[B, A]``,
         or ``observation`` and ``action`` to ``value`` ``[B]``, all float32. Discrete
@@ -237,11 +237,11 @@ class Policy(nn.Module):
 
 
 def load_policy(path: Path | str) -> Policy:
-    """Load a policy that was saved or exported, on the CPU; nothing is unpickled.
+    """Load a saved policy on the CPU; nothing is unpickled.
 
     Args:
         path: a ``.safetensors`` file of :meth:`~torchrl_osr.policy.Policy.save`, or
-            the folder of a run, whose last policy it is.
+            the folder of a finished run, for its last policy.
 
     Examples:
         >>> import tempfile

@@ -1,10 +1,10 @@
 """Checkpoints that are whole, and that cannot run code when loaded.
 
 They are :mod:`torchrl.checkpoint` archives: one ZIP file each, every member with a
-checksum. Three things are added: a payload that is only ever read with
-``weights_only=True`` (TorchRL 0.14.1 unpickles what it finds beside a memory-mapped
-tensordict), files that are synced before they are renamed and never away in between
-(TorchRL moves the old one aside first), and a way back from a damaged newest file.
+checksum. Three things are added. The payload is only read with ``weights_only=True``
+(TorchRL 0.14.1 unpickles files beside a memory-mapped tensordict). Files are synced
+before they are renamed and are never missing in between (TorchRL first moves the old
+one aside). A damaged newest file is skipped.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class SamplerState:
 
 
 def safe_checkpoint(**components: Any) -> Checkpoint:
-    """Checkpoint of ``components`` in one archive without pickled objects.
+    """Return a checkpoint of ``components``: one archive without pickled objects.
 
     A component has ``state_dict`` and ``load_state_dict``, or is JSON-compatible (lists
     and mappings are restored in place).
@@ -107,7 +107,7 @@ def safe_checkpoint(**components: Any) -> Checkpoint:
 
 
 def find_damage(path: Path) -> str | None:
-    """Description of a checkpoint's damage, ``None`` if it is whole."""
+    """Describe a checkpoint's damage; return ``None`` if it is whole."""
     try:
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()
@@ -180,7 +180,7 @@ class Checkpoints:
     def restore(self) -> Path | None:
         """Restore the newest undamaged checkpoint; return its path, if there is one.
 
-        What a killed process left half written is removed: only one run uses a folder.
+        Half-written files of a killed process are removed: only one run uses a folder.
 
         Raises:
             CheckpointError: if a checkpoint does not fit the components, or every one
@@ -207,7 +207,7 @@ class Checkpoints:
             return path
         if found:
             raise CheckpointError(
-                f"All {len(found)} checkpoints in {self.folder} are damaged; move them "
-                "away to start anew."
+                f"All {len(found)} checkpoints in {self.folder} are damaged: move them "
+                "away to start again."
             )
         return None

@@ -38,7 +38,7 @@ Hook = tuple[str, Callable[..., Any]]
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How and how often a run is evaluated.
+    """Evaluation of a run, and its interval.
 
     Attributes:
         run: returns JSON-compatible results by name; its numbers are logged.
@@ -165,7 +165,7 @@ class OfflineTrainer(Trainer):
 
     @property
     def step(self) -> int:
-        """Gradient steps since the run's beginning; the running one counts."""
+        """Gradient steps since the start of the run, with the current one."""
         return int(self._optim_count)
 
     def best(self) -> dict[str, Any] | None:
