@@ -187,5 +187,5 @@ def test_a_frozen_model_is_followed_and_never_trained(name) -> None:
 
 def test_td3_needs_the_bounds_of_a_plain_actor() -> None:
     for name in ("td3-bc", "rebrac", "scas"):
-        with pytest.raises(ValueError, match="Pass low= and high="):
+        with pytest.raises(ValueError, match="pass low= and high="):
             make_loss(name, low=None)

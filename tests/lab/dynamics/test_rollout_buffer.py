@@ -89,7 +89,7 @@ def test_a_continued_buffer_draws_the_same_batches(data, stop) -> None:
 
 
 def buffer_of(data: ModelData, options: DynamicsOptions, **batches):
-    """Return a buffer of roll-outs, a batch, the untrained model and the actor."""
+    """Return a buffer of rollouts, a batch, the untrained model and the actor."""
     torch.manual_seed(0)
     model, actor = options.ensemble(11, 3), deterministic_actor(11, 3, num_cells=[8])
     batches = {"batch_size": 8, "n_steps": 1} | batches

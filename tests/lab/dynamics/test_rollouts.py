@@ -1,4 +1,4 @@
-"""Roll-outs in worlds that can be computed by hand."""
+"""Rollouts in worlds that can be computed by hand."""
 
 from __future__ import annotations
 
@@ -105,5 +105,5 @@ def test_terminations_are_the_simulators(env_id) -> None:
 
 def test_a_task_without_a_rule_is_named() -> None:
     assert termination("Hopper-v5")(torch.full([2, 11], float("nan"))).all()
-    with pytest.raises(ValueError, match=r"mine:Hop-v0 ends.*terminations=never"):
+    with pytest.raises(ValueError, match=r"mine:Hop-v0.*terminations=never"):
         termination("mine:Hop-v0")

@@ -1,4 +1,4 @@
-"""Dynamics models: training, roll-outs, and policies and losses that use them."""
+"""Dynamics models: training, rollouts, and policies and losses that use them."""
 
 from torchrl_osr.lab.dynamics.model_adversary import ModelAdversary
 from torchrl_osr.lab.dynamics.models import (

@@ -21,7 +21,7 @@ from torchrl_osr.lab.dynamics.rollouts import action_of
 from torchrl_osr.objectives import ActorCriticLoss
 
 SEED = 2**40
-"""Added to a seed, so that roll-outs with the same one draw other numbers."""
+"""Added to a seed, so that rollouts with the same one draw other numbers."""
 
 
 class ModelAdversary:
@@ -34,8 +34,8 @@ class ModelAdversary:
             - \min_j Q_j(s, a)
 
     The first term is :class:`DynamicsLoss` on the data. The second is a policy gradient
-    with the model as the policy, on roll-outs of the actor: transitions to worse states
-    than expected become more likely. Roll-outs go on after an end of the task, as in
+    with the model as the policy, on rollouts of the actor: transitions to worse states
+    than expected become more likely. Rollouts go on after an end of the task, as in
     RAMBO's code (https://arxiv.org/abs/2204.12581, marc-rigter/rambo).
 
     ``loss`` has the critics; the model is trained already.

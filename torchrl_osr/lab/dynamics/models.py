@@ -40,7 +40,7 @@ class DynamicsEnsemble(nn.Module):
 
     as in PETS (https://arxiv.org/abs/1805.12114) and MOPO
     (https://arxiv.org/abs/2005.13239), which sets the defaults. Inputs and targets are
-    standardised. Roll-outs use the ``num_elites`` best networks, see
+    standardised. Rollouts use the ``num_elites`` best networks, see
     :meth:`calibrate_`.
 
     Examples:

@@ -15,7 +15,7 @@ from torchrl_osr.lab.dynamics.rollouts import Termination, never, termination
 
 @dataclass(frozen=True)
 class ModelData:
-    """The data of a run as its models see them, and what rewards and values mean."""
+    """The data of a run as its models see them, and the scale of rewards and values."""
 
     storage: Storage  # rows to train on
     held_out: TensorDict  # rows to evaluate models on
@@ -38,7 +38,7 @@ class ModelData:
 
 @dataclass
 class DynamicsOptions:
-    """Which models a run trains, and how its policy is rolled out in them."""
+    """Options of a run's dynamics models and of the policy's rollouts in them."""
 
     use: bool = False  # train a model, and the policy on its rollouts
     # The ensemble. Defaults are MOPO's.
@@ -51,7 +51,7 @@ class DynamicsOptions:
     # The autoencoder of loss=sdc.
     vae_num_cells: list[int] = field(default_factory=lambda: [750, 750])
     vae_steps: int = 100_000  # gradient steps of the autoencoder
-    # Roll-outs.
+    # Rollouts.
     real_ratio: float = 0.05  # share of recorded rows in a batch; 1: no rollouts
     rollout_steps: int = 5  # steps of a rollout
     rollout_starts: int = 50_000  # number of rollouts at a time
@@ -63,7 +63,7 @@ class DynamicsOptions:
     penalty: float = 0.0  # weight of the model's uncertainty in rewards
     unknown: str = "refuse"  # unknown rows: "refuse", "halt" (end there) or "take"
     known_share: float = 1.0  # share of held-out rows that count as known
-    # RAMBO's training of the model against the policy, before each further roll-out.
+    # RAMBO's training of the model against the policy, before each further rollout.
     adversarial_steps: int = 0  # gradient steps against the policy
     adversarial_weight: float = 3e-4  # weight of the adversarial term
     adversarial_lr: float = 3e-4  # learning rate of these steps
@@ -77,7 +77,7 @@ class DynamicsOptions:
     def termination(
         self, env_id: str, loc: Tensor | float = 0.0, scale: Tensor | float = 1.0
     ) -> Termination:
-        """Return the rule that ends roll-outs, for states ``(s - loc) / scale``."""
+        """Return the rule that ends rollouts, for states ``(s - loc) / scale``."""
         rule = never if self.terminations == "never" else termination(env_id)
         return lambda state: rule(state * scale + loc)
 

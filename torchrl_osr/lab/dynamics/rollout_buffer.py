@@ -25,15 +25,15 @@ from torchrl_osr.lab.dynamics.rollouts import (
 
 
 class RolloutReplayBuffer:
-    """Mix recorded rows with roll-outs of the policy's newest copies.
+    """Mix recorded rows with rollouts of the policy's newest copies.
 
     Before the first batch, and after every ``options.rollout_interval`` batches, a copy
     of the policy is rolled out, after the adversary has trained the model. The last
-    ``options.generations`` of roll-outs, ``synthetic``, are sampled from. Recorded rows
+    ``options.generations`` of rollouts, ``synthetic``, are sampled from. Recorded rows
     come first in a batch and may be of ``n_steps``; synthetic ones are single steps.
 
-    Each roll-out has its own seed and leaves torch's global generator alone. The state
-    dict holds policies instead of rows; loading it repeats the roll-outs.
+    Each rollout has its own seed and leaves torch's global generator alone. The state
+    dict holds policies instead of rows; loading it repeats the rollouts.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class RolloutReplayBuffer:
         self.adversary, self.n_steps = adversary, n_steps
         self.batch_size, self.transform = batch_size, transform
         self.real = data.buffer()
-        # The adversary's model is copied too: a roll-out must be repeatable.
+        # The adversary's model is copied too: a rollout must be repeatable.
         self.policy = actor if adversary is None else nn.ModuleList([actor, model])
         self.bounds = self._bounds()
         self.num_batches = 0
@@ -145,7 +145,7 @@ class RolloutReplayBuffer:
             rows, rejected = self.roll_out(self._copy)
         if not len(rows):
             raise ValueError(
-                "The model rejects all rows of a roll-out. Train it longer "
+                "The model rejects all rows of a rollout: train it longer "
                 "(dynamics.steps), or keep them (dynamics.unknown=take)."
             )
         return rows, rejected
@@ -176,7 +176,7 @@ class RolloutReplayBuffer:
         return state
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Repeat the roll-outs of a state."""
+        """Repeat the rollouts of a state."""
         self.num_batches = state_dict["num_batches"]
         self._policies = list(state_dict["policies"])
         if self.adversary is not None:

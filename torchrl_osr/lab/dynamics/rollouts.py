@@ -1,4 +1,4 @@
-"""Roll-outs of a policy in a dynamics model, and the rules that end them.
+"""Rollouts of a policy in a dynamics model, and the rules that end them.
 
 Shapes: ``B`` starts, ``S`` observation, ``A`` action, ``n`` transitions.
 """
@@ -51,8 +51,8 @@ def termination(env_id: str) -> Termination:
     found = re.fullmatch(r"(\w+)-v[2-5]", env_id)
     if found is None or found[1] not in RULES:
         raise ValueError(
-            f"No rule is known by which {env_id} ends, only those of {[*RULES]}. If a "
-            "time limit alone ends it, set dynamics.terminations=never."
+            f"The package has no end rule of {env_id}, only of {', '.join(RULES)}. If "
+            "only a time limit ends it, set dynamics.terminations=never."
         )
     return RULES[found[1]]
 
@@ -84,7 +84,7 @@ def rollout(
         starts: ``[B, S]``, in the units of the model's data, as all states.
 
     Keyword Args:
-        steps: largest length of a roll-out.
+        steps: largest length of a rollout.
         terminated: of next states.
         max_disagreement: of the elites; rows with more, or that are not finite, are
             rejected.

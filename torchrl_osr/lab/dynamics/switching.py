@@ -90,7 +90,7 @@ class SwitchingPolicy:
     Keyword Args:
         terminated: of next observations.
         steps: :math:`T`.
-        hold: calls for which the chosen policy acts.
+        hold: number of calls until the next choice.
 
     Examples:
         >>> rest, push = torch.zeros_like, torch.ones_like
@@ -118,13 +118,13 @@ class SwitchingPolicy:
         self.reset()
 
     def reset(self) -> None:
-        """Choose anew at the next call."""
+        """Choose a policy at the next call."""
         self.chosen: Tensor | None = None
         self._calls = 0
 
     @torch.no_grad()
     def __call__(self, observation: Tensor) -> Tensor:
-        """Return actions ``[B, A]`` for ``[B, S]``; another ``B`` chooses anew."""
+        """Return actions ``[B, A]`` for ``[B, S]``; a change of ``B`` is a reset."""
         holds = self.chosen is not None and len(self.chosen) == len(observation)
         if not holds or self._calls == self.hold:
             self.chosen, self._calls = self.returns(observation).argmax(1), 0

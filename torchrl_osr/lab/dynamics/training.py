@@ -1,4 +1,4 @@
-"""Train the dynamics models of a run, judge them, and roll its policy out in them."""
+"""Train and evaluate the dynamics models of a run; roll its policy out in them."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ def train_dynamics(
     """Train a run's dynamics models, and load them into the parts of its loss.
 
     Returns:
-        The policy's buffer with roll-outs, if there are to be any, whose options are
-        ``batches``.
+        The policy's buffer with rollouts, with the options ``batches``; ``None`` if
+        ``options.real_ratio`` is 1.
     """
     model = dynamics_model(options, data, fit, folder)
     parts = [each for each in loss.modules() if isinstance(each, ActorCriticLoss)]
@@ -146,12 +146,12 @@ def _standardize(model: DynamicsEnsemble | TransitionVAE, data: ModelData) -> No
 
 @torch.no_grad()
 def dynamics_report(model: DynamicsEnsemble, data: TensorDictBase) -> dict[str, Any]:
-    """Measure an ensemble's errors on rows ``[N]``, and how well it predicts them.
+    """Measure an ensemble's errors on rows ``[N]``, and its calibration.
 
     Returns:
-        ``"nll"`` of the elites, in nats, summed over entries; ``"mse"`` of all
-        networks, in standardised targets; ``"r2"`` of the elites' mean for each entry,
-        the reward last; the share of errors ``"within_1_sigma"``, 0.683 if calibrated;
+        ``"nll"`` of the elites, in nats, summed over entries. ``"mse"`` of all
+        networks, in standardised targets. ``"r2"`` of the elites' mean for each entry,
+        the reward last. The share of errors ``"within_1_sigma"``, 0.683 if calibrated.
         Spearman's correlation of disagreement and error, ``"disagreement_rank"``.
     """
     rows = data[has_next_state(data, model.in_keys[0])]

@@ -1,7 +1,7 @@
 """Disturbances for robustness evaluation, as Gymnasium wrappers.
 
-* ``reset(seed=...)`` seeds the disturbance, too. It draws from a generator of its own,
-  so that episodes with and without it start in the same state.
+* ``reset(seed=...)`` seeds the disturbance, too. Its random generator is its own:
+  episodes with and without it start in the same state.
 * Strength 0 is the bare environment, bit for bit.
 * ``info["disturbed"]`` is true in each step in which a disturbance acted.
 

@@ -45,10 +45,10 @@ def attacked_policy(
 ) -> Callable[[Tensor], Tensor]:
     """Return a deterministic policy ``[E, S]`` -> ``[E, A]`` under attack.
 
-    Each number of an observation is off by at most ``epsilon`` standard deviations:
-    uniformly (``"random"``), or as
-    :class:`~torchrl_osr.lab.losses.Adversary` finds it, with the largest change of the
-    policy (``"action_diff"``) or the action of lowest value (``"min_Q"``).
+    Each number of an observation is off by at most ``epsilon`` standard deviations.
+    ``"random"`` draws uniformly. Otherwise
+    :class:`~torchrl_osr.lab.losses.Adversary` seeks the largest change of the policy
+    (``"action_diff"``) or the action of lowest value (``"min_Q"``).
 
     Args:
         policy_distribution: the actor's ``get_dist``, for instance.

@@ -70,8 +70,8 @@ def disturbances_of(names: Iterable[str]) -> list[str]:
 def load_recoverable_states(env_name: str, half: str = "public") -> RecoverableStates:
     """Load the states of one task, ``"walker2d"`` for instance.
 
-    Choose methods by the ``"public"`` half. The ``"held-out"`` one is for one look at
-    the finished method.
+    Choose methods by the ``"public"`` half. Evaluate a finished method once on the
+    ``"held-out"`` half.
 
     Examples:
         >>> states = load_recoverable_states("walker2d")
@@ -92,9 +92,9 @@ def load_recoverable_states(env_name: str, half: str = "public") -> RecoverableS
 def recovers(states: RecoverableStates, policy: Policy) -> NDArray[np.bool_]:
     """Return whether a policy recovers from each state, ``[M]``.
 
-    Hopper and Walker2d: it has not fallen after ``steps`` steps. HalfCheetah: its mean
-    speed over the last 50 of them is at least ``least_speed``. Maze: it has reached
-    the goal by then.
+    Hopper and Walker2d: no fall within ``steps`` steps. HalfCheetah: a mean speed of
+    at least ``least_speed`` over the last 50 of these steps. Maze: the goal is reached
+    within them.
 
     Examples:
         >>> import torch

@@ -117,7 +117,7 @@ class Trajectory:
         return True if later >= STEPS_AFTER else None
 
     def steps_back(self, end: int, distance: DataDistance) -> int | None:
-        """Return the steps from ``end`` until it is in the data, if it comes back."""
+        """Return the steps from ``end`` to the first state in the data, if any."""
         # The state of a fall does not count.
         rows = self.observations[end : -1 if self.terminated else None]
         for first in range(0, len(rows), STEPS_AFTER):  # most are back soon
@@ -134,11 +134,11 @@ def measure_recovery(
     """Measure survival and recovery after the first disturbance of an episode.
 
     Returns:
-        ``None`` if the disturbance never acted. Else whether the episode had not fallen
-        at its end, ``"survived_knock"``, nor 100 steps later, ``"alive_after"``
-        (``None``: the time limit came first); the latter of the undisturbed episode,
-        ``"clean_alive_after"``; and the steps until the state is in the data,
-        ``"recovery_steps"`` (``None``: the episode ended before).
+        ``None`` if the disturbance never acted. Otherwise ``"survived_knock"``: no fall
+        until its end. ``"alive_after"``: nor within 100 steps after it (``None``: the
+        time limit came first). ``"clean_alive_after"``: the same of the undisturbed
+        episode. ``"recovery_steps"``: steps until the state is in the data (``None``:
+        the episode ended before).
     """
     block = disturbed.disturbance()
     if block is None:

@@ -1,6 +1,6 @@
 """Episodes with and without disturbances, in pairs: same policy, same start state.
 
-How it is measured is in ``docs/robustness.md``. Shapes: ``E`` pairs of episodes.
+``docs/robustness.md`` explains the measures. Shapes: ``E`` pairs of episodes.
 """
 
 from __future__ import annotations
@@ -58,9 +58,9 @@ def evaluate_paired(
 ) -> dict[str, Any]:
     """Play clean episodes once, and the same episodes under each disturbance.
 
-    Episodes of a pair have the same seed, hence the same start state, and the policy
-    is called with batches of one size: until the disturbance acts they are equal, bit
-    for bit. Warns if the environment ignores its seed.
+    Episodes of a pair have the same seed and start state, and the policy is called
+    with batches of one size. Until the disturbance acts they are equal, bit for bit.
+    Warns if the environment ignores its seed.
 
     Args:
         policy: to be evaluated, on the CPU.
@@ -77,10 +77,11 @@ def evaluate_paired(
     Returns:
         JSON-compatible. ``"clean"``: lists ``"returns"``, ``"lengths"``, ``"seeds"``
         and, with references, ``"scores"``, one entry an episode. ``"levels"``: the same
-        for each disturbance, with ``"name"``, ``"kind"``, ``"strength"``, the step at
-        which each episode was ``"disturbed_at"`` (``None``: it ended before), and the
-        entries of :func:`~torchrl_osr.lab.evaluation.recovery.measure_recovery`, which
-        are ``None`` if the disturbance does not end.
+        for each disturbance, with its ``"name"``, ``"kind"`` and ``"strength"``.
+        ``"disturbed_at"`` is the step of the disturbance (``None``: the episode ended
+        before). The entries of
+        :func:`~torchrl_osr.lab.evaluation.recovery.measure_recovery` are ``None`` if
+        the disturbance does not end.
     """
 
     def play(

@@ -25,8 +25,8 @@ NORMAL_QUANTILE_975 = 1.959963984540054
 class Estimate(NamedTuple):
     """A mean with its 95 % interval.
 
-    ``over`` is what was resampled: ``"seeds"``, ``"two seeds"``, or ``"episodes"`` or
-    ``"walks"`` of a single seed.
+    ``over`` names the resampled units: ``"seeds"``, ``"two seeds"``, or ``"episodes"``
+    or ``"walks"`` of a single seed.
     """
 
     mean: float

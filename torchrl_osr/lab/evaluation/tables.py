@@ -24,7 +24,7 @@ def score_table(
     """Format the scores, or returns, of the data and of all evaluations.
 
     The mean leaves out the untrained policy, at step 0. The ``best`` evaluation is
-    chosen by its own episodes, hence optimistic.
+    biased upwards, because its own episodes selected it.
     """
     measure, last = measure_of(best), history[-1]
 

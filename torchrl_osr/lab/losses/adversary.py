@@ -45,10 +45,10 @@ class Adversary:
     The methods:
 
     * ``"sample"`` (RORL's zero order): the best of ``num_samples`` uniform draws, for
-      ``"min_Q"`` also of no perturbation;
+      ``"min_Q"`` also of no perturbation.
     * ``"gradient"``: ``num_steps`` steps of ``step_size * epsilon`` along the sign of
-      the gradient from each of ``num_samples`` draws, kept in the box; then the best of
-      the ends. One start is RORL's first order, 20 are its mixed order.
+      the gradient, from each of ``num_samples`` draws and within the box. The best end
+      counts. One start is RORL's first order, 20 are its mixed order.
 
     Each row draws for itself; RORL's code draws once for the whole batch. ``epsilon``
     is in units of the observation.

@@ -126,7 +126,7 @@ class IQLLoss(ActorCriticLoss):
         if batch.is_data is not None:
             raise ValueError(
                 "The batch has synthetic rows, but IQL learns from the data's actions: "
-                "leave out the roll-outs of a model."
+                "leave out the rollouts of a model."
             )
         pi = distribution(
             self.actor_network, self.actor_network_params, batch.states[:1]

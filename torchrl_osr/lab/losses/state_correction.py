@@ -46,14 +46,14 @@ class SCASLoss(TD3Loss):
         V(s) = \frac1N \sum_i Q_i(s, \pi(s))
 
     with a perturbed state :math:`\hat s`, a frozen model :math:`M` of the dynamics, and
-    the critics of :class:`~torchrl_osr.lab.losses.td3.TD3Loss`, of which the authors
-    have four. "Offline Reinforcement Learning with OOD State Correction and OOD Action
+    the critics of :class:`~torchrl_osr.lab.losses.td3.TD3Loss` (the authors use four).
+    "Offline Reinforcement Learning with OOD State Correction and OOD Action
     Suppression", https://arxiv.org/abs/2410.19400. It prints :math:`\tilde s = \hat s`;
     its released code (MAOYIXIU/SCAS) has :math:`\tilde s = s`, the default here.
 
     Differences from that code: :math:`M` is the mean of an ensemble's elites, trained
-    by likelihood (there one network, by squared error); rows that are ``done`` have no
-    correction; the target is the critics' minimum in mazes, too (there their mean).
+    by likelihood (there one network, by squared error). Rows that are ``done`` have no
+    correction. In mazes, too, the target is the critics' minimum (there their mean).
 
     Keyword Args:
         correction_weight: :math:`\lambda`, between 0 and 1. Default 0.25.
@@ -125,7 +125,8 @@ class SCASLoss(TD3Loss):
     def deviation(self, batch: Transitions, action: Tensor) -> Tensor:
         """Return the squared distance from the data's next state, ``[R]``.
 
-        Of where the model says that the policy's action leads from the perturbed state.
+        It is the distance of the model's next state, after the policy's action at the
+        perturbed state.
         """
         check_single_steps(batch, "the model of the dynamics")
         perturbed, model = batch.states[2], self.dynamics_network
@@ -171,8 +172,8 @@ class StateDeviationLoss(ActorCriticLoss):
     https://doi.org/10.1609/aaai.v36i8.20886) adds it to CQL(H), see
     :class:`~torchrl_osr.objectives.WithRecovery`.
 
-    **This is our reading**: the authors have published no code and no settings that we
-    could find. Kernel, its width, :math:`\eta` and the number of samples are ours.
+    **This is our reading**: we found neither code nor settings of the authors. The
+    kernel, its width, :math:`\eta` and the number of samples are ours.
 
     Keyword Args:
         num_samples: ``n`` of :math:`M` and of :math:`U`. Default 4.
@@ -240,7 +241,7 @@ class StateDeviationLoss(ActorCriticLoss):
         }
 
     def deviation(self, batch: Transitions) -> Tensor:
-        """Return the discrepancy of where policy and data lead, ``[R]``."""
+        """Return the discrepancy of the next states of policy and data, ``[R]``."""
         model, aims = self.dynamics_network, self.transition_network
         number, keys = self.num_samples, state_keys(self.actor_network.in_keys)
         states = batch.states_of(keys, "perturbed")

@@ -61,8 +61,8 @@ class TD3Loss(ActorCriticLoss):
         own = squashing_bounds(actor_network)
         if not own and (low is None or high is None):
             raise ValueError(
-                "Pass low= and high= of the environment's actions: the actor's module "
-                "does not have them."
+                "The actor's module has no action bounds: pass low= and high= of the "
+                "environment's actions."
             )
         bounds = own or (torch.as_tensor(low).float(), torch.as_tensor(high).float())
         self.register_bounds(bounds)

@@ -47,10 +47,10 @@ class Quantity(NamedTuple):
 
 
 class Difference(NamedTuple):
-    """A method less the reference, in one quantity on one data set or :data:`ALL_DATA`.
+    """Method minus reference in one quantity, on one data set or :data:`ALL_DATA`.
 
-    ``seeds`` is the smallest number of pairs of runs of a data set; ``note`` says what
-    is left out, or why there is no ``estimate``.
+    ``seeds`` is the smallest number of pairs of runs of a data set. ``note`` names what
+    is left out, or the reason why there is no ``estimate``.
     """
 
     data: str

@@ -24,7 +24,7 @@ IGNORED = (
     *("resume", "seed", "data.storage", "logger.", "trainer.compile"),
     *("trainer.cudagraph", "trainer.checkpoint_interval", "loss.deactivate_vmap"),
 )
-"""Settings that change how a number is computed, not which, and the seed."""
+"""The seed, and settings that change how a number is computed, but not the number."""
 
 METHOD = (
     *("loss.", "recovery", "network.actor.", "optim.policy_delay", "perturbation."),
@@ -50,7 +50,7 @@ class RunTables:
             never ``disturbed_at`` a step, or the disturbance does not end.
         saved: a row for each run and recoverable state, in the order of the states.
             ``states`` is the half and a digest, ``back`` the share of the checkpoints
-            that came back from it.
+            that recovered.
         left_out: folder of each run that is not in the tables, and the reason.
     """
 
@@ -97,9 +97,9 @@ def find_runs(tops: Iterable[Path]) -> list[Path]:
 def read_runs(folders: Sequence[Path]) -> RunTables:
     """Read all finished runs in or below the folders, and name their methods.
 
-    Runs of one method differ in nothing but the seed, and what is chosen by the data
-    set. If other settings differ, the name of the method says in which. Of two runs of
-    one method, data set and seed the later one counts.
+    Runs of one method differ only in the seed, and in settings that depend on the data
+    set. Other differences become part of the method's name. Of two runs of one method,
+    data set and seed the later one counts.
     """
     found: list[_Run] = []
     left_out: list[tuple[str, str]] = []
@@ -295,7 +295,7 @@ def tell_apart(
 
 
 def comparison_notes(tables: RunTables) -> list[str]:
-    """Write a sentence for everything that makes a comparison less than fair."""
+    """Write a sentence for each thing that makes a comparison unfair."""
     runs, notes = tables.runs, []
     versions = pd.Series(runs["versions"].explode().dropna().unique()).sort_values()
     for _, each in versions.groupby(versions.str.rpartition(" ")[0]):

@@ -117,10 +117,10 @@ def _check_combination(config: TrainConfig, learner: Learner) -> None:
     elif not dynamics.use and any(hasattr(m, "dynamics_network") for m in modules):
         why = f"{name} needs a model of the dynamics: choose dynamics=ensemble"
     elif rolled_out and (reads_data or isinstance(loss, IQLLoss)):
-        why = f"{name} learns from actions of the data alone, which roll-outs lack:"
+        why = f"{name} learns from actions of the data alone, which rollouts lack:"
         why += " choose dynamics=none"
     elif dynamics.use and dynamics.adversarial_steps and not (rolled_out and critics):
-        why = "dynamics.adversarial_steps needs roll-outs and critics: set it to 0"
+        why = "dynamics.adversarial_steps needs rollouts and critics: set it to 0"
     if why:
         raise ValueError(f"{why}.")
     if dynamics.use:
