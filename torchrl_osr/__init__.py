@@ -4,16 +4,20 @@
 Learning" (Jiang et al., NeurIPS 2023), https://openreview.net/forum?id=4gLWjSaw4o
 """
 
-from torchrl_osr.objectives import (
-    CQLLoss,
-    DiscreteOSRLoss,
-    InverseDynamicsLoss,
-    OSRLoss,
-    OSRVLoss,
-    StateRecoveryLoss,
-)
-from torchrl_osr.policy import load_policy
-from torchrl_osr.transforms import StatePerturbation
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from torchrl_osr.objectives import (
+        CQLLoss,
+        DiscreteOSRLoss,
+        InverseDynamicsLoss,
+        OSRLoss,
+        OSRVLoss,
+        StateRecoveryLoss,
+    )
+    from torchrl_osr.policy import load_policy
+    from torchrl_osr.transforms import StatePerturbation
 
 __version__ = "0.1.0"
 
@@ -28,3 +32,12 @@ __all__ = [
     "__version__",
     "load_policy",
 ]
+
+
+def __getattr__(name: str) -> object:
+    """Import a name at its first use: the command line's help needs no torch."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    homes = {"load_policy": "policy", "StatePerturbation": "transforms"}
+    home = import_module(f"{__name__}.{homes.get(name, 'objectives')}")
+    return getattr(home, name)

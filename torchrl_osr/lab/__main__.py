@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
-from torchrl_osr.lab.cli.console import errors_as_sentences
+from torchrl_osr.lab.cli.console import errors_as_sentences, guess
+from torchrl_osr.lab.run import CONF
 
 # Waiting threads do not spin; read once, when torch is imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -23,6 +26,12 @@ COMMANDS = {
     "report": "compare any number of runs on one page",
     "export": "write a trained policy to one file, for use elsewhere",
 }
+
+CONFIGS = {
+    "data": "check_data", "train": "train", "collect": "collect",
+    "evaluate": "evaluation/evaluate",
+}  # fmt: skip
+"""Configurations of Hydra's commands; they have the commands' help."""
 
 HELP = """\
 Offline reinforcement learning that recovers from out-of-distribution states (OSR).
@@ -50,9 +59,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(HELP.format(commands="\n".join(lines)), end="")
     elif name == "--version":
         print(_versions())
+    elif name in CONFIGS and {"-h", "--help"} & {*rest}:
+        from yaml import safe_load  # quick, unlike Hydra and torch
+
+        content = safe_load(Path(CONF, f"{CONFIGS[name]}.yaml").read_text())
+        print(content["hydra"]["help"]["template"], end="")
     elif name in COMMANDS:
         # Hydra takes no flag behind the first key=value.
         rest.sort(key=lambda each: each not in ("-m", "--multirun"))
+        home = str(Path.home())  # a shell leaves the ~ of data.path=~/log.csv
+        rest = [re.sub(r"(?<=[=\[,\"'])~(?=/)", lambda _: home, each) for each in rest]
         sys.argv = [f"torchrl-osr {name}", *rest]
         # For modules of the user's; last, where they replace no installed package.
         sys.path.append(os.getcwd())
@@ -60,7 +76,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             import_module(f"torchrl_osr.lab.cli.{name}").main()
     else:
         known = ", ".join(COMMANDS)
-        sys.exit(f"torchrl-osr has no command {name!r}; it has {known}.")
+        similar = guess(name, COMMANDS)
+        sys.exit(f"torchrl-osr has no command {name!r}{similar}; it has {known}.")
 
 
 def _versions() -> str:

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
+import uuid
+from pathlib import Path
 
 import pytest
 from composed import composed
@@ -19,6 +23,19 @@ def test_help_lists_every_command(capsys):
     assert re.findall(r"(?m)^  (\w+)  +[a-z]", printed) == list(COMMANDS)
 
 
+def test_help_is_quick_and_has_no_raw_configuration():
+    """Without importing torch; the test of ``train`` compares its options."""
+    code = (
+        "import sys, torchrl_osr.lab.__main__ as lab\n"
+        "lab.main([]); [lab.main([name, '--help']) for name in lab.CONFIGS]\n"
+        "sys.exit('torch' in sys.modules)"
+    )
+    command = [sys.executable, "-c", code]
+    printed = subprocess.check_output(command, text=True)
+    assert "half-widths of their bounds" in printed
+    assert "action_low" not in printed
+
+
 def test_version_begins_with_the_package(capsys):
     main(["--version"])
     start = f"torchrl-osr {__version__}, python 3."
@@ -26,23 +43,34 @@ def test_version_begins_with_the_package(capsys):
 
 
 def test_unknown_command_lists_commands():
-    with pytest.raises(SystemExit, match=r"no command 'trian'; it has data, train, "):
+    with pytest.raises(SystemExit, match=r"'trian' \(did you mean 'train'\?\); it has"):
         main(["trian"])
+
+
+QUOTED = "cannot be read: quote a value with blanks, brackets or quotes, as in "
 
 
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("sed=1", "there is no key 'sed'; its group has .*seed, resume, "),
-        ("loss.num_randm=1", "there is no key 'loss.num_randm'; .*num_random, "),
-        ("loss=sql", "loss has no option 'sql'; it has .*iql, .*osr"),
+        ("sed=1", r"there is no key 'sed' \(did you mean 'seed'\?\); .*, resume, "),
+        (
+            "loss.num_randm=1",
+            r"there is .*_randm' \(did you mean 'num_random'.*, alpha_init",
+        ),
+        ("data=medum", r"data has no option 'medum' \(did you mean 'medium'\?\); it"),
         ("seed=a", "Error merging override seed=a: Value 'a' .* to Integer"),
+        ("seed=0,1", "seed=0,1 has several values: add -m to run each, or quote "),
+        ("data.path=a,b.npz", ".*, as in 'data.path=\"a,b.npz\"'"),
+        ("data.path=log (1).csv", f".*{QUOTED}'data.path=\"log \\(1\\).csv\"'"),
+        ("data.path=it's.csv", f".*{QUOTED}'data.path=\"it'\"'\"'s.csv\"'"),
+        ("seed", "'seed' is no key=value"),
     ],
 )
 def test_wrong_override_is_one_sentence(override, message):
     with pytest.raises(Exception, match=r".") as error:
         composed("train", override)
-    assert re.match(message, sentence(error.value))
+    assert re.match(message, sentence(error.value)), sentence(error.value)
     assert "\n" not in sentence(error.value)
 
 
@@ -53,6 +81,9 @@ def test_other_errors_are_one_sentence():
     assert sentence(ValueError("seed is too large.")) == "seed is too large."
     package = ModuleNotFoundError("No module named 'hydra'", name="hydra")
     assert "'hydra'. Commands need what 'torchrl-osr[train]'" in sentence(package)
+    with pytest.raises(ValueError, match="invalid literal") as foreign:
+        uuid.UUID("x" * 32)
+    assert sentence(foreign.value).startswith("ValueError: invalid literal")
     # A defect of ours: there is no sentence to it.
     assert sentence(KeyError("x")) == "KeyError: 'x'\nIts traceback: add --debug."
 
@@ -72,8 +103,9 @@ def test_error_is_printed_once_and_debug_shows_where(tmp_path, run):
     assert "FileNotFoundError: there is no run" in output
 
 
-def test_a_mistyped_folder_to_resume_is_not_left_behind(tmp_path, run):
-    code, output = run(tmp_path, "train", "resume=outputs/typo")
+def test_a_mistyped_folder_is_not_left_behind_and_home_is_expanded(tmp_path, run):
+    code, output = run(tmp_path, "train", "resume=~/outputs/typo")
     assert code == 1
-    assert "resume=outputs/typo: there is no config.yaml in it" in output
+    start = f"resume={Path.home()}/outputs/typo: there is no config.yaml in it; give"
+    assert output.startswith(start)
     assert list(tmp_path.iterdir()) == []

@@ -5,13 +5,17 @@ from __future__ import annotations
 import functools
 import logging
 import os
+import re
+import shlex
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from difflib import get_close_matches
+from traceback import walk_tb
 from typing import Any
 
 OURS = (ValueError, OSError, RuntimeError, ImportError, ArithmeticError, MemoryError)
-"""Errors that this package raises with a whole sentence; others are defects."""
+"""Errors that this package raises with a whole sentence."""
 
 
 @contextmanager
@@ -72,27 +76,56 @@ def single_job(task: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def sentence(error: BaseException) -> str:
-    """Return an error in words; of a defect also its type and how to see more."""
+    """Return an error in words; of a foreign one also its type and how to see more."""
     if type(error).__module__.startswith(("hydra.", "omegaconf.")):
         return _configuration_error(error)
     if isinstance(error, ModuleNotFoundError):
         return f"{error}. Commands need what 'torchrl-osr[train]' installs."
-    if isinstance(error, OURS) and str(error):
+    raised = [frame.f_globals["__name__"] for frame, _ in walk_tb(error.__traceback__)]
+    ours = not raised or raised[-1].startswith("torchrl_osr.")
+    if ours and isinstance(error, OURS) and str(error):
         return str(error)
     return f"{type(error).__name__}: {error}\nIts traceback: add --debug."
 
 
+def guess(name: str, known: Iterable[str]) -> str:
+    """Return a question after a mistyped name, if a known one is similar."""
+    found = get_close_matches(name, [*known], 1)
+    return f" (did you mean {found[0]!r}?)" if found else ""
+
+
 def _configuration_error(error: Any) -> str:
     """Name the key, and list the choices, of an error of Hydra's or OmegaConf's."""
-    from hydra.errors import MissingConfigException
+    from hydra.errors import MissingConfigException, OverrideParseException
     from omegaconf.errors import ConfigAttributeError, ConfigKeyError
 
     cause = error.__cause__
     if isinstance(error, MissingConfigException) and error.options:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
-        return f"{group} has no option {name!r}; it has {', '.join(error.options)}."
+        options, similar = ", ".join(error.options), guess(name, error.options)
+        return f"{group} has no option {name!r}{similar}; it has {options}."
     if isinstance(cause, (ConfigKeyError, ConfigAttributeError)):
-        known = ", ".join(map(str, cause.parent_node or ()))
-        return f"there is no key {cause.full_key!r}; its group has {known}."
+        known = [*map(str, cause.parent_node or ())]
+        similar = guess(str(cause.full_key).rpartition(".")[2], known)
+        return (
+            f"there is no key {cause.full_key!r}{similar}; "
+            f"its group has {', '.join(known)}."
+        )
+    several = re.match(
+        r"(?:Ambiguous value for argument|Sweep parameters) '(.*)'", str(error)
+    )
+    if several or isinstance(error, OverrideParseException):
+        given = several[1] if several else error.override
+        key, equals, value = given.partition("=")
+        escaped = value.replace('"', '\\"')
+        quoted = shlex.quote(f'{key}="{escaped}"')
+        if several:
+            why = "has several values: add -m to run each, or quote what is one value"
+        elif equals:
+            why = "cannot be read: quote a value with blanks, brackets or quotes"
+        else:
+            return f"{given!r} is no key=value: --help shows the options."
+        return f"{given} {why}, as in {quoted}."
     lines = [str(each).strip().split("\n")[0] for each in (error, cause) if each]
+    lines[0] = lines[0].rpartition("raised while resolving interpolation: ")[2]
     return ": ".join(lines)

@@ -175,9 +175,10 @@ def _registered(env_id: str) -> gymnasium.Env[Any, Any]:
     except (gymnasium.error.Error, ModuleNotFoundError) as error:
         missing = gymnasium.error.DependencyNotInstalled, ModuleNotFoundError
         kind = ImportError if isinstance(error, missing) else ValueError
+        why = str(error.__cause__ or error).rstrip(".")
         raise kind(
-            f"env.id={env_id} cannot be made: {error.__cause__ or error} A task of "
-            "your own is env.id=<package>:<name>, where that can be imported."
+            f"env.id={env_id} cannot be made: {why}. A task of your own is "
+            "env.id=<package>:<name>, where that can be imported."
         ) from error
     if env_id in MAZE_IDS.values():
         # The model's file, which is loaded now and would be left for ever.
