@@ -364,13 +364,15 @@ class ActorCriticLoss(LossModule):
 
     def unpack(self, tensordict: TensorDictBase) -> Transitions:
         """Return the batch as named tensors, see :class:`Transitions`."""
-        name = next(name for name in self._modules if name.endswith("_params"))
-        dtype = next(iter(getattr(self, name).values(True, True))).dtype
+        # To the end: torch.compile cannot leave an iterator of a dictionary halfway.
+        name, *_ = (name for name in self._modules if name.endswith("_params"))
+        first, *_ = getattr(self, name).values(True, True)
         masks = self._loss_mask_keys()
-        batch = Transitions(tensordict, self.in_keys, self.tensor_keys, masks, dtype)
-        action = batch.rows.get(self.tensor_keys.action, None)
+        keys, dtype = self.tensor_keys, first.dtype
+        batch = Transitions(tensordict, self.in_keys, keys, masks, dtype)
+        action = batch.rows.get(keys.action, None)
         if action is not None and "action_low" in self._buffers:  # real, if integers
-            batch.rows.set(self.tensor_keys.action, action.to(dtype))
+            batch.rows.set(keys.action, action.to(dtype))
         if "qvalue_network" in self.__dict__:
             batch.stack_states(self.observation_keys, perturbed=self.reads_perturbed)
         return batch
