@@ -12,23 +12,23 @@ from torch import Tensor
 
 
 def nested(prefix: NestedKey, key: NestedKey) -> NestedKey:
-    """``key`` below ``prefix``: ``("next", "observation")``, for instance."""
+    """Return ``key`` below ``prefix``: ``("next", "observation")``, for instance."""
     return unravel_key((prefix, key))
 
 
 def is_next(key: NestedKey) -> bool:
-    """Whether ``key`` lies below ``"next"``."""
+    """Return whether ``key`` lies below ``"next"``."""
     return isinstance(key, tuple) and key[0] == "next"
 
 
 def state_keys(in_keys: Iterable[NestedKey], *exclude: NestedKey) -> list[NestedKey]:
-    """The current-state entries of ``in_keys``, once each and in order."""
+    """Return the current-state entries of ``in_keys``, once each and in order."""
     keys = dict.fromkeys(unravel_key(key) for key in in_keys)
     return [key for key in keys if not is_next(key) and key not in exclude]
 
 
 def entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    """An entry that must be there; a KeyError names it and those that are there."""
+    """Return a required entry; a KeyError names it and the existing ones."""
     value: Tensor | None = tensordict.get(key, None)
     if value is None:
         there = sorted(map(str, tensordict.keys(True, True)))
@@ -37,7 +37,7 @@ def entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
 
 
 def column(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    """An entry with one number a row, ``[B, 1]``, as ``[B]``."""
+    """Return an entry with one number a row, ``[B, 1]``, as ``[B]``."""
     value = entry(tensordict, key)
     expected = (*tensordict.batch_size, 1)
     if value.shape != expected:

@@ -23,7 +23,7 @@ from torch import Tensor
 def gaussian_kl(
     loc_p: Tensor, scale_p: Tensor, loc_q: Tensor, scale_q: Tensor
 ) -> Tensor:
-    r""":math:`KL(p \,\|\, q)` of diagonal Gaussians, one number a dimension.
+    r"""Return :math:`KL(p \,\|\, q)` of diagonal Gaussians, one number a dimension.
 
     .. math::
         \log\frac{\sigma_q}{\sigma_p}
@@ -47,7 +47,7 @@ def gaussian_kl(
 
 
 def categorical_kl(log_prob_p: Tensor, log_prob_q: Tensor) -> Tensor:
-    r""":math:`KL(p \,\|\, q)` of categorical distributions.
+    r"""Return :math:`KL(p \,\|\, q)` of categorical distributions.
 
     .. math::
         \sum_a p(a) \, [\log p(a) - \log q(a)]
@@ -71,7 +71,7 @@ def state_recovery(
     direction: Literal["forward", "reverse"] = "forward",
     action_reduction: Literal["sum", "mean"] = "sum",
 ) -> Tensor:
-    r"""State-recovery term :math:`L_{sr}`, equations (11) and (12).
+    r"""Return the state-recovery term :math:`L_{sr}`, equations (11) and (12).
 
     .. math::
         KL\big(I(a \mid \tilde s, s') \,\|\, \pi(a \mid \tilde s)\big)
@@ -103,7 +103,7 @@ def deterministic_recovery(
     *,
     action_reduction: Literal["sum", "mean"] = "sum",
 ) -> Tensor:
-    r"""State-recovery term of a policy without a density.
+    r"""Return the state-recovery term of a policy without a density.
 
     .. math::
         \sum_d \frac{(x_d - \mu_{I,d})^2}{2\sigma_{I,d}^2}
@@ -123,7 +123,7 @@ def deterministic_recovery(
 def soft_policy_value(
     log_prob: Tensor, qvalue: Tensor, alpha: Tensor | float
 ) -> Tensor:
-    r"""SAC objective of the policy, to be minimised, section 4.4.
+    r"""Return SAC's objective of the policy, to be minimised, section 4.4.
 
     .. math::
         \alpha_e \log\pi(\hat a \mid \tilde s) - \min_i Q_i(\tilde s, \hat a)
@@ -143,7 +143,7 @@ def soft_policy_value(
 def bootstrap_value(
     qvalue: Tensor, log_prob: Tensor | None = None, alpha: Tensor | float = 0.0
 ) -> Tensor:
-    r"""Pessimistic value of the next state, :math:`V(s')` of the target (2).
+    r"""Return the pessimistic value of the next state, :math:`V(s')` of the target (2).
 
     .. math::
         \min_i \bar Q_i(s', a') - \alpha_e \log\pi(a' \mid s'),
@@ -165,7 +165,7 @@ def bootstrap_value(
 def discrete_policy_value(
     log_prob: Tensor, qvalue: Tensor, alpha: Tensor | float
 ) -> Tensor:
-    r""":func:`soft_policy_value` in expectation over all ``n`` actions.
+    r"""Return :func:`soft_policy_value` in expectation over all ``n`` actions.
 
     .. math::
         \sum_{a=1}^{n} \pi(a \mid \tilde s)
@@ -184,7 +184,7 @@ def discrete_policy_value(
 def temperature_objective(
     log_alpha: Tensor, log_prob: Tensor, target_entropy: float
 ) -> Tensor:
-    r"""SAC objective of the entropy temperature, linear in its logarithm.
+    r"""Return SAC's objective of the entropy temperature, linear in its logarithm.
 
     .. math::
         -\log\alpha_e \, \big(\log\pi(\hat a \mid \tilde s) + \bar{\mathcal H}\big)
@@ -196,14 +196,14 @@ def temperature_objective(
 
 
 def action_distance(action: Tensor, data_action: Tensor) -> Tensor:
-    r"""Squared distance :math:`\|a - a_D\|^2` of actions ``[B, A]`` from the data's."""
+    r"""Return the squared distance :math:`\|a - a_D\|^2` from the data's ``[B, A]``."""
     return (action - data_action).square().sum(-1)
 
 
 def soft_maximum(
     qvalue: Tensor, log_prob: Tensor, *, temperature: float = 1.0
 ) -> Tensor:
-    r"""Log-sum-exp of the values of sampled actions, weighted by their densities.
+    r"""Return the log-sum-exp of sampled actions' values, weighted by their densities.
 
     .. math::
         \tau \log \sum_{j=1}^{M} \exp\big(Q(s, a_j) / \tau\big) / p(a_j)
@@ -228,7 +228,7 @@ def soft_maximum(
 
 
 def conservative_gap(soft_maximum: Tensor, data_qvalue: Tensor) -> Tensor:
-    r"""CQL(H) penalty: by how much sampled actions are valued above the data's.
+    r"""Return CQL(H)'s penalty: the value of sampled actions above the data's.
 
     .. math::
         \tau \log \sum_{j=1}^{M} \exp\big(Q(s, a_j) / \tau\big) / p(a_j) - Q(s, a)
@@ -249,7 +249,7 @@ def conservative_gap(soft_maximum: Tensor, data_qvalue: Tensor) -> Tensor:
 def lagrange_terms(
     gap: Tensor, log_multiplier: Tensor, threshold: float
 ) -> tuple[Tensor, Tensor]:
-    r"""Both sides of CQL's Lagrangian, each to be minimised.
+    r"""Return both sides of CQL's Lagrangian, each to be minimised.
 
     .. math::
         \max_{\alpha' \ge 0} \min_Q \; \alpha' \, (\text{gap}(Q) - \tau)
@@ -281,7 +281,7 @@ def value_constraint(
     log_prob: Tensor | None = None,
     temperature: float = 1.0,
 ) -> Tensor:
-    r"""OSR-v constraint on the values, equation (8).
+    r"""Return OSR-v's constraint on the values, equation (8).
 
     .. math::
         \mathbb E_{\hat a \sim \pi(\tilde s)} Q(\tilde s, \hat a)

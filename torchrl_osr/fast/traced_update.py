@@ -178,7 +178,7 @@ class _State:
         self._traits = self._traits_now()
 
     def holds(self) -> bool:
-        """Whether everything is as it was."""
+        """Return whether nothing has changed."""
         try:
             return self._traits == self._traits_now() and all(
                 now == before for now, before in self._attributes
@@ -199,7 +199,7 @@ class _State:
 
 
 def _copied(value: Any) -> Any:
-    """The containers in a value as they are now; everything else by reference."""
+    """Copy the containers in a value; keep everything else by reference."""
     if isinstance(value, dict):
         return {key: _copied(each) for key, each in value.items()}
     if type(value) in (list, tuple):

@@ -81,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _versions() -> str:
-    """Python's version, and those of the packages that decide numbers."""
+    """Return the versions of Python and of the packages that decide numbers."""
     found = [f"python {sys.version.split()[0]}"]
     for package in ("torch", "torchrl", "tensordict", "gymnasium", "mujoco"):
         with suppress(PackageNotFoundError):

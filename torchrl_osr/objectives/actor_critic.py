@@ -392,7 +392,7 @@ class ActorCriticLoss(LossModule):
     def inverse_dynamics(self, batch: Transitions, states: States) -> Any:
         """Return the frozen model ``I(a | s~, s')``, ``[D, R]``, without gradient.
 
-        A latent variable stays at its mean, so that the label does not jitter.
+        A latent variable stays at its mean: the label must not jitter.
         """
         network = self.inverse_dynamics_network
         inputs = self.model_inputs(batch, network.in_keys, states)

@@ -142,7 +142,7 @@ class Checkpoints:
         self._checkpoint = safe_checkpoint(**components)
 
     def latest(self) -> Path | None:
-        """Path of the newest checkpoint, or ``None``."""
+        """Return the path of the newest checkpoint, or ``None``."""
         return max(self._found(), default=None)
 
     def _found(self) -> list[Path]:

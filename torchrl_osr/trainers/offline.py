@@ -169,7 +169,7 @@ class OfflineTrainer(Trainer):
         return int(self._optim_count)
 
     def best(self) -> dict[str, Any] | None:
-        """Best evaluation so far, the first of equals.
+        """Return the best evaluation so far, the first of equals.
 
         Evaluations without a value do not count, and that of the untrained networks
         only if it is the only one.
@@ -238,7 +238,7 @@ class OfflineTrainer(Trainer):
         self.checkpoints.save(step)
 
     def _sample(self, _: TensorDictBase) -> TensorDictBase:
-        """Next batch; TorchRL's loop begins an update here, having counted it."""
+        """Return the next batch; TorchRL's loop has counted this update."""
         if self._signals:
             raise self._interrupted(self.step - 1)
         batch: TensorDictBase = self.buffer.sample()

@@ -58,7 +58,7 @@ class ReplayBufferCollector(BaseCollector):
         return state
 
     def load_state_dict(self, state_dict: OrderedDict[str, Any]) -> None:
-        """Go on after so many rows; of a seeded one, call :meth:`set_seed` first."""
+        """Continue after the saved rows; if seeded, call :meth:`set_seed` first."""
         self._frames = int(state_dict["frames"])
         if self._generator is not None and "generator" in state_dict:
             self._generator.set_state(state_dict["generator"])

@@ -69,7 +69,7 @@ def test_recovery_rates_are_printed_by_group_and_for_a_sweep(folder, capsys):
     number = (load_recoverable_states("hopper", "public").group == "easy").sum()
     assert re.search(rf"(?m)^  easy +{number} +\d+ +\[", printed)
     text = evaluate_one_of_many(evaluating("suite=recoverable", "episodes=2"), folder)
-    assert re.fullmatch(r"comes back from \d+% of easy states, .*", text)
+    assert re.fullmatch(r"recovers from \d+% of easy states, .*", text)
 
 
 def test_runs_of_a_sweep_are_one_policy_that_switches(folder, tmp_path, capsys):

@@ -4,7 +4,7 @@
     torchrl-osr collect env.id=Pendulum-v1 policy=my_package:act path=pendulum.npz
     torchrl-osr collect policy=outputs/Pendulum-v1-file/osr-seed0-... path=new.npz
 
-The log is what ``torchrl-osr train data=file`` reads. See docs/any_environment.md.
+``torchrl-osr train data=file`` reads the log. See docs/any_environment.md.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ register()
 @hydra.main(version_base="1.3", config_path=CONF, config_name="collect")
 @single_job
 def main(cfg: DictConfig) -> None:
-    """Play the episodes, write the log, and say what is in it."""
+    """Play the episodes, write the log, and print a summary."""
     torch.set_num_threads(1)
     path = Path(cfg.path).expanduser()
     check_log_path(path)
@@ -54,7 +54,7 @@ def main(cfg: DictConfig) -> None:
             env_id = known
         act = policy.act
     if env_id is None:
-        raise ValueError("env.id is not given: say which environment to play.")
+        raise ValueError("env.id is not given: name the environment to play.")
     with closing(open_environment(env_id)) as env:
         check_simulated(env, env_id)
         loss = "loss=discrete_osr " if isinstance(env.action_space, Discrete) else ""

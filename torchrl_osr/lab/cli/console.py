@@ -44,10 +44,10 @@ def errors_as_sentences() -> Iterator[None]:
 
 
 def single_job(task: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorate a Hydra task so that its error is printed once, as a sentence.
+    """Decorate a Hydra task: print its error once, as a sentence.
 
-    The traceback goes into the job's log file. In a sweep the error goes on to Hydra,
-    for the other jobs are to run.
+    The traceback goes into the job's log file. In a sweep, Hydra gets the error and
+    runs the other jobs.
     """
 
     @functools.wraps(task)

@@ -1,11 +1,11 @@
-"""Look at data before anything is trained on them.
+"""Check data before training.
 
     torchrl-osr data data.path=log.csv env.id=Pendulum-v1
     torchrl-osr data data=minari data.path=mujoco/hopper/medium-v0
 
-Prints what was understood (rows, episodes, ends, ranges), what looks wrong and what to
-do about it, and draws a picture. The options are those of ``torchrl-osr train``, and
-what that refuses is refused here. See docs/your_data.md.
+Prints rows, episodes, ends and ranges, and what looks wrong with its cure; draws a
+picture. Takes the options of ``torchrl-osr train`` and refuses the same data. See
+docs/your_data.md.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ register()
 @hydra.main(version_base="1.3", config_path=CONF, config_name="check_data")
 @single_job
 def main(cfg: DictConfig) -> None:
-    """Read the data, print what they are, draw them; nothing else is written."""
+    """Read the data, print a summary and draw them; write nothing else."""
     torchrl_logger.setLevel("ERROR")  # warnings are among the findings
     options: Any = OmegaConf.to_object(cfg.data)
     env: Any = None

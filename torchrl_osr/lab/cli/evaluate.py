@@ -46,8 +46,8 @@ def main(cfg: DictConfig) -> None:
     config: Any = OmegaConf.to_object(cfg)
     if config.episodes < 2 or min(config.last, config.jobs) < 1:
         raise ValueError(
-            "last and jobs must be at least 1, and episodes at least 2: one pair of "
-            "episodes has no interval."
+            "last and jobs must be at least 1, and episodes at least 2: a single pair "
+            "of episodes has no interval."
         )
     if (config.checkpoint is None) == (config.sweep is None):
         raise ValueError(
@@ -122,10 +122,10 @@ def evaluate_one_of_many(config: EvaluateConfig, folder: Path) -> str:
     if config.suite.half is not None:
         rates = recovery_rates(results).items()
         known = [f"{share:.0%} of {name} states" for name, (_, share, *_) in rates]
-        return f"comes back from {', '.join(known)}"
+        return f"recovers from {', '.join(known)}"
     rows = results["summary"]
     measure = measure_of(rows[0])
-    # A disturbance that came in no episode says nothing.
+    # Leave out disturbances that no episode met.
     met = [row[measure] for row in rows if row["disturbed_share"]]
     clean = np.mean([row[f"clean_{measure}"] for row in rows])
     disturbed = f"{np.mean(met):.1f}" if met else "never met"
@@ -147,7 +147,7 @@ def recovery_rates(
 
 def recoverable_table(results: Mapping[str, Any]) -> str:
     """Return the text table of :func:`recovery_rates`."""
-    rows = [("states", "number", "comes back %", "[95 %]")]
+    rows = [("states", "number", "recovers %", "[95 %]")]
     for name, (number, mean, low, high) in recovery_rates(results).items():
         interval = f"[{100 * low:.0f}, {100 * high:.0f}]"
         rows.append((name, str(number), f"{100 * mean:.0f}", interval))

@@ -5,7 +5,7 @@
     torchrl-osr export policy.safetensors value.onnx --output value
 
 The suffix decides: .safetensors for load_policy, .onnx for ONNX Runtime, .pt2 for
-torch.export. docs/deploy.md says how to use each.
+torch.export. docs/deploy.md shows how to use each.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ the larger of 1 and the number itself."""
 
 
 def main() -> None:
-    """Load, write, check, and say what was written."""
+    """Load, write and check the policy; print a summary."""
     parser = argparse.ArgumentParser(prog=sys.argv[0], description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     add = parser.add_argument
     add("source", type=Path, help="a run's folder, a checkpoint, or a .safetensors")
     add("path", type=Path, help="the file to write")
-    add("--output", choices=("action", "value"), default="action", help="of a graph")
-    add("--trust", action="append", default=[], metavar="MODULE", help="see train")
+    add("--output", choices=("action", "value"), default="action", help="of the graph")
+    add("--trust", action="append", default=[], metavar="MODULE", help="yours")
     options = parser.parse_args()
     if options.path.suffix not in (SUFFIX, *GRAPHS):
         parser.error(f"the path must end in {SUFFIX}, {' or '.join(GRAPHS)}.")

@@ -3,8 +3,8 @@
     torchrl-osr report outputs/oos
     torchrl-osr report multirun outputs --reference cql --output page
 
-The page is <output>/report.html, with a CSV file for each table and the learning
-curves as PNG beside it. docs/robustness.md says how to read it.
+The page is <output>/report.html. The folder also gets a CSV file for each table and
+the learning curves as PNG. docs/robustness.md explains the page.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def main() -> None:
     add = parser.add_argument
     add("runs", nargs="+", type=Path, help="folders of runs, or above them")
     add("--output", type=Path, default=Path("report"), help="a folder")
-    add("--reference", help="method to compare with; default the first")
+    add("--reference", help="method to compare with; default: the first one")
     options = parser.parse_args()
     command = " ".join([sys.argv[0], shlex.join(sys.argv[1:])])
     tables = read_runs(options.runs)

@@ -3,8 +3,7 @@
     torchrl-osr settings env=hopper data=medium-expert
     torchrl-osr settings env=walker2d loss=osr,cql preset=paper
 
-Methods are comparable if what they share has equal values: a column that differs by
-accident makes a comparison unfair.
+A comparison of methods is fair if the settings that they share are equal.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(prog=sys.argv[0], description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.add_argument("overrides", nargs="*", help="as of torchrl-osr train")
+    parser.add_argument("overrides", nargs="*", help="those of torchrl-osr train")
     overrides = parser.parse_args().overrides
     chosen = [each[5:].split(",") for each in overrides if each.startswith("loss=")]
     rest = [each for each in overrides if not each.startswith("loss=")]

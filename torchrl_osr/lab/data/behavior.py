@@ -43,7 +43,7 @@ class BehaviorPolicy:
     log_std: Affine
 
     def sample(self, observation: NDArray[Any], rng: np.random.Generator) -> FloatArray:
-        """Random actions ``[A]`` or ``[B, A]`` for states that are not standardised."""
+        """Draw actions ``[A]`` or ``[B, A]`` for states that are not standardised."""
         features = self._features(observation)
         loc = self.mean(features)
         log_std = np.clip(self.log_std(features), LOG_STD_MIN, LOG_STD_MAX)
@@ -51,7 +51,7 @@ class BehaviorPolicy:
         return np.asarray(np.tanh(loc + np.exp(log_std) * noise))
 
     def deterministic(self, observation: NDArray[Any]) -> FloatArray:
-        """Squashed mean actions ``[A]`` or ``[B, A]``, see :meth:`sample`."""
+        """Return squashed mean actions ``[A]`` or ``[B, A]``, see :meth:`sample`."""
         return np.asarray(np.tanh(self.mean(self._features(observation))))
 
     def _features(self, observation: NDArray[Any]) -> FloatArray:
@@ -61,14 +61,14 @@ class BehaviorPolicy:
 
 
 def load_behavior_card(folder: Path | str | None = None) -> dict[str, Any]:
-    """``card.json``: ``{env_name: {"env": id, "policies": {policy_name: {...}}}}``."""
+    """Read ``card.json``: ``{env_name: {"env": id, "policies": {name: {...}}}}``."""
     return read_json(Path(folder or BEHAVIOR_POLICIES_DIR) / "card.json")
 
 
 def behavior_policy_path(
     env_name: str, policy_name: str, folder: Path | str | None = None
 ) -> Path:
-    """File of a policy that the card names."""
+    """Return the file of a policy that the card names."""
     card = load_behavior_card(folder)
     there = card.get(env_name, {}).get("policies", {})
     if policy_name not in there:

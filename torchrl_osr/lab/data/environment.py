@@ -38,17 +38,17 @@ MAX_EPISODE = 100_000
 
 
 def known_ids() -> dict[str, str]:
-    """Gymnasium ids of the mazes and of the tasks with behaviour policies, by name."""
+    """Return Gymnasium ids of mazes and tasks with behaviour policies, by name."""
     return {name: str(e["env"]) for name, e in load_behavior_card().items()} | MAZE_IDS
 
 
 def environment_id(env_name: str) -> str:
-    """Gymnasium id of a known task by its short name."""
+    """Return the Gymnasium id of a known task by its short name."""
     return known_ids()[env_name]
 
 
 def environment_name(env_id: str) -> str:
-    """Short name of a known task; of another one its id, as a folder can be called."""
+    """Return a known task's short name; for others their id as a folder's name."""
     names = {known: name for name, known in known_ids().items()}
     return names.get(env_id) or re.sub(r"[^\w.-]", "-", env_id.split(":")[-1])
 
@@ -69,7 +69,7 @@ class EnvironmentSpec(NamedTuple):
 
 
 def environment_spec(env_id: str) -> EnvironmentSpec:
-    """Sizes and action bounds of a task."""
+    """Read sizes and action bounds of a task."""
     with closing(open_environment(env_id)) as env:
         size = spaces.flatdim(env.observation_space)
         actions: Any = env.action_space
@@ -81,7 +81,7 @@ def environment_spec(env_id: str) -> EnvironmentSpec:
 
 
 def is_simulated(env: gymnasium.Env[Any, Any]) -> bool:
-    """Whether an environment can be played."""
+    """Return whether an environment can be played."""
     return type(env.unwrapped).step is not gymnasium.Env.step
 
 
@@ -130,7 +130,7 @@ def open_environment(env_id: str) -> gymnasium.Env[Any, Any]:
 
 
 def sorted_space(space: spaces.Space[Any]) -> spaces.Space[Any]:
-    """Space of an observation with the keys of dictionaries in alphabetical order.
+    """Return an observation's space with the keys of dictionaries sorted.
 
     Environments, data and policies have this order.
     """

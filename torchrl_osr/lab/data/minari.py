@@ -83,7 +83,7 @@ def open_minari(
 def _read(
     opened: minari.MinariDataset, space: spaces.Space[Any], progress: bool
 ) -> Iterator[dict[str, Array]]:
-    """Columns of each episode; raise if some of what the set announces is missing."""
+    """Yield each episode's columns; raise if announced parts are missing."""
     steps, first = 0, getattr(opened.action_space, "start", 0)
     total, hidden = opened.total_episodes, None if progress else True
     episodes = opened.iterate_episodes()
@@ -112,7 +112,7 @@ def _read(
 
 
 def _flattened(space: Any, observations: Any) -> Any:
-    """Rows ``[T + 1, S]`` of observations, in the order of their space."""
+    """Return rows ``[T + 1, S]`` of observations, in the order of their space."""
     if isinstance(space, (spaces.Dict, spaces.Tuple)):
         parted: Any = space
         keys = parted if isinstance(space, spaces.Dict) else range(len(space))

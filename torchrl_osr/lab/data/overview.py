@@ -81,7 +81,7 @@ def findings(
 
 
 def actions_at_bounds(data: TensorDict) -> Any:
-    """Share of rows in which each action is at one of its bounds, ``[A]``."""
+    """Return the share of rows with each action at one of its bounds, ``[A]``."""
     return (data["action"].abs() >= ACTION_LIMIT - 1e-6).double().mean(0)
 
 
@@ -98,7 +98,7 @@ def _about_jumps(data: TensorDict) -> Iterator[str]:
 
 
 def _about_order(data: TensorDict) -> Iterator[str]:
-    """Findings about rows that follow one another."""
+    """Yield findings about rows that follow one another."""
     followed = is_followed(data)
     inside = ~data["next", "done"][:-1, 0]
     share = 1 - followed[:-1][inside].double().mean().item() if inside.any() else 0
@@ -119,7 +119,7 @@ def _about_order(data: TensorDict) -> Iterator[str]:
 
 
 def _explained(data: TensorDict, rows: Tensor, shift: int) -> float:
-    """Share of the change of the state that actions explain linearly, given it."""
+    """Return the share of the state's change that actions explain linearly."""
     state = data["observation"][rows].double()
     change = data["next", "observation"][rows].double() - state
     known = torch.cat([torch.ones(len(rows), 1), state], 1).double()

@@ -64,7 +64,7 @@ class Reading:
 
 @dataclass
 class Recording:
-    """A recorded data set, to be converted once.
+    """A recorded data set, converted once.
 
     ``parts`` is its reader: it yields columns of whole trajectories, a file or many
     rows at a time. ``about`` goes into the manifest.
@@ -79,7 +79,7 @@ class Recording:
     _warnings: dict[str, None] = field(default_factory=dict, init=False)
 
     def load(self, *, on_disk: bool = False) -> Dataset:
-        """Transitions ``[N]`` and their manifest; on disk, converted in parts."""
+        """Return transitions ``[N]`` and manifest; on disk, convert in parts."""
         bounds = [
             np.asarray(b, np.float64).tolist() for b in self.options.action_bounds
         ]
@@ -121,7 +121,7 @@ class Recording:
             raise ValueError("no row has a true next state: give next_observation.")
 
     def _facts(self) -> dict[str, Any]:
-        """Facts about the transitions once all have been read."""
+        """Return facts about the transitions once all have been read."""
         returns, lengths, complete = np.concatenate(self._episodes).T
         whole, lengths = complete == 1, lengths.astype(int)
         left_out = {name: self._counts[name] for name in WARNINGS if self._counts[name]}
@@ -164,8 +164,8 @@ def transitions_from_columns(
     A trajectory ends where a row is terminated or truncated, where the episode number
     changes, and at the last row; an end without a flag becomes ``truncated``. Without
     ``next_observation``, a row's next state is the observation of the following row.
-    The last row of a trajectory has none: it stays, with its own observation as next
-    state, if it is terminated, because no loss reads that. Otherwise it is dropped, and
+    The last row of a trajectory has no next state. If it is terminated, it stays with
+    its own observation in that place, which no loss reads. Otherwise it is dropped, and
     the row before it becomes ``truncated``.
 
     Args:
@@ -207,7 +207,7 @@ def transitions_from_columns(
 def trajectories(
     rows: Columns, options: Reading
 ) -> tuple[TensorDict, dict[str, int], Array]:
-    """Transitions of whole trajectories, perhaps none, and facts about them.
+    """Return transitions of whole trajectories, perhaps none, and facts about them.
 
     These are counts of rows, and of each trajectory ``[E, 3]`` the return, the length,
     and whether it is complete.
@@ -276,7 +276,7 @@ def trajectories(
 
 
 def _arrays(rows: Columns, num_actions: int | None) -> dict[str, Array]:
-    """Columns as arrays of numbers with one row a step."""
+    """Return columns as arrays of numbers with one row a step."""
     required = ("observation", "action", "reward", "terminated")
     flaws = [f"no {name}" for name in required if name not in rows]
     if not {"truncated", "episode"} & rows.keys():
@@ -307,7 +307,7 @@ def _arrays(rows: Columns, num_actions: int | None) -> dict[str, Array]:
 
 
 def _missing(columns: Mapping[str, Array], missing: str) -> Array:
-    """Rows ``[N]`` without a value in some column."""
+    """Return which rows ``[N]`` lack a value in some column."""
     lost = np.zeros(len(columns["reward"]), np.bool_)
     for name, array in columns.items():
         wrong = (array != array).reshape(len(array), -1).any(1)  # NaN alone
@@ -322,7 +322,7 @@ def _missing(columns: Mapping[str, Array], missing: str) -> Array:
 
 
 def _ends(columns: Mapping[str, Array]) -> tuple[Array, Array]:
-    """Rows ``[N]`` whose flags end a trajectory, and all rows that end one."""
+    """Return rows ``[N]`` with a flag that ends a trajectory, and all that end one."""
     flagged = np.zeros(len(columns["reward"]), np.bool_)
     for name in {"terminated", "truncated"} & columns.keys():
         flagged |= np.nan_to_num(columns[name]).astype(np.bool_)
@@ -348,7 +348,7 @@ def _ends(columns: Mapping[str, Array]) -> tuple[Array, Array]:
 
 
 def _cast(columns: Mapping[str, Array], num_actions: int | None) -> dict[str, Array]:
-    """Columns as they are trained on; actions may still have other bounds."""
+    """Return columns of the training's types; actions may still have other bounds."""
     cast: dict[str, Array] = {}
     for name, array in columns.items():
         if name == "episode":
@@ -380,7 +380,7 @@ def _refuse(name: str, array: Array, wrong: Array, expected: str) -> None:
 
 
 def _unit_actions(action: Array, options: Reading) -> tuple[Array, int]:
-    """Actions from -1 to 1, clipped, and the number of rows outside."""
+    """Return actions from -1 to 1, clipped, and the number of rows outside."""
     if options.num_actions is not None:
         return action, 0
     size = action.shape[1]

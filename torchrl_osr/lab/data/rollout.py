@@ -72,7 +72,7 @@ Collection = tuple[TensorDict, NDArray[np.float64], NDArray[np.int64]]
 
 
 def behavior_of(env_name: str, source: str) -> dict[str, Any]:
-    """Entries of the manifest that determine the rows, beside the seed."""
+    """Return the manifest's entries that determine the rows, with the seed."""
     known: Sequence[str] = [*BEHAVIORS]
     if env_name.startswith("antmaze"):
         known = ("minari",)  # no policy that walks ships with the package
@@ -207,7 +207,7 @@ def _play_episode(
 
 
 def waypoint_sampler(maze: Any) -> ActionSampler:
-    r"""Noisy controller that leads the point to its goal.
+    r"""Return a noisy controller that leads the point to its goal.
 
     .. math::
         a = \mathrm{clip}(k (w - x) - d \dot x) + \sigma \epsilon
@@ -238,7 +238,7 @@ def waypoint_sampler(maze: Any) -> ActionSampler:
 
 
 def shortest_path(free: set[Cell], start: Cell, goal: Cell) -> list[Cell]:
-    """Free cells of a shortest way, both ends included; up before down, left, right."""
+    """Return a shortest path with both ends; up before down, left, right."""
     # From the goal, so that each cell that is reached knows the next one on its way.
     next_cell: dict[Cell, Cell] = {goal: goal}
     waiting = deque([goal])

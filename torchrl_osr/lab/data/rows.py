@@ -13,7 +13,7 @@ from torchrl_osr.lab.data.transitions import SAME_STATE
 
 
 def held_out_rows(rows: int, held_out: int | float, *, seed: int) -> Tensor:
-    """Random rows in random order; ``held_out`` is a number, or a share (float)."""
+    """Draw rows in random order; ``held_out`` is a number, or a share (float)."""
     count = round(held_out * rows) if isinstance(held_out, float) else held_out
     if not 0 < count < rows:
         raise ValueError(
@@ -27,7 +27,7 @@ def held_out_rows(rows: int, held_out: int | float, *, seed: int) -> Tensor:
 def split_held_out(
     data: TensorDict, held_out: int | float, *, seed: int
 ) -> tuple[TensorDict, TensorDict]:
-    """Training and held-out rows, see :func:`held_out_rows`, copied, in order."""
+    """Copy training and held-out rows in order, see :func:`held_out_rows`."""
     mask = torch.zeros(len(data), dtype=torch.bool)
     mask[held_out_rows(len(data), held_out, seed=seed)] = True
     mask = mask.to(data.device or "cpu")
@@ -48,7 +48,7 @@ def mix_datasets(
 
 
 def is_followed(data: TensorDictBase, rows: Tensor | None = None) -> Tensor:
-    """Whether the row that came next in time follows each row, bool ``[B]``."""
+    """Return whether the next row in time follows each row, bool ``[B]``."""
     rows = torch.arange(len(data)) if rows is None else rows
     after = (rows + 1).clamp(max=len(data) - 1)
     reached = data["next", "observation"][rows]
@@ -61,7 +61,7 @@ def is_followed(data: TensorDictBase, rows: Tensor | None = None) -> Tensor:
 
 
 def next_action(data: TensorDictBase, rows: Tensor | None = None) -> Tensor:
-    """Action ``[B, A]`` of the following row, 0 where an episode ends."""
+    """Return the action ``[B, A]`` of the following row, 0 at an episode's end."""
     rows = torch.arange(len(data)) if rows is None else rows
     following: Tensor = data["action"][(rows + 1).clamp(max=len(data) - 1)]
     return following.masked_fill(data["next", "done"][rows], 0.0)
@@ -88,13 +88,13 @@ def multi_step(
     reward_shift: float = 0.0,
     with_next_action: bool = False,
 ) -> TensorDict:
-    r"""Entries of ``"next"`` after at most ``n_steps`` steps of the data.
+    r"""Return the entries of ``"next"`` after at most ``n_steps`` steps of the data.
 
     The reward is :math:`\sum_{k<m} \gamma^k (a\,r_k + b)`, with ``reward_scale`` a and
-    ``reward_shift`` b. State and flags are those after the last of the m steps. m,
-    ``"steps"`` ``[B, 1]``, is less than ``n_steps`` where an episode ends, or where the
-    next row did not come next in time. ``with_next_action`` adds the data's
-    ``"action"`` at the state that the steps lead to, see :func:`next_action`.
+    ``reward_shift`` b. State and flags are those after the last of the m steps. The
+    number m, ``"steps"`` ``[B, 1]``, is less than ``n_steps`` where an episode ends or
+    the next row is not next in time. ``with_next_action`` adds the data's ``"action"``
+    at the state after the steps, see :func:`next_action`.
 
     TorchRL 0.14.1's ``MultiStep`` keeps the flags of the first step: it bootstraps
     returns that have reached a terminal state.
@@ -119,7 +119,7 @@ def multi_step(
 
 
 def take_multi_step(batch: TensorDictBase) -> TensorDictBase:
-    """A batch whose ``"next"`` is :func:`multi_step`, and ``"one_step"`` the old one.
+    """Set ``"next"`` to :func:`multi_step`, and ``"one_step"`` to the old ``"next"``.
 
     Some losses ask which action leads to the next state. ``"steps_to_next_obs"`` is
     TorchRL's name for the number of steps.

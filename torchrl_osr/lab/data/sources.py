@@ -61,14 +61,14 @@ def load_dataset(
 ) -> Dataset:
     """Load a data set that is rolled out on this machine, or a recorded one.
 
-    A rolled-out set is collected at first use and read from the cache folder ever
-    after.
+    A rolled-out set is collected at first use and later read from the cache folder.
 
     Args:
         env_name: short name of the task, such as ``"hopper"``; any, or ``None``, for
             recorded data.
-        source: behaviour policy, such as ``"medium-replay"``, of a maze ``"diverse"``
-            or ``"play"``; or ``"minari"``, ``"d4rl"`` or ``"file"`` (default).
+        source: behaviour policy, such as ``"medium-replay"``; in a maze ``"diverse"``
+            or ``"play"``. Recorded data: ``"minari"``, ``"d4rl"`` or ``"file"``
+            (default).
 
     Keyword Args:
         env_id: Gymnasium id of the task. The actions of a ``"file"`` are then in its
@@ -165,7 +165,7 @@ def _refuse(options: Mapping[str, Any], source: str) -> None:
 def _mean_and_score(
     manifest: Mapping[str, Any], references: ReferenceReturns | None
 ) -> tuple[float | None, float | None]:
-    """Mean return of the complete episodes, and its score, where they are known."""
+    """Return the complete episodes' mean return and its score, where known."""
     if not manifest.get("episode_returns"):
         return None, None
     mean = float(np.mean(manifest["episode_returns"]))
@@ -175,7 +175,7 @@ def _mean_and_score(
 def rolled_out(
     env_name: str, source: str, recipe: Mapping[str, int], *, progress: bool
 ) -> Dataset:
-    """Memory-mapped rows of a source, collected when they are first needed."""
+    """Return memory-mapped rows of a source; collect them at the first use."""
     rows, seed = recipe["num_transitions"], recipe["seed"]
     maze = env_name in MAZE_IDS
     # Other versions of these give other data for the same seed.

@@ -25,7 +25,7 @@ MIN_OBSERVATION_SCALE = 1e-3
 
 
 def observation_statistics(data: TensorDictBase) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of each observation entry, summed in float64.
+    """Return mean and standard deviation of each observation entry, by float64 sums.
 
     Returns:
         ``loc`` ``[S]`` and ``scale`` ``[S]``. The scale is at least 0.001; a logged
@@ -60,7 +60,7 @@ class ReferenceReturns(NamedTuple):
     expert: float
 
     def score(self, episode_return: Any) -> Any:
-        """Normalised scores in percent, of a number or an array of returns."""
+        """Return normalised scores in percent for one return or an array."""
         above = np.asarray(episode_return, dtype=np.float64) - self.random
         score = 100.0 * above / (self.expert - self.random)
         return float(score) if np.ndim(episode_return) == 0 else score
@@ -83,9 +83,9 @@ def reference_returns(
     random_return: float | None = None,
     expert_return: float | None = None,
 ) -> ReferenceReturns | None:
-    """Reference returns of a task, ``None`` if there are none.
+    """Return the reference returns of a task, ``None`` if there are none.
 
-    The arguments are for a task that has none of D4RL's: both returns, or neither for
+    The arguments are for a task without D4RL's: both returns, or neither for
     raw returns.
     """
     low, high = random_return, expert_return

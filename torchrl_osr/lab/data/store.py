@@ -42,7 +42,7 @@ FORMAT = "torchrl-osr transitions 2"
 
 
 def cache_root() -> Path:
-    """Folder of all cached data: ``TORCHRL_OSR_CACHE``, or the user's."""
+    """Return the folder of cached data: ``TORCHRL_OSR_CACHE``, or the user's."""
     root = os.environ.get("TORCHRL_OSR_CACHE")
     if root is None:
         with needed_by("the cache needs", "train"):
@@ -52,12 +52,12 @@ def cache_root() -> Path:
 
 
 def is_memory_mapped(data: TensorDictBase) -> bool:
-    """Whether a data set's rows are read from disk when they are drawn."""
+    """Return whether a data set's rows are read from disk when they are drawn."""
     return isinstance(data.get("observation", None), MemoryMappedTensor)
 
 
 def is_memmap_folder(folder: Path | str) -> bool:
-    """Whether :func:`load_memmap` is the reader of a path."""
+    """Return whether :func:`load_memmap` reads this path."""
     return (Path(folder).expanduser() / MANIFEST).is_file()
 
 
@@ -162,7 +162,7 @@ def load_or_write(
 
 
 def _checksum(folder: Path) -> str:
-    """SHA-256 of the files of the rows."""
+    """Return the SHA-256 of the files of the rows."""
     paths = sorted(path for path in folder.rglob("*") if path.is_file())
     digests = [sha256_of(path) for path in paths]
     return hashlib.sha256("".join(digests).encode()).hexdigest()
@@ -192,7 +192,7 @@ class MemmapStorage(Storage):
         return int(self.max_size)
 
     def get(self, index: Tensor) -> TensorDictBase:
-        """Rows ``[B]``."""
+        """Return rows ``[B]``."""
         index = index.cpu()
         rows = index + torch.searchsorted(self._shifts, index, right=True)
         batch = self.read(self.data, rows)
@@ -215,7 +215,7 @@ def make_replay_buffer(
     device: torch.device | str | None = None,
     read: Reader | None = None,
 ) -> ReplayBuffer:
-    """Replay buffer that samples a data set uniformly, with replacement.
+    """Return a replay buffer that samples a data set uniformly, with replacement.
 
     The batches depend on ``seed`` alone: the buffer has a generator of its own, and
     does not prefetch, because threads would make the order of the draws depend on time.

@@ -54,7 +54,7 @@ def open_log(
     about["path"] = paths[0] if len(paths) == 1 else paths
 
     def chosen(names: list[str]) -> list[str]:
-        """Names of the columns to read; those of the first file are looked for."""
+        """Return the columns to read by name; all files need those of the first."""
         if "columns" not in about:
             about["columns"] = find_columns(names, columns)
             used = {*chain(*about["columns"].values())}
@@ -87,7 +87,7 @@ def _files(path: str | Path | Sequence[str]) -> list[Path]:
 
 
 def _read(path: Path, chosen: Callable[[list[str]], list[str]]) -> Arrays:
-    """Columns of a file; ``chosen`` says which of its names."""
+    """Return the columns of a file that ``chosen`` selects from its names."""
     if path.suffix == ".npz":
         arrays = read_arrays(path)
         return {name: arrays[name] for name in chosen([*arrays])}
@@ -126,7 +126,7 @@ def _read_csv(path: Path) -> pd.DataFrame:
 def find_columns(
     names: Sequence[str], wanted: Mapping[str, Any]
 ) -> dict[str, list[str]]:
-    """Names of the columns of each part; without ``wanted``, all must be known."""
+    """Return each part's columns by name; without ``wanted``, all must be known."""
     if unknown := wanted.keys() - USUAL_NAMES.keys():
         raise ValueError(
             f"data.columns has no {', '.join(unknown)}, only {', '.join(USUAL_NAMES)}."
@@ -162,7 +162,7 @@ def find_columns(
 
 
 def _named(part: str, patterns: Any, names: Sequence[str]) -> list[str]:
-    """Columns that the user has named, in that order."""
+    """Return the columns that the user has named, in that order."""
     found: list[str] = []
     for pattern in patterns if isinstance(patterns, (list, tuple)) else [str(patterns)]:
         # A name that looks like a pattern is a name.
@@ -178,7 +178,7 @@ def _named(part: str, patterns: Any, names: Sequence[str]) -> list[str]:
 
 
 def _usual(part: str, names: Sequence[str]) -> list[str]:
-    """Columns that have a usual name, or begin with one: ``obs_0``, ``obs_x``."""
+    """Return columns with a usual name, or a usual start: ``obs_0``, ``obs_x``."""
     for usual in USUAL_NAMES[part]:
         if usual in names:
             return [usual]
@@ -188,7 +188,7 @@ def _usual(part: str, names: Sequence[str]) -> list[str]:
 
 
 def _in_order(names: list[str]) -> list[str]:
-    """Entries of a vector by their numbers if all have one, else as in the file."""
+    """Sort the entries of a vector by number if all have one, else as in the file."""
     matches = [re.fullmatch(r"(.*?)(\d+)\D?", name) for name in names]
     found = [match for match in matches if match]
     if len(found) < len(names) or len({match[1] for match in found}) != 1:
@@ -197,7 +197,7 @@ def _in_order(names: list[str]) -> list[str]:
 
 
 def assemble(layout: Mapping[str, list[str]], arrays: Arrays) -> Arrays:
-    """Columns of a log, from those of a file."""
+    """Return the columns of a log, from those of a file."""
     columns: Arrays = {}
     for part, names in layout.items():
         first = arrays[names[0]].reshape(-1)
@@ -215,7 +215,7 @@ def assemble(layout: Mapping[str, list[str]], arrays: Arrays) -> Arrays:
 
 
 def _numbers(name: str, array: Array) -> Array:
-    """Column of numbers, with NaN for missing values."""
+    """Return a column of numbers, with NaN for missing values."""
     if array.dtype.kind in "biuf":
         return array
     try:
@@ -228,7 +228,7 @@ def _numbers(name: str, array: Array) -> Array:
 
 
 def _sorted(columns: Arrays, name: str) -> Arrays:
-    """Rows of all episodes, each in order of its steps or time stamps."""
+    """Sort the rows of each episode by its steps or time stamps."""
     given, episode = columns.pop("step"), columns["episode"]
     step = given
     if given.dtype.kind not in "biuf":

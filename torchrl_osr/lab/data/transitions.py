@@ -30,7 +30,7 @@ Array = NDArray[Any]
 
 
 def as_transitions(columns: Mapping[str, Array]) -> TensorDict:
-    """Transitions ``[N]`` from arrays by name, which are not copied."""
+    """Return transitions ``[N]`` from arrays by name, which are not copied."""
     size = [len(columns["reward"])]
     tensors = {name: torch.from_numpy(array) for name, array in columns.items()}
     after = {n: tensors[n][:, None] for n in ("reward", "terminated", "truncated")}

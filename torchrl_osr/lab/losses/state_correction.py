@@ -143,7 +143,7 @@ class SCASLoss(TD3Loss):
 
 
 def maximum_mean_discrepancy(first: Tensor, second: Tensor, width: float) -> Tensor:
-    r"""Squared maximum mean discrepancy of two samples, with a Gaussian kernel.
+    r"""Return the squared maximum mean discrepancy of two samples, Gaussian kernel.
 
     The biased estimate of https://jmlr.org/papers/v13/gretton12a.html, with the kernel
     :math:`\exp(-\|x - y\|^2 / (2 h^2 S))` of width :math:`h`, in units of one entry.

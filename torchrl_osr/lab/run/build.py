@@ -131,7 +131,7 @@ def _check_combination(config: TrainConfig, learner: Learner) -> None:
 def read_environment(env: EnvConfig) -> EnvironmentSpec:
     """Set sizes and action bounds of a configuration from its environment.
 
-    A ValueError says which of them was another one when the run was trained.
+    A ValueError names those that have changed since the training.
     """
     from torchrl_osr.lab.data import environment_spec  # needs Gymnasium
 

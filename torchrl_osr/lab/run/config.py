@@ -1,4 +1,4 @@
-"""Reading and checking a configuration, also one that comes from somebody else.
+"""Reading and checking a configuration, also a foreign one.
 
 Networks and loss are built by calling the functions that a configuration names as
 ``_target_``: this package's, and those of modules that the user trusts.
@@ -163,7 +163,7 @@ def check_environment(env_id: str, trust: Sequence[str] = ()) -> None:
 
 
 def _public_names(name: str) -> set[str]:
-    """Full names of what a module offers, without what it has imported itself."""
+    """Return the full names that a module defines, without its imports."""
     try:
         module = import_module(name)
     except ImportError as error:

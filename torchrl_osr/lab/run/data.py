@@ -1,4 +1,4 @@
-"""What a run trains on: rows in memory, prepared once, or on disk, batch by batch.
+"""Training data: rows in memory, prepared once, or on disk, batch by batch.
 
 The same transforms prepare both: the same seed gives the same batches.
 """

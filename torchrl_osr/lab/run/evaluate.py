@@ -1,7 +1,7 @@
 """Evaluating trained runs: under disturbances, and from recoverable states.
 
 Each of a run's last checkpoints plays pairs of episodes, one of each pair disturbed.
-The results are kept as JSON beside the run, with the settings that decide them.
+The run's folder keeps the results as JSON, with the settings that decide them.
 """
 
 from __future__ import annotations
@@ -235,7 +235,7 @@ def impossible(
 
 
 def _obstacle(kind: str, trained: TrainedRun, switching: bool) -> str:
-    """Reason why a policy cannot be attacked, or nothing."""
+    """Return why a policy cannot be attacked, or nothing."""
     if switching:
         return "attacks do not support switching policies"
     if not trained.config.data.standardize:
@@ -252,7 +252,7 @@ def _obstacle(kind: str, trained: TrainedRun, switching: bool) -> str:
 def _requested(
     config: EvaluateConfig, files: list[Path], folder: Path
 ) -> dict[str, Any]:
-    """Everything that decides the results: settings, checkpoints' digests, versions."""
+    """Return all that decides the results: settings, checkpoints' digests, versions."""
     names = [each.absolute().relative_to(folder.absolute()) for each in files]
     request: dict[str, Any] = {
         "versions": package_versions(),

@@ -99,7 +99,7 @@ def open_run(
 
 
 def _absolute(path: Any) -> Any:
-    """The path of a file, a list or a pattern of them, seen from any folder."""
+    """Return absolute paths, of a file, a list or a pattern."""
     if isinstance(path, ListConfig):
         return [_absolute(each) for each in path]
     if path is None:

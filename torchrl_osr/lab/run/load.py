@@ -101,7 +101,7 @@ def restore(
 
 
 def load_run_policy(path: Path | str, trust: Sequence[str] = ()) -> Policy:
-    """Load the policy of a run's folder, of a checkpoint in it, or of a saved file.
+    """Load the policy from a run's folder, a checkpoint in it, or a saved file.
 
     A finished run has exported its policy: nothing is built from its configuration.
     """

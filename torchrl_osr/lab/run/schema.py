@@ -99,7 +99,7 @@ class PerturbationConfig:
     """Noise of the mixed data set, see StatePerturbation."""
 
     std: float = MISSING  # width of the noise, in deviations of the data
-    adversary: Any = None  # options of Adversary, which chooses the policy's instead
+    adversary: Any = None  # options of Adversary, which perturbs the policy's states
 
 
 @dataclass
@@ -138,7 +138,7 @@ class TrainerConfig:
     eval_episodes: int = MISSING  # episodes of an evaluation
     checkpoint_interval: int = MISSING  # steps between checkpoints
     checkpoints_kept: int = MISSING  # number of newest checkpoints kept
-    num_threads: int = MISSING  # torch threads; 1 if several runs share the machine
+    num_threads: int = MISSING  # torch threads; 1 if several runs share a machine
     device: str = MISSING  # cpu, cuda or cuda:1
     precision: str = MISSING  # precision of the losses: float32 or bfloat16
     matmul_precision: str = MISSING  # of float32 products: highest, high or medium
@@ -211,7 +211,7 @@ class DisturbanceConfig:
     """One kind of disturbance at one strength: either a wrapper or an attack."""
 
     kind: str = MISSING  # knock, push and start end; others last the whole episode
-    strength: float = MISSING  # for the figure's axis
+    strength: float = MISSING  # a number, in the unit of the suite
     wrap: Any = None  # wrapper of lab.envs, with _target_ and _partial_
     attack: Any = None  # options of attacked_policy
 
@@ -222,7 +222,7 @@ class SuiteConfig:
 
     name: str = MISSING  # part of the names of the result files
     disturbances: dict[str, DisturbanceConfig] = field(default_factory=dict)
-    half: str | None = None  # of the recoverable states: public or held-out
+    half: str | None = None  # half of the recoverable states: public or held-out
 
 
 @dataclass
@@ -232,7 +232,7 @@ class EvaluateConfig:
     checkpoint: str | None = None  # a run's folder, or one checkpoint in it
     sweep: str | None = None  # or a folder: every finished run in or below it
     switching: bool = MISSING  # play the runs of the sweep as one policy
-    jobs: int = MISSING  # runs of a sweep that are evaluated at once
+    jobs: int = MISSING  # runs of a sweep evaluated at once
     suite: SuiteConfig = field(default_factory=SuiteConfig)
     episodes: int = MISSING  # pairs for each checkpoint and disturbance, at least 2
     last: int = MISSING  # number of the run's newest checkpoints
@@ -272,7 +272,7 @@ def schema_of(target: type) -> type:
 
 
 def _config_type(annotation: Any) -> Any:
-    """The annotation, where OmegaConf can check it: a plain type, or that or none."""
+    """Return an annotation that OmegaConf can check: a plain or optional type."""
     parts = {*get_args(annotation)} - {NoneType} or {annotation}
     return annotation if parts < {bool, int, float, str} else Any
 
@@ -321,7 +321,7 @@ def _environment_name(env_id: str) -> str:
 
 
 def _run_dir(resume: str | None, fresh: str) -> str:
-    """The folder of a run: the one to continue, or a new one."""
+    """Return the folder of a run: the one to continue, or a new one."""
     if resume is not None and not Path(resume, "config.yaml").exists():
         raise FileNotFoundError(
             f"resume={resume}: there is no config.yaml in it; give the folder of a run."
