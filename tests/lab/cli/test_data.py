@@ -12,6 +12,7 @@ from composed import composed
 from PIL import Image
 
 from torchrl_osr.lab.cli import data
+from torchrl_osr.lab.run.config import checked
 
 
 @pytest.fixture
@@ -81,6 +82,22 @@ def test_what_cannot_be_trained_on_is_one_sentence(look, changes, overrides, mes
     with pytest.raises((ValueError, OSError), match=message):
         look(*NAMED, "data.action_bounds=[-2,2]", *overrides)
     assert not list(Path().glob("*.png"))
+
+
+def test_a_file_names_the_columns_of_an_observation_by_keys(look):
+    rng = np.random.default_rng(0)
+    names = ["x", "y", "goal_x", "goal_y", *"abcd", "u", "v"]
+    frame = pd.DataFrame(rng.uniform(-1, 1, (600, 10)), columns=names)
+    frame.assign(reward=0.0, end=1 * (frame.index % 100 == 99)).to_csv("maze.csv")
+    named = "observation: [x, y, goal_x, goal_y, a, b, c, d]\naction: [u, v]\n"
+    Path("columns.yaml").write_text(f"{named}terminated: false\ntruncated: end\n")
+    maze = "env=pointmaze-umaze", "data=file", "data.path=maze.csv"
+    output = look(*maze, "data.columns=columns.yaml")
+    assert re.search(r"y -> achieved_goal\[1\] .*\n +goal_x -> desired_goal", output)
+    assert "text      separator ',', decimal '.', UTF-8" in output
+    config = composed("train", *maze, "data.columns=columns.yaml")
+    read = checked(config).data
+    assert (read.columns.action, read.num_transitions) == (["u", "v"], None)
 
 
 def test_rolled_out_data_too(look):

@@ -17,6 +17,7 @@ PLANE = spaces.Box(-1, 1, (2,), np.float32)
 STATE = spaces.Dict([("speed", spaces.Box(2, 3, (1,))), ("angle", PLANE)])
 SPACES = {
     "test/Endless-v0": (PLANE, spaces.Box(-np.inf, np.inf, (1,), np.float32)),
+    "test/Fixed-v0": (PLANE, spaces.Box(np.float32([0, 1]), np.float32([1, 1]))),
     "test/Shifted-v0": (PLANE, spaces.Discrete(3, start=-1)),
     "test/Lazy-v0": (PLANE, spaces.Discrete(3)),
     "test/Tuple-v0": (spaces.Tuple([STATE, spaces.Discrete(3)]), PLANE),
@@ -41,7 +42,7 @@ class Bare(gymnasium.Env):
 def _bare_environments():
     for env_id, (observations, actions) in SPACES.items():
         kwargs = {"observations": observations, "actions": actions}
-        gymnasium.register(env_id, Bare, kwargs=kwargs)
+        gymnasium.register(env_id, Bare, kwargs=kwargs, disable_env_checker=True)
     yield
     for env_id in SPACES:
         del gymnasium.registry[env_id]
@@ -78,7 +79,8 @@ def test_mazes_observe_a_vector_with_the_goal_in_front(name, tmp_path, monkeypat
             "cannot be made: No module named 'not_there'",
         ),
         ("FrozenLake-v1", ValueError, r"has observations Discrete\(16\)"),
-        ("test/Endless-v0", ValueError, "expected bounded real numbers"),
+        ("test/Endless-v0", ValueError, "expected real numbers, low < high"),
+        ("test/Fixed-v0", ValueError, "expected real numbers, low < high"),
         ("test/Shifted-v0", ValueError, "or Discrete from 0"),
     ],
 )
@@ -97,6 +99,8 @@ def test_other_action_bounds_are_rescaled_and_tuples_become_vectors():
         observation, _ = env.reset(seed=0)
         assert env.observation_space.contains(observation)
         assert (observation.shape, observation[2] > 1) == ((6,), True), "speed is last"
+        entries = ["0.angle[0]", "0.angle[1]", "0.speed[0]", "1[0]", "1[1]", "1[2]"]
+        assert env.observation_space.entries == entries
 
 
 @pytest.mark.parametrize(

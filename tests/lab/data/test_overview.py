@@ -44,6 +44,8 @@ def test_a_sound_log_gives_no_reason_to_complain():
     [
         ({"reward": np.full(1200, 2.0)}, "reward is 2 in every row: all policies"),
         ({"action": np.sign(make_log()["action"])}, "at one of its bounds in 100%"),
+        ({"action": make_log()["action"] / 100}, "stays within 0.9% of its bounds"),
+        ({n: make_log()[n].repeat(2, 0)[:1200] for n in make_log()}, "repeat the row"),
         (
             {"observation": 1.7e9 + np.c_[np.zeros(1200), np.arange(1200)] / 50},
             "1,199 changes of observation[1] from row to row",

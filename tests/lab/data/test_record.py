@@ -79,7 +79,8 @@ def test_noise_stays_within_the_bounds():
     ("env_id", "act", "options", "message"),
     [
         ("Pendulum-v1", lambda _: [2.5], {}, r"action \[2.5\] is not in"),
-        ("CartPole-v1", None, {"noise": 1.5}, "from 0 to 1"),
+        ("CartPole-v1", forwards, {"noise": 1.5}, "from 0 to 1"),
+        ("CartPole-v1", None, {"noise": 0.5}, "noise=0.5 has no effect with policy=ra"),
     ],
 )
 def test_bad_input_is_named(env_id, act, options, message):

@@ -146,6 +146,8 @@ def test_bounds_come_from_the_environment_unless_given(tmp_path, bounds, high):
     ("source", "options", "message"),
     [
         ("minari", {}, r"data=minari needs data\.path="),
+        ("file", {"num_transitions": 9}, "num_transitions=9 has no effect with data=f"),
+        ("file", {"clip_actions": True, "env_id": "CartPole-v1", "path": "x"}, "discr"),
         ("medium", {"path": "x"}, r"data\.path=x has no effect with data=medium"),
         ("medium", {"random_share": 0.5, "on_disk": True}, "in memory: choose another"),
         (
@@ -162,4 +164,15 @@ def test_bounds_come_from_the_environment_unless_given(tmp_path, bounds, high):
 )
 def test_useless_options_are_refused(source, options, message):
     with pytest.raises(ValueError, match=message):
-        load_dataset("hopper", source, num_transitions=100, **options)
+        load_dataset("hopper", source, **options)
+
+
+def test_a_d4rl_file_without_ends_names_another_way(tmp_path):
+    columns = d4rl_columns(roll_out()[0])
+    path = str(
+        save(tmp_path / "hopper.hdf5", columns | {"ends": columns.pop("timeouts")})
+    )
+    with pytest.raises(ValueError, match="no 'timeouts' .* use data=file data.col"):
+        load_dataset("hopper", "d4rl", path=path)
+    names = {"observation": "observations", "truncated": "ends"}
+    assert len(load_dataset("hopper", path=path, columns=names)[0]) == 300

@@ -29,6 +29,11 @@ def robot(**changes):
     return frame.assign(**changes)
 
 
+def csv(folder, frame):
+    frame.to_csv(folder / "plain.csv", index=False)
+    return folder / "plain.csv"
+
+
 @pytest.fixture(params=[".csv", ".parquet"])
 def write(request, tmp_path):
     def write(frame):
@@ -55,21 +60,32 @@ def test_all_kinds_of_files_hold_the_same(tmp_path, ending):
 
 
 @pytest.mark.parametrize(
-    ("name", "options"),
+    ("name", "options", "text"),
     [
-        ("log.csv", {"sep": ";", "encoding": "utf-8-sig"}),
-        ("log.csv.gz", {"sep": ";", "decimal": ","}),
-        ("log.csv", {"sep": "\t", "decimal": ","}),
+        ("log.csv", {"sep": ";", "encoding": "utf-8-sig"}, "';', decimal '.', UTF-8"),
+        ("log.csv.gz", {"sep": ";", "decimal": ","}, "';', decimal ',', UTF-8"),
+        ("log.csv", {"sep": "\t", "encoding": "utf-16"}, "'\\t', decimal '.', UTF-16"),
+        ("log.csv", {"decimal": ",", "sep": ";", "encoding": "cp1252"}, "',', cp1252"),
     ],
 )
-def test_separators_and_decimals_are_detected(tmp_path, name, options):
-    robot().to_csv(tmp_path / name, index=False, **options)
-    robot().to_csv(tmp_path / "plain.csv", index=False)
-    data, expected = (
-        load_dataset(path=tmp_path / each, columns=WANTED)[0]
-        for each in (name, "plain.csv")
-    )
+def test_separators_decimals_and_encodings_are_detected(tmp_path, name, options, text):
+    robot(größe="weiß").to_csv(tmp_path / name, index=name == "log.csv.gz", **options)
+    expected, _ = load_dataset(path=csv(tmp_path, robot()), columns=WANTED)
+    data, manifest = load_dataset(path=tmp_path / name, columns=WANTED)
     assert (data == expected).all()
+    assert text in manifest["text"]
+    assert manifest["unused_columns"] == ["tick", "größe"]
+
+
+def test_comments_blank_lines_and_spaces_are_skipped(tmp_path):
+    expected, _ = load_dataset(path=csv(tmp_path, robot()), columns=WANTED)
+    lines = robot(fell=robot()["fell"] == 1).to_csv(index=False).splitlines()
+    lines = ["# robot 7", f"# {lines[0].replace(',', ', ')},", "", *lines[1:]]
+    text = "\n".join(lines).replace("True", " true").replace("monday 2", " monday 2")
+    (tmp_path / "log.csv").write_text(text.replace("\n\n", "\n"))
+    assert (
+        load_dataset(path=tmp_path / "log.csv", columns=WANTED)[0] == expected
+    ).all()
 
 
 def test_columns_are_taken_by_their_names(write):
@@ -98,15 +114,21 @@ def test_steps_bring_the_rows_of_an_episode_into_order(write, clock):
     ordered = robot().assign(tick=clock(robot()["tick"]))
     shuffled = ordered.sample(frac=1, random_state=0)
     wanted = WANTED | {"step": "tick"}
-    data, _ = load_dataset(path=write(shuffled), columns=wanted)
+    data, manifest = load_dataset(path=write(shuffled), columns=wanted)
+    rate = "0.02 s apart (50 a second)" if clock is stamps else "apart"
+    assert rate in manifest["steps"]
     # Episodes in the order in which they come up in the file.
     order = {name: i for i, name in enumerate(shuffled["run"].unique())}
     parts = np.argsort([order[f"monday {number}"] for number in range(3)])
     ends = expected["next", "done"][:, 0].nonzero()[:, 0] + 1
     episodes = expected.split(np.diff(ends.numpy(), prepend=0).tolist())
     assert (data == torch.cat([episodes[part] for part in parts])).all()
-    with pytest.raises(ValueError, match="where steps are .* a next state is missing"):
+    with pytest.raises(ValueError, match="where steps are .* or the rate changes"):
         load_dataset(path=write(ordered.drop(index=17)), columns=wanted)
+    holed = ordered.drop(index=17).assign(**{f"next_{n}": 0.5 for n in "xyz"})
+    known = wanted | {"next_observation": "next_*"}
+    _, manifest = load_dataset(path=write(holed), columns=known)
+    assert "as in 1 places: rows are missing" in manifest["warnings"][0]
     with pytest.raises(ValueError, match="the rows in another order"):
         load_dataset(path=write(shuffled), columns=WANTED)
     ordered.loc[17, "tick"] = ordered.loc[16, "tick"]
@@ -140,26 +162,32 @@ def test_rows_without_ends_and_values(write):
     assert manifest["unmarked_ends"] == 3
 
 
-USUAL = ["obs_10", "obs_2", "action", "reward", "terminated", "episode"]
+OBS = [f"obs_{number}" for number in range(10, -1, -1)]
+USUAL = [*OBS, "action", "reward", "terminated", "episode"]
 
 
 def test_names_are_found_in_the_order_of_their_numbers():
     columns = find_columns(USUAL, {})
-    assert columns["observation"] == ["obs_2", "obs_10"]
+    assert columns["observation"] == OBS[::-1]
     assert [*columns] == ["observation", "action", "reward", "terminated", "episode"]
     named = {"observation": "obs_*", "action": "action"}
     assert find_columns([*USUAL, "note"], named) == columns
-    named["observation"] = USUAL[:2]
-    assert find_columns(USUAL, named)["observation"] == USUAL[:2]
+    named["observation"] = ["obs_3", "obs_1"]
+    assert find_columns(USUAL, named)["observation"] == ["obs_3", "obs_1"]
 
 
 @pytest.mark.parametrize(
     ("names", "wanted", "message"),
     [
         (USUAL, {"action": "force"}, r"action=force names 0 columns; there are obs_10"),
-        (USUAL, dict.fromkeys(("action", "reward"), "obs_2"), "'obs_2' is read twice"),
+        (
+            USUAL,
+            dict.fromkeys(("action", "reward"), "action"),
+            "'action' is read twice",
+        ),
+        (["obs_0", "obs_2", *USUAL[11:]], {}, "obs_0 to obs_2 lack number 1"),
         (USUAL[:-1], {}, "the data lack truncated or episode; there"),
-        (USUAL[:4], {}, "lack terminated.*terminated=false if noth"),
+        (USUAL[:-2], {}, "lack terminated.*terminated=false if noth"),
         ([*USUAL, "note"], {}, "unknown columns note"),
     ],
 )
@@ -174,6 +202,10 @@ def test_wrong_columns_are_named(names, wanted, message):
         ("obs_0,action,reward,terminated,episode\n1,a,3,0,0\n", "'action' holds other"),
         ("obs_0,action,reward,terminated,episode\n1,.2,3,0,0,9\n", "more values than"),
         ("obs_0,action,reward,terminated,episode\n1,.2,3\n", "no value in row 0"),
+        ("0.5,.2,3,0,0\n1,.2,3,0,0\n", "the first line holds numbers; .* a header"),
+        ("1,1,0\n1,.2,3\n", "the first line holds numbers"),
+        ("obs,obs,action\n1,.2,3\n", "two columns are named 'obs'"),
+        ("obs;action\n1,234;0.5\n", "in 0.5 and 1,234: write all numbers alike"),
     ],
 )
 def test_wrong_csv_files_are_refused(tmp_path, rows, message):

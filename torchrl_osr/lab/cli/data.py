@@ -56,6 +56,10 @@ def main(cfg: DictConfig) -> None:
         with closing(make_environment(env.id)) as made:
             space: Any = made.observation_space
         wrong += out_of_space(entries, space.low.tolist(), space.high.tolist())
+        if keys := getattr(space, "entries", None):
+            observed = entries.loc["observation"].index
+            pairs = zip(observed, keys, strict=True)
+            entries = entries.rename({name: f"{name} -> {key}" for name, key in pairs})
     files = [options.path] if isinstance(options.path, str) else options.path
     title = Path(files[0]).name if files else f"{env.name} {options.source}"
     print(f"{title}: {overview(data, manifest, entries.loc['action'].index)}\n")
@@ -101,6 +105,7 @@ def overview(
         actions, shares = [*map(str, range(number))], data["action"].mean(0).tolist()
     each = [f"{share:.1%} {name}" for name, share in zip(actions, shares, strict=True)]
     lines.append(f"actions   {what}: {', '.join(each)}")
+    lines += [f"{n:<10}{manifest[n]}" for n in ("steps", "text") if n in manifest]
     if unused := manifest.get("unused_columns"):
         lines.append(f"not read  {', '.join(unused)}")
     return "\n  ".join(lines)

@@ -111,16 +111,20 @@ def open_environment(env_id: str) -> gymnasium.Env[Any, Any]:
     env = _registered(env_id)
     if isinstance(env.observation_space, (spaces.Dict, spaces.Tuple)):
         parts = sorted_space(env.observation_space)
-        flat = spaces.flatten_space(parts)
+        flat: Any = spaces.flatten_space(parts)
+        flat.entries = _entries(parts)
         flatten = partial(spaces.flatten, parts)
         env = gymnasium.wrappers.TransformObservation(env, flatten, flat)
     actions: Any = env.action_space
     bounded = _is_real_vector(actions) and actions.is_bounded()
+    bounded = bounded and (actions.low < actions.high).all()
     numbered = isinstance(actions, spaces.Discrete) and actions.start == 0
     if not _is_real_vector(env.observation_space):
         flaw = f"observations {env.observation_space}; expected a real vector"
     elif not bounded and not numbered:
-        flaw = f"actions {actions}; expected bounded real numbers, or Discrete from 0"
+        flaw = (
+            f"actions {actions}; expected real numbers, low < high, or Discrete from 0"
+        )
     else:
         limited = env.spec is not None and env.spec.max_episode_steps is not None
         return env if limited else gymnasium.wrappers.TimeLimit(env, MAX_EPISODE)
@@ -142,6 +146,15 @@ def sorted_space(space: spaces.Space[Any]) -> spaces.Space[Any]:
     if image or not space.is_np_flattenable:
         raise ValueError(f"an observation is {space}; expected real vectors.")
     return space
+
+
+def _entries(space: Any, name: str = "") -> list[str]:
+    """Names of the entries of the vector that an observation becomes."""
+    if isinstance(space, (spaces.Dict, spaces.Tuple)):
+        keys: Any = space if isinstance(space, spaces.Dict) else range(len(space))
+        parts = [_entries(space[key], f"{name}.{key}") for key in keys]
+        return [entry for part in parts for entry in part]
+    return [f"{name[1:]}[{entry}]" for entry in range(spaces.flatdim(space))]
 
 
 def _is_real_vector(space: gymnasium.Space[Any]) -> TypeGuard[spaces.Box]:

@@ -20,7 +20,7 @@ CONSTANT = {
 }
 
 FEW_ROWS, MOST_ROWS = 1000, 20_000
-SOME, MOST = 0.1, 0.5
+FEW, SOME, MOST = 0.02, 0.1, 0.5
 
 # A jump is so many times the change that nine in ten rows stay below.
 JUMP = 20
@@ -70,6 +70,13 @@ def findings(
                     f"{name} is at one of its bounds in {share:.0%} of the rows: they "
                     "may be too narrow (data.action_bounds=[low,high])."
                 )
+        largest = data["action"].abs().amax(0).tolist()
+        for name, most in zip(entries.loc["action"].index, largest, strict=True):
+            if 0 < most < FEW:
+                yield (
+                    f"{name} stays within {most:.1%} of its bounds: it may have other "
+                    "units than they (data.action_bounds=[low,high])."
+                )
     fell, lengths = manifest.get("terminated_ends"), manifest.get("episode_lengths", [])
     if len(lengths) > 2 and len({*lengths}) == 1 and fell == len(lengths):
         yield (
@@ -106,6 +113,13 @@ def _about_order(data: TensorDict) -> Iterator[str]:
         yield (
             f"after {share:.0%} of the rows the next row does not begin where this one "
             "ended: sort them (data.columns.step=...) unless they are single steps."
+        )
+    parts = data["observation"], data["action"], data["next", "reward"]
+    rows = torch.stack([(part[1:] == part[:-1]).all(1) for part in parts]).all(0)
+    if rows.double().mean() > SOME / 10:
+        yield (
+            f"{rows.sum():,} rows, such as {int(rows.int().argmax()) + 1}, repeat the "
+            "row before: rows may be double, or the sensors slower than the log."
         )
     rows = (followed[:-1] & followed[1:]).nonzero()[:MOST_ROWS, 0] + 1
     if len(rows) >= FEW_ROWS:

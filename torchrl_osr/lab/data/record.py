@@ -40,6 +40,8 @@ def record_episodes(
             f"episodes={num_episodes} noise={noise}: give at least 1 episode and noise "
             f"from 0 to {most}."
         )
+    if act is None and noise:
+        raise ValueError(f"noise={noise} has no effect with policy=random.")
     rng = np.random.default_rng([seed, 1])  # not the environment's own numbers
     env.action_space.seed(int(rng.integers(2**31)))
     steps: list[dict[str, Any]] = []

@@ -133,7 +133,7 @@ class Recording:
             "episode_lengths": lengths[whole].tolist(),
             "incomplete_returns": returns[~whole].tolist(),
             "incomplete_lengths": lengths[~whole].tolist(),
-            "warnings": [*self._warnings, *warnings],
+            "warnings": [*self.about.get("warnings", []), *self._warnings, *warnings],
         }
 
 
@@ -146,8 +146,7 @@ def _vanishing(columns: Columns) -> Iterator[str]:
         for entry in np.flatnonzero(lost.sum(0) > 0.01 * moved.sum(0)):
             yield (
                 f"{lost.sum(0)[entry]:,} changes of {name}[{entry}] from row to row "
-                "vanish in float32: subtract a constant (of a clock, its first "
-                "value), or leave the entry out."
+                "vanish in float32: subtract a constant (of a clock, its first value)."
             )
 
 

@@ -53,7 +53,7 @@ def load_dataset(
     clip_actions: bool = False,
     missing: str = "error",
     download: bool = False,
-    num_transitions: int = 200_000,
+    num_transitions: int | None = None,
     random_share: float = 0.0,
     seed: int = 0,
     on_disk: bool = False,
@@ -84,7 +84,8 @@ def load_dataset(
         clip_actions, missing: see
             :func:`~torchrl_osr.lab.data.transitions_from_columns`.
         download: fetch the Minari set of that name.
-        num_transitions, seed: exact number of rolled-out rows, and their seed.
+        num_transitions, seed: exact number of rolled-out rows, default 200,000, and
+            their seed.
         random_share: share of the rolled-out rows that are random instead.
         on_disk: leave the rows memory-mapped. They are converted in parts: a file of
             a log, or many episodes of Minari, at a time.
@@ -105,7 +106,8 @@ def load_dataset(
     }
     spec = None
     if source in RECORDED:
-        _refuse({"random_share": random_share}, f"data={source}")
+        useless = {"random_share": random_share, "num_transitions": num_transitions}
+        _refuse(useless, f"data={source}, which is recorded")
         spec = None if env_id is None else environment_spec(env_id)
         if path is None:
             raise ValueError(f"data={source} needs data.path=...")
@@ -134,7 +136,7 @@ def load_dataset(
                 f"'torchrl-osr collect env.id={env_id} path={name}.npz', then add "
                 f"data=file data.path={name}.npz."
             )
-        recipe = {"num_transitions": num_transitions, "seed": seed}
+        recipe = {"num_transitions": num_transitions or 200_000, "seed": seed}
         data, manifest = rolled_out(name, source, recipe, progress=progress)
     if is_memory_mapped(data) and not on_disk:
         data = data.clone()
@@ -221,7 +223,8 @@ def _opened(
     if source != "file":
         _refuse({"columns": log["columns"]}, f"data={source}")
     if spec is not None and spec.discrete:
-        _refuse({"action_bounds": bounds}, "discrete actions")
+        useless = {"action_bounds": bounds, "clip_actions": log["clip_actions"]}
+        _refuse(useless, "discrete actions")
         number = spec.action_size
     if bounds is None and source != "minari":
         bounds = -1.0, 1.0

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import codecs
+import csv
 import gzip
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from fnmatch import fnmatchcase
 from glob import glob
-from itertools import chain
+from itertools import chain, takewhile
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -40,6 +43,8 @@ USUAL_NAMES = {
 
 VECTORS = ("observation", "action", "next_observation")
 
+NUMBER = re.compile(r"[-+]?\d*[.,]?\d+(e[-+]?\d+)?", re.IGNORECASE)
+
 
 def open_log(
     path: str | Path | Sequence[str],
@@ -55,6 +60,12 @@ def open_log(
 
     def chosen(names: list[str]) -> list[str]:
         """Return the columns to read by name; all files need those of the first."""
+        if source == "d4rl" and "timeouts" not in names:
+            raise ValueError(
+                f"no 'timeouts' among {', '.join(names)}, and D4RL's episodes end "
+                "there. With other ends use data=file data.columns.observation="
+                "observations data.columns.truncated=<name>, or episode=<name>."
+            )
         if "columns" not in about:
             about["columns"] = find_columns(names, columns)
             used = {*chain(*about["columns"].values())}
@@ -64,10 +75,10 @@ def open_log(
     def parts() -> Iterator[Arrays]:
         for file in files:
             try:
-                arrays = _read(file, chosen)
+                arrays = _read(file, chosen, about)
                 rows = assemble(about["columns"], arrays)
                 if step := about["columns"].get("step"):
-                    rows = _sorted(rows, step[0])
+                    rows = _sorted(rows, step[0], about)
             except (KeyError, OSError, ValueError) as error:
                 raise ValueError(f"{file}: {error}") from error
             yield rows
@@ -86,7 +97,9 @@ def _files(path: str | Path | Sequence[str]) -> list[Path]:
     return files
 
 
-def _read(path: Path, chosen: Callable[[list[str]], list[str]]) -> Arrays:
+def _read(
+    path: Path, chosen: Callable[[list[str]], list[str]], about: dict[str, Any]
+) -> Arrays:
     """Return the columns of a file that ``chosen`` selects from its names."""
     if path.suffix == ".npz":
         arrays = read_arrays(path)
@@ -103,24 +116,70 @@ def _read(path: Path, chosen: Callable[[list[str]], list[str]]) -> Arrays:
         names = chosen(parquet.read_schema(path).names)
         frame = pd.read_parquet(path, columns=names)
     elif path.suffix in (".csv", ".gz"):
-        frame = _read_csv(path)
+        frame = _read_csv(path, about)
         names = chosen([*frame])
     else:
         raise ValueError("its name must end in .csv, .csv.gz, .parquet, .hdf5 or .npz")
     return {name: frame[name].to_numpy() for name in names}
 
 
-def _read_csv(path: Path) -> pd.DataFrame:
+def _read_csv(path: Path, about: dict[str, Any]) -> pd.DataFrame:
     opened = gzip.open if path.suffix == ".gz" else open
-    with opened(path, "rt", encoding="utf-8-sig") as file:
-        header, *lines = file.read(2**16).splitlines() or [""]
-    separator = max(",;\t", key=header.count)
-    comma = separator != "," and any(re.search(r"\d,\d", line) for line in lines)
-    decimal = "," if comma else "."
-    frame = pd.read_csv(path, sep=separator, decimal=decimal, low_memory=False)
+    with opened(path, "rb") as file:
+        wide = file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    for encoding in ("UTF-16" if wide else "UTF-8-sig", "cp1252"):
+        with suppress(UnicodeDecodeError), opened(path, "rt", encoding=encoding) as it:
+            frame, about["text"] = _parsed(it)
+            about["text"] += f", {encoding.removesuffix('-sig')}"
+            return frame
+    raise ValueError("its text is neither UTF-8, nor UTF-16, nor cp1252.")
+
+
+def _parsed(file: IO[str]) -> tuple[pd.DataFrame, str]:
+    """Table of a CSV file, and what was detected."""
+    lines = file.read(2**16).splitlines()
+    skipped = len([*takewhile(lambda line: line[:1] in ("", "#"), lines)])
+    if skipped and NUMBER.match("".join(lines[skipped : skipped + 1])):
+        skipped -= 1  # NumPy writes the names as a comment
+    header, *rest = lines[skipped:] or [""]
+    separator = next((each for each in ";\t|" if each in header), ",")
+    names = [
+        name.strip(" #") for name in next(csv.reader([header], delimiter=separator))
+    ]
+    twice = [name for name in names if name and names.count(name) > 1]
+    if any(
+        NUMBER.fullmatch(name) and (name in twice or not name.isdigit())
+        for name in names
+    ):
+        raise ValueError(
+            "the first line holds numbers; expected names of columns: add a header "
+            "line, such as obs_0,obs_1,action,reward,terminated,episode."
+        )
+    if twice:
+        raise ValueError(f"two columns are named {twice[0]!r}: rename one.")
+    values = [each.strip(' "') for line in rest for each in line.split(separator)]
+    numbers = [each for each in values if NUMBER.fullmatch(each)]
+    points, commas = ([each for each in numbers if mark in each] for mark in ".,")
+    if points and commas:
+        raise ValueError(
+            f"a point and a comma are decimal marks, in {points[0]} and {commas[0]}: "
+            "write all numbers alike, without separators of thousands."
+        )
+    decimal = "," if commas else "."
+    file.seek(0)
+    frame = pd.read_csv(
+        file,
+        sep=separator,
+        decimal=decimal,
+        skiprows=skipped,
+        skipinitialspace=True,
+        low_memory=False,
+    )
     if not isinstance(frame.index, pd.RangeIndex):
         raise ValueError("lines have more values than the header has names.")
-    return frame.rename(columns=str.strip)
+    named = [name for name in frame if not name.startswith("Unnamed: ")]
+    frame = frame[named].rename(columns=lambda name: name.strip(" #"))
+    return frame, f"separator {separator!r}, decimal {decimal!r}"
 
 
 def find_columns(
@@ -188,12 +247,22 @@ def _usual(part: str, names: Sequence[str]) -> list[str]:
 
 
 def _in_order(names: list[str]) -> list[str]:
-    """Sort the entries of a vector by number if all have one, else as in the file."""
+    """Sort the entries of a vector by number if all have one, else as in the file.
+
+    A gap in the numbers is an error: an entry may be missing.
+    """
     matches = [re.fullmatch(r"(.*?)(\d+)\D?", name) for name in names]
     found = [match for match in matches if match]
     if len(found) < len(names) or len({match[1] for match in found}) != 1:
         return names
-    return [match[0] for match in sorted(found, key=lambda match: int(match[2]))]
+    numbered = {int(match[2]): match[0] for match in found}
+    first, last = min(numbered), max(numbered)
+    if gaps := sorted({*range(1 if first else 0, last)} - numbered.keys()):
+        raise ValueError(
+            f"{numbered[first]} to {numbered[last]} lack number {gaps[0]}: if that is "
+            "right, list the columns to read (data.columns.observation=[...])."
+        )
+    return [numbered[number] for number in sorted(numbered)]
 
 
 def assemble(layout: Mapping[str, list[str]], arrays: Arrays) -> Arrays:
@@ -227,13 +296,13 @@ def _numbers(name: str, array: Array) -> Array:
     return np.asarray(numbers, np.float64)
 
 
-def _sorted(columns: Arrays, name: str) -> Arrays:
+def _sorted(columns: Arrays, name: str, about: dict[str, Any]) -> Arrays:
     """Sort the rows of each episode by its steps or time stamps."""
     given, episode = columns.pop("step"), columns["episode"]
-    step = given
+    step, unit = given, ""
     if given.dtype.kind not in "biuf":
         times = pd.to_datetime(given, format="ISO8601", utc=True)
-        step = np.asarray((times - times[0]).total_seconds())
+        step, unit = np.asarray((times - times[0]).total_seconds()), " s"
     if not np.isfinite(step).all():
         row = int((~np.isfinite(step)).argmax())
         raise ValueError(f"{name!r} has no value in row {row} of {len(step)}.")
@@ -245,12 +314,23 @@ def _sorted(columns: Arrays, name: str) -> Arrays:
     usual = np.sort(gaps[same])[same.sum() // 2]
     counted = step.dtype.kind in "iu"
     uneven = gaps != usual if counted else abs(gaps - usual) > usual / 2
-    wrong = same & ((gaps == 0) | (uneven & ("next_observation" not in columns)))
+    steps = f"{name}, {usual:.3g}{unit} apart"
+    if unit and usual:
+        steps += f" ({1 / usual:.3g} a second)"
+    wrong = same & ((gaps == 0) | uneven)
+    found = []
     if wrong.any():
         row = int(wrong.argmax())
-        raise ValueError(
+        found.append(
             f"episode {rows['episode'][row]:g} goes from {name!r} {given[order[row]]} "
-            f"to {given[order[row + 1]]}, where steps are {usual:g} apart, as in "
-            f"{wrong.sum()} places: a next state is missing. Give next_observation."
+            f"to {given[order[row + 1]]}, where steps are {usual:g}{unit} apart, as in "
+            f"{wrong.sum()} places: rows are missing or double, or the rate changes."
         )
+        if (same & (gaps == 0)).any() or "next_observation" not in columns:
+            raise ValueError(
+                f"{found[0]} Start a new episode there, or give next_observation."
+            )
+    if about.setdefault("steps", steps) != steps:
+        found.append(f"steps of one file are {about['steps']}, of another {steps}.")
+    about["warnings"] = [*about.get("warnings", []), *found]
     return rows

@@ -57,6 +57,8 @@ def checked(config: DictConfig, trust: Sequence[str] = ()) -> TrainConfig:
     """
     plain: Any = OmegaConf.to_container(config, resolve=True)
     plain.pop("settings", None)  # interpolations have read them
+    if "columns" in plain.get("data", {}):
+        plain["data"]["columns"] = read_columns(plain["data"]["columns"])
     check_targets(plain, trust)
     try:
         typed = OmegaConf.merge(OmegaConf.structured(TrainConfig), plain)
@@ -116,6 +118,11 @@ def write_config(folder: Path, config: TrainConfig) -> None:
     for key in ("resume", "force", "trust", "settings"):
         del content[key]
     write_atomically(folder / CONFIG, yaml.safe_dump(content, sort_keys=False))
+
+
+def read_columns(given: Any) -> Any:
+    """Return the names of a log's columns, of a YAML file if its path is given."""
+    return read_yaml(Path(given).expanduser()) if isinstance(given, str) else given
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

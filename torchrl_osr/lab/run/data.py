@@ -28,6 +28,7 @@ from torchrl_osr.lab.data.rows import (
     next_action,
     split_held_out,
 )
+from torchrl_osr.lab.run.config import read_columns
 from torchrl_osr.lab.run.schema import DataConfig, EnvConfig, TrainConfig
 
 OF_TRAINING = ("storage", "held_out", "standardize", "reward_scale", "reward_shift")
@@ -62,6 +63,7 @@ def load_data(
     from torchrl_osr.lab.data import load_dataset  # needs Gymnasium; networks do not
 
     reading = asdict(options)
+    reading["columns"] = read_columns(reading["columns"])
     for name in OF_TRAINING:
         del reading[name]
     if env is not None:
@@ -85,6 +87,12 @@ def load_training_data(
     """
     env, options, optim = config.env, config.data, config.optim
     data, manifest = load_data(env, options, progress=config.trainer.progress)
+    never = config.dynamics.use and config.dynamics.terminations == "never"
+    if never and (ends := int(data["next", "terminated"].sum())):
+        raise ValueError(
+            f"dynamics.terminations=never, and {ends:,} rows are terminated: leave it "
+            "out, or read a time limit as data.columns.truncated."
+        )
     if with_next_action := ("next", "action") in in_keys:
         check_order(data)
     loc, scale = observation_statistics(data) if options.standardize else (0.0, 1.0)

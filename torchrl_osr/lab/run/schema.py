@@ -69,12 +69,12 @@ class DataConfig:
     # maze diverse or play. Recorded data: minari, d4rl or file.
     source: str = MISSING
     path: Any = None  # recorded data: a file, a folder, a list or a pattern
-    columns: ColumnsConfig = field(default_factory=ColumnsConfig)
+    columns: Any = field(default_factory=ColumnsConfig)  # or a YAML file with them
     action_bounds: Any = None  # bounds in the log's units; null: the task's
     clip_actions: bool = MISSING  # clip actions outside the bounds; false: refuse them
     missing: str = MISSING  # missing values: error, or leave out the row or episode
     download: bool = MISSING  # download the set that path names
-    num_transitions: int = MISSING  # number of collected rows
+    num_transitions: int | None = None  # number of collected rows, default 200,000
     seed: int = MISSING  # random seed of collection and held-out rows
     random_share: float = MISSING  # share of rows replaced by random data
     storage: str = MISSING  # memory, or disk for sets larger than memory
@@ -292,6 +292,7 @@ def register() -> None:
         "run_dir": _run_dir,
         "method_name": method_name,
         "by_data": by_data,
+        "rolled_out": _rolled_out,
         # A part of a folder's name; file systems allow 255 bytes.
         "short": lambda text: re.sub(r"[^\w.-]+", "-", text)[:200],
     }
@@ -312,6 +313,13 @@ def by_data(key: str, *, _root_: DictConfig) -> Any:
     if group != "loss":
         raise ValueError(f"settings have no value of {key} for {env}-{source}.")
     return getattr(schema_of(get_class(_root_.loss._target_))(), option)
+
+
+def _rolled_out(value: Any, *, _root_: DictConfig) -> Any:
+    """The value of an option that recorded data do not have."""
+    from torchrl_osr.lab.data.sources import RECORDED  # needs Gymnasium
+
+    return None if _root_.data.source in RECORDED else value
 
 
 def _environment_name(env_id: str) -> str:
