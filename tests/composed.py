@@ -16,7 +16,7 @@ from torchrl_osr.lab.run.train import train
 CONF = Path(__file__).parents[1] / "conf"
 
 SMALL = (
-    "data=random", "data.num_transitions=600", "data.held_out=0.1",
+    "data=random", "data.num_transitions=${rolled_out:600}", "data.held_out=0.1",
     "network.num_cells=[8]", "trainer.batch_size=8",
     "trainer.inverse_dynamics_steps=10", "trainer.steps=10", "trainer.log_interval=10",
     "trainer.eval_interval=10", "trainer.eval_episodes=1",

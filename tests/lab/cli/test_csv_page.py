@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shlex
 from pathlib import Path
 
@@ -17,10 +16,8 @@ def test_the_page_leads_from_a_log_to_a_policy(tmp_path, monkeypatch, run):
     check_md_file(PAGE, memory=True)
     assert (tmp_path / "pendulum.csv").exists()
     text = PAGE.read_text(encoding="utf-8")
-    block = re.search(r"`(conf/\S+\.yaml)`:\n\n```yaml\n(.*?)```", text, re.S)
-    name, settings = block.groups()
-    (tmp_path / name).parent.mkdir(parents=True)
-    (tmp_path / name).write_text(settings, encoding="utf-8")
+    (names,) = grab_code_blocks(text, lang="yaml")
+    (tmp_path / "columns.yaml").write_text(names, encoding="utf-8")
 
     def typed(command: str) -> str:
         blocks = grab_code_blocks(text, lang="bash")
@@ -35,7 +32,7 @@ def test_the_page_leads_from_a_log_to_a_policy(tmp_path, monkeypatch, run):
     assert output[:-1] == shown.strip().splitlines()[:-1]
     assert (tmp_path / "pendulum-data.png").exists()
 
-    typed("torchrl-osr train --config-dir conf")
+    typed("torchrl-osr train env.id")
     folder = tmp_path / "pendulum"
     returns = json.loads((folder / "returns.json").read_text())
     assert returns["last"]["step"] == 40

@@ -63,18 +63,18 @@ def findings(
         if entry["min"] == entry["max"] and not (part == "reward" and falls):
             yield f"{name} is {entry['min']:g} in every row: {CONSTANT[part]}"
     if manifest.get("num_actions") is None:
-        shares = actions_at_bounds(data).tolist()
-        for name, share in zip(entries.loc["action"].index, shares, strict=True):
+        names, sizes = entries.loc["action"].index, data["action"].abs().amax(0)
+        for name, share, size in zip(
+            names, actions_at_bounds(data), sizes, strict=True
+        ):
             if share > MOST:
                 yield (
                     f"{name} is at one of its bounds in {share:.0%} of the rows: they "
                     "may be too narrow (data.action_bounds=[low,high])."
                 )
-        largest = data["action"].abs().amax(0).tolist()
-        for name, most in zip(entries.loc["action"].index, largest, strict=True):
-            if 0 < most < FEW:
+            if 0 < size < FEW:
                 yield (
-                    f"{name} stays within {most:.1%} of its bounds: it may have other "
+                    f"{name} stays within {size:.1%} of its bounds: it may have other "
                     "units than they (data.action_bounds=[low,high])."
                 )
     fell, lengths = manifest.get("terminated_ends"), manifest.get("episode_lengths", [])

@@ -143,14 +143,11 @@ def _parsed(file: IO[str]) -> tuple[pd.DataFrame, str]:
         skipped -= 1  # NumPy writes the names as a comment
     header, *rest = lines[skipped:] or [""]
     separator = next((each for each in ";\t|" if each in header), ",")
-    names = [
-        name.strip(" #") for name in next(csv.reader([header], delimiter=separator))
-    ]
+    (cells,) = csv.reader([header], delimiter=separator)
+    names = [name.strip(" #") for name in cells]
     twice = [name for name in names if name and names.count(name) > 1]
-    if any(
-        NUMBER.fullmatch(name) and (name in twice or not name.isdigit())
-        for name in names
-    ):
+    numeric = [name for name in names if NUMBER.fullmatch(name)]
+    if {*numeric} & {*twice} or not all(map(str.isdigit, numeric)):
         raise ValueError(
             "the first line holds numbers; expected names of columns: add a header "
             "line, such as obs_0,obs_1,action,reward,terminated,episode."
@@ -167,14 +164,8 @@ def _parsed(file: IO[str]) -> tuple[pd.DataFrame, str]:
         )
     decimal = "," if commas else "."
     file.seek(0)
-    frame = pd.read_csv(
-        file,
-        sep=separator,
-        decimal=decimal,
-        skiprows=skipped,
-        skipinitialspace=True,
-        low_memory=False,
-    )
+    options: Any = {"skipinitialspace": True, "low_memory": False, "decimal": decimal}
+    frame = pd.read_csv(file, sep=separator, skiprows=skipped, **options)
     if not isinstance(frame.index, pd.RangeIndex):
         raise ValueError("lines have more values than the header has names.")
     named = [name for name in frame if not name.startswith("Unnamed: ")]
