@@ -22,7 +22,7 @@ from torchrl_osr.lab.run import schema
 
 ROOT = Path(__file__).parents[1]
 PRESETS = ("quick", "paper")
-# What everybody changes; the rest follows by group.
+# Settings that users change first; the rest follows by group.
 COMMON = (
     *("env.id", "data.source", "seed", "resume", "trainer.steps"),
     *("loss.recovery_weight", "perturbation.std", "optim.actor_lr", "optim.qvalue_lr"),
@@ -43,7 +43,7 @@ another loss, add `loss=osr_v --cfg job`.
 
 
 def described(documented: Any) -> dict[str, str]:
-    """The meaning of each argument or attribute in a Google-style docstring."""
+    """Read the meaning of each argument or attribute in a Google-style docstring."""
     text = inspect.getdoc(documented) or ""
     found: dict[str, str] = {}
     names: list[str] = []
@@ -61,7 +61,7 @@ def described(documented: Any) -> dict[str, str]:
 
 
 def commented(config: type) -> dict[str, str]:
-    """The comment beside each field of a dataclass, or above it."""
+    """Read the comment of each dataclass field, to its right or above it."""
     found, above = {}, []
     for line in inspect.getsource(config).splitlines():
         if comment := re.match(r"    # (.*)", line):
@@ -74,7 +74,7 @@ def commented(config: type) -> dict[str, str]:
 
 
 def markdown(text: str) -> str:
-    """A docstring's markup as Markdown that fits into a table's cell."""
+    """Convert a docstring's markup to Markdown for a table's cell."""
     text = re.sub(r":math:`(.*?)`", r"$\1$", text)
     text = re.sub(r":(?:class|func|attr|meth):`~?(.*?)`", r"`\1`", text)
     text = text.replace("``", "`").replace("|", "\\|").replace("`None`", "`null`")
@@ -86,7 +86,7 @@ def markdown(text: str) -> str:
 
 
 def meanings(cfg: DictConfig) -> dict[str, str]:
-    """The meaning of every key, dotted."""
+    """Return the meaning of every key, dotted."""
     found = commented(schema.TrainConfig)
     found |= dict(meanings_of_groups(schema.TrainConfig))
     for name in ("loss", "inverse_dynamics.loss"):
@@ -99,7 +99,7 @@ def meanings(cfg: DictConfig) -> dict[str, str]:
 
 
 def meanings_of_groups(config: type, prefix: str = "") -> Iterator[tuple[str, str]]:
-    """The meaning of every key, dotted, of the groups in a dataclass."""
+    """Yield the meaning of every key, dotted, of the groups in a dataclass."""
     for name, field in config.__dataclass_fields__.items():
         if dataclasses.is_dataclass(field.default_factory):
             group = field.default_factory
@@ -109,7 +109,7 @@ def meanings_of_groups(config: type, prefix: str = "") -> Iterator[tuple[str, st
 
 
 def leaves(tree: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Every key, dotted, with its value; what is called for a key is no setting."""
+    """Yield every key, dotted, with its value; a ``_target_`` is no setting."""
     for key, value in tree.items():
         if isinstance(value, dict):
             yield from leaves(value, f"{prefix}{key}.")
@@ -118,7 +118,7 @@ def leaves(tree: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def shown(value: Any) -> str:
-    """A value as one types it."""
+    """Format a value as on the command line."""
     text = OmegaConf.to_yaml(OmegaConf.create({"_": value})).removeprefix("_:").strip()
     if isinstance(value, list):
         text = f"[{', '.join(map(str, value))}]"
@@ -126,7 +126,7 @@ def shown(value: Any) -> str:
 
 
 def page() -> str:
-    """The whole page."""
+    """Return the whole page."""
     schema.register()
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         composed = [compose("train", [f"preset={name}"]) for name in PRESETS]

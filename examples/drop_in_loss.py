@@ -1,4 +1,4 @@
-"""OSRLoss where CQLLoss stood, in a TorchRL user's own pipeline."""
+"""OSRLoss in place of CQLLoss, in a TorchRL user's own pipeline."""
 
 import torch
 from tensordict import TensorDict

@@ -1,13 +1,13 @@
-"""Draw figure 3 of the paper: three controllers go on from the same push.
+"""Draw figure 3 of the paper: three controllers after the same push.
 
     torchrl-osr train env=hopper data=medium-expert hydra.run.dir=outputs/hopper
     python examples/film_recovery.py outputs/hopper --push 0.5
 
-The behaviour policy plays until the push is over. Then it goes on, or the inverse
-dynamics model takes over, or the OSR policy. The model's target is the next state of
-the undisturbed episode: at the same time as in the paper, or with ``--nearest`` after
-the state that is most like the present one. Rendering needs ``MUJOCO_GL=egl`` (the
-default on Linux) or ``osmesa``.
+The behaviour policy plays until the push is over. Then it continues, or the inverse
+dynamics model or the OSR policy takes over. The model's target is a state of the
+undisturbed episode: the one at the next step, as in the paper, or with ``--nearest``
+the successor of the state nearest to the present one. Rendering needs
+``MUJOCO_GL=egl`` (the default on Linux) or ``osmesa``.
 """
 
 import argparse

@@ -1,7 +1,7 @@
-"""State recovery added to a loss that knows nothing of it: TorchRL's IQLLoss.
+"""State recovery added to another loss: TorchRL's IQLLoss.
 
 A point mass with data near the origin. The policy is trained with and without the
-recovery term; then its state is pushed out of the data, and its next state is
+recovery term. Then its state is pushed out of the data, and its next state is
 compared with the s' in the data. ``python iql_with_recovery.py [steps]``
 """
 

@@ -7,7 +7,7 @@
 
 Out-of-sample State Recovery keeps a policy close to the states of its data. An inverse
 dynamics model learns which action leads from a state, clean or perturbed, to the next
-state of the data. The policy learns to choose that action, so that it returns to the
+state of the data. The policy learns to choose that action, in order to return to the
 data after a push.
 
 ``torchrl-osr train`` makes the same run from the same parts, and has the other methods.

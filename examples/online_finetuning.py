@@ -1,4 +1,4 @@
-"""A policy that OSR has learnt from data goes on learning in its environment.
+"""Continue the training of an OSR policy online, in its environment.
 
     torchrl-osr train env=hopper
     python examples/online_finetuning.py outputs/hopper-medium-replay/osr-seed0-... out/

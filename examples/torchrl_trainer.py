@@ -2,9 +2,9 @@
 
     python examples/torchrl_trainer.py env=walker2d loss.recovery_weight=1.0
 
-The configuration is ``torchrl_trainer.yaml`` beside this file. Data are rolled out on
-this machine and standardised; the inverse dynamics model is trained first, then the
-policy, which plays its task at the end. Writes ``result.json`` to Hydra's folder.
+The configuration is ``torchrl_trainer.yaml`` beside this file. Data are collected on
+this machine and standardised. The inverse dynamics model is trained first, then the
+policy, which finally plays its task. Writes ``result.json`` to Hydra's folder.
 """
 
 from __future__ import annotations

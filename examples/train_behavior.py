@@ -6,7 +6,7 @@ the medium actor, and a card of their returns.
 
     python examples/train_behavior.py --env Hopper-v5 --steps 300000 --out policies
 
-Ctrl-C ends the training early and keeps what was learnt up to then.
+Ctrl-C ends the training early and keeps what has been learned.
 """
 
 from __future__ import annotations
@@ -213,7 +213,7 @@ def save(path: Path, policy: BehaviorPolicy, *, half: bool) -> None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Train, choose, measure anew and write."""
+    """Train, choose, measure again and write."""
     args = parse_arguments(arguments)
     torch.set_num_threads(args.threads)
     torch.manual_seed(args.seed)
