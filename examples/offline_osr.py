@@ -31,6 +31,7 @@ from torchrl_osr.lab.data.rows import take_multi_step
 from torchrl_osr.lab.evaluation import inverse_dynamics_report
 from torchrl_osr.lab.run import CONF
 from torchrl_osr.lab.run.build import Learner
+from torchrl_osr.lab.run.config import write_config
 from torchrl_osr.lab.run.data import load_training_data
 from torchrl_osr.lab.run.folder import Run, open_run
 from torchrl_osr.lab.run.load import CHECKPOINTS
@@ -92,6 +93,7 @@ def train(run: Run) -> float:
     # 2. Data: transitions with standardised states, and a perturbed state beside each
     # state. Both together are the paper's mixed data set D_tot.
     data = load_training_data(config, device)
+    write_config(folder, config)  # with the checksum of the data
     perturbation = StatePerturbation(config.perturbation.std, seed=config.seed)
     data.buffer.append_transform(perturbation)
 

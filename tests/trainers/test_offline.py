@@ -282,9 +282,12 @@ def test_numbers_are_logged_as_means_over_the_interval(tmp_path, make, logger):
     assert "train/raw" not in {name for name, *_ in logger.numbers}
 
 
-@pytest.mark.parametrize("interval", [5, 100])
-def test_killed_run_logs_no_step_twice(tmp_path, make, interval):
-    """Killed in its last step, some time after its last checkpoint or before any."""
+@pytest.mark.parametrize(("interval", "evaluated"), [(5, 0), (100, 0), (5, 10)])
+def test_killed_run_logs_no_step_twice(tmp_path, make, interval, evaluated):
+    """Killed in its last step, some time after its last checkpoint or before any.
+
+    Or killed after an evaluation, before the checkpoint that has the result.
+    """
 
     def make_logged(folder):
         return make(
@@ -292,16 +295,26 @@ def test_killed_run_logs_no_step_twice(tmp_path, make, interval):
             checkpoint_interval=interval,
             log_interval=1,
             loggers=[CSVLogger("csv", log_dir=str(tmp_path / folder))],
+            evaluate=lambda: {"score": 1},
         )
 
     def files(folder):
-        return (tmp_path / folder / "csv" / "scalars" / "train").glob("loss*.csv")
+        return (tmp_path / folder / "csv" / "scalars" / "train").glob("*.csv")
 
     def read(folder):
         return {path.name: path.read_text() for path in files(folder)}
 
     make_logged("undisturbed").train()
-    stop_at(make_logged("killed"), 19)
+    killed = make_logged("killed")
+    save = killed.checkpoints.save
+
+    def save_or_die(step):
+        if evaluated and killed.history[-1]["step"] == evaluated:
+            raise RuntimeError("killed")
+        save(step)
+
+    killed.checkpoints.save = save_or_die
+    stop_at(killed, 19)
     before = read("killed")
     for number, path in enumerate(files("killed")):  # killed within a line
         path.write_text(path.read_text() + ["6", "60,", "60,0.1"][number % 3])

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
@@ -204,7 +204,8 @@ class OfflineTrainer(Trainer):
     def resume(self) -> Path | None:
         """Restore the newest whole checkpoint of the folder, if there is one.
 
-        Rows that a CSV logger wrote after it are cut off: these steps are repeated.
+        Rows that a CSV logger wrote after it are cut off, and those of an evaluation at
+        its step whose result it lacks: these are repeated.
         """
         path = self.checkpoints.restore()
         step = self._saved["step"]
@@ -213,14 +214,15 @@ class OfflineTrainer(Trainer):
                 f"{path} is at step {step}, beyond the {self.total_frames} steps of "
                 "this run: ask for at least as many, or start in another folder."
             )
-        for logger in self.loggers:
-            if isinstance(logger, CSVLogger):
-                folder = Path(logger.experiment.log_dir, "scalars", self.description)
-                cut_back(folder, step if path else -1)
         if path and step < self.total_frames:
             log.info(f"{self.description}: goes on from {path}")
         self.collected_frames = self._optim_count = self.collector.step = step
         self.update.count = step
+        repeated = set[str]() if self._is_evaluated() else set().union(*self.history)
+        for logger in self.loggers:
+            if isinstance(logger, CSVLogger):
+                folder = Path(logger.experiment.log_dir, "scalars", self.description)
+                cut_back(folder, step if path else -1, repeated)
         return path
 
     def optim_steps(self, batch: TensorDictBase) -> None:
@@ -360,9 +362,10 @@ class _Stepper(OptimizationStepper):
             ) from error
 
 
-def cut_back(folder: Path, step: int) -> None:
+def cut_back(folder: Path, step: int, repeated: Set[str] = frozenset()) -> None:
     """Cut off the rows ``step,value`` that a ``CSVLogger`` wrote after a step.
 
+    Of the numbers that are logged at the step once more, ``repeated``, its row goes.
     A last line that a kill left unfinished goes, too.
     """
     for path in folder.glob("*.csv"):
@@ -371,7 +374,7 @@ def cut_back(folder: Path, step: int) -> None:
             for line in file:
                 number = line.split(b",")[0]
                 whole = line.endswith(b"\n") and number.isdigit()
-                if not whole or int(number) > step:
+                if not whole or int(number) > step - (path.stem in repeated):
                     break
                 kept += len(line)
             file.truncate(kept)

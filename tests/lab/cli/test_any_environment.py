@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from functools import partial
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from gymnasium.spaces import Box
 from torchrl_osr.lab.cli import collect, evaluate
 from torchrl_osr.lab.data import environment_spec
 from torchrl_osr.lab.report import read_runs, write_report
+from torchrl_osr.lab.report.runs import find_runs
 from torchrl_osr.lab.run.config import read_run
 from torchrl_osr.lab.run.load import load_run_policy
 
@@ -28,8 +30,8 @@ def trained(folder: Path, *overrides: str) -> Path:
     return trained_on(folder, "data=file", "trainer.eval_episodes=2", *overrides)
 
 
-def disturbed(folder: Path) -> dict:
-    given = (f"checkpoint={folder}", "episodes=2", "last=1", "progress=false")
+def disturbed(folder: Path, *more: str) -> dict:
+    given = (f"checkpoint={folder}", "episodes=2", "last=1", "progress=false", *more)
     evaluate.main(composed("evaluate", *given))
     return json.loads((folder / "robustness-oos.json").read_text())
 
@@ -81,6 +83,42 @@ def test_own_references_make_scores(tmp_path):
     run = trained(tmp_path / "scored", *given, "env.expert_return=-200")
     last = json.loads((run / "returns.json").read_text())["last"]
     assert last["score"] == pytest.approx((last["return"] + 1200) / 10)
+
+
+def test_a_run_knows_its_data_by_their_contents(tmp_path):
+    record(log := tmp_path / "log.npz", "env.id=Pendulum-v1", "episodes=3")
+    given = "env.id=Pendulum-v1", "loss=td3_bc"
+    run = trained(tmp_path / "run", *given, f"data.path={log}")
+    more = f"resume={run}", "trainer.steps=20"
+    log.rename(moved := tmp_path / "moved.npz")
+    with pytest.raises(FileNotFoundError, match=r"no file .*log\.npz"):
+        disturbed(run)
+    disturbed(run, f"data.path={moved}")
+    with np.load(moved) as columns:
+        np.savez(log, **{**columns, "reward": -columns["reward"]})
+    refused = r"data.path=.*log\.npz has other contents .* began with: give data.path="
+    for play in (
+        partial(disturbed, run, "force=true"),
+        partial(trained_on, run, *more),
+    ):
+        with pytest.raises(ValueError, match=refused):
+            play()
+    trained_on(run, more[0], f"data.path={moved}")
+    assert read_run(run).data.path == str(moved)
+    fixed = trained(tmp_path / "fixed", *given, f"data.path={log}")
+    os.replace(log, moved)
+    trained_on(run, *more, "force=true")
+    assert read_run(run).data.checksum == read_run(fixed).data.checksum
+
+
+def test_a_run_that_fails_before_its_training_is_none(tmp_path):
+    """A corrected command may use its folder."""
+    given = "env.id=Pendulum-v1", f"data.path={tmp_path}/log.npz"
+    with pytest.raises(FileNotFoundError, match="no file"):
+        trained(tmp_path / "run", *given, "loss=osr")
+    assert find_runs([tmp_path]) == []
+    record(tmp_path / "log.npz", "env.id=Pendulum-v1", "episodes=3")
+    trained(tmp_path / "run", *given, "loss=td3_bc")
 
 
 class Machine(gymnasium.Env):

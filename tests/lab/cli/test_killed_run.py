@@ -59,9 +59,6 @@ def results(folder: Path) -> dict:
         for pattern in ("*.json", "**/*.safetensors", "**/*.csv")
         for path in folder.glob(pattern)
     }
-    for name in [each for each in left if each.endswith(".csv")]:
-        # An evaluation that was killed before it was saved is logged once more.
-        left[name] = list(dict.fromkeys(left[name].splitlines()))
     names = sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
     return left | {"names": names}
 

@@ -20,7 +20,7 @@ from tensordict import TensorDict
 from torchrl import torchrl_logger
 
 from torchrl_osr._checks import check_choice
-from torchrl_osr.lab.data.store import Dataset, cache_root, load_or_write
+from torchrl_osr.lab.data.store import Dataset, cache_root, checksum_of, load_or_write
 from torchrl_osr.lab.data.transitions import (
     ACTION_LIMIT,
     SAME_STATE,
@@ -129,6 +129,7 @@ class Recording:
         return {
             **self.about,
             **self._counts,
+            "checksum": checksum_of(self.files),
             "episode_returns": returns[whole].tolist(),
             "episode_lengths": lengths[whole].tolist(),
             "incomplete_returns": returns[~whole].tolist(),

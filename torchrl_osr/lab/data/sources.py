@@ -118,9 +118,11 @@ def load_dataset(
         ):
             _refuse(log, f"{path}, which is converted")
             data, manifest = load_memmap(path)
+            checksum = manifest["rows_sha256"]
         else:
             recording = _opened(source, path, spec, log, progress)
             data, manifest = recording.load(on_disk=on_disk)
+            checksum = manifest.get("checksum")  # not in an older cache
     else:
         _refuse(log | {"path": path}, f"data={source}, which is rolled out")
         if random_share and (source == "random" or on_disk):
@@ -138,6 +140,7 @@ def load_dataset(
             )
         recipe = {"num_transitions": num_transitions or 200_000, "seed": seed}
         data, manifest = rolled_out(name, source, recipe, progress=progress)
+        checksum = manifest["rows_sha256"]
     if is_memory_mapped(data) and not on_disk:
         data = data.clone()
     if spec is not None:
@@ -153,7 +156,7 @@ def load_dataset(
         weights = [len(data) - number, number]
         score = float(np.average(scores, weights=weights)) if known else None
         manifest = recipe | {"random_share": random_share, "env_id": about["env_id"]}
-    facts = {"mean_return": mean, "normalized_score": score}
+    facts = {"mean_return": mean, "normalized_score": score, "checksum": checksum}
     return data, manifest | {"env_name": env_name, "source": source} | facts
 
 

@@ -163,8 +163,12 @@ def load_or_write(
 
 def _checksum(folder: Path) -> str:
     """Return the SHA-256 of the files of the rows."""
-    paths = sorted(path for path in folder.rglob("*") if path.is_file())
-    digests = [sha256_of(path) for path in paths]
+    return checksum_of(sorted(path for path in folder.rglob("*") if path.is_file()))
+
+
+def checksum_of(files: Iterable[Path]) -> str:
+    """Return the SHA-256 of the contents of files, wherever they are."""
+    digests = [sha256_of(path) for path in files]
     return hashlib.sha256("".join(digests).encode()).hexdigest()
 
 

@@ -21,8 +21,8 @@ from torchrl_osr.lab.run.schema import method_name
 
 IGNORED = (
     *sorted({*RESUMABLE} - {"trainer.steps", "trainer.eval_interval"}),
-    *("resume", "seed", "data.storage", "logger.", "trainer.compile"),
-    *("trainer.cudagraph", "trainer.checkpoint_interval", "loss.deactivate_vmap"),
+    *("resume", "seed", "data.storage", "data.checksum", "logger."),
+    *("trainer.compile", "trainer.checkpoint_interval", "loss.deactivate_vmap"),
 )
 """The seed, and settings that change how a number is computed, but not the number."""
 
@@ -228,7 +228,7 @@ def _read(folder: Path) -> _Run:
         "versions": sorted(packages),
     }
     contents = {"mean": f"{facts['data_score']:.2f}"}
-    contents["checksum"] = str(returns.get("data_checksum", ""))[:8]
+    contents["checksum"] = str(config.get("data.checksum") or "")[:8]
     settings = {key: str(value) for key, value in config.items()}
     states = pd.concat(saved, ignore_index=True)
     return _Run(facts, settings, contents, protocols, episodes, states)

@@ -31,7 +31,10 @@ from torchrl_osr.lab.data.rows import (
 from torchrl_osr.lab.run.config import read_columns
 from torchrl_osr.lab.run.schema import DataConfig, EnvConfig, TrainConfig
 
-OF_TRAINING = ("storage", "held_out", "standardize", "reward_scale", "reward_shift")
+OF_TRAINING = (
+    *("storage", "held_out", "standardize", "reward_scale", "reward_shift"),
+    "checksum",
+)
 """Options of the data that do not decide which rows there are."""
 
 MAX_HELD_OUT = 50_000
@@ -58,7 +61,8 @@ def load_data(
 ) -> tuple[TensorDict, dict[str, Any]]:
     """Load data set and manifest; rewards are the task's own.
 
-    Without a task, recorded data are not compared with it.
+    Without a task, recorded data are not compared with it. A ValueError says that they
+    are not those that a run began with.
     """
     from torchrl_osr.lab.data import load_dataset  # needs Gymnasium; networks do not
 
@@ -70,7 +74,15 @@ def load_data(
         reading |= {"env_name": env.name, "env_id": env.id}
         reading["references"] = references_of(env)
     on_disk = options.storage == "disk"
-    return load_dataset(**reading, on_disk=on_disk, progress=progress)
+    data, manifest = load_dataset(**reading, on_disk=on_disk, progress=progress)
+    if options.checksum not in (None, manifest["checksum"]):
+        place = "" if options.path is None else f" data.path={options.path}"
+        raise ValueError(
+            f"data={options.source}{place} has other contents than those that the run "
+            "began with: give data.path=<place of these>, or continue the run on the "
+            "new ones with 'train resume=<its folder> force=true'."
+        )
+    return data, manifest
 
 
 @torch.random.fork_rng(devices=[])
@@ -81,12 +93,15 @@ def load_training_data(
 ) -> TrainingData:
     """Load a run's data, split and prepared; torch's global generator is left alone.
 
+    Their checksum is kept in the configuration.
+
     Rewards become ``reward_scale * r + reward_shift``; the mean is of the task's own.
     If ``in_keys``, the keys that the loss reads, have ``("next", "action")``, batches
     have the data's next action, and the rows must be in order of time.
     """
     env, options, optim = config.env, config.data, config.optim
     data, manifest = load_data(env, options, progress=config.trainer.progress)
+    options.checksum = manifest["checksum"]
     never = config.dynamics.use and config.dynamics.terminations == "never"
     if never and (ends := int(data["next", "terminated"].sum())):
         raise ValueError(

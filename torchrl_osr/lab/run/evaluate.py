@@ -123,6 +123,7 @@ def play_suite(config: EvaluateConfig, players: list[Player]) -> dict[str, Any]:
     """Play under all disturbances; data and task are those of the first player."""
     first, _ = players[0]
     run = first.config
+    run.data.path = config.data.path or run.data.path
     data, _ = load_data(run.env, run.data, progress=config.progress)
     distance = DataDistance(data, seed=run.data.seed)
     scale = observation_statistics(data)[1].numpy()

@@ -8,7 +8,7 @@ import platform
 import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from glob import glob
 from importlib.metadata import version
 from pathlib import Path
@@ -70,7 +70,8 @@ def open_run(
 ) -> Iterator[Run]:
     """Check a configuration, and lock the folder of its run while it is trained.
 
-    The folder gets ``config.yaml``. Its ``status.json`` is running, then done,
+    The folder gets ``config.yaml``, which a run that fails before its training takes
+    away again: it is then no run's. Its ``status.json`` is running, then done,
     preempted or failed. With ``resume`` the run in that folder continues. Folder and
     ``job``, Hydra's part of the configuration, are those of the running job by default.
     """
@@ -79,23 +80,33 @@ def open_run(
         folder = Path(cfg.resume or job.runtime.output_dir).absolute()
     trust = list(cfg.trust)  # by the command line, not by a run's folder
     with _lock(folder):
-        if cfg.resume is None:
-            cfg.data.path = _absolute(cfg.data.path)
-        else:
+        if cfg.resume is not None:
             cfg = _resumed(folder, cfg, job.overrides.task)
             check_environment(cfg.env.id, trust)
+        cfg.data.path = _absolute(cfg.data.path)
         config = checked(cfg, trust)
         spec = read_environment(config.env)
-        if (folder / CONFIG).exists():
-            _check_same(read_run(folder, trust), config, folder)
-        else:
+        new, known = not (folder / CONFIG).exists(), config.data
+        if new:
             (folder / HYDRA).parent.mkdir(exist_ok=True)
             write_atomically(folder / HYDRA, OmegaConf.to_yaml({"hydra": job}))
-        write_config(folder, config)  # last: it makes the folder that of a run
+        else:
+            known = (run := read_run(folder, trust)).data
+            config.data.checksum = None if config.force else known.checksum
+            _check_same(run, config, folder)
+        # Last: it makes the folder that of a run. A new place of the data is kept once
+        # they have been found to be the same there.
+        there = replace(config.data, path=known.path)
+        write_config(folder, replace(config, data=there))
         choices = OmegaConf.load(folder / HYDRA).hydra.runtime.choices
         method = method_name(choices.loss, choices.get("recovery"))
         with _status(folder):
-            yield Run(config, folder, spec.simulated, method)
+            try:
+                yield Run(config, folder, spec.simulated, method)
+            except Exception:
+                if new and not (folder / "checkpoint").exists():  # nothing was trained
+                    (folder / CONFIG).unlink()
+                raise
 
 
 def _absolute(path: Any) -> Any:
@@ -136,7 +147,9 @@ def _check_same(run: TrainConfig, config: TrainConfig, folder: Path) -> None:
             f"{folder} holds a run with trainer.steps={run.trainer.steps}, and "
             f"{config.trainer.steps} are fewer: give more, or choose another folder."
         )
-    of_one_start = ("resume", "trust", "force", "settings", *RESUMABLE)
+    of_one_start = {"resume", "trust", "force", "settings", "data.checksum", *RESUMABLE}
+    if config.data.checksum:  # the log may have been moved
+        of_one_start.add("data.path")
     there, now = flatten(asdict(run)), flatten(asdict(config))
     different = "; ".join(
         f"{key}: {there.get(key, 'nothing')!r} there, {now.get(key, 'nothing')!r} now"

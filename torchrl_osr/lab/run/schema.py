@@ -82,6 +82,7 @@ class DataConfig:
     standardize: bool = MISSING  # standardise observations
     reward_scale: float = MISSING  # factor of the training rewards
     reward_shift: float = MISSING  # added to the scaled training rewards
+    checksum: str | None = None  # of the data; read from them and kept with the run
 
 
 @dataclass
@@ -226,6 +227,13 @@ class SuiteConfig:
 
 
 @dataclass
+class MovedConfig:
+    """Where a run's data are now."""
+
+    path: Any = None  # as in data.path of the run; null: where they were
+
+
+@dataclass
 class EvaluateConfig:
     """Configuration of ``torchrl-osr evaluate``."""
 
@@ -233,6 +241,7 @@ class EvaluateConfig:
     sweep: str | None = None  # or a folder: every finished run in or below it
     switching: bool = MISSING  # play the runs of the sweep as one policy
     jobs: int = MISSING  # runs of a sweep evaluated at once
+    data: MovedConfig = field(default_factory=MovedConfig)
     suite: SuiteConfig = field(default_factory=SuiteConfig)
     episodes: int = MISSING  # pairs for each checkpoint and disturbance, at least 2
     last: int = MISSING  # number of the run's newest checkpoints

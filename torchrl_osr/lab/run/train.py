@@ -44,6 +44,7 @@ from torchrl_osr.lab.evaluation import (
 from torchrl_osr.lab.evaluation.figures import learning_curve, read_scalars
 from torchrl_osr.lab.evaluation.tables import score_table
 from torchrl_osr.lab.run.build import Learner, make_learner, try_out
+from torchrl_osr.lab.run.config import write_config
 from torchrl_osr.lab.run.data import load_training_data, references_of
 from torchrl_osr.lab.run.folder import Run, package_versions
 from torchrl_osr.lab.run.load import CHECKPOINTS, POLICY, policy_of, restore
@@ -88,6 +89,7 @@ class Phases:
         # Transitions with standardised states. Each batch gets a perturbed state for
         # every state, which is the paper's mixed data set.
         self.data = load_training_data(config, device, self.learner.objective.in_keys)
+        write_config(run.folder, config)  # with the checksum of the data
         self.perturbation = StatePerturbation(config.perturbation.std, seed=config.seed)
         self.data.buffer.append_transform(self.perturbation)
 
