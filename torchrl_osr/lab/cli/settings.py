@@ -52,7 +52,10 @@ def main() -> None:
     chosen = [each[5:].split(",") for each in overrides if each.startswith("loss=")]
     rest = [each for each in overrides if not each.startswith("loss=")]
     names = chosen[-1] if chosen else methods()
-    rows = [("method", *(key.rpartition(".")[2] for key in KEYS))]
+    short = [key.rpartition(".")[2] for key in KEYS]
+    # Two keys of one name are told apart by their groups.
+    pairs = zip(short, KEYS, strict=True)
+    rows = [("method", *(key if short.count(n) > 1 else n for n, key in pairs))]
     register()
     with initialize_config_dir(CONF, version_base="1.3"):
         for name in names:

@@ -129,7 +129,7 @@ class Recording:
         return {
             **self.about,
             **self._counts,
-            "checksum": checksum_of(self.files),
+            **({"checksum": checksum_of(self.files)} if self.files else {}),
             "episode_returns": returns[whole].tolist(),
             "episode_lengths": lengths[whole].tolist(),
             "incomplete_returns": returns[~whole].tolist(),
