@@ -129,6 +129,9 @@ def test_steps_bring_the_rows_of_an_episode_into_order(write, clock):
     known = wanted | {"next_observation": "next_*"}
     _, manifest = load_dataset(path=write(holed), columns=known)
     assert "as in 1 places: rows are missing" in manifest["warnings"][0]
+    strange = ordered.assign(tick="10:00")
+    with pytest.raises(ValueError, match="'tick' holds 10:00; expected numbers, or ti"):
+        load_dataset(path=write(strange), columns=wanted)
     with pytest.raises(ValueError, match="the rows in another order"):
         load_dataset(path=write(shuffled), columns=WANTED)
     ordered.loc[17, "tick"] = ordered.loc[16, "tick"]
@@ -147,6 +150,8 @@ def test_several_files_are_one_log(tmp_path):
         data, manifest = load_dataset(path=path, columns=names)
         assert (data == torch.cat(parts)).all()
         assert manifest["path"] == paths
+    with pytest.raises(FileNotFoundError, match="no file .*2.npz"):
+        load_dataset(path=[*paths, str(tmp_path / "2.npz")], columns=names)
     # Episodes are numbered anew in each file.
     assert manifest["incomplete_lengths"] == [40, 20, 40, 20]
 
@@ -202,6 +207,7 @@ def test_wrong_columns_are_named(names, wanted, message):
         ("obs_0,action,reward,terminated,episode\n1,a,3,0,0\n", "'action' holds other"),
         ("obs_0,action,reward,terminated,episode\n1,.2,3,0,0,9\n", "more values than"),
         ("obs_0,action,reward,terminated,episode\n1,.2,3\n", "no value in row 0"),
+        ("obs_0,action,reward,terminated,episode\n", "hold no rows"),
         ("0.5,.2,3,0,0\n1,.2,3,0,0\n", "the first line holds numbers; .* a header"),
         ("1,1,0\n1,.2,3\n", "the first line holds numbers"),
         ("obs,obs,action\n1,.2,3\n", "two columns are named 'obs'"),

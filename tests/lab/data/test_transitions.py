@@ -80,8 +80,9 @@ def test_actions_out_of_bounds_are_refused_or_clipped():
     data, manifest = transitions_from_columns(log(action=action), clip_actions=True)
     assert data["action"][3].item() == np.float32(-0.999)
     assert manifest["warnings"][0].startswith("1 rows had actions outside")
-    with pytest.raises(ValueError, match=r"action.bounds"):
-        transitions_from_columns(log(), action_bounds=(1, -1))
+    for bounds in ((1, -1), 2, (1, 2, 3)):
+        with pytest.raises(ValueError, match=r"action.bounds=.* expected"):
+            transitions_from_columns(log(), action_bounds=bounds)
 
 
 def test_missing_rows_cut_their_trajectory():

@@ -60,6 +60,14 @@ class Reading:
 
     def __post_init__(self) -> None:
         check_choice("data.missing", self.missing, ("error", "row", "episode"))
+        bounds = self.action_bounds
+        if (
+            bounds is not None
+            and len(bounds if hasattr(bounds, "__len__") else ()) != 2
+        ):
+            raise ValueError(
+                f"data.action_bounds={bounds}; expected [lowest, highest]."
+            )
 
 
 @dataclass
@@ -288,9 +296,11 @@ def _arrays(rows: Columns, num_actions: int | None) -> dict[str, Array]:
         raise ValueError(f"the columns have {', '.join(flaws)}.")
     columns: dict[str, Array] = {}
     count = np.size(rows["reward"])
+    if not count:
+        raise ValueError("the data hold no rows; expected at least one transition.")
     for name, values in rows.items():
         array = np.asarray(values)
-        size = int(np.size(array) / max(count, 1))
+        size = np.size(array) // count
         if name == "next_observation":
             size = np.shape(rows["observation"])[-1]
         vector = name.endswith("observation") or (name, num_actions) == ("action", None)
@@ -301,8 +311,6 @@ def _arrays(rows: Columns, num_actions: int | None) -> dict[str, Array]:
                 f"numbers {' or '.join(str([*shape]) for shape in shapes)}."
             )
         columns[name] = array if vector else array.reshape(-1)
-    if not count:
-        raise ValueError("the data hold no rows; expected at least one transition.")
     return columns
 
 

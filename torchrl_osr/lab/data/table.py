@@ -91,8 +91,9 @@ def _files(path: str | Path | Sequence[str]) -> list[Path]:
     for each in [path] if isinstance(path, (str, Path)) else path:
         whole = Path(each).expanduser().absolute()
         # A name that looks like a pattern is a name.
-        files += [whole] if whole.is_file() else map(Path, sorted(glob(str(whole))))
-        if not files:
+        found = [whole] if whole.is_file() else [*map(Path, sorted(glob(str(whole))))]
+        files += found
+        if not found:
             raise FileNotFoundError(f"there is no file {whole}: give a log's path.")
     return files
 
@@ -167,7 +168,9 @@ def _parsed(file: IO[str]) -> tuple[pd.DataFrame, str]:
     options: Any = {"skipinitialspace": True, "low_memory": False, "decimal": decimal}
     frame = pd.read_csv(file, sep=separator, skiprows=skipped, **options)
     if not isinstance(frame.index, pd.RangeIndex):
-        raise ValueError("lines have more values than the header has names.")
+        raise ValueError(
+            "lines have more values than the header has names, or end with a separator."
+        )
     named = [name for name in frame if not name.startswith("Unnamed: ")]
     frame = frame[named].rename(columns=lambda name: name.strip(" #"))
     return frame, f"separator {separator!r}, decimal {decimal!r}"
@@ -214,7 +217,8 @@ def find_columns(
 def _named(part: str, patterns: Any, names: Sequence[str]) -> list[str]:
     """Return the columns that the user has named, in that order."""
     found: list[str] = []
-    for pattern in patterns if isinstance(patterns, (list, tuple)) else [str(patterns)]:
+    listed = isinstance(patterns, (list, tuple))
+    for pattern in map(str, patterns if listed else [patterns]):
         # A name that looks like a pattern is a name.
         exact = [pattern] * (pattern in names)
         matching = exact or _in_order([n for n in names if fnmatchcase(n, pattern)])
@@ -282,7 +286,7 @@ def _numbers(name: str, array: Array) -> Array:
         if len(array) and isinstance(array[0], np.ndarray):
             return np.stack([*array])  # lists of one length
         numbers = pd.to_numeric(pd.Series([*array], dtype=object))
-    except ValueError as error:
+    except (TypeError, ValueError) as error:
         raise ValueError(f"{name!r} holds other than numbers: {error}.") from error
     return np.asarray(numbers, np.float64)
 
@@ -292,7 +296,13 @@ def _sorted(columns: Arrays, name: str, about: dict[str, Any]) -> Arrays:
     given, episode = columns.pop("step"), columns["episode"]
     step, unit = given, ""
     if given.dtype.kind not in "biuf":
-        times = pd.to_datetime(given, format="ISO8601", utc=True)
+        try:
+            times = pd.to_datetime(given, format="ISO8601", utc=True)
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"{name!r} holds {given[0]}; expected numbers, or time stamps such as "
+                "2026-03-29T10:00:00.02."
+            ) from error
         step, unit = np.asarray((times - times[0]).total_seconds()), " s"
     if not np.isfinite(step).all():
         row = int((~np.isfinite(step)).argmax())
