@@ -7,6 +7,7 @@ import re
 import shlex
 from pathlib import Path
 
+import numpy as np
 from mktestdocs import grab_code_blocks
 
 PAGE = (Path(__file__).parents[3] / "docs" / "extend.md").read_text(encoding="utf-8")
@@ -43,7 +44,13 @@ def test_your_algorithm_in_your_environment(tmp_path, run, tiny):
         assert "Warning" not in output
         return output
 
-    read("torchrl-osr collect", "episodes=12")
+    # A policy of one's own, from the current folder as well.
+    pilot = "import numpy\n\n\ndef act(state):\n    return numpy.sign(-state[:2])\n"
+    (tmp_path / "pilot.py").write_text(pilot)
+    printed = read("torchrl-osr collect", "episodes=12", "policy=pilot:act")
+    assert "random.npz: 600 steps, 12 episodes" in printed
+    with np.load(tmp_path / "random.npz") as columns:
+        assert set(columns["action"].ravel()) == {-1.0, 1.0}
     read("torchrl-osr train", *tiny("file"))
     folder = tmp_path / "runs" / "awac"
     scalars = folder / "csv" / "scalars" / "policy"
@@ -57,3 +64,8 @@ def test_your_algorithm_in_your_environment(tmp_path, run, tiny):
     page = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
     assert "awac" in page
     assert "PointMass-v0" in page
+    # One's own run is exported without trust: nothing of the modules is needed.
+    for name in ("my_losses.py", "point_mass.py"):
+        (tmp_path / name).unlink()
+    code, output = run(tmp_path, "export", "runs/awac", "policy.pt2")
+    assert code == 0, output

@@ -6,31 +6,18 @@ import json
 
 import numpy as np
 import pytest
-from composed import composed
+from composed import composed, evaluating, trained
 
-from torchrl_osr.lab.cli import collect, evaluate
-
-
-@pytest.fixture
-def train(tmp_path, run, tiny):
-    """Return a function that trains in ``run``; it returns what was printed."""
-
-    def train(data: str, *arguments: str) -> str:
-        sizes = tiny(
-            data, inverse_dynamics_steps=2, steps=2, log_interval=1, eval_interval=2,
-            eval_episodes=2, checkpoint_interval=2,
-        )  # fmt: skip
-        code, output = run(tmp_path, "train", *sizes, "hydra.run.dir=run", *arguments)
-        assert code == 0, output
-        return output
-
-    return train
+from torchrl_osr.lab.cli import collect
+from torchrl_osr.lab.run.evaluate import evaluate_run
 
 
-def test_a_recorded_ant_is_trained_on(train, tmp_path):
+def test_a_recorded_ant_is_trained_on(run, tiny, tmp_path):
     ant, log = "env=antmaze-umaze", tmp_path / "ant.npz"
     collect.main(composed("collect", ant, f"path={log}", "episodes=3"))
-    printed = train("file", ant, f"data.path={log}", "preset=antmaze")
+    given = [*tiny("file"), ant, f"data.path={log}", "preset=antmaze"]
+    code, printed = run(tmp_path, "train", *given, "hydra.run.dir=run")
+    assert code == 0, printed
     for word in ("Warning", "WARN", "Traceback", "Adroit"):
         assert word not in printed
     last = json.loads((tmp_path / "run" / "returns.json").read_text())["last"]
@@ -38,16 +25,12 @@ def test_a_recorded_ant_is_trained_on(train, tmp_path):
     assert max(last["lengths"]) <= 700
 
 
-def test_a_point_is_trained_and_disturbed(train, tmp_path):
-    train("diverse", "env=pointmaze-umaze", "preset=pointmaze")
-    folder = tmp_path / "run"
+def test_a_point_is_trained_and_disturbed(tmp_path):
+    given = "data=diverse", "env=pointmaze-umaze", "preset=pointmaze"
+    folder = trained(tmp_path / "run", *given)
 
-    def disturb(suite: str) -> None:
-        given = f"suite={suite}", f"checkpoint={folder}", "episodes=2", "last=1"
-        evaluate.main(composed("evaluate", *given, "progress=false"))
-
-    disturb("torque")
-    results = json.loads((folder / "robustness-torque.json").read_text())
+    given = f"checkpoint={folder}", "episodes=2", "last=1"
+    _, results = evaluate_run(evaluating("suite=torque", *given))
     levels = results["evaluations"][0]["levels"]
     names = [f"torque-{steps}" for steps in (2, 5, 10, 15, 20)]
     assert [level["name"] for level in levels] == names
@@ -55,4 +38,4 @@ def test_a_point_is_trained_and_disturbed(train, tmp_path):
         assert set(level["scores"]) <= {0.0, 100.0}
     message = "no disturbance of suite=dynamics is possible, .*PointMaze_UMaze-v3"
     with pytest.raises(ValueError, match=message):
-        disturb("dynamics")
+        evaluate_run(evaluating("suite=dynamics", *given))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from torchrl_osr.lab.data import environment, environment_spec, make_environment
+from torchrl_osr.lab.data import environment, make_environment
 from torchrl_osr.lab.data.environment import MAZE_IDS, environment_id
 
 PLANE = spaces.Box(-1, 1, (2,), np.float32)
@@ -101,15 +101,6 @@ def test_other_action_bounds_are_rescaled_and_tuples_become_vectors():
         assert (observation.shape, observation[2] > 1) == ((6,), True), "speed is last"
         entries = ["0.angle[0]", "0.angle[1]", "0.speed[0]", "1[0]", "1[1]", "1[2]"]
         assert env.observation_space.entries == entries
-
-
-@pytest.mark.parametrize(
-    ("env_id", "spec"),
-    [("Pendulum-v1", (3, 1, [-2.0], [2.0])), ("CartPole-v1", (4, 2, None, None))],
-)
-def test_spec_is_in_the_environments_own_units(env_id, spec):
-    assert environment_spec(env_id) == (*spec, True)
-    assert environment_spec(env_id).discrete == (spec[2] is None)
 
 
 def test_an_episode_that_never_ends_is_cut(monkeypatch):

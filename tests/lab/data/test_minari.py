@@ -97,13 +97,18 @@ def flat(space, observations):
     return observations.reshape(len(observations), -1)
 
 
-def test_the_action_space_is_mapped_to_the_unit_box():
+def test_actions_are_mapped_to_the_unit_box_or_become_one_hot():
     made = make("test/set-v0", actions=spaces.Box(np.float32(-4), np.float32(0), (2,)))
     data, manifest = load("test/set-v0")
     raw = np.concatenate([e.actions for e in made.iterate_episodes()])
     expected = ((raw.astype(float) + 4) / 4 * 2 - 1).clip(-0.999, 0.999)
     assert np.array_equal(data["action"], expected.astype(np.float32))
     assert manifest["action_bounds"] == [[-4, -4], [0, 0]]
+    made = make("test/numbers-v0", actions=spaces.Discrete(3, start=1))
+    data, manifest = load("test/numbers-v0")
+    numbers = np.concatenate([each.actions for each in made.iterate_episodes()]) - 1
+    assert np.array_equal(data["action"], np.eye(3)[numbers])
+    assert manifest["num_actions"] == 3
 
 
 def test_nothing_is_fetched_unless_asked_for(monkeypatch):
@@ -120,14 +125,6 @@ def test_nothing_is_fetched_unless_asked_for(monkeypatch):
     data, _ = load("test/far-v0", download=True)
     load("test/far-v0", download=True)
     assert (asked, len(data)) == (["test/far-v0"], sum(LENGTHS))
-
-
-def test_discrete_actions_become_one_hot():
-    made = make("test/set-v0", actions=spaces.Discrete(3, start=1))
-    data, manifest = load("test/set-v0")
-    numbers = np.concatenate([each.actions for each in made.iterate_episodes()]) - 1
-    assert np.array_equal(data["action"], np.eye(3)[numbers])
-    assert manifest["num_actions"] == 3
 
 
 def test_other_action_bounds_than_the_tasks_are_a_warning(monkeypatch):

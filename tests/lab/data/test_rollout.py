@@ -8,21 +8,13 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import array_shapes, arrays
 
-from torchrl_osr.lab.data import (
-    check_dataset,
-    collect_transitions,
-    make_environment,
-)
+from torchrl_osr.lab.data import check_dataset, collect_transitions, make_environment
 from torchrl_osr.lab.data.behavior import load_behavior_card
 from torchrl_osr.lab.data.environment import MAZE_IDS
 from torchrl_osr.lab.data.rollout import (
     BEHAVIORS,
     PLAY_CELLS,
-    behavior_of,
     collect_source,
     shortest_path,
     waypoint_sampler,
@@ -169,38 +161,10 @@ def test_the_controller_by_hand():
     assert sample(observation, Silent()) == pytest.approx([0.4, 0])
 
 
-@pytest.mark.parametrize(
-    ("env_name", "source", "message"),
-    [
-        ("pointmaze-umaze", "play", "data=play of pointmaze-umaze; there are: diverse"),
-        ("hopper", "diverse", "data=diverse of hopper; there are: random, medium"),
-    ],
-)
-def test_sources_that_are_not_there_are_named(env_name, source, message):
-    with pytest.raises(ValueError, match=message):
-        behavior_of(env_name, source)
-
-
-@given(
-    arrays(bool, array_shapes(min_dims=2, max_dims=2, max_side=5)),
-    st.randoms(use_true_random=False),
-)
-def test_ways_are_valid_and_as_short_as_a_matrix_says(free, random):
-    cells = [tuple(map(int, cell)) for cell in np.argwhere(free)]
-    if not cells:
-        return
-    places = np.array(cells)
-    beside = np.abs(places[:, None] - places).sum(-1) == 1
-    start, goal = (random.randrange(len(cells)) for _ in range(2))
-    # Cells that can be reached within 0, 1, 2, ... steps.
-    reached, steps = np.arange(len(cells)) == start, 0
-    while not reached[goal] and steps <= len(cells):
-        reached, steps = reached | (beside @ reached), steps + 1
-    if not reached[goal]:
-        with pytest.raises(KeyError):
-            shortest_path(set(cells), cells[start], cells[goal])
-        return
-    path = shortest_path(set(cells), cells[start], cells[goal])
-    assert (path[0], path[-1], len(path)) == (cells[start], cells[goal], steps + 1)
-    assert all(free[cell] for cell in path)
-    assert (np.abs(np.diff(path, axis=0)).sum(axis=-1) == 1).all()
+def test_the_shortest_of_two_ways_is_taken():
+    ring = {(row, column) for row in range(3) for column in range(4)}
+    ring -= {(1, 1), (1, 2)}
+    way = shortest_path(ring, (0, 1), (2, 1))
+    assert way == [(0, 1), (0, 0), (1, 0), (2, 0), (2, 1)]
+    with pytest.raises(KeyError):
+        shortest_path(ring, (0, 0), (9, 9))

@@ -13,7 +13,6 @@ from torchrl_osr.lab.data.rows import (
     check_order,
     mix_datasets,
     multi_step,
-    next_action,
     split_held_out,
     take_multi_step,
 )
@@ -66,18 +65,6 @@ def test_split_keeps_every_row_once(held_out: int | float, expected: int) -> Non
     assert torch.equal(both.sort().values, torch.arange(50))
 
 
-@tried(20)
-@given(LENGTHS)
-def test_it_is_what_the_episode_did_next(lengths) -> None:
-    data = episodes(lengths)
-    check_order(data)
-    wanted, row = [], 0
-    for length in lengths:
-        wanted += [data["action"][row + step].item() for step in range(1, length)] + [0]
-        row += length
-    assert next_action(data).squeeze(-1).tolist() == wanted
-
-
 def test_rows_in_no_order_are_refused_by_number() -> None:
     data = episodes([4, 5])
     for wrong in (data[[0, 2, 3, 4, 5, 6, 7, 8]], data[[0, 2, 1, 3]]):
@@ -92,14 +79,8 @@ def test_rows_in_no_order_are_refused_by_number() -> None:
 @given(LENGTHS, st.integers(1, 8))
 def test_it_is_what_the_steps_add_up_to(lengths, n_steps) -> None:
     data = episodes(lengths)
-    found = multi_step(
-        data,
-        n_steps=n_steps,
-        gamma=0.9,
-        reward_scale=2.0,
-        reward_shift=-1.0,
-        with_next_action=True,
-    )
+    scaled = {"reward_scale": 2.0, "reward_shift": -1.0, "with_next_action": True}
+    found = multi_step(data, n_steps=n_steps, gamma=0.9, **scaled)
     ends = torch.tensor(lengths).cumsum(0).tolist()
     for row in range(len(data)):
         end = min(each for each in ends if each > row)
@@ -116,17 +97,6 @@ def test_it_is_what_the_steps_add_up_to(lengths, n_steps) -> None:
         ended = last["next", "done"]
         wanted = 0.0 if ended else data["action"][steps[-1] + 1].item()
         assert found["action"][row].item() == wanted
-
-
-@tried(20)
-@given(LENGTHS, st.randoms(use_true_random=False))
-def test_some_rows_are_those_of_all(lengths, random) -> None:
-    data = episodes(lengths)
-    rows = torch.tensor([random.randrange(len(data)) for _ in range(4)])
-    options = {"n_steps": 3, "gamma": 0.9}
-    assert (
-        multi_step(data, rows, **options) == multi_step(data, **options)[rows]
-    ).all()
 
 
 def test_a_batch_takes_them_and_keeps_its_single_steps() -> None:

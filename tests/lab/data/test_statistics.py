@@ -10,15 +10,9 @@ from torchrl_osr.lab.data import observation_statistics, reference_returns, stat
 from torchrl_osr.lab.data.statistics import REFERENCE_RETURNS
 
 
-@pytest.fixture
-def said(monkeypatch) -> list[str]:
-    """What was warned of."""
-    messages: list[str] = []
-    monkeypatch.setattr(statistics.torchrl_logger, "warning", messages.append)
-    return messages
-
-
-def test_statistics_by_hand(said) -> None:
+def test_statistics_by_hand(monkeypatch) -> None:
+    said: list[str] = []
+    monkeypatch.setattr(statistics.torchrl_logger, "warning", said.append)
     rows = torch.tensor([[1.0, 7.0, 0.0], [3.0, 7.0, 1e-5]])
     loc, scale = observation_statistics(TensorDict({"observation": rows}, [2]))
     torch.testing.assert_close(loc, torch.tensor([2.0, 7.0, 5e-6]))

@@ -135,10 +135,7 @@ def with_value(name, row, value):
         ({"observation": np.ones(6)}, r"'observation' has shape \[6\]"),
         ({"next_observations": np.ones((6, 2))}, "an unknown 'next_observations'"),
         ({"truncated": None}, "neither truncated nor episode"),
-        (
-            {"episode": [0, 0, 0, 1, 1, 0], "terminated": [0] * 6},
-            "'episode' 0 comes b",
-        ),
+        ({"episode": [0, 0, 0, 1, 1, 0], "terminated": [0] * 6}, "'episode' 0 comes b"),
         ({"episode": [0, 0, 0, 0, 1, 1]}, r"row 2 ends its episode, and row 3 .*late"),
         (
             {"action": np.array([[0], [1], [1], [0], [1], [0]])},

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
+from objectives.losses import Networks
 from tensordict import TensorDict
 from torch import nn
 from uneven_dynamics import linear_dynamics, plain_gaussian
 
-from torchrl_osr.lab.dynamics import (
-    DynamicsEnsemble,
-    DynamicsLoss,
-    TransitionVAE,
-    TransitionVAELoss,
-)
+from torchrl_osr.lab.dynamics import DynamicsEnsemble, DynamicsLoss, TransitionVAELoss
 from torchrl_osr.lab.dynamics.models import has_next_state
 
 
@@ -114,18 +110,10 @@ def test_weights_alone_decay_and_by_their_layer() -> None:
     assert {each: decay for each, decay in decays.items() if decay} == wanted
 
 
-def make_vae() -> TransitionVAE:
-    torch.manual_seed(0)
-    model = TransitionVAE(3, num_cells=[6])
-    for each in model.parameters():
-        nn.init.normal_(each, std=0.5)
-    return model.double()
-
-
 def test_loss_of_the_autoencoder_equals_the_plain_objective(make_batch, check) -> None:
     batch = make_batch(10, twin=False)
     batch["next", "observation"][1] = batch["observation"][1]  # terminated: no next
-    model, plain = make_vae(), make_vae()
+    model, plain = Networks().vae, Networks().vae
     model.standardize_(batch)
     loss = TransitionVAELoss(model, latent_weight=0.3)
     torch.manual_seed(3)
@@ -156,12 +144,13 @@ def test_loss_of_the_autoencoder_equals_the_plain_objective(make_batch, check) -
     )
 
 
-@pytest.mark.parametrize("build", [make_model, make_vae])
-def test_models_learn_single_steps_and_divide_the_batch(make_batch, build) -> None:
+@pytest.mark.parametrize("name", ["dynamics", "vae"])
+def test_models_learn_single_steps_and_divide_the_batch(make_batch, name) -> None:
     single = make_batch(10, twin=False)
     several = single.clone().set("next", single["next"].roll(1, 0))
     several["steps_to_next_obs"] = torch.full((10, 1), 5)
-    loss = (DynamicsLoss if build is make_model else TransitionVAELoss)(build())
+    kinds = {"dynamics": DynamicsLoss, "vae": TransitionVAELoss}
+    loss = kinds[name](getattr(Networks(), name))
     with pytest.raises(ValueError, match="5 steps.* reads the state one step ahead"):
         loss(several)
     found = []
@@ -169,6 +158,6 @@ def test_models_learn_single_steps_and_divide_the_batch(make_batch, build) -> No
         torch.manual_seed(0)
         found.append(sum(loss(batch).values()))
     assert torch.equal(*found)
-    if build is make_model:
+    if name == "dynamics":
         with pytest.raises(ValueError, match="9 rows cannot be divided among 2"):
             loss(make_batch(9, twin=False))

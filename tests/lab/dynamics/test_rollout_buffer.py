@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import replace
 
 import pytest
@@ -33,23 +32,16 @@ def rows_of(state, reward, terminated) -> TensorDict:
     return TensorDict({"state": state, "next": following}, [len(state)])
 
 
-def make_buffer(data: ModelData) -> Numbered:
-    policy = nn.Linear(1, 1, bias=False)
-    nn.init.zeros_(policy.weight)
+def test_batches_have_the_share_of_real_rows_and_the_newest_generations(data) -> None:
     zeros, storage = torch.zeros(50, 1), LazyTensorStorage(50)
     storage.set(range(50), rows_of(zeros - 1, zeros, zeros.bool()))
     buffer = Numbered(
         replace(TINY, unknown="take"), replace(data, storage=storage),
-        TINY.ensemble(11, 3), policy, batch_size=40, n_steps=1,
+        TINY.ensemble(11, 3), nn.Linear(1, 1, bias=False), batch_size=40, n_steps=1,
         transform=lambda batch: batch,
     )  # fmt: skip
     buffer.set_rng(torch.Generator().manual_seed(5))
-    return buffer
-
-
-def test_batches_have_the_share_of_real_rows_and_the_newest_generations(data) -> None:
-    found, buffer = [], make_buffer(data)
-    before = torch.get_rng_state()
+    found, before = [], torch.get_rng_state()
     for number in range(12):
         nn.init.constant_(buffer.policy.weight, float(number))
         state = buffer.sample()["state"]
@@ -64,28 +56,6 @@ def test_batches_have_the_share_of_real_rows_and_the_newest_generations(data) ->
         "rollout_terminated": pytest.approx(1 / 9),
         "rollout_reward": 1.0,
     }
-
-
-@pytest.mark.parametrize("stop", [1, 3, 8])
-def test_a_continued_buffer_draws_the_same_batches(data, stop) -> None:
-    """Whether or not a generation is due at the break."""
-    whole, resumed = make_buffer(data), make_buffer(data)
-    for number in range(stop):
-        nn.init.constant_(whole.policy.weight, float(number))
-        whole.sample()
-    file = io.BytesIO()
-    torch.save(whole.state_dict(), file)
-    file.seek(0)
-    torch.rand(7)  # whatever else has happened
-    before = torch.get_rng_state()
-    resumed.load_state_dict(torch.load(file, weights_only=True))
-    assert torch.equal(torch.get_rng_state(), before)
-    resumed._rng.set_state(whole._rng.get_state())
-    for number in range(stop, stop + 7):
-        for each in (whole, resumed):
-            nn.init.constant_(each.policy.weight, float(number))
-        torch.rand(number)
-        assert (whole.sample() == resumed.sample()).all()
 
 
 def buffer_of(data: ModelData, options: DynamicsOptions, **batches):

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from composed import trained
 from tensordict import TensorDict
 from uneven_dynamics import linear_dynamics
 
 from torchrl_osr.fast import fast_update
-from torchrl_osr.lab.__main__ import main
 from torchrl_osr.lab.dynamics import DynamicsOptions, ModelData
-from torchrl_osr.lab.dynamics.training import (
-    dynamics_model,
-    dynamics_report,
-)
+from torchrl_osr.lab.dynamics.training import dynamics_model, dynamics_report
+from torchrl_osr.lab.evaluation.figures import read_scalars
 from torchrl_osr.trainers import OfflineTrainer
 
 TINY = DynamicsOptions(
@@ -57,24 +54,17 @@ def test_the_best_model_is_kept_and_trained_once(data, tmp_path) -> None:
 
 
 SMALL = [
-    "data=random", "data.num_transitions=600", "network.num_cells=[8]",
-    "trainer.batch_size=8", "trainer.inverse_dynamics_steps=3",
-    "trainer.log_interval=1", "trainer.eval_episodes=1", "trainer.eval_interval=100",
-    "trainer.checkpoint_interval=7", "dynamics.num_networks=3",
+    "trainer.log_interval=1", "trainer.eval_interval=100", "dynamics.num_networks=3",
     "dynamics.num_elites=2", "dynamics.num_cells=[8]", "dynamics.batch_size=8",
     "dynamics.steps=20", "dynamics.vae_num_cells=[8]", "dynamics.vae_steps=10",
     "dynamics.rollout_starts=20", "dynamics.rollout_interval=4",
 ]  # fmt: skip
 
 
-def trained(folder: Path, *overrides: str) -> dict[str, list[list[str]]]:
-    """Run the command; return the policy's scalars."""
-    main(["train", *SMALL, *overrides, f"hydra.run.dir={folder}"])
-    found = {}
-    for path in (folder / "csv" / "scalars" / "policy").glob("*.csv"):
-        with path.open() as file:
-            found[path.stem] = list(csv.reader(file))
-    return found
+def scalars_of(folder: Path, *overrides: str) -> dict[str, list[tuple[int, float]]]:
+    """Train, or go on; return what is logged of the policy."""
+    trained(folder, *SMALL, *overrides)
+    return read_scalars(folder / "csv" / "scalars" / "policy")
 
 
 @pytest.mark.parametrize(
@@ -87,18 +77,18 @@ def trained(folder: Path, *overrides: str) -> dict[str, list[list[str]]]:
     ],
 )
 def test_each_method_is_one_line(tmp_path, options, names) -> None:
-    found = trained(tmp_path / "run", *options, "trainer.steps=2")
+    found = scalars_of(tmp_path / "run", *options, "trainer.steps=2")
     assert names <= found.keys()
 
 
 def test_rambo_is_continued_with_the_same_bits(tmp_path) -> None:
-    """Stopped in the middle of a generation, with OSR's recovery term added."""
+    """Stopped amid a generation, and where one is due; with OSR's recovery term."""
     rambo = ["loss=rambo", "recovery=osr", "dynamics.real_ratio=0.25"]
     rambo += ["dynamics.adversarial_steps=7", "dynamics.adversarial_weight=1"]
-    whole = trained(tmp_path / "whole", *rambo, "trainer.steps=14")
-    folder = tmp_path / "run"
-    trained(folder, *rambo, "trainer.steps=6")
-    found = trained(folder, *rambo, "trainer.steps=14", f"resume={folder}")
+    rambo += ["dynamics.generations=2"]
+    whole = scalars_of(tmp_path / "whole", *rambo, "trainer.steps=18")
+    for steps in (6, 12, 18):
+        found = scalars_of(tmp_path / "run", *rambo, f"trainer.steps={steps}")
     for name in ("loss_qvalue", "loss_recovery", "rollout_reward"):
         assert found[name] == whole[name], name
 

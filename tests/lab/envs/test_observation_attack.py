@@ -54,10 +54,7 @@ def shown(trained, observation, **arguments):
 
 
 @given(
-    st.sampled_from(KINDS),
-    st.floats(0, 3),
-    st.integers(1, 5),
-    st.integers(0, 2**32),
+    st.sampled_from(KINDS), st.floats(0, 3), st.integers(1, 5), st.integers(0, 2**32)
 )
 @settings(deadline=None, max_examples=40)
 def test_observations_stay_in_the_box(trained, kind, epsilon, episodes, seed):

@@ -6,17 +6,10 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from torchrl.envs import ObservationNorm
 
 from torchrl_osr.lab.data import reference_returns
-from torchrl_osr.lab.evaluation import (
-    EpisodeEvaluator,
-    deterministic_policy,
-    measure_of,
-    summarize,
-)
+from torchrl_osr.lab.evaluation import EpisodeEvaluator, measure_of, summarize
 from torchrl_osr.lab.evaluation.episodes import EpisodeResults
-from torchrl_osr.modules import tanh_gaussian_actor
 
 
 def linear_policy(observation: torch.Tensor) -> torch.Tensor:
@@ -45,17 +38,6 @@ def test_each_episode_is_what_it_would_be_alone():
     assert len(set(results.lengths)) > 1, "episodes shall end at different times here"
     again = evaluator(linear_policy)
     np.testing.assert_array_equal(results.returns, again.returns)
-
-
-def test_policy_sees_standardised_observations():
-    actor = tanh_gaussian_actor(2, 1, num_cells=[4])
-    loc, scale = torch.tensor([1.0, 2.0]), torch.tensor([3.0, 4.0])
-    norm = ObservationNorm(loc, scale, in_keys=["observation"], standard_normal=True)
-    # By hand: (4 - 1) / 3 = 1 and (-2 - 2) / 4 = -1.
-    raw, standard = torch.tensor([[4.0, -2.0]]), torch.tensor([[1.0, -1.0]])
-    expected = actor[0].module(standard)[0].tanh()
-    torch.testing.assert_close(deterministic_policy(actor, norm)(raw), expected)
-    torch.testing.assert_close(deterministic_policy(actor)(standard), expected)
 
 
 def test_summary_has_scores_only_with_references():

@@ -32,39 +32,25 @@ LIMIT = 150
 
 
 class Line(gymnasium.Env):
-    """A point on a line that moves by its action; beyond 10 it falls. Pays 1 a step."""
+    """A point on a line that moves by its action, and is shoved once if so asked.
 
-    def __init__(self) -> None:
-        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float64)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    Beyond 10 it falls. Pays 1 a step.
+    """
+
+    size, at = 0.0, -1
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.x = 0.5 + 0.1 * self.np_random.random()
+        self.x, self.steps = 0.5 + 0.1 * self.np_random.random(), 0
         return np.array([self.x]), {}
 
     def step(self, action):
-        self.x += float(action[0])
-        return np.array([self.x]), 1.0, abs(self.x) > 10, False, {}
-
-
-class Shove(gymnasium.Wrapper):
-    """Moves the point once."""
-
-    def __init__(self, env, size: float, at: int) -> None:
-        super().__init__(env)
-        self.size, self.at = size, at
-
-    def reset(self, **options):
-        self.steps = 0
-        return self.env.reset(**options)
-
-    def step(self, action):
         shoved = self.steps == self.at
+        self.x += float(action[0]) + self.size * shoved
         self.steps += 1
-        self.unwrapped.x += self.size * shoved
-        *results, info = self.env.step(action)
-        return *results, info | {"disturbed": shoved}
+        return np.array([self.x]), 1.0, abs(self.x) > 10, False, {"disturbed": shoved}
 
 
 def to_a_half(observation: torch.Tensor) -> torch.Tensor:
@@ -72,7 +58,11 @@ def to_a_half(observation: torch.Tensor) -> torch.Tensor:
 
 
 def shove(name: str, size: float, at: int) -> Disturbance:
-    return Disturbance(name, "push", size, partial(Shove, size=size, at=at))
+    def wrap(env):
+        env.unwrapped.size, env.unwrapped.at = size, at
+        return env
+
+    return Disturbance(name, "push", size, wrap)
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +172,7 @@ def test_an_episode_depends_on_its_own_disturbance_alone():
 
 @pytest.fixture
 def evaluations():
-    """Two checkpoints of three pairs, a knock and a change that does not end."""
+    """Two checkpoints of three pairs: a knock, a lasting change, a knock too late."""
 
     def level(name, scores, moments, alive=None, steps=None):
         entries = {"name": name, "kind": name, "strength": 1.0, "scores": scores}
@@ -194,6 +184,7 @@ def evaluations():
         levels = (
             level("knock", knocked, moments, alive, steps),
             level("m", heavy, [0] * 3),
+            level("never", knocked, *[[None] * 3] * 3),
         )
         return {"clean": {"scores": clean}, "levels": levels}
 
@@ -210,7 +201,7 @@ def evaluations():
 
 
 def test_summary_is_over_all_checkpoints(evaluations):
-    knock, mass = summarize_disturbances(evaluations)
+    knock, mass, never = summarize_disturbances(evaluations)
     assert knock["clean_score"] == pytest.approx(55)
     assert knock["score"] == pytest.approx(45)
     assert knock["decrease"] == pytest.approx(100 * 10 / 55)
@@ -221,24 +212,15 @@ def test_summary_is_over_all_checkpoints(evaluations):
     assert knock["recovery_median"] == 8  # of 0, 4, 12 and never
     assert mass["decrease"] == pytest.approx(100 * 40 / 55)
     for name in ("survival", "recovered_share", "recovery_median"):
-        assert mass[name] is None
+        assert mass[name] is never[name] is None
+    assert (never["disturbed_share"], never["decrease"]) == (0, None)
 
 
 def test_without_scores_it_is_returns(evaluations):
     for played in evaluations:
         for each in (played["clean"], *played["levels"]):
             each["returns"] = [score - 1000 for score in each.pop("scores")]
-    knock, mass = summarize_disturbances(evaluations)
+    knock, mass, _ = summarize_disturbances(evaluations)
     assert knock["clean_return"] == pytest.approx(-945)
     assert knock["return"] == pytest.approx(-955)
     assert mass["decrease"] is None, "no percentage of what is below 0"
-
-
-def test_a_disturbance_that_no_episode_met_has_no_loss(evaluations):
-    for each in evaluations:
-        each["levels"][0]["disturbed_at"] = [None] * 3
-        each["levels"][0]["alive_after"] = [None] * 3
-    knock, _ = summarize_disturbances(evaluations)
-    assert knock["disturbed_share"] == 0
-    for name in ("decrease", "survival", "recovered_share"):
-        assert knock[name] is None

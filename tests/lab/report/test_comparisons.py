@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-import pandas as pd
 import pytest
 from lab.report import fakes
 
@@ -12,7 +10,6 @@ from torchrl_osr.lab.report.comparisons import (
     MIN_SEEDS,
     compare,
     compare_all,
-    pair,
     quantities,
     verdict,
 )
@@ -21,34 +18,19 @@ SEEDS = range(MIN_SEEDS)
 TWO_SEEDS = f"too few seeds (2 of {MIN_SEEDS})"
 
 
-def test_pairs_are_of_one_checkpoint_and_episode():
-    steps = [(1, 10), (1, 11), (2, 10), (2, 11)]
-    numbers = {"osr": [5.0, 7.0, 1.0, 2.0], "cql": [4.0, 4.0, 0.0, 0.0]}
-    columns = ["method", "seed", "disturbance", "met", "step", "episode", "value"]
-    rows = pd.DataFrame(
-        [
-            (method, 0, "", True, *at, value)
-            for method, row in numbers.items()
-            for at, value in zip(steps, row, strict=True)
-        ],
-        columns=columns,
-    )
-    (found,), note = pair(rows, "osr", "cql")
-    np.testing.assert_array_equal(found, [(1 + 1) / 2, (3 + 2) / 2])
-    assert not note
-    (found,), note = pair(rows[:-1], "osr", "cql")
-    np.testing.assert_array_equal(found, [(1 + 1) / 2, 3])
-    assert note == "only episodes that both have"
-
-
 def both(folder, shift, *, seeds=SEEDS, env="hopper"):
-    """Write two methods that differ by a shift in every episode, and lose 10 and 4."""
+    """Write two methods that differ by a shift in every episode, and lose 10 and 4.
+
+    At the first of two checkpoints they differ by one less, at the second by one more.
+    """
     for seed in seeds:
         for name, more, lost in (("cql", 0, 10), ("osr", shift, 4)):
             scores = [20.0 + seed + more, 60.0 + more]
             low = fakes.level("x", [each - lost for each in scores])
+            more_at = {4: -1, 5: 1} if name == "osr" else {4: 0, 5: 0}
+            curve = {at: [each + by for each in scores] for at, by in more_at.items()}
             fakes.write_run(
-                folder / f"{env}-{name}{seed}", {5: scores}, seed=seed, env=env,
+                folder / f"{env}-{name}{seed}", curve, seed=seed, env=env,
                 suite=fakes.suite_of((5, [1, 2], scores, [low])), choice=name,
             )  # fmt: skip
 

@@ -49,7 +49,7 @@ def test_page_of_two_data_sets_stands_alone(tmp_path):
 
 
 def test_five_seeds_have_a_verdict(tmp_path):
-    for shift in range(7):
+    for shift in range(3):
         for seed in range(5):
             scores = [10.0 * shift + seed, 10.0 * shift + 2 * seed]
             fakes.write_run(
@@ -61,7 +61,7 @@ def test_five_seeds_have_a_verdict(tmp_path):
     assert first.read_bytes() == second.read_bytes()
     markup = first.read_text(encoding="utf-8")
     assert "m1 is better than m0 in undisturbed score on hopper" in markup
-    assert markup.count('<td class="better">') == 6
+    assert markup.count('<td class="better">') == 2
     with pytest.raises(ValueError, match="no method 'iql'; there are: m0; m1"):
         write_report(tables, tmp_path, reference="iql")
 

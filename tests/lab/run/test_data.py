@@ -18,7 +18,11 @@ def load(*overrides: str, in_keys=()) -> TrainingData:
 
 @pytest.mark.parametrize(
     "more",
-    [[], ["data.standardize=false"], ["data.reward_scale=3.0", "data.reward_shift=-1"]],
+    [
+        ["data.standardize=false"],
+        ["data.reward_scale=3.0", "data.reward_shift=-1", "data.held_out=0.01"],
+        ["data.held_out=0.99"],
+    ],
 )
 def test_the_same_seed_gives_the_same_batches(more):
     state = torch.get_rng_state()

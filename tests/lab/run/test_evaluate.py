@@ -16,7 +16,7 @@ from torchrl_osr.lab.evaluation import deterministic_policy
 from torchrl_osr.lab.evaluation.recoverable import load_recoverable_states, recovers
 from torchrl_osr.lab.run.config import read_run, write_config
 from torchrl_osr.lab.run.evaluate import evaluate_run, impossible, make_disturbances
-from torchrl_osr.lab.run.load import checkpoints_of, load_trained
+from torchrl_osr.lab.run.load import CHECKPOINTS, load_trained
 
 SUITES = sorted(path.stem for path in (CONF / "evaluation" / "suite").glob("*.yaml"))
 
@@ -30,16 +30,17 @@ def folder(tmp_path_factory, own_cache) -> Path:
     return trained(tmp_path_factory.mktemp("evaluate") / "run", *more)
 
 
-def play(folder: Path, *overrides: str) -> dict:
-    config = evaluating(f"checkpoint={folder}", "episodes=2", *overrides)
+def play(checkpoint: Path, *overrides: str) -> dict:
+    config = evaluating(f"checkpoint={checkpoint}", "episodes=2", *overrides)
     path, results = evaluate_run(config)
     assert json.loads(path.read_text()) == json.loads(json.dumps(results))
     return results
 
 
 def test_results_are_kept_with_what_decides_them(folder, capsys):
-    results = play(folder, "last=2")
-    names = list(evaluating().suite.disturbances)
+    given = folder, "suite=start", "last=2"
+    results = play(*given)
+    names = list(evaluating("suite=start").suite.disturbances)
     assert (results["env"], results["data"]) == ("hopper", "random")
     assert {"torchrl_osr", "torch", "mujoco"} < results["versions"].keys()
     assert [each["step"] for each in results["evaluations"]] == [20, 30]
@@ -52,13 +53,13 @@ def test_results_are_kept_with_what_decides_them(folder, capsys):
             assert len(level["returns"]) == len(level["scores"]) == 2
     assert [row["name"] for row in results["summary"]] == names
     # Not played again, unless forced; never replaced by other settings.
-    assert play(folder, "last=2") == results
+    assert play(*given) == results
     assert "is there already" in capsys.readouterr().out
-    assert play(folder, "last=2", "force=true") == results
+    assert play(*given, "force=true") == results
     for change, named in {"seed=5": "seed", "last=1": "checkpoints"}.items():
         with pytest.raises(ValueError, match=f"results of other {named}: force=true"):
-            play(folder, "last=2", change)
-    other = play(folder, "last=2", "seed=5", "force=true")
+            play(*given, change)
+    other = play(*given, "seed=5", "force=true")
     assert other["evaluations"] != results["evaluations"]
 
 
@@ -91,14 +92,12 @@ def test_attacks_that_a_policy_rules_out_are_left_out(folder):
 
 
 def test_recoverable_states_are_played_from(folder):
-    results = play(folder, "suite=recoverable", "last=2")
-    states = load_recoverable_states("hopper", "public")
-    assert [each["step"] for each in results["evaluations"]] == [20, 30]
-    trained = load_trained(checkpoints_of(folder)[-1])
+    best = folder / CHECKPOINTS / "best.torchrl"
+    results = play(best, "suite=recoverable")
+    states, trained = load_recoverable_states("hopper", "public"), load_trained(best)
     policy = deterministic_policy(trained.actor, trained.observation_norm)
     back = recovers(states, policy)
     assert results["evaluations"][-1]["back"] == back.astype(int).tolist()
-    play(folder / "checkpoint" / "policy" / "best.torchrl", "suite=recoverable")
     assert (folder / "best-recoverable-public.json").exists()
     # Fallen at once, as anything is that has learned nothing.
     assert not back[states.group == "recoverable"].any()

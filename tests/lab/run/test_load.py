@@ -40,13 +40,8 @@ def run(tmp_path_factory):
     return folder, *make_run(folder)
 
 
-@pytest.fixture
-def rows() -> torch.Tensor:
-    return torch.randn(6, 11)
-
-
-def test_policy_critics_and_model_are_those_that_were_saved(run, rows):
-    folder, policy, loss = run
+def test_policy_critics_and_model_are_those_that_were_saved(run):
+    (folder, policy, loss), rows = run, torch.randn(6, 11)
     before = torch.get_rng_state()
     trained = load_trained(folder)
     assert torch.equal(before, torch.get_rng_state())
@@ -158,8 +153,6 @@ def test_an_exported_policy_needs_neither_configuration_nor_environment(tmp_path
     assert policy.record["source"]["data"]["path"] is None
 
 
-# -- several runs as one policy ------------------------------------------------------
-
 LOSS = "loss=td3_bc"
 
 
@@ -201,12 +194,7 @@ def test_switching_uses_all_runs_policies_models_and_critics(folders) -> None:
     torch.testing.assert_close(switching.returns(state), wanted)
     actions = torch.stack([policy(state) for policy in policies], 1)
     assert torch.equal(switching(state), actions[torch.arange(6), wanted.argmax(1)])
-
-
-def test_critics_may_judge_alone(folders) -> None:
-    state = torch.zeros(1, 11)
     alone = load_switching_policy(folders, critics_only=True)
-    policies = [load_run_policy(folder) for folder in folders]
     for column, policy in zip(alone.returns(state).T, policies, strict=True):
         values = [each.smallest_value(state, policy(state)) for each in policies]
         torch.testing.assert_close(column, sum(values) / 2)
