@@ -90,10 +90,8 @@ def test_runs_of_a_sweep_are_one_policy_that_switches(folder, tmp_path, capsys):
     states = load_recoverable_states("hopper", "public")
     back = recovers(states, load_switching_policy(runs))
     assert results["evaluations"][0]["back"] == back.astype(int).tolist()
-    assert (
-        "hopper random, public recoverable states: 1 x each\n"
-        in capsys.readouterr().out
-    )
+    printed = capsys.readouterr().out
+    assert "hopper random, public recoverable states: 1 x each\n" in printed
     evaluate(*sweep, "suite=official")
     results = json.loads((tmp_path / "switching-robustness-official.json").read_text())
     assert len(results["evaluations"]) == 1

@@ -18,11 +18,8 @@ def save_files(folder: Path) -> None:
     blocks = re.findall(
         r"`([\w/.]+\.(?:py|yaml))`[^`]*:\n\n```\w+\n(.*?)```", PAGE, re.S
     )
-    assert [name for name, _ in blocks] == [
-        "my_losses.py",
-        "conf/loss/awac.yaml",
-        "point_mass.py",
-    ]
+    names = ["my_losses.py", "conf/loss/awac.yaml", "point_mass.py"]
+    assert [name for name, _ in blocks] == names
     for name, text in blocks:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text, encoding="utf-8")

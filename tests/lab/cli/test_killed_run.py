@@ -87,9 +87,7 @@ def test_killed_at_any_moment_it_ends_with_the_same_bits(runs, undisturbed, tmp_
     assert results(folder) == results(undisturbed), seed
 
 
-def test_interrupted_at_any_moment_it_ends_in_order_and_continues(
-    runs, undisturbed, tmp_path
-):
+def test_interrupted_it_ends_in_order_and_continues(runs, undisturbed, tmp_path):
     folder, seed = tmp_path / "run", random.randrange(10**6)
     rng = random.Random(seed)
     for number in (*CODES, *CODES):

@@ -64,9 +64,7 @@ def test_a_sweep_names_the_job_that_failed_and_ends_the_others(tmp_path, run, si
         assert json.loads(path.read_text())["last"]["step"] == 40
 
 
-def test_recovery_is_added_to_another_loss_from_training_to_the_page(
-    tmp_path, run, sizes
-):
+def test_recovery_is_added_from_training_to_the_page(tmp_path, run, sizes):
     def read(*arguments: str) -> str:
         code, output = run(tmp_path, *arguments)
         assert code == 0, output

@@ -88,9 +88,7 @@ def test_it_is_what_the_steps_add_up_to(lengths, n_steps) -> None:
         rewards = [2.0 * data["next", "reward"][step].item() - 1.0 for step in steps]
         total = sum(0.9**k * reward for k, reward in enumerate(rewards))
         last = data[steps[-1]]
-        torch.testing.assert_close(
-            found["reward"][row].item(), total, rtol=0, atol=1e-5
-        )
+        assert found["reward"][row].item() == pytest.approx(total, abs=1e-5)
         for key in ("observation", "done", "terminated"):
             assert torch.equal(found[key][row], last["next", key])
         assert found["steps"][row] == len(steps)

@@ -109,9 +109,7 @@ def test_counted_modes_replace_the_agents_actions(mode, play, recorder):
     st.sampled_from(["official", "paper", "torque"]),
 )
 @settings(deadline=None, max_examples=25)
-def test_random_moments_lie_in_the_window_and_follow_the_seed(
-    recorder, start, width, seed, mode
-):
+def test_moments_lie_in_the_window_and_follow_seeds(recorder, start, width, seed, mode):
     window = (start, start + width)
     env = ActionKnock(recorder(), 2, mode=mode, at=window)
     moments = []

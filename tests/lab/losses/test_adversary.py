@@ -72,9 +72,7 @@ def test_sampling_equals_a_plain_loop_over_the_same_draws(check, objective) -> N
 
 @both_objectives
 @pytest.mark.parametrize("num_samples", [1, 4])
-def test_gradient_steps_are_those_of_the_released_attack(
-    check, objective, num_samples
-) -> None:
+def test_gradient_steps_are_the_released_attacks(check, objective, num_samples) -> None:
     """A new Adam for each step, on the mean over rows, then back into the box."""
     real = Real()
     adversary = Adversary(objective, "gradient", 0.3, num_samples, 10, 0.25)
@@ -94,9 +92,7 @@ def test_gradient_steps_are_those_of_the_released_attack(
 
 @both_objectives
 @both_methods
-def test_a_loss_is_given_the_worst_states_of_its_own_networks(
-    objective, method
-) -> None:
+def test_a_loss_is_given_the_worst_states_of_its_networks(objective, method) -> None:
     adversary = Adversary(objective, method, epsilon=0.1, num_samples=3, num_steps=2)
     networks, batch = Networks(), make_batch("osr", 6)
     loss, real = make_loss("osr", networks), Real()

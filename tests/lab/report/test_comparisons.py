@@ -44,9 +44,7 @@ def both(folder, shift, *, seeds=SEEDS, env="hopper"):
         (2, SEEDS[:2], TWO_SEEDS),
     ],
 )
-def test_a_known_shift_is_found_without_the_spread_of_seeds(
-    tmp_path, shift, seeds, wanted
-):
+def test_a_known_shift_is_found_without_spread(tmp_path, shift, seeds, wanted):
     both(tmp_path, shift, seeds=seeds)
     tables = fakes.read_all(tmp_path)
     score, under, lost = quantities(tables)

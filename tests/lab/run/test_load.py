@@ -184,9 +184,7 @@ def test_switching_uses_all_runs_policies_models_and_critics(folders) -> None:
             plain = load_dynamics(folder / FILE)
             mean = plain.predict(seen, unit)[0][plain.elites[0]]
             after = state + mean[:, :-1] * own.scale
-            values = [
-                critic.smallest_value(after, policy(after)) for critic in policies
-            ]
+            values = [own.smallest_value(after, policy(after)) for own in policies]
             alive = ~switching.terminated(after)
             each.append(mean[:, -1] + 0.99 * alive * sum(values) / 2)
         wanted.append(sum(each) / 2)
