@@ -96,7 +96,7 @@ def test_official_preset_with_its_model_runs_in_half_precision(tmp_path, run, si
 def test_help_lists_the_options_of_every_group(tmp_path, run):
     code, output = run(tmp_path, SCRIPT, "--help")
     assert code == 0
-    offered = output.split("Groups, ")[1].split("Any key ")[0]
+    offered = output.split("Groups and ")[1].split("Set any key")[0]
     names = set(re.findall(r"[\w-]+(?=[,\n])", offered))
     groups = (
         *("env", "data", "inverse_dynamics", "dynamics", "loss", "recovery"),
