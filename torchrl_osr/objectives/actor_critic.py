@@ -281,7 +281,7 @@ class ActorCriticLoss(LossModule):
         *,
         gamma: float = 0.99,
     ) -> Self:
-        """Choose the discount of the TD target, which is TD(0) alone."""
+        """Set the discount of the TD(0) target."""
         names = ("value", "reward", "done", "terminated", "steps_to_next_obs")
         dispatch_value_estimator(
             self,

@@ -48,7 +48,7 @@ class CQLLoss(ActorCriticLoss):
         actor_states: where the policy seeks values: ``"clean"`` (default) states, or
             ``"both"`` for D_tot, which needs perturbed entries.
         min_q_weight: :math:`\alpha`, weight of the conservative term. Default 5.0. May
-            be assigned later; 0 *here* leaves the term out.
+            be assigned later. Pass 0 to remove the term permanently.
         num_random: ``K``, actions drawn of each kind (uniform, at ``s``, at ``s'``).
             Default 10.
         temperature: :math:`\tau` of the log-sum-exp, in units of the value. Default
@@ -61,7 +61,7 @@ class CQLLoss(ActorCriticLoss):
             ``False``.
         deterministic_backup: leave the entropy out of the target. Default ``True``.
         alpha_init: initial entropy temperature :math:`\alpha_e`. Default 1.0.
-        target_entropy: in nats; ``"auto"`` (default) is minus the action's size.
+        target_entropy: in nats; ``"auto"`` (default): minus the action's size.
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
     Examples:

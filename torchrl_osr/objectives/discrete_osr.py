@@ -59,9 +59,9 @@ class DiscreteOSRLoss(ActorCriticLoss):
             frozen here. Needed unless ``recovery_weight=0``.
 
     Keyword Args:
-        recovery_weight: :math:`\lambda`. Default 0.5. May be assigned later.
+        recovery_weight: weight :math:`\lambda`. Default 0.5. May be assigned later.
         min_q_weight: :math:`\alpha`, weight of the conservative term. Default 5.0. May
-            be assigned later; 0 *here* leaves the term out.
+            be assigned later. Pass 0 to remove the term permanently.
         temperature: :math:`\tau`, in units of the value. Default 1.0.
         alpha_init: see :class:`~torchrl_osr.CQLLoss`.
         target_entropy: in nats; ``"auto"`` (default) is 0.98 times ``log(n)``, as in

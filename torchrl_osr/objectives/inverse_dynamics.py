@@ -66,7 +66,7 @@ class InverseDynamicsLoss(ActorCriticLoss):
             dimensions; ``"mse"``: the squared error of one reparametrised action,
             averaged over its dimensions. It punishes the model's own noise as well:
             the scale shrinks to its floor.
-        latent_weight: of a latent's divergence. Default 0.5, the authors'.
+        latent_weight: weight of a latent's divergence. Default 0.5, the authors'.
         reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
 
     Examples:
@@ -93,7 +93,7 @@ class InverseDynamicsLoss(ActorCriticLoss):
             name = "inverse_dynamics_network"
             self.register_bounds(action_bounds(inverse_dynamics_network, name))
         elif loss_function == "mse":
-            raise ValueError("loss_function='mse' needs actions with a distance.")
+            raise ValueError("loss_function='mse' needs real actions: choose 'nll'.")
         self.convert_to_functional(inverse_dynamics_network, "inverse_dynamics_network")
         self.states: Literal["both", "clean"] = states
         self.action_error, self.latent_weight = loss_function, latent_weight

@@ -48,7 +48,7 @@ class OSRLoss(CQLLoss):
             here: in the state dict, moved by ``.to()``, without gradient.
 
     Keyword Args:
-        recovery_weight: :math:`\lambda`. Default 0.5. May be assigned later.
+        recovery_weight: weight :math:`\lambda`. Default 0.5. May be assigned later.
         actor_states: where the policy seeks values: ``"both"`` (default) for D_tot, or
             ``"clean"``.
         options: of :class:`~torchrl_osr.CQLLoss`.

@@ -67,7 +67,7 @@ class StateRecoveryLoss(ActorCriticLoss):
             Not needed with ``recovery_target="data"``.
 
     Keyword Args:
-        recovery_weight: :math:`\lambda`. Default 0.5. May be assigned later.
+        recovery_weight: weight :math:`\lambda`. Default 0.5. May be assigned later.
         recovery_target: what the policy is pulled to: ``"inverse_dynamics"`` (default)
             or ``"data"``, the data's action.
         recovery_direction: of a tanh-Gaussian actor: ``"forward"`` (default) is the

@@ -46,7 +46,7 @@ def open_minari(
     # which can be any function of any package.
     metadata = read_json(here / "metadata.json")
     if not {"observation_space", "action_space"} <= metadata.keys():
-        raise ValueError(f"{here / 'metadata.json'} names no spaces.")
+        raise ValueError(f"{here / 'metadata.json'} lacks the set's two spaces.")
     opened = minari.MinariDataset(here)
     actions: Any = opened.action_space
     if isinstance(actions, spaces.Discrete):

@@ -41,24 +41,25 @@ class DynamicsOptions:
     """Options of a run's dynamics models and of the policy's rollouts in them."""
 
     use: bool = False  # train a model, and the policy on its rollouts
-    # The ensemble. Defaults are MOPO's.
+    # Defaults of the ensemble are MOPO's.
     num_networks: int = 7  # number of networks
     num_elites: int = 5  # networks used for rollouts, the best on held-out rows
+    # width of each hidden layer of the networks
     num_cells: list[int] = field(default_factory=lambda: [200, 200, 200, 200])
     lr: float = 1e-3  # learning rate of the model
     batch_size: int = 256  # rows of a gradient step, for each network
     steps: int = 40_000  # gradient steps of the model; the best evaluation counts
-    # The autoencoder of loss=sdc.
+    # width of each hidden layer of the autoencoder, which loss=sdc trains
     vae_num_cells: list[int] = field(default_factory=lambda: [750, 750])
     vae_steps: int = 100_000  # gradient steps of the autoencoder
     # Rollouts.
     real_ratio: float = 0.05  # share of recorded rows in a batch; 1: no rollouts
     rollout_steps: int = 5  # steps of a rollout
     rollout_starts: int = 50_000  # number of rollouts at a time
-    perturbed_start_steps: int = 0  # most random actions before a rollout
+    perturbed_start_steps: int = 0  # largest number of random actions before a rollout
     action_noise: float = 0.0  # largest noise on a deterministic policy's actions
     rollout_interval: int = 1000  # gradient steps between rollouts
-    generations: int = 5  # newest rollouts in the batches
+    generations: int = 5  # number of newest rollouts that batches are drawn from
     terminations: str = "auto"  # "auto", or "never" where only a time limit ends a task
     penalty: float = 0.0  # weight of the model's uncertainty in rewards
     unknown: str = "refuse"  # unknown rows: "refuse", "halt" (end there) or "take"
@@ -66,7 +67,7 @@ class DynamicsOptions:
     # RAMBO's training of the model against the policy, before each further rollout.
     adversarial_steps: int = 0  # gradient steps against the policy
     adversarial_weight: float = 3e-4  # weight of the adversarial term
-    adversarial_lr: float = 3e-4  # learning rate of these steps
+    adversarial_lr: float = 3e-4  # learning rate of the adversarial steps
 
     def ensemble(self, observation_size: int, action_size: int) -> DynamicsEnsemble:
         """Build an untrained ensemble."""

@@ -134,6 +134,9 @@ def perturbed_starts(
     rows, _ = rollout(model, policy, starts, steps=steps, **options)
     following = rows["next", "observation"][~rows["next", "done"].squeeze(-1)]
     if not len(following):
-        raise ValueError("The model ends the task after every random action.")
+        raise ValueError(
+            "The model ends the task after every random action: train it longer "
+            "(dynamics.steps)."
+        )
     chosen: Tensor = following[torch.randint(len(following), [len(starts)])]
     return chosen

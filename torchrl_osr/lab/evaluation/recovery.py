@@ -55,7 +55,7 @@ class DataDistance:
     ) -> None:
         held_out = min(MAX_HELD_OUT, len(data) // 5)
         if len(data) - held_out < NUM_NEIGHBORS or not held_out:
-            raise ValueError(f"{len(data)} rows are too few to measure distances to.")
+            raise ValueError(f"distances need at least 12 rows, got {len(data)}.")
         loc, scale = observation_statistics(data)
         self._loc, self._scale = loc.cpu().double(), scale.cpu().double()
         generator = torch.Generator().manual_seed(seed)

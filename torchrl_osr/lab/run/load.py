@@ -60,7 +60,7 @@ def checkpoints_of(folder: Path | str) -> list[Path]:
     """Return the checkpoints that a run has kept, oldest first, without the best."""
     found = sorted((run_folder_of(folder) / CHECKPOINTS).glob("checkpoint-*.torchrl"))
     if not found:
-        raise FileNotFoundError(f"the run in {folder} has no checkpoint yet.")
+        raise FileNotFoundError(f"the run in {folder} has no checkpoint: train on.")
     return found
 
 
@@ -156,7 +156,7 @@ def load_switching_policy(
     policies, configs = [*map(policy_of, trained)], [run.config for run in trained]
     for run, policy in zip(runs, policies, strict=True):
         if policy.discrete or not policy.critics:
-            raise ValueError(f"{run} has discrete actions or no critics.")
+            raise ValueError(f"{run} needs real actions and critics to switch.")
     shared = {
         (each.env.id, each.optim.gamma, each.data.reward_scale, each.data.reward_shift)
         for each in configs

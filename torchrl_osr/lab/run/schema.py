@@ -53,11 +53,11 @@ class ColumnsConfig:
 
     observation: Any = None  # a name, a pattern such as obs_*, or a list of names
     action: Any = None  # a name, a pattern, or a list of names
-    reward: str | None = None  # a name
-    terminated: Any = None  # a name; false: nothing ever ends the task
-    truncated: str | None = None  # a name
-    episode: str | None = None  # a name; tells episodes apart
-    step: str | None = None  # a name; sorts the rows of an episode
+    reward: str | None = None  # name of the column
+    terminated: Any = None  # name of the column; false: nothing ends the task
+    truncated: str | None = None  # name of the column
+    episode: str | None = None  # name of the column that numbers the episodes
+    step: str | None = None  # name of the column that sorts the rows of an episode
     next_observation: Any = None  # a name, a pattern, or a list of names
 
 
@@ -117,9 +117,9 @@ class OptimConfig:
 
     actor_lr: float = MISSING  # learning rate of policy and temperature
     qvalue_lr: float = MISSING  # learning rate of the critics
-    inverse_dynamics_lr: float = MISSING  # learning rate of the model
+    inverse_dynamics_lr: float = MISSING  # learning rate of the inverse dynamics model
     gamma: float = MISSING  # discount factor
-    n_steps: int = 1  # steps of the returns, if the data have them
+    n_steps: int = 1  # steps of the n-step returns
     tau: float = MISSING  # step size of the target networks
     policy_delay: int = 1  # critic updates for each policy update
     actor_schedule: str = "constant"  # cosine: actor_lr falls to 0 over the run
@@ -132,7 +132,7 @@ class TrainerConfig:
     """Length, intervals and hardware. Intervals are in gradient steps."""
 
     batch_size: int = MISSING  # rows of a gradient step
-    inverse_dynamics_steps: int = MISSING  # gradient steps of the model
+    inverse_dynamics_steps: int = MISSING  # gradient steps of inverse dynamics model
     steps: int = MISSING  # gradient steps of policy and critics
     log_interval: int = MISSING  # steps between log entries
     eval_interval: int = MISSING  # steps between evaluations
@@ -142,7 +142,7 @@ class TrainerConfig:
     num_threads: int = MISSING  # torch threads; 1 if several runs share a machine
     device: str = MISSING  # cpu, cuda or cuda:1
     precision: str = MISSING  # precision of the losses: float32 or bfloat16
-    matmul_precision: str = MISSING  # of float32 products: highest, high or medium
+    matmul_precision: str = MISSING  # of matrix products: highest, high or medium
     record: bool = MISSING  # repeat recorded operations: same numbers, faster (CPU)
     compile: bool = MISSING  # compile the losses
     progress: bool = MISSING  # show progress bars
@@ -179,7 +179,7 @@ class TrainConfig:
     seed: int = MISSING  # random seed of networks, sampling and noise
     resume: str | None = None  # folder of a run to continue, or to extend
     force: bool = False  # continue although settings differ from those of the run
-    # Your modules that a configuration may import, see docs/extend.md.
+    # Modules of yours that a configuration may import, see docs/extend.md.
     trust: list[str] = field(default_factory=list)
 
 
