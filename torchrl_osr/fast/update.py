@@ -54,8 +54,7 @@ def fast_update(
     The trace follows all attributes of the loss. After you change a weight, ``gamma``,
     ``requires_grad`` or a hook, or call ``eval()``, the loss itself runs and is traced
     again later. A loss that cannot be traced runs untraced, with a warning. Pass
-    ``trace=False`` for a loss that reads numbers from elsewhere, such as a global
-    variable.
+    ``trace=False`` for a loss that reads numbers from elsewhere, such as a global.
 
     Args:
         loss_module: any loss module whose ``loss_*`` entries may be summed.

@@ -3,8 +3,7 @@ r"""Inverse dynamics models :math:`I(a \mid s, s')`.
 All read ``observation_key`` and the same key below ``"next"``; sizes and keywords are
 those of the actors (:mod:`torchrl_osr.modules.actor`).
 
-Shapes: ``B`` batch (any leading dimensions), ``S`` observation, ``A`` action, ``Z``
-latent.
+Shapes: ``B`` batch (any dimensions), ``S`` observation, ``A`` action, ``Z`` latent.
 """
 
 from __future__ import annotations

@@ -122,10 +122,9 @@ class ActorCriticLoss(LossModule):
         loss_function: distance of the TD error: ``"l2"`` (default), ``"l1"`` or
             ``"smooth_l1"``.
         deactivate_vmap: run the critics one by one. Default ``False``.
-        reduction: ``"mean"`` (default), ``"sum"``, or ``"none"``, which returns the
-            losses alone.
-        use_prioritized_weights: weigh rows by ``"priority_weight"``, if the entry is
-            there. Default ``True``.
+        reduction: ``"mean"`` (default), ``"sum"``, or ``"none"``: no metrics.
+        use_prioritized_weights: weigh rows by ``"priority_weight"``, if present.
+            Default ``True``.
     """
 
     default_value_estimator = ValueEstimators.TD0

@@ -49,16 +49,13 @@ class CQLLoss(ActorCriticLoss):
             ``"both"`` for D_tot, which needs perturbed entries.
         min_q_weight: :math:`\alpha`, weight of the conservative term. Default 5.0. May
             be assigned later. Pass 0 to remove the term permanently.
-        num_random: ``K``, actions drawn of each kind (uniform, at ``s``, at ``s'``).
-            Default 10.
-        temperature: :math:`\tau` of the log-sum-exp, in units of the value. Default
-            1.0.
+        num_random: ``K``, actions a kind: uniform, at ``s``, at ``s'``. Default 10.
+        temperature: of the log-sum-exp, :math:`\tau`, in units of the value. Default 1.
         target_action_gap: learn a multiplier of the conservative term that holds the
             gap at this value; adds ``loss_alpha_prime``. Default: none.
         clip_diff_min: lower bound of the gap, per critic and row, in units of the
             value. Default: none.
-        max_q_backup: the target takes the best of ``num_random`` actions. Default
-            ``False``.
+        max_q_backup: target of the best of ``num_random`` actions. Default ``False``.
         deterministic_backup: leave the entropy out of the target. Default ``True``.
         alpha_init: initial entropy temperature :math:`\alpha_e`. Default 1.0.
         target_entropy: in nats; ``"auto"`` (default): minus the action's size.

@@ -49,8 +49,7 @@ class OSRLoss(CQLLoss):
 
     Keyword Args:
         recovery_weight: weight :math:`\lambda`. Default 0.5. May be assigned later.
-        actor_states: where the policy seeks values: ``"both"`` (default) for D_tot, or
-            ``"clean"``.
+        actor_states: states of the sought values, ``"both"`` (default) or ``"clean"``.
         options: of :class:`~torchrl_osr.CQLLoss`.
 
     Examples:

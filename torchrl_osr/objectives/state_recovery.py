@@ -71,10 +71,8 @@ class StateRecoveryLoss(ActorCriticLoss):
         recovery_target: what the policy is pulled to: ``"inverse_dynamics"`` (default)
             or ``"data"``, the data's action.
         recovery_direction: of a tanh-Gaussian actor: ``"forward"`` (default) is the
-            paper's ``KL(I || pi)``, ``"reverse"`` the ``KL(pi || I)`` of the authors'
-            code.
-        action_reduction: of the divergence over action dimensions: ``"sum"`` (default)
-            or ``"mean"``.
+            paper's ``KL(I || pi)``, ``"reverse"`` the authors' code's ``KL(pi || I)``.
+        action_reduction: over action dimensions: ``"sum"`` (default) or ``"mean"``.
         recovery_states: ``"both"`` (default) for D_tot, ``"perturbed"``, or
             ``"clean"``, which needs no perturbed entry.
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.

@@ -56,9 +56,8 @@ class TransitionKeys:
 class Transitions:
     """A batch, unpacked once for everything downstream.
 
-    Rows are flattened. Flags are bool, whatever they were. Floating-point entries have
-    the networks' ``dtype``. Rows that one of ``masks`` leaves out are zeros, for they
-    may hold NaN.
+    Rows are flattened. Flags become bool. Floating-point entries have the networks'
+    ``dtype``. Rows that one of ``masks`` leaves out may hold NaN and become zeros.
 
     Attributes:
         tensordict: the batch as it was given.

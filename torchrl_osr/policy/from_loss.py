@@ -44,8 +44,7 @@ def policy_from_loss(
             of the loss's class.
 
     Raises:
-        ValueError: the networks are of another kind, or the bounds are not finite or
-            not in order.
+        ValueError: the networks are of another kind, or the bounds are no interval.
 
     Examples:
         >>> import numpy as np

@@ -88,8 +88,7 @@ class Policy(nn.Module):
 
         Args:
             observation: as the environment gives it, one ``[S]`` or many ``[B, S]``. A
-                dictionary is joined in the alphabetical order of its keys, like the
-                data.
+                dictionary is joined, like the data, in the alphabetical order of keys.
 
         Returns:
             Actions as the environment takes them: float32, ``[A]`` or ``[B, A]``,
@@ -107,8 +106,7 @@ class Policy(nn.Module):
         """Return the smallest of the critics' values, float32, ``[]`` or ``[B]``.
 
         It estimates the discounted sum of the training rewards. Conservative losses
-        keep values low on purpose: set thresholds by values of states that are known
-        to be good.
+        keep values low on purpose: take thresholds from values of known good states.
 
         Args:
             observation: as for :meth:`act`.

@@ -57,9 +57,9 @@ class OfflineTrainer(Trainer):
     """Train on a replay buffer, with evaluation, checkpoints and resume.
 
     One step is a batch and one ``update`` on it. A killed run continues from its newest
-    whole checkpoint and ends with the same bits as one that was never killed (on the
-    same machine and libraries, on a CPU): networks, optimizer, targets, random
-    generators, the sampler's order or priorities, and ``components`` are restored.
+    whole checkpoint: networks, optimizer, targets, random generators, the sampler's
+    order or priorities, and ``components``. On a CPU with the same libraries it ends
+    with the same bits as one that was never killed.
 
     Args:
         update: one gradient step; :func:`~torchrl_osr.fast.fast_update` returns it from
@@ -78,13 +78,11 @@ class OfflineTrainer(Trainer):
             learning rate schedule, an average of the weights.
         evaluation: run before the first step, at its interval and at the end, after the
             checkpoint. The results are in ``history``. Default: none.
-        checkpoint_interval: steps between checkpoints. Default: that of the evaluation,
-            or 5000.
-        checkpoints_kept: regular ones, beside the newest and the best. Default 2.
+        checkpoint_interval: in steps. Default: that of the evaluation, or 5000.
+        checkpoints_kept: regular ones; the newest and the best stay too. Default 2.
         loggers: TorchRL loggers; all get every number. Default: none.
         log_interval: steps between log entries, which are means over them. Default 200.
-        description: name of the phase in the progress bar and the logs. Default
-            "train".
+        description: name of the phase in progress bar and logs. Default "train".
         progress: show a progress bar on a terminal; elsewhere a line is logged every
             half minute. Default ``True``.
 

@@ -64,11 +64,9 @@ def load_dataset(
     A rolled-out set is collected at first use and later read from the cache folder.
 
     Args:
-        env_name: short name of the task, such as ``"hopper"``; any, or ``None``, for
-            recorded data.
+        env_name: short name of the task, ``"hopper"``; not needed for recorded data.
         source: behaviour policy, such as ``"medium-replay"``; in a maze ``"diverse"``
-            or ``"play"``. Recorded data: ``"minari"``, ``"d4rl"`` or ``"file"``
-            (default).
+            or ``"play"``. Recorded data: ``"minari"``, ``"d4rl"`` or ``"file"``.
 
     Keyword Args:
         env_id: Gymnasium id of the task. The actions of a ``"file"`` are then in its
@@ -84,8 +82,7 @@ def load_dataset(
         clip_actions, missing: see
             :func:`~torchrl_osr.lab.data.transitions_from_columns`.
         download: fetch the Minari set of that name.
-        num_transitions, seed: exact number of rolled-out rows, default 200,000, and
-            their seed.
+        num_transitions, seed: number of rolled-out rows, default 200,000, and seed.
         random_share: share of the rolled-out rows that are random instead.
         on_disk: leave the rows memory-mapped. They are converted in parts: a file of
             a log, or many episodes of Minari, at a time.
@@ -219,8 +216,7 @@ def _opened(
 ) -> Recording:
     """Open recorded data without reading a row.
 
-    A reader is a function that returns a :class:`Recording`. Each needs a library of
-    its own.
+    A reader is a function that returns a :class:`Recording`.
     """
     bounds, number = log["action_bounds"], None
     if source != "file":

@@ -85,8 +85,7 @@ def reference_returns(
 ) -> ReferenceReturns | None:
     """Return the reference returns of a task, ``None`` if there are none.
 
-    The arguments are for a task without D4RL's: both returns, or neither for
-    raw returns.
+    The arguments are for tasks without D4RL's: both, or neither for raw returns.
     """
     low, high = random_return, expert_return
     if low is None and high is None:

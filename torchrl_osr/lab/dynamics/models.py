@@ -1,8 +1,7 @@
 """Ensemble of probabilistic dynamics models, autoencoder of next states; their losses.
 
 Shapes: ``B`` batch (any leading dimensions), ``S`` observation, ``A`` action, ``E``
-networks, ``D = S + 1`` predicted entries: the change of the state, and the reward;
-``Z`` latent.
+networks, ``Z`` latent, ``D = S + 1`` predicted entries: change of the state and reward.
 """
 
 from __future__ import annotations

@@ -86,8 +86,7 @@ def rollout(
     Keyword Args:
         steps: largest length of a rollout.
         terminated: of next states.
-        max_disagreement: of the elites; rows with more, or that are not finite, are
-            rejected.
+        max_disagreement: of the elites; rows above it or not finite are rejected.
         halt_reward: keep rows with more disagreement, as ends of the task with this
             reward in their own state, as in MOReL (https://arxiv.org/abs/2005.05951).
         units: factors ``[S + 1]`` of predictions in ``"uncertainty"``,

@@ -50,9 +50,8 @@ class ActionKnock(TimedDisturbance):
     Reinforcement Learning", section 5.2, https://openreview.net/forum?id=4gLWjSaw4o.
 
     * ``"official"``: the released sampler (https://github.com/Jack10843/OSR,
-      ``sampler.py``). After ``at`` steps of the agent, the bare environment takes
-      ``steps`` *extra* steps with actions :math:`U[0, 10^{-3})^A`. Sizes s, m, l: 5,
-      10, 15.
+      ``sampler.py``). After ``at`` steps of the agent, the environment takes ``steps``
+      *extra* steps with actions :math:`U[0, 10^{-3})^A`. Sizes s, m, l: 5, 10, 15.
     * ``"paper"``: actions :math:`N(0, 10^{-6} I)` replace the agent's for ``steps``
       steps, which count like all others. Sizes s, m, l: 5, 10, 20.
     * ``"torque"``: as ``"paper"``, but each number of the action is at its lower or
@@ -138,8 +137,7 @@ class ExternalPush(TimedDisturbance):
 
     Args:
         env: one of Gymnasium's MuJoCo tasks.
-        force: in weights of all bodies: 155 N for hopper, 232 N for walker2d, 137 N for
-            halfcheetah.
+        force: in body weights: 155 N for hopper, 232 N walker2d, 137 N halfcheetah.
 
     Keyword Args:
         duration: in steps of the agent: 0.008 s each for hopper and walker2d, 0.05 s

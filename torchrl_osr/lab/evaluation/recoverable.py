@@ -93,8 +93,7 @@ def recovers(states: RecoverableStates, policy: Policy) -> NDArray[np.bool_]:
     """Return whether a policy recovers from each state, ``[M]``.
 
     Hopper and Walker2d: no fall within ``steps`` steps. HalfCheetah: a mean speed of
-    at least ``least_speed`` over the last 50 of these steps. Maze: the goal is reached
-    within them.
+    at least ``least_speed`` over the last 50 of these steps. Maze: the goal is reached.
 
     Examples:
         >>> import torch

@@ -83,9 +83,8 @@ class IQLLoss(ActorCriticLoss):
     :func:`~torchrl_osr.modules.gaussian_actor`.
 
     Keyword Args:
-        temperature: :math:`\beta`. Default 3.0, the authors' for the robots; 10.0 for
-            the mazes.
-        expectile: :math:`\tau`. Default 0.7; 0.9 for the mazes.
+        temperature: :math:`\beta`. Default 3.0, the authors' for robots; mazes 10.0.
+        expectile: :math:`\tau`. Default 0.7, the authors' for robots; mazes 0.9.
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
     Examples:

@@ -117,8 +117,7 @@ def jeffreys_divergence(
 ) -> Tensor:
     r"""Return :math:`KL(p \,\|\, q) + KL(q \,\|\, p)` of Gaussians ``[R, A]``, ``[R]``.
 
-    The logarithms cancel, and a sum of squares keeps its digits where ``p`` and ``q``
-    are close.
+    The logarithms cancel; a sum of squares keeps its digits where ``p`` is near ``q``.
     """
     gap = loc_p - loc_q
     means = (gap / scale_p).square() + (gap / scale_q).square()
@@ -150,8 +149,7 @@ class RORLLoss(ActorCriticLoss):
         num_samples: ``M``.
         policy_smooth_reg, q_smooth_reg, q_ood_reg: the weights :math:`\beta_P`,
             :math:`\beta_Q` and :math:`\beta_{ood}`.
-        policy_smooth_eps, q_smooth_eps, q_ood_eps: half-widths of their boxes, in units
-            of the state.
+        policy_smooth_eps, q_smooth_eps, q_ood_eps: half-widths of boxes around states.
         q_smooth_tau: weight of values that fall against those that rise.
         q_ood_uncertainty_reg, q_ood_uncertainty_reg_min, q_ood_uncertainty_decay:
             :math:`\lambda` at first, what it falls to, and by how much an update.

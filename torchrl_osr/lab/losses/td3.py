@@ -33,8 +33,7 @@ class TD3Loss(ActorCriticLoss):
     every second step; that is the training loop's part.
 
     Keyword Args:
-        policy_noise: standard deviation of :math:`\epsilon`, in units of the action.
-            Default 0.2.
+        policy_noise: scale of :math:`\epsilon`, in units of the action. Default 0.2.
         noise_clip: largest magnitude of :math:`\epsilon`. Default 0.5.
         low, high: action bounds, numbers or ``[A]``. Those of an actor that ends in a
             :class:`~torchrl.modules.TanhDelta` are the actor's.

@@ -1,7 +1,6 @@
 """Tables of scores, robustness and recoverable states.
 
-A cell is an :class:`~torchrl_osr.lab.evaluation.statistics.Estimate`, a text or a
-number.
+A cell is an :class:`~torchrl_osr.lab.evaluation.statistics.Estimate`, text or number.
 """
 
 from __future__ import annotations
