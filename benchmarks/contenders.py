@@ -26,7 +26,7 @@ from torchrl.objectives import CQLLoss as TorchRLCQLLoss
 from torchrl.objectives import LossModule, SoftUpdate, group_optimizers
 
 from torchrl_osr import CQLLoss, OSRLoss, OSRVLoss, StatePerturbation
-from torchrl_osr.fast import fast_update
+from torchrl_osr.fast import FastUpdate
 from torchrl_osr.modules import (
     critic_ensemble,
     tanh_gaussian_actor,
@@ -46,7 +46,7 @@ PLAIN, TIGHT, TORCHRL, EAGER, COMPILED, LOOP, FAST_LOOP = (
     "OSR, eager",
     "OSR, compiled",
     "drop-in loss",
-    "drop-in loss + fast_update",
+    "drop-in loss + FastUpdate",
 )
 CONTENDERS = (
     *("OSR", EAGER, LOOP, FAST_LOOP, "CQL(H)", "OSR-v", "OSR-10"),
@@ -134,7 +134,7 @@ def our_update(loss: LossModule, *, traced: bool) -> Update:
     """Return the trainer's update: one backward, one optimizer, traced on a CPU."""
     updater = SoftUpdate(loss, tau=TAU)
     optimizer = torch.optim.Adam(loss.parameters(), lr=RATE, fused=True)
-    update = fast_update(loss, optimizer, updater, trace=traced, warm_up=2)
+    update = FastUpdate(loss, optimizer, updater, trace=traced, warm_up=2)
     return lambda batch: update(batch.copy())
 
 
@@ -142,7 +142,7 @@ def loop_update(loss: LossModule, *, fast: bool) -> Update:
     """Return the update of a plain TorchRL loop, with PyTorch's default Adam."""
     updater = SoftUpdate(loss, tau=TAU)
     optimizer = torch.optim.Adam(loss.parameters(), lr=RATE)
-    fast_step = fast_update(loss, optimizer, updater, trace=fast, warm_up=2)
+    fast_step = FastUpdate(loss, optimizer, updater, trace=fast, warm_up=2)
 
     def step(batch: TensorDictBase) -> None:
         losses = loss(batch)

@@ -25,7 +25,7 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_osr import InverseDynamicsLoss, OSRLoss, OSRVLoss, StatePerturbation
 from torchrl_osr._files import write_json
-from torchrl_osr.fast import fast_update
+from torchrl_osr.fast import FastUpdate
 from torchrl_osr.lab.cli.console import single_job
 from torchrl_osr.lab.data.rows import take_multi_step
 from torchrl_osr.lab.evaluation import inverse_dynamics_report
@@ -72,7 +72,7 @@ def train(run: Run) -> float:
     config, folder = run.config, run.folder
     optim, sizes = config.optim, config.trainer
     device, autocast = prepare_machine(run)
-    update = partial(fast_update, autocast_dtype=autocast, trace=sizes.record)
+    update = partial(FastUpdate, autocast_dtype=autocast, trace=sizes.record)
 
     # 1. Networks and loss: OSR (equations 2 and 11), or OSR-v (equation 8).
     torch.manual_seed(config.seed)

@@ -10,7 +10,7 @@ from torch._dynamo.testing import CompileCounter
 from torchrl.objectives import HardUpdate, SoftUpdate
 
 from torchrl_osr import InverseDynamicsLoss, OSRLoss
-from torchrl_osr.fast import NonfiniteError, fast_update, fuse_critics
+from torchrl_osr.fast import FastUpdate, NonfiniteError, fuse_critics
 from torchrl_osr.modules import (
     critic_ensemble,
     tanh_gaussian_actor,
@@ -59,7 +59,7 @@ def test_it_is_a_loop_with_two_optimizers(make_batch, trace, delay, updater) -> 
     loss, plain = make_loss(), make_loss()
     fuse_critics(plain)
     critics, policy = parts(loss)
-    update = fast_update(
+    update = FastUpdate(
         loss, adam([{"params": critics}, {"params": policy}]), updater(loss),
         policy_delay=delay, policy_params=policy, trace=trace, warm_up=1,
     )  # fmt: skip
@@ -89,7 +89,7 @@ def test_a_delay_needs_something_to_delay_and_something_to_train(params) -> None
     loss = InverseDynamicsLoss(tanh_gaussian_inverse_dynamics(3, 2, **CELLS))
     params = list(loss.parameters()) if params else params
     with pytest.raises(ValueError, match="policy_delay=2 needs policy_params"):
-        fast_update(loss, adam(loss.parameters()), policy_delay=2, policy_params=params)
+        FastUpdate(loss, adam(loss.parameters()), policy_delay=2, policy_params=params)
 
 
 def test_only_the_losses_are_computed_in_half_precision(
@@ -104,7 +104,7 @@ def test_only_the_losses_are_computed_in_half_precision(
 
     monkeypatch.setattr(torch.nn.Linear, "forward", forward)
     optimizer, dtype = adam(loss.parameters()), torch.bfloat16
-    losses = fast_update(loss, optimizer, soft(loss), autocast_dtype=dtype)(
+    losses = FastUpdate(loss, optimizer, soft(loss), autocast_dtype=dtype)(
         make_batch(5).apply(lambda x: x.float() if x.dtype.is_floating_point else x)
     )
     assert seen == {dtype}
@@ -115,7 +115,7 @@ def test_only_the_losses_are_computed_in_half_precision(
 def test_a_batch_that_is_not_finite_changes_nothing(make_batch, trace) -> None:
     loss, before = make_loss(), make_loss()
     updates = [
-        fast_update(each, adam(each.parameters()), soft(each), trace=trace, warm_up=1)
+        FastUpdate(each, adam(each.parameters()), soft(each), trace=trace, warm_up=1)
         for each in (loss, before)
     ]
     for update in updates:
@@ -144,7 +144,7 @@ def test_a_gradient_of_a_finite_loss_is_named(make_batch) -> None:
 
     loss.forward = forward
     with pytest.raises(NonfiniteError, match=f"losses none; gradients {name}"):
-        fast_update(loss, adam(loss.parameters()))(make_batch(5))
+        FastUpdate(loss, adam(loss.parameters()))(make_batch(5))
 
 
 # What tensordict 0.14.3 and torch.compile print when they trace.
@@ -158,7 +158,7 @@ def test_a_compiled_loss_is_traced_by_the_compiler_alone(make_batch) -> None:
         loss = make_loss()
         if is_compiled:
             loss.compile(backend=graphs, fullgraph=True)
-        update = fast_update(loss, adam(loss.parameters()), soft(loss), warm_up=1)
+        update = FastUpdate(loss, adam(loss.parameters()), soft(loss), warm_up=1)
         torch.manual_seed(3)
         for _ in range(4):
             update(make_batch(5))

@@ -12,7 +12,7 @@ from torch.utils._pytree import tree_leaves
 from torchrl.objectives import SoftUpdate
 
 from torchrl_osr import InverseDynamicsLoss, OSRLoss, StatePerturbation
-from torchrl_osr.fast import fast_update
+from torchrl_osr.fast import FastUpdate
 from torchrl_osr.lab.data import make_replay_buffer
 from torchrl_osr.modules import (
     critic_ensemble,
@@ -81,7 +81,7 @@ def make(transitions):
             transitions(64), batch_size=8, seed=0, transform=perturbation
         )
         optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2, fused=True)
-        update = fast_update(loss, optimizer, updater if targets else None, **tracing)
+        update = FastUpdate(loss, optimizer, updater if targets else None, **tracing)
         return OfflineTrainer(update, buffer, folder=folder, **options)
 
     return make

@@ -22,7 +22,7 @@ from torchrl.objectives import SoftUpdate
 from torchrl.record.loggers import CSVLogger
 
 from torchrl_osr import StatePerturbation
-from torchrl_osr.fast import fast_update
+from torchrl_osr.fast import FastUpdate
 from torchrl_osr.lab.data import make_replay_buffer
 from torchrl_osr.trainers import OfflineTrainer, divergence_warning
 
@@ -117,7 +117,7 @@ def test_a_sampler_without_replacement_goes_on_in_its_epoch(
         loss = runs.inverse_dynamics_loss()
         buffer = make_replay_buffer(transitions(64), batch_size=8, seed=0)
         buffer.set_sampler(SamplerWithoutReplacement())
-        update = fast_update(loss, torch.optim.Adam(loss.parameters()))
+        update = FastUpdate(loss, torch.optim.Adam(loss.parameters()))
         return OfflineTrainer(
             update, buffer, STEPS, folder, checkpoint_interval=5, progress=False
         )
@@ -139,7 +139,7 @@ def test_priorities_follow_the_errors_and_are_restored(
         buffer.extend(transitions(64))
         optimizer = torch.optim.Adam(loss.parameters())
         updater = SoftUpdate(loss, tau=0.1)
-        update = fast_update(loss, optimizer, updater, trace=trace, warm_up=2)
+        update = FastUpdate(loss, optimizer, updater, trace=trace, warm_up=2)
         return OfflineTrainer(
             update, buffer, STEPS, folder, checkpoint_interval=5, progress=False,
             components={"perturbation": buffer.transform[-1]},

@@ -1,11 +1,11 @@
 """Faster updates of small networks on a CPU, with the same numbers.
 
-:func:`fast_update` is the door, for your own training loop and for the trainer. It
+:class:`FastUpdate` is the door, for your own training loop and for the trainer. It
 calls :func:`fuse_critics`, which lets a loss score its sampled actions with fewer,
 larger products.
 """
 
 from torchrl_osr.fast.critics import fuse_critics
-from torchrl_osr.fast.update import NonfiniteError, Update, fast_update
+from torchrl_osr.fast.update import FastUpdate, NonfiniteError
 
-__all__ = ["NonfiniteError", "Update", "fast_update", "fuse_critics"]
+__all__ = ["FastUpdate", "NonfiniteError", "fuse_critics"]

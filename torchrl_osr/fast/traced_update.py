@@ -43,7 +43,7 @@ CHECK_INTERVAL = 1000
 class LossGradients:
     """Compute the losses of a batch, and add the gradients of their sum to ``grad``.
 
-    See :func:`~torchrl_osr.fast.fast_update` for the options. ``parameters`` get a
+    See :class:`~torchrl_osr.fast.FastUpdate` for the options. ``parameters`` get a
     gradient, by default all of the loss module.
     """
 

@@ -25,7 +25,7 @@ from torchrl.record.loggers import CSVLogger, Logger
 from torchrl.trainers import OptimizationStepper, Trainer
 
 from torchrl_osr._files import finite_or_none
-from torchrl_osr.fast import NonfiniteError, Update
+from torchrl_osr.fast import FastUpdate, NonfiniteError
 from torchrl_osr.trainers.checkpoints import Checkpoints, SamplerState
 from torchrl_osr.trainers.interruption import EXIT_CODES, Interrupted, signals_noted
 from torchrl_osr.trainers.progress import progress_bar
@@ -62,7 +62,7 @@ class OfflineTrainer(Trainer):
     with the same bits as one that was never killed.
 
     Args:
-        update: one gradient step; :func:`~torchrl_osr.fast.fast_update` returns it from
+        update: one gradient step; :class:`~torchrl_osr.fast.FastUpdate` makes it of
             a loss module, an optimizer and a target updater.
         replay_buffer: sampled once a step, with a generator that the trainer puts in.
             The priorities of a prioritised buffer are updated after each step.
@@ -95,7 +95,7 @@ class OfflineTrainer(Trainer):
 
     def __init__(
         self,
-        update: Update,
+        update: FastUpdate,
         replay_buffer: ReplayBuffer,
         total_steps: int,
         folder: Path | str,

@@ -12,7 +12,7 @@ from composed import trained
 from tensordict import TensorDict
 from uneven_dynamics import linear_dynamics
 
-from torchrl_osr.fast import fast_update
+from torchrl_osr.fast import FastUpdate
 from torchrl_osr.lab.dynamics import DynamicsOptions, ModelData
 from torchrl_osr.lab.dynamics.training import dynamics_model, dynamics_report
 from torchrl_osr.lab.evaluation.figures import read_scalars
@@ -31,7 +31,7 @@ def modelled(folder: Path, data: ModelData, options: DynamicsOptions):
     trainers = []
 
     def fit(name, loss, params, **keywords) -> OfflineTrainer:
-        update = fast_update(loss, torch.optim.Adam(params, lr=options.lr))
+        update = FastUpdate(loss, torch.optim.Adam(params, lr=options.lr))
         keywords |= {"folder": folder / name, "seed": data.seed, "progress": False}
         trainers.append(OfflineTrainer(update, **keywords))
         trainers[0].train()

@@ -31,7 +31,7 @@ from torchrl.record.loggers.wandb import WandbLogger
 from torchrl_osr import StatePerturbation
 from torchrl_osr._extras import needed_by
 from torchrl_osr._files import write_atomically, write_json
-from torchrl_osr.fast import fast_update
+from torchrl_osr.fast import FastUpdate
 from torchrl_osr.lab.data.rows import take_multi_step
 from torchrl_osr.lab.dynamics import ModelData, RolloutReplayBuffer, training
 from torchrl_osr.lab.evaluation import (
@@ -108,7 +108,7 @@ class Phases:
         config, data = self.config, self.data
         if config.trainer.compile:
             loss.compile()
-        update = fast_update(
+        update = FastUpdate(
             loss,
             optimizer,
             target_updater,
