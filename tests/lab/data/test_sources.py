@@ -172,7 +172,8 @@ def test_a_d4rl_file_without_ends_names_another_way(tmp_path):
     path = str(
         save(tmp_path / "hopper.hdf5", columns | {"ends": columns.pop("timeouts")})
     )
-    with pytest.raises(ValueError, match="no 'timeouts' .* use data=file data.col"):
+    with pytest.raises(
+        ValueError, match=r"truncated .*as in data=file data\.columns\.tr"
+    ):
         load_dataset("hopper", "d4rl", path=path)
-    names = {"observation": "observations", "truncated": "ends"}
-    assert len(load_dataset("hopper", path=path, columns=names)[0]) == 300
+    assert len(load_dataset(path=path, columns={"truncated": "ends"})[0]) == 300

@@ -58,14 +58,8 @@ def main(cfg: DictConfig) -> None:
     with closing(open_environment(env_id)) as env:
         check_simulated(env, env_id)
         loss = "loss=discrete_osr " if isinstance(env.action_space, Discrete) else ""
-        columns = record_episodes(
-            env,
-            act,
-            cfg.episodes,
-            noise=cfg.noise,
-            seed=cfg.seed,
-            progress=cfg.progress,
-        )
+        options = {name: cfg[name] for name in ("noise", "seed", "progress")}
+        columns = record_episodes(env, act, cfg.episodes, **options)
     write_log(path, columns)
     returns = np.bincount(columns["episode"], weights=columns["reward"])
     print(

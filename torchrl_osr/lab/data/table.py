@@ -58,14 +58,9 @@ def open_log(
     about: dict[str, Any] = {"source": source, "column_names": {**columns}}
     about["path"] = paths[0] if len(paths) == 1 else paths
 
-    def chosen(names: list[str]) -> list[str]:
+    def chosen(names: list[str], **known: str) -> list[str]:
         """Return the columns to read by name; all files need those of the first."""
-        if source == "d4rl" and "timeouts" not in names:
-            raise ValueError(
-                f"no 'timeouts' among {', '.join(names)}, and D4RL's episodes end "
-                "there. With other ends use data=file data.columns.observation="
-                "observations data.columns.truncated=<name>, or episode=<name>."
-            )
+        about.update(known)
         if "columns" not in about:
             about["columns"] = find_columns(names, columns)
             used = {*chain(*about["columns"].values())}
@@ -75,7 +70,7 @@ def open_log(
     def parts() -> Iterator[Arrays]:
         for file in files:
             try:
-                arrays = _read(file, chosen, about)
+                arrays = _read(file, chosen)
                 rows = assemble(about["columns"], arrays)
                 if step := about["columns"].get("step"):
                     rows = _sorted(rows, step[0], about)
@@ -98,9 +93,7 @@ def _files(path: str | Path | Sequence[str]) -> list[Path]:
     return files
 
 
-def _read(
-    path: Path, chosen: Callable[[list[str]], list[str]], about: dict[str, Any]
-) -> Arrays:
+def _read(path: Path, chosen: Callable[..., list[str]]) -> Arrays:
     """Return the columns of a file that ``chosen`` selects from its names."""
     if path.suffix == ".npz":
         arrays = read_arrays(path)
@@ -117,27 +110,26 @@ def _read(
         names = chosen(parquet.read_schema(path).names)
         frame = pd.read_parquet(path, columns=names)
     elif path.suffix in (".csv", ".gz"):
-        frame = _read_csv(path, about)
-        names = chosen([*frame])
+        frame, text = _read_csv(path)
+        names = chosen([*frame], text=text)
     else:
         raise ValueError("its name must end in .csv, .csv.gz, .parquet, .hdf5 or .npz")
     return {name: frame[name].to_numpy() for name in names}
 
 
-def _read_csv(path: Path, about: dict[str, Any]) -> pd.DataFrame:
+def _read_csv(path: Path) -> tuple[pd.DataFrame, str]:
+    """Return the table of a CSV file, and what was detected."""
     opened = gzip.open if path.suffix == ".gz" else open
     with opened(path, "rb") as file:
         wide = file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
     for encoding in ("UTF-16" if wide else "UTF-8-sig", "cp1252"):
         with suppress(UnicodeDecodeError), opened(path, "rt", encoding=encoding) as it:
-            frame, about["text"] = _parsed(it)
-            about["text"] += f", {encoding.removesuffix('-sig')}"
-            return frame
+            frame, marks = _parsed(it)
+            return frame, f"{marks}, {encoding.removesuffix('-sig')}"
     raise ValueError("its text is neither UTF-8, nor UTF-16, nor cp1252.")
 
 
 def _parsed(file: IO[str]) -> tuple[pd.DataFrame, str]:
-    """Table of a CSV file, and what was detected."""
     lines = file.read(2**16).splitlines()
     skipped = len([*takewhile(lambda line: line[:1] in ("", "#"), lines)])
     if skipped and NUMBER.match("".join(lines[skipped : skipped + 1])):
@@ -184,7 +176,6 @@ def find_columns(
         raise ValueError(
             f"data.columns has no {', '.join(unknown)}, only {', '.join(USUAL_NAMES)}."
         )
-    wanted = {part: each for part, each in wanted.items() if each is not None}
     endless = wanted.get("terminated") is False
     found = {part: _named(part, each, names) for part, each in wanted.items() if each}
     free = [name for name in names if name not in {*chain(*found.values())}]
@@ -198,7 +189,7 @@ def find_columns(
     if "episode" not in columns and ("step" in columns or "truncated" not in columns):
         missing.append("episode" if "step" in columns else "truncated or episode")
     if missing:
-        cure = f"name it as in data.columns.{missing[0].split()[0]}=<name>"
+        cure = f"name it as in data=file data.columns.{missing[0].split()[0]}=<name>"
         if missing[0] == "terminated":
             cure += ", or data.columns.terminated=false if nothing ends the task"
         raise ValueError(
@@ -318,20 +309,17 @@ def _sorted(columns: Arrays, name: str, about: dict[str, Any]) -> Arrays:
     steps = f"{name}, {usual:.3g}{unit} apart"
     if unit and usual:
         steps += f" ({1 / usual:.3g} a second)"
-    wrong = same & ((gaps == 0) | uneven)
-    found = []
+    wrong, warnings = same & ((gaps == 0) | uneven), about.setdefault("warnings", [])
     if wrong.any():
         row = int(wrong.argmax())
-        found.append(
+        found = (
             f"episode {rows['episode'][row]:g} goes from {name!r} {given[order[row]]} "
             f"to {given[order[row + 1]]}, where steps are {usual:g}{unit} apart, as in "
             f"{wrong.sum()} places: rows are missing or double, or the rate changes."
         )
         if (same & (gaps == 0)).any() or "next_observation" not in columns:
-            raise ValueError(
-                f"{found[0]} Start a new episode there, or give next_observation."
-            )
+            raise ValueError(f"{found} Start a new episode, or give next_observation.")
+        warnings.append(found)
     if about.setdefault("steps", steps) != steps:
-        found.append(f"steps of one file are {about['steps']}, of another {steps}.")
-    about["warnings"] = [*about.get("warnings", []), *found]
+        warnings.append(f"steps are {about['steps']}, and in another file {steps}.")
     return rows
