@@ -108,11 +108,7 @@ def load_dataset(
         spec = None if env_id is None else environment_spec(env_id)
         if path is None:
             raise ValueError(f"data={source} needs data.path=...")
-        if (
-            source == "file"
-            and isinstance(path, (str, Path))
-            and is_memmap_folder(path)
-        ):
+        if source == "file" and is_memmap_folder(path):
             _refuse(log, f"{path}, which is converted")
             data, manifest = load_memmap(path)
             checksum = manifest["rows_sha256"]
@@ -135,7 +131,8 @@ def load_dataset(
                 f"'torchrl-osr collect env.id={env_id} path={name}.npz', then add "
                 f"data=file data.path={name}.npz."
             )
-        recipe = {"num_transitions": num_transitions or 200_000, "seed": seed}
+        rows = 200_000 if num_transitions is None else num_transitions
+        recipe = {"num_transitions": rows, "seed": seed}
         data, manifest = rolled_out(name, source, recipe, progress=progress)
         checksum = manifest["rows_sha256"]
     if is_memory_mapped(data) and not on_disk:

@@ -14,7 +14,7 @@ import shutil
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import torch
 from filelock import FileLock
@@ -56,9 +56,10 @@ def is_memory_mapped(data: TensorDictBase) -> bool:
     return isinstance(data.get("observation", None), MemoryMappedTensor)
 
 
-def is_memmap_folder(folder: Path | str) -> bool:
+def is_memmap_folder(folder: Any) -> TypeGuard[Path | str]:
     """Return whether :func:`load_memmap` reads this path."""
-    return (Path(folder).expanduser() / MANIFEST).is_file()
+    named = isinstance(folder, (str, Path))
+    return named and (Path(folder).expanduser() / MANIFEST).is_file()
 
 
 def write_memmap(
