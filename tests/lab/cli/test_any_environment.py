@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from composed import composed
 from composed import trained as trained_on
+from gymnasium.envs.classic_control import PendulumEnv
 from gymnasium.spaces import Box
 
 from torchrl_osr.lab.cli import collect, evaluate
@@ -122,6 +123,34 @@ def test_a_run_that_fails_before_its_training_is_none(tmp_path):
     assert find_runs([tmp_path]) == []
     record(tmp_path / "log.npz", "env.id=Pendulum-v1", "episodes=3")
     trained(tmp_path / "run", *given, "loss=td3_bc")
+
+
+class Late(PendulumEnv):
+    """Fails later than the steps that are tried before the training, if it is told."""
+
+    broken = False
+
+    def step(self, action):
+        self.steps += 1
+        if self.broken and self.steps > 20:
+            raise ConnectionError("motor driver")
+        return super().step(action)
+
+    def reset(self, *, seed=None, options=None):
+        self.steps = 0
+        return super().reset(seed=seed)
+
+
+def test_evaluations_that_fail_are_told_when_the_policy_is_saved(tmp_path):
+    gymnasium.register("Late-v0", Late, max_episode_steps=30)
+    record(log := tmp_path / "log.npz", "env.id=Late-v0", "episodes=10")
+    given = "env.id=Late-v0", "loss=td3_bc", f"data.path={log}"
+    run = trained(tmp_path / "run", *given)
+    Late.broken = True
+    failed = r"the policy is saved, .* in Late-v0 failed: step 20: ConnectionError: mot"
+    with pytest.raises(RuntimeError, match=failed):
+        trained(run, *given, "trainer.steps=20")
+    assert load_run_policy(run).record["source"]["step"] == 20
 
 
 class Machine(gymnasium.Env):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import gymnasium
 import numpy as np
 import pytest
@@ -96,29 +98,31 @@ def test_options_that_do_not_fit_each_other_are_refused(overrides, message) -> N
         make_learner(configured(*overrides))
 
 
-STEPS = {
-    "raise": lambda action: 1 / 0,
-    "nan": lambda action: (np.full(2, np.nan, np.float32), 0.0, False, False, {}),
-    "four": lambda action: (np.zeros(2, np.float32), 0.0, False, {}),
-}
+def rows(nan_at: int, size: int = 5):
+    """Return a step of an environment: its rows have ``size`` parts."""
+    count = itertools.count(1)
 
+    def step(action):
+        state = np.full(2, np.nan if next(count) == nan_at else 0, np.float32)
+        return (state, 0.0, False, False, {})[:size]
 
-class Broken(gymnasium.Env):
-    """An environment whose step is broken in one of several ways."""
-
-    observation_space, action_space = Box(-1, 1, (2,)), Box(-1, 1, (1,))
-
-    def __init__(self, how: str) -> None:
-        self.step = STEPS[how]
-
-    def reset(self, *, seed=None, options=None):
-        return np.zeros(2, np.float32), {}
+    return step
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
-@pytest.mark.parametrize("how", STEPS)
-def test_a_broken_environment_is_found_by_one_step(how):
-    gymnasium.register("Broken-v0", Broken, kwargs={"how": how}, max_episode_steps=5)
-    with pytest.raises(RuntimeError, match="^Broken-v0 cannot be played"):
+@pytest.mark.parametrize(
+    ("entries", "step", "at"),
+    [(3, None, 0), (2, {}.pop, 1), (2, rows(0, size=4), 1), (2, rows(nan_at=7), 7)],
+)
+def test_a_broken_environment_is_found_by_some_steps(entries, step, at):
+    class Broken(gymnasium.Env):
+        observation_space, action_space = Box(-1, 1, (2,)), Box(-1, 1, (1,))
+
+        def reset(self, *, seed=None, options=None):
+            self.step = step
+            return np.zeros(entries, np.float32), {}
+
+    gymnasium.register("Broken-v0", Broken, max_episode_steps=9)
+    with pytest.raises(RuntimeError, match=f"^Broken-v0 .* played: step {at} ended"):
         try_out("Broken-v0")
     del gymnasium.registry["Broken-v0"]

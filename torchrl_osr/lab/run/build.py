@@ -139,25 +139,39 @@ def read_environment(env: EnvConfig) -> EnvironmentSpec:
     for name in ("action_low", "action_high", "observation_size", "action_size"):
         given, found = getattr(env, name), getattr(spec, name)
         if given is not None and given != found:
-            raise ValueError(f"env.{name}={given}, but {env.id} has {found}.")
+            raise ValueError(
+                f"the run has env.{name}={given}, but {env.id} has {found}: use the "
+                "environment that it was trained for."
+            )
         setattr(env, name, found)
     return spec
 
 
 def try_out(env_id: str) -> None:
-    """Reset an environment and take a step: a broken one is found before training."""
+    """Reset an environment and take ten steps: find a broken one before training.
+
+    The actions are the middle ones: others may end in states that no data have.
+    """
     from torchrl_osr.lab.data import make_environment  # needs Gymnasium
 
     with closing(make_environment(env_id)) as env:
+        step, actions, wanted = 0, env.action_space, env.observation_space.shape
+        action: Any = np.zeros(actions.shape, actions.dtype) if actions.shape else 0
         try:
-            first, _ = env.reset(seed=0)
-            after, reward, *flags, _ = env.step(env.action_space.sample())
-            terminated, truncated = map(bool, flags)
-            numbers = [*first, *after, float(reward), terminated, truncated]
-            if not np.isfinite(numbers).all():
-                raise ArithmeticError("observations or rewards are not finite")
+            state, _ = env.reset(seed=0)
+            reward: Any = 0.0
+            ended = False
+            for step in range(11):
+                if step and not ended:
+                    state, reward, *flags, _ = env.step(action)
+                    terminated, truncated = map(bool, flags)
+                    ended = terminated or truncated
+                if np.shape(state) != wanted:
+                    raise ValueError(f"observation {np.shape(state)}, not {wanted}")
+                if not np.isfinite([*state, float(reward)]).all():
+                    raise ValueError(f"observation {state} or reward {reward}")
         except Exception as error:
             raise RuntimeError(
-                f"{env_id} cannot be played: a reset and a step ended with "
+                f"{env_id} cannot be played: step {step} ended with "
                 f"{type(error).__name__}: {error}"
             ) from error

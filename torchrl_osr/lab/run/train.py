@@ -65,13 +65,7 @@ def train(run: Run) -> float:
     rollouts = phases.train_dynamics() if run.config.dynamics.use else None
     trainer = phases.train_policy(rollouts)
     save_policies(run, phases.learner, phases.data.norm)
-    score = report(run, phases.data.mean, trainer)
-    if trainer.failed_evaluations:
-        raise RuntimeError(
-            "The training is complete and the policy is saved, but evaluations failed: "
-            + "; ".join(f"step {n}: {e}" for n, e in trainer.failed_evaluations.items())
-        )
-    return score
+    return report(run, phases.data.mean, trainer)
 
 
 class Phases:
@@ -371,7 +365,8 @@ def save_policies(run: Run, learner: Learner, norm: ObservationNorm) -> None:
 def report(run: Run, data_mean: float | None, trainer: OfflineTrainer) -> float:
     """Write raw returns and the figure, print the table; return the last score.
 
-    Without a simulator there are no evaluations, and the score is NaN.
+    Without a simulator there are no evaluations, and the score is NaN. A RuntimeError
+    names evaluations that failed.
     """
     config, folder = run.config, run.folder
     history = trainer.history
@@ -399,4 +394,9 @@ def report(run: Run, data_mean: float | None, trainer: OfflineTrainer) -> float:
         print(f"\n{name}, in {folder}: {config.env.id} has no simulator to play in")
         return math.nan
     print("\n" + score_table(name, history, rows["best"], data_mean, folder))
+    if failed := [f"step {n}: {e}" for n, e in trainer.failed_evaluations.items()]:
+        raise RuntimeError(
+            "The training is complete and the policy is saved, but evaluations in "
+            f"{config.env.id} failed: {'; '.join(failed)}"
+        )
     return float(history[-1][measure])
