@@ -84,8 +84,11 @@ def test_what_cannot_be_paired_is_refused_or_noted(tmp_path):
     fakes.write_run(tmp_path / "alone", {5: [1.0, 2.0]}, seed=7)
     fakes.write_run(tmp_path / "clean", {5: [1.0, 2.0]}, choice="clean")
     fakes.write_run(tmp_path / "z", {5: [1.0, 2.0]}, choice="seedless", seed=8)
+    fakes.write_run(tmp_path / "m", {5: [30.0, 70.0], 6: [0.0] * 2}, choice="more")
     tables = fakes.read_all(tmp_path)
     score, under, _ = quantities(tables)
+    (found,) = compare(tables, "more", "cql", score)
+    assert found.estimate[:3] == pytest.approx((10,) * 3), "of the same checkpoint"
     (found,) = compare(tables, "osr", "cql", score)
     assert (found.seeds, found.note) == (2, "only episodes that both have")
     (found,) = compare(tables, "seedless", "cql", score)
