@@ -28,7 +28,7 @@ extensions = [
     "sphinx.ext.mathjax",
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
-    # MathJax itself, so that formulas need no network either.
+    # MathJax itself: formulas need no network.
     "sphinx-mathjax-offline",
 ]
 exclude_patterns = ["_build"]
@@ -56,7 +56,7 @@ nitpick_ignore_regex = [
     ("py:.*", r".*\.(_AcceptedKeys|Array)"),  # in annotations
 ]
 
-# Links into the neighbours' documentation need a network, and the build shall not.
+# Links into other projects' documentation need a network, which a build must not.
 if os.environ.get("TORCHRL_OSR_DOCS_ONLINE"):
     extensions.append("sphinx.ext.intersphinx")
     intersphinx_mapping = {
@@ -83,7 +83,7 @@ def rooms():
         if any(part.startswith("_") for part in parts) or parts[:2] == ["lab", "cli"]:
             continue
         depth = 2 if parts[0] == "lab" else 1
-        # What a package exports is documented where it is defined.
+        # A package's exported names are documented where they are defined.
         members = "" if found.ispkg else "\n   :members:"
         directive = f".. automodule:: {found.name}{members}\n"
         pages.setdefault(".".join(parts[:depth]), []).append(directive)

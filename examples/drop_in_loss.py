@@ -30,7 +30,7 @@ buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1000), batch_size=64)
 buffer.append_transform(StatePerturbation(std=1e-2))
 buffer.extend(data)
 
-# Your networks, and a model of which action led from a state to the next.
+# Your networks, and a model of the action that led from a state to the next.
 head = nn.Sequential(MLP(in_features=3, out_features=6), NormalParamExtractor())
 actor = ProbabilisticActor(
     TensorDictModule(head, ["observation"], ["loc", "scale"]),

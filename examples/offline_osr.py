@@ -90,14 +90,14 @@ def train(run: Run) -> float:
     loss = loss_class(actor, critics, model, **options_in(config.loss)).to(device)
     loss.make_value_estimator(gamma=optim.gamma)
 
-    # 2. Data: transitions with standardised states, and a perturbed state beside each
+    # 2. Data: transitions with standardised states, and a perturbed state for each
     # state. Both together are the paper's mixed data set D_tot.
     data = load_training_data(config, device)
     write_config(folder, config)  # with the checksum of the data
     perturbation = StatePerturbation(config.perturbation.std, seed=config.seed)
     data.buffer.append_transform(perturbation)
 
-    # What all trainers share. A killed run continues from its last checkpoint.
+    # All trainers share these. A killed run continues from its last checkpoint.
     shared = trainer_options(run)
     kept = {"perturbation": perturbation, "observation_norm": data.norm}
 

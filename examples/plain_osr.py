@@ -141,7 +141,7 @@ class PlainOSR:
 
     def losses(self, batch: Batch, noise: Noise) -> dict[str, Tensor]:
         """Return all terms under the names of ``OSRLoss``."""
-        # The value of a terminal state is 0, so that any finite stand-in will do.
+        # The value of a terminal state is 0: any finite state can replace it.
         ended = batch.terminated.unsqueeze(-1)
         next_state = torch.where(ended, batch.state, batch.next_state)
         batch = batch._replace(next_state=next_state)

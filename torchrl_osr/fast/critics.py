@@ -185,7 +185,7 @@ class _SoftMaximum(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, upstream: Tensor) -> Any:
         # Not torch's once_differentiable: it objects only where the upstream gradient
-        # has a gradient itself, which that of a mean has not.
+        # has a gradient itself, unlike the one of a mean.
         if torch.is_grad_enabled():
             raise RuntimeError("Fused critics have no second derivatives.")
         if ctx.alike:

@@ -438,7 +438,7 @@ class ActorCriticLoss(LossModule):
             value: Tensor = full_precision(self._vmap_qvalue(rows, params)).get(key)
             return value
         values = []
-        # Not TorchRL 0.14.1's loop, which torch.compile traces anew at every call.
+        # Not TorchRL 0.14.1's loop, which torch.compile traces at every call.
         for each in params.unbind(0):
             with each.to_module(network, preserve_module_state=False):
                 values.append(full_precision(network(rows.copy())).get(key))

@@ -92,7 +92,7 @@ def evaluate_sweep(config: EvaluateConfig) -> None:
     """Evaluate every finished run below a folder, ``jobs`` at once."""
     runs = finished_runs(str(config.sweep))
     failed = []
-    # Spawned, for torch's threads do not survive a fork. Ctrl-C ends them in silence.
+    # Spawned: torch's threads do not survive a fork. Ctrl-C ends them in silence.
     workers = ProcessPoolExecutor(
         min(config.jobs, len(runs)),
         multiprocessing.get_context("spawn"),

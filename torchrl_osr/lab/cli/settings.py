@@ -53,7 +53,7 @@ def main() -> None:
     rest = [each for each in overrides if not each.startswith("loss=")]
     names = chosen[-1] if chosen else methods()
     short = [key.rpartition(".")[2] for key in KEYS]
-    # Two keys of one name are told apart by their groups.
+    # Two keys of one name also show their groups.
     pairs = zip(short, KEYS, strict=True)
     rows = [("method", *(key if short.count(n) > 1 else n for n, key in pairs))]
     register()

@@ -57,7 +57,7 @@ def findings(
 ) -> Iterator[str]:
     """Yield what looks wrong with a data set that can be trained on, and the cure."""
     yield from manifest.get("warnings", [])
-    # Where episodes end by themselves, to last long is worth something.
+    # If episodes can terminate, a constant reward still favours long ones.
     falls = bool(data["next", "terminated"].any())
     for (part, name), entry in entries.iterrows():
         if entry["min"] == entry["max"] and not (part == "reward" and falls):

@@ -34,8 +34,8 @@ ActionBounds = tuple[ArrayLike, ArrayLike]
 
 Columns = Mapping[str, Any]
 
-# Raise it whenever other rows or another manifest are made of a source: recordings in
-# the cache are then converted anew.
+# Raise it whenever a source gives other rows or another manifest: recordings in the
+# cache are then converted again.
 READER_VERSION = 5
 
 WARNINGS = {
@@ -229,8 +229,8 @@ def trajectories(
         lost = broken
     resets = np.zeros_like(lost)
     if "next_observation" in columns:
-        # Where a vector environment was reset, no action was executed: the row begins
-        # in the state that an episode ended in, and has a reward of 0.
+        # At the reset of a vector environment no action was executed: the row begins in
+        # the last state of an episode, and has a reward of 0.
         reached = columns["next_observation"][:-1]
         begun = (reached == columns["observation"][1:]).all(1) & flagged[:-1]
         resets[1:] = begun & (columns["reward"][1:] == 0) & ~lost[1:]

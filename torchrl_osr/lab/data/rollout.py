@@ -239,7 +239,7 @@ def waypoint_sampler(maze: Any) -> ActionSampler:
 
 def shortest_path(free: set[Cell], start: Cell, goal: Cell) -> list[Cell]:
     """Return a shortest path with both ends; up before down, left, right."""
-    # From the goal, so that each cell that is reached knows the next one on its way.
+    # From the goal: each cell that is reached then knows the next one on its path.
     next_cell: dict[Cell, Cell] = {goal: goal}
     waiting = deque([goal])
     while waiting and start not in next_cell:

@@ -37,7 +37,7 @@ from torchrl_osr.lab.data.store import (
 RECORDED = ("minari", "d4rl", "file")
 """Sources that are recorded; the others are rolled out."""
 
-# Raise it whenever the rollouts change: older sets are then made anew.
+# Raise it whenever the rollouts change: older sets are then collected again.
 RECIPE_VERSION = 1
 
 

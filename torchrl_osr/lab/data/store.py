@@ -189,8 +189,8 @@ class MemmapStorage(Storage):
         left_out = torch.arange(0) if left_out is None else left_out
         super().__init__(len(data) - len(left_out))
         self.data, self.device, self.read = data, device, read or operator.getitem
-        # Before row i of the rest lie as many of the left-out ones as have no more than
-        # i rows of the rest before them.
+        # Left-out rows before row i of the rest: those with at most i rows of the rest
+        # before them.
         self._shifts = left_out - torch.arange(len(left_out))
 
     def __len__(self) -> int:

@@ -154,7 +154,7 @@ class RolloutReplayBuffer:
         """Sample from these rows."""
         rows, rejected = zip(*rollouts, strict=True)
         self.synthetic = torch.cat(rows)
-        # Slices, so that rows are in memory once.
+        # Slices: the rows are in memory once.
         slices = self.synthetic.split([len(each) for each in rows])
         self._rollouts = list(zip(slices, rejected, strict=True))
 

@@ -75,7 +75,7 @@ def dynamics_model(
         # The rest of the run draws the same numbers with a model from a file.
         with torch.random.fork_rng(devices=[]):
             write_dynamics(file, _trained(options, data, fit))
-    # From the file in any case, so that a continued run has the very same model.
+    # Always from the file: a continued run must have the same model.
     model = load_dynamics(file)
     model.to(data.held_out.device or "cpu").requires_grad_(False)
     report = dynamics_report(model, data.held_out)

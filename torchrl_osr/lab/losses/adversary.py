@@ -122,8 +122,8 @@ class Adversary:
             return jeffreys_divergence(clean.loc, clean.scale, pi.loc, pi.scale)
 
         if self.method == "gradient":
-            # Not torch.autograd.grad: torch.compile cannot trace it, and this one is
-            # not switched off by no_grad, so that no parameter enters a graph.
+            # Unlike torch.autograd.grad, torch.compile can trace it, and no_grad does
+            # not switch it off: no parameter enters a graph.
             gradient = torch.func.grad(lambda noise: objective(noise).sum())
             step = self.step_size * self.epsilon
             for _ in range(self.num_steps):

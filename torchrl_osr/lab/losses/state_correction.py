@@ -137,7 +137,7 @@ class SCASLoss(TD3Loss):
         with self.dynamics_network_params.to_module(model, preserve_module_state=False):
             mean, _ = model.predict(state, action)
             reached = state + mean[model.elites].mean(0)[..., :-1]
-        # What follows an end may be anything, and 0 * nan is nan in the backward pass.
+        # The state after an end may be anything; in the backward pass 0 * nan is nan.
         after = torch.where(batch.done.unsqueeze(-1), torch.zeros_like(after), after)
         return (reached - after).square().mean(-1)
 

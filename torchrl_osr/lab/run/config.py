@@ -121,7 +121,7 @@ def write_config(folder: Path, config: TrainConfig) -> None:
 
 
 def read_columns(given: Any) -> Any:
-    """Return the names of a log's columns, of a YAML file if its path is given."""
+    """Return the names of a log's columns; read them if a YAML file is given."""
     return read_yaml(Path(given).expanduser()) if isinstance(given, str) else given
 
 

@@ -61,8 +61,8 @@ def load_data(
 ) -> tuple[TensorDict, dict[str, Any]]:
     """Load data set and manifest; rewards are the task's own.
 
-    Without a task, recorded data are not compared with it. A ValueError says that they
-    are not those that a run began with.
+    Without a task, recorded data are not compared with it. A ValueError reports data
+    that have changed since the run began.
     """
     from torchrl_osr.lab.data import load_dataset  # needs Gymnasium; networks do not
 

@@ -63,7 +63,7 @@ def evaluate_run(config: EvaluateConfig) -> tuple[Path, dict[str, Any]]:
     if path.is_dir():
         files = checkpoints_of(path)[-config.last :]
     else:
-        name = f"{path.stem}-{name}"  # beside the one of the whole run
+        name = f"{path.stem}-{name}"  # another file than that of the whole run
     return evaluate_files(config, run_folder_of(path) / name, files)
 
 

@@ -110,7 +110,7 @@ def open_run(
 
 
 def _absolute(path: Any) -> Any:
-    """Return absolute paths, of a file, a list or a pattern."""
+    """Return the absolute paths of a file, a list or a pattern."""
     if isinstance(path, ListConfig):
         return [_absolute(each) for each in path]
     if path is None:

@@ -228,7 +228,7 @@ class SuiteConfig:
 
 @dataclass
 class MovedConfig:
-    """Where a run's data are now."""
+    """The present place of a run's data."""
 
     path: Any = None  # as in data.path of the run; null: where they were
 
