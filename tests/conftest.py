@@ -74,21 +74,6 @@ def transitions():
 
 
 @pytest.fixture
-def make_batch(transitions):
-    """Return a factory of what losses read: float64, perturbed states if ``twin``."""
-
-    def make(*size: int, twin: bool = True) -> TensorDict:
-        batch = transitions(*size, dtype=torch.float64).exclude(("next", "truncated"))
-        if twin:
-            state, generator = batch["observation"], torch.Generator().manual_seed(8)
-            noise = torch.randn(state.shape, generator=generator, dtype=state.dtype)
-            batch["perturbed", "observation"] = state + 0.1 * noise
-        return batch
-
-    return make
-
-
-@pytest.fixture
 def check():
     """Return an assertion of closeness, relative to the larger of 1 and each number."""
 

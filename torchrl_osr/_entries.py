@@ -29,10 +29,15 @@ def state_keys(in_keys: Iterable[NestedKey], *exclude: NestedKey) -> list[Nested
 
 def entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
     """Return a required entry; a KeyError names it and the existing ones."""
-    value: Tensor | None = tensordict.get(key, None)
+    value: Tensor | TensorDictBase | None = tensordict.get(key, None)
     if value is None:
         there = sorted(map(str, tensordict.keys(True, True)))
         raise KeyError(f"The batch has no entry {key!r}; it has {there}.")
+    if isinstance(value, TensorDictBase):
+        each = unravel_key((key, next(iter(value.keys(True, True)), "name")))
+        raise ValueError(
+            f"{key!r} is a group, not a tensor. Name a key in it: [{each}]."
+        )
     return value
 
 

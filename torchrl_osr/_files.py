@@ -56,7 +56,9 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def finite_or_none(value: Any) -> Any:
-    """Return the value with ``None`` in place of every float that is not finite."""
+    """Return the value for JSON: lists for arrays, ``None`` for NaN and infinity."""
+    if hasattr(value, "tolist"):  # of NumPy or torch
+        value = value.tolist()
     if isinstance(value, Mapping):
         return {key: finite_or_none(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -13,6 +13,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
 from hydra.errors import ConfigCompositionException
 from hydra.utils import instantiate
+from objectives.losses import make_batch
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torchrl.data import TensorDictReplayBuffer
@@ -103,11 +104,10 @@ def test_a_loss_and_its_networks_from_a_file(composed, name, kind) -> None:
     assert isinstance(buffer, TensorDictReplayBuffer)
     assert isinstance(transform, StatePerturbation)
     buffer.append_transform(transform)
-    no = torch.zeros(8, 1, dtype=torch.bool)
-    following = {"agent": {"obs": torch.randn(8, 3)}, "reward": torch.ones(8, 1)}
-    following |= {"done": no, "terminated": no}
-    agent = {"obs": torch.randn(8, 3), "action": torch.rand(8, 2)}
-    buffer.extend(TensorDict({"agent": agent, "next": following}, [8]))
+    data = make_batch("osr", 8)
+    for each in (data, data["next"]):
+        each["agent"] = {"obs": each["observation"], "action": each["action"]}
+    buffer.extend(data.exclude("observation", ("next", "observation")))
     assert loss(buffer.sample())["loss_actor"].isfinite()
 
 

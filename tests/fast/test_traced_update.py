@@ -7,6 +7,7 @@ from unittest import mock
 
 import pytest
 import torch
+from objectives.losses import A, Networks, S, make_batch, make_loss, make_networks
 from tensordict import TensorDict
 from tensordict.nn import (
     InteractionType,
@@ -15,87 +16,24 @@ from tensordict.nn import (
     set_interaction_type,
 )
 from torch import nn
-from torchrl.objectives import LossModule, SoftUpdate
+from torchrl.objectives import LossModule
 
-from torchrl_osr import (
-    CQLLoss,
-    InverseDynamicsLoss,
-    OSRLoss,
-    OSRVLoss,
-    StateRecoveryLoss,
-)
+from torchrl_osr import modules
 from torchrl_osr.fast import fuse_critics, traced_update
 from torchrl_osr.fast.traced_update import LossGradients
-from torchrl_osr.lab.losses import (
-    BCLoss,
-    EDACLoss,
-    IQLLoss,
-    ReBRACLoss,
-    RORLLoss,
-    TD3BCLoss,
-)
-from torchrl_osr.modules import (
-    critic_ensemble,
-    deterministic_actor,
-    gaussian_actor,
-    state_value,
-    tanh_gaussian_actor,
-    tanh_gaussian_inverse_dynamics,
-)
-from torchrl_osr.objectives import WithRecovery
 
-SIZES = (3, 2)
-CELLS = {"num_cells": [8, 8]}
-
-
-def networks(actor=tanh_gaussian_actor, **options):
-    return actor(*SIZES, **CELLS), critic_ensemble(*SIZES, **CELLS, **options)
-
-
-def model():
-    return tanh_gaussian_inverse_dynamics(*SIZES, **CELLS)
-
-
-def with_recovery(loss, recovery):
-    SoftUpdate(loss, tau=0.1)  # TorchRL warns of losses without one
-    return WithRecovery(loss, recovery)
-
-
-LOSSES = {
-    "osr": lambda: OSRLoss(*networks(layer_norm=True), model(), num_random=2),
-    "cql": lambda: CQLLoss(*networks(), target_action_gap=0.0, clip_diff_min=-1.0),
-    "osr_v": lambda: OSRVLoss(*networks(), model(), num_random=2),
-    "edac": lambda: EDACLoss(*networks()),
-    "td3_bc": lambda: TD3BCLoss(*networks(deterministic_actor)),
-    "rebrac": lambda: ReBRACLoss(*networks(deterministic_actor, layer_norm=True)),
-    "rebrac+osr": lambda: with_recovery(
-        ReBRACLoss(actor := networks(deterministic_actor)[0], networks()[1]),
-        StateRecoveryLoss(actor, model()),
-    ),
-    "iql": lambda: IQLLoss(*networks(gaussian_actor), state_value(SIZES[0], **CELLS)),
-    "rorl": lambda: RORLLoss(*networks(), num_samples=2),
-    "bc": lambda: BCLoss(networks()[0]),
-    "inverse_dynamics": lambda: InverseDynamicsLoss(model()),
-}
-
-
-@pytest.fixture
-def make_batch(make_batch):
-    """Return a factory of batches that any loss can read."""
-
-    def make(*size, **options):
-        batch = make_batch(*size, **options)
-        batch["next", "action"] = batch["action"].flip(0)
-        return batch
-
-    return make
+LOSSES = ["osr", "cql-options", "osr-v", "edac", "td3-bc", "rebrac", "official", "iql"]
+LOSSES += ["rorl", "bc", "model", "discrete"]
 
 
 def make(name):
-    loss = LOSSES[name]().double()
+    networks = make_networks(name)
+    if name == "osr":
+        options = {"num_cells": [8, 8], "layer_norm": True}
+        critics = modules.critic_ensemble(S, A, **options)
+        networks.critics = [each.double() for each in critics]
+    loss = make_loss(name, networks)
     fuse_critics(loss)
-    if hasattr(loss, "qvalue_network"):
-        SoftUpdate(loss, tau=0.1)  # TorchRL warns of losses without one
     return loss
 
 
@@ -120,11 +58,6 @@ def assert_same_bits(given, expected) -> None:
     assert given[3] == expected[3]  # the generator moved on alike
 
 
-def single(batch: TensorDict) -> TensorDict:
-    """The batch in float32."""
-    return batch.apply(lambda each: each.float() if each.is_floating_point() else each)
-
-
 def pair(loss, batch) -> tuple[LossGradients, LossGradients]:
     """The loss as it is and traced."""
     traced = LossGradients(loss, warm_up=1)
@@ -135,14 +68,13 @@ def pair(loss, batch) -> tuple[LossGradients, LossGradients]:
 
 
 @pytest.mark.parametrize("name", LOSSES)
-def test_a_trace_has_the_bits_of_the_loss(name, make_batch):
-    loss = make(name)
-    eager, traced = pair(loss, make_batch(6))
+def test_a_trace_has_the_bits_of_the_loss(name):
+    loss, batch = make(name), make_batch(name, 6)
+    eager, traced = pair(loss, batch)
     gc.collect()  # the trace owns what it needs
     assert isinstance(traced.trace.run, torch.jit.ScriptModule)
-    for seed in (1, 2):
-        torch.manual_seed(seed)
-        batch = make_batch(6)
+    for _ in range(2):
+        batch["observation"] = batch["observation"].flip(0)
         with torch.no_grad():
             for each in loss.parameters():
                 each.mul_(1.01)
@@ -152,27 +84,25 @@ def test_a_trace_has_the_bits_of_the_loss(name, make_batch):
         assert_same_bits(given, expected)
 
 
-def test_wide_networks_have_the_bits_too(make_batch):
+def test_wide_networks_have_the_bits_too():
     """TorchScript, optimised, would join the products of two layers and round anew."""
-    cells = {"num_cells": [256, 256]}
-    actor, critics = (
-        tanh_gaussian_actor(*SIZES, **cells),
-        critic_ensemble(*SIZES, **cells),
-    )
-    loss = OSRVLoss(actor, critics, tanh_gaussian_inverse_dynamics(*SIZES, **cells))
-    SoftUpdate(loss, tau=0.1)
-    batch = single(make_batch(6))
+    sizes, cells = (S, A), {"num_cells": [256, 256]}
+    networks = Networks()
+    networks.actor = modules.tanh_gaussian_actor(*sizes, **cells)
+    networks.critics = modules.critic_ensemble(*sizes, **cells)
+    networks.model = modules.tanh_gaussian_inverse_dynamics(*sizes, **cells)
+    loss, batch = make_loss("osr-v", networks).float(), make_batch("osr", 6)
     eager, traced = pair(loss, batch)
     assert traced.trace
     assert_same_bits(results(traced, loss, batch), results(eager, loss, batch))
 
 
-def test_another_kind_of_batch_runs_the_loss_itself(make_batch):
+def test_another_kind_of_batch_runs_the_loss_itself():
     loss = make("osr")
-    eager, traced = pair(loss, make_batch(6))
-    weighted = make_batch(6)
+    eager, traced = pair(loss, make_batch("osr", 6))
+    weighted = make_batch("osr", 6)
     weighted["priority_weight"] = torch.rand(6, dtype=torch.float64)
-    for batch in (make_batch(5), weighted, make_batch(6)):
+    for batch in (make_batch("osr", 5), weighted, make_batch("osr", 6)):
         assert_same_bits(results(traced, loss, batch), results(eager, loss, batch))
     assert traced.trace
 
@@ -203,9 +133,9 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_what_is_changed_later_counts_at_once(change, make_batch):
+def test_what_is_changed_later_counts_at_once(change):
     loss = make("osr")
-    batch = make_batch(6)
+    batch = make_batch("osr", 6)
     batch["next", "other"] = 3 * batch["next", "reward"]
     eager, traced = pair(loss, batch)
     assert traced.trace
@@ -218,9 +148,8 @@ def test_what_is_changed_later_counts_at_once(change, make_batch):
     assert (traced.trace is not None) == (retrace or in_place)
 
 
-def test_modes_of_the_caller_count(make_batch):
-    loss = make("osr").float()
-    batch = single(make_batch(6))
+def test_modes_of_the_caller_count():
+    loss, batch = make("osr").float(), make_batch("osr", 6)
     for context in (
         set_interaction_type(InteractionType.DETERMINISTIC),
         torch.autocast("cpu", torch.bfloat16),
@@ -272,40 +201,28 @@ class Regression(LossModule):
 
 
 ELSEWHERE = [1.0]
+KINDS = ["dropout", "assigned", "in place", "schedule", "batch norm", "deciding"]
 
 
-@pytest.mark.parametrize(
-    ("kind", "is_traced"),
-    [
-        ("dropout", True),
-        ("assigned", False),
-        ("in place", False),
-        ("schedule", False),
-        ("batch norm", False),
-        ("deciding", False),
-    ],
-)
-def test_a_loss_with_a_state_of_its_own_is_not_frozen(
-    kind, is_traced, make_batch, caplog
-):
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_loss_with_a_state_of_its_own_is_not_frozen(kind, caplog):
     losses = Regression(kind), Regression(kind)
     plain, traced = (
-        LossGradients(each, trace=trace, warm_up=3)
-        for each, trace in zip(losses, (False, True), strict=True)
+        LossGradients(each, trace=each is losses[1], warm_up=3) for each in losses
     )
     for _ in range(30):
-        batch = make_batch(6)
+        batch = make_batch("osr", 6)
         found = [
             results(gradients, loss, batch)
             for gradients, loss in zip((traced, plain), losses[::-1], strict=True)
         ]
         assert_same_bits(*found)
-    assert (traced.trace is not None) == is_traced
-    assert ("runs without a trace" in caplog.text) != is_traced
+    assert (traced.trace is not None) == (kind == "dropout")
+    assert ("runs without a trace" in caplog.text) != (kind == "dropout")
 
 
-def test_a_users_own_loss_is_followed(make_batch):
-    loss, batch = Regression("dropout"), make_batch(6)
+def test_a_users_own_loss_is_followed():
+    loss, batch = Regression("dropout"), make_batch("osr", 6)
     for change in (
         lambda: loss.weights.__setitem__(0, 2.0),
         lambda: setattr(loss, "share", 3 * loss.share),
@@ -318,11 +235,9 @@ def test_a_users_own_loss_is_followed(make_batch):
         assert_same_bits(results(traced, loss, batch), results(eager, loss, batch))
 
 
-def test_numbers_from_elsewhere_are_found_by_comparison(
-    make_batch, caplog, monkeypatch
-):
+def test_numbers_from_elsewhere_are_found_by_comparison(caplog, monkeypatch):
     monkeypatch.setattr(traced_update, "CHECK_INTERVAL", 10)
-    loss, batch = Regression("elsewhere"), make_batch(6)
+    loss, batch = Regression("elsewhere"), make_batch("osr", 6)
     eager, traced = pair(loss, batch)
     monkeypatch.setitem(globals(), "ELSEWHERE", [2.0])
     for _ in range(10):

@@ -8,8 +8,7 @@ from tensordict import TensorDict
 from tensordict.nn import InteractionType, set_interaction_type
 
 from torchrl_osr.functional import gaussian_kl
-from torchrl_osr.modules import categorical_inverse_dynamics as categorical
-from torchrl_osr.modules import cvae_inverse_dynamics, tanh_gaussian_inverse_dynamics
+from torchrl_osr.modules import cvae_inverse_dynamics
 
 LATENT_KEYS = ["latent_loc", "latent_scale"]
 RANDOM = InteractionType.RANDOM
@@ -23,31 +22,6 @@ def states(*size: int, scale: float = 1.0) -> TensorDict:
     observation, next_observation = scale * torch.randn(2, *size, 3)
     next_states = {"observation": next_observation}
     return TensorDict({"observation": observation, "next": next_states}, size)
-
-
-@pytest.mark.parametrize(
-    ("build", "writes"),
-    [(tanh_gaussian_inverse_dynamics, "loc"), (categorical, "logits")],
-)
-def test_models_read_both_states(build, writes) -> None:
-    network, before = build(3, 2, num_cells=[8]), states(4)
-    for key in ("observation", ("next", "observation")):
-        after = before.clone().set(key, before[key] + 1)
-        found = [network(each)[writes] for each in (before.clone(), after)]
-        assert not torch.equal(*found)
-
-
-@pytest.mark.parametrize("size", [(7,), (2, 5, 3), ()])
-def test_the_conditional_vae_stands_in_for_the_tanh_gaussian(size) -> None:
-    bounds = {"low": torch.tensor([-1.0, -2.0]), "high": torch.tensor([2.0, 1.0])}
-    model = make_model(**bounds)
-    plain = tanh_gaussian_inverse_dynamics(3, 2, num_cells=[8], **bounds)
-    ours, theirs = (network(states(*size)) for network in (model, plain))
-    assert model.in_keys == plain.in_keys
-    for key in ("loc", "scale", "action", "action_log_prob"):
-        assert ours[key].shape == theirs[key].shape
-    assert all(ours[key].shape == (*size, 4) for key in LATENT_KEYS)
-    assert torch.equal(model.get_dist(ours).high, bounds["high"])
 
 
 def test_layers_are_the_authors_by_default() -> None:

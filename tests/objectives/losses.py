@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import pytest
 import torch
 from tensordict import NestedKey, TensorDict
 from tensordict.nn import TensorDictModule
@@ -45,17 +46,9 @@ class Squash(nn.Module):
         return self.center + self.half * torch.tanh(value)
 
 
-def _module(
-    size: int,
-    number: int,
-    *,
-    low: Any,
-    high: Any,
-    observation_key: Any,
-    action_key: Any,
-) -> TensorDictModule:
+def _module(size: int, number: int, *, low: Any, high: Any, **keys: Any):
     layers = nn.Sequential(MLP(size, number, num_cells=[8]), Squash(low, high))
-    return TensorDictModule(layers, [observation_key], [action_key])
+    return TensorDictModule(layers, [keys["observation_key"]], [keys["action_key"]])
 
 
 MLPS, LIMITS = {"num_cells": [8], "activation_class": nn.Tanh}, ("low", "high")
@@ -69,7 +62,7 @@ BUILDERS: dict[str, tuple[Callable[..., Any], tuple[int, ...], dict, tuple]] = {
     "delta": (modules.deterministic_actor, (S, A), MLPS, BOTH + LIMITS),
     "module": (_module, (S, A), {}, BOTH + LIMITS),
     "gaussian": (modules.gaussian_actor, (S, A), MLPS, BOTH),
-    "critics": (modules.critic_ensemble, (S, A), MLPS, BOTH + COUNT),
+    "critics": (modules.critic_ensemble, (S, A), {"num_cells": [16]}, BOTH + COUNT),
     "value": (modules.state_value, (S,), MLPS, STATE),
     "model": (modules.tanh_gaussian_inverse_dynamics, (S, A), MLPS, BOTH + LIMITS),
     "latent_model": (modules.cvae_inverse_dynamics, (S, A), LATENT, BOTH + LIMITS),
@@ -216,6 +209,8 @@ LOSSES: dict[str, Case] = {
 }
 WITH_CRITICS = [name for name, case in LOSSES.items() if "loss_qvalue" in case.trains]
 WRAPPED = ["official", "sdc"]  # two losses of one actor, see WithRecovery
+every_loss = pytest.mark.parametrize("name", LOSSES)
+with_critics = pytest.mark.parametrize("name", WITH_CRITICS)
 ONE_BASE = [name for name in LOSSES if name not in WRAPPED]
 
 

@@ -131,15 +131,9 @@ def following(batch: TensorDict) -> Tensor:
 
 
 K, LOG_PRIME, WEIGHT = 3, 0.4, 2.5
-DEFAULTS = {
-    "temperature": 1.7,
-    "min_q_weight": WEIGHT,
-    "num_random": K,
-    "clip_diff_min": -math.inf,
-    "target_action_gap": None,
-    "max_q_backup": False,
-    "deterministic_backup": True,
-}
+DEFAULTS = {"temperature": 1.7, "min_q_weight": WEIGHT, "num_random": K}
+DEFAULTS |= {"clip_diff_min": -math.inf, "target_action_gap": None}
+DEFAULTS |= {"max_q_backup": False, "deterministic_backup": True}
 
 
 class PlainCQL(Plain):

@@ -39,6 +39,7 @@ from torch.distributions import kl_divergence
 from torchrl_osr import CQLLoss, OSRLoss
 
 RECOVERY_WEIGHT = 0.75
+ALL = {"clip_diff_min": 5.9, "target_action_gap": -1.0, "max_q_backup": True}
 ENSEMBLE = {"min_q_weight": 0.0, "deterministic_backup": False}
 VARIANTS = {
     "CQL(H)": {},
@@ -48,11 +49,7 @@ VARIANTS = {
     "CQL(H) with its options: max backup": {"max_q_backup": True},
     "CQL(H) with its options: entropy": {"deterministic_backup": False},
     "CQL(H) with its options: gap": {"target_action_gap": 2.0},
-    "CQL(H) with its options: all": {
-        "clip_diff_min": 5.9,
-        "target_action_gap": -1.0,
-        "max_q_backup": True,
-    },
+    "CQL(H) with its options: all": ALL,
     "SAC-N": ENSEMBLE,
     "OSR": {},
     "OSR: temperature 1": {"temperature": 1.0},

@@ -13,6 +13,7 @@ from objectives.losses import (
     assert_same,
     assert_same_bits,
     call,
+    every_loss,
     make_batch,
     make_loss,
     make_networks,
@@ -20,7 +21,6 @@ from objectives.losses import (
 )
 from tensordict import TensorDict, unravel_key
 
-every_loss = pytest.mark.parametrize("name", LOSSES)
 every_base = pytest.mark.parametrize("name", ONE_BASE)
 ENDS = [("next", key) for key in ("reward", "done", "terminated")]
 READS = {

@@ -6,12 +6,7 @@ import copy
 
 import pytest
 import torch
-from objectives.losses import (
-    Networks,
-    density,
-    make_batch,
-    update_targets,
-)
+from objectives.losses import Networks, density, make_batch, update_targets
 from objectives.plain import BOX, SOFT, Plain, compare, following, prepare
 from torch import Tensor
 

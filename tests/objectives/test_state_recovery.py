@@ -168,19 +168,9 @@ def test_beside_torchrls_losses_the_actor_gets_both_gradients(kind) -> None:
         assert extra.any() == key.startswith(ACTOR), key
 
 
-def test_combined_losses_train_and_load_as_one() -> None:
+def test_a_model_and_one_actor_are_asked_for() -> None:
     first, second = (make_loss("official") for _ in range(2))
-    batch = make_batch("official", 10)
-    out = first(batch.select(*first.in_keys))
-    assert list(out.keys()) == first.out_keys
-    sum(out[key] for key in out.keys() if key.startswith("loss_")).backward()  # noqa: SIM118
-    torch.optim.SGD(first.parameters(), lr=0.1).step()
-    second.load_state_dict(first.state_dict())
-    assert all(map(torch.equal, second.parameters(), first.parameters()))
     with pytest.raises(ValueError, match="of another actor than the loss's"):
         WithRecovery(first.loss, second.recovery)
-
-
-def test_a_missing_model_is_asked_for() -> None:
     with pytest.raises(ValueError, match="needs an inverse_dynamics_network"):
         StateRecoveryLoss(Networks().actor)

@@ -5,21 +5,16 @@ from __future__ import annotations
 import pytest
 import torch
 from objectives.losses import (
-    ONE_BASE,
     WITH_CRITICS,
-    WRAPPED,
     assert_same,
     call,
     make_batch,
     make_loss,
     parts,
     record,
+    with_critics,
 )
 from torchrl.data.postprocs import MultiStep
-
-with_critics = pytest.mark.parametrize(
-    "name", [each for each in ONE_BASE if each in WITH_CRITICS]
-)
 
 
 def test_target_is_the_reward_and_the_discounted_value() -> None:
@@ -45,14 +40,6 @@ def test_target_follows_the_discount(name) -> None:
         loss.make_value_estimator("tdlambda")
 
 
-@pytest.mark.parametrize("name", WRAPPED)
-def test_a_combined_loss_has_the_estimator_of_its_critics(name) -> None:
-    loss, batch = make_loss(name), make_batch(name, 10)
-    loss.make_value_estimator(gamma=0.0)
-    found = call(loss, batch)["target_value"]
-    torch.testing.assert_close(found, batch["next", "reward"].mean())
-
-
 @with_critics
 def test_a_return_of_one_step_changes_nothing(name) -> None:
     loss, batch = make_loss(name), make_batch(name, 2, 5)
@@ -60,15 +47,9 @@ def test_a_return_of_one_step_changes_nothing(name) -> None:
 
 
 # Those that read the next state as the one an action leads to, and the term that does.
-SINGLE = {
-    "osr": "recovery_kl",
-    "osr-v": "recovery_gap",
-    "discrete": "recovery_kl",
-    "recovery": "loss_recovery",
-    "official": "loss_recovery",
-    "model": "loss_inverse_dynamics",
-    "scas": "correction_error",
-}
+SINGLE = {"osr": "recovery_kl", "osr-v": "recovery_gap", "discrete": "recovery_kl"}
+SINGLE |= {"recovery": "loss_recovery", "official": "loss_recovery"}
+SINGLE |= {"model": "loss_inverse_dynamics", "scas": "correction_error"}
 
 
 @pytest.mark.parametrize(("name", "key"), SINGLE.items())

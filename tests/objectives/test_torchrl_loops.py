@@ -20,12 +20,7 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import SoftUpdate
 from torchrl.trainers.algorithms import CQLTrainer
 
-from torchrl_osr import OSRLoss, OSRVLoss, StatePerturbation
-from torchrl_osr.modules import (
-    critic_ensemble,
-    tanh_gaussian_actor,
-    tanh_gaussian_inverse_dynamics,
-)
+from torchrl_osr import OSRLoss, OSRVLoss, StatePerturbation, modules
 
 BOUNDS = {"low": -2.0, "high": 2.0, "num_cells": [8]}
 LOSSES = {
@@ -44,9 +39,9 @@ def make_loss(loss_class: type = OSRLoss, **options: Any):
     """Return a loss for Pendulum; equal weights at each call."""
     torch.manual_seed(0)
     return loss_class(
-        tanh_gaussian_actor(3, 1, **BOUNDS),
-        critic_ensemble(3, 1, num_cells=[8]),
-        tanh_gaussian_inverse_dynamics(3, 1, **BOUNDS),
+        modules.tanh_gaussian_actor(3, 1, **BOUNDS),
+        modules.critic_ensemble(3, 1, num_cells=[8]),
+        modules.tanh_gaussian_inverse_dynamics(3, 1, **BOUNDS),
         **options,
     )
 

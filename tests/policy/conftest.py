@@ -8,15 +8,8 @@ import pytest
 import torch
 from torchrl.envs import ObservationNorm
 
-from torchrl_osr import CQLLoss, DiscreteOSRLoss
+from torchrl_osr import CQLLoss, DiscreteOSRLoss, modules
 from torchrl_osr.lab.losses import TD3BCLoss
-from torchrl_osr.modules import (
-    categorical_actor,
-    critic_ensemble,
-    deterministic_actor,
-    discrete_critic_ensemble,
-    tanh_gaussian_actor,
-)
 from torchrl_osr.policy import Policy, policy_from_loss
 
 STATE, ACTION = 3, 2
@@ -32,13 +25,15 @@ def make_loss() -> Callable[..., torch.nn.Module]:
         cells = {"num_cells": [8, 4]}
         many = cells | {"num_qvalue_nets": num_qvalue_nets}
         if kind == "discrete":
-            actor = categorical_actor(STATE, ACTION, **cells)
-            critics = discrete_critic_ensemble(STATE, ACTION, **many)
+            actor = modules.categorical_actor(STATE, ACTION, **cells)
+            critics = modules.discrete_critic_ensemble(STATE, ACTION, **many)
             return DiscreteOSRLoss(actor, critics, recovery_weight=0)
-        critics = critic_ensemble(STATE, ACTION, layer_norm=layer_norm, **many)
+        critics = modules.critic_ensemble(STATE, ACTION, layer_norm=layer_norm, **many)
         if kind == "td3_bc":
-            return TD3BCLoss(deterministic_actor(STATE, ACTION, **cells), critics)
-        actor = tanh_gaussian_actor(STATE, ACTION, **cells)
+            return TD3BCLoss(
+                modules.deterministic_actor(STATE, ACTION, **cells), critics
+            )
+        actor = modules.tanh_gaussian_actor(STATE, ACTION, **cells)
         return CQLLoss(actor, critics)
 
     return make

@@ -25,26 +25,13 @@ LINEAR = {"num_cells": [], "activation": "ReLU", "layer_norm": False}
 
 def linear_policy(low: float = -1.0, high: float = 5.0) -> Policy:
     """One number in, one out, all weights known."""
-    record = {
-        "distribution": "TanhDelta",
-        "observation_size": 1,
-        "action_size": 1,
-        "actor": LINEAR,
-        "critics": LINEAR | {"number": 2},
-        "source": {},
-    }
-    numbers = {
-        "loc": [2.0],
-        "scale": [4.0],
-        "low": [low],
-        "high": [high],
-        "actor.0.weight": [[0.5]],
-        "actor.0.bias": [0.1],
-        "critics.0.0.weight": [[3.0, 1.0]],
-        "critics.0.0.bias": [0.0],
-        "critics.1.0.weight": [[-3.0, 1.0]],
-        "critics.1.0.bias": [1.0],
-    }
+    record = {"distribution": "TanhDelta", "observation_size": 1, "action_size": 1}
+    record |= {"actor": LINEAR, "critics": LINEAR | {"number": 2}, "source": {}}
+    numbers = {"loc": [2.0], "scale": [4.0], "low": [low], "high": [high]}
+    numbers |= {"actor.0.weight": [[0.5]], "actor.0.bias": [0.1]}
+    for n, (weight, bias) in enumerate([(3.0, 0.0), (-3.0, 1.0)]):
+        numbers[f"critics.{n}.0.weight"] = [[weight, 1.0]]
+        numbers[f"critics.{n}.0.bias"] = [bias]
     return Policy(record, {name: torch.tensor(each) for name, each in numbers.items()})
 
 
@@ -115,11 +102,7 @@ def test_actions_are_within_their_bounds(observation, low, width):
         ("osr", [np.array([0.0, 0.0, 1e300])], "NaN or infinite"),
         ("osr", [np.zeros((4, 3)), np.zeros(3)], r"action has shape \(3,\), expected"),
         ("osr", [np.zeros((4, 3)), np.ones((1, 2))], r"shape \(4, 2\).* is \(1, 2\)"),
-        (
-            "osr",
-            [np.zeros((4, 3)), np.full((4, 2), 1.6)],
-            r"within \[-2\.0.*4\.0",
-        ),
+        ("osr", [np.zeros((4, 3)), np.full((4, 2), 1.6)], r"within \[-2\.0.*4\.0"),
         ("discrete", [np.zeros((2, 3)), np.array([0, 2])], "lie within 0 and 1"),
         ("discrete", [np.zeros((4, 3)), np.array([0, 1])], r"must have shape \(4,\)"),
     ],

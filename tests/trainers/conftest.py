@@ -4,35 +4,19 @@ from __future__ import annotations
 
 import io
 import zipfile
+from collections.abc import Callable
 from types import SimpleNamespace
 
 import pytest
 import torch
+from objectives.losses import make_loss
 from torch.utils._pytree import tree_leaves
 from torchrl.objectives import SoftUpdate
 
-from torchrl_osr import InverseDynamicsLoss, OSRLoss, StatePerturbation
+from torchrl_osr import StatePerturbation
 from torchrl_osr.fast import FastUpdate
 from torchrl_osr.lab.data import make_replay_buffer
-from torchrl_osr.modules import (
-    critic_ensemble,
-    tanh_gaussian_actor,
-    tanh_gaussian_inverse_dynamics,
-)
 from torchrl_osr.trainers import Evaluation, OfflineTrainer
-
-
-def inverse_dynamics_loss() -> InverseDynamicsLoss:
-    torch.manual_seed(0)
-    return InverseDynamicsLoss(tanh_gaussian_inverse_dynamics(3, 2), states="clean")
-
-
-def osr_loss(cells: int = 8) -> OSRLoss:
-    torch.manual_seed(0)
-    each = {"num_cells": [cells]}
-    critics = critic_ensemble(3, 2, **each)
-    model = tanh_gaussian_inverse_dynamics(3, 2, **each)
-    return OSRLoss(tanh_gaussian_actor(3, 2, **each), critics, model, num_random=2)
 
 
 def state_of_run(trainer: OfflineTrainer) -> list[torch.Tensor]:
@@ -51,8 +35,10 @@ def state_of_run(trainer: OfflineTrainer) -> list[torch.Tensor]:
     return tensors
 
 
-def assert_same_bits(mine, theirs) -> None:
-    assert all(torch.equal(a, b) for a, b in zip(mine, theirs, strict=True))
+@pytest.fixture(scope="session")
+def state() -> Callable[[OfflineTrainer], list[torch.Tensor]]:
+    """Return a function: the tensors of a trainer's newest checkpoint."""
+    return state_of_run
 
 
 @pytest.fixture
@@ -62,8 +48,9 @@ def make(transitions):
     Two of them are the same run up to their folders.
     """
 
-    def make(folder, *, cells=8, targets=True, **options) -> OfflineTrainer:
-        loss, perturbation = osr_loss(cells), StatePerturbation(0.1, seed=0)
+    def make(folder, *, targets=True, **options) -> OfflineTrainer:
+        loss = make_loss("osr").float()
+        perturbation = StatePerturbation(0.1, seed=0)
         updater = SoftUpdate(loss, tau=0.1)
         tracing = {name: options.pop(name, False) for name in ("trace", "warm_up")}
         scores = iter(range(1000))
@@ -93,17 +80,6 @@ def undisturbed(make, tmp_path) -> OfflineTrainer:
     trainer = make(tmp_path / "undisturbed")
     trainer.train()
     return trainer
-
-
-@pytest.fixture(scope="session")
-def runs() -> SimpleNamespace:
-    """Losses, and what compares runs."""
-    return SimpleNamespace(
-        osr_loss=osr_loss,
-        inverse_dynamics_loss=inverse_dynamics_loss,
-        state=state_of_run,
-        assert_same_bits=assert_same_bits,
-    )
 
 
 @pytest.fixture

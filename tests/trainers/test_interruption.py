@@ -9,14 +9,11 @@ import threading
 
 import pytest
 import torch
+from objectives.losses import assert_same_bits
 from tensordict import TensorDict
 
 from torchrl_osr.trainers import Interrupted
-from torchrl_osr.trainers.interruption import (
-    EXIT_CODES,
-    interrupts_kept,
-    signals_noted,
-)
+from torchrl_osr.trainers.interruption import EXIT_CODES, interrupts_kept, signals_noted
 
 STEPS = 20
 
@@ -45,7 +42,7 @@ def files(trainer) -> set[str]:
 
 @pytest.mark.parametrize("steps", [[1], [5], [19], [2, 3, 9], [7, 8]])
 def test_interrupted_run_ends_as_an_undisturbed_one(
-    tmp_path, make, runs, logger, undisturbed, steps
+    tmp_path, make, state, logger, undisturbed, steps
 ):
     for step in steps:
         trainer = make(tmp_path / "run", loggers=[logger])
@@ -58,7 +55,7 @@ def test_interrupted_run_ends_as_an_undisturbed_one(
         assert files(trainer) == names
     resumed = make(tmp_path / "run", loggers=[logger])
     resumed.train()
-    runs.assert_same_bits(runs.state(resumed), runs.state(undisturbed))
+    assert_same_bits(state(resumed), state(undisturbed))
     assert [row["step"] for row in resumed.history] == [0, 5, 10, 15, STEPS]
     assert files(resumed) == files(undisturbed)
     logged = [step for name, step, _ in logger.numbers if name == "train/loss_qvalue"]

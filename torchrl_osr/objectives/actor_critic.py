@@ -127,7 +127,6 @@ class ActorCriticLoss(LossModule):
             Default ``True``.
     """
 
-    default_value_estimator = ValueEstimators.TD0
     _AcceptedKeys = TransitionKeys
     default_keys = TransitionKeys
     tensor_keys: TransitionKeys

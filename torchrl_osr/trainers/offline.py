@@ -133,6 +133,10 @@ class OfflineTrainer(Trainer):
         # The buffer is not handed to TorchRL's trainer, which would put the whole data
         # set into checkpoints.
         self.update, self.buffer, self.evaluation = update, replay_buffer, evaluation
+        # TorchRL's losses would make theirs, and with it more state, in the first call.
+        for module in update.loss_module.modules():
+            if getattr(module, "default_value_estimator", None) is not None:
+                module.value_estimator  # noqa: B018
         self.loggers, self.description = loggers, description
         self.history: list[dict[str, Any]] = []
         self.failed_evaluations: dict[int, str] = {}

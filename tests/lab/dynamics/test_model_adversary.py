@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 import torch
-from objectives.losses import Networks
+from objectives.losses import Networks, make_batch
 from torch import Tensor
 from torchrl.data import LazyTensorStorage
 from torchrl.objectives import SoftUpdate
@@ -30,10 +30,10 @@ def falls(state: Tensor) -> Tensor:
     return state[..., 0] > 0.5
 
 
-def make_adversary(networks: Networks, make_batch) -> ModelAdversary:
+def make_adversary(networks: Networks) -> ModelAdversary:
     loss = CQLLoss(networks.actor, networks.critics, min_q_weight=0.0).double()
     SoftUpdate(loss, tau=0.1)
-    rows, storage = make_batch(50, twin=False), LazyTensorStorage(50)
+    rows, storage = make_batch("osr", 50), LazyTensorStorage(50)
     storage.set(range(50), rows)
     data = ModelData(
         storage, rows, torch.zeros(3), torch.ones(3), reward_scale=1.0, gamma=GAMMA,
@@ -87,10 +87,10 @@ def restated(networks: Networks, model: DynamicsEnsemble, states: Tensor) -> Ten
     return standardized * torch.stack(log_density)
 
 
-def test_objective_and_gradients_equal_the_restatement(make_batch, check) -> None:
+def test_objective_and_gradients_equal_the_restatement(check) -> None:
     networks, plain, model = Networks(number=3), Networks(number=3), uneven_dynamics()
-    adversary = make_adversary(networks, make_batch)
-    states = make_batch(12, twin=False)["observation"]
+    adversary = make_adversary(networks)
+    states = make_batch("osr", 12)["observation"]
     torch.manual_seed(6)
     got, _ = adversary.objective(states)
     torch.manual_seed(6)
@@ -103,8 +103,8 @@ def test_objective_and_gradients_equal_the_restatement(make_batch, check) -> Non
     assert not any(each.grad is not None for each in adversary.loss.parameters())
 
 
-def test_equal_numbers_draw_equally(make_batch) -> None:
-    pair = [make_adversary(Networks(), make_batch) for _ in range(2)]
+def test_equal_numbers_draw_equally() -> None:
+    pair = [make_adversary(Networks()) for _ in range(2)]
     for number, adversary in enumerate(pair):
         torch.manual_seed(number)
         generator = torch.get_rng_state()

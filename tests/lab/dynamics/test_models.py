@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from objectives.losses import Networks
+from objectives.losses import Networks, make_batch
 from tensordict import TensorDict
 from torch import nn
 from uneven_dynamics import linear_dynamics, plain_gaussian
@@ -79,8 +79,8 @@ def plain_loss(model: DynamicsEnsemble, batch, weight: float) -> torch.Tensor:
 
 @pytest.mark.parametrize("weight", [0.0, 2.0])
 @pytest.mark.parametrize("num_cells", [(), (6, 5)])
-def test_loss_equals_the_plain_likelihood(make_batch, check, weight, num_cells) -> None:
-    batch = make_batch(10, twin=False)
+def test_loss_equals_the_plain_likelihood(check, weight, num_cells) -> None:
+    batch = make_batch("osr", 10)
     ended = batch["next", "terminated"].squeeze(-1)  # a row of each network
     batch["next", "observation"][ended] = batch["observation"][ended]
     model, plain = make_model(num_cells), make_model(num_cells)
@@ -108,8 +108,8 @@ def test_weights_alone_decay_and_by_their_layer() -> None:
     assert {each: decay for each, decay in decays.items() if decay} == wanted
 
 
-def test_loss_of_the_autoencoder_equals_the_plain_objective(make_batch, check) -> None:
-    batch = make_batch(10, twin=False)
+def test_loss_of_the_autoencoder_equals_the_plain_objective(transitions, check) -> None:
+    batch = transitions(10, dtype=torch.float64)
     batch["next", "observation"][1] = batch["observation"][1]  # terminated: no next
     model, plain = Networks().vae, Networks().vae
     model.standardize_(batch)
@@ -143,8 +143,8 @@ def test_loss_of_the_autoencoder_equals_the_plain_objective(make_batch, check) -
 
 
 @pytest.mark.parametrize("name", ["dynamics", "vae"])
-def test_models_learn_single_steps_and_divide_the_batch(make_batch, name) -> None:
-    single = make_batch(10, twin=False)
+def test_models_learn_single_steps_and_divide_the_batch(name) -> None:
+    single = make_batch("osr", 10)
     several = single.clone().set("next", single["next"].roll(1, 0))
     several["steps_to_next_obs"] = torch.full((10, 1), 5)
     kinds = {"dynamics": DynamicsLoss, "vae": TransitionVAELoss}
@@ -158,4 +158,4 @@ def test_models_learn_single_steps_and_divide_the_batch(make_batch, name) -> Non
     assert torch.equal(*found)
     if name == "dynamics":
         with pytest.raises(ValueError, match="9 rows cannot be divided among 2"):
-            loss(make_batch(9, twin=False))
+            loss(make_batch("osr", 9))

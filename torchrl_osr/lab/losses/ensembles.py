@@ -202,7 +202,6 @@ class RORLLoss(ActorCriticLoss):
         for name, value in given.items():
             setattr(self, name, value)
         self.num_samples, self.q_smooth_tau = num_samples, q_smooth_tau
-        self.register_buffer("uncertainty_weight", torch.tensor(q_ood_uncertainty_reg))
         self.register_buffer("num_updates", torch.tensor(0.0))
         terms = {
             "policy_smoothness": policy_smooth_reg,
@@ -216,12 +215,14 @@ class RORLLoss(ActorCriticLoss):
     def decay_uncertainty(self) -> None:
         """Lower the weight of the uncertainty by one update's decay."""
         self.num_updates += 1
+
+    @property
+    def uncertainty_weight(self) -> Tensor:
+        """Weight of the uncertainty after the updates so far."""
         # Of the number of updates: small steps of a float32 would add up wrongly.
         fallen = self.num_updates.double() * self.q_ood_uncertainty_decay
-        weight = self.q_ood_uncertainty_reg - fallen
-        weight = weight.clamp(min=self.q_ood_uncertainty_reg_min)
-        # Into the same tensor: a recording or a CUDA graph reads it there.
-        self.uncertainty_weight.copy_(weight)
+        weight: Tensor = self.q_ood_uncertainty_reg - fallen
+        return weight.clamp(min=self.q_ood_uncertainty_reg_min).to(self.num_updates)
 
     def losses(self, batch: Transitions) -> Losses:
         policy = self.policy(batch)
