@@ -166,10 +166,9 @@ def try_out(env_id: str) -> None:
                     state, reward, *flags, _ = env.step(action)
                     terminated, truncated = map(bool, flags)
                     ended = terminated or truncated
-                if np.shape(state) != wanted:
-                    raise ValueError(f"observation {np.shape(state)}, not {wanted}")
-                if not np.isfinite([*state, float(reward)]).all():
-                    raise ValueError(f"observation {state} or reward {reward}")
+                finite = np.isfinite([*state, float(reward)]).all()
+                if np.shape(state) != wanted or not finite:
+                    raise ValueError(f"observation {state}, reward {reward}")
         except Exception as error:
             raise RuntimeError(
                 f"{env_id} cannot be played: step {step} ended with "

@@ -31,10 +31,7 @@ from torchrl_osr.lab.data.rows import (
 from torchrl_osr.lab.run.config import read_columns
 from torchrl_osr.lab.run.schema import DataConfig, EnvConfig, TrainConfig
 
-OF_TRAINING = (
-    *("storage", "held_out", "standardize", "reward_scale", "reward_shift"),
-    "checksum",
-)
+OF_TRAINING = ("storage", "held_out", "standardize", "reward_scale", "reward_shift")
 """Options of the data that do not decide which rows there are."""
 
 MAX_HELD_OUT = 50_000
@@ -68,7 +65,7 @@ def load_data(
 
     reading = asdict(options)
     reading["columns"] = read_columns(reading["columns"])
-    for name in OF_TRAINING:
+    for name in (*OF_TRAINING, "checksum"):
         del reading[name]
     if env is not None:
         reading |= {"env_name": env.name, "env_id": env.id}
