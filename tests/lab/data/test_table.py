@@ -179,6 +179,8 @@ def test_names_are_found_in_the_order_of_their_numbers():
     assert find_columns([*USUAL, "note"], named) == columns
     named["observation"] = ["obs_3", "obs_1"]
     assert find_columns(USUAL, named)["observation"] == ["obs_3", "obs_1"]
+    named["observation"] = [7]
+    assert find_columns(["7", *USUAL], named)["observation"] == ["7"]
 
 
 @pytest.mark.parametrize(

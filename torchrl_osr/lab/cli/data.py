@@ -107,5 +107,6 @@ def overview(
     lines.append(f"actions   {what}: {', '.join(each)}")
     lines += [f"{n:<10}{manifest[n]}" for n in ("steps", "text") if n in manifest]
     if unused := manifest.get("unused_columns"):
-        lines.append(f"not read  {', '.join(unused)}")
+        more = "" if len(unused) <= MOST_ENTRIES else f", ... ({len(unused):,})"
+        lines.append(f"not read  {', '.join(unused[:MOST_ENTRIES])}{more}")
     return "\n  ".join(lines)

@@ -130,7 +130,7 @@ def _read_csv(path: Path) -> tuple[pd.DataFrame, str]:
 
 
 def _parsed(file: IO[str]) -> tuple[pd.DataFrame, str]:
-    lines = file.read(2**16).splitlines()
+    lines = file.read(2**20).splitlines()
     skipped = len([*takewhile(lambda line: line[:1] in ("", "#"), lines)])
     if skipped and NUMBER.match("".join(lines[skipped : skipped + 1])):
         skipped -= 1  # NumPy writes the names as a comment
