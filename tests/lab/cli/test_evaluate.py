@@ -57,7 +57,7 @@ def test_sweep_evaluates_every_finished_run(tmp_path, folder, run):
     lines = output.splitlines()
     assert lines[0] == "left out: sweep/2_running: not finished, its status is running"
     assert lines[-1] == "1 of 2 runs failed: sweep/1_damaged."
-    assert re.search(r"of 2: sweep/1_damaged: failed: .* is damaged", output)
+    assert re.search(r"of 2: sweep/1_damaged: failed: \S+ is damaged: ", output)
     assert re.search(r"0_good: score -?\d+\.\d undisturbed, -?\d+\.\d dist", output)
     assert (sweep / "0_good" / "robustness-start.json").exists()
 

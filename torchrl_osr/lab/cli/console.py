@@ -82,7 +82,9 @@ def sentence(error: BaseException) -> str:
     if isinstance(error, ModuleNotFoundError):
         return f"{error}. Commands need what 'torchrl-osr[train]' installs."
     raised = [frame.f_globals["__name__"] for frame, _ in walk_tb(error.__traceback__)]
-    ours = not raised or raised[-1].startswith("torchrl_osr.")
+    # Unknown where it was raised in another process.
+    lost = not raised or type(error.__cause__).__name__ == "_RemoteTraceback"
+    ours = lost or raised[-1].startswith("torchrl_osr.")
     if ours and isinstance(error, OURS) and str(error):
         return str(error)
     return f"{type(error).__name__}: {error}\nIts traceback: add --debug."
