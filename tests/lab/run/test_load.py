@@ -202,7 +202,7 @@ def test_switching_uses_all_runs_policies_models_and_critics(folders) -> None:
     ("options", "message"),
     [
         ([LOSS], "dynamics.safetensors"),
-        (["loss=bc"], "no critics"),
+        (["loss=bc"], "needs real actions and critics"),
         ([LOSS, "optim.gamma=0.9"], "differ in .*0.9, "),
         ([LOSS, "data.reward_scale=100"], "differ in .*100.0"),
         ([LOSS, "env=walker2d"], "differ in .*Walker2d-v5"),
