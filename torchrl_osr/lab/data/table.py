@@ -89,7 +89,7 @@ def _files(path: str | Path | Sequence[str]) -> list[Path]:
         found = [whole] if whole.is_file() else [*map(Path, sorted(glob(str(whole))))]
         files += found
         if not found:
-            raise FileNotFoundError(f"there is no file {whole}: give a log's path.")
+            raise FileNotFoundError(f"there is no file {whole}: give its place with data.path=...")
     return files
 
 
