@@ -89,7 +89,8 @@ def _files(path: str | Path | Sequence[str]) -> list[Path]:
         found = [whole] if whole.is_file() else [*map(Path, sorted(glob(str(whole))))]
         files += found
         if not found:
-            raise FileNotFoundError(f"there is no file {whole}: give its place with data.path=...")
+            cure = "give its place with data.path=..."
+            raise FileNotFoundError(f"there is no file {whole}: {cure}")
     return files
 
 
