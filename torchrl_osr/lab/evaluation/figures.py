@@ -72,8 +72,10 @@ def data_figure(
     figure.suptitle(title + (f" ({left} more entries are not shown)" if left else ""))
     grid = figure.subplots(height, COLUMNS, squeeze=False).ravel()
     for axes, (name, values, colour) in zip(grid, panels, strict=False):
-        if len(values):
+        if len(values) and np.ptp(values) > 1e-12 * np.abs(values).max():
             axes.hist(values, bins=40, color=colour)
+        elif len(values):  # too narrow for bins
+            axes.text(0.5, 0.5, f"{np.max(values):g} in all rows", ha="center")
         axes.set_title(name, fontsize=9)
         axes.tick_params(labelsize=7)
         axes.set_yticks([])
