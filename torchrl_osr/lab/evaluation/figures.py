@@ -75,7 +75,8 @@ def data_figure(
         if len(values) and np.ptp(values) > 1e-12 * np.abs(values).max():
             axes.hist(values, bins=40, color=colour)
         elif len(values):  # too narrow for bins
-            axes.text(0.5, 0.5, f"{np.max(values):g} in all rows", ha="center")
+            axes.text(0.5, 0.5, f"always {np.max(values):g}", ha="center")
+            axes.set_xticks([])
         axes.set_title(name, fontsize=9)
         axes.tick_params(labelsize=7)
         axes.set_yticks([])
