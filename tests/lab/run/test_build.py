@@ -11,6 +11,7 @@ import torch
 from composed import CONF, composed, configured
 from gymnasium.spaces import Box
 from hydra.utils import get_class
+from objectives.losses import make_batch
 from torchrl.objectives import SoftUpdate
 
 from torchrl_osr.lab.run.build import make_learner, try_out
@@ -29,10 +30,9 @@ def learner_of(*overrides: str):
 
 
 @pytest.fixture
-def batch(make_batch):
-    batch = make_batch(10).apply(lambda x: x.float() if x.is_floating_point() else x)
-    batch["next", "action"] = batch["action"].flip(0)
-    return batch
+def batch():
+    batch = make_batch("osr", 10)
+    return batch.apply(lambda x: x.float() if x.is_floating_point() else x)
 
 
 @pytest.mark.parametrize("name", LOSSES)
