@@ -12,7 +12,11 @@ import pytest
 import torch
 from objectives.losses import Networks, make_batch, update_targets
 from objectives.plain import BOX, Plain, compare, following, prepare
-from torch import Tensor
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torch.distributions import Categorical, Normal
+from torchrl.modules import ProbabilisticActor
 
 from torchrl_osr.lab.losses import BCLoss, IQLLoss
 
@@ -69,3 +73,23 @@ def test_cloning_equals_the_restatement(check, kind) -> None:
     found = [value.detach(), *(each.grad for each in loss.parameters())]
     wanted = [expected.detach(), *slopes]
     check("Behaviour cloning", found, wanted, tolerance=1e-10)
+
+
+@pytest.mark.parametrize("kind", ["normal", "categorical"])
+def test_cloning_with_torchs_own_distributions(kind) -> None:
+    torch.manual_seed(0)
+    s, layer = torch.randn(10, 3), nn.Linear(3, 2)
+    batch = TensorDict({"observation": s}, [10])
+    if kind == "normal":  # a density for each dimension
+        keys, density, options = ["loc"], Normal, {"scale": 0.5}
+        batch["action"] = a = torch.randn(10, 2)
+        expected = -Normal(layer(s), 0.5).log_prob(a).sum(-1).mean()
+    else:
+        keys, density, options = ["logits"], Categorical, {}
+        batch["action"] = a = torch.arange(10) % 2
+        expected = nn.functional.cross_entropy(layer(s), a)
+    actor = ProbabilisticActor(
+        TensorDictModule(layer, ["observation"], keys), in_keys=keys,
+        distribution_class=density, distribution_kwargs=options,
+    )  # fmt: skip
+    torch.testing.assert_close(BCLoss(actor)(batch)["loss_actor"], expected)
