@@ -25,7 +25,9 @@ from objectives.losses import (
 )
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
-from torchrl.modules import MLP
+from torchrl.modules import MLP, TanhModule
+
+from torchrl_osr import StateRecoveryLoss
 
 
 def critics_of(name: str, networks: Networks) -> list[TensorDictModule]:
@@ -153,6 +155,14 @@ def test_a_model_of_other_bounds_or_actions_is_refused(name) -> None:
         networks.model[0][0].module = MLP(2 * S, 2 * size, num_cells=[8]).double()
         with pytest.raises(ValueError, match=f"has {size} actions, but actor_network"):
             make_loss(name, networks)(make_batch(name, 4))
+
+
+def test_a_tanh_module_has_bounds_too() -> None:
+    layer = TensorDictModule(nn.Linear(S, 2), ["observation"], ["action"])
+    tanh = TanhModule(in_keys=["action"], low=-2.0, high=2.0)
+    actor, model = TensorDictSequential(layer, tanh), Networks().model
+    with pytest.raises(ValueError, match="share their action bounds"):
+        StateRecoveryLoss(actor, model)
 
 
 FROZEN = {

@@ -24,6 +24,7 @@ from torchrl.modules import (
     MaskedOneHotCategorical,
     OneHotCategorical,
     TanhDelta,
+    TanhModule,
     TanhNormal,
 )
 
@@ -57,7 +58,10 @@ def is_deterministic(network: TensorDictModuleBase) -> bool:
 def squashing_bounds(network: TensorDictModuleBase) -> tuple[Tensor, ...]:
     """Return ``low`` and ``high`` of a network that ends in a tanh, or nothing."""
     head, options = head_of(network)
-    if head not in (TanhNormal, TanhDelta):
+    tanh = [each for each in network.modules() if isinstance(each, TanhModule)]
+    if head is None and tanh:
+        options = dict(zip(("low", "high"), tanh[-1].buffers(), strict=False))
+    elif head not in (TanhNormal, TanhDelta):
         return ()
     dtype = torch.get_default_dtype()
     low = torch.as_tensor(options.get("low", -1.0), dtype=dtype)
