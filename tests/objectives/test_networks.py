@@ -25,7 +25,7 @@ from objectives.losses import (
 )
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
-from torchrl.modules import MLP, TanhModule
+from torchrl.modules import MLP, GRUModule, TanhModule
 
 from torchrl_osr import StateRecoveryLoss
 
@@ -155,6 +155,13 @@ def test_a_model_of_other_bounds_or_actions_is_refused(name) -> None:
         networks.model[0][0].module = MLP(2 * S, 2 * size, num_cells=[8]).double()
         with pytest.raises(ValueError, match=f"has {size} actions, but actor_network"):
             make_loss(name, networks)(make_batch(name, 4))
+
+
+def test_recurrent_actors_are_refused() -> None:
+    gru = GRUModule(S, 8, in_key="observation", out_key="hidden")
+    layer = TensorDictModule(nn.Linear(8, 2), ["hidden"], ["action"])
+    with pytest.raises(ValueError, match="actor_network is recurrent"):
+        StateRecoveryLoss(TensorDictSequential(gru, layer), recovery_target="data")
 
 
 def test_a_tanh_module_has_bounds_too() -> None:

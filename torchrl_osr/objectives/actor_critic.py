@@ -28,6 +28,7 @@ from tensordict.nn import (
     set_interaction_type,
 )
 from torch import Tensor, nn
+from torchrl.modules import GRUModule, LSTMModule
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import LossModule, ValueEstimators, distance_loss
 from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
@@ -206,6 +207,18 @@ class ActorCriticLoss(LossModule):
             )
             self.qvalue_network_params = TensorDictParams(own, no_convert=True)
         self._make_vmap()
+
+    def convert_to_functional(
+        self, module: Any, module_name: str, *args: Any, **options: Any
+    ) -> None:
+        """Register a network, as TorchRL does; refuse a recurrent one."""
+        each = nn.ModuleList(module if isinstance(module, Sequence) else [module])
+        if any(isinstance(part, (GRUModule, LSTMModule)) for part in each.modules()):
+            raise ValueError(
+                f"{module_name} is recurrent, but all steps of a batch are rows here: "
+                "give it stacked states instead (TorchRL's CatFrames)."
+            )
+        super().convert_to_functional(module, module_name, *args, **options)
 
     def register_frozen(self, name: str, network: nn.Module) -> None:
         """Register a trained network frozen: in the state dict, moved by ``.to()``.
