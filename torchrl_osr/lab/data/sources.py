@@ -245,9 +245,12 @@ def _check_fit(
 ) -> None:
     """Raise unless the data have the task's observations and actions."""
     ours = [data[name].shape[-1] for name in ("observation", "action")]
-    action = data["action"]
-    hot = ((action == 0) | (action == 1)).all() and (action.sum(1) == 1).all()
-    if ours != [spec.observation_size, spec.action_size] or spec.discrete > bool(hot):
+    fits = ours == [spec.observation_size, spec.action_size]
+    if fits and spec.discrete:
+        action = data["action"]
+        one_hot = ((action == 0) | (action == 1)).all() and (action.sum(1) == 1).all()
+        fits = bool(one_hot)
+    if not fits:
         kind = "discrete" if spec.discrete else "real"
         raise ValueError(
             f"the data have {ours[0]} observation and {ours[1]} action entries, "
