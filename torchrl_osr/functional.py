@@ -128,9 +128,9 @@ def soft_policy_value(
     .. math::
         \alpha_e \log\pi(\hat a \mid \tilde s) - \min_i Q_i(\tilde s, \hat a)
 
-    The paper prints :math:`+Q` in an objective to be minimised, which would seek
-    the worst action; the entropy term is not printed but is in the authors' code
-    (and in CQL, on which the method stands).
+    The paper prints :math:`+Q` in an objective to be minimised, which would seek the
+    worst action. It does not print the entropy term. The authors' code has it, and so
+    has CQL.
 
     Args:
         log_prob: log-density of the sampled action, ``[B]``.

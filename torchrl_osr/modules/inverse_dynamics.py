@@ -104,7 +104,7 @@ def cvae_inverse_dynamics(
     parameters, ``"latent_loc"`` and ``"latent_scale"``, ``[B, Z]``. From these,
     :class:`~torchrl_osr.InverseDynamicsLoss` adds :math:`KL(q(z) \,\|\, N(0, 1))`.
     ``z`` is drawn under ``set_interaction_type(InteractionType.RANDOM)``, as in
-    training. Under every other type, as in the policy's losses, it is its mean.
+    training. Otherwise, as in the policy's losses, it is the latent's mean.
 
     A known limit, also of the original: the encoder does not see the action, and ``z``
     tells the decoder nothing new. Training teaches the decoder to ignore it.

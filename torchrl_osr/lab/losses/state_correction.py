@@ -45,8 +45,10 @@ class SCASLoss(TD3Loss):
         w(s, s') &= \min\big(e^{\tau (V(s') - V(s))}, w_{max}\big), \quad
         V(s) = \frac1N \sum_i Q_i(s, \pi(s))
 
-    with a perturbed state :math:`\hat s`, a frozen model :math:`M` of the dynamics, and
-    the critics of :class:`~torchrl_osr.lab.losses.td3.TD3Loss` (the authors use four).
+    with a perturbed state :math:`\hat s` and a frozen model :math:`M` of the dynamics.
+    The critics are those of :class:`~torchrl_osr.lab.losses.td3.TD3Loss`; the authors
+    use four.
+
     "Offline Reinforcement Learning with OOD State Correction and OOD Action
     Suppression", https://arxiv.org/abs/2410.19400. It prints :math:`\tilde s = \hat s`;
     its released code (MAOYIXIU/SCAS) has :math:`\tilde s = s`, the default here.
