@@ -140,7 +140,9 @@ class StatePerturbation(Transform):
         """Return the generator's state, for the state dict."""
         if self._generator is None and self._loaded is not None:
             return self._loaded
-        generator = self._generator or torch.Generator().manual_seed(self.seed)
+        generator = self._generator
+        if generator is None:
+            generator = torch.Generator(self.std.device).manual_seed(self.seed)
         return generator.get_state()
 
     def set_extra_state(self, state: Tensor) -> None:

@@ -6,13 +6,15 @@ traced once, by :func:`torch.fx.experimental.proxy_tensor.make_fx`, forward and
 backward, and repeated with the next batches. The same operations on the same numbers in
 the same order give the same bits, without a compiler.
 
-TorchScript's interpreter repeats them. PyTorch deprecates it, but offers nothing else
-that repeats operations from C++ without a compiler.
+On a CPU, TorchScript's interpreter repeats them. PyTorch deprecates it, but offers
+nothing else that repeats operations from C++ without a compiler. On a GPU, a CUDA graph
+does.
 """
 
 from __future__ import annotations
 
 import enum
+import gc
 import logging
 import types
 import warnings
@@ -59,7 +61,7 @@ class LossGradients:
         self.loss_module, self.autocast_dtype = loss_module, autocast_dtype
         self.parameters, self.warm_up = parameters, max(warm_up, 1)
         self.device = next(loss_module.parameters()).device
-        self.may_trace = trace and self.device.type == "cpu"
+        self.may_trace = trace and self.device.type in ("cpu", "cuda")
         self._countdown, self._changes, self._replays = self.warm_up, -1, 0
         self._state: _State | None = None
         self.trace: _Trace | None = None
@@ -97,7 +99,7 @@ class LossGradients:
 
     def _try_to_trace(self, batch: TensorDictBase) -> None:
         assert self._state is not None
-        generator, tensors = torch.get_rng_state(), self._state.tensors
+        generator, tensors = self._draws().get_state(), self._state.tensors
         before = [each.detach().clone() for each in tensors]
         try:
             trace = _Trace(self._losses, self.loss_module, batch, self.parameters)
@@ -107,29 +109,38 @@ class LossGradients:
                 self._give_up("it writes into its own tensors")
         except Exception as error:  # whatever a loss does that cannot be traced
             self._give_up(f"{type(error).__name__}: {str(error).splitlines()[0]}")
+            if self.device.type == "cuda":  # it would wait for the end of the capture
+                fresh = torch.Generator(self.device).graphsafe_get_state()
+                self._draws().graphsafe_set_state(fresh)
         finally:
-            torch.set_rng_state(generator)
+            self._draws().set_state(generator)
             if self.trace is None:
                 for tensor, value in zip(tensors, before, strict=True):
                     tensor.data.copy_(value)
 
     def _replay(self, trace: _Trace, batch: TensorDictBase) -> TensorDictBase:
         """Repeat the trace; at first and now and then, compare it with the loss."""
-        start = None if self._replays % CHECK_INTERVAL else torch.get_rng_state()
+        draws = self._draws()
+        start = None if self._replays % CHECK_INTERVAL else draws.get_state()
         self._replays += 1
         # Optimised, TorchScript joins matrix products, which rounds otherwise.
         with torch.no_grad(), optimized_execution(False):
             outputs = trace.run(*trace.tensors(batch))
         if start is not None:
-            end = torch.get_rng_state()
-            torch.set_rng_state(start)
+            end = draws.get_state()
+            draws.set_state(start)
             wanted = trace.update(*trace.tensors(batch))
-            if not all(
-                map(torch.equal, [*outputs, end], [*wanted, torch.get_rng_state()])
-            ):
+            if not all(map(torch.equal, [*outputs, end], [*wanted, draws.get_state()])):
                 outputs = wanted
                 self._give_up("it reads numbers from outside of its attributes")
         return trace.spread(outputs, batch)
+
+    def _draws(self) -> torch.Generator:
+        """Return the generator that the loss draws from: torch's own of its device."""
+        if self.device.type == "cpu":
+            return torch.default_generator
+        generator: torch.Generator = torch.cuda.default_generators[self.device.index]
+        return generator
 
     def _give_up(self, why: str) -> None:
         self.may_trace, self.trace = False, None
@@ -189,7 +200,8 @@ class _State:
     def _traits_now(self) -> list[Any]:
         modes = (
             torch.is_grad_enabled(),
-            torch.is_autocast_enabled("cpu") and torch.get_autocast_dtype("cpu"),
+            *map(torch.is_autocast_enabled, ("cpu", "cuda")),
+            *map(torch.get_autocast_dtype, ("cpu", "cuda")),
             torch.get_default_dtype(),
             interaction_type(),
             RemovableHandle.next_id,
@@ -225,7 +237,10 @@ class _Trace:
         self._kind = self._kind_of(batch)
         self._empty = TensorDict({}, batch.batch_size, device=batch.device)
         tensors = self.tensors(batch)
-        self.run = _without_python(make_fx(self.update)(*tensors), tensors)
+        if tensors[0].device.type == "cuda":
+            self.run: Any = _CudaGraph(self.update, tensors)
+        else:
+            self.run = _without_python(make_fx(self.update)(*tensors), tensors)
 
     def update(self, *tensors: Tensor) -> list[Tensor]:
         """Return losses, entries written to the batch, and gradients."""
@@ -251,7 +266,10 @@ class _Trace:
         self, outputs: Sequence[Tensor], batch: TensorDictBase
     ) -> TensorDictBase:
         """Put written entries into the batch, add gradients, and return the losses."""
-        remaining = iter(outputs)
+        number = len(self._names) + len(self._written)
+        # A CUDA graph writes its outputs once more at the next update.
+        copied = [each.clone() if each.is_cuda else each for each in outputs[:number]]
+        remaining = iter([*copied, *outputs[number:]])
         losses = TensorDict({name: next(remaining) for name in self._names}, [])
         for key in self._written:
             batch.set(key, next(remaining))
@@ -275,6 +293,31 @@ class _Trace:
             if key in self._keys or key not in self._written
         }
         return batch.batch_size, entries
+
+
+class _CudaGraph:
+    """The kernels of a function of tensors, launched together.
+
+    The results are overwritten by the next call.
+    """
+
+    def __init__(self, function: Callable[..., Any], tensors: list[Tensor]) -> None:
+        self._given = [each.clone() for each in tensors]
+        stream = torch.cuda.Stream()  # type: ignore[no-untyped-call]
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):  # libraries allocate in their first call
+            function(*self._given)
+        torch.cuda.current_stream().wait_stream(stream)
+        gc.collect()  # to free another graph during the capture would end it
+        self._graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(self._graph, stream=stream):
+            self._found = function(*self._given)
+
+    def __call__(self, *tensors: Tensor) -> list[Tensor]:
+        torch._foreach_copy_(self._given, tensors)
+        self._graph.replay()
+        found: list[Tensor] = self._found
+        return found
 
 
 def _laid_out(gradient: Tensor, like: Tensor) -> Tensor:

@@ -84,7 +84,9 @@ class Phases:
         # every state, which is the paper's mixed data set.
         self.data = load_training_data(config, device, self.learner.objective.in_keys)
         write_config(run.folder, config)  # with the checksum of the data
-        self.perturbation = StatePerturbation(config.perturbation.std, seed=config.seed)
+        self.perturbation = StatePerturbation(
+            config.perturbation.std, seed=config.seed
+        ).to(device)
         self.data.buffer.append_transform(self.perturbation)
 
     def trainer(
@@ -316,10 +318,12 @@ def averaged(network: torch.nn.Module, share: float) -> AveragedModel:
     """
 
     @torch.no_grad()
-    def move(average: Any, weights: Any, count: Tensor | int) -> None:
-        torch._foreach_lerp_(average, weights, max(share, 10 / (int(count) + 10)))
+    def move(average: Any, weights: Any, _: Any) -> None:
+        count = int(model.n_averaged)  # on the host, unlike what is passed
+        torch._foreach_lerp_(average, weights, max(share, 10 / (count + 10)))
 
-    return AveragedModel(network, multi_avg_fn=move)
+    model = AveragedModel(network, multi_avg_fn=move)
+    return model
 
 
 @contextmanager
