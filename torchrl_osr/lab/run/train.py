@@ -18,7 +18,6 @@ from typing import Any
 
 import torch
 from hydra.utils import instantiate
-from torch import Tensor
 from torch.nn import Parameter
 from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import AveragedModel
