@@ -1,6 +1,6 @@
 """Print the tables of an experiment in Markdown.
 
-    python results/tables.py results/scoreboard
+    python results/tables.py results/paper
     python results/tables.py results/oos --reference cql_noisy_bc
 
 Reads ``runs.csv.xz``, ``episodes.csv.xz`` and, where they exist, ``recoverable.csv.xz``

@@ -1,8 +1,8 @@
 """Train every method for two minutes of a core each, then disturb the last policy.
 
-    python results/scoreboard/run.py outputs/scoreboard
-    python results/scoreboard/run.py outputs/scoreboard --methods osr cql --seeds 0
-    python results/scoreboard/run.py outputs/scoreboard --pack new
+    python results/paper/run.py outputs/paper
+    python results/paper/run.py outputs/paper --methods osr cql --seeds 0
+    python results/paper/run.py outputs/paper --pack new
 
 Each run is one process with one torch thread. Stop the script at any time and start it
 again: finished runs are skipped, others resume. ``--pack`` writes the tables that
