@@ -1,12 +1,14 @@
-"""Train every method for two minutes of a core each, then disturb the last policy.
+"""Make the runs behind the paper's tables and figures.
 
-    python results/paper/run.py outputs/paper
-    python results/paper/run.py outputs/paper --methods osr cql --seeds 0
-    python results/paper/run.py outputs/paper --pack new
+    python results/paper/run.py table1                       # or table2, figure4, d4
+    python results/paper/run.py table1 --data hopper-medium --methods osr cql --seeds 0
+    python results/paper/run.py methods                      # all methods, six sets
+    python results/paper/run.py table1 --pack                # and then page.py
 
 Each run is one process with one torch thread. Stop the script at any time and start it
-again: finished runs are skipped, others resume. ``--pack`` writes the tables that
-``results/tables.py`` reads into a folder.
+again: finished runs are skipped, others resume. Runs that are in the tables of this
+folder with as many updates are not made again. ``--pack`` adds finished runs to these
+tables.
 """
 
 from __future__ import annotations
@@ -14,18 +16,22 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import subprocess
 import sys
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import product
 from pathlib import Path
+from typing import NamedTuple
+
+import pandas as pd
 
 from torchrl_osr.lab.report import read_runs
 
 HERE = Path(__file__).parent
-CORE_SECONDS = 120  # for the updates of a policy; models are trained beside it
+ENVS = ("hopper", "walker2d", "halfcheetah")
 
-# In the order in which they are trained: a prefix of the list is a fair comparison.
 METHODS = {
     name: [f"loss={name}"]
     for name in (
@@ -38,16 +44,67 @@ METHODS = {
     "rebrac+osr": ["loss=rebrac", "recovery=osr"],
     "cql_both": ["loss=cql", "loss.actor_states=both"],
 }
+"""In the order in which they are trained."""
+
+MUJOCO = {
+    f"{env} {source}": [f"env={env}", f"data={source}"]
+    for source in ("medium", "medium-replay", "medium-expert", "expert", "random")
+    for env in ENVS
+}
+LIMITED = {
+    f"{env} expert, {share} % random": [
+        f"env={env}", "data=expert", f"data.random_share={share / 100}"
+    ]
+    for share in (50, 70, 90)
+    for env in ENVS
+}  # fmt: skip
+DATA = MUJOCO | LIMITED
+SIX = [data for data in MUJOCO if data.endswith(("-replay", "-expert"))]
+
 SUITES = {
     "oos": "robustness-oos.json",
+    "official": "robustness-official.json",
     "push": "robustness-push.json",
     "observation_noise": "robustness-observation_noise.json",
     "recoverable": "recoverable-public.json",
 }
-"""And the file that each writes."""
+"""Suites that the last policy of a two-minute run on the six data sets plays, and the
+file of each. ``official`` is for ``medium-expert`` alone, as in the paper."""
 
-ENVS = ("hopper", "walker2d", "halfcheetah")
-DATA = [f"{env}-{data}" for data in ("medium-replay", "medium-expert") for env in ENVS]
+
+class Table(NamedTuple):
+    """Runs of a table; ``seconds`` of a core go to the updates of each policy."""
+
+    methods: Sequence[str]
+    data: Sequence[str]
+    suites: Sequence[str] = ()  # that the table shows
+    seeds: Sequence[int] = (0, 1, 2)
+    seconds: int = 120
+
+    @property
+    def place(self) -> str:
+        """Name the folder of runs of other lengths, so that they stay apart."""
+        return "" if self.seconds == 120 else f"{self.seconds}s"
+
+
+PAPER = ("osr", "osr_v", "cql", "iql", "sdc", "mopo", "rambo")
+EXPERTS = [f"{env} medium-expert" for env in ENVS]
+TABLES = {
+    "table1": Table((*PAPER, "td3_bc", "rebrac", "cql_noisy_bc"), list(MUJOCO)),
+    "table2": Table(("osr", "osr_v", "cql", "sdc"), EXPERTS, ("oos", "official")),
+    "figure4": Table(("osr", "cql", "sdc"), list(LIMITED)),
+    "d4": Table(
+        ("osr_10", "sac_10", "edac_10", "rorl"),
+        ("hopper medium-replay", "walker2d medium-replay"),
+        seeds=(0, 1), seconds=600,
+    ),
+    "methods": Table(list(METHODS), SIX, ("oos", "push", "observation_noise")),
+}  # fmt: skip
+
+
+def folder_name(data: str) -> str:
+    """Return a data set's name without spaces and signs."""
+    return re.sub(r"[^\w-]+", "-", data)
 
 
 def command(log: Path, *arguments: str) -> None:
@@ -60,23 +117,28 @@ def command(log: Path, *arguments: str) -> None:
         )  # fmt: skip
 
 
-def run(folder: Path, data: str, method: str, seed: int) -> None:
+def updates(method: str, seconds: int) -> int:
+    """Return how many updates fit into the time."""
+    ms = json.loads((HERE / "update_ms.json").read_text())["quick"][method]
+    return round(seconds / ms) * 1000
+
+
+def run(folder: Path, data: str, method: str, seed: int, seconds: int) -> None:
     """Train one run, then disturb its last policy."""
-    env, source = data.split("-", 1)
     folder.mkdir(parents=True, exist_ok=True)
     status = folder / "status.json"
     if not status.exists() or json.loads(status.read_text())["status"] != "done":
-        ms = json.loads((HERE / "update_ms.json").read_text())["quick"][method]
-        steps = round(CORE_SECONDS / ms) * 1000
+        steps = updates(method, seconds)
         command(
-            folder / "train.txt", "train", f"env={env}", f"data={source}",
-            f"seed={seed}", *METHODS[method], f"trainer.steps={steps}",
+            folder / "train.txt", "train", *DATA[data], f"seed={seed}",
+            *METHODS[method], f"trainer.steps={steps}",
             f"trainer.eval_interval={steps // 10}", "trainer.eval_episodes=5",
             f"trainer.checkpoint_interval={steps // 10}", "trainer.progress=false",
             f"hydra.run.dir={folder}",
         )  # fmt: skip
     for suite, file in SUITES.items():
-        if not (folder / file).exists():
+        shown = seconds == 120 and data in (EXPERTS if suite == "official" else SIX)
+        if shown and not (folder / file).exists():
             command(
                 folder / f"{suite}.txt", "evaluate", f"checkpoint={folder}",
                 f"suite={suite}", "episodes=4", "last=1", "progress=false",
@@ -84,51 +146,96 @@ def run(folder: Path, data: str, method: str, seed: int) -> None:
     print(folder, flush=True)
 
 
-def pack(folder: Path, to: Path) -> None:
-    """Write the tables of the finished runs."""
-    tables = read_runs([folder])
+def packed(folder: Path, suites: Sequence[str]) -> set[tuple[str, str, int, int]]:
+    """Return data, method, seed and updates of the runs that have the suites."""
+    if not (folder / "runs.csv.xz").exists():
+        return set()
+    runs = pd.read_csv(folder / "runs.csv.xz", index_col="run")
+    played = pd.read_csv(folder / "episodes.csv.xz").groupby("run")["suite"]
+    has_all = played.agg(lambda names: set(suites) <= set(names))
+    columns = ["data", "method", "seed", "updates"]
+    return set(runs.loc[has_all, columns].itertuples(index=False, name=None))
+
+
+def pack(folders: Sequence[Path], to: Path) -> None:
+    """Add finished runs to the tables; a run replaces one of the same settings."""
+    tables = read_runs(folders)
+    for folder, reason in tables.left_out:
+        print(f"{folder}: {reason}", file=sys.stderr)
     to.mkdir(parents=True, exist_ok=True)
-    runs = tables.runs.rename(columns={"steps": "updates"})
-    columns = ["data", "method", "seed", "updates", "data_score", "overrides"]
-    runs[columns].to_csv(to / "runs.csv.xz", index_label="run")
+    new = {"runs": tables.runs.rename(columns={"steps": "updates"})}
+    new["runs"] = (
+        new["runs"]
+        .rename_axis("run")
+        .reset_index()[
+            ["run", "data", "method", "seed", "updates", "data_score", "overrides"]
+        ]
+    )
     columns = ["run", "suite", "disturbance", "step", "episode", "score"]
     columns += ["disturbed_at", "recovery_steps"]
-    episodes = tables.episodes[columns].round({"score": 2})
-    episodes.to_csv(to / "episodes.csv.xz", index=False)
+    new["episodes"] = tables.episodes[columns].round({"score": 2})
     saved = tables.saved
-    saved[["half", "states"]] = saved["states"].str.split(" ", expand=True)
-    of_each = ["half", "states", "group", "disturbance", "walk"]
-    first = saved.groupby("states")["run"].transform("first") == saved["run"]
-    saved.loc[first, of_each].to_csv(to / "states.csv.xz", index=False)
-    back = saved.groupby(["run", "half", "states"], sort=False)["back"]
-    bits = back.agg(lambda rows: "".join(str(int(bit)) for bit in rows))
-    bits.reset_index().assign(checkpoints=1).to_csv(
-        to / "recoverable.csv.xz", index=False
-    )
+    if len(saved):
+        saved[["half", "states"]] = saved["states"].str.split(" ", expand=True)
+        of_each = ["half", "states", "group", "disturbance", "walk"]
+        first = saved.groupby("states")["run"].transform("first") == saved["run"]
+        new["states"] = saved.loc[first, of_each]
+        back = saved.groupby(["run", "half", "states"], sort=False)["back"]
+        bits = back.agg(lambda rows: "".join(str(int(bit)) for bit in rows))
+        new["recoverable"] = bits.reset_index().assign(checkpoints=1)
+    old = {
+        path.name.removesuffix(".csv.xz"): pd.read_csv(path, dtype={"back": str})
+        for path in to.glob("*.csv.xz")
+    }
+    if old:
+        key = ["data", "method", "seed"]
+        again = old["runs"].merge(new["runs"][key])["run"]
+        shift = old["runs"]["run"].max() + 1
+    for name, rows in new.items():
+        if name == "states" and name in old:  # a mark stands for a list of states
+            rows = rows[~rows["states"].isin(old[name]["states"])]
+            rows = pd.concat([old[name], rows])
+        elif name in old:
+            kept = old[name][~old[name]["run"].isin(again)]
+            rows = pd.concat([kept, rows.assign(run=rows["run"] + shift)])
+        rows.to_csv(to / f"{name}.csv.xz", index=False)
 
 
 def main() -> None:
     """Go through the grid seed by seed, or pack what is there."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--pack", type=Path, metavar="FOLDER", help="run nothing")
-    parser.add_argument("--data", nargs="+", default=DATA, choices=DATA)
-    parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=METHODS)
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("table", choices=TABLES)
+    parser.add_argument("--folder", type=Path, default=Path("outputs/paper"))
+    parser.add_argument("--pack", action="store_true", help="run nothing")
+    parser.add_argument("--data", nargs="+", help="such as hopper-medium")
+    parser.add_argument("--methods", nargs="+")
+    parser.add_argument("--seeds", nargs="+", type=int)
     parser.add_argument("--jobs", type=int, default=2, help="runs at once")
     options = parser.parse_args()
+    table = TABLES[options.table]
+    top, tables = options.folder / table.place, HERE / table.place
+    folders = {data: top / folder_name(data) for data in table.data}
+    names = [folder.name for folder in folders.values()]
     if options.pack:
-        pack(options.folder, options.pack)
+        pack([folder for folder in folders.values() if folder.exists()], tables)
         return
+    if unknown := {*(options.data or ())} - {*names}:
+        parser.error(f"--data has {sorted(unknown)}; expected some of {names}.")
+    done = packed(tables, table.suites)
+    grid = product(
+        options.seeds or table.seeds,
+        [data for data in table.data if folder_name(data) in (options.data or names)],
+        options.methods or table.methods,
+    )
     with ThreadPoolExecutor(options.jobs) as pool:
         jobs = [
             pool.submit(
-                run, options.folder / data / method / f"seed{seed}", data, method, seed
+                run, folders[data] / method / f"seed{seed}",
+                data, method, seed, table.seconds,
             )
-            for seed, data, method in product(
-                options.seeds, options.data, options.methods
-            )
-        ]
+            for seed, data, method in grid
+            if (data, method, seed, updates(method, table.seconds)) not in done
+        ]  # fmt: skip
         for job in jobs:
             if job.exception():
                 print(job.exception(), file=sys.stderr, flush=True)
