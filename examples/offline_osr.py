@@ -171,7 +171,6 @@ def check_scope(config: TrainConfig) -> None:
         config.loss["_target_"] not in LOSSES
         or built != [{"_target_": f"torchrl_osr.modules.{x.__name__}"} for x in ours]
         or config.recovery is not None
-        or config.perturbation.adversary is not None
         or config.dynamics.use
         or config.trainer.compile
     ):

@@ -95,5 +95,3 @@ def test_runs_of_a_sweep_are_one_policy_that_switches(folder, tmp_path, capsys):
     evaluate(*sweep, "suite=official")
     results = json.loads((tmp_path / "switching-robustness-official.json").read_text())
     assert len(results["evaluations"]) == 1
-    with pytest.raises(ValueError, match="attacks do not support switching"):
-        evaluate(*sweep, "suite=observation_attack")

@@ -100,7 +100,7 @@ def test_help_lists_the_options_of_every_group(tmp_path, run):
     names = set(re.findall(r"[\w-]+(?=[,\n])", offered))
     groups = (
         *("env", "data", "inverse_dynamics", "dynamics", "loss", "recovery"),
-        *("perturbation", "logger", "preset"),
+        *("logger", "preset"),
     )
     files = {path.stem for group in groups for path in CONF.glob(f"{group}/*.yaml")}
     assert names - {"basic"} == files | {"pool", "cluster"}

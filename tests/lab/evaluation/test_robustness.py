@@ -17,11 +17,11 @@ from torchrl_osr.lab.envs import (
     DynamicsChange,
     ExternalPush,
     ObservationNoise,
-    attacked_policy,
 )
 from torchrl_osr.lab.evaluation import (
     DataDistance,
     Disturbance,
+    deterministic_policy,
     evaluate_paired,
     summarize_disturbances,
 )
@@ -75,7 +75,7 @@ def line_results():
         shove("deadly", 20.0, 5),
         shove("late", 9.0, LIMIT - 3),
         shove("never", 6.0, LIMIT),
-        Disturbance("always", "observation", 0.0),
+        Disturbance("always", "observation", 0.0, partial(ObservationNoise, std=0.0)),
     ]
     calls = []
     results = evaluate_paired(
@@ -131,17 +131,13 @@ def play(*disturbances: Disturbance, policy, episodes: int = 4):
 
 def test_strength_zero_is_the_clean_episodes_bit_for_bit():
     actor = tanh_gaussian_actor(11, 3, num_cells=[16])
-    attack = partial(attacked_policy, actor.get_dist, None, kind="action_diff")
-    bare = attack(epsilon=0.0)
     results = play(
         Disturbance("push", "push", 0.0, partial(ExternalPush, force=0.0, duration=5)),
         Disturbance("noise", "observation", 0.0, partial(ObservationNoise, std=0.0)),
         Disturbance("heavy", "dynamics", 2.0, partial(DynamicsChange, mass=2.0)),
         # After the heavy one: nothing of it may be left.
         Disturbance("mass", "dynamics", 1.0, partial(DynamicsChange, mass=1.0)),
-        Disturbance("attack", "attack", 0.0, policy=attack(epsilon=0.0)),
-        Disturbance("attacked", "attack", 0.5, policy=attack(epsilon=0.5)),
-        policy=bare,
+        policy=deterministic_policy(actor),
     )
     levels = {each["name"]: each for each in results["levels"]}
     for name, each in levels.items():
@@ -149,7 +145,7 @@ def test_strength_zero_is_the_clean_episodes_bit_for_bit():
         assert same == (each["strength"] in (0.0, 1.0)), name
         assert each["seeds"] == results["clean"]["seeds"]
     moments = {name: each["disturbed_at"] for name, each in levels.items()}
-    assert moments["attacked"] == moments["heavy"] == [0] * 4
+    assert moments["heavy"] == [0] * 4
     assert moments["push"] == moments["noise"] == [None] * 4
 
 

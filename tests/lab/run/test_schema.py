@@ -19,8 +19,7 @@ from torchrl_osr.lab.run.config import checked
 from torchrl_osr.lab.run.schema import CHOSEN, TrainConfig, schema_of
 
 # Environments are composed below, losses in test_build.py.
-GROUPS = ("data", "inverse_dynamics", "dynamics", "recovery", "logger")
-GROUPS += ("perturbation", "preset")
+GROUPS = ("data", "inverse_dynamics", "dynamics", "recovery", "logger", "preset")
 
 
 def options(group: str) -> list[str]:

@@ -25,8 +25,7 @@ pytestmark = pytest.mark.usefixtures("own_cache")
 def folder(tmp_path_factory, own_cache):
     top = tmp_path_factory.mktemp("train")
     intervals = "trainer.eval_interval=5", "trainer.checkpoint_interval=5"
-    more = "logger=tensorboard", "perturbation=adversarial"
-    return trained(top / "run", *intervals, *more)
+    return trained(top / "run", *intervals, "logger=tensorboard")
 
 
 def test_the_last_and_the_best_policy_are_exported(folder):

@@ -24,7 +24,6 @@ from torchrl_osr.lab.envs.faults import (
     StartStateNoise,
     StickyAction,
 )
-from torchrl_osr.lab.envs.observation_attack import attacked_policy, critics_of
 from torchrl_osr.lab.envs.timed import ActionKnock, ExternalPush
 
 __all__ = [
@@ -37,6 +36,4 @@ __all__ = [
     "ObservationNoise",
     "StartStateNoise",
     "StickyAction",
-    "attacked_policy",
-    "critics_of",
 ]

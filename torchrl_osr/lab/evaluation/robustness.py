@@ -34,15 +34,13 @@ RECOVERY = ("survived_knock", "alive_after", "clean_alive_after", "recovery_step
 class Disturbance:
     """One kind of disturbance at one strength, with a name unique in its suite.
 
-    ``wrap`` puts it around an environment; an attacked ``policy`` is played instead of
-    the evaluated one. Kinds in :data:`TRANSIENT` end.
+    ``wrap`` puts it around an environment. Kinds in :data:`TRANSIENT` end.
     """
 
     name: str
     kind: str
     strength: float
-    wrap: Wrap | None = None
-    policy: Policy | None = None
+    wrap: Wrap
 
 
 def evaluate_paired(
@@ -84,9 +82,7 @@ def evaluate_paired(
         the disturbance does not end.
     """
 
-    def play(
-        policy: Policy, wrap: Wrap | None
-    ) -> tuple[dict[str, Any], list[Trajectory]]:
+    def play(wrap: Wrap | None) -> tuple[dict[str, Any], list[Trajectory]]:
         evaluator = EpisodeEvaluator(
             env_id, num_episodes=num_episodes, seed=seed, wrap=wrap, fixed_batch=True
         )
@@ -109,15 +105,13 @@ def evaluate_paired(
             raw["scores"] = references.score(results.returns).tolist()
         return raw, played
 
-    clean, undisturbed = play(policy, None)
+    clean, undisturbed = play(None)
     levels = []
     for each in disturbances:
-        results, played = play(each.policy or policy, each.wrap)
-        moments: list[int | None] = [0] * num_episodes  # an attack: in every step
-        if each.policy is None:
-            blocks = [trajectory.disturbance() for trajectory in played]
-            # A disturbance of the start state counts as step 0.
-            moments = [block and max(block[0] - 1, 0) for block in blocks]
+        results, played = play(each.wrap)
+        blocks = [trajectory.disturbance() for trajectory in played]
+        # A disturbance of the start state counts as step 0.
+        moments = [block and max(block[0] - 1, 0) for block in blocks]
         recovery: dict[str, Any] = dict.fromkeys(RECOVERY)
         if each.kind in TRANSIENT:
             pairs = zip(played, undisturbed, strict=True)

@@ -1,13 +1,11 @@
 """The losses that OSR is compared with."""
 
-from torchrl_osr.lab.losses.adversary import Adversary
 from torchrl_osr.lab.losses.cloning import BCLoss, IQLLoss
 from torchrl_osr.lab.losses.ensembles import EDACLoss, RORLLoss
 from torchrl_osr.lab.losses.state_correction import SCASLoss, StateDeviationLoss
 from torchrl_osr.lab.losses.td3 import ReBRACLoss, TD3BCLoss
 
 __all__ = [
-    "Adversary",
     "BCLoss",
     "EDACLoss",
     "IQLLoss",

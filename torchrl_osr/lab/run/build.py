@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from hydra.utils import get_class, instantiate
 from tensordict.nn import ProbabilisticTensorDictSequential
-from torchrl.modules import TanhNormal
 from torchrl.objectives import LossModule
 
 from torchrl_osr.lab.dynamics import TransitionVAE
@@ -18,7 +17,7 @@ from torchrl_osr.lab.losses import IQLLoss
 from torchrl_osr.lab.run.schema import EnvConfig, TrainConfig
 from torchrl_osr.modules import state_value
 from torchrl_osr.objectives import ActorCriticLoss, WithRecovery
-from torchrl_osr.objectives.networks import head_of, is_categorical
+from torchrl_osr.objectives.networks import is_categorical
 
 if TYPE_CHECKING:
     from torchrl_osr.lab.data import EnvironmentSpec
@@ -106,15 +105,12 @@ def make_learner(config: TrainConfig, device: torch.device | str = "cpu") -> Lea
 def _check_combination(config: TrainConfig, learner: Learner) -> None:
     """Raise a ValueError for options that would be ignored, or train nonsense."""
     dynamics, loss, name = config.dynamics, learner.loss, type(learner.loss).__name__
-    adversary, modules = config.perturbation.adversary, learner.objective.modules()
+    modules = learner.objective.modules()
     rolled_out = dynamics.use and dynamics.real_ratio < 1
     reads_data = ("next", "action") in learner.objective.in_keys
     critics = isinstance(loss, ActorCriticLoss) and hasattr(loss, "qvalue_network")
     why = ""
-    if adversary and not (critics and head_of(learner.actor)[0] is TanhNormal):
-        why = "perturbation=adversarial needs critics and a tanh-Gaussian policy, which"
-        why += f" {name} lacks"
-    elif not dynamics.use and any(hasattr(m, "dynamics_network") for m in modules):
+    if not dynamics.use and any(hasattr(m, "dynamics_network") for m in modules):
         why = f"{name} needs a model of the dynamics: choose dynamics=ensemble"
     elif rolled_out and (reads_data or isinstance(loss, IQLLoss)):
         why = f"{name} learns from actions of the data alone, which rollouts lack:"

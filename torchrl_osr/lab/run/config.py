@@ -103,6 +103,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     """Read the configuration in the folder of a run; refuse that of another version."""
     content = read_yaml(folder / CONFIG)
     found = content.pop("format", 1)
+    content.get("perturbation", {}).pop("adversary", None)  # an option of before
     if found != FORMAT:
         raise ValueError(
             f"{folder} holds a run of another version of torchrl-osr (format {found}, "

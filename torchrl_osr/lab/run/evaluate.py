@@ -17,12 +17,10 @@ import torch
 from hydra.utils import instantiate
 from numpy.typing import NDArray
 from torchrl import torchrl_logger
-from torchrl.modules import TanhNormal
 
 from torchrl_osr._files import read_json, sha256_of, write_json
 from torchrl_osr.lab.data import observation_statistics
 from torchrl_osr.lab.data.environment import environment_id
-from torchrl_osr.lab.envs import attacked_policy, critics_of
 from torchrl_osr.lab.evaluation import (
     DataDistance,
     Disturbance,
@@ -45,7 +43,6 @@ from torchrl_osr.lab.run.load import (
     run_folder_of,
 )
 from torchrl_osr.lab.run.schema import DisturbanceConfig, EvaluateConfig, SuiteConfig
-from torchrl_osr.objectives.networks import head_of, is_categorical
 from torchrl_osr.trainers.progress import progress_bar
 
 SEED_STRIDE = 1000
@@ -127,9 +124,14 @@ def play_suite(config: EvaluateConfig, players: list[Player]) -> dict[str, Any]:
     data, _ = load_data(run.env, run.data, progress=config.progress)
     distance = DataDistance(data, seed=run.data.seed)
     scale = observation_statistics(data)[1].numpy()
-    left_out = impossible(config.suite, first, scale, switching=config.switching)
-    levels = config.suite.disturbances
-    suite = {name: levels[name] for name in levels if name not in left_out}
+    suite = make_disturbances(config.suite.disturbances, scale)
+    left_out = impossible_disturbances(run.env.id, suite)
+    suite = [each for each in suite if each.name not in left_out]
+    if not suite:
+        raise ValueError(
+            f"no disturbance of suite={config.suite.name} is possible, "
+            f"{'; '.join(sorted({*left_out.values()}))}: choose another suite."
+        )
     plays = len(players) * (1 + len(suite))  # the clean episodes first
     shown = progress_bar(config.suite.name, plays, unit="play", bar=config.progress)
     evaluations = []
@@ -139,7 +141,7 @@ def play_suite(config: EvaluateConfig, players: list[Player]) -> dict[str, Any]:
             paired = evaluate_paired(
                 policy,
                 run.env.id,
-                make_disturbances(suite, trained, scale, seed=seed),
+                suite,
                 distance,
                 num_episodes=config.episodes,
                 seed=seed,
@@ -179,75 +181,20 @@ def play_states(config: EvaluateConfig, players: list[Player]) -> dict[str, Any]
 
 
 def make_disturbances(
-    configs: Mapping[str, DisturbanceConfig],
-    trained: TrainedRun,
-    scale: NDArray[np.floating],
-    *,
-    seed: int = 0,
+    configs: Mapping[str, DisturbanceConfig], scale: NDArray[np.floating]
 ) -> list[Disturbance]:
-    """Build the wrappers of a suite, and its attacks on a run's networks.
+    """Build the wrappers of a suite.
 
     ``scale``, the deviation of each observation entry in the data ``[S]``, takes the
     place of a wrapper's ``unit: data``.
     """
     made = []
     for name, config in configs.items():
-        if (config.wrap is None) == (config.attack is None):
-            raise ValueError(f"disturbance {name!r} needs either wrap or attack.")
-        wrap = policy = None
-        if config.wrap is not None:
-            wrap = instantiate(config.wrap)
-            if wrap.keywords.get("unit") == "data":
-                wrap = partial(wrap, unit=scale)
-        else:
-            policy = attacked_policy(
-                trained.actor.get_dist,
-                critics_of(trained.loss),
-                trained.observation_norm,
-                **config.attack,
-                seed=seed,
-            )
-        made.append(Disturbance(name, config.kind, config.strength, wrap, policy))
+        wrap = instantiate(config.wrap)
+        if wrap.keywords.get("unit") == "data":
+            wrap = partial(wrap, unit=scale)
+        made.append(Disturbance(name, config.kind, config.strength, wrap))
     return made
-
-
-def impossible(
-    suite: SuiteConfig,
-    trained: TrainedRun,
-    scale: NDArray[np.floating],
-    *,
-    switching: bool = False,
-) -> dict[str, str]:
-    """Return the disturbances that environment or policy rule out, and why, by name."""
-    configs, left_out = suite.disturbances, dict[str, str]()
-    for name, config in configs.items():
-        if config.attack is not None:
-            why = _obstacle(config.attack["kind"], trained, switching)
-            left_out |= {name: why} if why else {}
-    others = {name: configs[name] for name in configs if name not in left_out}
-    made = make_disturbances(others, trained, scale)
-    left_out |= impossible_disturbances(trained.config.env.id, made)
-    if len(left_out) == len(configs):
-        raise ValueError(
-            f"no disturbance of suite={suite.name} is possible, "
-            f"{'; '.join(sorted(set(left_out.values())))}: choose another suite."
-        )
-    return left_out
-
-
-def _obstacle(kind: str, trained: TrainedRun, switching: bool) -> str:
-    """Return why a policy cannot be attacked, or nothing."""
-    if switching:
-        return "attacks do not support switching policies"
-    if not trained.config.data.standardize:
-        return "attacks need data.standardize=true"
-    if is_categorical(trained.actor):
-        return "attacks need real actions"
-    if kind == "min_Q" and not hasattr(trained.loss, "qvalue_network"):
-        return "min_Q needs critics"
-    if kind == "action_diff" and head_of(trained.actor)[0] is not TanhNormal:
-        return "action_diff needs a tanh-Gaussian policy"
-    return ""
 
 
 def _requested(

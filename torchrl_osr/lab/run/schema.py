@@ -10,7 +10,7 @@ import functools
 import inspect
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field, is_dataclass, make_dataclass
+from dataclasses import dataclass, field, make_dataclass
 from pathlib import Path
 from types import NoneType
 from typing import Any, get_args, get_type_hints
@@ -29,7 +29,7 @@ CHOSEN = {
     for name in package.__all__
     if name not in ("ActorCriticLoss", "WithRecovery")
 }
-"""Classes that a configuration can name: the losses, and the adversary."""
+"""Losses that a configuration can name."""
 
 
 @dataclass
@@ -100,7 +100,6 @@ class PerturbationConfig:
     """Noise of the mixed data set, see StatePerturbation."""
 
     std: float = MISSING  # width of the noise, in deviations of the data
-    adversary: Any = None  # options of Adversary, which perturbs the policy's states
 
 
 @dataclass
@@ -209,12 +208,11 @@ class CollectConfig:
 
 @dataclass
 class DisturbanceConfig:
-    """One kind of disturbance at one strength: either a wrapper or an attack."""
+    """One kind of disturbance at one strength."""
 
     kind: str = MISSING  # knock, push and start end; others last the whole episode
     strength: float = MISSING  # a number, in the unit of the suite
-    wrap: Any = None  # wrapper of lab.envs, with _target_ and _partial_
-    attack: Any = None  # options of attacked_policy
+    wrap: Any = MISSING  # wrapper of lab.envs, with _target_ and _partial_
 
 
 @dataclass
@@ -253,7 +251,7 @@ class EvaluateConfig:
 
 
 def schema_of(target: type) -> type:
-    """Return a dataclass of the options of a loss, or of the adversary.
+    """Return a dataclass of the options of a loss.
 
     Its fields are the keyword-only parameters of the class, and of the bases that its
     ``**options`` reach.
@@ -270,9 +268,8 @@ def schema_of(target: type) -> type:
         hints = get_type_hints(vars(each)["__init__"])
         for name, parameter in parameters.items():
             # Not a Python object, nor what every loss refuses.
-            if name not in ("action_spec", "gamma") and (
-                parameter.kind is parameter.KEYWORD_ONLY or is_dataclass(target)
-            ):
+            keyword = parameter.kind is parameter.KEYWORD_ONLY
+            if keyword and name not in ("action_spec", "gamma"):
                 option = name, _config_type(hints[name]), parameter.default
                 options.setdefault(name, option)
         if not any(each.kind is each.VAR_KEYWORD for each in parameters.values()):

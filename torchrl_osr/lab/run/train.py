@@ -201,9 +201,6 @@ class Phases:
         ]
         if hasattr(loss, "decay_uncertainty"):
             hooks.append(("post_optim", loss.decay_uncertainty))
-        if config.perturbation.adversary is not None:
-            attack = instantiate(config.perturbation.adversary)
-            hooks.append(("process_optim_batch", partial(attack, loss)))
         if rollouts is not None:
             components["rollouts"] = rollouts
             hooks.append(("post_steps", lambda: _log_rollouts(trainer, rollouts)))
