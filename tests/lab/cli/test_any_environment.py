@@ -13,7 +13,6 @@ import pytest
 from composed import composed
 from composed import trained as trained_on
 from gymnasium.envs.classic_control import PendulumEnv
-from gymnasium.spaces import Box
 
 from torchrl_osr.lab.cli import collect, evaluate
 from torchrl_osr.lab.data import environment_spec
@@ -153,27 +152,42 @@ def test_evaluations_that_fail_are_told_when_the_policy_is_saved(tmp_path):
     assert load_run_policy(run).record["source"]["step"] == 20
 
 
-class Machine(gymnasium.Env):
-    """The pendulum's spaces, and nothing to play."""
-
-    observation_space = Box(-np.inf, np.inf, (3,))
-    action_space = Box(-2, 2, (1,))
-
-
 def test_without_a_simulator_a_log_still_makes_a_policy(tmp_path, capsys):
-    gymnasium.register("Machine-v0", Machine)
-    log, machine = tmp_path / "log.npz", "env.id=Machine-v0"
-    record(log, "env.id=Pendulum-v1", "episodes=3")
-    run = trained(tmp_path / "run", machine, f"data.path={log}")
-    assert "Machine-v0 has no simulator to play in" in capsys.readouterr().out
+    record(log := tmp_path / "log.npz", "env.id=Pendulum-v1", "episodes=3")
+    with np.load(log) as columns:
+        action = columns["action"]
+    given = "env=none", f"data.path={log}"
+    run = trained(tmp_path / "run", *given)
+    assert "the policy is trained, and was never played" in capsys.readouterr().out
     assert (run / "curve.png").exists()
     assert json.loads((run / "returns.json").read_text())["evaluations"] == []
-    action = load_run_policy(run).act(np.zeros((2, 3), np.float32))
-    assert action.shape == (2, 1)
-    assert (abs(action) < 2).all()
-    for play in (partial(disturbed, run), partial(record, tmp_path / "x.npz", machine)):
-        with pytest.raises(RuntimeError, match="^Machine-v0 has no simulator"):
-            play()
+    env = read_run(run).env
+    margin = 0.05 * np.ptp(action)
+    assert env.action_low == pytest.approx([action.min() - margin])
+    assert env.action_high == pytest.approx([action.max() + margin])
+    trained(run, *given, "trainer.steps=20")
+    log.unlink()  # from here on the run is enough
+    policy = load_run_policy(run)
+    assert (policy.low, policy.high) == (*env.action_low, *env.action_high)
+    assert policy.act(np.zeros((2, 3), np.float32)).shape == (2, 1)
+    with pytest.raises(ValueError, match=r"^log-log has no simulator \(env=none\)"):
+        disturbed(run)
+    with pytest.raises(ValueError, match=r"env\.id is not given"):
+        record(tmp_path / "x.npz", "env=none")
+
+
+def test_without_a_simulator_bounds_and_discrete_actions_may_be_given(tmp_path):
+    record(log := tmp_path / "real.npz", "env.id=Pendulum-v1", "episodes=3")
+    given = "env=none", f"data.path={log}", "data.action_bounds=[-3,2.5]", "loss=td3_bc"
+    env = read_run(trained(tmp_path / "real", *given)).env
+    assert (env.action_low, env.action_high, env.name) == ([-3], [2.5], "log-real")
+    record(log := tmp_path / "whole.npz", "env.id=CartPole-v1", "episodes=3")
+    given = "env=none", f"data.path={log}", "loss=discrete_osr"
+    with pytest.raises(ValueError, match=r"give their number .*env\.action_size="):
+        trained(tmp_path / "whole", *given)
+    run = trained(tmp_path / "whole", *given, "env.action_size=2")
+    trained(run, *given, "env.action_size=2", "trainer.steps=20")
+    assert load_run_policy(run).act(np.zeros(4)) in (0, 1)
 
 
 @pytest.mark.parametrize(

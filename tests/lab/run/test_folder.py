@@ -38,7 +38,7 @@ def test_a_new_run_is_named_checked_and_done(tmp_path):
     folder = tmp_path / "run"
     with opened(folder, "loss=cql", "recovery=none", "seed=3") as run:
         assert status(folder)["status"] == "running"
-        assert (run.method, run.folder, run.simulated) == ("cql", folder, True)
+        assert (run.method, run.folder) == ("cql", folder)
         assert run.config.env.observation_size == 11
         assert run.config.env.action_high == [1.0, 1.0, 1.0]
     assert status(folder) == {"status": "done"}

@@ -46,7 +46,7 @@ def test_every_experiment_sweeps_over_values_that_compose(name):
 
 def test_groups_name_what_the_package_has():
     assert options("data") == sorted([*BEHAVIORS, *MAZE_SOURCES, *RECORDED])
-    assert options("env") == sorted([*load_behavior_card(), *MAZE_IDS])
+    assert options("env") == sorted([*load_behavior_card(), *MAZE_IDS, "none"])
     ids = MAZE_IDS | {name: card["env"] for name, card in load_behavior_card().items()}
     for name, env_id in ids.items():
         env = checked(composed("train", f"env={name}")).env

@@ -20,7 +20,7 @@ from gymnasium.spaces import Discrete
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_osr.lab.cli.console import single_job
-from torchrl_osr.lab.data.environment import check_simulated, open_environment
+from torchrl_osr.lab.data.environment import open_environment
 from torchrl_osr.lab.data.record import (
     Act,
     check_log_path,
@@ -42,7 +42,7 @@ def main(cfg: DictConfig) -> None:
     torch.set_num_threads(1)
     path = Path(cfg.path).expanduser()
     check_log_path(path)
-    env_id = None if OmegaConf.is_missing(cfg.env, "id") else str(cfg.env.id)
+    env_id = None if OmegaConf.is_missing(cfg.env, "id") else cfg.env.id
     act: Act | None = None
     if ":" in cfg.policy:
         act = resolve_name(cfg.policy)
@@ -56,7 +56,6 @@ def main(cfg: DictConfig) -> None:
     if env_id is None:
         raise ValueError("env.id is not given: name the environment to play.")
     with closing(open_environment(env_id)) as env:
-        check_simulated(env, env_id)
         loss = "loss=discrete_osr " if isinstance(env.action_space, Discrete) else ""
         options = {name: cfg[name] for name in ("noise", "seed", "progress")}
         columns = record_episodes(env, act, cfg.episodes, **options)

@@ -52,7 +52,7 @@ def main(cfg: DictConfig) -> None:
     columns = recorded_columns(data, manifest)
     entries = describe_entries(columns)
     wrong = [*findings(data, manifest, entries)]
-    if env is not None:
+    if env is not None and env.id is not None:
         with closing(make_environment(env.id)) as made:
             space: Any = made.observation_space
         wrong += out_of_space(entries, space.low.tolist(), space.high.tolist())

@@ -60,7 +60,6 @@ class EnvironmentSpec(NamedTuple):
     action_size: int
     action_low: list[float] | None
     action_high: list[float] | None
-    simulated: bool
 
     @property
     def discrete(self) -> bool:
@@ -73,22 +72,10 @@ def environment_spec(env_id: str) -> EnvironmentSpec:
     with closing(open_environment(env_id)) as env:
         size = spaces.flatdim(env.observation_space)
         actions: Any = env.action_space
-        simulated = is_simulated(env)
         if isinstance(actions, spaces.Discrete):
-            return EnvironmentSpec(size, int(actions.n), None, None, simulated)
+            return EnvironmentSpec(size, int(actions.n), None, None)
         low, high = actions.low.tolist(), actions.high.tolist()
-        return EnvironmentSpec(size, len(low), low, high, simulated)
-
-
-def is_simulated(env: gymnasium.Env[Any, Any]) -> bool:
-    """Return whether an environment can be played."""
-    return type(env.unwrapped).step is not gymnasium.Env.step
-
-
-def check_simulated(env: gymnasium.Env[Any, Any], env_id: str) -> None:
-    """Raise a RuntimeError unless an environment can be played."""
-    if not is_simulated(env):
-        raise RuntimeError(f"{env_id} has no simulator: its class has no step.")
+        return EnvironmentSpec(size, len(low), low, high)
 
 
 def make_environment(env_id: str) -> gymnasium.Env[Any, Any]:

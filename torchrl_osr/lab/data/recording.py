@@ -9,7 +9,7 @@ import hashlib
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +48,9 @@ WARNINGS = {
 # A bound may be exceeded by float32 arithmetic, not by an unclipped policy.
 ROUNDING = 1e-5
 
+MARGIN = 0.05
+"""Between the log's largest actions and their bounds, where none are given."""
+
 
 @dataclass(frozen=True)
 class Reading:
@@ -61,10 +64,8 @@ class Reading:
     def __post_init__(self) -> None:
         check_choice("data.missing", self.missing, ("error", "row", "episode"))
         bounds = self.action_bounds
-        if (
-            bounds is not None
-            and len(bounds if hasattr(bounds, "__len__") else ()) != 2
-        ):
+        listed = hasattr(bounds, "__len__") and bounds != "log"
+        if bounds not in (None, "log") and len(bounds if listed else ()) != 2:
             raise ValueError(
                 f"data.action_bounds={bounds}; expected [lowest, highest]."
             )
@@ -88,6 +89,8 @@ class Recording:
 
     def load(self, *, on_disk: bool = False) -> Dataset:
         """Return transitions ``[N]`` and manifest; on disk, convert in parts."""
+        if self.options.action_bounds == "log":
+            self.options = replace(self.options, action_bounds=self._range())
         bounds = [
             np.asarray(b, np.float64).tolist() for b in self.options.action_bounds
         ]
@@ -114,6 +117,20 @@ class Recording:
         for warning in manifest["warnings"]:
             torchrl_logger.warning(warning)
         return data, manifest
+
+    def _range(self) -> list[list[float]]:
+        """Return the log's lowest and highest actions, with :data:`MARGIN`."""
+        actions = [np.asarray(part["action"], np.float64) for part in self.parts()]
+        low = np.min([np.nanmin(each, 0) for each in actions], 0)
+        high = np.max([np.nanmax(each, 0) for each in actions], 0)
+        slack = MARGIN * (high - low)
+        bounds = [(low - slack).tolist(), (high + slack).tolist()]
+        low, high = ("[" + ", ".join(f"{x:.4g}" for x in each) + "]" for each in bounds)
+        self._warnings[
+            f"The bounds of the actions are {low} and {high}, the range of the log and "
+            f"{MARGIN:.0%} on either side: data.action_bounds=[low,high] sets others."
+        ] = None
+        return bounds
 
     def _transitions(self) -> Iterator[TensorDict]:
         kept = 0
@@ -404,7 +421,8 @@ def _unit_actions(action: Array, options: Reading) -> tuple[Array, int]:
         raise ValueError(
             f"'action' holds only the whole numbers {action.min():g} to "
             f"{action.max():g}, which look like discrete actions: name the environment "
-            "(env.id=...), or give the bounds of forces (data.action_bounds=[0,high])."
+            "(env.id=...), give their number (env=none env.action_size=...), or the "
+            "bounds of forces (data.action_bounds=[0,high])."
         )
     unit = action
     # Bounds of -1 and 1 leave the numbers as they are, bit by bit.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from tensordict import TensorDict
@@ -49,7 +49,8 @@ def load_dataset(
     references: ReferenceReturns | None = None,
     path: str | Path | Sequence[str] | None = None,
     columns: Mapping[str, Any] | None = None,
-    action_bounds: ActionBounds | None = None,
+    action_bounds: ActionBounds | Literal["log"] | None = None,
+    num_actions: int | None = None,
     clip_actions: bool = False,
     missing: str = "error",
     download: bool = False,
@@ -78,7 +79,9 @@ def load_dataset(
         columns: of a ``"file"``, names, patterns or lists of columns by their part,
             see ``docs/your_data.md``. Default: the usual names.
         action_bounds: lowest and highest action of the recording. Default: of
-            ``"minari"`` its action space; otherwise the task's own bounds.
+            ``"minari"`` its action space; otherwise the task's own bounds. ``"log"``:
+            those of a ``"file"`` itself and 5 % of their distance on either side.
+        num_actions: number of discrete actions. Default: the task's, if it has any.
         clip_actions, missing: see
             :func:`~torchrl_osr.lab.data.transitions_from_columns`.
         download: fetch the Minari set of that name.
@@ -113,7 +116,7 @@ def load_dataset(
             data, manifest = load_memmap(path)
             checksum = manifest["rows_sha256"]
         else:
-            recording = _opened(source, path, spec, log, progress)
+            recording = _opened(source, path, spec, num_actions, log, progress)
             data, manifest = recording.load(on_disk=on_disk)
             checksum = manifest.get("checksum")  # not in an older cache
     else:
@@ -208,6 +211,7 @@ def _opened(
     source: str,
     path: str | Path | Sequence[str],
     spec: EnvironmentSpec | None,
+    number: int | None,
     log: Mapping[str, Any],
     progress: bool,
 ) -> Recording:
@@ -215,13 +219,14 @@ def _opened(
 
     A reader is a function that returns a :class:`Recording`.
     """
-    bounds, number = log["action_bounds"], None
+    bounds = log["action_bounds"]
     if source != "file":
         _refuse({"columns": log["columns"]}, f"data={source}")
     if spec is not None and spec.discrete:
+        number = spec.action_size
+    if number is not None:
         useless = {"action_bounds": bounds, "clip_actions": log["clip_actions"]}
         _refuse(useless, "discrete actions")
-        number = spec.action_size
     if bounds is None and source != "minari":
         bounds = -1.0, 1.0
         if spec is not None and spec.action_low and spec.action_high:

@@ -23,7 +23,7 @@ class ModelData:
     scale: Tensor
     reward_scale: float  # factor of the task's own rewards
     gamma: float  # discount factor
-    env_id: str
+    env_id: str | None
     seed: int
 
     def buffer(self, batch_size: int | None = None) -> ReplayBuffer:
@@ -76,13 +76,13 @@ class DynamicsOptions:
         return DynamicsEnsemble(observation_size, action_size, **options)
 
     def termination(
-        self, env_id: str, loc: Tensor | float = 0.0, scale: Tensor | float = 1.0
+        self, env_id: str | None, loc: Tensor | float = 0.0, scale: Tensor | float = 1.0
     ) -> Termination:
         """Return the rule that ends rollouts, for states ``(s - loc) / scale``."""
         rule = never if self.terminations == "never" else termination(env_id)
         return lambda state: rule(state * scale + loc)
 
-    def check(self, env_id: str, *, batch_size: int, gamma: float) -> None:
+    def check(self, env_id: str | None, *, batch_size: int, gamma: float) -> None:
         """Raise a ValueError if the options contradict each other or the task."""
         for name, known in (
             ("terminations", ("auto", "never")),

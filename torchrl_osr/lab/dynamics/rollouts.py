@@ -46,13 +46,14 @@ def walker2d(observation: Tensor) -> Tensor:
 RULES = {"HalfCheetah": never, "Hopper": hopper, "Walker2d": walker2d}
 
 
-def termination(env_id: str) -> Termination:
+def termination(env_id: str | None) -> Termination:
     """Return the rule by which a Gymnasium task ends, time limits apart."""
-    found = re.fullmatch(r"(\w+)-v[2-5]", env_id)
+    found = re.fullmatch(r"(\w+)-v[2-5]", env_id or "")
     if found is None or found[1] not in RULES:
         raise ValueError(
-            f"The package has no end rule of {env_id}, only of {', '.join(RULES)}. If "
-            "only a time limit ends it, set dynamics.terminations=never."
+            f"The package has no end rule of {env_id or 'a log'}, only of "
+            f"{', '.join(RULES)}. If only a time limit ends it, set "
+            "dynamics.terminations=never."
         )
     return RULES[found[1]]
 

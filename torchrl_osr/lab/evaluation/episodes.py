@@ -19,7 +19,7 @@ from torchrl.envs import ObservationNorm
 
 from torchrl_osr._checks import check_positive
 from torchrl_osr.lab.data import ReferenceReturns
-from torchrl_osr.lab.data.environment import check_simulated, make_environment
+from torchrl_osr.lab.data.environment import make_environment
 from torchrl_osr.lab.evaluation.statistics import mean_interval
 from torchrl_osr.objectives.networks import ONE_HOT
 
@@ -110,7 +110,6 @@ class EpisodeEvaluator:
     ) -> None:
         check_positive("num_episodes", num_episodes, minimum=1)
         self.environments = [make_environment(env_id) for _ in range(num_episodes)]
-        check_simulated(self.environments[0], env_id)
         if wrap is not None:
             self.environments = [wrap(each) for each in self.environments]
         self.seeds = seed + np.arange(num_episodes)

@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from torchrl_osr.lab.data import EnvironmentSpec
 
 
+SIZES = ("action_low", "action_high", "observation_size", "action_size")
+"""Settings that are read from the environment or the log."""
+
+
 class Learner(NamedTuple):
     """A policy's loss and the networks in it."""
 
@@ -48,11 +52,11 @@ def make_learner(config: TrainConfig, device: torch.device | str = "cpu") -> Lea
     sizes = env.observation_size, env.action_size
     layer_norm = config.network.layer_norm
     actor = instantiate(config.network.actor, *sizes, num_cells=cells).to(device)
-    if is_categorical(actor) != (env.action_low is None):
+    kind, other = ("discrete", "discrete_osr") if env.discrete else ("real", "osr")
+    if is_categorical(actor) != env.discrete:
         raise ValueError(
-            f"{env.id} has {'discrete' if env.action_low is None else 'real'} actions, "
-            f"and {config.loss['_target_']} is for others: choose "
-            f"loss={'discrete_osr' if env.action_low is None else 'osr'}, for example."
+            f"{env.id or env.name} has {kind} actions, and {config.loss['_target_']} "
+            f"is for others: choose loss={other}, for example."
         )
     critics = instantiate(
         config.network.critic,
@@ -131,8 +135,12 @@ def read_environment(env: EnvConfig) -> EnvironmentSpec:
     """
     from torchrl_osr.lab.data import environment_spec  # needs Gymnasium
 
+    if env.id is None:
+        raise ValueError(
+            f"{env.name} has no simulator (env=none): nothing can be played there."
+        )
     spec = environment_spec(env.id)
-    for name in ("action_low", "action_high", "observation_size", "action_size"):
+    for name in SIZES:
         given, found = getattr(env, name), getattr(spec, name)
         if given is not None and given != found:
             raise ValueError(
@@ -168,5 +176,5 @@ def try_out(env_id: str) -> None:
         except Exception as error:
             raise RuntimeError(
                 f"{env_id} cannot be played: step {step} ended with "
-                f"{type(error).__name__}: {error}"
+                f"{type(error).__name__}: {error}. Without a simulator, use env=none."
             ) from error

@@ -160,9 +160,9 @@ def check_targets(config: Mapping[str, Any], trust: Sequence[str] = ()) -> None:
             )
 
 
-def check_environment(env_id: str, trust: Sequence[str] = ()) -> None:
+def check_environment(env_id: str | None, trust: Sequence[str] = ()) -> None:
     """Refuse an id as ``"module:Name-v0"``, which Gymnasium imports, without trust."""
-    module = env_id.rpartition(":")[0]
+    module = (env_id or "").rpartition(":")[0]
     if module and module not in trust:
         raise ValueError(
             f"env.id={env_id} imports a module: allow it with trust=[{module}] if you "

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
@@ -28,6 +29,7 @@ from torchrl_osr.lab.data.rows import (
     next_action,
     split_held_out,
 )
+from torchrl_osr.lab.data.store import is_memmap_folder
 from torchrl_osr.lab.run.config import read_columns
 from torchrl_osr.lab.run.schema import DataConfig, EnvConfig, TrainConfig
 
@@ -58,10 +60,13 @@ def load_data(
 ) -> tuple[TensorDict, dict[str, Any]]:
     """Load data set and manifest; rewards are the task's own.
 
-    Without a task, recorded data are not compared with it. A ValueError reports data
-    that have changed since the run began.
+    Without a task, recorded data are not compared with it. Without a simulator, the
+    actions' bounds are those of the options, of the run, or else of the log. A
+    ValueError reports data that have changed since the run began.
     """
     from torchrl_osr.lab.data import load_dataset  # needs Gymnasium; networks do not
+
+    converted = isinstance(options.path, str) and is_memmap_folder(options.path)
 
     reading = asdict(options)
     reading["columns"] = read_columns(reading["columns"])
@@ -70,6 +75,11 @@ def load_data(
     if env is not None:
         reading |= {"env_name": env.name, "env_id": env.id}
         reading["references"] = references_of(env)
+        if env.id is None and env.discrete:
+            reading["num_actions"] = env.action_size
+        elif env.id is None and options.source == "file" and not converted:
+            known = env.action_low and (env.action_low, env.action_high)
+            reading["action_bounds"] = known or options.action_bounds or "log"
     on_disk = options.storage == "disk"
     data, manifest = load_dataset(**reading, on_disk=on_disk, progress=progress)
     if options.checksum not in (None, manifest["checksum"]):
@@ -80,6 +90,18 @@ def load_data(
             "new ones with 'train resume=<its folder> force=true'."
         )
     return data, manifest
+
+
+def read_log(config: TrainConfig) -> None:
+    """Set sizes and action bounds of a configuration without a simulator."""
+    env = config.env
+    data, manifest = load_data(env, config.data, progress=config.trainer.progress)
+    env.observation_size = data["observation"].shape[-1]
+    env.action_size = data["action"].shape[-1]
+    if manifest.get("num_actions") is None:
+        low, high = manifest.get("action_bounds") or (-1.0, 1.0)
+        env.action_low = np.broadcast_to(low, env.action_size).tolist()
+        env.action_high = np.broadcast_to(high, env.action_size).tolist()
 
 
 @torch.random.fork_rng(devices=[])

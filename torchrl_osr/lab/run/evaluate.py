@@ -140,7 +140,7 @@ def play_suite(config: EvaluateConfig, players: list[Player]) -> dict[str, Any]:
             seed = config.seed + SEED_STRIDE * number
             paired = evaluate_paired(
                 policy,
-                run.env.id,
+                str(run.env.id),
                 suite,
                 distance,
                 num_episodes=config.episodes,

@@ -21,7 +21,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import Container, DictConfig, ListConfig, OmegaConf
 
 from torchrl_osr._files import read_json, write_atomically, write_json
-from torchrl_osr.lab.run.build import read_environment
+from torchrl_osr.lab.run.build import SIZES, read_environment
 from torchrl_osr.lab.run.config import (
     CONFIG,
     check_environment,
@@ -31,6 +31,7 @@ from torchrl_osr.lab.run.config import (
     read_run,
     write_config,
 )
+from torchrl_osr.lab.run.data import read_log
 from torchrl_osr.lab.run.schema import TrainConfig, method_name
 from torchrl_osr.trainers import Interrupted
 from torchrl_osr.trainers.interruption import (
@@ -60,7 +61,6 @@ class Run(NamedTuple):
 
     config: TrainConfig  # checked, with the sizes of its environment
     folder: Path
-    simulated: bool  # whether its environment can be played
     method: str
 
 
@@ -85,13 +85,19 @@ def open_run(
             check_environment(cfg.env.id, trust)
         cfg.data.path = _absolute(cfg.data.path)
         config = checked(cfg, trust)
-        spec = read_environment(config.env)
         new, known = not (folder / CONFIG).exists(), config.data
+        if config.env.id is not None:
+            read_environment(config.env)
+        elif new:
+            read_log(config)
         if new:
             (folder / HYDRA).parent.mkdir(exist_ok=True)
             write_atomically(folder / HYDRA, OmegaConf.to_yaml({"hydra": job}))
         else:
             known = (run := read_run(folder, trust)).data
+            if config.env.id is None:
+                for name in SIZES:
+                    setattr(config.env, name, getattr(run.env, name))
             config.data.checksum = None if config.force else known.checksum
             _check_same(run, config, folder)
         # Last: it makes the folder that of a run. A new place of the data is kept once
@@ -102,7 +108,7 @@ def open_run(
         method = method_name(choices.loss, choices.get("recovery"))
         with _status(folder):
             try:
-                yield Run(config, folder, spec.simulated, method)
+                yield Run(config, folder, method)
             except Exception:
                 if new and not (folder / "checkpoint").exists():  # nothing was trained
                     (folder / CONFIG).unlink()

@@ -123,7 +123,7 @@ def policy_of(run: TrainedRun) -> Policy:
         low=-1.0 if low is None else low,
         high=1.0 if high is None else high,
         source={
-            "env_id": config.env.id,
+            "env_id": config.env.id or config.env.name,
             "step": run.step,
             "checkpoint": run.path.name,
             "seed": config.seed,

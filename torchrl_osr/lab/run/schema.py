@@ -36,15 +36,21 @@ CHOSEN = {
 class EnvConfig:
     """The task."""
 
-    id: str = MISSING  # Gymnasium id; package:Name-v0 imports the package first
+    # Gymnasium id; package:Name-v0 imports the package first; null: no simulator
+    id: str | None = MISSING
     name: str = "${environment_name:${env.id}}"  # short name of the task
     random_return: float | None = None  # mean return of a random policy
     expert_return: float | None = None  # mean return of an expert; null: raw returns
-    # Read from the environment and kept with the run.
+    # Read from the environment or the log, and kept with the run.
     action_low: list[float] | None = None  # lowest actions; null: discrete
     action_high: list[float] | None = None  # highest actions; null: discrete
     observation_size: int | None = None  # number of observation entries
     action_size: int | None = None  # number of action entries, or of discrete actions
+
+    @property
+    def discrete(self) -> bool:
+        """Whether an action is one of ``action_size``; needs the sizes."""
+        return self.action_size is not None and self.action_low is None
 
 
 @dataclass
@@ -295,6 +301,8 @@ def register() -> None:
         store.store(group="schema", name=name, node=schema_of(chosen))
     resolvers: dict[str, Callable[..., Any]] = {
         "environment_name": _environment_name,
+        # Never that of a task, which has settings and scores.
+        "log_name": lambda path: "log-" + re.sub(r"\W+", "-", Path(str(path)).stem),
         "run_dir": _run_dir,
         "method_name": method_name,
         "by_data": by_data,

@@ -76,7 +76,7 @@ class Phases:
         # Before the data are made: a wrong option costs no time.
         torch.manual_seed(config.seed)
         self.learner = make_learner(config, device)
-        if run.simulated:
+        if config.env.id is not None:
             try_out(config.env.id)
         self.options = trainer_options(run)
         # Transitions with standardised states. Each batch gets a perturbed state for
@@ -327,12 +327,13 @@ def evaluation(
     run: Run, norm: ObservationNorm, average: AveragedModel
 ) -> Iterator[Evaluation | None]:
     """Open the episodes that evaluate the averaged policy; ``None``: no simulator."""
-    if not run.simulated:
+    env = run.config.env
+    if env.id is None:
         yield None
         return
-    references = references_of(run.config.env)
+    references = references_of(env)
     episodes = EpisodeEvaluator(
-        run.config.env.id,
+        env.id,
         num_episodes=run.config.trainer.eval_episodes,
         seed=EVALUATION_SEED,
         device=run.config.trainer.device,
@@ -391,7 +392,7 @@ def report(run: Run, data_mean: float | None, trainer: OfflineTrainer) -> float:
             logger.experiment.log({"curve": wandb.Image(str(folder / "curve.png"))})
             logger.experiment.finish()
     if not history:
-        print(f"\n{name}, in {folder}: {config.env.id} has no simulator to play in")
+        print(f"\n{name}, in {folder}: the policy is trained, and was never played")
         return math.nan
     print("\n" + score_table(name, history, rows["best"], data_mean, folder))
     if failed := [f"step {n}: {e}" for n, e in trainer.failed_evaluations.items()]:
