@@ -125,7 +125,7 @@ def play_suite(config: EvaluateConfig, players: list[Player]) -> dict[str, Any]:
     distance = DataDistance(data, seed=run.data.seed)
     scale = observation_statistics(data)[1].numpy()
     suite = make_disturbances(config.suite.disturbances, scale)
-    left_out = impossible_disturbances(run.env.id, suite)
+    left_out = impossible_disturbances(str(run.env.id), suite)
     suite = [each for each in suite if each.name not in left_out]
     if not suite:
         raise ValueError(
