@@ -173,7 +173,7 @@ def test_a_d4rl_file_without_ends_names_another_way(tmp_path):
         save(tmp_path / "hopper.hdf5", columns | {"ends": columns.pop("timeouts")})
     )
     with pytest.raises(
-        ValueError, match=r"truncated .*as in data=file data\.columns\.tr"
+        ValueError, match=r"truncated .*name it with data\.columns\.tr"
     ):
         load_dataset("hopper", "d4rl", path=path)
     assert len(load_dataset(path=path, columns={"truncated": "ends"})[0]) == 300

@@ -39,7 +39,8 @@ def recorded_columns(data: TensorDict, manifest: Mapping[str, Any]) -> pd.DataFr
     }
     frames = {}
     for part, table in parts.items():
-        names = manifest.get("columns", {}).get(part, ())
+        read, entries = manifest.get("columns", {}), manifest.get("entry_names", {})
+        names = [n for each in read.get(part, ()) for n in entries.get(each) or [each]]
         if len(names) != table.shape[1]:
             numbered = [f"{part}[{entry}]" for entry in range(table.shape[1])]
             names = [part] if part == "reward" else numbered

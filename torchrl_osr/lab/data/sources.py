@@ -34,7 +34,7 @@ from torchrl_osr.lab.data.store import (
     load_or_write,
 )
 
-RECORDED = ("minari", "d4rl", "file")
+RECORDED = ("minari", "d4rl", "lerobot", "file")
 """Sources that are recorded; the others are rolled out."""
 
 # Raise it whenever the rollouts change: older sets are then collected again.
@@ -67,7 +67,8 @@ def load_dataset(
     Args:
         env_name: short name of the task, ``"hopper"``; not needed for recorded data.
         source: behaviour policy, such as ``"medium-replay"``; in a maze ``"diverse"``
-            or ``"play"``. Recorded data: ``"minari"``, ``"d4rl"`` or ``"file"``.
+            or ``"play"``. Recorded data: ``"minari"``, ``"d4rl"``, ``"lerobot"`` or
+            ``"file"``.
 
     Keyword Args:
         env_id: Gymnasium id of the task. The actions of a ``"file"`` are then in its
@@ -75,9 +76,10 @@ def load_dataset(
             and 1, not compared.
         references: scale of the scores. Default: D4RL's, if there are any.
         path: file of a log, a list or a pattern of files, or a folder of
-            :func:`~torchrl_osr.lab.data.write_memmap`; name or folder of a Minari set.
-        columns: of a ``"file"``, names, patterns or lists of columns by their part,
-            see ``docs/your_data.md``. Default: the usual names.
+            :func:`~torchrl_osr.lab.data.write_memmap`; name or folder of a Minari set;
+            folder of a LeRobot set.
+        columns: of a ``"file"`` or ``"lerobot"``, names, patterns or lists of columns
+            by their part, see ``docs/your_data.md``. Default: the usual names.
         action_bounds: lowest and highest action of the recording. Default: of
             ``"minari"`` its action space; otherwise the task's own bounds. ``"log"``:
             those of a ``"file"`` itself and 5 % of their distance on either side.
@@ -220,7 +222,7 @@ def _opened(
     A reader is a function that returns a :class:`Recording`.
     """
     bounds = log["action_bounds"]
-    if source != "file":
+    if source not in ("file", "lerobot"):
         _refuse({"columns": log["columns"]}, f"data={source}")
     if spec is not None and spec.discrete:
         number = spec.action_size
@@ -238,9 +240,12 @@ def _opened(
         from torchrl_osr.lab.data.minari import open_minari
 
         return open_minari(path, options, download=log["download"], progress=progress)
+    from torchrl_osr.lab.data.lerobot import open_lerobot
     from torchrl_osr.lab.data.table import open_log
 
     _refuse({"download": log["download"]}, f"data={source}")
+    if source == "lerobot":
+        return open_lerobot(path, log["columns"], options)
     d4rl = {"observation": "observations"}  # others have their usual names
     return open_log(path, d4rl if source == "d4rl" else log["columns"], options, source)
 

@@ -107,9 +107,15 @@ def _read(path: Path, chosen: Callable[..., list[str]]) -> Arrays:
             return {name: np.asarray(file[name]) for name in chosen(names)}
     if path.suffix == ".parquet":
         with needed_by("Parquet files need", "minari"):
-            from pyarrow import parquet
-        names = chosen(parquet.read_schema(path).names)
-        frame = pd.read_parquet(path, columns=names)
+            from pyarrow import ArrowException, parquet
+        try:
+            names = chosen(parquet.read_schema(path).names)
+            frame = pd.read_parquet(path, columns=names)
+        except ArrowException as error:
+            raise ValueError(
+                f"the file is damaged or cut short ({error}): copy it again, or have "
+                "its writer finish it (LeRobot: dataset.finalize())."
+            ) from error
     elif path.suffix in (".csv", ".gz"):
         frame, text = _read_csv(path)
         names = chosen([*frame], text=text)
@@ -190,7 +196,8 @@ def find_columns(
     if "episode" not in columns and ("step" in columns or "truncated" not in columns):
         missing.append("episode" if "step" in columns else "truncated or episode")
     if missing:
-        cure = f"name it as in data=file data.columns.{missing[0].split()[0]}=<name>"
+        part = missing[0].split()[0]
+        cure = f"name it with data.columns.{part}=<name> (data=file or data=lerobot)"
         if missing[0] == "terminated":
             cure += ", or data.columns.terminated=false if nothing ends the task"
         raise ValueError(

@@ -1,0 +1,90 @@
+"""LeRobot data sets of version 3, a folder with several episodes in a Parquet file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from glob import escape
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchrl_osr._files import read_json
+from torchrl_osr.lab.data.recording import Columns, Reading, Recording
+from torchrl_osr.lab.data.table import open_log
+
+KNOWN_NAMES = {
+    "observation": ("observation.state", "observation.environment_state"),
+    "action": ("action",),
+    "reward": ("next.reward",),
+    "terminated": ("next.success",),
+    "truncated": ("next.truncated",),
+    "episode": ("episode_index",),
+    "step": ("frame_index",),
+}
+"""Columns by their part, where a set has them and the user names no others."""
+
+
+def open_lerobot(path: Any, columns: Mapping[str, Any], options: Reading) -> Recording:
+    """Open a LeRobot data set without reading a row; ``columns`` names its parts.
+
+    Every episode ends in its last row, and ``next.done`` does not say why. It is
+    terminated there if ``next.truncated`` is false or, in a set without that column,
+    ``next.success`` is true. A column that the user names takes their place.
+    """
+    folder = Path(path).expanduser().absolute()
+    if not (folder / "meta" / "info.json").is_file():
+        raise FileNotFoundError(
+            f"{folder} has no meta/info.json: give the folder of a LeRobot data set "
+            "(data.path=...)."
+        )
+    info = read_json(folder / "meta" / "info.json")
+    if not (version := str(info.get("codebase_version"))).startswith("v3."):
+        raise ValueError(
+            f"{folder} has LeRobot's format {version}; expected v3.0. Convert a copy: "
+            "'python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=any/name "
+            "--root=<copy> --push-to-hub=false'."
+        )
+    features = info["features"]
+    known: dict[str, Any] = {}
+    for part, names in KNOWN_NAMES.items():
+        known[part] = [name for name in names if name in features] or None
+    by_truncated = known["truncated"] and "terminated" not in columns
+    if by_truncated:
+        known["terminated"] = False
+    wanted = {part: each for part, each in known.items() if each is not None}
+    files = escape(str(folder)) + "/data/chunk-*/file-*.parquet"
+    log = open_log(files, {**wanted, **columns}, options, "lerobot")
+    log.about["path"] = str(folder)
+    log.about["entry_names"] = {n: _entry_names(each) for n, each in features.items()}
+    cameras = [n for n, each in features.items() if each["dtype"] in ("video", "image")]
+    if cameras:
+        unseen = f"images and videos are left out: {', '.join(cameras)}."
+        log.about["warnings"] = [unseen]
+
+    def parts() -> Iterator[Columns]:
+        total = 0
+        for rows in log.parts():
+            last = np.r_[np.diff(rows["episode"]) != 0, True]
+            flag = np.reshape(rows["truncated" if by_truncated else "terminated"], -1)
+            ended = last & (flag.astype(np.bool_) != bool(by_truncated))
+            total += len(last)
+            yield {**rows, "terminated": ended, "truncated": last & ~ended}
+        if total != info["total_frames"]:
+            raise ValueError(
+                f"{folder} holds {total:,} rows where meta/info.json says "
+                f"{info['total_frames']:,}: copy the whole folder again."
+            )
+
+    return replace(log, parts=parts)
+
+
+def _entry_names(feature: Mapping[str, Any]) -> list[str]:
+    """Return the names of a vector's entries, or none."""
+    names: Any = feature.get("names") or []
+    groups = [*names.values()] if isinstance(names, dict) else [names]
+    if not all(isinstance(group, list) for group in groups):
+        return [*names]  # {"x": 0, "y": 1}
+    return [*chain(*groups)]  # {"motors": ["pan", "lift"]}
