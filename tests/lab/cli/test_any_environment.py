@@ -14,7 +14,7 @@ from composed import composed
 from composed import trained as trained_on
 from gymnasium.envs.classic_control import PendulumEnv
 
-from torchrl_osr.lab.cli import collect, evaluate
+from torchrl_osr.lab.cli import collect, data, evaluate
 from torchrl_osr.lab.data import environment_spec
 from torchrl_osr.lab.report import read_runs, write_report
 from torchrl_osr.lab.report.runs import find_runs
@@ -174,6 +174,29 @@ def test_without_a_simulator_a_log_still_makes_a_policy(tmp_path, capsys):
         disturbed(run)
     with pytest.raises(ValueError, match=r"env\.id is not given"):
         record(tmp_path / "x.npz", "env=none")
+
+
+def test_a_log_without_rewards_trains_what_needs_none(tmp_path, capsys):
+    record(log := tmp_path / "log.npz", "env.id=Pendulum-v1", "episodes=3")
+    with np.load(log) as columns:
+        np.savez(log, **{name: columns[name] for name in columns if name != "reward"})
+    given = "env=none", f"data.path={log}"
+    with pytest.raises(ValueError, match=r"no reward column: .* or loss=bc recovery="):
+        trained(tmp_path / "osr", *given, "loss=osr")
+    assert find_runs([tmp_path]) == []
+    for loss in (["loss=noisy_bc"], ["loss=bc", "recovery=osr"]):
+        run = trained(tmp_path / loss[-1], *given, *loss)
+        assert json.loads((run / "returns.json").read_text())["data_return"] is None
+    assert (run / "inverse_dynamics.json").exists()
+    capsys.readouterr()
+    data.main(
+        composed(
+            "check_data", "progress=false", *given, f"picture={tmp_path}/picture.png"
+        )
+    )
+    shown = capsys.readouterr().out
+    assert "1. The data have no reward column" in shown
+    assert "returns " not in shown
 
 
 def test_without_a_simulator_bounds_and_discrete_actions_may_be_given(tmp_path):

@@ -29,6 +29,7 @@ from torchrl_osr.lab.data.overview import (
     out_of_space,
     recorded_columns,
 )
+from torchrl_osr.lab.data.recording import has_rewards
 from torchrl_osr.lab.evaluation.figures import data_figure
 from torchrl_osr.lab.run import CONF
 from torchrl_osr.lab.run.data import load_data
@@ -89,7 +90,7 @@ def overview(
         numbers = [f"{manifest[f'{kind}_ends']:,} {kind}" for kind in kinds]
         lines.append(f"ends      {', '.join(numbers)}")
     kind = "episode" if manifest.get("episode_returns") else "incomplete"
-    for name in ("lengths", "returns"):
+    for name in ("lengths", "returns") if has_rewards(manifest) else ("lengths",):
         if values := manifest.get(f"{kind}_{name}"):
             mean, known = sum(values) / len(values), kind.replace("episode", "complete")
             lines.append(

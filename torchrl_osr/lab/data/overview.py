@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from torchrl_osr.lab.data.recording import has_rewards
 from torchrl_osr.lab.data.rows import is_followed
 from torchrl_osr.lab.data.transitions import ACTION_LIMIT
 
@@ -61,7 +62,8 @@ def findings(
     # If episodes can terminate, a constant reward still favours long ones.
     falls = bool(data["next", "terminated"].any())
     for (part, name), entry in entries.iterrows():
-        if entry["min"] == entry["max"] and not (part == "reward" and falls):
+        meant = part == "reward" and (falls or not has_rewards(manifest))
+        if entry["min"] == entry["max"] and not meant:
             yield f"{name} is {entry['min']:g} in every row: {CONSTANT[part]}"
     if manifest.get("num_actions") is None:
         names, sizes = entries.loc["action"].index, data["action"].abs().amax(0)

@@ -45,11 +45,21 @@ WARNINGS = {
     "0, as a vector environment records its resets",
 }
 
+NO_REWARDS = (
+    "The data have no reward column: name it (data.columns.reward=...), or train what "
+    "needs none, as loss=bc, loss=noisy_bc or loss=bc recovery=osr do."
+)
+
 # A bound may be exceeded by float32 arithmetic, not by an unclipped policy.
 ROUNDING = 1e-5
 
 MARGIN = 0.05
 """Between the log's largest actions and their bounds, where none are given."""
+
+
+def has_rewards(manifest: Mapping[str, Any]) -> bool:
+    """Return whether the rewards of a data set were recorded; else they are 0."""
+    return "reward" in manifest.get("columns", ["reward"])
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from torchrl_osr.lab.data.environment import (
     environment_spec,
     known_ids,
 )
-from torchrl_osr.lab.data.recording import ActionBounds, Reading, Recording
+from torchrl_osr.lab.data.recording import ActionBounds, Reading, Recording, has_rewards
 from torchrl_osr.lab.data.rollout import behavior_of, collect_source
 from torchrl_osr.lab.data.rows import mix_datasets
 from torchrl_osr.lab.data.statistics import REFERENCE_RETURNS, ReferenceReturns
@@ -170,7 +170,7 @@ def _mean_and_score(
     manifest: Mapping[str, Any], references: ReferenceReturns | None
 ) -> tuple[float | None, float | None]:
     """Return the complete episodes' mean return and its score, where known."""
-    if not manifest.get("episode_returns"):
+    if not (manifest.get("episode_returns") and has_rewards(manifest)):
         return None, None
     mean = float(np.mean(manifest["episode_returns"]))
     return mean, None if references is None else references.score(mean)

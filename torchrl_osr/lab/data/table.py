@@ -18,7 +18,7 @@ import numpy as np
 
 from torchrl_osr._extras import needed_by
 from torchrl_osr._files import read_arrays
-from torchrl_osr.lab.data.recording import Reading, Recording
+from torchrl_osr.lab.data.recording import NO_REWARDS, Reading, Recording, has_rewards
 from torchrl_osr.lab.data.transitions import Array
 
 with needed_by("tables need", "train"):
@@ -65,6 +65,8 @@ def open_log(
             about["columns"] = find_columns(names, columns)
             used = {*chain(*about["columns"].values())}
             about["unused_columns"] = [name for name in names if name not in used]
+            if not has_rewards(about):
+                about["warnings"] = [NO_REWARDS]
         return [*chain(*about["columns"].values())]
 
     def parts() -> Iterator[Arrays]:
@@ -191,7 +193,7 @@ def find_columns(
     used = [*chain(*columns.values())]
     if twice := [name for name in used if used.count(name) > 1]:
         raise ValueError(f"column {twice[0]!r} is read twice: {columns}.")
-    required = ["observation", "action", "reward"] + ["terminated"] * (not endless)
+    required = ["observation", "action"] + ["terminated"] * (not endless)
     missing = [part for part in required if part not in columns]
     if "episode" not in columns and ("step" in columns or "truncated" not in columns):
         missing.append("episode" if "step" in columns else "truncated or episode")
@@ -273,7 +275,9 @@ def assemble(layout: Mapping[str, list[str]], arrays: Arrays) -> Arrays:
         else:  # names, numbered in order of appearance
             numbers = pd.factorize(first)[0].astype(np.float64)
             columns[part] = np.where(numbers < 0, np.nan, numbers)
-    columns.setdefault("terminated", np.zeros(len(columns["reward"]), np.bool_))
+    rows = len(columns["action"])
+    columns.setdefault("reward", np.zeros(rows))  # see has_rewards
+    columns.setdefault("terminated", np.zeros(rows, np.bool_))
     return columns
 
 

@@ -22,6 +22,7 @@ from torchrl_osr.lab.data import (
     observation_statistics,
     reference_returns,
 )
+from torchrl_osr.lab.data.recording import NO_REWARDS, has_rewards
 from torchrl_osr.lab.data.rows import (
     check_order,
     held_out_rows,
@@ -115,12 +116,16 @@ def load_training_data(
     Their checksum is kept in the configuration.
 
     Rewards become ``reward_scale * r + reward_shift``; the mean is of the task's own.
-    If ``in_keys``, the keys that the loss reads, have ``("next", "action")``, batches
+    ``in_keys`` are the keys that the loss reads, by default with rewards; a log without
+    these is then refused. If they have ``("next", "action")``, batches
     have the data's next action, and the rows must be in order of time.
     """
     env, options, optim = config.env, config.data, config.optim
     data, manifest = load_data(env, options, progress=config.trainer.progress)
     options.checksum = manifest["checksum"]
+    rewarded = not in_keys or ("next", "reward") in in_keys or config.dynamics.use
+    if rewarded and not has_rewards(manifest):
+        raise ValueError(NO_REWARDS)
     never = config.dynamics.use and config.dynamics.terminations == "never"
     if never and (ends := int(data["next", "terminated"].sum())):
         raise ValueError(
