@@ -1,6 +1,6 @@
 """Print the tables of an experiment in Markdown.
 
-    python results/tables.py results/paper
+    python results/tables.py results/paper --data medium-replay medium-expert
     python results/tables.py results/oos --reference cql_noisy_bc
 
 Reads ``runs.csv.xz``, ``episodes.csv.xz`` and, where they exist, ``recoverable.csv.xz``
@@ -21,9 +21,14 @@ from torchrl_osr.lab.evaluation import statistics
 from torchrl_osr.lab.evaluation.statistics import Estimate, over_what, saved_share
 
 
-def read(folder: Path) -> pd.DataFrame:
-    """Return a row for each episode, with its run's data set, method and seed."""
+def read(folder: Path, sources: Sequence[str] = ()) -> pd.DataFrame:
+    """Return a row for each episode, with its run's data set, method and seed.
+
+    ``sources`` are kinds of data, such as ``"medium-expert"``; default all.
+    """
     runs = pd.read_csv(folder / "runs.csv.xz")
+    if sources:
+        runs = runs[runs["data"].str.partition(" ")[2].isin(sources)]
     episodes = pd.read_csv(folder / "episodes.csv.xz").merge(runs, on="run")
     for column in ("suite", "disturbance"):  # "" is undisturbed
         episodes[column] = episodes[column].fillna("") if column in episodes else ""
@@ -41,17 +46,17 @@ def conditions(episodes: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
         yield suite, episodes[rows & (episodes["disturbance"] != "")]
 
 
-def estimate(episodes: pd.DataFrame) -> str:
+def estimate(episodes: pd.DataFrame) -> Estimate | None:
     """Return the mean score over runs; episodes of one start state are averaged."""
     if episodes.empty:
-        return ""
+        return None
     means = episodes.groupby(["run", "episode"])["score"].mean()
-    return str(statistics.estimate([run.to_numpy() for _, run in means.groupby("run")]))
+    return statistics.estimate([run.to_numpy() for _, run in means.groupby("run")])
 
 
 def differences(
     episodes: pd.DataFrame, method: str, reference: str
-) -> tuple[str, str] | None:
+) -> tuple[int, Estimate] | None:
     """Return the fewest seeds, and the mean difference over all data sets.
 
     Runs are paired by data set and seed, episodes by checkpoint and start state.
@@ -71,7 +76,7 @@ def differences(
         [run.to_numpy() for _, run in group.groupby("seed")]
         for _, group in less.groupby("data")
     ]
-    return str(min(map(len, data_sets))), str(statistics.mean_difference(data_sets))
+    return min(map(len, data_sets)), statistics.mean_difference(data_sets)
 
 
 def recoverable(folder: Path) -> dict[tuple[str, str], tuple[str, float]]:
@@ -101,9 +106,29 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def main(folder: Path, reference: str) -> None:
+def means_over_data(episodes: pd.DataFrame, folder: Path) -> pd.DataFrame:
+    """Return the means of the methods that have runs on every data set, best first."""
+    means = pd.DataFrame(
+        {
+            name: part.groupby(["method", "data", "run"])["score"].mean()
+            for name, part in conditions(episodes)
+        }
+    )
+    means = means.groupby(["method", "data"]).mean()
+    complete = means.groupby("method").size() == episodes["data"].nunique()
+    if saved := recoverable(folder):
+        share = {(method, data): each[1] for (data, method), each in saved.items()}
+        means["recoverable %"] = pd.Series(share)
+    means = means.groupby("method").mean()[complete]
+    return means.sort_values("undisturbed", ascending=False)
+
+
+def main(folder: Path, reference: str, sources: Sequence[str] = ()) -> None:
     """Print a table for each data set, means over all, and differences."""
-    episodes, saved = read(folder), recoverable(folder)
+    episodes, saved = read(folder, sources), recoverable(folder)
+    there = episodes.groupby("suite")["data"].nunique()
+    everywhere = there.index[there == episodes["data"].nunique()]
+    episodes = episodes[episodes["suite"].isin(everywhere)]
     suites = [name for name, _ in conditions(episodes)]
     quoted = folder / "published.csv"
     published = pd.read_csv(quoted, index_col=0) if quoted.exists() else pd.DataFrame()
@@ -114,7 +139,7 @@ def main(folder: Path, reference: str) -> None:
         rows = []
         for method, of in mine.groupby("method"):
             cells = [str(of["seed"].nunique()), f"{of['updates'].max():,}"]
-            cells += [estimate(part) for _, part in conditions(of)]
+            cells += [str(estimate(part) or "") for _, part in conditions(of)]
             cells += [saved.get((data, method), ("", 0))[0]] if saved else []
             if not published.empty:
                 cells.append(str(published.get(data, {}).get(method, "")))
@@ -125,20 +150,9 @@ def main(folder: Path, reference: str) -> None:
 
     if episodes["data"].nunique() == 1:
         return
-    means = pd.DataFrame(
-        {
-            name: part.groupby(["method", "data", "run"])["score"].mean()
-            for name, part in conditions(episodes)
-        }
-    )
-    means = means.groupby(["method", "data"]).mean()
-    complete = means.groupby("method").size() == episodes["data"].nunique()
-    if saved:
-        share = {(method, data): each[1] for (data, method), each in saved.items()}
-        means["recoverable %"] = pd.Series(share)
-    means = means.groupby("method").mean()[complete].sort_values("undisturbed")
+    means = means_over_data(episodes, folder)
     rows = [[f"`{each[0]}`", *(f"{x:.1f}" for x in each[1:])]
-            for each in means.iloc[::-1].itertuples()]  # fmt: skip
+            for each in means.itertuples()]  # fmt: skip
     print(f"## Means over all data sets\n\n{markdown(['method', *means], rows)}\n")
 
     rows = []
@@ -147,8 +161,8 @@ def main(folder: Path, reference: str) -> None:
             differences(part, reference, method) for _, part in conditions(episodes)
         ]
         if all(found):
-            cells = [each[1] for each in found if each]
-            rows.append([f"`{method}`", found[0][0] if found[0] else "", *cells])
+            cells = [str(each[1]) for each in found if each]
+            rows.append([f"`{method}`", str(found[0][0] if found[0] else ""), *cells])
     print(f"## `{reference}` less each other method, over all data sets\n")
     print(markdown(["less", "seeds", *suites], rows))
 
@@ -157,5 +171,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--reference", default="osr")
+    parser.add_argument("--data", nargs="+", default=(), metavar="SOURCE")
     given = parser.parse_args()
-    main(given.folder, given.reference)
+    main(given.folder, given.reference, given.data)

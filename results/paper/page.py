@@ -1,0 +1,384 @@
+"""Write the tables of this folder into the pages that show them.
+
+    python results/paper/page.py
+
+A page marks the place of a table or number with ``<!-- name -->`` and
+``<!-- /name -->``. The pages are this folder's README.md and tables.md, the
+repository's README.md and docs/results.md. Also draws the figures.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+from run import ENVS, EXPERTS, HERE, LIMITED, SIX, TABLES, folder_name
+
+sys.path.append(str(HERE.parent))
+import tables
+from tables import differences, estimate, markdown
+
+from torchrl_osr.lab.evaluation.statistics import (
+    Estimate,
+    decimal,
+    scores_and_decreases,
+)
+
+mpl.use("agg")
+import matplotlib.pyplot as plt
+
+ROOT = HERE.parents[1]
+NOT_RUN = "not run"
+SOURCES = ("medium-replay", "medium-expert")
+TITLES = {
+    "cql": "CQL(H)", "iql": "IQL", "mopo": "MOPO", "rambo": "RAMBO", "sdc": "SDC",
+    "osr": "OSR", "osr_v": "OSR-v", "td3_bc": "TD3+BC", "rebrac": "ReBRAC",
+    "cql_noisy_bc": "CQL + noisy BC", "osr_10": "OSR-10", "sac_10": "SAC-10",
+    "edac_10": "EDAC-10", "rorl": "RORL",
+}  # fmt: skip
+IN_DOCS = {"rim": "RIM", "noisy_bc": "noisy BC"} | {
+    name: TITLES[name] for name in ("osr", "cql_noisy_bc", "td3_bc", "cql", "osr_v")
+}
+COLUMNS = [name for name in TITLES if name in TABLES["table1"].methods]
+KNOCKS = {
+    "corrected": ("oos", ["torque-5", "torque-10", "torque-20"]),
+    "released": ("official", [f"knock-official-{n}" for n in (5, 10, 15)]),
+}
+KNOCK_SIZES = ("slight", "moderate", "large")
+"""Suites, and their disturbances of these sizes."""
+
+
+def name_of(data: str) -> str:
+    """Return a data set's name as the paper writes it."""
+    robots = {
+        "halfcheetah": "HalfCheetah",
+        "antmaze": "AntMaze",
+        "walker2d": "Walker2d",
+    }
+    return re.sub(
+        r"^[a-z0-9]+", lambda name: robots.get(name[0], name[0].title()), data
+    )
+
+
+def interval(found: Estimate) -> str:
+    """Format an interval without decimals, on one line."""
+    low, high = (f"{end:z.0f}".replace("-", "\N{MINUS SIGN}") for end in found[1:3])
+    return f"[{low},\N{NO-BREAK SPACE}{high}]"
+
+
+def small(*lines: str) -> str:
+    """Return lines in small type."""
+    text = "<br>".join(filter(None, lines))
+    return f"<br><sub>{text}</sub>" if text else ""
+
+
+def shown(found: Estimate | None, absent: str, seeds: str, *quoted: str) -> str:
+    """Return a mean; small: its interval, number of seeds, and quoted numbers."""
+    if found is None:
+        return absent + small(*quoted)
+    return decimal(found.mean) + small(interval(found) + seeds, *quoted)
+
+
+def cell(runs: pd.DataFrame, *quoted: str) -> str:
+    """Return the mean score of runs, or say that there are none."""
+    seeds = f"\N{NO-BREAK SPACE}\N{MULTIPLICATION SIGN}{runs['seed'].nunique()}"
+    return shown(estimate(runs), NOT_RUN, seeds, *quoted)
+
+
+def number(value: float) -> str:
+    """Format a quoted number in italics, or return nothing."""
+    return "" if pd.isna(value) else f"<i>{decimal(value)}</i>"
+
+
+def table1(clean: pd.DataFrame, printed: pd.DataFrame) -> str:
+    """Return Table 1; ``clean`` has the undisturbed episodes."""
+    parts = dict(iter(clean.groupby(["data", "method"])))
+    rows, complete = [], []
+    for data in printed.index:
+        found = [parts.get((data, method), clean.iloc[:0]) for method in COLUMNS]
+        means = clean.loc[clean["data"] == data, "data_score"]
+        quoted = [number(printed[method].get(data)) for method in COLUMNS]
+        cells = map(cell, found, quoted)
+        own = decimal(means.mean()) if len(means) else ""
+        rows.append([name_of(data), own, *cells])
+        if all(len(part) for part in found):
+            complete.append(data)
+    both = clean[clean["data"].isin(complete)]
+    means = both.groupby(["data", "method", "run"])["score"].mean()
+    means = means.groupby(["data", "method"]).mean().groupby("method").mean()
+    own = both.groupby("data")["data_score"].mean().mean()
+    cells = [
+        decimal(means[name]) + small(number(printed[name][complete].mean()))
+        for name in COLUMNS
+    ]
+    label = f"**Mean** of the {len(complete)} rows with all methods"
+    rows.append([label, decimal(own), *cells])
+    head = ["data", "data's mean", *(TITLES[name] for name in COLUMNS)]
+    return markdown(head, rows)
+
+
+def table2(episodes: pd.DataFrame, printed: pd.DataFrame, protocol: str) -> str:
+    """Return Table 2 under one of the protocols."""
+    suite, names = KNOCKS[protocol]
+    methods = [name for name in COLUMNS if name in TABLES["table2"].methods]
+    played = episodes[episodes["suite"] == suite].set_index(["data", "method"])
+    rows = []
+    for env in ("halfcheetah", "walker2d", "hopper"):
+        cells = [[f"{name_of(env)}, {knock}"] for knock in KNOCK_SIZES]
+        for method in methods:
+            mine = played[played.index == (f"{env} medium-expert", method)]
+            runs = [
+                run.pivot_table("score", "episode", "disturbance")[["", *names]]
+                for _, run in mine.groupby("run")
+            ]
+            found = scores_and_decreases(runs)[1:] if runs else [(None, None)] * 3
+            for line, knock, pair in zip(cells, KNOCK_SIZES, found, strict=True):
+                for kind, value in zip(("score", "decrease"), pair, strict=True):
+                    absent = "\N{EN DASH}" if runs else NOT_RUN
+                    quoted = number(printed.loc[(env, knock), f"{method} {kind}"])
+                    line.append(shown(value, absent, "", quoted))
+        rows += cells
+    kinds = ("score", "loss %")
+    head = [f"{TITLES[name]} {kind}" for name in methods for kind in kinds]
+    return markdown(["robot, knock", *head], rows)
+
+
+def figure4(clean: pd.DataFrame) -> str:
+    """Return the scores of Figure 4 in a table."""
+    rows = []
+    for env in ENVS:
+        for method in (name for name in COLUMNS if name in TABLES["figure4"].methods):
+            sets = [
+                f"{env} expert",
+                *(name for name in LIMITED if name.startswith(env)),
+            ]
+            mine = clean[clean["method"] == method]
+            cells = [cell(mine[mine["data"] == data]) for data in sets]
+            rows.append([name_of(env), TITLES[method], *cells])
+    shares = ("0 %", "50 %", "70 %", "90 %")
+    return markdown(["robot", "method", *shares], rows)
+
+
+def d4(clean: pd.DataFrame, quoted: pd.DataFrame) -> str:
+    """Return appendix D.4: ten minutes, and small the two minutes of ``clean``."""
+    grid = TABLES["d4"]
+    place = HERE / grid.place
+    longer = tables.read(place) if place.exists() else clean.iloc[:0]
+    rows = []
+    for data in grid.data:
+        cells = []
+        for method in grid.methods:
+            ours, brief = (
+                part[(part["data"] == data) & (part["method"] == method)]
+                for part in (longer, clean)
+            )
+            published = quoted.get(data, {}).get(method, np.nan)
+            two = f"two minutes: {decimal(brief['score'].mean())}"
+            cells.append(cell(ours, two, number(published)))
+        rows.append([name_of(data), *cells])
+    return markdown(["data", *(TITLES[name] for name in grid.methods)], rows)
+
+
+SHORT = "too short a training"
+CLAIMS = [
+    ("OSR scores higher than CQL", "osr", "cql", "score", ""),
+    ("OSR scores higher than IQL", "osr", "iql", "score", ""),
+    ("OSR scores higher than SDC", "osr", "sdc", "score", f"{SHORT} for SDC"),
+    ("OSR scores higher than MOPO", "osr", "mopo", "score", f"{SHORT} for MOPO"),
+    ("OSR scores higher than RAMBO", "osr", "rambo", "score", f"{SHORT} for RAMBO"),
+    ("OSR-v scores higher than OSR", "osr_v", "osr", "score", ""),
+    ("OSR scores higher than its twin without a model", "osr", "cql_noisy_bc", "score",
+     "not a claim of the paper"),
+    ("Knocked, OSR scores higher than CQL", "osr", "cql", "knocked", ""),
+    ("Knocked, OSR scores higher than SDC", "osr", "sdc", "knocked",
+     f"{SHORT} for SDC"),
+    ("OSR loses fewer points to knocks than CQL", "cql", "osr", "lost",
+     "a low score has less to lose"),
+    ("OSR loses fewer points to knocks than SDC", "sdc", "osr", "lost",
+     "a low score has less to lose"),
+    ("OSR-v loses fewer points to knocks than CQL", "cql", "osr_v", "lost",
+     "a low score has less to lose"),
+]  # fmt: skip
+"""A claim, whose number is larger than whose, the kind of number, and a note."""
+
+
+def claims(episodes: pd.DataFrame, printed: pd.DataFrame, knocked: pd.DataFrame) -> str:
+    """Return the claims of Tables 1 and 2 beside our differences."""
+    suite, names = KNOCKS["corrected"]
+    played = episodes[episodes["suite"] == suite]
+    pairs = played[played["disturbance"].isin(names)].merge(
+        played.loc[played["disturbance"] == "", ["run", "episode", "score"]],
+        on=["run", "episode"], suffixes=("", "_clean"),
+    )  # fmt: skip
+    pairs = pairs[pairs["data"].isin(EXPERTS)]
+    after = knocked.filter(like="score").groupby("env").mean()
+    after = after.rename(
+        index=lambda env: f"{env} medium-expert", columns=lambda name: name.split()[0]
+    )
+    sources = {
+        "score": (episodes[episodes["suite"] == ""], printed),
+        "knocked": (pairs, after),
+        "lost": (
+            pairs.assign(score=pairs["score_clean"] - pairs["score"]),
+            printed.reindex(after.index)[list(after)] - after,
+        ),
+    }
+    rows = []
+    for claim, more, less, kind, note in CLAIMS:
+        part, theirs = sources[kind]
+        part = part[part["method"].isin((more, less))]
+        seeds = part.groupby(["data", "method"])["seed"].nunique().unstack()
+        both = seeds.index[seeds.min(axis=1, skipna=False) >= 3]
+        found = differences(part[part["data"].isin(both)], more, less)
+        ours = found[1] if found else None
+        quoted = (theirs[more] - theirs[less]).reindex(both).mean()
+        seen = "not resolved"
+        if ours and not ours.low <= 0 <= ours.high:
+            seen = "yes" if ours.low > 0 else "no, the reverse"
+        cells = (number(quoted), str(ours or NOT_RUN), str(len(both)), seen, note)
+        rows.append([claim, *cells])
+    head = ["claim", "paper", "here [95 %]", "data sets", "seen here", "note"]
+    return markdown(head, rows)
+
+
+def settings() -> str:
+    """Return the pinned settings of the methods of Table 1, by kind of data."""
+    path = ROOT / "tests" / "lab" / "run" / "settings.csv"
+    table = pd.read_csv(path, dtype=str, keep_default_na=False)
+    table["loss.recovery_weight"] += table["recovery.recovery_weight"]  # one is blank
+    keys = ["loss.min_q_weight", "loss.num_random", "loss.recovery_weight"]
+    keys += ["optim.actor_lr", "optim.qvalue_lr"]
+    kinds = table.groupby(["method", "source"])[keys].agg(
+        lambda values: " / ".join(dict.fromkeys(values))
+    )
+    rows = []
+    for method in COLUMNS:
+        pairs = zip(*(kinds.loc[(method, source)] for source in SOURCES), strict=True)
+        rows.append([TITLES[method], *(" → ".join(dict.fromkeys(x)) for x in pairs)])
+    return markdown(["method", *(f"`{key.partition('.')[2]}`" for key in keys)], rows)
+
+
+def draw_curves() -> None:
+    """Draw score over minutes of updates, every seed and the mean."""
+    runs = pd.read_csv(HERE / "runs.csv.xz")
+    episodes = pd.read_csv(HERE / "episodes.csv.xz").merge(runs, on="run")
+    episodes = episodes[episodes["suite"].isna()]
+    minutes = TABLES["table1"].seconds / 60 * episodes["step"] / episodes["updates"]
+    episodes = episodes.assign(minutes=minutes.round(3))
+    colors = dict(zip(("osr", "cql_noisy_bc", "cql", "td3_bc", "iql"),
+                      ("#0072B2", "#56B4E9", "#D55E00", "#009E73", "#E69F00"),
+                      strict=True))  # fmt: skip
+    figure, grid = plt.subplots(
+        2, 3, figsize=(11, 6), layout="constrained", sharex=True
+    )
+    for axes, data in zip(grid.flat, SIX, strict=True):
+        for method, color in colors.items():
+            mine = episodes[(episodes["data"] == data) & (episodes["method"] == method)]
+            by_seed = mine.groupby(["minutes", "seed"])["score"].mean().unstack()
+            axes.plot(by_seed.index, by_seed, color=color, lw=0.5, alpha=0.4)
+            axes.plot(by_seed.mean(axis=1), color=color, lw=2, label=TITLES[method])
+        axes.set_title(name_of(data), fontsize=10, loc="left")
+        axes.spines[["top", "right"]].set_visible(False)
+    grid[0, 0].legend(frameon=False, fontsize=8)
+    figure.supxlabel("minutes of updates on one core", fontsize=10)
+    figure.supylabel("normalised score", fontsize=10)
+    figure.savefig(ROOT / "docs" / "figures" / "curves.png", dpi=110)
+    plt.close(figure)
+
+
+def methods_table(means: pd.DataFrame, titles: Mapping[str, str]) -> str:
+    """Return the means of methods over the six data sets, best first."""
+    rows = [
+        [titles[name], *map(decimal, line)]
+        for name, line in means.iterrows()
+        if name in titles
+    ]
+    return markdown(["method", "score", "disturbed", "recovery rate %"], rows)
+
+
+def fill(path: Path, blocks: Mapping[str, str]) -> None:
+    """Replace what is between a page's marks."""
+    mark = re.compile(r"<!-- (\S+) -->.*?<!-- /\1 -->", re.S)
+
+    def filled(found: re.Match[str]) -> str:
+        name = found[1]
+        block = f"\n\n{blocks[name]}\n\n" if "\n" in blocks[name] else blocks[name]
+        return f"<!-- {name} -->{block}<!-- /{name} -->"
+
+    text = path.read_text(encoding="utf-8")
+    path.write_text(mark.sub(filled, text), encoding="utf-8")
+
+
+def fill_readme(means: pd.DataFrame) -> None:
+    """Put the means into the rows of the README's table of methods, best first."""
+    path = ROOT / "README.md"
+    text = path.read_text(encoding="utf-8")
+    found = re.search(r"(\|`loss=`\|score\|disturbed\|\n\|[-|]+\n)((?:\|.*\n)+)", text)
+    firsts = {re.search(r"`(\w+)`", row)[1]: row.split("|")[1]
+              for row in found[2].splitlines()}  # fmt: skip
+    rows = [
+        f"|{firsts[name]}|{decimal(line['score'])}|{decimal(line['disturbed'])}|\n"
+        for name, line in means.iterrows()
+        if name in firsts
+    ]
+    path.write_text(text.replace(found[2], "".join(rows)), encoding="utf-8")
+
+
+def main() -> None:
+    """Fill the pages and draw the figures."""
+    episodes = tables.read(HERE)
+    clean = episodes[episodes["suite"] == ""]
+    printed = pd.read_csv(HERE / "printed_table1.csv", index_col="data")
+    quoted = pd.read_csv(HERE / "published.csv", index_col=0)
+    for name in ("td3_bc", "rebrac", "cql_noisy_bc"):
+        printed[name] = quoted.T.get(name, np.nan)
+    knocked = pd.read_csv(HERE / "printed_table2.csv", index_col=["env", "knock"])
+
+    six = episodes[episodes["data"].isin(SIX)]
+    shown = six[six["suite"].isin(["", *TABLES["methods"].suites])]
+    means = tables.means_over_data(shown, HERE)
+    means["disturbed"] = means[list(TABLES["methods"].suites)].mean(axis=1)
+    means = means[["undisturbed", "disturbed", "recoverable %"]]
+    means.columns = ["score", "disturbed", "recovery"]
+    blocks = {
+        "claims": claims(episodes, printed, knocked),
+        "table1": table1(clean, printed),
+        "settings": settings(),
+        "table2": table2(episodes, knocked, "corrected"),
+        "table2-released": table2(episodes, knocked, "released"),
+        "figure4": figure4(clean),
+        "d4": d4(clean, quoted),
+        "methods": methods_table(means, {name: f"`{name}`" for name in means.index}),
+        "scores": methods_table(means, IN_DOCS),
+    }
+    # Single numbers in the text.
+    for name, line in means.iterrows():
+        blocks |= {f"{name}/{kind}": decimal(value) for kind, value in line.items()}
+        found = differences(clean[clean["data"].isin(SIX)], "osr", name)
+        blocks[f"osr-less-{name}"] = str(found and found[1])
+    for (data, name), score in clean.groupby(["data", "method"])["score"]:
+        blocks[f"{folder_name(data)}/{name}"] = decimal(score.mean())
+    for (data, name), (_, share) in tables.recoverable(HERE).items():
+        blocks[f"{folder_name(data)}/{name}/recovery"] = decimal(share)
+    others, lead = quoted.loc["cql"].mean(), printed["osr"][SIX].mean()
+    blocks["cql/printed"] = number(printed["cql"][SIX].mean())
+    blocks["cql/published"] = number(others)
+    blocks["osr-less-cql/published"] = number(lead - others)
+    for page in (HERE / "README.md", ROOT / "docs" / "results.md"):
+        fill(page, blocks)
+    fill_readme(means)
+    draw_curves()
+    with contextlib.redirect_stdout(io.StringIO()) as text:
+        tables.main(HERE, "osr", SOURCES)
+    fill(HERE / "tables.md", {"tables": text.getvalue().strip()})
+
+
+if __name__ == "__main__":
+    main()
