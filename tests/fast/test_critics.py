@@ -91,7 +91,7 @@ def test_losses_and_gradients_are_those_of_the_modules(
     assert max(calls) <= max(rows, 16)
 
 
-@pytest.mark.parametrize("name", ["osr", "edac"])
+@pytest.mark.parametrize("name", ["osr", "osr-v-cql", "edac"])
 def test_other_losses_have_the_values_of_the_modules(calls, name):
     assert_fuses(make_loss(name, PLAIN["normalised"]), make_batch(name, 7))
     assert calls

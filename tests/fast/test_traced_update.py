@@ -23,7 +23,7 @@ from torchrl_osr.fast import fuse_critics, traced_update
 from torchrl_osr.fast.traced_update import LossGradients
 
 LOSSES = ["osr", "cql-options", "osr-v", "edac", "td3-bc", "rebrac", "official", "iql"]
-LOSSES += ["rorl", "bc", "model", "discrete"]
+LOSSES += ["osr-v-cql", "rorl", "bc", "model", "discrete"]
 
 
 def make(name):

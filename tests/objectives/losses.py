@@ -179,6 +179,7 @@ LOSSES: dict[str, Case] = {
     "osr": Case(of(OSRLoss, TRIPLE, **SMALL), CQL),
     "osr-v": Case(of(OSRVLoss, TRIPLE, **SMALL), SAC),
     "osr-v-logsumexp": Case(of(OSRVLoss, TRIPLE, **LSE), SAC),
+    "osr-v-cql": Case(of(OSRVLoss, TRIPLE, **SMALL, policy_values="cql"), SAC),
     "discrete": Case(of(DiscreteOSRLoss, DISCRETE), CQL, "one_hot"),
     "discrete-cql": Case(
         of(DiscreteOSRLoss, DISCRETE, recovery_weight=0.0), CQL, "index"

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import copy
+import math
+from collections.abc import Callable
+from functools import partial
 
 import pytest
 import torch
 from objectives.losses import Networks, density, make_batch, update_targets
 from objectives.plain import BOX, SOFT, Plain, compare, following, prepare
-from torch import Tensor
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
 
 from torchrl_osr import OSRVLoss
 
@@ -29,23 +33,29 @@ def restated(networks: Networks, batch, number: int, values: str, target: str):
             logits, mean, wanted = [], 0.0, 0.0
             for k in range(number):
                 with torch.no_grad():
-                    action, log_prob = plain.act(plain.policy(state), draws["pi"][k, i])
+                    sampled = [plain.act(plain.policy(state), draws["pi"][i][k])]
+                    if values != "mean":
+                        low = plain.center - plain.half
+                        uniform = low + 2 * plain.half * draws["uniform"][i][k]
+                        box = -torch.log(2 * plain.half).sum()
+                        sampled.append((uniform, box))
+                    if values == "cql":
+                        pi = plain.policy(s_next)
+                        sampled.append(plain.act(pi, draws["next"][i][k]))
                     other = batch["action"]
                     if target != "data":
                         gaussian = density(model, state, s_next)
                         other, _ = plain.act(gaussian, draws["model"][k, i])
-                value = plain.values(state, action, [critic])[0]
-                mean = mean + value / number
+                    if values == "cql":
+                        counts = valid.unsqueeze(-1) & (i == 1)
+                        other = torch.where(counts, other, batch["action"])
                 wanted = wanted + plain.values(state, other, [critic])[0] / number
-                if values == "logsumexp":
+                for action, log_prob in sampled:
+                    value = plain.values(state, action, [critic])[0]
+                    mean = mean + value / number
                     # Importance weights 1 / p, whatever the temperature.
                     logits.append(value / TEMPERATURE - log_prob)
-                    low = plain.center - plain.half
-                    uniform = low + 2 * plain.half * draws["uniform"][k, i]
-                    value = plain.values(state, uniform, [critic])[0]
-                    box = -torch.log(2 * plain.half).sum()
-                    logits.append(value / TEMPERATURE - box)
-            if logits:
+            if values != "mean":
                 mean = TEMPERATURE * sum(logit.exp() for logit in logits).log()
             total = total + (mean - wanted) / 2
         return total
@@ -54,20 +64,32 @@ def restated(networks: Networks, batch, number: int, values: str, target: str):
         # The draws, in the order in which the loss makes them.
         shape, like = (number, 2, *batch["action"].shape), {"dtype": torch.float64}
         found = plain.policy_losses(states)
-        draws = {"pi": torch.randn(shape, **like)}
+        draws = {name: [] for name in ("uniform", "pi", "next")}
+        if values == "cql":
+            for first, second in (("pi", "next"), ("next", "pi")):
+                draws["uniform"].append(torch.rand(number, *shape[2:], **like))
+                pair = torch.randn(shape, **like).unbind(1)
+                draws[first].append(pair[0])
+                draws[second].append(pair[1])
+        else:
+            draws["pi"] = torch.randn(shape, **like).unbind(1)
         if target != "data":
-            draws["model"] = torch.randn(shape, **like)
+            one = (1, 1) if values == "cql" else shape[:2]
+            draws["model"] = torch.randn(*one, *shape[2:], **like).expand(shape)
         if values == "logsumexp":
-            draws["uniform"] = torch.rand(shape, **like)
+            draws["uniform"] = torch.rand(shape, **like).unbind(1)
         value = plain.soft_value(batch, entropy=False)
-        gaps = sum(gap(critic, draws)[valid].mean() for critic in plain.critics)
+        gaps = [gap(critic, draws) for critic in plain.critics]
+        if values != "cql":
+            gaps = [each[valid] for each in gaps]
+        gaps = sum(each.mean() for each in gaps)
         return found | {"loss_qvalue": plain.td_loss(batch, value) + WEIGHT * gaps}
 
     return losses, plain.networks
 
 
 @pytest.mark.parametrize("target", ["inverse_dynamics", "data"])
-@pytest.mark.parametrize("values", ["mean", "logsumexp"])
+@pytest.mark.parametrize("values", ["mean", "logsumexp", "cql"])
 @pytest.mark.parametrize("number", [1, 3])
 def test_losses_and_gradients_equal_the_restatement(
     check, values, target, number
@@ -80,3 +102,41 @@ def test_losses_and_gradients_equal_the_restatement(
     loss = update_targets(loss.double())
     label = "OSR-v" + " on the data's actions" * (target == "data")
     compare(check, label, prepare(loss), batch, *expected)
+
+
+class Scaled(nn.Module):
+    """A critic: a multiple of an action's log-density, the same in every state."""
+
+    def __init__(self, scale: float, log_prob: Callable[[Tensor], Tensor]) -> None:
+        super().__init__()
+        self.scale = nn.Parameter(torch.tensor(scale, dtype=torch.float64))
+        self.log_prob = log_prob
+
+    def forward(self, observation: Tensor, action: Tensor) -> Tensor:
+        return self.scale * self.log_prob(action).unsqueeze(-1)
+
+
+def test_cql_values_do_not_fall_below_the_models_entropy() -> None:
+    """Gibbs' inequality, which holds with equality at the model's log-density."""
+    networks, batch = Networks(**BOX), make_batch("osr-v", 500)
+    plain, number, states = Plain(networks), 100, batch["observation"]
+    for parameter in networks.model.parameters():
+        nn.init.zeros_(parameter)  # the same density for all states
+    gaussian = density(networks.model, states[:1], states[:1])
+    batch["action"], _ = plain.act(gaussian, torch.randn(500, 2).double())
+    floor = -plain.act(gaussian, torch.randn(2000, 500, 2).double())[1].mean()
+
+    def gap(*scales: float) -> Tensor:
+        critics = [Scaled(x, partial(plain.log_prob, gaussian)) for x in scales]
+        keys = ["observation", "action"], ["state_action_value"]
+        critics = [TensorDictModule(each, *keys) for each in critics]
+        options = {"policy_values": "cql", "num_random": number}
+        parts = networks.actor, critics, networks.model
+        torch.manual_seed(3)
+        loss = update_targets(OSRVLoss(*parts, deactivate_vmap=True, **options))
+        # The sum over three kinds of actions is not divided by their number.
+        return loss(batch)["recovery_gap"] / len(scales) - math.log(3 * number)
+
+    torch.testing.assert_close(gap(1.0, 1.0), floor, atol=0.05, rtol=0)
+    assert gap(-1.0, -1.0) > floor + 0.05
+    assert gap(3.0, 3.0) > floor + 0.05

@@ -11,7 +11,6 @@ Shapes: ``B`` states, ``S`` observation, ``A`` action, ``M`` sampled actions of 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -23,7 +22,6 @@ from torch.nn.functional import layer_norm
 from torchrl.modules import MLP, ValueOperator
 
 from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Critics
-from torchrl_osr.objectives.transitions import Transitions
 
 CHUNK_ROWS = 1024
 """Actions that go through the critics at a time: their activations fit the cache."""
@@ -51,7 +49,13 @@ class FusedCritics(Critics):
         return _values(self._layers(params), eps, rows)
 
     def values_and_soft_maximum(
-        self, batch: Transitions, action: Tensor, log_prob: Tensor
+        self,
+        states: TensorDictBase,
+        target: Tensor,
+        action: Tensor,
+        log_prob: Tensor,
+        *,
+        alike: bool,
     ) -> tuple[Tensor, Tensor]:
         loss, eps = self.loss, self._eps()
         if (
@@ -59,12 +63,13 @@ class FusedCritics(Critics):
             or action.device.type != "cpu"
             or not torch.is_grad_enabled()
             or torch.compiler.is_compiling()
-            or any(value.requires_grad for value in batch.s.values(True, True))
+            or any(value.requires_grad for value in states.values(True, True))
         ):
-            return super().values_and_soft_maximum(batch, action, log_prob)
-        params, state = loss.qvalue_network_params, self._state(batch.s)
+            return super().values_and_soft_maximum(
+                states, target, action, log_prob, alike=alike
+            )
+        params, state = loss.qvalue_network_params, self._state(states)
         layers = self._layers(params)
-        alike = loss.clip_diff_min == -math.inf and loss.rows_weigh_alike(batch)
         autocast = torch.is_autocast_enabled("cpu")
         given = (
             [len(each) for each in layers],
@@ -73,7 +78,7 @@ class FusedCritics(Critics):
             torch.get_autocast_dtype("cpu") if autocast else None,
             *(state, action, log_prob),
         )
-        return self.values(batch.s, batch.a, params), soft_maximum(alike, given, layers)
+        return self.values(states, target, params), soft_maximum(alike, given, layers)
 
     def _eps(self) -> list[float] | None:
         """Return the ``eps`` of each normalisation, or ``None`` for other networks.

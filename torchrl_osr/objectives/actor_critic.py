@@ -95,12 +95,22 @@ class Critics:
         return value.reshape(-1, *action.shape[:-1])
 
     def values_and_soft_maximum(
-        self, batch: Transitions, action: Tensor, log_prob: Tensor
+        self,
+        states: TensorDictBase,
+        target: Tensor,
+        action: Tensor,
+        log_prob: Tensor,
+        *,
+        alike: bool,
     ) -> tuple[Tensor, Tensor]:
-        """Return both terms of CQL(H) for actions ``[M, R, A]`` at ``s``."""
-        action = torch.cat([batch.a.unsqueeze(0), action])
+        """Return both terms of CQL(H) at states ``[R]``, ``[N, R]`` each.
+
+        They are the value of the target's action, ``[R, A]``, and the log-sum-exp over
+        actions ``[M, R, A]``. ``alike``: every row has the same weight in the loss.
+        """
+        action = torch.cat([target.unsqueeze(0), action])
         params = self.loss.qvalue_network_params
-        qvalue = self.values(batch.s.expand(action.shape[:-1]), action, params)
+        qvalue = self.values(states.expand(action.shape[:-1]), action, params)
         return qvalue[:, 0], F.soft_maximum(
             qvalue[:, 1:].movedim(1, -1),
             log_prob.movedim(0, -1),
@@ -514,6 +524,23 @@ class ActorCriticLoss(LossModule):
         action = torch.rand(shape, dtype=like.dtype, device=like.device)
         log_density = -width.log().sum().expand(action.shape[:-1])
         return action * width + low, log_density
+
+    @torch.no_grad()
+    def proposals(
+        self, batch: Transitions, policy: StatePolicy, states: str = "recorded"
+    ) -> tuple[Tensor, Tensor]:
+        """Draw ``K`` actions each: uniform, and of the policy at two sets of states.
+
+        The default sets are ``s`` and ``s'``, as in CQL(H). Also return the actions'
+        log-densities, ``[3K, R]``.
+        """
+        uniform, log_density = self.uniform_actions(batch.a)
+        # rsample also without gradient: torch's sample reads the scale back to the host
+        # to check its sign.
+        number = (self.num_random,)
+        action, log_prob = rsample_and_log_prob(policy[states], number)
+        action = torch.cat([uniform, action.flatten(0, 1)])
+        return action, torch.cat([log_density, log_prob.flatten(0, 1)])
 
     def soft_target(self, batch: Transitions, policy: StatePolicy) -> Tensor:
         """Return the TD target of an action of the policy at ``s'``, ``[R]``."""

@@ -13,7 +13,6 @@ from typing import Any, Literal
 import torch
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor, nn
-from torchrl.modules.distributions.utils import rsample_and_log_prob
 
 from torchrl_osr import functional as F
 from torchrl_osr._checks import check_positive
@@ -137,26 +136,11 @@ class CQLLoss(ActorCriticLoss):
         self, batch: Transitions, policy: StatePolicy
     ) -> tuple[Tensor, Tensor]:
         """Return :math:`Q_i(s, a)` and CQL(H)'s gap, ``[N, R]`` each."""
+        alike = self.clip_diff_min == -math.inf and self.rows_weigh_alike(batch)
         q_data, soft_maximum = self.critics.values_and_soft_maximum(
-            batch, *self.proposals(batch, policy)
+            batch.s, batch.a, *self.proposals(batch, policy), alike=alike
         )
         gap = F.conservative_gap(soft_maximum, q_data)
         if self.clip_diff_min > -math.inf:
             gap = gap.clamp(min=self.clip_diff_min)
         return q_data, gap
-
-    @torch.no_grad()
-    def proposals(
-        self, batch: Transitions, policy: StatePolicy
-    ) -> tuple[Tensor, Tensor]:
-        """Draw ``K`` actions each: uniform, from ``pi(s)`` and from ``pi(s')``.
-
-        Also return their log-densities, ``[3K, R]``.
-        """
-        uniform, log_density = self.uniform_actions(batch.a)
-        # rsample also without gradient: torch's sample reads the scale back to the host
-        # to check its sign.
-        number = (self.num_random,)
-        action, log_prob = rsample_and_log_prob(policy["recorded"], number)
-        action = torch.cat([uniform, action.flatten(0, 1)])
-        return action, torch.cat([log_density, log_prob.flatten(0, 1)])

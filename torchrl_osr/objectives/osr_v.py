@@ -18,7 +18,7 @@ from torchrl_osr import functional as F
 from torchrl_osr._checks import check_positive
 from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses, StatePolicy
 from torchrl_osr.objectives.networks import check_num_actions
-from torchrl_osr.objectives.transitions import SETS, Transitions
+from torchrl_osr.objectives.transitions import SETS, States, Transitions
 
 
 class OSRVLoss(ActorCriticLoss):
@@ -50,9 +50,13 @@ class OSRVLoss(ActorCriticLoss):
         recovery_target: whose actions the policy's are compared with:
             ``"inverse_dynamics"`` (default), the model's, or ``"data"``, the data's
             own, at clean and at perturbed states: OSR-v without its model.
-        policy_values: how the first expectation is taken: ``"mean"`` (default, the
-            paper's) over ``K`` actions of the policy, or ``"logsumexp"`` over ``K`` of
-            the policy and ``K`` uniform ones, weighted by their densities.
+        policy_values: how the first expectation is taken. ``"mean"`` (default) is the
+            paper's, over ``K`` actions of the policy. ``"logsumexp"`` is over ``K`` of
+            the policy and ``K`` uniform ones, weighted by their densities. ``"cql"``
+            takes CQL(H)'s samples, as the authors' code does for (3): ``K`` uniform
+            actions, ``K`` at the state and ``K`` at ``s'``. It compares them with the
+            data's action at clean states, and with one of the model's at perturbed
+            states. At clean states it is CQL(H)'s term.
         num_random: ``K``, actions drawn of each kind. Default 1.
         temperature: of the log-sum-exp. Default 1.0.
         alpha_init, target_entropy: see :class:`~torchrl_osr.CQLLoss`.
@@ -79,7 +83,7 @@ class OSRVLoss(ActorCriticLoss):
         *,
         recovery_weight: float = 5.0,
         recovery_target: Literal["inverse_dynamics", "data"] = "inverse_dynamics",
-        policy_values: Literal["mean", "logsumexp"] = "mean",
+        policy_values: Literal["mean", "logsumexp", "cql"] = "mean",
         num_random: int = 1,
         temperature: float = 1.0,
         alpha_init: float = 1.0,
@@ -112,9 +116,10 @@ class OSRVLoss(ActorCriticLoss):
         q_data, gap = self.data_values_and_gap(batch, policy)
         # The paper prints OSR-v's TD error without the square; (2) has it.
         error, values = self.td_error(batch, q_data, self.soft_target(batch, policy))
-        constraint = self.reduce(gap, batch, batch.has_next)
+        valid = None if self.policy_values == "cql" else batch.has_next
+        constraint = self.reduce(gap, batch, valid)
         qvalue = self.reduce(error, batch) + self.recovery_weight * constraint
-        metrics["recovery_gap"] = self.mean(gap, batch, batch.has_next)
+        metrics["recovery_gap"] = self.mean(gap, batch, valid)
         return losses | {"loss_qvalue": qvalue}, metrics | values
 
     def data_values_and_gap(
@@ -124,6 +129,8 @@ class OSRVLoss(ActorCriticLoss):
 
         The gap is the mean over both halves of D_tot, summed over critics.
         """
+        if self.policy_values == "cql":
+            return self.data_values_and_cql_gap(batch, policy)
         target, action, log_prob = self.candidates(batch, policy)
         candidates = torch.cat([action, target])
         mixed = batch.states[SETS["both"]].expand(candidates.shape[:-1])
@@ -141,6 +148,27 @@ class OSRVLoss(ActorCriticLoss):
         )
         return qvalue[:, 0], gap.mean(1).sum(0)
 
+    def data_values_and_cql_gap(
+        self, batch: Transitions, policy: StatePolicy
+    ) -> tuple[Tensor, Tensor]:
+        """Return the same, with CQL(H)'s term at clean and at perturbed states."""
+        # Not in the paper, which prints (8), as (3), with a mean over pi(s~). For (3)
+        # the authors' code has a log-sum-exp, uniform actions, and those of pi(s').
+        sets = "recorded", "perturbed_and_next"
+        drawn = [self.proposals(batch, policy, states) for states in sets]
+        sampled = (torch.cat(both, 1) for both in zip(*drawn, strict=True))
+        # Not in (8), which has the model's action at clean states, too. It has the
+        # data's in expectation (Proposition 2). A row without s' has it at both.
+        wanted = self.recovery_actions(batch, "perturbed", 1)[0, 0]
+        wanted = torch.where(batch.has_next.unsqueeze(-1), wanted, batch.a)
+        mixed = batch.states[SETS["both"]].reshape(-1)
+        target, alike = torch.cat([batch.a, wanted]), self.rows_weigh_alike(batch)
+        qvalue, soft_maximum = self.critics.values_and_soft_maximum(
+            mixed, target, *sampled, alike=alike
+        )
+        gap = F.conservative_gap(soft_maximum, qvalue).reshape(len(qvalue), 2, -1)
+        return qvalue[:, : len(batch.a)], gap.mean(1).sum(0)
+
     @torch.no_grad()
     def candidates(
         self, batch: Transitions, policy: StatePolicy
@@ -151,17 +179,25 @@ class OSRVLoss(ActorCriticLoss):
             Those to recover with, ``[K, 2, R, A]`` (the data's: ``K = 1``); the others,
             ``[M, 2, R, A]``; their log-densities ``[M, 2, R]`` where they are needed.
         """
-        number, pi = (self.num_random,), policy["both"]
-        action, log_prob = rsample_and_log_prob(pi, number)
-        if self.recovery_target == "data":
-            target = batch.a.expand_as(pi.loc).unsqueeze(0)
-        else:
-            model = self.inverse_dynamics(batch, "both")
-            sizes = model.loc.shape[-1], pi.loc.shape[-1]
-            check_num_actions("inverse_dynamics_network", *sizes)
-            target, _ = rsample_and_log_prob(model, number)
+        action, log_prob = rsample_and_log_prob(policy["both"], (self.num_random,))
+        target = self.recovery_actions(batch, "both", self.num_random)
         if self.policy_values == "mean":
             return target, action, None
-        uniform, log_density = self.uniform_actions(pi.loc)
+        uniform, log_density = self.uniform_actions(action[0])
         action = torch.cat([uniform, action])
         return target, action, torch.cat([log_density, log_prob])
+
+    @torch.no_grad()
+    def recovery_actions(
+        self, batch: Transitions, states: States, number: int
+    ) -> Tensor:
+        """Return actions to recover with, ``[K, D, R, A]``; the data's: ``K = 1``."""
+        if self.recovery_target == "data":
+            sets = 2 if states == "both" else 1
+            return batch.a.expand(1, sets, *batch.a.shape)
+        model = self.inverse_dynamics(batch, states)
+        check_num_actions(
+            "inverse_dynamics_network", model.loc.shape[-1], batch.a.shape[-1]
+        )
+        action: Tensor = rsample_and_log_prob(model, (number,))[0]
+        return action

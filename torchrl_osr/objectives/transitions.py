@@ -25,6 +25,7 @@ SETS = {
     "perturbed": slice(2, 3),
     "next": slice(1, 2),
     "recorded": slice(0, 2),
+    "perturbed_and_next": slice(1, 3),
 }
 """Sets of states in the stack ``[s, s', s^]``; ``"recorded"`` is ``s`` and ``s'``."""
 
