@@ -172,8 +172,6 @@ def test_a_d4rl_file_without_ends_names_another_way(tmp_path):
     path = str(
         save(tmp_path / "hopper.hdf5", columns | {"ends": columns.pop("timeouts")})
     )
-    with pytest.raises(
-        ValueError, match=r"truncated .*name it with data\.columns\.tr"
-    ):
+    with pytest.raises(ValueError, match=r"truncated .*name it with data\.columns\.tr"):
         load_dataset("hopper", "d4rl", path=path)
     assert len(load_dataset(path=path, columns={"truncated": "ends"})[0]) == 300

@@ -60,11 +60,12 @@ def test_every_loss_is_built_and_trains_its_networks(name, batch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "recovery"), [("bc", "osr"), ("iql", "osr"), ("rebrac", "noisy_bc")]
+    ("name", "recovery"),
+    [("bc", "osr"), ("iql", "osr"), ("rebrac", "noisy_bc"), ("osr_v", "noisy_bc")],
 )
 def test_recovery_is_added_to_a_loss_without_it(name, recovery, batch) -> None:
     _, added = learner_of(f"loss={name}", f"recovery={recovery}")
-    assert (added.model is not None) == (recovery == "osr")
+    assert (added.model is not None) == (recovery == "osr" or name == "osr_v")
     if hasattr(added.loss, "qvalue_network"):
         SoftUpdate(added.loss, tau=0.1)
     out = added.objective(batch)

@@ -12,6 +12,7 @@ from hydra.utils import get_class, instantiate
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torchrl.objectives import LossModule
 
+from torchrl_osr import OSRVLoss
 from torchrl_osr.lab.dynamics import TransitionVAE
 from torchrl_osr.lab.losses import IQLLoss
 from torchrl_osr.lab.run.schema import EnvConfig, TrainConfig
@@ -93,7 +94,8 @@ def make_learner(config: TrainConfig, device: torch.device | str = "cpu") -> Lea
         loss.make_value_estimator(gamma=config.optim.gamma)
     parts = [loss]
     if config.recovery is not None:
-        if config.loss.get("recovery_weight"):
+        # That of OSR-v is a term of the critics.
+        if config.loss.get("recovery_weight") and not isinstance(loss, OSRVLoss):
             raise ValueError(
                 f"{config.loss['_target_']} has a recovery term of its own: leave out "
                 "recovery=..., or set loss.recovery_weight=0."
