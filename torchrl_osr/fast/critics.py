@@ -49,14 +49,9 @@ class FusedCritics(Critics):
         return _values(self._layers(params), eps, rows)
 
     def values_and_soft_maximum(
-        self,
-        states: TensorDictBase,
-        target: Tensor,
-        action: Tensor,
-        log_prob: Tensor,
-        *,
-        alike: bool,
+        self, states: TensorDictBase, target: Tensor, *sampled: Tensor, alike: bool
     ) -> tuple[Tensor, Tensor]:
+        action, log_prob = sampled
         loss, eps = self.loss, self._eps()
         if (
             eps is None
@@ -66,7 +61,7 @@ class FusedCritics(Critics):
             or any(value.requires_grad for value in states.values(True, True))
         ):
             return super().values_and_soft_maximum(
-                states, target, action, log_prob, alike=alike
+                states, target, *sampled, alike=alike
             )
         params, state = loss.qvalue_network_params, self._state(states)
         layers = self._layers(params)

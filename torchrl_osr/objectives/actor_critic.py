@@ -95,19 +95,15 @@ class Critics:
         return value.reshape(-1, *action.shape[:-1])
 
     def values_and_soft_maximum(
-        self,
-        states: TensorDictBase,
-        target: Tensor,
-        action: Tensor,
-        log_prob: Tensor,
-        *,
-        alike: bool,
+        self, states: TensorDictBase, target: Tensor, *sampled: Tensor, alike: bool
     ) -> tuple[Tensor, Tensor]:
         """Return both terms of CQL(H) at states ``[R]``, ``[N, R]`` each.
 
         They are the value of the target's action, ``[R, A]``, and the log-sum-exp over
-        actions ``[M, R, A]``. ``alike``: every row has the same weight in the loss.
+        actions ``[M, R, A]`` with log-densities ``[M, R]``. ``alike``: every row has
+        the same weight in the loss.
         """
+        action, log_prob = sampled
         action = torch.cat([target.unsqueeze(0), action])
         params = self.loss.qvalue_network_params
         qvalue = self.values(states.expand(action.shape[:-1]), action, params)
@@ -529,10 +525,9 @@ class ActorCriticLoss(LossModule):
     def proposals(
         self, batch: Transitions, policy: StatePolicy, states: str = "recorded"
     ) -> tuple[Tensor, Tensor]:
-        """Draw ``K`` actions each: uniform, and of the policy at two sets of states.
+        """Draw ``K`` actions each: uniform, and at two sets of states, ``[3K, R, A]``.
 
-        The default sets are ``s`` and ``s'``, as in CQL(H). Also return the actions'
-        log-densities, ``[3K, R]``.
+        The default sets are those of CQL(H). Also return log-densities, ``[3K, R]``.
         """
         uniform, log_density = self.uniform_actions(batch.a)
         # rsample also without gradient: torch's sample reads the scale back to the host

@@ -193,11 +193,9 @@ class OSRVLoss(ActorCriticLoss):
     ) -> Tensor:
         """Return actions to recover with, ``[K, D, R, A]``; the data's: ``K = 1``."""
         if self.recovery_target == "data":
-            sets = 2 if states == "both" else 1
-            return batch.a.expand(1, sets, *batch.a.shape)
+            return batch.a.expand(1, 1 + (states == "both"), *batch.a.shape)
         model = self.inverse_dynamics(batch, states)
-        check_num_actions(
-            "inverse_dynamics_network", model.loc.shape[-1], batch.a.shape[-1]
-        )
+        sizes = model.loc.shape[-1], batch.a.shape[-1]
+        check_num_actions("inverse_dynamics_network", *sizes)
         action: Tensor = rsample_and_log_prob(model, (number,))[0]
         return action
