@@ -1,4 +1,4 @@
-"""Rolled-out sets: the rows, the behaviours, and the mazes."""
+"""Rolled-out sets: the rows and the behaviours."""
 
 from __future__ import annotations
 
@@ -11,14 +11,9 @@ import torch
 
 from torchrl_osr.lab.data import check_dataset, collect_transitions, make_environment
 from torchrl_osr.lab.data.behavior import load_behavior_card
-from torchrl_osr.lab.data.environment import MAZE_IDS
-from torchrl_osr.lab.data.rollout import (
-    BEHAVIORS,
-    PLAY_CELLS,
-    collect_source,
-    shortest_path,
-    waypoint_sampler,
-)
+from torchrl_osr.lab.data.environment import MAZE_IDS, TEST_CELLS
+from torchrl_osr.lab.data.mazes import PLAY_CELLS
+from torchrl_osr.lab.data.rollout import BEHAVIORS, collect_source
 from torchrl_osr.lab.data.transitions import ACTION_LIMIT
 
 
@@ -139,32 +134,25 @@ def test_nearly_every_episode_reaches_its_goal(source):
         first = np.r_[True, data["next", "done"].flatten()[:-1]]
         starts = data["observation"].numpy()[first]
         places = [cells_of(MAZE_IDS[name], starts[:, i : i + 2]) for i in (0, 2)]
-        assert set(zip(*places, strict=True)) <= set(PLAY_CELLS[name])
+        assert set(zip(*places, strict=True)) <= set(PLAY_CELLS["large"])
         assert len(np.unique(starts[:, :4], axis=0)) == len(starts), "moved in cells"
 
 
-def test_the_controller_by_hand():
-    with closing(make_environment("PointMaze_UMaze-v3")) as env:
-        sample = waypoint_sampler(env.unwrapped.maze)
-
-    class Silent:
-        def standard_normal(self, size):
-            return np.zeros(size)
-
-    # From the upper left cell to the lower left one, whose centres are (-1, 1) and
-    # (-1, -1), the way leads through (0, 1): 2 * (0 - -1.2) - 0.4 * 1 = 2, at most 1.
-    # Across it 2 * (1 - 1.1) - 0.4 * -0.25 = -0.1.
-    observation = np.array([-1.2, 1.1, -1, -1, -1.2, 1.1, 1, -0.25])
-    assert sample(observation, Silent()) == pytest.approx([1, -0.1])
-    # In the cell before the goal's it goes straight to the goal, here 0.2 away.
-    observation = np.array([0.4, 1, 0.6, 1, 0.4, 1, 0, 0])
-    assert sample(observation, Silent()) == pytest.approx([0.4, 0])
-
-
-def test_the_shortest_of_two_ways_is_taken():
-    ring = {(row, column) for row in range(3) for column in range(4)}
-    ring -= {(1, 1), (1, 2)}
-    way = shortest_path(ring, (0, 1), (2, 1))
-    assert way == [(0, 1), (0, 0), (1, 0), (2, 0), (2, 1)]
-    with pytest.raises(KeyError):
-        shortest_path(ring, (0, 0), (9, 9))
+@pytest.mark.parametrize("source", ["umaze", "diverse"])
+def test_most_ants_reach_their_goal_and_a_time_out_is_no_terminal(source):
+    data, returns, lengths = collect_source("antmaze-umaze", source, 5000, seed=2)
+    check_sound(data)
+    assert set(returns) <= {0, 1}
+    assert returns.mean() > 0.5
+    reward, terminated = data["next", "reward"], data["next", "terminated"]
+    assert ((reward == 1) == terminated).all()
+    assert ((reward == 0) | (reward == 1)).all()
+    # Without the goal an episode lasts 700 steps, and its end is a time-out.
+    assert set(lengths[returns == 0]) == {700}
+    assert (data["next", "done"] == terminated | data["next", "truncated"]).all()
+    assert data["next", "truncated"].sum() >= (returns == 0).sum()
+    first = np.r_[True, data["next", "done"].flatten()[:-1]]
+    starts = data["observation"].numpy()[first]
+    places = [cells_of(MAZE_IDS["antmaze-umaze"], starts[:, i : i + 2]) for i in (0, 2)]
+    pairs = set(zip(*places, strict=True))
+    assert (pairs == {TEST_CELLS["umaze"]}) == (source == "umaze")

@@ -13,7 +13,8 @@ from omegaconf import OmegaConf
 
 from torchrl_osr.lab.data.behavior import load_behavior_card
 from torchrl_osr.lab.data.environment import MAZE_IDS
-from torchrl_osr.lab.data.rollout import BEHAVIORS, MAZE_SOURCES
+from torchrl_osr.lab.data.mazes import MAZE_SOURCES
+from torchrl_osr.lab.data.rollout import BEHAVIORS
 from torchrl_osr.lab.data.sources import RECORDED
 from torchrl_osr.lab.run.config import checked
 from torchrl_osr.lab.run.schema import CHOSEN, TrainConfig, schema_of

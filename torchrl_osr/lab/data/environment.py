@@ -27,11 +27,21 @@ MAZE_IDS = {
     "pointmaze-umaze": "PointMaze_UMaze-v3",
     "pointmaze-medium": "PointMaze_Medium-v3",
     "pointmaze-large": "PointMaze_Large-v3",
-    "antmaze-umaze": "AntMaze_UMaze-v4",
-    "antmaze-medium": "AntMaze_Medium-v4",
-    "antmaze-large": "AntMaze_Large-v4",
+    "antmaze-umaze": "AntMaze_UMaze_Test-v4",
+    "antmaze-medium": "AntMaze_Medium_Test-v4",
+    "antmaze-large": "AntMaze_Large_Test-v4",
 }
 """Gymnasium ids of the mazes, by short name."""
+
+Cell = tuple[int, int]
+"""Row and column."""
+
+TEST_CELLS: dict[str, tuple[Cell, Cell]] = {
+    "umaze": ((1, 1), (3, 1)),
+    "medium": ((1, 1), (6, 6)),
+    "large": ((1, 1), (7, 9)),
+}
+"""Start and goal of D4RL's tests of the ant; gymnasium-robotics has no ids for them."""
 
 MAX_EPISODE = 100_000
 """Time limit of tasks that have none, in steps."""
@@ -171,6 +181,8 @@ def _registered(env_id: str) -> gymnasium.Env[Any, Any]:
             with needed_by(what, "mazes"), redirect_stderr(io.StringIO()):
                 import gymnasium_robotics
             gymnasium.register_envs(gymnasium_robotics)
+            if MAZE_IDS["antmaze-umaze"] not in gymnasium.registry:
+                _register_ant_tests()
             env = make()
     except (gymnasium.error.Error, ModuleNotFoundError) as error:
         missing = gymnasium.error.DependencyNotInstalled, ModuleNotFoundError
@@ -180,10 +192,24 @@ def _registered(env_id: str) -> gymnasium.Env[Any, Any]:
             f"env.id={env_id} cannot be made: {why}. A task of your own is "
             "env.id=<package>:<name>, where that can be imported."
         ) from error
-    if env_id in MAZE_IDS.values():
+    if env.spec is not None and "maze_map" in env.spec.kwargs:
         # The model's file, which is loaded now and would be left for ever.
         Path(env.get_wrapper_attr("tmp_xml_file_path")).unlink(missing_ok=True)
     return env
+
+
+def _register_ant_tests() -> None:
+    for name, (start, goal) in TEST_CELLS.items():
+        env_id = MAZE_IDS[f"antmaze-{name}"]
+        spec = gymnasium.registry[env_id.replace("_Test", "")]
+        maze = [list(row) for row in spec.kwargs["maze_map"]]
+        maze[start[0]][start[1]], maze[goal[0]][goal[1]] = "r", "g"
+        gymnasium.register(
+            env_id,
+            spec.entry_point,
+            max_episode_steps=spec.max_episode_steps,
+            kwargs=spec.kwargs | {"maze_map": maze},
+        )
 
 
 @contextmanager

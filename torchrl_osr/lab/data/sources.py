@@ -66,9 +66,9 @@ def load_dataset(
 
     Args:
         env_name: short name of the task, ``"hopper"``; not needed for recorded data.
-        source: behaviour policy, such as ``"medium-replay"``; in a maze ``"diverse"``
-            or ``"play"``. Recorded data: ``"minari"``, ``"d4rl"``, ``"lerobot"`` or
-            ``"file"``.
+        source: behaviour policy, such as ``"medium-replay"``; in a maze ``"diverse"``,
+            ``"play"`` or ``"umaze"``. Recorded data: ``"minari"``, ``"d4rl"``,
+            ``"lerobot"`` or ``"file"``.
 
     Keyword Args:
         env_id: Gymnasium id of the task. The actions of a ``"file"`` are then in its

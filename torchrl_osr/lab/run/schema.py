@@ -72,7 +72,7 @@ class DataConfig:
     """The data set: rolled out from packaged behaviour policies, or recorded."""
 
     # Behaviour policy: random, medium, medium-replay, medium-expert or expert; in a
-    # maze diverse or play. Recorded data: minari, d4rl, lerobot or file.
+    # maze diverse, play or umaze. Recorded data: minari, d4rl, lerobot or file.
     source: str = MISSING
     path: Any = None  # recorded data: a file, a folder, a list or a pattern
     columns: Any = field(default_factory=ColumnsConfig)  # or a YAML file with them
