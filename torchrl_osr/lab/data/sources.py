@@ -82,7 +82,7 @@ def load_dataset(
             by their part, see ``docs/your_data.md``. Default: the usual names.
         action_bounds: lowest and highest action of the recording. Default: of
             ``"minari"`` its action space; otherwise the task's own bounds. ``"log"``:
-            those of a ``"file"`` itself and 5 % of their distance on either side.
+            the range of the recorded actions and 5 % of it on either side.
         num_actions: number of discrete actions. Default: the task's, if it has any.
         clip_actions, missing: see
             :func:`~torchrl_osr.lab.data.transitions_from_columns`.

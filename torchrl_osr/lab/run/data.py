@@ -68,7 +68,7 @@ def load_data(
     from torchrl_osr.lab.data import load_dataset  # needs Gymnasium; networks do not
 
     converted = isinstance(options.path, str) and is_memmap_folder(options.path)
-
+    is_log = options.source in ("file", "lerobot") and not converted
     reading = asdict(options)
     reading["columns"] = read_columns(reading["columns"])
     for name in (*OF_TRAINING, "checksum"):
@@ -78,7 +78,7 @@ def load_data(
         reading["references"] = references_of(env)
         if env.id is None and env.discrete:
             reading["num_actions"] = env.action_size
-        elif env.id is None and options.source == "file" and not converted:
+        elif env.id is None and is_log:
             known = env.action_low and (env.action_low, env.action_high)
             reading["action_bounds"] = known or options.action_bounds or "log"
     on_disk = options.storage == "disk"
