@@ -72,6 +72,12 @@ def test_rows_are_those_that_lerobot_was_given(on_disk):
     assert manifest["warnings"] == [unseen]
 
 
+def test_a_set_without_rewards_can_be_cloned(edited):
+    path = edited(lambda table: table.drop(columns="next.reward"))
+    _, manifest = load(path)
+    assert manifest["warnings"][-1].startswith("The data have no reward column: name")
+
+
 def without_success(table):
     return table.drop(columns="next.success")
 

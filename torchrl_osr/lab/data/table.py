@@ -66,7 +66,7 @@ def open_log(
             used = {*chain(*about["columns"].values())}
             about["unused_columns"] = [name for name in names if name not in used]
             if not has_rewards(about):
-                about["warnings"] = [NO_REWARDS]
+                about.setdefault("warnings", []).append(NO_REWARDS)
         return [*chain(*about["columns"].values())]
 
     def parts() -> Iterator[Arrays]:
