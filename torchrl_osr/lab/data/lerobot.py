@@ -35,11 +35,6 @@ def open_lerobot(path: Any, columns: Mapping[str, Any], options: Reading) -> Rec
     ``next.success`` is true. A column that the user names takes their place.
     """
     folder = Path(path).expanduser().absolute()
-    if not (folder / "meta" / "info.json").is_file():
-        raise FileNotFoundError(
-            f"{folder} has no meta/info.json: give the folder of a LeRobot data set "
-            "(data.path=...)."
-        )
     info = read_json(folder / "meta" / "info.json")
     if not (version := str(info.get("codebase_version"))).startswith("v3."):
         raise ValueError(
@@ -48,28 +43,29 @@ def open_lerobot(path: Any, columns: Mapping[str, Any], options: Reading) -> Rec
             "--root=<copy> --push-to-hub=false'."
         )
     features = info["features"]
-    known: dict[str, Any] = {}
-    for part, names in KNOWN_NAMES.items():
-        known[part] = [name for name in names if name in features] or None
-    by_truncated = known["truncated"] and "terminated" not in columns
+    known: dict[str, Any] = {
+        part: there
+        for part, names in KNOWN_NAMES.items()
+        if (there := [name for name in names if name in features])
+    }
+    by_truncated = "truncated" in known and "terminated" not in columns
     if by_truncated:
         known["terminated"] = False
-    wanted = {part: each for part, each in known.items() if each is not None}
     files = escape(str(folder)) + "/data/chunk-*/file-*.parquet"
-    log = open_log(files, {**wanted, **columns}, options, "lerobot")
+    log = open_log(files, {**known, **columns}, options, "lerobot")
     log.about["path"] = str(folder)
     log.about["entry_names"] = {n: _entry_names(each) for n, each in features.items()}
     cameras = [n for n, each in features.items() if each["dtype"] in ("video", "image")]
     if cameras:
-        unseen = f"images and videos are left out: {', '.join(cameras)}."
-        log.about["warnings"] = [unseen]
+        text = f"images and videos are left out: {', '.join(cameras)}."
+        log.about["warnings"] = [text]
 
     def parts() -> Iterator[Columns]:
         total = 0
         for rows in log.parts():
             last = np.r_[np.diff(rows["episode"]) != 0, True]
             flag = np.reshape(rows["truncated" if by_truncated else "terminated"], -1)
-            ended = last & (flag.astype(np.bool_) != bool(by_truncated))
+            ended = last & (flag.astype(np.bool_) != by_truncated)
             total += len(last)
             yield {**rows, "terminated": ended, "truncated": last & ~ended}
         if total != info["total_frames"]:
