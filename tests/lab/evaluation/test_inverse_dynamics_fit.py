@@ -50,3 +50,5 @@ def test_ended_rows_do_not_count():
     data["next", "done"][:10] = True
     data["next", "observation"][:10] = float("nan")
     assert inverse_dynamics_report(MODEL, data) == expected
+    with pytest.raises(ValueError, match=r"hold out more rows \(data\.held_out="):
+        inverse_dynamics_report(MODEL, data[:10])

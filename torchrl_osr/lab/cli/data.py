@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+import numpy as np
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 from torchrl import torchrl_logger
@@ -98,7 +99,8 @@ def overview(
                 f"{len(values):,} {known} episodes"
             )
     if (number := manifest.get("num_actions")) is None:
-        low, high = manifest.get("action_bounds", (-1, 1))
+        bounds = manifest.get("action_bounds", (-1, 1))
+        low, high = (np.round(bound, 4).tolist() for bound in bounds)
         what = f"{low} to {high} become -1 to 1; rows at a bound"
         shares = actions_at_bounds(data).tolist()
     else:

@@ -29,6 +29,10 @@ def inverse_dynamics_report(
         deterministic action explains.
     """
     data = data[~data.get(("next", "done")).squeeze(-1)]
+    if not len(data):
+        raise ValueError(
+            "all held-out rows end an episode: hold out more rows (data.held_out=0.2)."
+        )
     # Latent variables at their mean, as the policy's losses use the model.
     with set_interaction_type(InteractionType.DETERMINISTIC):
         distribution = inverse_dynamics_network.get_dist(
