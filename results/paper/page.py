@@ -19,7 +19,18 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 import pandas as pd
-from run import ENVS, EXPERTS, HERE, LIMITED, SIX, TABLES, folder_name
+from run import (
+    ENVS,
+    EXPERTS,
+    HERE,
+    LIMITED,
+    SIX,
+    TABLES,
+    TRIALS,
+    folder_name,
+    packed,
+    updates,
+)
 
 sys.path.append(str(HERE.parent))
 import tables
@@ -303,6 +314,41 @@ def methods_table(means: pd.DataFrame, titles: Mapping[str, str]) -> str:
     return markdown(["method", "score", "disturbed", "recovery rate %"], rows)
 
 
+def tuning() -> str:
+    """Return each method's best trial by its tuning seed, and its mean on others."""
+    place = HERE / TABLES["tune"].place
+    if not place.exists():
+        return NOT_RUN
+    runs = tables.read(place)
+    runs["trial"] = runs["method"]
+    runs["method"] = runs["method"].str.partition("-")[0]
+    rows = []
+    for (data, method), mine in runs.groupby(["data", "method"]):
+        trials = mine[mine["seed"] == 100].groupby("trial")["score"].mean()
+        fresh = mine[(mine["trial"] == trials.idxmax()) & (mine["seed"] != 100)]
+        best = " ".join(f"`{text}`" for text in TRIALS[trials.idxmax()][1:])
+        cells = (str(len(trials)), best, decimal(trials.max()), cell(fresh))
+        rows.append([name_of(data), TITLES[method], *cells])
+    head = ["data", "method", "trials", "best", "tuning seed", "fresh seeds"]
+    return markdown(head, rows)
+
+
+def state() -> str:
+    """Return how many runs of each table there are."""
+    rows = []
+    for name, table in TABLES.items():
+        there = packed(HERE / table.place, table.suites)
+        grid = [
+            (data, method, seed, updates(method, table.seconds))
+            for data in table.data
+            for method in table.methods
+            for seed in table.seeds
+        ]
+        done = sum(each in there for each in grid)
+        rows.append([f"`{name}`", f"{len(grid)}", f"{done}"])
+    return markdown(["table", "runs", "made"], rows)
+
+
 def fill(path: Path, blocks: Mapping[str, str]) -> None:
     """Replace what is between a page's marks."""
     mark = re.compile(r"<!-- (\S+) -->.*?<!-- /\1 -->", re.S)
@@ -356,6 +402,8 @@ def main() -> None:
         "figure4": figure4(clean),
         "d4": d4(clean, quoted),
         "methods": methods_table(means, {name: f"`{name}`" for name in means.index}),
+        "tuning": tuning(),
+        "state": state(),
         "scores": methods_table(means, IN_DOCS),
     }
     # Single numbers in the text.

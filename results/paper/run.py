@@ -3,6 +3,7 @@
     python results/paper/run.py table1                       # or table2, figure4, d4
     python results/paper/run.py table1 --data hopper-medium --methods osr cql --seeds 0
     python results/paper/run.py methods                      # all methods, six sets
+    python results/paper/run.py tune                         # eight trials a method
     python results/paper/run.py table1 --pack                # and then page.py
 
 Each run is one process with one torch thread. Stop the script at any time and start it
@@ -46,6 +47,24 @@ METHODS = {
 }
 """In the order in which they are trained."""
 
+OWN = {
+    **dict.fromkeys(("osr", "cql_noisy_bc", "cql"), ("loss.min_q_weight", 5, 20)),
+    "td3_bc": ("loss.alpha", 2.5, 10),
+    "iql": ("loss.temperature", 3, 10),
+}
+"""Two values of a weight of each method's own, to tune it by."""
+
+TRIALS = {
+    f"{name}-{number}": [
+        *METHODS[name], f"optim.actor_lr={rate}", f"optim.tau={tau}", f"{key}={weight}"
+    ]
+    for name, (key, *weights) in OWN.items()
+    for number, (rate, tau, weight) in enumerate(
+        product((3e-4, 1e-3), (5e-3, 2e-2), weights)
+    )
+}  # fmt: skip
+"""The same number of trials for every method."""
+
 MUJOCO = {
     f"{env} {source}": [f"env={env}", f"data={source}"]
     for source in ("medium", "medium-replay", "medium-expert", "expert", "random")
@@ -80,11 +99,7 @@ class Table(NamedTuple):
     suites: Sequence[str] = ()  # that the table shows
     seeds: Sequence[int] = (0, 1, 2)
     seconds: int = 120
-
-    @property
-    def place(self) -> str:
-        """Name the folder of runs of other lengths, so that they stay apart."""
-        return "" if self.seconds == 120 else f"{self.seconds}s"
+    place: str = ""  # folder of runs that are not the quick preset's two minutes
 
 
 PAPER = ("osr", "osr_v", "cql", "iql", "sdc", "mopo", "rambo")
@@ -96,7 +111,11 @@ TABLES = {
     "d4": Table(
         ("osr_10", "sac_10", "edac_10", "rorl"),
         ("hopper medium-replay", "walker2d medium-replay"),
-        seeds=(0, 1), seconds=600,
+        seeds=(0, 1), seconds=600, place="d4",
+    ),
+    "tune": Table(
+        list(TRIALS), ("hopper medium-replay", "walker2d medium-expert"),
+        seeds=(100,), place="tune",
     ),
     "methods": Table(list(METHODS), SIX, ("oos", "push", "observation_noise")),
 }  # fmt: skip
@@ -119,26 +138,27 @@ def command(log: Path, *arguments: str) -> None:
 
 def updates(method: str, seconds: int) -> int:
     """Return how many updates fit into the time."""
-    ms = json.loads((HERE / "update_ms.json").read_text())["quick"][method]
+    ms = json.loads((HERE / "update_ms.json").read_text())["quick"]
+    ms = ms[method.partition("-")[0]]
     return round(seconds / ms) * 1000
 
 
-def run(folder: Path, data: str, method: str, seed: int, seconds: int) -> None:
+def run(folder: Path, data: str, method: str, seed: int, table: Table) -> None:
     """Train one run, then disturb its last policy."""
     folder.mkdir(parents=True, exist_ok=True)
     status = folder / "status.json"
     if not status.exists() or json.loads(status.read_text())["status"] != "done":
-        steps = updates(method, seconds)
+        steps = updates(method, table.seconds)
         command(
             folder / "train.txt", "train", *DATA[data], f"seed={seed}",
-            *METHODS[method], f"trainer.steps={steps}",
+            *(METHODS | TRIALS)[method], f"trainer.steps={steps}",
             f"trainer.eval_interval={steps // 10}", "trainer.eval_episodes=5",
             f"trainer.checkpoint_interval={steps // 10}", "trainer.progress=false",
             f"hydra.run.dir={folder}",
         )  # fmt: skip
     for suite, file in SUITES.items():
-        shown = seconds == 120 and data in (EXPERTS if suite == "official" else SIX)
-        if shown and not (folder / file).exists():
+        sets = EXPERTS if suite == "official" else SIX
+        if not table.place and data in sets and not (folder / file).exists():
             command(
                 folder / f"{suite}.txt", "evaluate", f"checkpoint={folder}",
                 f"suite={suite}", "episodes=4", "last=1", "progress=false",
@@ -231,7 +251,7 @@ def main() -> None:
         jobs = [
             pool.submit(
                 run, folders[data] / method / f"seed{seed}",
-                data, method, seed, table.seconds,
+                data, method, seed, table,
             )
             for seed, data, method in grid
             if (data, method, seed, updates(method, table.seconds)) not in done
