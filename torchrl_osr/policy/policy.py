@@ -23,6 +23,7 @@ from torchrl_osr._checks import check_choice
 from torchrl_osr._extras import needed_by
 from torchrl_osr._files import RECORD, read_tensors, write_atomically, write_tensors
 from torchrl_osr.modules.actor import mlp
+from torchrl_osr.policy.monitor import DataMonitor
 
 DISTRIBUTIONS = ("TanhNormal", "TanhDelta", "OneHotCategorical")
 """Distributions that an actor may end in, by TorchRL's names."""
@@ -51,6 +52,7 @@ class Policy(nn.Module):
         record: sizes of the networks, and what is known of the run in ``"source"``.
         loc, scale: of the training observations, ``[S]``.
         low, high: bounds of the actions, ``[A]``; empty where actions are discrete.
+        data_monitor: see :meth:`attach`, or ``None``.
     """
 
     loc: Tensor
@@ -79,6 +81,9 @@ class Policy(nn.Module):
             )
             for name, size in numbers.items():
                 self.register_buffer(name, torch.empty(size))
+            self.data_monitor: DataMonitor | None = None
+            if "monitor" in record:
+                self.data_monitor = DataMonitor(record["monitor"])
         self.load_state_dict(dict(tensors), assign=True)
         self.requires_grad_(False).eval()
 
@@ -119,6 +124,30 @@ class Policy(nn.Module):
         result: Array = _like(given, self.smallest_value(rows, actions))
         return result
 
+    @torch.no_grad()
+    def monitor(self, observation: Array | Mapping[str, Any]) -> tuple[Array, Array]:
+        """Return how far states are from the data, and whether that is an alarm.
+
+        Args:
+            observation: as for :meth:`act`. NaN and infinity raise an alarm.
+
+        Returns:
+            Scores, float32, and alarms, bool, both ``[]`` or ``[B]``; see
+            :class:`~torchrl_osr.policy.DataMonitor`.
+        """
+        given = joined(observation)
+        rows = self._rows("observation", given, self.observation_size)
+        if self.data_monitor is None:
+            raise ValueError(
+                "this policy has no monitor: attach torchrl_osr.policy.fit_monitor()."
+            )
+        score, alarm = self.data_monitor(rows)
+        return _like(given, score), _like(given, alarm)
+
+    def attach(self, monitor: DataMonitor) -> None:
+        """Attach a monitor, which :meth:`save` and :meth:`export` write too."""
+        self.data_monitor, self.record["monitor"] = monitor, monitor.record
+
     def save(self, path: Path | str) -> None:
         """Write everything to one file, ``policy.safetensors`` for instance.
 
@@ -136,6 +165,9 @@ class Policy(nn.Module):
         or ``observation`` and ``action`` to ``value`` ``[B]``, all float32. Discrete
         actions are int64, ``[B]``. A graph checks nothing: NaN in is NaN out.
 
+        With a monitor, ``score`` ``[B]`` and ``alarm`` ``[B]``, bool, follow
+        ``action``. An action that is not finite becomes the middle of the bounds then.
+
         Args:
             path: ends in ``.onnx`` for ONNX, or in ``.pt2`` for :mod:`torch.export`.
             output: what it computes, as :meth:`act` or as :meth:`value`.
@@ -146,8 +178,13 @@ class Policy(nn.Module):
         inputs = {"observation": self.loc.repeat(2, 1)}
         part = copy.deepcopy(self)  # a graph keeps all weights, needed or not
         graph: nn.Module = part
+        part.data_monitor = None
+        names: list[str] = [output]
         if output == "action":
             part.critics = nn.ModuleList()
+            if self.data_monitor is not None:
+                graph = _Monitored(part, self.data_monitor)
+                names = ["action", "score", "alarm"]
         else:
             self._check_critics()
             inputs["action"] = self(inputs["observation"])
@@ -157,7 +194,7 @@ class Policy(nn.Module):
         given["dynamic_shapes"] = {name: {0: rows} for name in inputs}
         record = json.dumps(self.record)
         if path.suffix == ".onnx":
-            content = _onnx(graph, given, output, record)
+            content = _onnx(graph, given, names, record)
         else:
             file, program = io.BytesIO(), torch.export.export(graph, **given)
             torch.export.save(program, file, extra_files={RECORD: record})
@@ -200,14 +237,18 @@ class Policy(nn.Module):
 
     def _numbers(self, name: str, value: Any, size: int) -> Tensor:
         """Return the value as finite float32 rows on the policy's device."""
+        rows = self._rows(name, value, size)
+        if not rows.isfinite().all():
+            raise ValueError(f"the {name} has entries that are NaN or infinite.")
+        return rows
+
+    def _rows(self, name: str, value: Any, size: int) -> Tensor:
         rows = _tensor(value).to(self.loc.device, torch.float32)
         if not rows.ndim or rows.shape[-1] != size:
             raise ValueError(
                 f"the {name} has shape {tuple(rows.shape)}, expected ({size},) or "
                 f"(batch, {size})."
             )
-        if not rows.isfinite().all():
-            raise ValueError(f"the {name} has entries that are NaN or infinite.")
         return rows
 
     def _actions(self, value: Any, observation: Tensor) -> Tensor:
@@ -281,10 +322,27 @@ class _Value(nn.Module):
         return self.policy.smallest_value(observation, action)
 
 
-def _onnx(graph: nn.Module, given: dict[str, Any], output: str, record: str) -> bytes:
+class _Monitored(nn.Module):
+    """Returns action, score and alarm; the action is finite."""
+
+    def __init__(self, policy: Policy, monitor: DataMonitor) -> None:
+        super().__init__()
+        self.policy, self.monitor = policy, monitor
+
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        policy, action = self.policy, self.policy(observation)
+        if not policy.discrete:
+            center = (policy.low + policy.high) / 2
+            action = torch.where(action.isnan(), center, action)
+        return action, *self.monitor(observation)
+
+
+def _onnx(
+    graph: nn.Module, given: dict[str, Any], names: list[str], record: str
+) -> bytes:
     with needed_by("ONNX needs", "export"):
         import onnxscript  # noqa: F401
-    given = given | {"input_names": list(given["kwargs"]), "output_names": [output]}
+    given = given | {"input_names": list(given["kwargs"]), "output_names": names}
     # torch 2.13's exporter calls what torch deprecates, and misses torchvision.
     log = logging.getLogger("torch.onnx")
     level = log.level

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
+from recorded_logs import make_columns, save
 from untrained_run import make_run
 
+from torchrl_osr import load_policy
 from torchrl_osr.lab.cli import export
 from torchrl_osr.lab.run.load import load_run_policy
 
@@ -23,6 +26,32 @@ def test_from_a_run_to_each_kind_of_file(tmp_path, run):
         assert float(output.rpartition(" ")[2]) <= 1e-6
 
 
+def test_a_monitor_of_the_runs_data(tmp_path, run):
+    """Rows before a fall are far from the others: they are the only alarms."""
+    columns = make_columns(4000)
+    rows = np.random.default_rng(0).normal(size=(4000, 11)).astype(np.float32)
+    fell = columns["terminated"].reshape(100, 40)[:, -1]
+    late = np.zeros((100, 40), bool)
+    late[fell, -5:] = True
+    rows[late.ravel()] += 9
+    columns |= {"observation": rows, "action": rows[:, :3].clip(-1, 1)}
+    save(tmp_path / "log.npz", columns)
+    save(tmp_path / "own.npz", columns | {"observation": rows * 2})
+    make_run(tmp_path / "run", "data=file", f"data.path={tmp_path}/old.npz")
+    given = ["data.path=log.npz", "monitor.false_alarms=0.1", "monitor.fall_steps=5"]
+    code, output = run(tmp_path, "export", "run", "m.safetensors", *given)
+    assert code == 0, output
+    assert "in at most 0.1 of episodes like the 50 held-out episodes" in output
+    assert f"{5 * fell.sum()} rows in the 5 steps before a terminal state" in output
+    alarm = load_policy(tmp_path / "m.safetensors").monitor(rows)[1].reshape(100, 40)
+    assert alarm[late].all()
+    assert np.where(late, False, alarm).any(1).mean() <= 0.1
+    given.append("monitor.episodes=own.npz")
+    code, output = run(tmp_path, "export", "run", "m.pt2", *given)
+    assert code == 0, output
+    assert "100 episodes of own.npz" in output
+
+
 def test_a_file_that_deviates_is_reported(tmp_path):
     make_run(tmp_path / "run")
     policy, path = load_run_policy(tmp_path / "run"), tmp_path / "p.safetensors"
@@ -34,8 +63,14 @@ def test_a_file_that_deviates_is_reported(tmp_path):
 
 
 def test_what_cannot_be_exported_is_one_line(tmp_path, run):
+    make_run(tmp_path / "run")
     for arguments, message in [
         (["nowhere", "p.onnx"], "there is no run and no checkpoint at nowhere."),
+        (["run", "p.pt2", "monitor.rate=1"], "Key 'rate' not in 'MonitorConfig'"),
+        (
+            ["run", "p.pt2", "monitor.fall_steps=1", "--output", "value"],
+            "leave out --output value",
+        ),
         (["nowhere", "p.pt"], "must end in .safetensors, .onnx or .pt2.\n"),
     ]:
         code, output = run(tmp_path, "export", *arguments)

@@ -3,9 +3,16 @@
     torchrl-osr export outputs/hopper-medium-replay/osr-seed0-... policy.safetensors
     torchrl-osr export policy.safetensors policy.onnx
     torchrl-osr export policy.safetensors value.onnx --output value
+    torchrl-osr export outputs/arm/osr-seed0-... policy.onnx monitor.false_alarms=0.05
 
 The suffix decides: .safetensors for load_policy, .onnx for ONNX Runtime, .pt2 for
 torch.export. docs/deploy.md shows how to use each.
+
+Any of these adds a monitor of the distance to the run's data, with an alarm:
+  monitor.false_alarms=0.05   share of undisturbed episodes with a false alarm
+  monitor.fall_steps=100      steps before a terminal state that count as a fall
+  monitor.episodes=FILE       log of undisturbed episodes of the policy to calibrate on
+  data.path=PATH              of a log that has moved since the run
 """
 
 from __future__ import annotations
@@ -14,14 +21,19 @@ import argparse
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
+from omegaconf import OmegaConf
 from torch import Tensor
 
 from torchrl_osr._extras import needed_by
 from torchrl_osr.lab.run.load import load_run_policy
+from torchrl_osr.lab.run.monitor import MonitorConfig, monitor_of_run
 from torchrl_osr.policy import Policy, load_policy
 from torchrl_osr.policy.policy import GRAPHS, SUFFIX
+
+Outputs = Callable[..., tuple[Tensor, ...]]
 
 ROWS, TOLERANCE = 256, 1e-5
 """Random observations that a file is checked on, and its largest deviation, relative to
@@ -35,12 +47,23 @@ def main() -> None:
     add = parser.add_argument
     add("source", type=Path, help="a run's folder, a checkpoint, or a .safetensors")
     add("path", type=Path, help="the file to write")
+    add("settings", nargs="*", metavar="key=value", help="of the monitor")
     add("--output", choices=("action", "value"), default="action", help="of the graph")
     add("--trust", action="append", default=[], metavar="MODULE", help="yours")
     options = parser.parse_args()
     if options.path.suffix not in (SUFFIX, *GRAPHS):
         parser.error(f"the path must end in {SUFFIX}, {' or '.join(GRAPHS)}.")
+    if options.settings and options.output == "value":
+        parser.error("the monitor belongs to the action: leave out --output value.")
     policy = load_run_policy(options.source, options.trust)
+    if options.settings:
+        known = OmegaConf.create({"monitor": MonitorConfig, "data": {"path": None}})
+        OmegaConf.set_struct(known, True)
+        given: Any = OmegaConf.merge(known, OmegaConf.from_dotlist(options.settings))
+        monitor: Any = OmegaConf.to_object(given.monitor)
+        policy.attach(
+            monitor_of_run(options.source, monitor, given.data.path, options.trust)
+        )
     if options.path.suffix == SUFFIX:
         policy.save(options.path)
     else:
@@ -60,11 +83,14 @@ def check(policy: Policy, path: Path, output: str) -> float:
     noise = torch.randn(ROWS, policy.observation_size, generator=generator)
     observation = policy.loc + policy.scale * noise
     inputs = {"observation": observation}
-    wanted = policy.act(observation)
     if output == "value":
-        inputs["action"], wanted = wanted, policy.value(observation)
-    deviation = (read(path, output)(**inputs) - wanted).abs() / wanted.abs().clamp(1)
-    largest = deviation.max().item()
+        inputs["action"] = policy.act(observation)
+    largest = 0.0
+    wanted, found = outputs_of(policy, output), read(path, output)
+    for one, other in zip(found(**inputs), wanted(**inputs), strict=True):
+        size = other.float().abs().clamp(1)
+        deviation = (one.float() - other.float()).abs() / size  # alarms are bool
+        largest = max(largest, deviation.max().item())
     if not largest <= TOLERANCE:
         raise ValueError(
             f"{path} was written, but deviates from the policy by {largest:.1e}, more "
@@ -73,19 +99,36 @@ def check(policy: Policy, path: Path, output: str) -> float:
     return largest
 
 
-def read(path: Path, output: str) -> Callable[..., Tensor]:
+def outputs_of(policy: Policy, output: str) -> Outputs:
+    """Return what a graph of the policy computes, as a function of named tensors."""
+
+    def run(**inputs: Tensor) -> tuple[Tensor, ...]:
+        if output == "value":
+            return (policy.value(**inputs),)
+        more = policy.monitor(**inputs) if policy.data_monitor is not None else ()
+        return policy.act(**inputs), *more
+
+    return run
+
+
+def read(path: Path, output: str) -> Outputs:
     """Return what a written file computes, as a function of named tensors."""
     if path.suffix == SUFFIX:
-        policy = load_policy(path)
-        return policy.value if output == "value" else policy.act
+        return outputs_of(load_policy(path), output)
     if path.suffix == ".pt2":
-        return torch.export.load(path).module()
+        graph = torch.export.load(path).module()
+
+        def call(**inputs: Tensor) -> tuple[Tensor, ...]:
+            found = graph(**inputs)
+            return found if isinstance(found, tuple) else (found,)
+
+        return call
     with needed_by("a check of the ONNX file needs", "export"):
         import onnxruntime
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
 
-    def run(**inputs: Tensor) -> Tensor:
+    def run(**inputs: Tensor) -> tuple[Tensor, ...]:
         arrays = {name: each.numpy() for name, each in inputs.items()}
-        return torch.from_numpy(session.run(None, arrays)[0])
+        return tuple(map(torch.from_numpy, session.run(None, arrays)))
 
     return run

@@ -15,6 +15,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_osr.lab.data import observation_statistics
+from torchrl_osr.policy.monitor import distance_to
 
 NUM_NEIGHBORS = 10
 MAX_HELD_OUT = 2_000  # and at most a fifth of the data
@@ -72,9 +73,8 @@ class DataDistance:
         """Return the distances of raw observations ``[M, S]``, float32 ``[M]``."""
         # Double: the difference of two near states cancels the digits of float32.
         chunks = torch.split(self._standard(observation.cpu()), ROWS_AT_A_TIME)
-        distances = (torch.cdist(each, self._states) for each in chunks)
-        nearest = [each.topk(NUM_NEIGHBORS, largest=False)[0] for each in distances]
-        return torch.cat(nearest).mean(-1).float()
+        distances = [distance_to(each, self._states, NUM_NEIGHBORS) for each in chunks]
+        return torch.cat(distances).float()
 
     def _standard(self, observation: Tensor) -> Tensor:
         return (observation.double() - self._loc) / self._scale

@@ -1,0 +1,86 @@
+"""A monitor of a run's policy, from the data of the run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_osr.lab.data.rows import check_order
+from torchrl_osr.lab.evaluation.recovery import STEPS_AFTER
+from torchrl_osr.lab.run.config import read_run
+from torchrl_osr.lab.run.data import load_data
+from torchrl_osr.lab.run.load import run_folder_of
+from torchrl_osr.policy import DataMonitor, fit_monitor
+
+
+@dataclass
+class MonitorConfig:
+    """Options of a monitor; ``episodes`` is a log of the policy, undisturbed."""
+
+    false_alarms: float = 0.05
+    fall_steps: int = STEPS_AFTER
+    episodes: str | None = None
+
+
+def monitor_of_run(
+    path: Path | str,
+    options: MonitorConfig,
+    data_path: str | None = None,
+    trust: Sequence[str] = (),
+) -> DataMonitor:
+    """Fit a monitor to a run's data; print what it is made of.
+
+    Args:
+        path: the run's folder, or a checkpoint in it.
+        options: of the monitor.
+        data_path: of a log that has moved since the run.
+        trust: modules of your own that the run's configuration may name.
+    """
+    config = read_run(run_folder_of(path), trust)
+    log = replace(config.data, path=data_path or config.data.path)
+    data, _ = load_data(None if log.path else config.env, log)
+    episode, counts = rows_of(data, options.fall_steps)
+    rate = options.false_alarms
+    monitor = fit_monitor(
+        data["observation"][:], episode, counts, false_alarms=rate, seed=log.seed
+    )
+    source = "held-out episodes of the log"
+    if options.episodes is not None:
+        source = f"episodes of {options.episodes}"
+        log = replace(
+            log, source="file", path=options.episodes, num_transitions=None,
+            checksum=None, random_share=0.0,
+        )  # fmt: skip
+        own, _ = load_data(None, log)
+        about = rows_of(own, options.fall_steps)
+        monitor.calibrate(own["observation"][:], *about, false_alarms=rate)
+    print(
+        f"monitor: an alarm beyond {monitor.threshold:.3g}, in at most {rate:.3g} of "
+        f"episodes like the {monitor.record['episodes']:,} {source}"
+    )
+    if left_out := int((~counts).sum()):
+        print(
+            f"{left_out:,} rows in the {options.fall_steps} steps before a terminal "
+            "state count as falls; if those are goals, give monitor.fall_steps=0"
+        )
+    return monitor
+
+
+def rows_of(data: TensorDictBase, fall_steps: int) -> tuple[Tensor, Tensor]:
+    """Return the episode of each row, and whether it is none of the last before a fall.
+
+    Raises:
+        ValueError: the rows are not in the order of time.
+    """
+    check_order(data)
+    done, terminated = (data["next", k][:, 0] for k in ("done", "terminated"))
+    episode = done.cumsum(0) - done.long()
+    rows = torch.arange(len(data))
+    ends = rows[done | (rows == len(data) - 1)]
+    last = ends[episode]
+    return episode, ~(terminated[last] & (last - rows < fall_steps))
