@@ -162,19 +162,33 @@ def table2(episodes: pd.DataFrame, printed: pd.DataFrame, protocol: str) -> str:
 
 
 def figure4(clean: pd.DataFrame) -> str:
-    """Return the scores of Figure 4 in a table."""
+    """Return the scores of Figure 4 in a table; draw them if there are any."""
+    shares = [0, 50, 70, 90]
+    methods = [name for name in COLUMNS if name in TABLES["figure4"].methods]
+    figure, grid = plt.subplots(1, len(ENVS), figsize=(11, 3.2), layout="constrained")
     rows = []
-    for env in ENVS:
-        for method in (name for name in COLUMNS if name in TABLES["figure4"].methods):
-            sets = [
-                f"{env} expert",
-                *(name for name in LIMITED if name.startswith(env)),
-            ]
+    for env, axes in zip(ENVS, grid, strict=True):
+        axes.set_title(name_of(env), fontsize=10, loc="left")
+        sets = [f"{env} expert", *(name for name in LIMITED if name.startswith(env))]
+        for method in methods:
             mine = clean[clean["method"] == method]
-            cells = [cell(mine[mine["data"] == data]) for data in sets]
-            rows.append([name_of(env), TITLES[method], *cells])
-    shares = ("0 %", "50 %", "70 %", "90 %")
-    return markdown(["robot", "method", *shares], rows)
+            parts = [mine[mine["data"] == data] for data in sets]
+            rows.append([name_of(env), TITLES[method], *map(cell, parts)])
+            found = zip(shares, map(estimate, parts), strict=True)
+            points = [(share, *score[:3]) for share, score in found if score]
+            if points:
+                share, mean, low, high = np.array(points).T
+                axes.plot(share, mean, marker="o", label=TITLES[method])
+                axes.fill_between(share, low, high, alpha=0.2)
+    figure.supxlabel("random rows, %", fontsize=10)
+    figure.supylabel("normalised score", fontsize=10)
+    text = markdown(["robot", "method", *(f"{share} %" for share in shares)], rows)
+    if clean["data"].isin(LIMITED).any():
+        grid[0].legend(frameon=False, fontsize=8)
+        figure.savefig(HERE / "figure4.png", dpi=110)
+        text += "\n\n![Score against the share of random rows](figure4.png)"
+    plt.close(figure)
+    return text
 
 
 def d4(clean: pd.DataFrame, quoted: pd.DataFrame) -> str:
