@@ -15,6 +15,7 @@ from lerobot_pendulum import LENGTHS, REACHED, make_episodes
 
 from torchrl_osr.lab.cli import data as data_command
 from torchrl_osr.lab.data import load_dataset
+from torchrl_osr.lab.run.monitor import MonitorConfig, monitor_of_run
 
 PENDULUM = Path(__file__).parent / "lerobot_pendulum"
 INFO = Path("meta", "info.json")
@@ -133,3 +134,5 @@ def test_the_commands_read_a_folder(tmp_path, monkeypatch, capsys):
     assert [name in output for name in ("cos", "speed", "torque")] == [True] * 3
     folder = trained(tmp_path / "run", *given, "data.held_out=0.2")
     assert json.loads((folder / "inverse_dynamics.json").read_text())["rows"] > 0
+    monitor_of_run(folder, MonitorConfig(false_alarms=0.5, fall_steps=0))
+    assert "monitor: an alarm beyond" in capsys.readouterr().out

@@ -43,7 +43,8 @@ def monitor_of_run(
     """
     config = read_run(run_folder_of(path), trust)
     log = replace(config.data, path=data_path or config.data.path)
-    data, _ = load_data(None if log.path else config.env, log)
+    env = replace(config.env, id=None)  # its bounds are known: no simulator is made
+    data, _ = load_data(env if log.path else config.env, log)
     episode, counts = rows_of(data, options.fall_steps)
     rate = options.false_alarms
     monitor = fit_monitor(
@@ -56,7 +57,7 @@ def monitor_of_run(
             log, source="file", path=options.episodes, num_transitions=None,
             checksum=None, random_share=0.0,
         )  # fmt: skip
-        own, _ = load_data(None, log)
+        own, _ = load_data(env, log)
         about = rows_of(own, options.fall_steps)
         monitor.calibrate(own["observation"][:], *about, false_alarms=rate)
     print(
