@@ -199,6 +199,7 @@ LOSSES: dict[str, Case] = {
     "choice-model": Case(of(InverseDynamicsLoss, "choice_model"), FIT, "one_hot"),
     "bc": Case(of(lab.BCLoss, "actor"), {"loss_actor": ACTOR}),
     "iql": Case(of(lab.IQLLoss, "gaussian critics value"), TD3 | {"loss_value": VALUE}),
+    "fqe": Case(of(lab.FQELoss, "critics"), {"loss_qvalue": CRITICS}),
     "edac": Case(of(lab.EDACLoss, PAIR, alpha_init=0.5), SAC),
     "rorl": Case(of(lab.RORLLoss, PAIR, num_samples=2, alpha_init=0.5), SAC),
     "td3-bc": Case(of(lab.TD3BCLoss, PLAIN, **BOX), TD3),

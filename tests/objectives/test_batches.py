@@ -177,7 +177,7 @@ def test_iql_refuses_synthetic_rows() -> None:
         make_loss("iql")(batch)
 
 
-UNBOUNDED = ["discrete", "discrete-cql", "choice-model", "iql"]
+UNBOUNDED = ["discrete", "discrete-cql", "choice-model", "iql", "fqe"]
 READS_NONE = ["recovery", "recovery-delta", "recovery-module"]
 WITH_BOUNDS = [name for name in LOSSES if name not in (*UNBOUNDED, *READS_NONE)]
 

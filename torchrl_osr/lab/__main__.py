@@ -23,6 +23,7 @@ COMMANDS = {
     "settings": "print the settings of every method on a data set",
     "collect": "roll out a policy in any environment and keep the log",
     "evaluate": "disturb a trained policy: score lost, survival, recovery",
+    "evaluate-offline": "estimate how good policies are from their data alone",
     "report": "compare any number of runs on one page",
     "export": "write a trained policy to one file, for use elsewhere",
 }
@@ -55,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Dispatch to the subcommand; ``arguments`` are by default the process's."""
     name, *rest = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if name in ("-h", "--help"):
-        lines = [f"  {command:10}{does}" for command, does in COMMANDS.items()]
+        lines = [f"  {command:18}{does}" for command, does in COMMANDS.items()]
         print(HELP.format(commands="\n".join(lines)), end="")
     elif name == "--version":
         print(_versions())
@@ -73,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         # For modules of the user's; last, where they replace no installed package.
         sys.path.append(os.getcwd())
         with errors_as_sentences():
-            import_module(f"torchrl_osr.lab.cli.{name}").main()
+            import_module(f"torchrl_osr.lab.cli.{name.replace('-', '_')}").main()
     else:
         known = ", ".join(COMMANDS)
         similar = guess(name, COMMANDS)

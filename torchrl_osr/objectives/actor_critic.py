@@ -191,6 +191,13 @@ class ActorCriticLoss(LossModule):
         self.convert_to_functional(
             actor_network, "actor_network", create_target_params=delay_actor
         )
+        self.register_critics(qvalue_network)
+
+    def register_critics(
+        self, qvalue_network: TensorDictModule | Sequence[TensorDictModule]
+    ) -> None:
+        """Register critics, with targets: one to be copied, or a list."""
+        check_networks(qvalue_network=qvalue_network)
         if isinstance(qvalue_network, Sequence):
             self.num_qvalue_nets = len(qvalue_network)
         check_positive("num_qvalue_nets", self.num_qvalue_nets, minimum=1)

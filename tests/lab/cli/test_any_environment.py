@@ -14,7 +14,7 @@ from composed import composed
 from composed import trained as trained_on
 from gymnasium.envs.classic_control import PendulumEnv
 
-from torchrl_osr.lab.cli import collect, data, evaluate
+from torchrl_osr.lab.cli import collect, data, evaluate, evaluate_offline
 from torchrl_osr.lab.data import environment_spec
 from torchrl_osr.lab.report import read_runs, write_report
 from torchrl_osr.lab.report.runs import find_runs
@@ -197,6 +197,30 @@ def test_a_log_without_rewards_trains_what_needs_none(tmp_path, capsys):
     shown = capsys.readouterr().out
     assert "1. The data have no reward column" in shown
     assert "returns " not in shown
+
+
+def test_policies_are_ranked_on_their_log_alone(tmp_path, capsys, monkeypatch):
+    record(log := tmp_path / "log.npz", "env.id=Pendulum-v1", "episodes=3")
+    given = "env=none", f"data.path={log}"
+    runs = [trained(tmp_path / loss, *given, f"loss={loss}") for loss in ("bc", "iql")]
+    command = ["torchrl-osr", *map(str, runs), "--steps", "5", "--discount", "0.9"]
+    monkeypatch.setattr("sys.argv", command)
+    evaluate_offline.main()
+    found = [json.loads((run / "offline_evaluation.json").read_text()) for run in runs]
+    with np.load(log) as columns:
+        rewards = columns["reward"].reshape(3, 200)[:, :199]  # the last has no next
+    own = (rewards @ 0.9 ** np.arange(199)).mean()
+    for each in found:
+        assert each["value_low"] < each["value"] < each["value_high"]
+        assert each["data_value"] == pytest.approx(own, rel=1e-5)
+    table = capsys.readouterr().out.split("estimated discounted return")[-1]
+    best = max(zip(found, runs, strict=True), key=lambda pair: pair[0]["value"])[1]
+    assert table.index(str(best)) == min(table.index(str(run)) for run in runs)
+    assert "from the first states of 3 episodes" in table
+    log.unlink()
+    evaluate_offline.main()  # the results are there already
+    with pytest.raises(ValueError, match=r"never played: .*; estimated discounted ret"):
+        read_runs([tmp_path])
 
 
 def test_without_a_simulator_bounds_and_discrete_actions_may_be_given(tmp_path):

@@ -11,6 +11,7 @@ from torchrl_osr.lab.evaluation.inverse_dynamics_fit import (
     describe_inverse_dynamics,
     inverse_dynamics_report,
 )
+from torchrl_osr.lab.evaluation.offline import fitted_values
 from torchrl_osr.lab.evaluation.recoverable import load_recoverable_states, recovers
 from torchrl_osr.lab.evaluation.recovery import DataDistance
 from torchrl_osr.lab.evaluation.robustness import (
@@ -28,6 +29,7 @@ __all__ = [
     "describe_inverse_dynamics",
     "deterministic_policy",
     "evaluate_paired",
+    "fitted_values",
     "inverse_dynamics_report",
     "load_recoverable_states",
     "mean_interval",

@@ -16,6 +16,7 @@ from torchrl_osr._files import read_json
 from torchrl_osr.lab.data import reference_returns
 from torchrl_osr.lab.evaluation.robustness import RECOVERY
 from torchrl_osr.lab.run.config import CONFIG, flatten, read_config, read_yaml
+from torchrl_osr.lab.run.evaluate_offline import FILE as OFFLINE
 from torchrl_osr.lab.run.folder import RESUMABLE, read_status
 from torchrl_osr.lab.run.schema import method_name
 
@@ -187,7 +188,14 @@ def _read(folder: Path) -> _Run:
     evaluations = returns["evaluations"]
     if not evaluations or evaluations[-1]["step"] != steps:
         at = evaluations[-1]["step"] if evaluations else "none"
-        raise ValueError(f"not finished, or never played: last evaluation at step {at}")
+        reason = f"not finished, or never played: last evaluation at step {at}"
+        if (folder / OFFLINE).exists():
+            each = read_json(folder / OFFLINE)
+            reason += (
+                "; estimated discounted return {value:.4g} [{value_low:.4g}, "
+                "{value_high:.4g}], of the data {data_value:.4g}".format(**each)
+            )
+        raise ValueError(reason)
     rows, protocols, versions = [], [], [returns["versions"]]
     for each in evaluations:
         values = np.array(each["returns"], dtype=float)

@@ -139,7 +139,8 @@ def read_environment(env: EnvConfig) -> EnvironmentSpec:
 
     if env.id is None:
         raise ValueError(
-            f"{env.name} has no simulator (env=none): nothing can be played there."
+            f"{env.name} has no simulator (env=none): nothing can be played there. "
+            "torchrl-osr evaluate-offline estimates the policy's value."
         )
     spec = environment_spec(env.id)
     for name in SIZES:

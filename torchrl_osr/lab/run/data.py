@@ -80,7 +80,7 @@ def load_data(
             reading["num_actions"] = env.action_size
         elif env.id is None and is_log:
             known = env.action_low and (env.action_low, env.action_high)
-            reading["action_bounds"] = known or options.action_bounds or "log"
+            reading["action_bounds"] = options.action_bounds or known or "log"
     on_disk = options.storage == "disk"
     data, manifest = load_dataset(**reading, on_disk=on_disk, progress=progress)
     if options.checksum not in (None, manifest["checksum"]):

@@ -88,14 +88,14 @@ def open_run(
         new, known = not (folder / CONFIG).exists(), config.data
         if config.env.id is not None:
             read_environment(config.env)
-        elif new:
+        elif new or config.force:
             read_log(config)
         if new:
             (folder / HYDRA).parent.mkdir(exist_ok=True)
             write_atomically(folder / HYDRA, OmegaConf.to_yaml({"hydra": job}))
         else:
             known = (run := read_run(folder, trust)).data
-            if config.env.id is None:
+            if config.env.id is None and not config.force:
                 for name in SIZES:
                     setattr(config.env, name, getattr(run.env, name))
             config.data.checksum = None if config.force else known.checksum

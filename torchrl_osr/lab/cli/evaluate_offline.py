@@ -1,0 +1,67 @@
+"""Estimate how good trained policies are, from their data alone.
+
+    torchrl-osr evaluate-offline outputs/log-pump-file/*
+    torchrl-osr evaluate-offline <run's folder> --discount 0.995 --steps 20000
+
+Fitted Q evaluation: critics learn the discounted return of each policy, which is then
+averaged over the first state of every episode of the data. A run's folder gets
+offline_evaluation.json. See docs/any_environment.md for how far to trust the order.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import defaultdict
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from torchrl_osr.lab.evaluation.tables import aligned_columns
+from torchrl_osr.lab.run.evaluate_offline import evaluate_offline
+
+
+def main() -> None:
+    """Evaluate the runs; print a table for each data set, best first."""
+    parser = argparse.ArgumentParser(prog=sys.argv[0], description=__doc__)
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    add = parser.add_argument
+    add("runs", nargs="+", type=Path, help="folders of runs, or checkpoints in them")
+    add("--discount", type=float, help="default: that of each run")
+    add("--steps", type=int, default=4000, help="updates of the critics")
+    add("--seed", type=int, default=0, help="of the critics")
+    add("--data", metavar="PATH", help="place of the log, if it was moved")
+    add("--trust", action="append", default=[], metavar="MODULE", help="yours")
+    given = parser.parse_args()
+    tables: dict[Any, dict[str, Mapping[str, Any]]] = defaultdict(dict)
+    for run in given.runs:
+        found = evaluate_offline(
+            run,
+            steps=given.steps,
+            discount=given.discount,
+            seed=given.seed,
+            place=given.data,
+            trust=given.trust,
+        )
+        tables[found["env"], found["data"], found["discount"]][str(run)] = found
+    for table in tables.values():
+        print("\n" + ranking(table))
+
+
+def ranking(results: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return a text table of policies on one data set, the best estimate first."""
+    best, *others = order = sorted(results, key=lambda run: -results[run]["value"])
+    first = results[best]
+    rows = [("policy", "value", "[95 %]")]
+    for run in order:
+        interval = "[{value_low:.4g}, {value_high:.4g}]".format(**results[run])
+        rows.append((run, f"{results[run]['value']:.4g}", interval))
+    rows.append(("the data", f"{first['data_value']:.4g}", ""))
+    lines = [
+        "{env} {source}: estimated discounted return, discount {discount:g}, from the "
+        "first states of {episodes:,} episodes".format(**first),
+        *aligned_columns(rows),
+    ]
+    if others and results[others[0]]["value_high"] > first["value_low"]:
+        lines.append("  The intervals of the first two overlap: their order is unsure.")
+    return "\n".join(lines)
