@@ -74,7 +74,7 @@ def test_too_few_episodes_say_how_many_are_needed(log):
     with pytest.raises(ValueError, match="within 0 and 1"):
         conformal_threshold(torch.ones(5), 0.0)
     one = log[0], np.zeros(ROWS, int)
-    with pytest.raises(ValueError, match="too few episodes"):
+    with pytest.raises(ValueError, match="need 19 held-out .* are 1"):
         monitor_of(one)
 
 

@@ -175,10 +175,8 @@ def fit_monitor(
     held_out = torch.isin(episode, order[len(order) // 2 :])
     known = (~held_out & counts).nonzero()[:, 0]
     if not len(known):
-        raise ValueError(
-            f"no row of {len(numbers) // 2} episodes counts as data: all are near a "
-            "terminal state, or there are too few episodes."
-        )
+        conformal_threshold(torch.zeros(len(order) - len(order) // 2), false_alarms)
+        raise ValueError("no row counts as data: all are near a terminal state.")
     data = observation[known].float()
     chosen = torch.randperm(len(data), generator=generator)[:num_states]
     size = {"num_states": len(chosen), "observation_size": data.shape[-1]}
