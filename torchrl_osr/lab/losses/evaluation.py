@@ -34,8 +34,8 @@ class FQELoss(ActorCriticLoss):
     "Bootstrapping Fitted Q-Evaluation", https://arxiv.org/abs/2102.03607.
 
     Keyword Args:
-        value_bounds: smallest and largest possible value; targets are clipped to them,
-            so that values cannot diverge. Default: none.
+        value_bounds: smallest and largest possible value. Clips the targets, and so
+            prevents divergence. Default: none.
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 
     Examples:

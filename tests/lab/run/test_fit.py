@@ -1,0 +1,29 @@
+"""Training on columns in one call."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+from composed import SMALL
+
+from torchrl_osr.lab import fit
+from torchrl_osr.lab.run.config import read_run
+
+
+def test_columns_become_a_run_that_the_same_call_continues(tmp_path):
+    rng, folder = np.random.default_rng(0), tmp_path / "my arm"
+    frame = pd.DataFrame(
+        rng.random((60, 4)), columns=["obs_0", "obs_1", "act", "reward"]
+    )
+    frame = frame.assign(terminated=0, episode=np.arange(60) // 20)
+    small = [each for each in SMALL if not each.startswith("data.num")][1:]
+    given = "loss=td3_bc", "data.action_bounds=[-1,3]"
+    policy = fit(frame, folder, *small, *given)
+    assert policy.act(np.zeros(2)).shape == (1,)
+    assert (policy.low, policy.high) == (-1, 3)
+    assert read_run(folder).env.name == "log-my-arm"
+    again = fit(frame, folder, *small, *given)
+    assert again.act(np.zeros(2)) == policy.act(np.zeros(2))
+    with pytest.raises(ValueError, match=r"other contents"):
+        fit(frame.assign(reward=0.5), folder, *small, *given)

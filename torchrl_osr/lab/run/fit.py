@@ -1,0 +1,60 @@
+"""Training on a log, as one function."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from torchrl_osr.lab.run import CONF
+from torchrl_osr.lab.run.folder import open_run
+from torchrl_osr.lab.run.load import load_run_policy
+from torchrl_osr.lab.run.schema import register
+from torchrl_osr.lab.run.train import train
+from torchrl_osr.policy import Policy
+
+
+def fit(
+    log: Mapping[str, Any] | Path | str, folder: Path | str, *overrides: str
+) -> Policy:
+    """Train a policy on a log, as ``torchrl-osr train env=none data=file`` does.
+
+    The same call continues a run that was stopped, and returns a finished one's policy.
+
+    Args:
+        log: file of a log, or its columns by their usual names, such as a data frame.
+            Columns are kept in the folder.
+        folder: of the run.
+        overrides: settings, as on the command line: ``"loss=td3_bc"``.
+
+    Examples:
+        >>> from tempfile import mkdtemp
+        >>> import numpy as np
+        >>> from torchrl_osr.lab import fit
+        >>> rng = np.random.default_rng(0)
+        >>> log = {"observation": rng.normal(size=(300, 2)), "reward": rng.random(300)}
+        >>> log |= {"action": rng.random((300, 1)), "terminated": np.zeros(300)}
+        >>> log["episode"] = np.arange(300) // 100
+        >>> policy = fit(log, mkdtemp() + "/arm", "loss=bc", "trainer.steps=2")
+        <BLANKLINE>
+        log-arm file, in /.../arm: the policy is trained, and was never played
+        >>> policy.act(np.zeros(2)).shape
+        (1,)
+    """
+    register()
+    folder = Path(folder)
+    if isinstance(log, Mapping) or hasattr(log, "items"):
+        folder.mkdir(parents=True, exist_ok=True)
+        columns: Any = {str(name): np.asarray(column) for name, column in log.items()}
+        np.savez(log := folder / f"{folder.name}.npz", **columns)
+    given = ["env=none", "data=file", f"data.path='{log}'", *overrides]
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        cfg = compose("train", given, return_hydra_config=True)
+    settings = OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"])
+    with open_run(settings, folder, cfg.hydra) as run:
+        train(run)
+    return load_run_policy(folder)
