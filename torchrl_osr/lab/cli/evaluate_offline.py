@@ -32,17 +32,10 @@ def main() -> None:
     add("--seed", type=int, default=0, help="of the critics")
     add("--data", metavar="PATH", help="place of the log, if it was moved")
     add("--trust", action="append", default=[], metavar="MODULE", help="yours")
-    given = parser.parse_args()
-    tables: dict[Any, dict[str, Mapping[str, Any]]] = defaultdict(dict)
-    for run in given.runs:
-        found = evaluate_offline(
-            run,
-            steps=given.steps,
-            discount=given.discount,
-            seed=given.seed,
-            place=given.data,
-            trust=given.trust,
-        )
+    options = vars(parser.parse_args())
+    runs, tables = options.pop("runs"), defaultdict[Any, dict[str, Any]](dict)
+    for run in runs:
+        found = evaluate_offline(run, **options)
         tables[found["env"], found["data"], found["discount"]][str(run)] = found
     for table in tables.values():
         print("\n" + ranking(table))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,12 +22,7 @@ from torchrl_osr.lab.data.rows import check_order
 from torchrl_osr.lab.data.store import is_memory_mapped
 from torchrl_osr.lab.data.transitions import ROWS_AT_A_TIME
 from torchrl_osr.lab.evaluation.episodes import Policy
-from torchrl_osr.lab.evaluation.statistics import (
-    NUM_RESAMPLES,
-    Array,
-    Estimate,
-    interval,
-)
+from torchrl_osr.lab.evaluation.statistics import Array
 from torchrl_osr.lab.losses import FQELoss
 from torchrl_osr.modules import critic_ensemble
 from torchrl_osr.trainers import OfflineTrainer
@@ -65,7 +61,7 @@ def fitted_values(
         Values ``[K, E]``, one for each critic and episode.
 
     Raises:
-        ValueError: the rows are not in order of time.
+        ValueError: the rows are not in order of time, or the discount is 1.
 
     Examples:
         >>> from torchrl_osr.lab.data import load_dataset
@@ -75,6 +71,8 @@ def fitted_values(
         >>> len(fitted_values(data, lambda state: state[:, :3].tanh(), **options))
         2
     """
+    if not 0 <= gamma < 1:
+        raise ValueError(f"The discount is {gamma}; expected at least 0 and below 1.")
     check_order(data)
     ends = data["next", "done"].squeeze(-1)
     first = torch.cat([ends.new_ones(1), ends[:-1]])
@@ -82,9 +80,8 @@ def fitted_values(
     number, size = len(starts), data["action"].shape[-1]
 
     def act(states: Tensor) -> Tensor:
-        action = torch.cat(
-            [policy(rows) for rows in torch.split(states, ROWS_AT_A_TIME)]
-        )
+        parts = torch.split(states, ROWS_AT_A_TIME)
+        action = torch.cat([policy(rows) for rows in parts])
         return action if action.ndim > 1 else one_hot(action, size).float()
 
     next_action = act(data["next", "observation"])
@@ -106,11 +103,10 @@ def fitted_values(
         batch["bootstrap"] = weight[:, episode[rows]].T
         return batch
 
-    if is_memory_mapped(data):
-        buffer = make_replay_buffer(data, batch_size=batch_size, seed=0, read=read)
-    else:
-        buffer = make_replay_buffer(read(data), batch_size=batch_size, seed=0)
-    bounds = [bound / unit / (1 - gamma) for bound in reward.aminmax()]
+    on_disk: Any = {"read": read} if is_memory_mapped(data) else {}
+    rows = data if on_disk else read(data)
+    buffer = make_replay_buffer(rows, batch_size=batch_size, seed=0, **on_disk)
+    least, most = (each.item() / unit / (1 - gamma) for each in reward.aminmax())
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         critics = critic_ensemble(
@@ -120,8 +116,8 @@ def fitted_values(
             num_cells=num_cells,
             layer_norm=True,
         )
-    low, high = min(0.0, float(bounds[0])), max(0.0, float(bounds[1]))
-    loss = FQELoss(critics, value_bounds=(low, high), deactivate_vmap=True)
+    bounds = min(0.0, least), max(0.0, most)
+    loss = FQELoss(critics, value_bounds=bounds, deactivate_vmap=True)
     loss.make_value_estimator(gamma=gamma)
     optimizer = torch.optim.Adam(loss.parameters(), lr=lr, fused=True)
     with TemporaryDirectory() as folder:
@@ -148,12 +144,3 @@ def episode_values(data: TensorDict, gamma: float) -> Array:
     ends = np.flatnonzero(data["next", "done"].squeeze(-1).numpy())
     parts = np.split(reward, ends[:-1] + 1)
     return np.array([each @ gamma ** np.arange(len(each)) for each in parts])
-
-
-def value_estimate(values: Array, *, seed: int = 0) -> Estimate:
-    """Return the mean of values ``[K, E]``, by a bootstrap of critics and episodes."""
-    rng, (critics, number) = np.random.default_rng(seed), values.shape
-    counts = rng.multinomial(number, np.full(number, 1 / number), size=NUM_RESAMPLES)
-    rows = values[rng.integers(critics, size=NUM_RESAMPLES)]
-    resamples = (rows * counts).sum(1) / number
-    return interval(values.mean(), resamples, "episodes")

@@ -13,11 +13,8 @@ from torchrl import torchrl_logger
 from torchrl_osr._files import read_json, sha256_of, write_json
 from torchrl_osr.lab.data.recording import NO_REWARDS, has_rewards
 from torchrl_osr.lab.evaluation import deterministic_policy
-from torchrl_osr.lab.evaluation.offline import (
-    episode_values,
-    fitted_values,
-    value_estimate,
-)
+from torchrl_osr.lab.evaluation.offline import episode_values, fitted_values
+from torchrl_osr.lab.evaluation.statistics import interval, nested_resamples
 from torchrl_osr.lab.run.data import load_data
 from torchrl_osr.lab.run.folder import package_versions
 from torchrl_osr.lab.run.load import load_trained, run_folder_of
@@ -32,7 +29,7 @@ def evaluate_offline(
     steps: int,
     discount: float | None = None,
     seed: int = 0,
-    place: str | None = None,
+    data: str | None = None,
     trust: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Estimate the value of a run's policy by fitted Q evaluation on the run's data.
@@ -45,14 +42,14 @@ def evaluate_offline(
     Keyword Args:
         steps, seed: of the training of the critics.
         discount: default: that of the run.
-        place: of the data, if they have been moved.
+        data: place of the data, if they have been moved.
         trust: modules of yours that the run may name.
     """
     torchrl_logger.setLevel("WARNING")
     trained = load_trained(path, trust=trust)
     # Without its simulator: the run knows sizes and bounds.
     env, options = replace(trained.config.env, id=None), trained.config.data
-    options.path = place or options.path
+    options.path = data or options.path
     gamma = trained.config.optim.gamma if discount is None else discount
     request = {
         "versions": package_versions(),
@@ -66,13 +63,14 @@ def evaluate_offline(
     file = run_folder_of(path) / name
     if file.exists() and request.items() <= (known := read_json(file)).items():
         return known
-    data, manifest = load_data(env, options)
+    rows, manifest = load_data(env, options)
     if not has_rewards(manifest):
         raise ValueError(f"{path} cannot be evaluated on its data. {NO_REWARDS}")
     policy = deterministic_policy(trained.actor, trained.observation_norm)
     torch.set_num_threads(trained.config.trainer.num_threads)
-    values = fitted_values(data, policy, gamma=gamma, steps=steps, seed=seed)
-    found, recorded = value_estimate(values), episode_values(data, gamma)
+    values = fitted_values(rows, policy, gamma=gamma, steps=steps, seed=seed)
+    recorded = episode_values(rows, gamma)
+    found = interval(values.mean(), nested_resamples([*values[..., None]])[:, 0])
     results = request | {
         "env": env.name,
         "source": options.source,
