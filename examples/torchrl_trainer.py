@@ -20,8 +20,9 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torchrl.data import ReplayBuffer
 from torchrl.envs import ObservationNorm
 from torchrl.trainers import DefaultOptimizationStepper, Trainer
+from torchrl.trainers.algorithms import configs  # noqa: F401 (TorchRL's options)
 
-from torchrl_osr import configs
+from torchrl_osr import InverseDynamicsLoss
 from torchrl_osr._files import write_json
 from torchrl_osr.lab.data import (
     load_dataset,
@@ -33,7 +34,6 @@ from torchrl_osr.lab.data.environment import environment_id
 from torchrl_osr.lab.evaluation import EpisodeEvaluator, deterministic_policy, summarize
 from torchrl_osr.trainers import ReplayBufferCollector
 
-configs.register()
 OmegaConf.register_new_resolver("frames", lambda steps, rows: steps * rows)
 
 
@@ -60,9 +60,7 @@ def train_inverse_dynamics(
 ) -> ProbabilisticTensorDictSequential:
     """Learn which action leads from a state to the next, with TorchRL's Trainer."""
     model = instantiate(cfg.inverse_dynamics)
-    loss = instantiate(cfg.inverse_dynamics_loss, _partial_=True)(
-        inverse_dynamics_network=model
-    )
+    loss = InverseDynamicsLoss(model)
     frames = cfg.inverse_dynamics_steps * cfg.batch_size
     Trainer(
         collector=ReplayBufferCollector(buffer, total_frames=frames),
@@ -85,13 +83,11 @@ def main(cfg: DictConfig) -> None:
     buffer, norm = load_buffer(cfg)
     model = train_inverse_dynamics(cfg, buffer)
     actor = instantiate(cfg.actor)
-    loss = instantiate(cfg.loss, _partial_=True)(
-        actor_network=actor,
-        qvalue_network=instantiate(cfg.critics),
-        inverse_dynamics_network=model,
-    )
+    loss = instantiate(cfg.loss)(actor, instantiate(cfg.critics), model)
+    loss.make_value_estimator(gamma=cfg.gamma)
+    frames = cfg.trainer.total_frames
     trainer = instantiate(cfg.trainer, _partial_=True)(
-        collector=instantiate(cfg.collector, _partial_=True)(replay_buffer=buffer),
+        collector=ReplayBufferCollector(buffer, total_frames=frames),
         loss_module=loss,
         optimizer=instantiate(cfg.optimizer),
         target_net_updater=instantiate(cfg.target_net_updater),
