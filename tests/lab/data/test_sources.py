@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from concurrent.futures import ThreadPoolExecutor
 from unittest import mock
 
@@ -11,14 +10,8 @@ import numpy as np
 import pytest
 from recorded_logs import make_columns, save
 
-from torchrl_osr.lab.data import (
-    load_dataset,
-    sources,
-    transitions_from_columns,
-    write_memmap,
-)
+from torchrl_osr.lab.data import load_dataset, sources, transitions_from_columns
 from torchrl_osr.lab.data.statistics import REFERENCE_RETURNS
-from torchrl_osr.lab.data.store import is_memory_mapped
 
 pytestmark = pytest.mark.usefixtures("cache")
 
@@ -40,13 +33,9 @@ def test_a_set_is_collected_once(collections):
     with ThreadPoolExecutor(2) as pool:
         (first, manifest), _ = pool.map(lambda _: roll_out(), range(2))
     second, again = roll_out()
-    mapped, also = roll_out(on_disk=True)
     assert collections.call_count == 1
     assert (first == second).all()
-    assert (first == mapped).all()
-    assert manifest == again == also
-    assert is_memory_mapped(mapped)
-    assert not is_memory_mapped(second)
+    assert manifest == again
 
 
 def test_other_versions_make_the_set_anew(collections, monkeypatch):
@@ -99,37 +88,18 @@ def d4rl_columns(data):
 
 
 @pytest.mark.parametrize("source", ["d4rl", "file"])
-@pytest.mark.parametrize("on_disk", [False, True])
-def test_recorded_data_are_read(source, on_disk, tmp_path):
+def test_recorded_data_are_read(source, tmp_path):
     rows, _ = roll_out("medium")
     path = str(save(tmp_path / "hopper.hdf5", d4rl_columns(rows)))
-    options = {"path": path, "on_disk": on_disk}
+    options = {"path": path}
     data, manifest = load_dataset("hopper", source, env_id="Hopper-v5", **options)
     assert (data == rows).all()
-    assert is_memory_mapped(data) == on_disk
     score = REFERENCE_RETURNS["hopper"].score(manifest["mean_return"])
     assert (manifest["source"], manifest["normalized_score"]) == (source, score)
     _, other = load_dataset("another", source, **options)
     assert other["normalized_score"] is None
     with pytest.raises(ValueError, match=r"11 observation and 3 .*Walker2d-v5 has 17"):
         load_dataset("walker2d", source, env_id="Walker2d-v5", **options)
-    write_memmap([rows], tmp_path / "mine")  # a set of one's own
-    data, _ = load_dataset("hopper", path=str(tmp_path / "mine"), on_disk=on_disk)
-    assert is_memory_mapped(data) == on_disk
-    assert (data == rows).all()
-
-
-def test_a_converted_log_is_kept_until_the_file_or_an_option_changes(cache, tmp_path):
-    path = save(tmp_path / "log.npz", make_columns())
-    for bounds in ((-1, 1), (-2, 2), (-1, 1)):
-        data, manifest = load_dataset(path=path, action_bounds=bounds, on_disk=True)
-        expected, about = load_dataset(path=path, action_bounds=bounds)
-        assert (data == expected).all()
-        assert about.items() <= manifest.items()
-    assert len(list((cache / "recorded").glob("file-*/"))) == 2
-    save(path, make_columns(100))
-    os.utime(path, ns=(0, 0))  # clocks may be coarse
-    assert len(load_dataset(path=path, on_disk=True)[0]) < 100
 
 
 @pytest.mark.parametrize(("bounds", "high"), [(None, 2), ([[-4.0], [4.0]], 4)])
@@ -149,7 +119,7 @@ def test_bounds_come_from_the_environment_unless_given(tmp_path, bounds, high):
         ("file", {"num_transitions": 9}, "num_transitions=9 has no effect with data=f"),
         ("file", {"clip_actions": True, "env_id": "CartPole-v1", "path": "x"}, "discr"),
         ("medium", {"path": "x"}, r"data\.path=x has no effect with data=medium"),
-        ("medium", {"random_share": 0.5, "on_disk": True}, "in memory: choose another"),
+        ("random", {"random_share": 0.5}, "random rows: choose another source"),
         (
             "d4rl",
             {"path": "x.h5", "columns": {"reward": "x"}},

@@ -90,7 +90,7 @@ def test_settings_of_speed_or_chosen_by_the_data_keep_no_runs_apart(tmp_path):
     for seed in (0, 1):
         for env, rate in (("hopper", 1e-3), ("walker2d", 3e-4)):
             changes = {"optim.actor_lr": rate, "loss.beta": seed * (env == "hopper")}
-            changes |= {"trainer.num_threads": seed, "data.storage": f"of {seed}"}
+            changes |= {"trainer.num_threads": seed, "trainer.compile": f"of {seed}"}
             folder = tmp_path / f"{env}{seed}"
             fakes.write_run(folder, CURVE, seed=seed, env=env, changes=changes)
     tables = fakes.read_all(tmp_path)

@@ -1,4 +1,4 @@
-"""Training from disk and from memory: the same batches, the same losses."""
+"""Training data, prepared and split."""
 
 from __future__ import annotations
 
@@ -16,44 +16,27 @@ def load(*overrides: str, in_keys=()) -> TrainingData:
     return load_training_data(config, in_keys=in_keys)
 
 
-@pytest.mark.parametrize(
-    "more",
-    [
-        ["data.standardize=false"],
-        ["data.reward_scale=3.0", "data.reward_shift=-1", "data.held_out=0.01"],
-        ["data.held_out=0.99"],
-    ],
-)
-def test_the_same_seed_gives_the_same_batches(more):
+def test_preparing_leaves_the_global_generator_alone():
     state = torch.get_rng_state()
-    here, there = (load(f"data.storage={each}", *more) for each in ("memory", "disk"))
+    here, there = load(), load()
     assert torch.equal(state, torch.get_rng_state())
-    torch.testing.assert_close(there.held_out, here.held_out, rtol=0, atol=1e-6)
-    assert there.mean == here.mean
-    assert there.largest_reward == pytest.approx(here.largest_reward)
-    for _ in range(20):
+    assert (here.held_out == there.held_out).all()
+    for _ in range(5):
         batch, other = (each.buffer.sample() for each in (here, there))
-        torch.testing.assert_close(other, batch, rtol=1e-6, atol=1e-6)
+        assert (batch == other).all()
 
 
 def test_the_next_action_is_there_for_losses_that_read_it():
     key = ("next", "action")
     config = configured(*SMALL)
     whole, _ = load_data(config.env, config.data, progress=False)
-    overrides = ["data.standardize=false", "data.held_out=0.5"]
-    here, there = (
-        load(f"data.storage={each}", *overrides, in_keys=[key])
-        for each in ("memory", "disk")
-    )
+    data = load("data.standardize=false", "data.held_out=0.5", in_keys=[key])
     assert key not in load().buffer.sample().keys(True)
-    for _ in range(20):
-        batch, other = (each.buffer.sample() for each in (here, there))
-        torch.testing.assert_close(other, batch, rtol=1e-6, atol=1e-6)
-        for row in batch:
-            for after in (row["next"], row["multi_step"]):
-                if not after["done"]:
-                    at = (whole["observation"] == after["observation"]).all(-1)
-                    assert torch.equal(whole["action"][at].squeeze(0), after["action"])
+    for row in data.buffer.sample():
+        for after in (row["next"], row["multi_step"]):
+            if not after["done"]:
+                at = (whole["observation"] == after["observation"]).all(-1)
+                assert torch.equal(whole["action"][at].squeeze(0), after["action"])
 
 
 def test_without_an_order_the_next_action_is_refused():

@@ -75,7 +75,6 @@ def test_wandb_gets_the_run_its_curve_and_its_results(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", fake)
     monkeypatch.setattr("torchrl.record.loggers.wandb._has_wandb", True)
     given = ["loss=rebrac", "recovery=osr", "logger=wandb", "logger.project=mine"]
-    given += ["data.storage=disk"]
     folder = trained(tmp_path / "run", *given)
     trained(folder, *given, "trainer.steps=12")
     first, second = (call.kwargs for call in fake.init.call_args_list)

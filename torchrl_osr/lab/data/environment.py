@@ -11,15 +11,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeGuard
 
+import gymnasium
+import mujoco
 import numpy as np
+from gymnasium import spaces
 
 from torchrl_osr._extras import needed_by
 from torchrl_osr.lab.data.behavior import load_behavior_card
-
-with needed_by("MuJoCo tasks need", "train"):
-    import gymnasium
-    import mujoco
-    from gymnasium import spaces
 
 # v4 of the ant, although there is v5: Minari's sets are of v4, whose observations lack
 # the 78 contact forces of v5, as D4RL's do.

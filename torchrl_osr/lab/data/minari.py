@@ -18,7 +18,6 @@ from torchrl_osr._extras import needed_by
 from torchrl_osr._files import read_json
 from torchrl_osr.lab.data.environment import sorted_space
 from torchrl_osr.lab.data.recording import Columns, Reading, Recording
-from torchrl_osr.lab.data.store import CHUNK_ROWS
 from torchrl_osr.lab.data.transitions import Array
 
 with needed_by("Minari data sets need", "minari"):
@@ -66,15 +65,8 @@ def open_minari(
     }
 
     def parts() -> Iterator[Columns]:
-        waiting: list[dict[str, Array]] = []
-        rows, left = 0, opened.total_steps
-        for episode in _read(opened, space, progress):
-            waiting.append(episode)
-            rows += len(episode["reward"])
-            left -= len(episode["reward"])
-            if rows >= CHUNK_ROWS or not left:
-                yield {n: np.concatenate([e[n] for e in waiting]) for n in waiting[0]}
-                waiting, rows = [], 0
+        episodes = [*_read(opened, space, progress)]
+        yield {n: np.concatenate([e[n] for e in episodes]) for n in episodes[0]}
 
     files = sorted(path for path in here.rglob("*") if path.is_file())
     return Recording(parts, options, about, files)

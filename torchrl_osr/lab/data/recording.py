@@ -1,12 +1,10 @@
-"""Recorded columns become transitions, in memory or on disk.
+"""Recorded columns become transitions.
 
 Shapes: ``N`` rows, ``E`` trajectories, ``S`` observation, ``A`` action.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -20,7 +18,7 @@ from tensordict import TensorDict
 from torchrl import torchrl_logger
 
 from torchrl_osr._checks import check_choice
-from torchrl_osr.lab.data.store import Dataset, cache_root, checksum_of, load_or_write
+from torchrl_osr.lab.data.store import Dataset, checksum_of
 from torchrl_osr.lab.data.transitions import (
     ACTION_LIMIT,
     SAME_STATE,
@@ -33,10 +31,6 @@ ActionBounds = tuple[ArrayLike, ArrayLike]
 """Lowest and highest action, numbers or ``[A]``."""
 
 Columns = Mapping[str, Any]
-
-# Raise it whenever a source gives other rows or another manifest: recordings in the
-# cache are then converted again.
-READER_VERSION = 5
 
 WARNINGS = {
     "actions_outside": "had actions outside their bounds, which were clipped",
@@ -74,8 +68,8 @@ class Reading:
     def __post_init__(self) -> None:
         check_choice("data.missing", self.missing, ("error", "row", "episode"))
         bounds = self.action_bounds
-        listed = hasattr(bounds, "__len__") and bounds != "log"
-        if bounds not in (None, "log") and len(bounds if listed else ()) != 2:
+        listed = np.shape(bounds)[:1] == (2,)
+        if bounds is not None and not listed and bounds != "log":
             raise ValueError(
                 f"data.action_bounds={bounds}; expected [lowest, highest]."
             )
@@ -83,7 +77,7 @@ class Reading:
 
 @dataclass
 class Recording:
-    """A recorded data set, converted once.
+    """A recorded data set.
 
     ``parts`` is its reader: it yields columns of whole trajectories, a file or many
     rows at a time. ``about`` goes into the manifest.
@@ -93,40 +87,56 @@ class Recording:
     options: Reading
     about: dict[str, Any] = field(default_factory=dict)
     files: list[Path] = field(default_factory=list)
-    _counts: Counter[str] = field(default_factory=Counter, init=False)
-    _episodes: list[Array] = field(default_factory=list, init=False)
-    _warnings: dict[str, None] = field(default_factory=dict, init=False)
 
-    def load(self, *, on_disk: bool = False) -> Dataset:
-        """Return transitions ``[N]`` and manifest; on disk, convert in parts."""
+    def load(self) -> Dataset:
+        """Return transitions ``[N]`` and manifest."""
+        warnings = list(self.about.get("warnings", []))
         if self.options.action_bounds == "log":
-            self.options = replace(self.options, action_bounds=self._range())
+            bounds = self._range()
+            self.options = replace(self.options, action_bounds=bounds)
+            low, high = (
+                "[" + ", ".join(f"{x:.4g}" for x in each) + "]" for each in bounds
+            )
+            warnings.append(
+                f"The bounds of the actions are {low} and {high}, the range of the log "
+                f"and {MARGIN:.0%} on either side: data.action_bounds=[low,high] sets "
+                "others."
+            )
+        rows, episodes, counts = [], [], Counter[str]()
+        for columns in self.parts():
+            data, numbers, of_each = trajectories(columns, self.options)
+            warnings += _vanishing(columns)
+            counts.update(numbers)
+            rows.append(data)
+            episodes.append(of_each)
+        data = torch.cat(rows)
+        if not len(data):
+            raise ValueError("no row has a true next state: give next_observation.")
+        check_dataset(data)
         bounds = [
             np.asarray(b, np.float64).tolist() for b in self.options.action_bounds
         ]
-        options = asdict(self.options) | {"action_bounds": bounds}
-        if on_disk:
-            # Sizes and times: to read a large source at each start is slow.
-            states = [(str(file.resolve()), file.stat()) for file in self.files]
-            request = {
-                **self.about,
-                **options,
-                "reader_version": READER_VERSION,
-                "source_files": [[n, s.st_size, s.st_mtime_ns] for n, s in states],
-            }
-            text = json.dumps(request, sort_keys=True)
-            digest = hashlib.sha256(text.encode()).hexdigest()[:16]
-            folder = cache_root() / "recorded" / f"{self.about['source']}-{digest}"
-            data, manifest = load_or_write(
-                folder, request, self._transitions, describe=self._facts
-            )
-        else:
-            data = torch.cat([*self._transitions()])
-            check_dataset(data)
-            manifest = options | {"num_transitions": len(data)} | self._facts()
-        for warning in manifest["warnings"]:
+        returns, lengths, complete = np.concatenate(episodes).T
+        whole, lengths = complete == 1, lengths.astype(int)
+        warnings = [*dict.fromkeys(warnings)]
+        warnings += [
+            f"{counts[n]:,} rows {t}." for n, t in WARNINGS.items() if counts[n]
+        ]
+        for warning in warnings:
             torchrl_logger.warning(warning)
-        return data, manifest
+        return data, {
+            **asdict(self.options),
+            "action_bounds": bounds,
+            "num_transitions": len(data),
+            **self.about,
+            **counts,
+            **({"checksum": checksum_of(self.files)} if self.files else {}),
+            "episode_returns": returns[whole].tolist(),
+            "episode_lengths": lengths[whole].tolist(),
+            "incomplete_returns": returns[~whole].tolist(),
+            "incomplete_lengths": lengths[~whole].tolist(),
+            "warnings": warnings,
+        }
 
     def _range(self) -> list[list[float]]:
         """Return the log's lowest and highest actions, with :data:`MARGIN`."""
@@ -134,43 +144,7 @@ class Recording:
         low = np.min([np.nanmin(each, 0) for each in actions], 0)
         high = np.max([np.nanmax(each, 0) for each in actions], 0)
         slack = MARGIN * (high - low)
-        bounds = [(low - slack).tolist(), (high + slack).tolist()]
-        low, high = ("[" + ", ".join(f"{x:.4g}" for x in each) + "]" for each in bounds)
-        self._warnings[
-            f"The bounds of the actions are {low} and {high}, the range of the log and "
-            f"{MARGIN:.0%} on either side: data.action_bounds=[low,high] sets others."
-        ] = None
-        return bounds
-
-    def _transitions(self) -> Iterator[TensorDict]:
-        kept = 0
-        for columns in self.parts():
-            data, counts, episodes = trajectories(columns, self.options)
-            self._warnings |= dict.fromkeys(_vanishing(columns))
-            self._counts.update(counts)
-            self._episodes.append(episodes)
-            kept += len(data)
-            if len(data):
-                yield data
-        if not kept:
-            raise ValueError("no row has a true next state: give next_observation.")
-
-    def _facts(self) -> dict[str, Any]:
-        """Return facts about the transitions once all have been read."""
-        returns, lengths, complete = np.concatenate(self._episodes).T
-        whole, lengths = complete == 1, lengths.astype(int)
-        left_out = {name: self._counts[name] for name in WARNINGS if self._counts[name]}
-        warnings = [f"{rows:,} rows {WARNINGS[n]}." for n, rows in left_out.items()]
-        return {
-            **self.about,
-            **self._counts,
-            **({"checksum": checksum_of(self.files)} if self.files else {}),
-            "episode_returns": returns[whole].tolist(),
-            "episode_lengths": lengths[whole].tolist(),
-            "incomplete_returns": returns[~whole].tolist(),
-            "incomplete_lengths": lengths[~whole].tolist(),
-            "warnings": [*self.about.get("warnings", []), *self._warnings, *warnings],
-        }
+        return [(low - slack).tolist(), (high + slack).tolist()]
 
 
 def _vanishing(columns: Columns) -> Iterator[str]:

@@ -12,8 +12,11 @@ from torch import Tensor
 from torchrl_osr.lab.data.transitions import SAME_STATE
 
 
-def held_out_rows(rows: int, held_out: int | float, *, seed: int) -> Tensor:
-    """Draw rows in random order; ``held_out`` is a number, or a share (float)."""
+def split_held_out(
+    data: TensorDict, held_out: int | float, *, seed: int
+) -> tuple[TensorDict, TensorDict]:
+    """Copy training and held-out rows; ``held_out`` is a number, or a share (float)."""
+    rows = len(data)
     count = round(held_out * rows) if isinstance(held_out, float) else held_out
     if not 0 < count < rows:
         raise ValueError(
@@ -21,15 +24,8 @@ def held_out_rows(rows: int, held_out: int | float, *, seed: int) -> Tensor:
             "expected at least one row on each side."
         )
     order = torch.randperm(rows, generator=torch.Generator().manual_seed(seed))
-    return order[:count].clone()  # not the rest of the memory with it
-
-
-def split_held_out(
-    data: TensorDict, held_out: int | float, *, seed: int
-) -> tuple[TensorDict, TensorDict]:
-    """Copy training and held-out rows in order, see :func:`held_out_rows`."""
-    mask = torch.zeros(len(data), dtype=torch.bool)
-    mask[held_out_rows(len(data), held_out, seed=seed)] = True
+    mask = torch.zeros(rows, dtype=torch.bool)
+    mask[order[:count]] = True
     mask = mask.to(data.device or "cpu")
     return data[~mask], data[mask]
 
@@ -47,16 +43,14 @@ def mix_datasets(
     return torch.cat([valuable[kept], random[taken]])
 
 
-def is_followed(data: TensorDictBase, rows: Tensor | None = None) -> Tensor:
-    """Return whether the next row in time follows each row, bool ``[B]``."""
-    rows = torch.arange(len(data)) if rows is None else rows
-    after = (rows + 1).clamp(max=len(data) - 1)
-    reached = data["next", "observation"][rows]
-    state = data["observation"][after]
+def is_followed(data: TensorDictBase) -> Tensor:
+    """Return whether the next row in time follows each row, bool ``[N]``."""
+    followed: Tensor = ~data["next", "done"].squeeze(-1)
+    state = data["observation"][1:]
     slack = SAME_STATE * state.abs().clamp_min(1)
-    apart = ((reached - state).abs() > slack).any(-1)
-    ends = data["next", "done"][rows].squeeze(-1) | (rows + 1 == len(data))
-    followed: Tensor = ~(apart | ends)
+    apart = ((data["next", "observation"][:-1] - state).abs() > slack).any(-1)
+    followed[:-1] &= ~apart
+    followed[-1] = False
     return followed
 
 
@@ -80,7 +74,6 @@ def check_order(data: TensorDictBase) -> None:
 
 def multi_step(
     data: TensorDictBase,
-    rows: Tensor | None = None,
     *,
     n_steps: int,
     gamma: float,
@@ -99,18 +92,13 @@ def multi_step(
     TorchRL 0.14.1's ``MultiStep`` keeps the flags of the first step: it bootstraps
     returns that have reached a terminal state.
     """
-
-    def reward_of(rows: Tensor) -> Tensor:
-        reward: Tensor = data["next", "reward"][rows]
-        return reward_scale * reward + reward_shift
-
-    last = torch.arange(len(data)) if rows is None else rows
-    whole = is_followed(data) if rows is None else None
-    steps, reward = torch.ones_like(last), reward_of(last)
+    single = reward_scale * data["next", "reward"] + reward_shift
+    followed, last = is_followed(data), torch.arange(len(data))
+    steps, reward = torch.ones_like(last), single.clone()
     for step in range(1, n_steps):
-        goes_on = is_followed(data, last) if whole is None else whole[last]
+        goes_on = followed[last]
         last = last + goes_on
-        reward += goes_on.unsqueeze(-1) * gamma**step * reward_of(last)
+        reward += goes_on.unsqueeze(-1) * gamma**step * single[last]
         steps += goes_on
     found: TensorDict = data["next"].exclude("action")[last].set("reward", reward)
     if with_next_action:

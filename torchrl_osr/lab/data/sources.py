@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
@@ -28,9 +28,6 @@ from torchrl_osr.lab.data.statistics import REFERENCE_RETURNS, ReferenceReturns
 from torchrl_osr.lab.data.store import (
     Dataset,
     cache_root,
-    is_memmap_folder,
-    is_memory_mapped,
-    load_memmap,
     load_or_write,
 )
 
@@ -57,7 +54,6 @@ def load_dataset(
     num_transitions: int | None = None,
     random_share: float = 0.0,
     seed: int = 0,
-    on_disk: bool = False,
     progress: bool = True,
 ) -> Dataset:
     """Load a data set that is rolled out on this machine, or a recorded one.
@@ -75,9 +71,8 @@ def load_dataset(
             units, and data that do not fit it are refused. Default: actions within -1
             and 1, not compared.
         references: scale of the scores. Default: D4RL's, if there are any.
-        path: file of a log, a list or a pattern of files, or a folder of
-            :func:`~torchrl_osr.lab.data.write_memmap`; name or folder of a Minari set;
-            folder of a LeRobot set.
+        path: file of a log, a list or a pattern of files; name or folder of a Minari
+            set; folder of a LeRobot set.
         columns: of a ``"file"`` or ``"lerobot"``, names, patterns or lists of columns
             by their part, see ``docs/your_data.md``. Default: the usual names.
         action_bounds: lowest and highest action of the recording. Default: of
@@ -89,8 +84,6 @@ def load_dataset(
         download: fetch the Minari set of that name.
         num_transitions, seed: number of rolled-out rows, default 200,000, and seed.
         random_share: share of the rolled-out rows that are random instead.
-        on_disk: leave the rows memory-mapped. They are converted in parts: a file of
-            a log, or many episodes of Minari, at a time.
         progress: show a progress bar when on a terminal.
 
     Examples:
@@ -113,20 +106,15 @@ def load_dataset(
         spec = None if env_id is None else environment_spec(env_id)
         if path is None:
             raise ValueError(f"data={source} needs data.path=...")
-        if source == "file" and is_memmap_folder(path):
-            _refuse(log, f"{path}, which is converted")
-            data, manifest = load_memmap(path)
-            checksum = manifest["rows_sha256"]
-        else:
-            recording = _opened(source, path, spec, num_actions, log, progress)
-            data, manifest = recording.load(on_disk=on_disk)
-            checksum = manifest.get("checksum")  # not in an older cache
+        recording = _opened(source, path, spec, num_actions, log, progress)
+        data, manifest = recording.load()
+        checksum = manifest.get("checksum")
     else:
         _refuse(log | {"path": path}, f"data={source}, which is rolled out")
-        if random_share and (source == "random" or on_disk):
+        if random_share and source == "random":
             raise ValueError(
-                f"data.random_share={random_share} mixes a source with random rows, in "
-                "memory: choose another source, and leave out data.storage=disk."
+                f"data.random_share={random_share} mixes a source with random rows: "
+                "choose another source."
             )
         name = env_name if env_id is None else environment_name(env_id)
         if name not in known_ids() or name != env_name:
@@ -140,8 +128,6 @@ def load_dataset(
         recipe = {"num_transitions": rows, "seed": seed}
         data, manifest = rolled_out(name, source, recipe, progress=progress)
         checksum = manifest["rows_sha256"]
-    if is_memory_mapped(data) and not on_disk:
-        data = data.clone()
     if spec is not None:
         _check_fit(data, manifest, str(env_id), spec)
     references = references or REFERENCE_RETURNS.get(str(env_name))
@@ -179,7 +165,7 @@ def _mean_and_score(
 def rolled_out(
     env_name: str, source: str, recipe: Mapping[str, int], *, progress: bool
 ) -> Dataset:
-    """Return memory-mapped rows of a source; collect them at the first use."""
+    """Return rows of a source from the cache; collect them at the first use."""
     rows, seed = recipe["num_transitions"], recipe["seed"]
     maze = env_name in MAZE_IDS
     # Other versions of these give other data for the same seed.
@@ -195,18 +181,17 @@ def rolled_out(
         **behavior_of(env_name, source),
         "versions": versions,
     }
-    about: dict[str, Any] = {"torchrl_osr_version": __version__}
 
-    def collect() -> Iterator[TensorDict]:
+    def collect() -> Dataset:
         data, returns, lengths = collect_source(
             env_name, source, rows, seed=seed, progress=progress
         )
-        about["episode_returns"] = returns.tolist()
-        about["episode_lengths"] = lengths.tolist()
-        yield data
+        about = {"torchrl_osr_version": __version__}
+        about |= {"episode_returns": returns.tolist()}
+        return data, about | {"episode_lengths": lengths.tolist()}
 
     folder = cache_root() / "collected" / f"{env_name}-{source}-{rows}-seed{seed}"
-    return load_or_write(folder, request, collect, describe=lambda: about)
+    return load_or_write(folder, request, collect)
 
 
 def _opened(

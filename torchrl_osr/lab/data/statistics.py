@@ -16,8 +16,6 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl import torchrl_logger
 
-from torchrl_osr.lab.data.transitions import ROWS_AT_A_TIME
-
 # A constant observation entry would otherwise be divided by zero, and one that barely
 # moves would drown the others. TD3+BC adds 1e-3 to the standard deviation; as a floor
 # it leaves all larger entries exactly unit-variance.
@@ -32,17 +30,7 @@ def observation_statistics(data: TensorDictBase) -> tuple[Tensor, Tensor]:
         warning names entries that vary less.
     """
     observation = data.get("observation")
-    # Chan's formula for the variance of two sets together.
-    loc = torch.zeros_like(observation[0], dtype=torch.float64)
-    variance, count = torch.zeros_like(loc), 0
-    for rows in observation.split(ROWS_AT_A_TIME):
-        chunk_variance, chunk_loc = torch.var_mean(rows.double(), dim=0, correction=0)
-        total = count + len(rows)
-        share = len(rows) / total
-        delta = chunk_loc - loc
-        variance = (1 - share) * (variance + share * delta**2) + share * chunk_variance
-        loc = loc + share * delta
-        count = total
+    variance, loc = torch.var_mean(observation.double(), dim=0, correction=0)
     scale = variance.sqrt()
     if small := (scale < MIN_OBSERVATION_SCALE).nonzero()[:, 0].tolist():
         torchrl_logger.warning(

@@ -20,9 +20,6 @@ DATASET_KEYS: tuple[NestedKey, ...] = (*VECTOR_KEYS, ("next", "reward"), *FLAG_K
 # float32 tanh reaches exactly 1. At 0.999 the pre-tanh action is 3.8.
 ACTION_LIMIT = 0.999
 
-ROWS_AT_A_TIME = 2**20
-"""Rows of a memory-mapped set that are copied at a time: 90 MB of hopper."""
-
 # Two recordings of one state may differ by rounding, relative to its entries.
 SAME_STATE = 1e-6
 

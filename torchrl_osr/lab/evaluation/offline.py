@@ -7,11 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torch import Tensor
 from torch.nn.functional import one_hot
 from torchrl.objectives import SoftUpdate
@@ -19,8 +18,6 @@ from torchrl.objectives import SoftUpdate
 from torchrl_osr.fast import FastUpdate
 from torchrl_osr.lab.data import make_replay_buffer, observation_statistics
 from torchrl_osr.lab.data.rows import check_order
-from torchrl_osr.lab.data.store import is_memory_mapped
-from torchrl_osr.lab.data.transitions import ROWS_AT_A_TIME
 from torchrl_osr.lab.evaluation.episodes import Policy
 from torchrl_osr.lab.evaluation.statistics import Array
 from torchrl_osr.lab.losses import FQELoss
@@ -80,11 +77,10 @@ def fitted_values(
     number, size = len(starts), data["action"].shape[-1]
 
     def act(states: Tensor) -> Tensor:
-        parts = torch.split(states, ROWS_AT_A_TIME)
+        parts = torch.split(states, 2**20)
         action = torch.cat([policy(rows) for rows in parts])
         return action if action.ndim > 1 else one_hot(action, size).float()
 
-    next_action = act(data["next", "observation"])
     generator = torch.Generator().manual_seed(seed)
     drawn = torch.randint(number, (num_critics, number), generator=generator)
     weight = torch.stack([each.bincount(minlength=number) for each in drawn]).float()
@@ -93,19 +89,13 @@ def fitted_values(
     # Values are then between -1 and 1.
     unit = max(reward.abs().max().item(), 1e-8) / (1 - gamma)
 
-    def read(data: TensorDictBase, rows: Tensor | None = None) -> TensorDictBase:
-        batch = data.copy() if rows is None else data[rows]
-        rows = torch.arange(len(data)) if rows is None else rows
-        batch["observation"] = (batch["observation"] - loc) / scale
-        batch["next", "observation"] = (batch["next", "observation"] - loc) / scale
-        batch["next", "reward"] = batch["next", "reward"] / unit
-        batch["next", "action"] = next_action[rows]
-        batch["bootstrap"] = weight[:, episode[rows]].T
-        return batch
-
-    on_disk: Any = {"read": read} if is_memory_mapped(data) else {}
-    rows = data if on_disk else read(data)
-    buffer = make_replay_buffer(rows, batch_size=batch_size, seed=0, **on_disk)
+    rows = data.copy()
+    for key in ("observation", ("next", "observation")):
+        rows[key] = (data[key] - loc) / scale
+    rows["next", "reward"] = reward / unit
+    rows["next", "action"] = act(data["next", "observation"])
+    rows["bootstrap"] = weight[:, episode].T
+    buffer = make_replay_buffer(rows, batch_size=batch_size, seed=0)
     least, most = (each.item() / unit / (1 - gamma) for each in reward.aminmax())
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

@@ -61,7 +61,6 @@ class DataDistance:
         self._loc, self._scale = loc.cpu().double(), scale.cpu().double()
         generator = torch.Generator().manual_seed(seed)
         order = torch.randperm(len(data), generator=generator)
-        # Of a set on disk, only these rows are read.
         states, others = (
             data[rows]["observation"].cpu()
             for rows in (order[held_out:][:max_reference], order[:held_out])

@@ -22,7 +22,7 @@ from torchrl_osr.lab.run.schema import method_name
 
 IGNORED = (
     *sorted({*RESUMABLE} - {"trainer.steps", "trainer.eval_interval"}),
-    *("resume", "seed", "data.storage", "data.checksum", "logger."),
+    *("resume", "seed", "data.checksum", "logger."),
     *("trainer.compile", "trainer.checkpoint_interval", "loss.deactivate_vmap"),
 )
 """The seed, and settings that change how a number is computed, but not the number."""

@@ -42,7 +42,6 @@ SHARES = (
 """Keys between 0 and 1."""
 
 CHOICES = {
-    "data.storage": ("memory", "disk"),
     "logger.kind": ("csv", "tensorboard", "wandb"),
     "optim.actor_schedule": ("constant", "cosine"),
     "trainer.precision": ("float32", "bfloat16"),
@@ -103,7 +102,8 @@ def read_config(folder: Path) -> dict[str, Any]:
     """Read the configuration in the folder of a run; refuse that of another version."""
     content = read_yaml(folder / CONFIG)
     found = content.pop("format", 1)
-    content.get("perturbation", {}).pop("adversary", None)  # an option of before
+    for group, option in (("perturbation", "adversary"), ("data", "storage")):
+        content.get(group, {}).pop(option, None)  # older runs have them
     if found != FORMAT:
         raise ValueError(
             f"{folder} holds a run of another version of torchrl-osr (format {found}, "

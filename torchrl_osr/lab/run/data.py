@@ -1,7 +1,4 @@
-"""Training data: rows in memory, prepared once, or on disk, batch by batch.
-
-The same transforms prepare both: the same seed gives the same batches.
-"""
+"""Training data: rows in memory, prepared once."""
 
 from __future__ import annotations
 
@@ -11,13 +8,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
-from torch import Tensor
+from tensordict import NestedKey, TensorDict
 from torchrl.data import ReplayBuffer
 from torchrl.envs import Compose, ObservationNorm, RewardScaling
 
 from torchrl_osr.lab.data import (
     ReferenceReturns,
+    load_dataset,
     make_replay_buffer,
     observation_statistics,
     reference_returns,
@@ -25,20 +22,15 @@ from torchrl_osr.lab.data import (
 from torchrl_osr.lab.data.recording import NO_REWARDS, has_rewards
 from torchrl_osr.lab.data.rows import (
     check_order,
-    held_out_rows,
     multi_step,
     next_action,
     split_held_out,
 )
-from torchrl_osr.lab.data.store import is_memmap_folder
 from torchrl_osr.lab.run.config import read_columns
 from torchrl_osr.lab.run.schema import DataConfig, EnvConfig, TrainConfig
 
-OF_TRAINING = ("storage", "held_out", "standardize", "reward_scale", "reward_shift")
+OF_TRAINING = ("held_out", "standardize", "reward_scale", "reward_shift")
 """Options of the data that do not decide which rows there are."""
-
-MAX_HELD_OUT = 50_000
-"""Held-out rows of a set on disk that are read into memory, at most."""
 
 
 class TrainingData(NamedTuple):
@@ -65,10 +57,6 @@ def load_data(
     actions' bounds are those of the options, of the run, or else of the log. A
     ValueError reports data that have changed since the run began.
     """
-    from torchrl_osr.lab.data import load_dataset  # needs Gymnasium; networks do not
-
-    converted = isinstance(options.path, str) and is_memmap_folder(options.path)
-    is_log = options.source in ("file", "lerobot") and not converted
     reading = asdict(options)
     reading["columns"] = read_columns(reading["columns"])
     for name in (*OF_TRAINING, "checksum"):
@@ -78,11 +66,10 @@ def load_data(
         reading["references"] = references_of(env)
         if env.id is None and env.discrete:
             reading["num_actions"] = env.action_size
-        elif env.id is None and is_log:
+        elif env.id is None and options.source in ("file", "lerobot"):
             known = env.action_low and (env.action_low, env.action_high)
             reading["action_bounds"] = options.action_bounds or known or "log"
-    on_disk = options.storage == "disk"
-    data, manifest = load_dataset(**reading, on_disk=on_disk, progress=progress)
+    data, manifest = load_dataset(**reading, progress=progress)
     if options.checksum not in (None, manifest["checksum"]):
         place = "" if options.path is None else f" data.path={options.path}"
         raise ValueError(
@@ -146,36 +133,23 @@ def load_training_data(
     prepare = Compose(norm(*states))
     if (factor, addend) != (1.0, 0.0):
         prepare.append(RewardScaling(addend, factor, in_keys=[("next", "reward")]))
-    prepare_steps = norm("observation")
-
-    def read(data: TensorDictBase, rows: Tensor | None = None) -> TensorDictBase:
-        batch = data.copy() if rows is None else data[rows]
-        if with_next_action:
-            batch["next", "action"] = next_action(data, rows)
-        batch = prepare(batch)
-        if optim.n_steps > 1:
-            steps = multi_step(
-                data,
-                rows,
-                n_steps=optim.n_steps,
-                gamma=optim.gamma,
-                reward_scale=factor,
-                reward_shift=addend,
-                with_next_action=with_next_action,
-            )
-            batch["multi_step"] = prepare_steps(steps)
-        return batch
-
+    rows = data.copy()
+    if with_next_action:
+        rows["next", "action"] = next_action(data)
+    rows = prepare(rows)
+    if optim.n_steps > 1:  # what follows a row, before some are held out
+        steps = multi_step(
+            data,
+            n_steps=optim.n_steps,
+            gamma=optim.gamma,
+            reward_scale=factor,
+            reward_shift=addend,
+            with_next_action=with_next_action,
+        )
+        rows["multi_step"] = norm("observation")(steps)
+    rows, held_out = split_held_out(rows, options.held_out, seed=options.seed)
     size = config.trainer.batch_size
-    sampling: dict[str, Any] = {"batch_size": size, "seed": 0, "device": device}
-    if options.storage == "disk":
-        chosen = held_out_rows(len(data), options.held_out, seed=options.seed)
-        held_out = read(data, chosen[:MAX_HELD_OUT].sort().values)
-        left_out = chosen.sort().values
-        buffer = make_replay_buffer(data, left_out=left_out, read=read, **sampling)
-    else:  # what follows a row, before some are held out
-        rows, held_out = split_held_out(read(data), options.held_out, seed=options.seed)
-        buffer = make_replay_buffer(rows, **sampling)
+    buffer = make_replay_buffer(rows, batch_size=size, seed=0, device=device)
     mean = manifest["normalized_score"]
     if references_of(env) is None:
         mean = manifest["mean_return"]

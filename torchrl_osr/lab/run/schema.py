@@ -21,6 +21,8 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 
 from torchrl_osr import objectives
 from torchrl_osr.lab import losses
+from torchrl_osr.lab.data.environment import environment_name
+from torchrl_osr.lab.data.sources import RECORDED
 from torchrl_osr.lab.dynamics import DynamicsOptions
 
 CHOSEN = {
@@ -83,7 +85,6 @@ class DataConfig:
     num_transitions: int | None = None  # number of collected rows, default 200,000
     seed: int = MISSING  # random seed of collection and held-out rows
     random_share: float = MISSING  # share of rows replaced by random data
-    storage: str = MISSING  # memory, or disk for sets larger than memory
     held_out: float = MISSING  # share of rows kept to judge models
     standardize: bool = MISSING  # standardise observations
     reward_scale: float = MISSING  # factor of the training rewards
@@ -300,7 +301,7 @@ def register() -> None:
     for name, chosen in CHOSEN.items():
         store.store(group="schema", name=name, node=schema_of(chosen))
     resolvers: dict[str, Callable[..., Any]] = {
-        "environment_name": _environment_name,
+        "environment_name": environment_name,
         # Never that of a task, which has settings and scores.
         "log_name": lambda path: "log-" + re.sub(r"\W+", "-", Path(str(path)).stem),
         "run_dir": _run_dir,
@@ -331,15 +332,7 @@ def by_data(key: str, *, _root_: DictConfig) -> Any:
 
 def _rolled_out(value: Any, *, _root_: DictConfig) -> Any:
     """The value of an option that recorded data do not have."""
-    from torchrl_osr.lab.data.sources import RECORDED  # needs Gymnasium
-
     return None if _root_.data.source in RECORDED else value
-
-
-def _environment_name(env_id: str) -> str:
-    from torchrl_osr.lab.data.environment import environment_name  # needs Gymnasium
-
-    return environment_name(env_id)
 
 
 def _run_dir(resume: str | None, fresh: str) -> str:
