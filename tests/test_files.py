@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-from collections import namedtuple
-
 import numpy as np
 import pytest
 import torch
@@ -12,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchrl_osr._files import (
-    check_disk_space,
     read_arrays,
     read_json,
     read_tensors,
@@ -70,14 +66,3 @@ def test_no_damaged_tensors_are_used(tmp_path_factory, data):
     path.write_bytes(content)
     with pytest.raises(ValueError, match=r"model\.safetensors is"):
         read_tensors(path)
-
-
-def test_a_full_disk_is_noticed_before_the_work(tmp_path, monkeypatch):
-    usage = namedtuple("Usage", "total used free")(10**12, 0, 2_500_000)
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
-    folder = tmp_path / "not" / "yet" / "there"
-    check_disk_space(folder, 2_500_000, "a file")
-    match = "3,000.0 MB are needed for a file, 2.5 MB are free"
-    with pytest.raises(OSError, match=match) as raised:
-        check_disk_space(folder, 3_000_000_000, "a file")
-    assert raised.value.filename == str(folder)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import math
 import os
-import shutil
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -146,18 +144,3 @@ def sha256_of(path: Path) -> str:
     """Return the SHA-256 of a file, in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def check_disk_space(folder: Path | str, needed_bytes: int, what: str) -> None:
-    """Raise an OSError unless a folder's disk has room; it need not be there yet."""
-    there = Path(folder).absolute()
-    while not there.exists():
-        there = there.parent
-    free = shutil.disk_usage(there).free
-    if free < needed_bytes:
-        raise OSError(
-            errno.ENOSPC,
-            f"not enough disk space: {needed_bytes / 1e6:,.1f} MB are needed for "
-            f"{what}, {free / 1e6:,.1f} MB are free. Free space or choose another disk",
-            str(folder),
-        )

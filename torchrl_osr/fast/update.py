@@ -24,10 +24,6 @@ class NonfiniteError(FloatingPointError):
     """A loss or a gradient is NaN or infinite; the weights are those before the update.
 
     A GPU is asked once in a hundred updates only: then the weights may be NaN, too.
-
-    Attributes:
-        losses: values of the losses and metrics, by name.
-        gradients: names of the parameters whose gradient is not finite.
     """
 
     def __init__(self, losses: dict[str, float], gradients: list[str]) -> None:
@@ -36,7 +32,6 @@ class NonfiniteError(FloatingPointError):
             f"not finite: losses {', '.join(bad) or 'none'}; gradients "
             f"{', '.join(gradients[:5]) or 'none'}"
         )
-        self.losses, self.gradients = losses, gradients
 
 
 class FastUpdate:

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from composed import composed, evaluating, trained
+from composed import composed, trained
 
-from torchrl_osr.lab.cli.evaluate import evaluate_one_of_many, main
+from torchrl_osr.lab.cli.evaluate import main
 from torchrl_osr.lab.dynamics import DynamicsEnsemble
 from torchrl_osr.lab.dynamics.training import FILE, write_dynamics
 from torchrl_osr.lab.evaluation.recoverable import load_recoverable_states, recovers
@@ -58,17 +58,15 @@ def test_sweep_evaluates_every_finished_run(tmp_path, folder, run):
     assert lines[0] == "left out: sweep/2_running: not finished, its status is running"
     assert lines[-1] == "1 of 2 runs failed: sweep/1_damaged."
     assert re.search(r"of 2: sweep/1_damaged: failed: \S+ is damaged: ", output)
-    assert re.search(r"0_good: score -?\d+\.\d undisturbed, -?\d+\.\d dist", output)
+    assert "sweep/0_good: sweep/0_good/robustness-start.json" in output
     assert (sweep / "0_good" / "robustness-start.json").exists()
 
 
-def test_recovery_rates_are_printed_by_group_and_for_a_sweep(folder, capsys):
+def test_recovery_rates_are_printed_by_group(folder, capsys):
     evaluate(f"checkpoint={folder}", "suite=recoverable")
     printed = capsys.readouterr().out
     number = (load_recoverable_states("hopper", "public").group == "easy").sum()
     assert re.search(rf"(?m)^  easy +{number} +\d+ +\[", printed)
-    text = evaluate_one_of_many(evaluating("suite=recoverable", "episodes=2"), folder)
-    assert re.fullmatch(r"recovers from \d+% of easy states, .*", text)
 
 
 def test_runs_of_a_sweep_are_one_policy_that_switches(folder, tmp_path, capsys):

@@ -17,7 +17,6 @@ from untrained_run import make_run
 
 from torchrl_osr.lab.dynamics import DynamicsEnsemble
 from torchrl_osr.lab.dynamics.training import FILE, load_dynamics, write_dynamics
-from torchrl_osr.lab.envs import critics_of
 from torchrl_osr.lab.evaluation import deterministic_policy
 from torchrl_osr.lab.run.build import make_learner
 from torchrl_osr.lab.run.config import read_run, write_config
@@ -48,9 +47,7 @@ def test_policy_critics_and_model_are_those_that_were_saved(run):
     again = deterministic_policy(trained.actor, trained.observation_norm)
     assert torch.equal(again(rows), policy(rows))
     states = TensorDict({"observation": rows}, [6])
-    there, here = (
-        critics_of(each)(states, policy(rows)) for each in (loss, trained.loss)
-    )
+    there, here = (each.q(states, policy(rows)) for each in (loss, trained.loss))
     assert torch.equal(there, here)
     batch = TensorDict({"observation": rows, "next": {"observation": rows + 1}}, [6])
     with loss.inverse_dynamics_network_params.to_module(
@@ -129,7 +126,7 @@ def test_the_policy_of_a_run_acts_as_in_its_evaluation(tmp_path, loss):
     act = policy.act(rows)
     torch.testing.assert_close(act, middle + half * actions, atol=4e-6, rtol=0)
     states = TensorDict({"observation": (rows - 2) / 3}, [6])
-    values = critics_of(networks)(states, actions).amin(0)
+    values = networks.q(states, actions).amin(0)
     torch.testing.assert_close(policy.value(rows, act), values)
     source = policy.record["source"]
     assert (source["step"], source["env_id"]) == (900, "Hopper-v5")

@@ -25,7 +25,6 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_osr.lab.cli.console import sentence, single_job
-from torchrl_osr.lab.evaluation import measure_of
 from torchrl_osr.lab.evaluation.recoverable import GROUPS
 from torchrl_osr.lab.evaluation.statistics import saved_share
 from torchrl_osr.lab.evaluation.tables import aligned_columns, robustness_table
@@ -117,40 +116,21 @@ def evaluate_sweep(config: EvaluateConfig) -> None:
 
 
 def evaluate_one_of_many(config: EvaluateConfig, folder: Path) -> str:
-    """Evaluate one run of a sweep; return its main numbers as text."""
-    _, results = evaluate_run(replace(config, checkpoint=str(folder), progress=False))
-    if config.suite.half is not None:
-        rates = recovery_rates(results).items()
-        known = [f"{share:.0%} of {name} states" for name, (_, share, *_) in rates]
-        return f"recovers from {', '.join(known)}"
-    rows = results["summary"]
-    measure = measure_of(rows[0])
-    # Leave out disturbances that no episode met.
-    met = [row[measure] for row in rows if row["disturbed_share"]]
-    clean = np.mean([row[f"clean_{measure}"] for row in rows])
-    disturbed = f"{np.mean(met):.1f}" if met else "never met"
-    return f"{measure} {clean:.1f} undisturbed, {disturbed} disturbed"
-
-
-def recovery_rates(
-    results: Mapping[str, Any],
-) -> dict[str, tuple[int, float, float, float]]:
-    """Return number of states and recovery rate with interval, by group of states."""
-    group, walk = np.array(results["group"]), np.array(results["walk"])
-    back = np.mean([each["back"] for each in results["evaluations"]], axis=0)
-    return {
-        name: (int(chosen.sum()), *saved_share(back[None, chosen], walk[chosen]))
-        for name in GROUPS
-        if (chosen := group == name).any()
-    }
+    """Evaluate one run of a sweep; return the place of its results."""
+    one = replace(config, checkpoint=str(folder), progress=False)
+    return str(evaluate_run(one)[0])
 
 
 def recoverable_table(results: Mapping[str, Any]) -> str:
-    """Return the text table of :func:`recovery_rates`."""
+    """Return a text table of recovery rates with intervals, by group of states."""
+    group, walk = np.array(results["group"]), np.array(results["walk"])
+    back = np.mean([each["back"] for each in results["evaluations"]], axis=0)
     rows = [("states", "number", "recovers %", "[95 %]")]
-    for name, (number, mean, low, high) in recovery_rates(results).items():
-        interval = f"[{100 * low:.0f}, {100 * high:.0f}]"
-        rows.append((name, str(number), f"{100 * mean:.0f}", interval))
+    for name in GROUPS:
+        if (chosen := group == name).any():
+            rate = 100 * np.array(saved_share(back[None, chosen], walk[chosen]))
+            mean, low, high = (f"{each:.0f}" for each in rate)
+            rows.append((name, str(chosen.sum()), mean, f"[{low}, {high}]"))
     number = len(results["evaluations"])
     title = f"{results['env']} {results['data']}, {results['half']} recoverable states"
     return "\n".join([f"{title}: {number} x each", *aligned_columns(rows)])

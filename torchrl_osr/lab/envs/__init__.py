@@ -9,12 +9,6 @@ To combine several, wrap the task first in changes of dynamics and start state, 
 knocks and pushes, actuators, and sensors.
 """
 
-from torchrl_osr._extras import needed_by
-
-with needed_by("disturbances need", "train"):
-    import gymnasium  # noqa: F401
-    import mujoco  # noqa: F401
-
 from torchrl_osr.lab.envs.disturbance import NotPossible
 from torchrl_osr.lab.envs.faults import (
     ActionDelay,

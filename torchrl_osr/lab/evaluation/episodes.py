@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
+import gymnasium
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -23,16 +24,13 @@ from torchrl_osr.lab.data.environment import make_environment
 from torchrl_osr.lab.evaluation.statistics import mean_interval
 from torchrl_osr.objectives.networks import ONE_HOT
 
-if TYPE_CHECKING:
-    import gymnasium
-
 Policy = Callable[[Tensor], Tensor]
 """Maps raw observations ``[E, S]`` to actions ``[E, A]`` within -1 and 1.
 
 Discrete actions are their numbers, ``[E]``.
 """
 
-Wrap: TypeAlias = "Callable[[gymnasium.Env[Any, Any]], gymnasium.Env[Any, Any]]"
+Wrap: TypeAlias = Callable[[gymnasium.Env[Any, Any]], gymnasium.Env[Any, Any]]
 """Puts wrappers around an environment."""
 
 Watch = Callable[[int, NDArray[Any], bool, dict[str, Any]], None]

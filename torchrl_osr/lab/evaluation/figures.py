@@ -5,17 +5,14 @@ from __future__ import annotations
 import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
 
-from torchrl_osr._extras import needed_by
 from torchrl_osr._files import whole_file
 from torchrl_osr.lab.evaluation.episodes import measure_of
-
-if TYPE_CHECKING:
-    import pandas as pd
-    from matplotlib.figure import Figure
 
 # Okabe and Ito's palette, which colour-blind readers can distinguish.
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
@@ -37,8 +34,6 @@ MOST_ROWS = 200_000  # of a data set, in a histogram
 
 def new_figure(width: float, height: float) -> Figure:
     """Return a figure of ``width`` x ``height`` inches that needs no display."""
-    with needed_by("figures need", "train"):
-        from matplotlib.figure import Figure
     return Figure(figsize=(width, height), layout="constrained")
 
 
@@ -127,11 +122,13 @@ def learning_curve(
 def read_scalars(folder: Path) -> dict[str, list[tuple[int, float]]]:
     """Read steps and values of each scalar that TorchRL's ``CSVLogger`` wrote.
 
-    A resumed run logs the steps since its checkpoint once more; the later row counts.
+    A resumed run logs the steps since its checkpoint once more; the later row counts,
+    and a line that a kill left unfinished does not.
     """
     scalars = {}
     for path in sorted(folder.glob("*.csv")):
         with path.open(newline="") as file:
-            rows = {int(step): float(value) for step, value in csv.reader(file)}
+            whole = (row for row in csv.reader(file) if len(row) == 2 and all(row))
+            rows = {int(step): float(value) for step, value in whole}
         scalars[path.stem] = sorted(rows.items())
     return scalars

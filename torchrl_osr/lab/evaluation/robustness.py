@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 
 from torchrl_osr.lab.data import ReferenceReturns
+from torchrl_osr.lab.envs import NotPossible
 from torchrl_osr.lab.evaluation.episodes import EpisodeEvaluator, Policy, Wrap
 from torchrl_osr.lab.evaluation.recovery import (
     DataDistance,
@@ -126,8 +127,6 @@ def impossible_disturbances(
     env_id: str, disturbances: Sequence[Disturbance]
 ) -> dict[str, str]:
     """Return the reasons why the environment does not allow a disturbance, by name."""
-    from torchrl_osr.lab.envs import NotPossible  # needs MuJoCo, and the rest does not
-
     reasons = {}
     for each in disturbances:
         try:

@@ -6,12 +6,13 @@ import base64
 import re
 import textwrap
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
+from jinja2 import Environment, PackageLoader
+from matplotlib.figure import Figure
 
-from torchrl_osr._extras import needed_by
 from torchrl_osr._files import write_atomically
 from torchrl_osr.lab.evaluation.figures import GREY, new_figure, save_figure
 from torchrl_osr.lab.evaluation.statistics import NUM_RESAMPLES, Estimate, estimate
@@ -30,12 +31,6 @@ from torchrl_osr.lab.report.tables import (
     text,
     undisturbed,
 )
-
-with needed_by("the report needs", "train"):
-    from jinja2 import Environment, PackageLoader
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 # Each method has its own combination. The palette is Okabe and Ito's.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")

@@ -4,25 +4,24 @@ from __future__ import annotations
 
 import inspect
 from contextlib import closing
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from gymnasium.wrappers import TimeLimit
 from hydra.utils import get_class, instantiate
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torchrl.objectives import LossModule
 
 from torchrl_osr import OSRVLoss
+from torchrl_osr.lab.data import EnvironmentSpec, environment_spec, make_environment
+from torchrl_osr.lab.data.record import record_episodes
 from torchrl_osr.lab.dynamics import TransitionVAE
 from torchrl_osr.lab.losses import IQLLoss
 from torchrl_osr.lab.run.schema import EnvConfig, TrainConfig
 from torchrl_osr.modules import state_value
 from torchrl_osr.objectives import ActorCriticLoss, WithRecovery
 from torchrl_osr.objectives.networks import is_categorical
-
-if TYPE_CHECKING:
-    from torchrl_osr.lab.data import EnvironmentSpec
-
 
 SIZES = ("action_low", "action_high", "observation_size", "action_size")
 """Settings that are read from the environment or the log."""
@@ -135,8 +134,6 @@ def read_environment(env: EnvConfig) -> EnvironmentSpec:
 
     A ValueError names those that have changed since the training.
     """
-    from torchrl_osr.lab.data import environment_spec  # needs Gymnasium
-
     if env.id is None:
         raise ValueError(
             f"{env.name} has no simulator (env=none): nothing can be played there. "
@@ -159,25 +156,12 @@ def try_out(env_id: str) -> None:
 
     The actions are the middle ones: others may end in states that no data have.
     """
-    from torchrl_osr.lab.data import make_environment  # needs Gymnasium
-
-    with closing(make_environment(env_id)) as env:
-        step, actions, wanted = 0, env.action_space, env.observation_space.shape
-        action: Any = np.zeros(actions.shape, actions.dtype) if actions.shape else 0
+    with closing(TimeLimit(make_environment(env_id), 10)) as env:
+        shape = env.action_space.shape
         try:
-            state, _ = env.reset(seed=0)
-            reward: Any = 0.0
-            ended = False
-            for step in range(11):
-                if step and not ended:
-                    state, reward, *flags, _ = env.step(action)
-                    terminated, truncated = map(bool, flags)
-                    ended = terminated or truncated
-                finite = np.isfinite([*state, float(reward)]).all()
-                if np.shape(state) != wanted or not finite:
-                    raise ValueError(f"observation {state}, reward {reward}")
+            record_episodes(env, lambda _: np.zeros(shape or ()), 1, progress=False)
         except Exception as error:
             raise RuntimeError(
-                f"{env_id} cannot be played: step {step} ended with "
-                f"{type(error).__name__}: {error}. Without a simulator, use env=none."
+                f"{env_id} cannot be played: {type(error).__name__}: {error}. Without "
+                "a simulator, use env=none."
             ) from error
