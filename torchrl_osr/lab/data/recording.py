@@ -90,14 +90,14 @@ class Recording:
 
     def load(self) -> Dataset:
         """Return transitions ``[N]`` and manifest."""
-        warnings = list(self.about.get("warnings", []))
+        found: list[str] = []
         if self.options.action_bounds == "log":
             bounds = self._range()
             self.options = replace(self.options, action_bounds=bounds)
             low, high = (
                 "[" + ", ".join(f"{x:.4g}" for x in each) + "]" for each in bounds
             )
-            warnings.append(
+            found.append(
                 f"The bounds of the actions are {low} and {high}, the range of the log "
                 f"and {MARGIN:.0%} on either side: data.action_bounds=[low,high] sets "
                 "others."
@@ -105,7 +105,7 @@ class Recording:
         rows, episodes, counts = [], [], Counter[str]()
         for columns in self.parts():
             data, numbers, of_each = trajectories(columns, self.options)
-            warnings += _vanishing(columns)
+            found += _vanishing(columns)
             counts.update(numbers)
             rows.append(data)
             episodes.append(of_each)
@@ -118,10 +118,10 @@ class Recording:
         ]
         returns, lengths, complete = np.concatenate(episodes).T
         whole, lengths = complete == 1, lengths.astype(int)
-        warnings = [*dict.fromkeys(warnings)]
-        warnings += [
-            f"{counts[n]:,} rows {t}." for n, t in WARNINGS.items() if counts[n]
-        ]
+        # Of the reader first, which has read all.
+        warnings = [*self.about.get("warnings", []), *dict.fromkeys(found)]
+        told = [name for name in WARNINGS if counts[name]]
+        warnings += [f"{counts[name]:,} rows {WARNINGS[name]}." for name in told]
         for warning in warnings:
             torchrl_logger.warning(warning)
         return data, {
