@@ -157,9 +157,10 @@ def try_out(env_id: str) -> None:
     The actions are the middle ones: others may end in states that no data have.
     """
     with closing(TimeLimit(make_environment(env_id), 10)) as env:
-        shape = env.action_space.shape
+        actions: Any = env.action_space
+        middle = np.zeros(actions.shape, actions.dtype)
         try:
-            record_episodes(env, lambda _: np.zeros(shape or ()), 1, progress=False)
+            record_episodes(env, lambda _: middle, 1, progress=False)
         except Exception as error:
             raise RuntimeError(
                 f"{env_id} cannot be played: {type(error).__name__}: {error}. Without "
