@@ -189,11 +189,7 @@ def test_a_log_without_rewards_trains_what_needs_none(tmp_path, capsys):
         assert json.loads((run / "returns.json").read_text())["data_return"] is None
     assert (run / "inverse_dynamics.json").exists()
     capsys.readouterr()
-    data.main(
-        composed(
-            "check_data", "progress=false", *given, f"picture={tmp_path}/picture.png"
-        )
-    )
+    data.main(composed("check_data", "progress=false", *given))
     shown = capsys.readouterr().out
     assert "1. The data have no reward column" in shown
     assert "returns " not in shown

@@ -3,9 +3,8 @@
     torchrl-osr data data.path=log.csv env.id=Pendulum-v1
     torchrl-osr data data=minari data.path=mujoco/hopper/medium-v0
 
-Prints rows, episodes, ends and ranges, and what looks wrong with its cure; draws a
-picture. Takes the options of ``torchrl-osr train`` and refuses the same data. See
-docs/your_data.md.
+Prints rows, episodes, ends and ranges, and what looks wrong with its cure. Takes the
+options of ``torchrl-osr train`` and refuses the same data. See docs/your_data.md.
 """
 
 from __future__ import annotations
@@ -31,7 +30,6 @@ from torchrl_osr.lab.data.overview import (
     recorded_columns,
 )
 from torchrl_osr.lab.data.recording import has_rewards
-from torchrl_osr.lab.evaluation.figures import data_figure
 from torchrl_osr.lab.run import CONF
 from torchrl_osr.lab.run.data import load_data
 from torchrl_osr.lab.run.schema import register
@@ -44,15 +42,14 @@ register()
 @hydra.main(version_base="1.3", config_path=CONF, config_name="check_data")
 @single_job
 def main(cfg: DictConfig) -> None:
-    """Read the data, print a summary and draw them; write nothing else."""
+    """Read the data and print a summary; write nothing."""
     torchrl_logger.setLevel("ERROR")  # warnings are among the findings
     options: Any = OmegaConf.to_object(cfg.data)
     env: Any = None
     if not OmegaConf.is_missing(cfg.env, "id"):
         env = OmegaConf.to_object(cfg.env)
     data, manifest = load_data(env, options, progress=cfg.progress)
-    columns = recorded_columns(data, manifest)
-    entries = describe_entries(columns)
+    entries = describe_entries(recorded_columns(data, manifest))
     wrong = [*findings(data, manifest, entries)]
     if env is not None and env.id is not None:
         with closing(make_environment(env.id)) as made:
@@ -69,10 +66,6 @@ def main(cfg: DictConfig) -> None:
     print("\nWhat looks wrong:" if wrong else "\nNothing looks wrong.")
     for number, sentence in enumerate(wrong, 1):
         print(f"  {number}. {sentence}")
-    name = title.partition(".")[0].replace(" ", "-")
-    picture = Path(cfg.picture or f"{name}-data.png")
-    data_figure(columns, manifest, picture, title=title)
-    print(f"\nPicture: {picture.absolute()}")
 
 
 def overview(

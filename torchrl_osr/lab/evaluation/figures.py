@@ -1,4 +1,4 @@
-"""Figures of data sets and training runs."""
+"""Figures of training runs."""
 
 from __future__ import annotations
 
@@ -7,15 +7,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pandas as pd
 from matplotlib.figure import Figure
 
 from torchrl_osr._files import whole_file
 from torchrl_osr.lab.evaluation.episodes import measure_of
 
 # Okabe and Ito's palette, which colour-blind readers can distinguish.
-BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
+BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#666666"
 
 IN_WORDS = {"score": "normalised score", "return": "return"}
 
@@ -27,9 +25,6 @@ PANELS = {
     "pred_value": "Q of the data's actions",
 }
 """Logged scalars below the learning curve, and their titles."""
-
-COLUMNS, MOST_PANELS = 5, 30  # histograms in a row and in a figure
-MOST_ROWS = 200_000  # of a data set, in a histogram
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -43,41 +38,6 @@ def save_figure(figure: Figure, path: Path | str, *, dpi: int = 150) -> None:
         axes.spines[["top", "right"]].set_visible(False)
     with whole_file(Path(path)) as file:
         figure.savefig(file, dpi=dpi, format="png")
-
-
-def data_figure(
-    columns: pd.DataFrame, manifest: Mapping[str, Any], path: Path | str, *, title: str
-) -> None:
-    """Draw histograms of the episodes' returns and lengths and of every entry.
-
-    ``columns`` are those of :func:`~torchrl_osr.lab.data.overview.recorded_columns`.
-    """
-    panels: list[tuple[str, Any, str]] = []
-    for name, kind in (("return of an episode", "returns"), ("steps", "lengths")):
-        values = [
-            manifest.get(f"{part}_{kind}", []) for part in ("episode", "incomplete")
-        ]
-        panels.append((name, np.concatenate(values), GREEN))
-    rows = columns.iloc[:: len(columns) // MOST_ROWS + 1]
-    for part, colour in {"reward": GREY, "action": ORANGE, "observation": BLUE}.items():
-        panels += [(name, rows[part, name], colour) for name in rows[part]]
-    height = -(-min(len(panels), MOST_PANELS) // COLUMNS)
-    figure = new_figure(2.6 * COLUMNS, 2.0 * height + 0.6)
-    left = max(len(panels) - MOST_PANELS, 0)
-    figure.suptitle(title + (f" ({left} more entries are not shown)" if left else ""))
-    grid = figure.subplots(height, COLUMNS, squeeze=False).ravel()
-    for axes, (name, values, colour) in zip(grid, panels, strict=False):
-        if len(values) and np.ptp(values) > 1e-12 * np.abs(values).max():
-            axes.hist(values, bins=40, color=colour)
-        elif len(values):  # too narrow for bins
-            axes.text(0.5, 0.5, f"always {np.max(values):g}", ha="center")
-            axes.set_xticks([])
-        axes.set_title(name, fontsize=9)
-        axes.tick_params(labelsize=7)
-        axes.set_yticks([])
-    for axes in grid[len(panels) :]:
-        axes.set_axis_off()
-    save_figure(figure, path, dpi=110)
 
 
 def learning_curve(

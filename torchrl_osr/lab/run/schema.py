@@ -195,7 +195,6 @@ class CheckDataConfig:
 
     env: EnvConfig = field(default_factory=EnvConfig)  # compared with, if given
     data: DataConfig = field(default_factory=DataConfig)
-    picture: str | None = None  # null: <name of the data>-data.png
     progress: bool = MISSING
 
 
