@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from glob import escape
 from itertools import chain
 from pathlib import Path
@@ -12,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from torchrl_osr._files import read_json
-from torchrl_osr.lab.data.recording import Columns, Reading, Recording
-from torchrl_osr.lab.data.table import open_log
+from torchrl_osr.lab.data.recording import Columns, Reading, convert
+from torchrl_osr.lab.data.store import Dataset
+from torchrl_osr.lab.data.table import log_files, log_parts
 
 KNOWN_NAMES = {
     "observation": ("observation.state", "observation.environment_state"),
@@ -27,8 +27,8 @@ KNOWN_NAMES = {
 """Columns by their part, where a set has them and the user names no others."""
 
 
-def open_lerobot(path: Any, columns: Mapping[str, Any], options: Reading) -> Recording:
-    """Open a LeRobot data set without reading a row; ``columns`` names its parts.
+def read_lerobot(path: Any, columns: Mapping[str, Any], options: Reading) -> Dataset:
+    """Return transitions of a LeRobot set and manifest; ``columns`` names its parts.
 
     Every episode ends in its last row, and ``next.done`` does not say why. It is
     terminated there if ``next.truncated`` is false or, in a set without that column,
@@ -51,18 +51,17 @@ def open_lerobot(path: Any, columns: Mapping[str, Any], options: Reading) -> Rec
     by_truncated = "truncated" in known and "terminated" not in columns
     if by_truncated:
         known["terminated"] = False
-    files = escape(str(folder)) + "/data/chunk-*/file-*.parquet"
-    log = open_log(files, {**known, **columns}, options, "lerobot")
-    log.about["path"] = str(folder)
-    log.about["entry_names"] = {n: _entry_names(each) for n, each in features.items()}
+    about: dict[str, Any] = {"source": "lerobot", "path": str(folder)}
+    about["entry_names"] = {name: _entry_names(each) for name, each in features.items()}
     cameras = [n for n, each in features.items() if each["dtype"] in ("video", "image")]
     if cameras:
         text = f"images and videos are left out: {', '.join(cameras)}."
-        log.about["warnings"] = [text]
+        about["warnings"] = [text]
+    files = log_files(escape(str(folder)) + "/data/chunk-*/file-*.parquet")
 
     def parts() -> Iterator[Columns]:
         total = 0
-        for rows in log.parts():
+        for rows in log_parts(files, {**known, **columns}, about):
             last = np.r_[np.diff(rows["episode"]) != 0, True]
             flag = np.reshape(rows["truncated" if by_truncated else "terminated"], -1)
             ended = last & (flag.astype(np.bool_) != by_truncated)
@@ -74,7 +73,7 @@ def open_lerobot(path: Any, columns: Mapping[str, Any], options: Reading) -> Rec
                 f"{info['total_frames']:,}: copy the whole folder again."
             )
 
-    return replace(log, parts=parts)
+    return convert(parts(), options, about, files)
 
 
 def _entry_names(feature: Mapping[str, Any]) -> list[str]:

@@ -17,7 +17,8 @@ from tqdm.auto import tqdm
 from torchrl_osr._extras import needed_by
 from torchrl_osr._files import read_json
 from torchrl_osr.lab.data.environment import sorted_space
-from torchrl_osr.lab.data.recording import Columns, Reading, Recording
+from torchrl_osr.lab.data.recording import Reading, convert
+from torchrl_osr.lab.data.store import Dataset
 from torchrl_osr.lab.data.transitions import Array
 
 with needed_by("Minari data sets need", "minari"):
@@ -25,10 +26,10 @@ with needed_by("Minari data sets need", "minari"):
     from minari.storage import get_dataset_path, hosting
 
 
-def open_minari(
+def read_minari(
     path: Any, options: Reading, *, download: bool, progress: bool
-) -> Recording:
-    """Open a Minari data set by its id or folder; no episode is read yet.
+) -> Dataset:
+    """Return the transitions of a Minari set, by its id or folder, and their manifest.
 
     Bounds of ``None`` are the set's own.
     """
@@ -63,13 +64,10 @@ def open_minari(
         "env_id": opened.env_spec and opened.env_spec.id,
         "minari_version": opened.minari_version,
     }
-
-    def parts() -> Iterator[Columns]:
-        episodes = [*_read(opened, space, progress)]
-        yield {n: np.concatenate([e[n] for e in episodes]) for n in episodes[0]}
-
+    episodes = [*_read(opened, space, progress)]
+    columns = {n: np.concatenate([e[n] for e in episodes]) for n in episodes[0]}
     files = sorted(path for path in here.rglob("*") if path.is_file())
-    return Recording(parts, options, about, files)
+    return convert([columns], options, about, files)
 
 
 def _read(

@@ -6,8 +6,8 @@ Shapes: ``N`` rows, ``E`` trajectories, ``S`` observation, ``A`` action.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -75,76 +75,72 @@ class Reading:
             )
 
 
-@dataclass
-class Recording:
-    """A recorded data set.
+def convert(
+    parts: Iterable[Columns],
+    options: Reading,
+    about: Mapping[str, Any] | None = None,
+    files: Iterable[Path] = (),
+) -> Dataset:
+    """Return transitions ``[N]`` and their manifest, with the checksum of ``files``.
 
-    ``parts`` is its reader: it yields columns of whole trajectories, a file or many
-    rows at a time. ``about`` goes into the manifest.
+    Each part has columns of whole trajectories. ``about`` goes into the manifest; a
+    reader may fill it while it yields its parts.
     """
+    found: list[str] = []
+    if options.action_bounds == "log":
+        parts = [*parts]
+        options = replace(options, action_bounds=_range(parts))
+        low, high = (
+            "[" + ", ".join(f"{x:.4g}" for x in each) + "]"
+            for each in options.action_bounds
+        )
+        found.append(
+            f"The bounds of the actions are {low} and {high}, the range of the log and "
+            f"{MARGIN:.0%} on either side: data.action_bounds=[low,high] sets others."
+        )
+    rows, episodes, counts = [], [], Counter[str]()
+    for columns in parts:
+        data, numbers, of_each = trajectories(columns, options)
+        found += _vanishing(columns)
+        counts.update(numbers)
+        rows.append(data)
+        episodes.append(of_each)
+    data = torch.cat(rows)
+    if not len(data):
+        raise ValueError("no row has a true next state: give next_observation.")
+    check_dataset(data)
+    about = about or {}
+    returns, lengths, complete = np.concatenate(episodes).T
+    whole, lengths = complete == 1, lengths.astype(int)
+    warnings = [*about.get("warnings", []), *dict.fromkeys(found)]
+    told = [name for name in WARNINGS if counts[name]]
+    warnings += [f"{counts[name]:,} rows {WARNINGS[name]}." for name in told]
+    for warning in warnings:
+        torchrl_logger.warning(warning)
+    bounds = [np.asarray(b, np.float64).tolist() for b in options.action_bounds]
+    files = [*files]
+    return data, {
+        **asdict(options),
+        "action_bounds": bounds,
+        "num_transitions": len(data),
+        **about,
+        **counts,
+        **({"checksum": checksum_of(files)} if files else {}),
+        "episode_returns": returns[whole].tolist(),
+        "episode_lengths": lengths[whole].tolist(),
+        "incomplete_returns": returns[~whole].tolist(),
+        "incomplete_lengths": lengths[~whole].tolist(),
+        "warnings": warnings,
+    }
 
-    parts: Callable[[], Iterable[Columns]]
-    options: Reading
-    about: dict[str, Any] = field(default_factory=dict)
-    files: list[Path] = field(default_factory=list)
 
-    def load(self) -> Dataset:
-        """Return transitions ``[N]`` and manifest."""
-        found: list[str] = []
-        if self.options.action_bounds == "log":
-            bounds = self._range()
-            self.options = replace(self.options, action_bounds=bounds)
-            low, high = (
-                "[" + ", ".join(f"{x:.4g}" for x in each) + "]" for each in bounds
-            )
-            found.append(
-                f"The bounds of the actions are {low} and {high}, the range of the log "
-                f"and {MARGIN:.0%} on either side: data.action_bounds=[low,high] sets "
-                "others."
-            )
-        rows, episodes, counts = [], [], Counter[str]()
-        for columns in self.parts():
-            data, numbers, of_each = trajectories(columns, self.options)
-            found += _vanishing(columns)
-            counts.update(numbers)
-            rows.append(data)
-            episodes.append(of_each)
-        data = torch.cat(rows)
-        if not len(data):
-            raise ValueError("no row has a true next state: give next_observation.")
-        check_dataset(data)
-        bounds = [
-            np.asarray(b, np.float64).tolist() for b in self.options.action_bounds
-        ]
-        returns, lengths, complete = np.concatenate(episodes).T
-        whole, lengths = complete == 1, lengths.astype(int)
-        # Of the reader first, which has read all.
-        warnings = [*self.about.get("warnings", []), *dict.fromkeys(found)]
-        told = [name for name in WARNINGS if counts[name]]
-        warnings += [f"{counts[name]:,} rows {WARNINGS[name]}." for name in told]
-        for warning in warnings:
-            torchrl_logger.warning(warning)
-        return data, {
-            **asdict(self.options),
-            "action_bounds": bounds,
-            "num_transitions": len(data),
-            **self.about,
-            **counts,
-            **({"checksum": checksum_of(self.files)} if self.files else {}),
-            "episode_returns": returns[whole].tolist(),
-            "episode_lengths": lengths[whole].tolist(),
-            "incomplete_returns": returns[~whole].tolist(),
-            "incomplete_lengths": lengths[~whole].tolist(),
-            "warnings": warnings,
-        }
-
-    def _range(self) -> list[list[float]]:
-        """Return the log's lowest and highest actions, with :data:`MARGIN`."""
-        actions = [np.asarray(part["action"], np.float64) for part in self.parts()]
-        low = np.min([np.nanmin(each, 0) for each in actions], 0)
-        high = np.max([np.nanmax(each, 0) for each in actions], 0)
-        slack = MARGIN * (high - low)
-        return [(low - slack).tolist(), (high + slack).tolist()]
+def _range(parts: Iterable[Columns]) -> list[list[float]]:
+    """Return the log's lowest and highest actions, with :data:`MARGIN`."""
+    actions = [np.asarray(part["action"], np.float64) for part in parts]
+    low = np.min([np.nanmin(each, 0) for each in actions], 0)
+    high = np.max([np.nanmax(each, 0) for each in actions], 0)
+    slack = MARGIN * (high - low)
+    return [(low - slack).tolist(), (high + slack).tolist()]
 
 
 def _vanishing(columns: Columns) -> Iterator[str]:
@@ -210,7 +206,7 @@ def transitions_from_columns(
         (1, [2.0, 2.0])
     """
     options = Reading(action_bounds, clip_actions, num_actions, missing)
-    return Recording(lambda: [columns], options).load()
+    return convert([columns], options)
 
 
 def trajectories(

@@ -21,15 +21,11 @@ from torchrl_osr.lab.data.environment import (
     environment_spec,
     known_ids,
 )
-from torchrl_osr.lab.data.recording import ActionBounds, Reading, Recording, has_rewards
+from torchrl_osr.lab.data.recording import ActionBounds, Reading, has_rewards
 from torchrl_osr.lab.data.rollout import behavior_of, collect_source
 from torchrl_osr.lab.data.rows import mix_datasets
 from torchrl_osr.lab.data.statistics import REFERENCE_RETURNS, ReferenceReturns
-from torchrl_osr.lab.data.store import (
-    Dataset,
-    cache_root,
-    load_or_write,
-)
+from torchrl_osr.lab.data.store import Dataset, cache_root, load_or_write
 
 RECORDED = ("minari", "d4rl", "lerobot", "file")
 """Sources that are recorded; the others are rolled out."""
@@ -100,8 +96,7 @@ def load_dataset(
         spec = None if env_id is None else environment_spec(env_id)
         if path is None:
             raise ValueError(f"data={source} needs data.path=...")
-        recording = _opened(source, path, spec, num_actions, log, progress)
-        data, manifest = recording.load()
+        data, manifest = _recorded(source, path, spec, num_actions, log, progress)
         checksum = manifest.get("checksum")
     else:
         _refuse(log | {"path": path}, f"data={source}, which is rolled out")
@@ -188,18 +183,15 @@ def rolled_out(
     return load_or_write(folder, request, collect)
 
 
-def _opened(
+def _recorded(
     source: str,
     path: str | Path | Sequence[str],
     spec: EnvironmentSpec | None,
     number: int | None,
     log: Mapping[str, Any],
     progress: bool,
-) -> Recording:
-    """Open recorded data without reading a row.
-
-    A reader is a function that returns a :class:`Recording`.
-    """
+) -> Dataset:
+    """Read recorded data."""
     bounds = log["action_bounds"]
     if source not in ("file", "lerobot"):
         _refuse({"columns": log["columns"]}, f"data={source}")
@@ -216,17 +208,17 @@ def _opened(
                 bounds = low[0], high[0]
     options = Reading(bounds, log["clip_actions"], number, log["missing"])
     if source == "minari":
-        from torchrl_osr.lab.data.minari import open_minari
+        from torchrl_osr.lab.data.minari import read_minari
 
-        return open_minari(path, options, download=log["download"], progress=progress)
-    from torchrl_osr.lab.data.lerobot import open_lerobot
-    from torchrl_osr.lab.data.table import open_log
+        return read_minari(path, options, download=log["download"], progress=progress)
+    from torchrl_osr.lab.data.lerobot import read_lerobot
+    from torchrl_osr.lab.data.table import read_log
 
     _refuse({"download": log["download"]}, f"data={source}")
     if source == "lerobot":
-        return open_lerobot(path, log["columns"], options)
+        return read_lerobot(path, log["columns"], options)
     d4rl = {"observation": "observations"}  # others have their usual names
-    return open_log(path, d4rl if source == "d4rl" else log["columns"], options, source)
+    return read_log(path, d4rl if source == "d4rl" else log["columns"], options, source)
 
 
 def _check_fit(
@@ -234,12 +226,9 @@ def _check_fit(
 ) -> None:
     """Raise unless the data have the task's observations and actions."""
     ours = [data[name].shape[-1] for name in ("observation", "action")]
+    numbered = manifest["num_actions"] is not None
     fits = ours == [spec.observation_size, spec.action_size]
-    if fits and spec.discrete:
-        action = data["action"]
-        one_hot = ((action == 0) | (action == 1)).all() and (action.sum(1) == 1).all()
-        fits = bool(one_hot)
-    if not fits:
+    if not fits or numbered != spec.discrete:
         kind = "discrete" if spec.discrete else "real"
         raise ValueError(
             f"the data have {ours[0]} observation and {ours[1]} action entries, "

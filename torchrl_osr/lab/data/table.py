@@ -16,7 +16,8 @@ import numpy as np
 
 from torchrl_osr._extras import needed_by
 from torchrl_osr._files import read_arrays
-from torchrl_osr.lab.data.recording import NO_REWARDS, Reading, Recording, has_rewards
+from torchrl_osr.lab.data.recording import NO_REWARDS, Reading, convert, has_rewards
+from torchrl_osr.lab.data.store import Dataset
 from torchrl_osr.lab.data.transitions import Array
 
 with needed_by("tables need", "train"):
@@ -44,17 +45,37 @@ VECTORS = ("observation", "action", "next_observation")
 NUMBER = re.compile(r"[-+]?\d*[.,]?\d+(e[-+]?\d+)?", re.IGNORECASE)
 
 
-def open_log(
+def read_log(
     path: str | Path | Sequence[str],
     columns: Mapping[str, Any],
     options: Reading,
     source: str = "file",
-) -> Recording:
-    """Open a log without reading a row; ``columns`` names its parts."""
-    files = _files(path)
+) -> Dataset:
+    """Return transitions of a log and their manifest; ``columns`` names its parts."""
+    files = log_files(path)
     paths = [str(file) for file in files]
-    about: dict[str, Any] = {"source": source, "column_names": {**columns}}
-    about["path"] = paths[0] if len(paths) == 1 else paths
+    about = {"source": source, "path": paths[0] if len(paths) == 1 else paths}
+    return convert(log_parts(files, columns, about), options, about, files)
+
+
+def log_files(path: str | Path | Sequence[str]) -> list[Path]:
+    """Return the files of a name, a pattern or a list of both."""
+    files: list[Path] = []
+    for each in [path] if isinstance(path, (str, Path)) else path:
+        whole = Path(each).expanduser().absolute()
+        # A name that looks like a pattern is a name.
+        found = [whole] if whole.is_file() else [*map(Path, sorted(glob(str(whole))))]
+        files += found
+        if not found:
+            cure = "give its place with data.path=..."
+            raise FileNotFoundError(f"there is no file {whole}: {cure}")
+    return files
+
+
+def log_parts(
+    files: Sequence[Path], columns: Mapping[str, Any], about: dict[str, Any]
+) -> Iterator[Arrays]:
+    """Yield the columns of each file; put what was found into ``about``."""
 
     def chosen(names: list[str], **known: str) -> list[str]:
         """Return the columns to read by name; all files need those of the first."""
@@ -67,31 +88,15 @@ def open_log(
                 about.setdefault("warnings", []).append(NO_REWARDS)
         return [*chain(*about["columns"].values())]
 
-    def parts() -> Iterator[Arrays]:
-        for file in files:
-            try:
-                arrays = _read(file, chosen)
-                rows = assemble(about["columns"], arrays)
-                if step := about["columns"].get("step"):
-                    rows = _sorted(rows, step[0], about)
-            except (KeyError, OSError, ValueError) as error:
-                raise ValueError(f"{file}: {error}") from error
-            yield rows
-
-    return Recording(parts, options, about, files)
-
-
-def _files(path: str | Path | Sequence[str]) -> list[Path]:
-    files: list[Path] = []
-    for each in [path] if isinstance(path, (str, Path)) else path:
-        whole = Path(each).expanduser().absolute()
-        # A name that looks like a pattern is a name.
-        found = [whole] if whole.is_file() else [*map(Path, sorted(glob(str(whole))))]
-        files += found
-        if not found:
-            cure = "give its place with data.path=..."
-            raise FileNotFoundError(f"there is no file {whole}: {cure}")
-    return files
+    for file in files:
+        try:
+            arrays = _read(file, chosen)
+            rows = assemble(about["columns"], arrays)
+            if step := about["columns"].get("step"):
+                rows = _sorted(rows, step[0], about)
+        except (KeyError, OSError, ValueError) as error:
+            raise ValueError(f"{file}: {error}") from error
+        yield rows
 
 
 def _read(path: Path, chosen: Callable[..., list[str]]) -> Arrays:
