@@ -395,6 +395,9 @@ def main() -> None:
     """Fill the pages and draw the figures."""
     episodes = tables.read(HERE)
     clean = episodes[episodes["suite"] == ""]
+    if (mazes := HERE / TABLES["mazes"].place).exists():
+        of_mazes = tables.read(mazes)
+        clean = pd.concat([clean, of_mazes[of_mazes["step"] > 0]])
     printed = pd.read_csv(HERE / "printed_table1.csv", index_col="data")
     quoted = pd.read_csv(HERE / "published.csv", index_col=0)
     for name in ("td3_bc", "rebrac", "cql_noisy_bc"):

@@ -1,7 +1,8 @@
 """Make the runs behind the paper's tables and figures.
 
-    python results/paper/run.py table1                       # or table2, figure4, d4
+    python results/paper/run.py table1                       # table2, figure4, d4
     python results/paper/run.py table1 --data hopper-medium --methods osr cql --seeds 0
+    python results/paper/run.py mazes                        # the rest of Table 1
     python results/paper/run.py methods                      # all methods, six sets
     python results/paper/run.py tune                         # eight trials a method
     python results/paper/run.py table1 --pack                # and then page.py
@@ -27,6 +28,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pandas as pd
+from omegaconf import OmegaConf
 
 from torchrl_osr.lab.report import read_runs
 
@@ -77,7 +79,18 @@ LIMITED = {
     for share in (50, 70, 90)
     for env in ENVS
 }  # fmt: skip
-DATA = MUJOCO | LIMITED
+MAZES = {
+    f"antmaze-{maze} {source}": [
+        f"env=antmaze-{maze}", f"data={source}", "preset=antmaze_quick"
+    ]
+    for maze, *sources in (
+        ("umaze", "umaze", "diverse"),
+        ("medium", "play", "diverse"),
+        ("large", "play", "diverse"),
+    )
+    for source in sources
+}  # fmt: skip
+DATA = MUJOCO | LIMITED | MAZES
 SIX = [data for data in MUJOCO if data.endswith(("-replay", "-expert"))]
 
 SUITES = {
@@ -92,7 +105,10 @@ file of each. ``official`` is for ``medium-expert`` alone, as in the paper."""
 
 
 class Table(NamedTuple):
-    """Runs of a table; ``seconds`` of a core go to the updates of each policy."""
+    """Runs of a table; ``seconds`` of a core go to the updates of each policy.
+
+    0 stands for the updates and evaluations of ``preset=antmaze_quick``.
+    """
 
     methods: Sequence[str]
     data: Sequence[str]
@@ -103,9 +119,11 @@ class Table(NamedTuple):
 
 
 PAPER = ("osr", "osr_v", "cql", "iql", "sdc", "mopo", "rambo")
+TEN = (*PAPER, "td3_bc", "rebrac", "cql_noisy_bc")
 EXPERTS = [f"{env} medium-expert" for env in ENVS]
 TABLES = {
-    "table1": Table((*PAPER, "td3_bc", "rebrac", "cql_noisy_bc"), list(MUJOCO)),
+    "table1": Table(TEN, list(MUJOCO)),
+    "mazes": Table(TEN, list(MAZES), seconds=0, place="mazes"),
     "table2": Table(("osr", "osr_v", "cql", "sdc"), EXPERTS, ("oos", "official")),
     "figure4": Table(("osr", "cql", "sdc"), list(LIMITED)),
     "d4": Table(
@@ -138,6 +156,9 @@ def command(log: Path, *arguments: str) -> None:
 
 def updates(method: str, seconds: int) -> int:
     """Return how many updates fit into the time."""
+    if not seconds:
+        preset = HERE.parents[1] / "conf" / "preset" / "antmaze_quick.yaml"
+        return int(OmegaConf.load(preset).trainer.steps)
     ms = json.loads((HERE / "update_ms.json").read_text())["quick"]
     ms = ms[method.partition("-")[0]]
     return round(seconds / ms) * 1000
@@ -149,12 +170,13 @@ def run(folder: Path, data: str, method: str, seed: int, table: Table) -> None:
     status = folder / "status.json"
     if not status.exists() or json.loads(status.read_text())["status"] != "done":
         steps = updates(method, table.seconds)
+        tenth = steps // 10
+        length = [f"trainer.steps={steps}", f"trainer.eval_interval={tenth}"]
+        length += [f"trainer.checkpoint_interval={tenth}", "trainer.eval_episodes=5"]
         command(
             folder / "train.txt", "train", *DATA[data], f"seed={seed}",
-            *(METHODS | TRIALS)[method], f"trainer.steps={steps}",
-            f"trainer.eval_interval={steps // 10}", "trainer.eval_episodes=5",
-            f"trainer.checkpoint_interval={steps // 10}", "trainer.progress=false",
-            f"hydra.run.dir={folder}",
+            *(METHODS | TRIALS)[method], *(length if table.seconds else []),
+            "trainer.progress=false", f"hydra.run.dir={folder}",
         )  # fmt: skip
     for suite, file in SUITES.items():
         sets = EXPERTS if suite == "official" else SIX
