@@ -219,7 +219,9 @@ def test_policies_are_ranked_on_their_log_alone(tmp_path, capsys, monkeypatch):
         read_runs([tmp_path])
 
 
-def test_without_a_simulator_bounds_and_discrete_actions_may_be_given(tmp_path):
+def test_without_a_simulator_bounds_and_discrete_actions_may_be_given(
+    tmp_path, capsys, monkeypatch
+):
     record(log := tmp_path / "real.npz", "env.id=Pendulum-v1", "episodes=3")
     given = "env=none", f"data.path={log}", "data.action_bounds=[-3,2.5]", "loss=td3_bc"
     env = read_run(trained(tmp_path / "real", *given)).env
@@ -231,6 +233,9 @@ def test_without_a_simulator_bounds_and_discrete_actions_may_be_given(tmp_path):
     run = trained(tmp_path / "whole", *given, "env.action_size=2")
     trained(run, *given, "env.action_size=2", "trainer.steps=20")
     assert load_run_policy(run).act(np.zeros(4)) in (0, 1)
+    monkeypatch.setattr("sys.argv", ["torchrl-osr", str(run), "--steps", "5"])
+    evaluate_offline.main()
+    assert "value " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

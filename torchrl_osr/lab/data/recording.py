@@ -393,7 +393,7 @@ def _unit_actions(action: Array, options: Reading) -> tuple[Array, int]:
     if not (np.isfinite([low, high]).all() and (low < high).all()):
         raise ValueError(
             f"action_bounds={options.action_bounds}; expected the lowest and the "
-            "highest action, finite numbers (data.action_bounds)."
+            "highest action, finite numbers, low < high (data.action_bounds)."
         )
     whole = ((action >= 0) & (action == np.round(action))).all()
     alone = size == 1 or (action.sum(1) == 1).all()
