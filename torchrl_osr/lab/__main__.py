@@ -20,7 +20,6 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 COMMANDS = {
     "data": "check a log before training on it",
     "train": "train a policy on offline data, or continue a run",
-    "settings": "print the settings of every method on a data set",
     "collect": "roll out a policy in any environment and keep the log",
     "evaluate": "disturb a trained policy: score lost, survival, recovery",
     "evaluate-offline": "estimate how good policies are from their data alone",

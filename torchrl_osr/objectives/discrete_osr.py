@@ -60,10 +60,7 @@ class DiscreteOSRLoss(ActorCriticLoss):
 
     Keyword Args:
         recovery_weight: weight :math:`\lambda`. Default 0.5. May be assigned later.
-        min_q_weight: :math:`\alpha`, weight of the conservative term. Default 5.0. May
-            be assigned later. Pass 0 to remove the term permanently.
-        temperature: :math:`\tau`, in units of the value. Default 1.0.
-        alpha_init: see :class:`~torchrl_osr.CQLLoss`.
+        min_q_weight, temperature, alpha_init: see :class:`~torchrl_osr.CQLLoss`.
         target_entropy: in nats; ``"auto"`` (default) is 0.98 times ``log(n)``, as in
             TorchRL's ``DiscreteSACLoss``: a policy that is nearly uniform.
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.

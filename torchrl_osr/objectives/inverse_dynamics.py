@@ -39,9 +39,7 @@ class InverseDynamicsLoss(ActorCriticLoss):
         L = -\mathbb E_{(\tilde s, a, s') \sim D_{tot}} \log I(a \mid \tilde s, s')
 
     on clean and perturbed states alike. Rows that are ``done`` are left out: their
-    ``s'`` may not be a next state. "Recovering from Out-of-sample States via Inverse
-    Dynamics in Offline Reinforcement Learning",
-    https://openreview.net/forum?id=4gLWjSaw4o.
+    ``s'`` may not be a next state. From the paper of :class:`~torchrl_osr.OSRLoss`.
 
     The authors' released code trains a
     :func:`~torchrl_osr.modules.cvae_inverse_dynamics` on clean states and on the

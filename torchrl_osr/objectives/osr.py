@@ -40,9 +40,7 @@ class OSRLoss(CQLLoss):
     only: add them up for one backward, or use separate optimizers.
 
     Args:
-        actor_network: ends in a :class:`~torchrl.modules.TanhNormal`.
-        qvalue_network: one critic, copied by TorchRL, or a list of critics that keep
-            their own weights (:func:`~torchrl_osr.modules.critic_ensemble`).
+        actor_network, qvalue_network: see :class:`~torchrl_osr.CQLLoss`.
         inverse_dynamics_network: a *trained* model of ``I(a | s, s')`` with the
             actor's bounds (see :class:`~torchrl_osr.InverseDynamicsLoss`). It is frozen
             here: in the state dict, moved by ``.to()``, without gradient.

@@ -7,13 +7,11 @@ from torchrl_osr.trainers.offline import (
     OfflineTrainer,
     divergence_warning,
 )
-from torchrl_osr.trainers.replay_buffer_collector import ReplayBufferCollector
 
 __all__ = [
     "Evaluation",
     "Hook",
     "Interrupted",
     "OfflineTrainer",
-    "ReplayBufferCollector",
     "divergence_warning",
 ]

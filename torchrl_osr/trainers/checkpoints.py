@@ -120,14 +120,8 @@ class Checkpoints:
     """The checkpoints of one training run, in a folder of its own.
 
     ``checkpoint-<step>.torchrl`` are the newest; ``best.torchrl`` has the model of the
-    best evaluation.
-
-    Args:
-        folder: where they are; made when the run is restored.
-        components: live objects, by name, see :func:`safe_checkpoint`.
-        interval: steps between two checkpoints.
-        kept: how many of the newest stay, of those at multiples of ``interval``. The
-            newest of all stays too.
+    best evaluation. Of those at multiples of ``interval`` the newest ``kept`` stay, and
+    the newest of all.
     """
 
     def __init__(

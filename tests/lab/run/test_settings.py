@@ -1,7 +1,7 @@
 """Settings by data set: the same for all methods that share them, in one table.
 
-``settings.csv`` is what ``torchrl-osr settings`` prints for the six main data sets. A
-change here changes what methods are compared by.
+``settings.csv`` has those of the six main data sets. A change here changes what methods
+are compared by.
 """
 
 from __future__ import annotations
@@ -10,12 +10,21 @@ import csv
 from pathlib import Path
 
 import pytest
-from composed import composed
+from composed import CONF, composed
+from omegaconf import DictConfig, OmegaConf
 
-from torchrl_osr.lab.cli.settings import KEYS, main, methods, settings_of
 from torchrl_osr.lab.data.environment import environment_id
 
 TABLE = Path(__file__).with_name("settings.csv")
+KEYS = (
+    *("loss.min_q_weight", "loss.num_random", "loss.recovery_weight"),
+    "recovery.recovery_weight",
+    *("optim.actor_lr", "optim.qvalue_lr", "optim.inverse_dynamics_lr"),
+    *("dynamics.rollout_steps", "dynamics.penalty", "dynamics.adversarial_weight"),
+)
+"""Columns of the table. Those of ``dynamics`` are blank without a model."""
+
+METHODS = sorted(path.stem for path in (CONF / "loss").glob("*.yaml"))
 DATA = [
     (env, source)
     for source in ("medium-expert", "medium-replay")
@@ -29,10 +38,20 @@ def table() -> dict[tuple[str, str, str], dict[str, str]]:
     return {(row["method"], row["env"], row["source"]): row for row in rows}
 
 
-@pytest.mark.parametrize("method", methods())
+def settings_of(config: DictConfig) -> dict[str, str]:
+    """Return the values of ``KEYS``, blank where a method has no such key."""
+    found = {key: OmegaConf.select(config, key) for key in KEYS}
+    blank = () if config.dynamics.use else ("dynamics.",)
+    return {
+        key: "" if value is None or key.startswith(blank) else f"{value:g}"
+        for key, value in found.items()
+    }
+
+
+@pytest.mark.parametrize("method", METHODS)
 def test_every_method_has_the_settings_of_the_table(method):
     cfg, rows = composed("train", f"loss={method}"), table()
-    assert {name for name, *_ in rows} == set(methods())
+    assert {name for name, *_ in rows} == set(METHODS)
     for env, source in DATA:
         cfg.env.id, cfg.data.source = environment_id(env), source
         row = rows[method, env, source]
@@ -44,13 +63,3 @@ def test_settings_are_those_of_the_task_not_of_the_group():
     assert composed("train", *given).loss.actor_bc_coef == 0.01
     # Of data without a row they are the constructor's.
     assert composed("train", "loss=rorl", "env.id=Pendulum-v1").loss.num_samples == 20
-
-
-def test_the_command_prints_a_row_for_each_method(capsys, monkeypatch):
-    given = ["settings", "env=hopper", "data=medium-expert", "loss=osr,iql"]
-    monkeypatch.setattr("sys.argv", given)
-    main()
-    head, osr, iql = (line.split() for line in capsys.readouterr().out.splitlines())
-    assert head[:3] == ["method", "min_q_weight", "num_random"]
-    assert osr[:3] == ["osr", "20", "4"]
-    assert iql == ["iql", "0.0003", "0.001", "0.001"]

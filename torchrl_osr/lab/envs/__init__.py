@@ -12,22 +12,18 @@ knocks and pushes, actuators, and sensors.
 from torchrl_osr.lab.envs.disturbance import NotPossible
 from torchrl_osr.lab.envs.faults import (
     ActionDelay,
-    ActionNoise,
     DynamicsChange,
     ObservationNoise,
     StartStateNoise,
-    StickyAction,
 )
 from torchrl_osr.lab.envs.timed import ActionKnock, ExternalPush
 
 __all__ = [
     "ActionDelay",
     "ActionKnock",
-    "ActionNoise",
     "DynamicsChange",
     "ExternalPush",
     "NotPossible",
     "ObservationNoise",
     "StartStateNoise",
-    "StickyAction",
 ]

@@ -20,27 +20,6 @@ from torchrl_osr.lab.envs.disturbance import (
 )
 
 
-class ActionNoise(DisturbanceWrapper):
-    """Add Gaussian noise, ``std`` half-widths of the action box, to every action.
-
-    From "Robust Gymnasium" (https://arxiv.org/abs/2502.19652).
-    """
-
-    def __init__(self, env: Env, std: float) -> None:
-        check_weight("std", std)
-        super().__init__(env, always=std > 0)
-        self.box = box_of(env.action_space, "actions")
-        low, high = (each.astype(np.float64) for each in (self.box.low, self.box.high))
-        self.scale = std * (high - low) / 2
-
-    def act(self, action: Vector) -> Vector:
-        if not self.always:
-            return action
-        noise = self.scale * self.generator.standard_normal(self.scale.shape)
-        noisy = (action + noise).astype(self.box.dtype)
-        return np.clip(noisy, self.box.low, self.box.high)
-
-
 class ActionDelay(DisturbanceWrapper):
     """Delay every action by some steps; execute zeros until the first one arrives."""
 
@@ -57,31 +36,6 @@ class ActionDelay(DisturbanceWrapper):
         # A copy: the caller may write the next action into the same array.
         self.pending.append(np.array(action))
         return self.pending.popleft()
-
-
-class StickyAction(DisturbanceWrapper):
-    """Execute the previous action once more, with some probability in each step.
-
-    As :class:`gymnasium.wrappers.StickyAction`, which draws from the environment's own
-    generator and sets no flag.
-    """
-
-    def __init__(self, env: Env, probability: float) -> None:
-        check_weight("probability", probability)
-        super().__init__(env)
-        self.probability = probability
-        self.previous: Vector | None = None
-
-    def begin(self) -> None:
-        self.previous = None
-
-    def act(self, action: Vector) -> Vector:
-        if self.previous is not None and self.generator.random() < self.probability:
-            self.acted = True
-        else:
-            # A copy: the caller may write the next action into the same array.
-            self.previous = np.array(action)
-        return self.previous
 
 
 class ObservationNoise(DisturbanceWrapper):

@@ -61,12 +61,7 @@ class ActionKnock(TimedDisturbance):
     knock, with the reward and end of the agent's own action. Neither the time limit nor
     other wrappers see the extra steps. Put this around the bare task.
 
-    Args:
-        env: the environment, with real actions, or in ``"torque"`` mode discrete ones.
-        steps: of the knock.
-
     Keyword Args:
-        mode: ``"official"``, ``"paper"`` or ``"torque"``.
         at: steps of the agent before it; of a range ``(low, high)``, a number from
             ``low`` to below ``high`` is drawn for each episode. Default 500.
 

@@ -63,13 +63,10 @@ def evaluate_paired(
 
     Args:
         policy: to be evaluated, on the CPU.
-        env_id: a Gymnasium id, ``"Hopper-v5"`` for instance.
-        disturbances: of one suite.
         distance: to the training data.
 
     Keyword Args:
-        num_episodes: ``E``. Default 10.
-        seed: the episodes are seeded ``seed, seed + 1, ...``. Default 0.
+        num_episodes, seed: see :class:`~torchrl_osr.lab.evaluation.EpisodeEvaluator`.
         references: to normalise returns by. Default: no scores.
         advance: called after the clean episodes and after each disturbance.
 
