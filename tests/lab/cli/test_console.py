@@ -20,7 +20,7 @@ from torchrl_osr.lab.cli.console import sentence
 def test_help_lists_every_command(capsys):
     main([])
     printed = capsys.readouterr().out
-    assert re.findall(r"(?m)^  (\w+)  +[a-z]", printed) == list(COMMANDS)
+    assert re.findall(r"(?m)^  ([\w-]+)  +[a-z]", printed) == list(COMMANDS)
 
 
 def test_help_is_quick_and_has_no_raw_configuration():

@@ -31,11 +31,10 @@ def one(state: Tensor) -> Tensor:
 
 
 def test_rows_are_those_of_a_known_world_until_the_task_ends() -> None:
-    rows, rejected = rollout(
+    rows = rollout(
         linear_world(), one, torch.tensor([[0.0], [10.0]]), steps=3,
         terminated=lambda state: state[:, 0] == 12,
     )  # fmt: skip
-    assert rejected == 0
     assert rows["observation"].flatten().tolist() == [0, 10, 1, 11, 2]
     after = rows["next", "observation"]
     torch.testing.assert_close(after, rows["observation"] + 1)
@@ -48,11 +47,11 @@ def test_rows_are_those_of_a_known_world_until_the_task_ends() -> None:
 def test_unknown_rows_are_rejected_or_end_the_task() -> None:
     starts, world = torch.tensor([[2.0], [math.inf]]), linear_world(spread=0.5)
     for limit, number in {0.4: 0, 0.6: 3}.items():
-        rows, rejected = rollout(world, one, starts, steps=3, max_disagreement=limit)
-        assert (len(rows), rejected) == (number, 2 - (number > 0))
+        rows = rollout(world, one, starts, steps=3, max_disagreement=limit)
+        assert len(rows) == number
     options = {"steps": 3, "max_disagreement": 0.4, "halt_reward": -7.0}
-    rows, rejected = rollout(world, one, starts, **options)
-    assert (len(rows), rejected) == (1, 1)
+    rows = rollout(world, one, starts, **options)
+    assert len(rows) == 1
     assert rows["next", "observation"].item() == 2
     assert rows["next", "reward"].item() == -7
     assert rows["next", "terminated"].all()
@@ -62,7 +61,7 @@ def test_unknown_rows_are_rejected_or_end_the_task() -> None:
 
 def test_each_row_is_drawn_from_the_gaussian_of_an_elite() -> None:
     world = linear_world(spread=3.0, log_variance=math.log(0.25))
-    rows, _ = rollout(world, one, torch.zeros(20_000, 1), steps=1)
+    rows = rollout(world, one, torch.zeros(20_000, 1), steps=1)
     change = rows["next", "observation"].flatten() - 1
     upper = change > 0
     # Gaussians of deviation .5 around 3 and -3; the third network is never used.

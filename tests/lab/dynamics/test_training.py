@@ -70,8 +70,8 @@ def scalars_of(folder: Path, *overrides: str) -> dict[str, list[tuple[int, float
 @pytest.mark.parametrize(
     ("options", "names"),
     [
-        (["loss=mopo", "dynamics.real_ratio=0.5"], {"rollout_reward"}),
-        (["loss=rim"], {"cloning_error", "rollout_rejected"}),
+        (["loss=mopo", "dynamics.real_ratio=0.5"], {"loss_qvalue"}),
+        (["loss=rim"], {"cloning_error"}),
         (["loss=sdc"], {"deviation", "multiplier"}),
         (["loss=scas"], {"loss_actor"}),
     ],

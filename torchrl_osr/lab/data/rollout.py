@@ -104,14 +104,7 @@ def collect_transitions(
     a share is then marked truncated. Rows are ordered by policy and time. The stored
     actions are the executed ones, clipped to ±0.999.
 
-    Args:
-        env: task as :func:`~torchrl_osr.lab.data.make_environment` returns it.
-        samplers: one for each policy.
-        num_transitions: ``N``, at least one for each policy.
-
-    Keyword Args:
-        seed: non-negative seed or seeds; global generators are not used.
-        progress: show a progress bar when on a terminal.
+    The task is one of :func:`~torchrl_osr.lab.data.make_environment`.
 
     Returns:
         The transitions ``[N]``; returns and lengths ``[E]`` of complete episodes.

@@ -17,7 +17,6 @@ from torchrl_osr.lab.dynamics.model_adversary import ModelAdversary
 from torchrl_osr.lab.dynamics.models import DynamicsEnsemble
 from torchrl_osr.lab.dynamics.options import DynamicsOptions, ModelData
 from torchrl_osr.lab.dynamics.rollouts import (
-    Rollout,
     action_of,
     perturbed_starts,
     rollout,
@@ -60,7 +59,7 @@ class RolloutReplayBuffer:
         self._rng: torch.Generator | None = None
         self._copy = deepcopy(self.policy).requires_grad_(False)
         self._policies: list[dict[str, Any]] = []
-        self._rollouts: list[Rollout] = []
+        self._rollouts: list[TensorDict] = []
 
     @torch.no_grad()
     def _bounds(self) -> dict[str, Any]:
@@ -107,7 +106,7 @@ class RolloutReplayBuffer:
         batch["is_synthetic"] = order.unsqueeze(-1) >= num_real
         return take_multi_step(batch) if self.n_steps > 1 else batch
 
-    def roll_out(self, copied: nn.Module) -> Rollout:
+    def roll_out(self, copied: nn.Module) -> TensorDict:
         """Roll out a copy of the policy, by torch's global generator alone."""
         options, data, policy, model = self.options, self.data, copied, self.model
         if self.adversary is not None:
@@ -127,46 +126,34 @@ class RolloutReplayBuffer:
         sizes = data.scale.expand(model.observation_dim)
         units = torch.cat([sizes, sizes.new_tensor([1 / data.reward_scale])])
         limits = self.bounds | {"steps": options.rollout_steps, "units": units}
-        rows, rejected = rollout(model, act, starts, **limits)
+        rows = rollout(model, act, starts, **limits)
         penalty = options.penalty * data.reward_scale
         rows["next", "reward"] -= penalty * rows["uncertainty"]
         rows = rows.select(*DATASET_KEYS)
         if self.n_steps > 1:
             ones = torch.ones_like(rows["next", "done"], dtype=torch.long)
             rows["multi_step"] = rows["next"].copy().set("steps", ones)
-        return rows, rejected
+        return rows
 
-    def _repeatable(self, weights: Mapping[str, Any], number: int) -> Rollout:
+    def _repeatable(self, weights: Mapping[str, Any], number: int) -> TensorDict:
         """Roll out a policy with these weights, with the seed of this number."""
         self._copy.load_state_dict(weights)
         device = next(self._copy.parameters()).device
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
             torch.manual_seed(self.data.seed + number)
-            rows, rejected = self.roll_out(self._copy)
+            rows = self.roll_out(self._copy)
         if not len(rows):
             raise ValueError(
                 "The model rejects all rows of a rollout: train it longer "
                 "(dynamics.steps), or keep them (dynamics.unknown=take)."
             )
-        return rows, rejected
+        return rows
 
-    def _keep(self, rollouts: list[Rollout]) -> None:
+    def _keep(self, rollouts: list[TensorDict]) -> None:
         """Sample from these rows."""
-        rows, rejected = zip(*rollouts, strict=True)
-        self.synthetic = torch.cat(rows)
+        self.synthetic = torch.cat(rollouts)
         # Slices: the rows are in memory once.
-        slices = self.synthetic.split([len(each) for each in rows])
-        self._rollouts = list(zip(slices, rejected, strict=True))
-
-    def metrics(self) -> dict[str, float]:
-        """Return the share of rejected rows, and numbers of the others."""
-        rejected = sum(number for _, number in self._rollouts)
-        following = self.synthetic["next"]
-        return {
-            "rollout_rejected": rejected / (rejected + len(following)),
-            "rollout_terminated": following["terminated"].float().mean().item(),
-            "rollout_reward": following["reward"].mean().item(),
-        }
+        self._rollouts = list(self.synthetic.split([len(each) for each in rollouts]))
 
     def state_dict(self) -> dict[str, Any]:
         """Return the number of batches and the policies that were rolled out."""

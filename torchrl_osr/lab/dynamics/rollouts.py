@@ -20,9 +20,6 @@ from torchrl_osr.lab.dynamics.models import DynamicsEnsemble
 Termination = Callable[[Tensor], Tensor]
 """Maps next observations ``[B, S]`` to bool ``[B]``."""
 
-Rollout = tuple[TensorDict, int]
-"""Rows ``[n]`` of a data set with ``"uncertainty"``, ``[n, 1]``; number of rejected."""
-
 
 def never(observation: Tensor) -> Tensor:
     """Return ``False``."""
@@ -77,8 +74,10 @@ def rollout(
     max_disagreement: float = math.inf,
     halt_reward: float | None = None,
     units: Tensor | float = 1.0,
-) -> Rollout:
+) -> TensorDict:
     r"""Sample transitions of a policy in a model, with torch's global generator.
+
+    They are rows ``[n]`` of a data set, with ``"uncertainty"`` ``[n, 1]``.
 
     Args:
         policy: maps states ``[B, S]`` to actions ``[B, A]``.
@@ -93,7 +92,7 @@ def rollout(
         units: factors ``[S + 1]`` of predictions in ``"uncertainty"``,
             :math:`\max_i \lVert \sigma_i \rVert_2` of all networks, MOPO's penalty.
     """
-    state, rejected, kept = starts, 0, []
+    state, kept = starts, []
     for _ in range(steps):
         action = policy(state)
         mean, scale = model.predict(state, action)
@@ -115,12 +114,11 @@ def rollout(
             "next": after,
             "uncertainty": (scale * units).norm(dim=-1).amax(0).unsqueeze(-1),
         }
-        rejected += int((~known).sum())
         kept.append(TensorDict(entries, [len(state)])[known])
         state = following[known & ~ended.squeeze(-1)]
         if not len(state):
             break
-    return torch.cat(kept), rejected
+    return torch.cat(kept)
 
 
 def perturbed_starts(
@@ -131,7 +129,7 @@ def perturbed_starts(
     def policy(state: Tensor) -> Tensor:
         return 2 * torch.rand(len(state), model.action_dim, device=state.device) - 1
 
-    rows, _ = rollout(model, policy, starts, steps=steps, **options)
+    rows = rollout(model, policy, starts, steps=steps, **options)
     following = rows["next", "observation"][~rows["next", "done"].squeeze(-1)]
     if not len(following):
         raise ValueError(

@@ -78,9 +78,8 @@ class SwitchingPolicy:
 
     Each network :math:`i` of the dynamics is rolled out from :math:`s` with its mean
     predictions and the policy :math:`\pi_n`; no reward and no value follow after an
-    end. This is policy switching (Chang, Givan and Chong, "Parallel Rollout for Online
-    Solution of Partially Observable Markov Decision Processes", 2004) with learned
-    dynamics and values. Call :meth:`reset` at the start of an episode.
+    end. This is policy switching (Chang, Givan and Chong, "Parallel Rollout", 2004)
+    with learned dynamics and values. Call :meth:`reset` at the start of an episode.
 
     Args:
         policies: each maps observations ``[n, S]`` to actions ``[n, A]``.
@@ -91,14 +90,6 @@ class SwitchingPolicy:
         terminated: of next observations.
         steps: :math:`T`.
         hold: number of calls until the next choice.
-
-    Examples:
-        >>> rest, push = torch.zeros_like, torch.ones_like
-        >>> policy = SwitchingPolicy(
-        ...     [rest, push], None, lambda state, action: (state * action)[:, 0])
-        >>> policy(torch.tensor([[0.5], [-0.5]]))
-        tensor([[1.],
-                [0.]])
     """
 
     def __init__(

@@ -26,14 +26,11 @@ STEPS_AFTER = 100
 
 
 class DataDistance:
-    r"""Measure the mean distance to the ``K = 10`` nearest states of the data.
+    """Measure the mean distance to the 10 nearest states of the data.
 
-    .. math::
-        d(s) = \frac{1}{K} \sum_{k=1}^{K} \lVert \sigma^{-1} (s - s_{(k)}) \rVert_2
-
-    with :math:`s_{(k)}` the ``k``-th nearest of a random subset of the states and
-    :math:`\sigma` the data's standard deviation in each dimension. A state counts as
-    in the data up to :attr:`threshold`, which 95 % of held-out states are within.
+    They are the nearest of a random subset, in standard deviations of the data. A state
+    counts as in the data up to :attr:`threshold`, which 95 % of held-out states are
+    within.
 
     Args:
         data: transitions ``[N]`` with raw ``observation`` ``[N, S]``.

@@ -47,11 +47,9 @@ class RunTables:
         runs: a row for each run; ``data_score`` is the mean of the data's episodes.
         settings: its configuration as texts, a column for each dotted key.
         episodes: a row for each episode. ``suite`` is ``""`` for the training's own
-            evaluations, ``disturbance`` for undisturbed episodes. NaN: an episode was
-            never ``disturbed_at`` a step, or the disturbance does not end.
-        saved: a row for each run and recoverable state, in the order of the states.
-            ``states`` is the half and a digest, ``back`` the share of the checkpoints
-            that recovered.
+            evaluations, ``disturbance`` for undisturbed episodes.
+        saved: a row for each run and recoverable state; ``back`` is the share of the
+            checkpoints that recovered.
         left_out: folder of each run that is not in the tables, and the reason.
     """
 

@@ -203,7 +203,6 @@ class Phases:
             hooks.append(("post_optim", loss.decay_uncertainty))
         if rollouts is not None:
             components["rollouts"] = rollouts
-            hooks.append(("post_steps", lambda: _log_rollouts(trainer, rollouts)))
         elif optim.n_steps > 1:
             data.buffer.append_transform(take_multi_step)
         with evaluation(run, data.norm, average) as evaluate:
@@ -222,13 +221,6 @@ class Phases:
             )
             trainer.train()
         return trainer
-
-
-def _log_rollouts(trainer: OfflineTrainer, rollouts: RolloutReplayBuffer) -> None:
-    """Log numbers of the synthetic rows."""
-    for name, value in rollouts.metrics().items():
-        for logger in trainer.loggers:
-            logger.log_scalar(f"policy/{name}", value, step=trainer.step)
 
 
 # -- parts, also of examples/offline_osr.py ----------------------------------------
