@@ -27,9 +27,7 @@ if hasattr(signal, "SIGHUP"):
 class Interrupted(SystemExit):
     """Ends the process after a signal, with everything saved to be continued.
 
-    Args:
-        reason: which signal, and what was saved where.
-        code: of the exit, see :data:`EXIT_CODES`.
+    The reason says which signal came, and what was saved where.
     """
 
     def __init__(self, reason: str, code: int) -> None:

@@ -349,9 +349,8 @@ class _Stepper(OptimizationStepper):
 def divergence_warning(largest_reward: float, gamma: float) -> Hook:
     r"""Return a trainer's hook that warns once of values that diverge.
 
-    No policy's value is above :math:`\max|r| / (1 - \gamma)`, the discounted sum of the
-    largest reward for ever. Learned values may be: the conservative penalty pushes them
-    down, and errors are bootstrapped. Ten times as much is neither.
+    No policy's value is above :math:`\max|r| / (1 - \gamma)`. Learned values may be, by
+    the conservative penalty and by errors, but not ten times as much.
     """
     limit = 10 * largest_reward / (1 - gamma) if gamma < 1 else math.inf
     watched = {"pred_value", "target_value"}

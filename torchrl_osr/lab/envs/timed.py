@@ -131,7 +131,6 @@ class ExternalPush(TimedDisturbance):
     the world's x axis, whose sign is drawn for each episode.
 
     Args:
-        env: one of Gymnasium's MuJoCo tasks.
         force: in body weights: 155 N for hopper, 232 N walker2d, 137 N halfcheetah.
 
     Keyword Args:

@@ -77,9 +77,6 @@ class EpisodeEvaluator:
 
     The policy is called once a step, with all unfinished episodes.
 
-    Args:
-        env_id: a Gymnasium id, ``"Hopper-v5"`` for instance.
-
     Keyword Args:
         num_episodes: ``E``. Default 10.
         seed: the episodes are seeded ``seed, seed + 1, ...``. Default 0.

@@ -1,7 +1,6 @@
 """Benchmark of recoverable states.
 
-A score under disturbances mixes states that every policy survives with states that no
-policy can. Here the states are sorted beforehand, and a policy starts from each.
+A policy starts from states that are sorted by whether a way back is known.
 Shapes: ``M`` states, ``Q`` positions, ``V`` velocities.
 """
 

@@ -138,18 +138,15 @@ def summarize_disturbances(
 ) -> list[dict[str, Any]]:
     """Average each disturbance over the episodes of all checkpoints.
 
-    Args:
-        evaluations: see :func:`evaluate_paired`; the same disturbances in all.
+    The evaluations are those of :func:`evaluate_paired`, with the same disturbances.
 
     Returns:
-        A row for each disturbance, with means over all pairs of episodes:
-        ``"clean_score"``, ``"score"``, ``"decrease"`` in percent, and
-        ``"disturbed_share"``, the share that the disturbance acted in. Over those
+        A row for each disturbance: ``"clean_score"``, ``"score"``, ``"decrease"`` in
+        percent, and ``"disturbed_share"``, the share that it acted in. Over those
         alone: the share alive 100 steps after its end (``"survival"``, and
         ``"clean_survival"`` of the undisturbed ones), ``"recovered_share"`` and
         ``"recovery_median"``, steps until back in the data. ``None`` where there is
-        nothing to average, or the median is infinite. If evaluations have no scores,
-        ``"clean_return"``, ``"return"`` and so on.
+        nothing to average. Without scores ``"clean_return"``, ``"return"`` and so on.
     """
     rows = []
     measure = "score" if "scores" in evaluations[0]["clean"] else "return"

@@ -37,12 +37,6 @@ class FQELoss(ActorCriticLoss):
         value_bounds: smallest and largest possible value. Clips the targets, and so
             prevents divergence. Default: none.
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
-
-    Examples:
-        >>> from torchrl_osr.lab.losses import FQELoss
-        >>> from torchrl_osr.modules import critic_ensemble
-        >>> FQELoss(critic_ensemble(11, 3)).in_keys[-1]
-        ('next', 'action')
     """
 
     def __init__(

@@ -74,11 +74,7 @@ def file_name(suite: SuiteConfig) -> str:
 def evaluate_files(
     config: EvaluateConfig, path: Path, files: list[Path]
 ) -> tuple[Path, dict[str, Any]]:
-    """Evaluate checkpoints, unless ``path`` has the results; return these, too.
-
-    Raises:
-        ValueError: ``path`` has other results, which only ``force`` replaces.
-    """
+    """Evaluate checkpoints, unless ``path`` has the results; return these, too."""
     torchrl_logger.setLevel("WARNING")
     torch.set_num_threads(config.num_threads)
     request = _requested(config, files, path.parent)

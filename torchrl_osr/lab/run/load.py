@@ -146,11 +146,8 @@ def load_switching_policy(
     Each run's policy is rolled out in the models of all runs, and the mean of all runs'
     critics values its last state. Several seeds of ``loss=rim`` have all parts.
 
-    Args:
-        runs: folders, or checkpoints in them.
-        critics_only: use no models.
-        trust: modules of your own that a run may name.
-        options: those of :class:`~torchrl_osr.lab.dynamics.SwitchingPolicy`.
+    They are folders, or checkpoints in them. With ``critics_only`` no model is used.
+    ``options`` are those of :class:`~torchrl_osr.lab.dynamics.SwitchingPolicy`.
     """
     trained = [load_trained(each, trust=trust) for each in runs]
     policies, configs = [*map(policy_of, trained)], [run.config for run in trained]
