@@ -212,6 +212,7 @@ def pack(folders: Sequence[Path], to: Path) -> None:
         .reset_index()[
             ["run", "data", "method", "seed", "updates", "data_score", "overrides"]
         ]
+        .round({"data_score": 2})
     )
     columns = ["run", "suite", "disturbance", "step", "episode", "score"]
     columns += ["disturbed_at", "recovery_steps"]
@@ -240,7 +241,7 @@ def pack(folders: Sequence[Path], to: Path) -> None:
         elif name in old:
             kept = old[name][~old[name]["run"].isin(again)]
             rows = pd.concat([kept, rows.assign(run=rows["run"] + shift)])
-        rows.to_csv(to / f"{name}.csv.xz", index=False)
+        rows.convert_dtypes().to_csv(to / f"{name}.csv.xz", index=False)
 
 
 def main() -> None:
