@@ -57,7 +57,7 @@ def test_groups_name_what_the_package_has():
 def test_an_id_alone_is_enough():
     for env_id, name in {
         "Pendulum-v1": "Pendulum-v1", "robots:ns/Arm-v0": "ns-Arm-v0",
-        "Walker2d-v5": "walker2d",
+        "Walker2d-v5": "walker2d", "AntMaze_UMaze-v4": "antmaze-umaze",
     }.items():  # fmt: skip
         assert composed("train", f"env.id={env_id}").env.name == name
 

@@ -56,9 +56,14 @@ def environment_id(env_name: str) -> str:
 
 
 def environment_name(env_id: str) -> str:
-    """Return a known task's short name; for others their id as a folder's name."""
-    names = {known: name for name, known in known_ids().items()}
-    return names.get(env_id) or re.sub(r"[^\w.-]", "-", env_id.split(":")[-1])
+    """Return a known task's short name; for others their id as a folder's name.
+
+    An ant with any start and goal has the name of its D4RL test.
+    """
+    names = {known.replace("_Test", ""): name for name, known in known_ids().items()}
+    return names.get(env_id.replace("_Test", "")) or re.sub(
+        r"[^\w.-]", "-", env_id.split(":")[-1]
+    )
 
 
 class EnvironmentSpec(NamedTuple):
