@@ -64,12 +64,6 @@ class DynamicsChange(DisturbanceWrapper):
 
     A factor of mass is also that of the moments of inertia; MuJoCo's armature and the
     motors' strength stay. As in ODRL (https://arxiv.org/abs/2410.20750).
-
-    Examples:
-        >>> from torchrl_osr.lab.data import make_environment
-        >>> env = DynamicsChange(make_environment("Hopper-v5"), gravity=0.5)
-        >>> float(env.unwrapped.model.opt.gravity[2])
-        -4.905
     """
 
     def __init__(

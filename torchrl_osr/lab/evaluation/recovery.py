@@ -38,14 +38,6 @@ class DataDistance:
     Keyword Args:
         max_reference: size of the subset, at most. Default 20,000.
         seed: of the random subset and of the held-out states. Default 0.
-
-    Examples:
-        >>> from tensordict import TensorDict
-        >>> rows = torch.randn(1000, 3, generator=torch.Generator().manual_seed(0))
-        >>> distance = DataDistance(TensorDict({"observation": rows}, [1000]))
-        >>> far = torch.tensor([[0.0, 0.0, 0.0], [9.0, 9.0, 9.0]])
-        >>> (distance(far) <= distance.threshold).tolist()
-        [True, False]
     """
 
     def __init__(

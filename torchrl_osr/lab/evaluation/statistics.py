@@ -61,13 +61,7 @@ def interval(point: float, resamples: ArrayLike, over: str = "seeds") -> Estimat
 
 
 def mean_interval(values: ArrayLike) -> tuple[float, float, float]:
-    """Return the mean of ``[E]`` values and its 95 % percentile-bootstrap interval.
-
-    Examples:
-        >>> mean, low, high = mean_interval([1.0, 2.0, 3.0, 4.0])
-        >>> mean, low <= mean <= high
-        (2.5, True)
-    """
+    """Return the mean of ``[E]`` values and its 95 % percentile-bootstrap interval."""
     sample = np.asarray(values, np.float64).ravel()
     if not sample.size or not np.isfinite(sample).all():
         raise ValueError(f"mean_interval needs finite values, got {sample}.")
@@ -181,10 +175,6 @@ def saved_share(
 
     Raises:
         ValueError: if the baseline saves all states, in the data or in a resample.
-
-    Examples:
-        >>> saved_share([[1, 0, 1, 0]], walk=[0, 0, 1, 1])
-        (0.5, 0.5, 0.5)
     """
     walks, number = np.unique(np.asarray(walk), return_inverse=True)
     member = np.eye(len(walks))[number]
