@@ -11,6 +11,8 @@ import torch
 from objectives.losses import make_batch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.envs import GymEnv, SerialEnv, TransformedEnv
+from torchrl.envs.utils import check_env_specs
 
 from torchrl_osr import StatePerturbation
 
@@ -60,6 +62,33 @@ def test_a_seed_decides_the_noise() -> None:
     assert torch.equal(drawn[0], wanted)
 
 
+def of_serial_environments() -> list[torch.Tensor]:
+    env = SerialEnv(
+        3, lambda: TransformedEnv(GymEnv("Pendulum-v1"), StatePerturbation(1.0))
+    )
+    rows = env.reset()
+    gaps = rows[PERTURBED] - rows["observation"]
+    env.close()
+    return list(gaps)
+
+
+class Rows(torch.utils.data.Dataset):
+    def __init__(self) -> None:
+        self.transform = StatePerturbation(1.0, seed=3)
+
+    def __len__(self) -> int:
+        return 4
+
+    def __getitem__(self, _: int) -> torch.Tensor:
+        return noise(self.transform)
+
+
+def of_workers() -> list[torch.Tensor]:
+    rows = Rows()
+    loader = torch.utils.data.DataLoader(rows, num_workers=2)
+    return [*[each[0] for each in loader], noise(rows.transform)]
+
+
 def of_instances() -> list[torch.Tensor]:
     torch.manual_seed(12)
     drawn = [noise(StatePerturbation(1.0), 8) for _ in range(2)]
@@ -75,7 +104,9 @@ def of_copies() -> list[torch.Tensor]:
     return [noise(each, 8) for each in every]
 
 
-@pytest.mark.parametrize("draws", [of_instances, of_copies])
+@pytest.mark.parametrize(
+    "draws", [of_instances, of_copies, of_serial_environments, of_workers]
+)
 def test_no_two_have_the_same_noise(draws) -> None:
     for one, other in itertools.combinations(draws(), 2):
         assert not (one == other).any()
@@ -130,6 +161,21 @@ def test_nested_and_several_keys_draw_apart() -> None:
         ValueError, match=r"'agent' is a group.*\[\('agent', 'pixels'\)"
     ):
         StatePerturbation(1.0, in_keys=("agent", "pixels"))(batch)
+
+
+def test_environment_specs_hold_the_perturbed_state() -> None:
+    env = TransformedEnv(GymEnv("Pendulum-v1"), StatePerturbation(0.1))
+    env.set_seed(0)
+    check_env_specs(env)
+    rollout = env.rollout(3)
+    for each in (rollout, rollout["next"]):
+        gap = each[PERTURBED] - each["observation"]
+        assert (gap != 0).all()
+        assert gap.abs().max() < 1
+    # Pendulum's observation is bounded; its perturbed state may leave the bounds.
+    far = torch.full((3,), 100.0)
+    assert not env.observation_spec["observation"].is_in(far)
+    assert env.observation_spec[PERTURBED].is_in(far)
 
 
 def test_compiled_transform_draws_the_same_noise() -> None:

@@ -5,18 +5,23 @@ from __future__ import annotations
 import hashlib
 import itertools
 import multiprocessing
+import os
 from collections.abc import Sequence
 from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
+from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from torchrl_osr._checks import check_weight
 from torchrl_osr._entries import entry, nested
 
 _number = itertools.count()
+_process = [os.getpid()]  # torch.compile cannot trace the call
+if hasattr(os, "register_at_fork"):  # Windows has no forks
+    os.register_at_fork(after_in_child=lambda: _process.__setitem__(0, os.getpid()))
 
 
 class StatePerturbation(Transform):
@@ -25,10 +30,12 @@ class StatePerturbation(Transform):
     Appended to a replay buffer it makes the mixed data set D_tot of section 4.1: one
     freshly perturbed state for each clean one, the next state untouched. It works out
     of place, keeps the batch size and has its own random generator, which leaves the
-    other draws of a run unchanged.
+    other draws of a run unchanged. In an environment it adds the same entry to
+    observations and specs.
 
-    Each transform draws its own noise, also without a ``seed`` or as a copy.
-    ``load_state_dict`` continues the noise of the saved transform.
+    Each transform draws its own noise, also without a ``seed``, as a copy, or in a
+    worker process of a ``DataLoader``. ``load_state_dict`` continues the noise of the
+    saved transform.
 
     Args:
         std: :math:`\beta`, the standard deviation of the Gaussian noise, in units of
@@ -70,7 +77,7 @@ class StatePerturbation(Transform):
         super().__init__(in_keys=keys, out_keys=perturbed_keys)
         self.register_buffer("std", torch.as_tensor(std, dtype=torch.float64))
         self.seed = _derived("new", next(_number)) if seed is None else seed
-        self._copies = 0
+        self._copies, self._process = 0, _process[0]
         self._generator: torch.Generator | None = None
         self._loaded: Tensor | None = None
 
@@ -83,6 +90,9 @@ class StatePerturbation(Transform):
 
     def _generator_on(self, device: torch.device) -> torch.Generator:
         """Return the noise's generator, made on the device of the first batch."""
+        if self._process != _process[0]:  # inherited by another process
+            self.seed, self._process = _derived("process", self.seed), _process[0]
+            self._generator = self._loaded = None
         if self._generator is None or self._generator.device != device:
             self._generator = torch.Generator(device).manual_seed(self.seed)
             self._continue(self._generator)
@@ -108,6 +118,24 @@ class StatePerturbation(Transform):
             tensordict.set(out_key, torch.addcmul(state, noise, self.std.to(state)))
         return tensordict
 
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self.forward(next_tensordict)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self.forward(tensordict_reset)
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Add the perturbed entries: unbounded, of the states' shape."""
+        assert isinstance(observation_spec, Composite)
+        for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
+            spec = observation_spec[key]
+            observation_spec[out_key] = Unbounded(
+                shape=spec.shape, dtype=_floating(spec.dtype), device=spec.device
+            )
+        return observation_spec
+
     def get_extra_state(self) -> Tensor:
         """Return the generator's state, for the state dict."""
         if self._generator is None and self._loaded is not None:
@@ -119,7 +147,7 @@ class StatePerturbation(Transform):
 
     def set_extra_state(self, state: Tensor) -> None:
         """Continue the noise from a saved state; another device starts it again."""
-        self._loaded = state.cpu()
+        self._loaded, self._process = state.cpu(), _process[0]
         if self._generator is not None:
             self._continue(self._generator)
 

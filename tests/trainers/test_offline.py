@@ -20,6 +20,7 @@ from torchrl.data import (
     TensorDictReplayBuffer,
 )
 from torchrl.objectives import SACLoss, SoftUpdate
+from torchrl.record.loggers import CSVLogger
 
 from torchrl_osr import StatePerturbation
 from torchrl_osr.fast import FastUpdate
@@ -279,6 +280,46 @@ def test_numbers_are_logged_as_means_over_the_interval(tmp_path, make, logger):
         mean = torch.stack([row["loss_qvalue"] for row in seen[start:end]]).mean()
         assert value == pytest.approx(mean.item(), rel=1e-5)
     assert "train/raw" not in {name for name, *_ in logger.numbers}
+
+
+@pytest.mark.parametrize(("interval", "evaluated"), [(5, 0), (100, 0), (5, 10)])
+def test_killed_run_logs_no_step_twice(tmp_path, make, interval, evaluated):
+    """Killed in its last step, some time after its last checkpoint or before any.
+
+    Or killed after an evaluation, before the checkpoint that has the result.
+    """
+
+    def make_logged(folder):
+        return make(
+            tmp_path / folder,
+            checkpoint_interval=interval,
+            log_interval=1,
+            loggers=[CSVLogger("csv", log_dir=str(tmp_path / folder))],
+            evaluate=lambda: {"score": 1},
+        )
+
+    def files(folder):
+        return (tmp_path / folder / "csv" / "scalars" / "train").glob("*.csv")
+
+    def read(folder):
+        return {path.name: path.read_text() for path in files(folder)}
+
+    make_logged("undisturbed").train()
+    killed = make_logged("killed")
+    save = killed.checkpoints.save
+
+    def save_or_die(step):
+        if evaluated and killed.history[-1]["step"] == evaluated:
+            raise RuntimeError("killed")
+        save(step)
+
+    killed.checkpoints.save = save_or_die
+    stop_at(killed, 19)
+    before = read("killed")
+    for number, path in enumerate(files("killed")):  # killed within a line
+        path.write_text(path.read_text() + ["6", "60,", "60,0.1"][number % 3])
+    make_logged("killed").train()
+    assert read("killed") == read("undisturbed") != before
 
 
 def test_hooks_run_before_checkpoint_and_evaluation(tmp_path, make):

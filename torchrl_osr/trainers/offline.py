@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
@@ -21,7 +21,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.data import PrioritizedSampler, ReplayBuffer
-from torchrl.record.loggers import Logger
+from torchrl.record.loggers import CSVLogger, Logger
 from torchrl.trainers import OptimizationStepper, Trainer
 
 from torchrl_osr._files import finite_or_none
@@ -206,7 +206,8 @@ class OfflineTrainer(Trainer):
     def resume(self) -> Path | None:
         """Restore the newest whole checkpoint of the folder, if there is one.
 
-        A CSV logger's rows after it are written once more.
+        Rows that a CSV logger wrote after it are cut off, and those of an evaluation at
+        its step whose result it lacks: these are repeated.
         """
         path = self.checkpoints.restore()
         step = self._saved["step"]
@@ -219,6 +220,11 @@ class OfflineTrainer(Trainer):
             log.info(f"{self.description}: goes on from {path}")
         self.collected_frames = self._optim_count = self.collector.step = step
         self.update.count = step
+        repeated = set[str]() if self._is_evaluated() else set().union(*self.history)
+        for logger in self.loggers:
+            if isinstance(logger, CSVLogger):
+                folder = Path(logger.experiment.log_dir, "scalars", self.description)
+                cut_back(folder, step if path else -1, repeated)
         return path
 
     def optim_steps(self, batch: TensorDictBase) -> None:
@@ -344,6 +350,24 @@ class _Stepper(OptimizationStepper):
                 f"{trainer.description}: step {trainer.step}: {error}. Look at the "
                 "data's rewards and states, or lower the learning rates."
             ) from error
+
+
+def cut_back(folder: Path, step: int, repeated: Set[str] = frozenset()) -> None:
+    """Cut off the rows ``step,value`` that a ``CSVLogger`` wrote after a step.
+
+    Of the numbers that are logged at the step once more, ``repeated``, its row goes.
+    A last line that a kill left unfinished goes, too.
+    """
+    for path in folder.glob("*.csv"):
+        with path.open("r+b") as file:
+            kept = 0
+            for line in file:
+                number = line.split(b",")[0]
+                whole = line.endswith(b"\n") and number.isdigit()
+                if not whole or int(number) > step - (path.stem in repeated):
+                    break
+                kept += len(line)
+            file.truncate(kept)
 
 
 def divergence_warning(largest_reward: float, gamma: float) -> Hook:

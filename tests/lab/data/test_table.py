@@ -62,18 +62,19 @@ def test_all_kinds_of_files_hold_the_same(tmp_path, ending):
 @pytest.mark.parametrize(
     ("name", "options", "text"),
     [
-        ("log.csv", {"sep": "\t", "encoding": "utf-8-sig"}, "'\\t', decimal '.'"),
-        ("log.csv.gz", {"sep": ";", "decimal": ","}, "';', decimal ','"),
-        ("log.csv", {"sep": ";", "encoding": "cp1252"}, "';', decimal '.'"),
+        ("log.csv", {"sep": ";", "encoding": "utf-8-sig"}, "';', decimal '.', UTF-8"),
+        ("log.csv.gz", {"sep": ";", "decimal": ","}, "';', decimal ',', UTF-8"),
+        ("log.csv", {"sep": "\t", "encoding": "utf-16"}, "'\\t', decimal '.', UTF-16"),
+        ("log.csv", {"decimal": ",", "sep": ";", "encoding": "cp1252"}, "',', cp1252"),
     ],
 )
-def test_separators_and_decimals_are_detected(tmp_path, name, options, text):
+def test_separators_decimals_and_encodings_are_detected(tmp_path, name, options, text):
     robot(größe="weiß").to_csv(tmp_path / name, index=name == "log.csv.gz", **options)
     expected, _ = load_dataset(path=csv(tmp_path, robot()), columns=WANTED)
     data, manifest = load_dataset(path=tmp_path / name, columns=WANTED)
     assert (data == expected).all()
     assert text in manifest["text"]
-    assert manifest["unused_columns"][0] == "tick"
+    assert manifest["unused_columns"] == ["tick", "größe"]
 
 
 def test_comments_blank_lines_and_spaces_are_skipped(tmp_path):

@@ -81,6 +81,12 @@ def load_dataset(
         num_transitions, seed: number of rolled-out rows, default 200,000, and seed.
         random_share: share of the rolled-out rows that are random instead.
         progress: show a progress bar when on a terminal.
+
+    Examples:
+        >>> from torchrl_osr.lab.data import load_dataset
+        >>> data, manifest = load_dataset("hopper", "random", num_transitions=500)
+        >>> data["observation"].shape, manifest["env_id"]
+        (torch.Size([500, 11]), 'Hopper-v5')
     """
     log: dict[str, Any] = {
         "columns": {k: name for k, name in (columns or {}).items() if name is not None},

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import gzip
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from fnmatch import fnmatchcase
 from glob import glob
 from itertools import chain, takewhile
@@ -132,9 +134,13 @@ def _read(path: Path, chosen: Callable[..., list[str]]) -> Arrays:
 def _read_csv(path: Path) -> tuple[pd.DataFrame, str]:
     """Return the table of a CSV file, and what was detected."""
     opened = gzip.open if path.suffix == ".gz" else open
-    # Numbers are the same bytes in other encodings; names may get a replacement mark.
-    with opened(path, "rt", encoding="utf-8-sig", errors="replace") as file:
-        return _parsed(file)
+    with opened(path, "rb") as file:
+        wide = file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    for encoding in ("UTF-16" if wide else "UTF-8-sig", "cp1252"):
+        with suppress(UnicodeDecodeError), opened(path, "rt", encoding=encoding) as it:
+            frame, marks = _parsed(it)
+            return frame, f"{marks}, {encoding.removesuffix('-sig')}"
+    raise ValueError("its text is neither UTF-8, nor UTF-16, nor cp1252.")
 
 
 def _parsed(file: IO[str]) -> tuple[pd.DataFrame, str]:

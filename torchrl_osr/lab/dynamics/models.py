@@ -41,6 +41,12 @@ class DynamicsEnsemble(nn.Module):
     (https://arxiv.org/abs/2005.13239), which sets the defaults. Inputs and targets are
     standardised. Rollouts use the ``num_elites`` best networks, see
     :meth:`calibrate_`.
+
+    Examples:
+        >>> model = DynamicsEnsemble(11, 3, num_networks=3, num_elites=2)
+        >>> mean, scale = model.predict(torch.zeros(4, 11), torch.zeros(4, 3))
+        >>> mean.shape
+        torch.Size([3, 4, 12])
     """
 
     input_loc: Tensor

@@ -85,6 +85,12 @@ class EpisodeEvaluator:
         fixed_batch: call the policy with all ``E`` rows to the end. torch's rounding
             depends on the number of rows; with a fixed number, an episode does not
             depend on when others end. Default ``False``.
+
+    Examples:
+        >>> evaluator = EpisodeEvaluator("Hopper-v5", num_episodes=2)
+        >>> results = evaluator(lambda observation: torch.zeros(len(observation), 3))
+        >>> results.lengths.shape
+        (2,)
     """
 
     def __init__(

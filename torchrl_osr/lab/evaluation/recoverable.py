@@ -71,6 +71,11 @@ def load_recoverable_states(env_name: str, half: str = "public") -> RecoverableS
 
     Choose methods by the ``"public"`` half. Evaluate a finished method once on the
     ``"held-out"`` half.
+
+    Examples:
+        >>> states = load_recoverable_states("walker2d")
+        >>> states.qpos.shape[1], sorted(set(states.group.tolist()))
+        (9, ['contested', 'easy', 'recoverable'])
     """
     check_choice("half", half, HALVES)
     files = STATES.glob(f"*-{half}.npz")
@@ -88,6 +93,12 @@ def recovers(states: RecoverableStates, policy: Policy) -> NDArray[np.bool_]:
 
     Hopper and Walker2d: no fall within ``steps`` steps. HalfCheetah: a mean speed of
     at least ``least_speed`` over the last 50 of these steps. Maze: the goal is reached.
+
+    Examples:
+        >>> import torch
+        >>> states = load_recoverable_states("walker2d")
+        >>> bool(recovers(states, lambda state: torch.zeros(len(state), 6)).any())
+        False
     """
     back = np.zeros(len(states), dtype=np.bool_)
     waiting = iter(range(len(states)))

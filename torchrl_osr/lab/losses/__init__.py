@@ -1,13 +1,4 @@
-"""The losses that OSR is compared with.
-
-All are built and called alike, from networks of :mod:`torchrl_osr.modules`:
-
-    >>> from torchrl_osr.lab.losses import TD3BCLoss
-    >>> from torchrl_osr.modules import critic_ensemble, deterministic_actor
-    >>> loss = TD3BCLoss(deterministic_actor(11, 3), critic_ensemble(11, 3))
-    >>> loss.out_keys
-    ['loss_actor', 'loss_qvalue', 'cloning_error', 'pred_value', 'target_value']
-"""
+"""The losses that OSR is compared with."""
 
 from torchrl_osr.lab.losses.cloning import BCLoss, IQLLoss
 from torchrl_osr.lab.losses.ensembles import EDACLoss, RORLLoss

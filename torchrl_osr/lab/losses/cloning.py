@@ -42,6 +42,12 @@ class BCLoss(ActorCriticLoss):
 
     Keyword Args:
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
+
+    Examples:
+        >>> from torchrl_osr.lab.losses import BCLoss
+        >>> from torchrl_osr.modules import tanh_gaussian_actor
+        >>> BCLoss(tanh_gaussian_actor(11, 3)).in_keys
+        ['observation', 'action']
     """
 
     def __init__(self, actor_network: TensorDictModuleBase, **options: Any) -> None:
@@ -80,6 +86,14 @@ class IQLLoss(ActorCriticLoss):
         temperature: :math:`\beta`. Default 3.0, the authors' for robots; mazes 10.0.
         expectile: :math:`\tau`. Default 0.7, the authors' for robots; mazes 0.9.
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
+
+    Examples:
+        >>> from torchrl_osr.lab.losses import IQLLoss
+        >>> from torchrl_osr.modules import critic_ensemble, gaussian_actor, state_value
+        >>> critics = critic_ensemble(11, 3)
+        >>> loss = IQLLoss(gaussian_actor(11, 3), critics, state_value(11))
+        >>> loss.out_keys[:3]
+        ['loss_actor', 'loss_qvalue', 'loss_value']
     """
 
     value_network: TensorDictModule

@@ -49,6 +49,14 @@ class EDACLoss(ActorCriticLoss):
         diversity_weight: :math:`\eta`. Default 1.0. May be assigned later.
         alpha_init, target_entropy: see :class:`~torchrl_osr.CQLLoss`.
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
+
+    Examples:
+        >>> from torchrl_osr.lab.losses import EDACLoss
+        >>> from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
+        >>> critics = critic_ensemble(11, 3, num_qvalue_nets=4)
+        >>> loss = EDACLoss(tanh_gaussian_actor(11, 3), critics)
+        >>> loss.out_keys[:3]
+        ['loss_actor', 'loss_alpha', 'loss_qvalue']
     """
 
     _schedulable_buffers = frozenset({"diversity_weight"})
@@ -147,6 +155,15 @@ class RORLLoss(ActorCriticLoss):
             :math:`\lambda` at first, what it falls to, and by how much an update.
         alpha_init, target_entropy: see :class:`~torchrl_osr.CQLLoss`.
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
+
+    Examples:
+        >>> from torchrl_osr.lab.losses import RORLLoss
+        >>> from torchrl_osr.modules import critic_ensemble, tanh_gaussian_actor
+        >>> critics = critic_ensemble(11, 3, num_qvalue_nets=4)
+        >>> loss = RORLLoss(tanh_gaussian_actor(11, 3), critics)
+        >>> loss.decay_uncertainty()
+        >>> loss.uncertainty_weight
+        tensor(0.1000)
     """
 
     def __init__(

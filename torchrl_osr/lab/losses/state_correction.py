@@ -64,6 +64,16 @@ class SCASLoss(TD3Loss):
         gain_temperature: :math:`\tau`. Default 5.0.
         largest_weight: :math:`w_{max}`. Default 50.0.
         options: of :class:`~torchrl_osr.lab.losses.td3.TD3Loss`.
+
+    Examples:
+        >>> from torchrl_osr.lab.dynamics import DynamicsEnsemble
+        >>> from torchrl_osr.lab.losses import SCASLoss
+        >>> from torchrl_osr.modules import critic_ensemble, deterministic_actor
+        >>> loss = SCASLoss(
+        ...     deterministic_actor(11, 3), critic_ensemble(11, 3, num_qvalue_nets=4),
+        ...     DynamicsEnsemble(11, 3))
+        >>> loss.out_keys
+        ['loss_actor', 'loss_qvalue', 'correction_error', 'pred_value', 'target_value']
     """
 
     reads_perturbed, metric = True, "correction_error"
@@ -172,6 +182,15 @@ class StateDeviationLoss(ActorCriticLoss):
         kernel_width: in units of the observation. Default 1.
         threshold: :math:`\eta`. Default 0.05.
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
+
+    Examples:
+        >>> from torchrl_osr.lab.dynamics import DynamicsEnsemble, TransitionVAE
+        >>> from torchrl_osr.lab.losses import StateDeviationLoss
+        >>> from torchrl_osr.modules import tanh_gaussian_actor
+        >>> loss = StateDeviationLoss(
+        ...     tanh_gaussian_actor(11, 3), DynamicsEnsemble(11, 3), TransitionVAE(11))
+        >>> loss.out_keys
+        ['loss_deviation', 'loss_multiplier', 'deviation', 'multiplier']
     """
 
     reads_perturbed = True

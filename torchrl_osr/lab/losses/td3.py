@@ -118,6 +118,13 @@ class TD3BCLoss(TD3Loss):
     Keyword Args:
         alpha: weight of the values against cloning. Default 2.5.
         options: of :class:`~torchrl_osr.lab.losses.td3.TD3Loss`.
+
+    Examples:
+        >>> from torchrl_osr.lab.losses import TD3BCLoss
+        >>> from torchrl_osr.modules import critic_ensemble, deterministic_actor
+        >>> loss = TD3BCLoss(deterministic_actor(11, 3), critic_ensemble(11, 3))
+        >>> loss.out_keys
+        ['loss_actor', 'loss_qvalue', 'cloning_error', 'pred_value', 'target_value']
     """
 
     def __init__(
@@ -165,6 +172,14 @@ class ReBRACLoss(TD3Loss):
         actor_bc_coef: :math:`\beta_1`. Default 0.01.
         critic_bc_coef: :math:`\beta_2`. Default 0.01; with 0 no next action is read.
         options: of :class:`~torchrl_osr.lab.losses.td3.TD3Loss`.
+
+    Examples:
+        >>> from torchrl_osr.lab.losses import ReBRACLoss
+        >>> from torchrl_osr.modules import critic_ensemble, deterministic_actor
+        >>> critics = critic_ensemble(11, 3, layer_norm=True)
+        >>> loss = ReBRACLoss(deterministic_actor(11, 3), critics)
+        >>> ("next", "action") in loss.in_keys
+        True
     """
 
     def __init__(
