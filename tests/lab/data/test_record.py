@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import closing
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -81,3 +82,10 @@ def test_noise_stays_within_the_bounds():
 def test_bad_input_is_named(env_id, act, options, message):
     with pytest.raises(ValueError, match=message):
         record(env_id, act, **options)
+
+
+def test_a_step_without_finite_numbers_is_an_error():
+    env = open_environment("Pendulum-v1")
+    strange = gymnasium.wrappers.TransformReward(env, lambda _: np.nan)
+    with closing(strange), pytest.raises(ValueError, match="step 1 .* expected finite"):
+        record_episodes(strange, None, 1, progress=False)

@@ -192,6 +192,7 @@ def test_names_are_found_in_the_order_of_their_numbers():
             dict.fromkeys(("action", "reward"), "action"),
             "'action' is read twice",
         ),
+        (["obs_0", "obs_2", *USUAL[11:]], {}, "obs_0 to obs_2 lack number 1"),
         (USUAL[:-1], {}, "the data lack truncated or episode; there"),
         (USUAL[:-2], {}, "lack terminated.*terminated=false if noth"),
         ([*USUAL, "note"], {}, "unknown columns note"),

@@ -62,6 +62,13 @@ def record_episodes(
                 "episode": episode,
             }
             steps.append(step)
+            for name in ("observation", "next_observation", "reward"):
+                shape = () if name == "reward" else env.observation_space.shape
+                if np.shape(step[name]) != shape or not np.isfinite(step[name]).all():
+                    raise ValueError(
+                        f"step {len(steps)} of {env} has {name} {step[name]}; expected "
+                        f"finite numbers of shape {shape}."
+                    )
             observation, ended = step["next_observation"], terminated or truncated
     columns = {name: np.array([step[name] for step in steps]) for name in steps[0]}
     return {

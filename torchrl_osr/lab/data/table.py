@@ -248,12 +248,22 @@ def _usual(part: str, names: Sequence[str]) -> list[str]:
 
 
 def _in_order(names: list[str]) -> list[str]:
-    """Sort the entries of a vector by number if all have one, else as in the file."""
+    """Sort the entries of a vector by number if all have one, else as in the file.
+
+    A gap in the numbers is an error: an entry may be missing.
+    """
     matches = [re.fullmatch(r"(.*?)(\d+)\D?", name) for name in names]
     found = [match for match in matches if match]
     if len(found) < len(names) or len({match[1] for match in found}) != 1:
         return names
-    return [match[0] for match in sorted(found, key=lambda match: int(match[2]))]
+    numbered = {int(match[2]): match[0] for match in found}
+    first, last = min(numbered), max(numbered)
+    if gaps := sorted({*range(1 if first else 0, last)} - numbered.keys()):
+        raise ValueError(
+            f"{numbered[first]} to {numbered[last]} lack number {gaps[0]}: if that is "
+            "right, list the columns to read (data.columns.observation=[...])."
+        )
+    return [numbered[number] for number in sorted(numbered)]
 
 
 def assemble(layout: Mapping[str, list[str]], arrays: Arrays) -> Arrays:
