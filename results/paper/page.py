@@ -24,6 +24,8 @@ from run import (
     EXPERTS,
     HERE,
     LIMITED,
+    MAZES,
+    RESULTS,
     SIX,
     TABLES,
     TRIALS,
@@ -32,7 +34,7 @@ from run import (
     updates,
 )
 
-sys.path.append(str(HERE.parent))
+sys.path.append(str(RESULTS))
 import tables
 from tables import differences, estimate, markdown
 
@@ -73,9 +75,10 @@ def name_of(data: str) -> str:
         "antmaze": "AntMaze",
         "walker2d": "Walker2d",
     }
-    return re.sub(
-        r"^[a-z0-9]+", lambda name: robots.get(name[0], name[0].title()), data
-    )
+    first, _, rest = data.partition(" ")
+    env, dash, size = first.partition("-")
+    rest = rest if rest != "umaze" else ""
+    return f"{robots.get(env, env.title())}{dash}{size} {rest}".strip()
 
 
 def interval(found: Estimate) -> str:
@@ -194,7 +197,7 @@ def figure4(clean: pd.DataFrame) -> str:
 def d4(clean: pd.DataFrame, quoted: pd.DataFrame) -> str:
     """Return appendix D.4: ten minutes, and small the two minutes of ``clean``."""
     grid = TABLES["d4"]
-    place = HERE / grid.place
+    place = RESULTS / grid.place
     longer = tables.read(place) if place.exists() else clean.iloc[:0]
     rows = []
     for data in grid.data:
@@ -330,7 +333,7 @@ def methods_table(means: pd.DataFrame, titles: Mapping[str, str]) -> str:
 
 def tuning() -> str:
     """Return each method's best trial by its tuning seed, and its mean on others."""
-    place = HERE / TABLES["tune"].place
+    place = RESULTS / TABLES["tune"].place
     if not place.exists():
         return NOT_RUN
     runs = tables.read(place)
@@ -351,7 +354,7 @@ def state() -> str:
     """Return how many runs of each table there are."""
     rows = []
     for name, table in TABLES.items():
-        there = packed(HERE / table.place, table.suites)
+        there = packed(RESULTS / table.place, table.suites)
         grid = [
             (data, method, seed, updates(method, table.seconds))
             for data in table.data
@@ -395,9 +398,9 @@ def main() -> None:
     """Fill the pages and draw the figures."""
     episodes = tables.read(HERE)
     clean = episodes[episodes["suite"] == ""]
-    if (mazes := HERE / TABLES["mazes"].place).exists():
-        of_mazes = tables.read(mazes)
-        clean = pd.concat([clean, of_mazes[of_mazes["step"] > 0]])
+    mazes = tables.read(RESULTS / TABLES["mazes"].place)
+    whole = mazes["step"] == updates("", TABLES["mazes"].seconds)
+    clean = pd.concat([clean, mazes[whole & mazes["data"].isin(MAZES)]])
     printed = pd.read_csv(HERE / "printed_table1.csv", index_col="data")
     quoted = pd.read_csv(HERE / "published.csv", index_col=0)
     for name in ("td3_bc", "rebrac", "cql_noisy_bc"):
@@ -433,6 +436,8 @@ def main() -> None:
     for (data, name), (_, share) in tables.recoverable(HERE).items():
         blocks[f"{folder_name(data)}/{name}/recovery"] = decimal(share)
     others, lead = quoted.loc["cql"].mean(), printed["osr"][SIX].mean()
+    found = differences(clean[clean["data"].isin(SIX)], "cql", "osr_v")
+    blocks["cql-less-osr_v"] = str(found and found[1])
     blocks["cql/printed"] = number(printed["cql"][SIX].mean())
     blocks["cql/published"] = number(others)
     blocks["osr-less-cql/published"] = number(lead - others)

@@ -33,6 +33,7 @@ from omegaconf import OmegaConf
 from torchrl_osr.lab.report import read_runs
 
 HERE = Path(__file__).parent
+RESULTS = HERE.parent
 ENVS = ("hopper", "walker2d", "halfcheetah")
 
 METHODS = {
@@ -81,7 +82,8 @@ LIMITED = {
 }  # fmt: skip
 MAZES = {
     f"antmaze-{maze} {source}": [
-        f"env=antmaze-{maze}", f"data={source}", "preset=antmaze_quick"
+        f"env=antmaze-{maze}", f"data={source}", "preset=antmaze_quick",
+        "data.num_transitions=100_000",
     ]
     for maze, *sources in (
         ("umaze", "umaze", "diverse"),
@@ -115,7 +117,7 @@ class Table(NamedTuple):
     suites: Sequence[str] = ()  # that the table shows
     seeds: Sequence[int] = (0, 1, 2)
     seconds: int = 120
-    place: str = ""  # folder of runs that are not the quick preset's two minutes
+    place: str = "paper"  # folder in results of its tables
 
 
 PAPER = ("osr", "osr_v", "cql", "iql", "sdc", "mopo", "rambo")
@@ -129,11 +131,11 @@ TABLES = {
     "d4": Table(
         ("osr_10", "sac_10", "edac_10", "rorl"),
         ("hopper medium-replay", "walker2d medium-replay"),
-        seeds=(0, 1), seconds=600, place="d4",
+        seeds=(0, 1), seconds=600, place="paper/d4",
     ),
     "tune": Table(
         list(TRIALS), ("hopper medium-replay", "walker2d medium-expert"),
-        seeds=(100,), place="tune",
+        seeds=(100,), place="paper/tune",
     ),
     "methods": Table(list(METHODS), SIX, ("oos", "push", "observation_noise")),
 }  # fmt: skip
@@ -180,7 +182,7 @@ def run(folder: Path, data: str, method: str, seed: int, table: Table) -> None:
         )  # fmt: skip
     for suite, file in SUITES.items():
         sets = EXPERTS if suite == "official" else SIX
-        if not table.place and data in sets and not (folder / file).exists():
+        if table.place == "paper" and data in sets and not (folder / file).exists():
             command(
                 folder / f"{suite}.txt", "evaluate", f"checkpoint={folder}",
                 f"suite={suite}", "episodes=4", "last=1", "progress=false",
@@ -193,10 +195,11 @@ def packed(folder: Path, suites: Sequence[str]) -> set[tuple[str, str, int, int]
     if not (folder / "runs.csv.xz").exists():
         return set()
     runs = pd.read_csv(folder / "runs.csv.xz", index_col="run")
-    played = pd.read_csv(folder / "episodes.csv.xz").groupby("run")["suite"]
-    has_all = played.agg(lambda names: set(suites) <= set(names))
+    if suites:
+        played = pd.read_csv(folder / "episodes.csv.xz").groupby("run")["suite"]
+        runs = runs[played.agg(lambda names: set(suites) <= set(names))]
     columns = ["data", "method", "seed", "updates"]
-    return set(runs.loc[has_all, columns].itertuples(index=False, name=None))
+    return set(runs[columns].itertuples(index=False, name=None))
 
 
 def pack(folders: Sequence[Path], to: Path) -> None:
@@ -248,7 +251,7 @@ def main() -> None:
     """Go through the grid seed by seed, or pack what is there."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("table", choices=TABLES)
-    parser.add_argument("--folder", type=Path, default=Path("outputs/paper"))
+    parser.add_argument("--folder", type=Path, default=Path("outputs"))
     parser.add_argument("--pack", action="store_true", help="run nothing")
     parser.add_argument("--data", nargs="+", help="such as hopper-medium")
     parser.add_argument("--methods", nargs="+")
@@ -256,7 +259,7 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2, help="runs at once")
     options = parser.parse_args()
     table = TABLES[options.table]
-    top, tables = options.folder / table.place, HERE / table.place
+    top, tables = options.folder / table.place, RESULTS / table.place
     folders = {data: top / folder_name(data) for data in table.data}
     names = [folder.name for folder in folders.values()]
     if options.pack:
