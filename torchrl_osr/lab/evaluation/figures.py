@@ -82,13 +82,11 @@ def learning_curve(
 def read_scalars(folder: Path) -> dict[str, list[tuple[int, float]]]:
     """Read steps and values of each scalar that TorchRL's ``CSVLogger`` wrote.
 
-    A resumed run logs the steps since its checkpoint once more; the later row counts,
-    and a line that a kill left unfinished does not.
+    A resumed run logs the steps since its checkpoint once more; the later row counts.
     """
     scalars = {}
     for path in sorted(folder.glob("*.csv")):
         with path.open(newline="") as file:
-            whole = (row for row in csv.reader(file) if len(row) == 2 and all(row))
-            rows = {int(step): float(value) for step, value in whole}
+            rows = {int(step): float(value) for step, value in csv.reader(file)}
         scalars[path.stem] = sorted(rows.items())
     return scalars

@@ -160,11 +160,7 @@ def try_out(env_id: str) -> None:
         actions: Any = env.action_space
         middle = np.zeros(actions.shape, actions.dtype)
         try:
-            columns = record_episodes(env, lambda _: middle, 1, progress=False)
-            states, shape = columns["next_observation"], env.observation_space.shape
-            finite = np.isfinite(states).all() and np.isfinite(columns["reward"]).all()
-            if states.shape[1:] != shape or not finite:
-                raise ValueError(f"expected finite rewards and states of shape {shape}")
+            record_episodes(env, lambda _: middle, 1, progress=False)
         except Exception as error:
             raise RuntimeError(
                 f"{env_id} cannot be played: {type(error).__name__}: {error}. Without "
