@@ -41,7 +41,7 @@ METHODS = {
     for name in (
         *("osr", "noisy_bc", "cql_noisy_bc", "cql", "iql", "td3_bc", "rebrac", "bc"),
         *("osr_v", "osr_10", "sac_10", "edac_10", "rorl", "mopo", "rambo"),
-        *("scas", "sdc", "osr_v_data", "osr_v_noisy_bc", "rim"),
+        *("sdc", "osr_v_data", "osr_v_noisy_bc", "rim"),
     )
 } | {
     "iql+osr": ["loss=iql", "recovery=osr"],

@@ -204,7 +204,6 @@ LOSSES: dict[str, Case] = {
     "rorl": Case(of(lab.RORLLoss, PAIR, num_samples=2, alpha_init=0.5), SAC),
     "td3-bc": Case(of(lab.TD3BCLoss, PLAIN, **BOX), TD3),
     "rebrac": Case(of(lab.ReBRACLoss, PLAIN, **BOX), TD3),
-    "scas": Case(of(lab.SCASLoss, f"{PLAIN} dynamics", **BOX), TD3),
     "sdc": Case(
         combined(of(lab.StateDeviationLoss, "actor dynamics vae", num_samples=2)), SDC
     ),

@@ -152,7 +152,7 @@ def test_a_batch_of_ends_alone_gives_zeros(name) -> None:
 
 
 # What a loss learns from the data's actions, or from where they led.
-LOSS_ACTOR = ["osr", "discrete", "bc", "scas", "td3-bc", "rebrac"]
+LOSS_ACTOR = ["osr", "discrete", "bc", "td3-bc", "rebrac"]
 RECOVERY = ["official", "recovery", "recovery-module", "noisy-cloning"]
 OF_DATA = dict.fromkeys(LOSS_ACTOR, "loss_actor") | {"osr-v": "recovery_gap"}
 OF_DATA |= dict.fromkeys(RECOVERY, "loss_recovery")
@@ -185,7 +185,7 @@ WITH_BOUNDS = [name for name in LOSSES if name not in (*UNBOUNDED, *READS_NONE)]
 @pytest.mark.parametrize("name", WITH_BOUNDS)
 def test_actions_beyond_the_bounds_are_warned_about_once(name) -> None:
     networks, batch = Networks(high=torch.tensor([1.0, 0.5])), make_batch(name, 10)
-    options = {"high": [1.0, 0.5]} if name in ("td3-bc", "rebrac", "scas") else {}
+    options = {"high": [1.0, 0.5]} if name in ("td3-bc", "rebrac") else {}
     batch["action"][:] = 0.2
     make_loss(name, networks, **options)(batch)
     loss = make_loss(name, networks, **options)

@@ -58,7 +58,7 @@ def seeing(name: str, encoder: nn.Module) -> Networks:
 
 
 # These hand the state itself to a model of the dynamics, or perturb it themselves.
-SEEING = sorted(set(LOSSES) - {"latent-model", "scas", "sdc", "rorl"})
+SEEING = sorted(set(LOSSES) - {"latent-model", "sdc", "rorl"})
 
 
 @pytest.mark.parametrize("name", SEEING)
@@ -178,7 +178,6 @@ FROZEN = {
     "discrete": ("choice_model", "recovery_kl"),
     "recovery": ("model", "recovery_kl"),
     "official": ("model", "recovery_kl"),
-    "scas": ("dynamics", "correction_error"),
     "sdc": ("dynamics", "deviation"),
 }
 
@@ -201,6 +200,6 @@ def test_a_frozen_model_is_followed_and_never_trained(name) -> None:
 
 
 def test_td3_needs_the_bounds_of_a_plain_actor() -> None:
-    for name in ("td3-bc", "rebrac", "scas"):
+    for name in ("td3-bc", "rebrac"):
         with pytest.raises(ValueError, match="pass low= and high="):
             make_loss(name, low=None)

@@ -49,7 +49,7 @@ def test_a_return_of_one_step_changes_nothing(name) -> None:
 # Those that read the next state as the one an action leads to, and the term that does.
 SINGLE = {"osr": "recovery_kl", "osr-v": "recovery_gap", "discrete": "recovery_kl"}
 SINGLE |= {"recovery": "loss_recovery", "official": "loss_recovery"}
-SINGLE |= {"model": "loss_inverse_dynamics", "scas": "correction_error"}
+SINGLE |= {"model": "loss_inverse_dynamics"}
 
 
 @pytest.mark.parametrize(("name", "key"), SINGLE.items())

@@ -53,7 +53,7 @@ def test_run_leaves_table_figure_returns_and_checkpoints(tmp_path, sizes):
 
 def test_a_sweep_names_the_job_that_failed_and_ends_the_others(tmp_path, run, sizes):
     """Over the classes that no other test here trains; its flag may come last."""
-    chosen = ["loss=osr_v,scas,edac_10,iql,rorl", "dynamics=none"]
+    chosen = ["loss=osr_v,sdc,edac_10,iql,rorl", "dynamics=none"]
     code, output = run(tmp_path, SCRIPT, *sizes, *chosen, "hydra.sweep.dir=sweep", "-m")
     assert code != 0, output
     assert "choose dynamics=ensemble" in output

@@ -73,7 +73,6 @@ def scalars_of(folder: Path, *overrides: str) -> dict[str, list[tuple[int, float
         (["loss=mopo", "dynamics.real_ratio=0.5"], {"loss_qvalue"}),
         (["loss=rim"], {"cloning_error"}),
         (["loss=sdc"], {"deviation", "multiplier"}),
-        (["loss=scas"], {"loss_actor"}),
     ],
 )
 def test_each_method_is_one_line(tmp_path, options, names) -> None:

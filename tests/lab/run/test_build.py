@@ -42,7 +42,7 @@ def test_every_loss_is_built_and_trains_its_networks(name, batch) -> None:
     assert type(loss) is get_class(config.loss["_target_"])
     if hasattr(loss, "qvalue_network"):
         ten = name == "rorl" or name.endswith("_10")
-        assert loss.num_qvalue_nets == (4 if name == "scas" else 10 if ten else 2)
+        assert loss.num_qvalue_nets == (10 if ten else 2)
         assert loss.value_estimator.gamma == 0.5
         SoftUpdate(loss, tau=0.1)
     assert model is None or "osr" in name
@@ -82,7 +82,7 @@ def test_recovery_is_added_to_a_loss_without_it(name, recovery, batch) -> None:
     [
         (["recovery=osr"], "a recovery term of its own"),
         (["loss=rebrac", "dynamics=ensemble"], "choose dynamics=none"),
-        (["loss=scas", "dynamics=none"], "choose dynamics=ensemble"),
+        (["loss=sdc", "dynamics=none"], "choose dynamics=ensemble"),
         (["loss=rambo", "dynamics.real_ratio=1.0"], "set it to 0"),
         (["loss=mopo", "dynamics.real_ratio=0.001"], "real_ratio=0.001: 0 of"),
         (["loss=rim", "optim.gamma=1"], "needs optim.gamma below 1"),

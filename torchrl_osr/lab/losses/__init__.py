@@ -3,7 +3,7 @@
 from torchrl_osr.lab.losses.cloning import BCLoss, IQLLoss
 from torchrl_osr.lab.losses.ensembles import EDACLoss, RORLLoss
 from torchrl_osr.lab.losses.evaluation import FQELoss
-from torchrl_osr.lab.losses.state_correction import SCASLoss, StateDeviationLoss
+from torchrl_osr.lab.losses.state_deviation import StateDeviationLoss
 from torchrl_osr.lab.losses.td3 import ReBRACLoss, TD3BCLoss
 
 __all__ = [
@@ -13,7 +13,6 @@ __all__ = [
     "IQLLoss",
     "RORLLoss",
     "ReBRACLoss",
-    "SCASLoss",
     "StateDeviationLoss",
     "TD3BCLoss",
 ]

@@ -1,19 +1,16 @@
-r"""SCAS and SDC: a model of the dynamics leads the policy back to the data.
+r"""SDC: a model of the dynamics leads the policy back to the data.
 
 Shapes: ``R`` rows, ``S`` observation, ``A`` action, ``N`` critics, ``n`` samples.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from tensordict import NestedKey
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
-    TensorDictModule,
-    TensorDictModuleBase,
     TensorDictParams,
 )
 from torch import Tensor, nn
@@ -23,125 +20,11 @@ from torchrl_osr import functional as F
 from torchrl_osr._checks import check_positive, check_weight
 from torchrl_osr._entries import entry, nested, state_keys
 from torchrl_osr.lab.dynamics.models import DynamicsEnsemble, TransitionVAE
-from torchrl_osr.lab.losses.td3 import TD3Loss
 from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses
 from torchrl_osr.objectives.networks import distribution
 from torchrl_osr.objectives.transitions import (
     Transitions,
-    check_single_steps,
-    next_states,
 )
-
-
-class SCASLoss(TD3Loss):
-    r"""State Correction and OOD Action Suppression (SCAS).
-
-    .. math::
-        L_\pi &= (1 - \lambda)\,\mathbb E_D \Big[
-            - \frac{\min_i Q_i(s, \pi(s))}{\mathbb E_D |\min_i Q_i(s, \pi(s))|} \Big]
-            + \lambda\,\mathbb E_D \Big[
-            w(s, s')\,\frac1S \big\| M(\hat s, \pi(\tilde s)) - s' \big\|^2 \Big]
-            \\
-        w(s, s') &= \min\big(e^{\tau (V(s') - V(s))}, w_{max}\big), \quad
-        V(s) = \frac1N \sum_i Q_i(s, \pi(s))
-
-    with a perturbed state :math:`\hat s` and a frozen model :math:`M` of the dynamics.
-    The critics are those of :class:`~torchrl_osr.lab.losses.td3.TD3Loss`; the authors
-    use four.
-
-    "Offline Reinforcement Learning with OOD State Correction and OOD Action
-    Suppression", https://arxiv.org/abs/2410.19400. It prints :math:`\tilde s = \hat s`;
-    its released code (MAOYIXIU/SCAS) has :math:`\tilde s = s`, the default here.
-
-    Differences from that code: :math:`M` is the mean of an ensemble's elites, trained
-    by likelihood (there one network, by squared error). Rows that are ``done`` have no
-    correction. In mazes, too, the target is the critics' minimum (there their mean).
-
-    Keyword Args:
-        correction_weight: :math:`\lambda`, between 0 and 1. Default 0.25.
-        correction_action: the state :math:`\tilde s`, ``"clean"`` (default) or
-            ``"perturbed"``.
-        gain_temperature: :math:`\tau`. Default 5.0.
-        largest_weight: :math:`w_{max}`. Default 50.0.
-        options: of :class:`~torchrl_osr.lab.losses.td3.TD3Loss`.
-
-    Examples:
-        >>> from torchrl_osr.lab.dynamics import DynamicsEnsemble
-        >>> from torchrl_osr.lab.losses import SCASLoss
-        >>> from torchrl_osr.modules import critic_ensemble, deterministic_actor
-        >>> loss = SCASLoss(
-        ...     deterministic_actor(11, 3), critic_ensemble(11, 3, num_qvalue_nets=4),
-        ...     DynamicsEnsemble(11, 3))
-        >>> loss.out_keys
-        ['loss_actor', 'loss_qvalue', 'correction_error', 'pred_value', 'target_value']
-    """
-
-    reads_perturbed, metric = True, "correction_error"
-    dynamics_network: DynamicsEnsemble
-    dynamics_network_params: TensorDictParams
-    target_dynamics_network_params: TensorDictParams
-
-    def __init__(
-        self,
-        actor_network: TensorDictModuleBase,
-        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
-        dynamics_network: DynamicsEnsemble,
-        *,
-        correction_weight: float = 0.25,
-        correction_action: Literal["clean", "perturbed"] = "clean",
-        gain_temperature: float = 5.0,
-        largest_weight: float = 50.0,
-        **options: Any,
-    ) -> None:
-        check_weight("correction_weight", correction_weight)
-        check_weight("1 - correction_weight", 1 - correction_weight)
-        check_weight("gain_temperature", gain_temperature)
-        super().__init__(actor_network, qvalue_network, **options)
-        self.register_frozen("dynamics_network", dynamics_network)
-        self.correction_weight = correction_weight
-        self.correction_action = correction_action
-        self.gain_temperature, self.largest_weight = gain_temperature, largest_weight
-
-    def losses(self, batch: Transitions) -> Losses:
-        share = self.correction_weight
-        action, qvalues = self.policy_values(batch)
-        lowest = qvalues.min(0).values
-        weight = self.weight(batch, qvalues.detach().mean(0))
-        error = weight * self.deviation(batch, action)
-        sought = self.reduce(-lowest / self.magnitude(batch, lowest), batch)
-        correction = self.reduce(error, batch, batch.has_next)
-        actor = (1 - share) * sought + share * correction
-        qvalue, metrics = self.critic_loss(batch)
-        metrics["correction_error"] = self.mean(error, batch, batch.has_next)
-        return {"loss_actor": actor, "loss_qvalue": qvalue}, metrics
-
-    @torch.no_grad()
-    def weight(self, batch: Transitions, value: Tensor) -> Tensor:
-        """Return the weight of each row's correction, ``[R]``, from its value."""
-        # Of single steps, as the correction.
-        after = next_states(batch.one_step, self.observation_keys, batch.done)
-        action = self.act(after, self.actor_network_params)
-        gain = self.q(after, action).mean(0) - value
-        return (self.gain_temperature * gain).exp().clamp(max=self.largest_weight)
-
-    def deviation(self, batch: Transitions, action: Tensor) -> Tensor:
-        """Return the squared distance from the data's next state, ``[R]``.
-
-        It is the distance of the model's next state, after the policy's action at the
-        perturbed state.
-        """
-        check_single_steps(batch, "the model of the dynamics")
-        perturbed, model = batch.states[2], self.dynamics_network
-        if self.correction_action == "perturbed":
-            action = self.act(perturbed, self.actor_network_params)
-        key = model.in_keys[0]
-        state, after = entry(perturbed, key), entry(batch.one_step, nested("next", key))
-        with self.dynamics_network_params.to_module(model, preserve_module_state=False):
-            mean, _ = model.predict(state, action)
-            reached = state + mean[model.elites].mean(0)[..., :-1]
-        # The state after an end may be anything; in the backward pass 0 * nan is nan.
-        after = torch.where(batch.done.unsqueeze(-1), torch.zeros_like(after), after)
-        return (reached - after).square().mean(-1)
 
 
 def maximum_mean_discrepancy(first: Tensor, second: Tensor, width: float) -> Tensor:
