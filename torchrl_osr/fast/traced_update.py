@@ -311,13 +311,12 @@ class _CudaGraph:
         gc.collect()  # to free another graph during the capture would end it
         self._graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(self._graph, stream=stream):
-            self._found = function(*self._given)
+            self._found: list[Tensor] = function(*self._given)
 
     def __call__(self, *tensors: Tensor) -> list[Tensor]:
         torch._foreach_copy_(self._given, tensors)
         self._graph.replay()
-        found: list[Tensor] = self._found
-        return found
+        return self._found
 
 
 def _laid_out(gradient: Tensor, like: Tensor) -> Tensor:

@@ -160,15 +160,17 @@ def hold_bounds(loss_module: LossModule) -> None:
     """
     device = next(loss_module.parameters()).device
     parts = [part for each in loss_module.modules() for part in vars(each).values()]
-    networks = [part for part in parts if isinstance(part, nn.Module)]
-    for head in (each for network in networks for each in network.modules()):
+    networks = nn.ModuleList([part for part in parts if isinstance(part, nn.Module)])
+    for head in networks.modules():
         if isinstance(head, ProbabilisticTensorDictModule):
-            kind, options = head.distribution_class, head.distribution_kwargs
-            for name in {"low", "high"} & options.keys():
-                bound = torch.as_tensor(options[name])
-                alike = kind is TanhDelta and bool((bound == bound.amin()).all())
-                held = bound.amin().item() if alike else bound.to(device)
-                head.distribution_kwargs = head.distribution_kwargs | {name: held}
+            bounds = {}
+            for name in {"low", "high"} & head.distribution_kwargs.keys():
+                bound = torch.as_tensor(head.distribution_kwargs[name], device=device)
+                alike = head.distribution_class is TanhDelta and bool(
+                    (bound == bound.amin()).all()
+                )
+                bounds[name] = bound.amin().item() if alike else bound
+            head.distribution_kwargs = head.distribution_kwargs | bounds
 
 
 def _mover(updater: TargetNetUpdater | None) -> Callable[[], None]:

@@ -8,10 +8,4 @@ from torchrl_osr.trainers.offline import (
     divergence_warning,
 )
 
-__all__ = [
-    "Evaluation",
-    "Hook",
-    "Interrupted",
-    "OfflineTrainer",
-    "divergence_warning",
-]
+__all__ = ["Evaluation", "Hook", "Interrupted", "OfflineTrainer", "divergence_warning"]

@@ -21,12 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_osr.lab.cli.console import single_job
 from torchrl_osr.lab.data.environment import open_environment
-from torchrl_osr.lab.data.record import (
-    Act,
-    check_log_path,
-    record_episodes,
-    write_log,
-)
+from torchrl_osr.lab.data.record import Act, check_log_path, record_episodes, write_log
 from torchrl_osr.lab.run import CONF
 from torchrl_osr.lab.run.config import check_environment
 from torchrl_osr.lab.run.load import load_run_policy

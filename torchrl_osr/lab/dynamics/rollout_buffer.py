@@ -16,11 +16,7 @@ from torchrl_osr.lab.data.transitions import DATASET_KEYS
 from torchrl_osr.lab.dynamics.model_adversary import ModelAdversary
 from torchrl_osr.lab.dynamics.models import DynamicsEnsemble
 from torchrl_osr.lab.dynamics.options import DynamicsOptions, ModelData
-from torchrl_osr.lab.dynamics.rollouts import (
-    action_of,
-    perturbed_starts,
-    rollout,
-)
+from torchrl_osr.lab.dynamics.rollouts import action_of, perturbed_starts, rollout
 
 
 class RolloutReplayBuffer:

@@ -93,12 +93,6 @@ def recovers(states: RecoverableStates, policy: Policy) -> NDArray[np.bool_]:
 
     Hopper and Walker2d: no fall within ``steps`` steps. HalfCheetah: a mean speed of
     at least ``least_speed`` over the last 50 of these steps. Maze: the goal is reached.
-
-    Examples:
-        >>> import torch
-        >>> states = load_recoverable_states("walker2d")
-        >>> bool(recovers(states, lambda state: torch.zeros(len(state), 6)).any())
-        False
     """
     back = np.zeros(len(states), dtype=np.bool_)
     waiting = iter(range(len(states)))

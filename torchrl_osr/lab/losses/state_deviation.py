@@ -9,10 +9,7 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey
-from tensordict.nn import (
-    ProbabilisticTensorDictSequential,
-    TensorDictParams,
-)
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictParams
 from torch import Tensor, nn
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 
@@ -22,9 +19,7 @@ from torchrl_osr._entries import entry, nested, state_keys
 from torchrl_osr.lab.dynamics.models import DynamicsEnsemble, TransitionVAE
 from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses
 from torchrl_osr.objectives.networks import distribution
-from torchrl_osr.objectives.transitions import (
-    Transitions,
-)
+from torchrl_osr.objectives.transitions import Transitions
 
 
 def maximum_mean_discrepancy(first: Tensor, second: Tensor, width: float) -> Tensor:
