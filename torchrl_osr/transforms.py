@@ -140,10 +140,8 @@ class StatePerturbation(Transform):
         """Return the generator's state, for the state dict."""
         if self._generator is None and self._loaded is not None:
             return self._loaded
-        generator = self._generator
-        if generator is None:
-            generator = torch.Generator(self.std.device).manual_seed(self.seed)
-        return generator.get_state()
+        own = torch.Generator(self.std.device).manual_seed(self.seed)
+        return (self._generator or own).get_state()
 
     def set_extra_state(self, state: Tensor) -> None:
         """Continue the noise from a saved state; another device starts it again."""

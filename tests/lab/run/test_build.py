@@ -113,8 +113,8 @@ def rows(nan_at: int, size: int = 5):
 @pytest.mark.parametrize(
     ("entries", "step", "what"),
     [
-        *((3, rows(0), "step 1 .* of shape"), (2, {}.pop, "KeyError")),
-        *((2, rows(0, size=4), "`info`"), (2, rows(nan_at=7), "step 7 .*nan")),
+        *((3, rows(0), "step 1 .* of shape"), (2, {}.pop, "step 1 .*KeyError")),
+        *((2, rows(0, size=4), "step 1 .*`info`"), (2, rows(nan_at=7), "step 7 .*nan")),
     ],
 )
 def test_a_broken_environment_is_found_by_some_steps(entries, step, what):

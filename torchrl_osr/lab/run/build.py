@@ -158,11 +158,16 @@ def try_out(env_id: str) -> None:
     """
     with closing(TimeLimit(make_environment(env_id), 10)) as env:
         actions: Any = env.action_space
-        middle = np.zeros(actions.shape, actions.dtype)
+        taken: list[Any] = []
+
+        def act(_: Any) -> Any:
+            taken.append(np.zeros(actions.shape, actions.dtype))
+            return taken[-1]
+
         try:
-            record_episodes(env, lambda _: middle, 1, progress=False)
+            record_episodes(env, act, 1, progress=False)
         except Exception as error:
             raise RuntimeError(
-                f"{env_id} cannot be played: {type(error).__name__}: {error}. Without "
-                "a simulator, use env=none."
+                f"{env_id} cannot be played: step {len(taken)} ended with "
+                f"{type(error).__name__}: {error}. Without a simulator, use env=none."
             ) from error
