@@ -47,6 +47,15 @@ def test_a_cached_set_is_made_once_for_a_request(load, data, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"set", "set.lock"}
 
 
+def test_a_folder_with_other_files_is_not_replaced(load, tmp_path):
+    load(seed=1)
+    (tmp_path / "set" / "notes.txt").write_text("mine")
+    with pytest.raises(FileExistsError, match="is not replaced"):
+        load(seed=2)
+    assert (tmp_path / "set" / "notes.txt").exists()
+    load(seed=1)
+
+
 def test_what_fails_leaves_no_set(load, data, tmp_path):
     data["observation"][37] = torch.nan
     with pytest.raises(ValueError, match="'observation'.* holds NaN"):

@@ -72,6 +72,13 @@ def check_order(data: TensorDictBase) -> None:
         )
 
 
+def episode_of(data: TensorDictBase) -> Tensor:
+    """Return the number of each row's episode, int ``[N]``; see :func:`check_order`."""
+    check_order(data)
+    done: Tensor = data["next", "done"].squeeze(-1)
+    return done.cumsum(0) - done.long()
+
+
 def multi_step(
     data: TensorDictBase,
     *,

@@ -54,8 +54,7 @@ def load_or_write(
     def load() -> Dataset:
         manifest = read_json(folder / MANIFEST)
         for key, value in {**wanted, "format": FORMAT}.items():
-            if manifest.get(key) != value:
-                was = manifest.get(key)
+            if (was := manifest.get(key)) != value:
                 raise ValueError(f"its {key} is {was!r}, wanted {value!r}.")
         if manifest.get("rows_sha256") != _checksum(folder / ROWS):
             raise ValueError("its checksum is wrong: the files are damaged.")
@@ -80,6 +79,8 @@ def load_or_write(
 def _write(folder: Path, data: TensorDict, manifest: Mapping[str, Any]) -> None:
     """Write a data set, or replace it; an interrupted call leaves none."""
     check_dataset(data)
+    if folder.exists() and not {p.name for p in folder.iterdir()} <= {MANIFEST, ROWS}:
+        raise FileExistsError(f"{folder} is not replaced: it holds other files.")
     partial = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     try:

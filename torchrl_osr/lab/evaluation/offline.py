@@ -17,7 +17,7 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_osr.fast import FastUpdate
 from torchrl_osr.lab.data import make_replay_buffer, observation_statistics
-from torchrl_osr.lab.data.rows import check_order
+from torchrl_osr.lab.data.rows import episode_of
 from torchrl_osr.lab.evaluation.episodes import Policy
 from torchrl_osr.lab.evaluation.statistics import Array
 from torchrl_osr.lab.losses import FQELoss
@@ -70,10 +70,8 @@ def fitted_values(
     """
     if not 0 <= gamma < 1:
         raise ValueError(f"The discount is {gamma}; expected at least 0 and below 1.")
-    check_order(data)
-    ends = data["next", "done"].squeeze(-1)
-    first = torch.cat([ends.new_ones(1), ends[:-1]])
-    episode, starts = first.cumsum(0) - 1, data["observation"][first]
+    episode = episode_of(data)
+    starts = data["observation"][episode.diff(prepend=episode.new_tensor([-1])) > 0]
     number, size = len(starts), data["action"].shape[-1]
 
     def act(states: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_osr.lab.data.rows import check_order
+from torchrl_osr.lab.data.rows import episode_of
 from torchrl_osr.lab.evaluation.recovery import STEPS_AFTER
 from torchrl_osr.lab.run.config import read_run
 from torchrl_osr.lab.run.data import load_data
@@ -73,15 +73,11 @@ def monitor_of_run(
 
 
 def rows_of(data: TensorDictBase, fall_steps: int) -> tuple[Tensor, Tensor]:
-    """Return the episode of each row, and whether it is none of the last before a fall.
+    """Return the episode of each row, and whether it is not one shortly before a fall.
 
-    Raises:
-        ValueError: the rows are not in the order of time.
+    The rows must be in order of time.
     """
-    check_order(data)
+    episode, rows = episode_of(data), torch.arange(len(data))
     done, terminated = (data["next", k][:, 0] for k in ("done", "terminated"))
-    episode = done.cumsum(0) - done.long()
-    rows = torch.arange(len(data))
-    ends = rows[done | (rows == len(data) - 1)]
-    last = ends[episode]
+    last = done.nonzero()[episode, 0]  # the last row of all ends one, too
     return episode, ~(terminated[last] & (last - rows < fall_steps))
