@@ -73,10 +73,7 @@ def monitor_of_run(
 
 
 def rows_of(data: TensorDictBase, fall_steps: int) -> tuple[Tensor, Tensor]:
-    """Return the episode of each row, and whether it is not one shortly before a fall.
-
-    The rows must be in order of time.
-    """
+    """Return each row's episode, and whether no fall follows within so many steps."""
     episode, rows = episode_of(data), torch.arange(len(data))
     done, terminated = (data["next", k][:, 0] for k in ("done", "terminated"))
     last = done.nonzero()[episode, 0]  # the last row of all ends one, too
