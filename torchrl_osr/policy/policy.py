@@ -99,8 +99,7 @@ class Policy(nn.Module):
             Actions as the environment takes them: float32, ``[A]`` or ``[B, A]``,
             within the bounds; of a discrete policy int64 indices, ``[]`` or ``[B]``.
         """
-        given = joined(observation)
-        rows = self._numbers("observation", given, self.observation_size)
+        given, rows = self._given(observation)
         result: Array = _like(given, self(rows))
         return result
 
@@ -118,8 +117,7 @@ class Policy(nn.Module):
             action: as :meth:`act` returns it. Default: the policy's deterministic one.
         """
         self._check_critics()
-        given = joined(observation)
-        rows = self._numbers("observation", given, self.observation_size)
+        given, rows = self._given(observation)
         actions = self(rows) if action is None else self._actions(action, rows)
         result: Array = _like(given, self.smallest_value(rows, actions))
         return result
@@ -135,12 +133,11 @@ class Policy(nn.Module):
             Scores, float32, and alarms, bool, both ``[]`` or ``[B]``; see
             :class:`~torchrl_osr.policy.DataMonitor`.
         """
-        given = joined(observation)
-        rows = self._rows("observation", given, self.observation_size)
         if self.data_monitor is None:
             raise ValueError(
                 "this policy has no monitor: attach torchrl_osr.policy.fit_monitor()."
             )
+        given, rows = self._given(observation, finite=False)
         score, alarm = self.data_monitor(rows)
         return _like(given, score), _like(given, alarm)
 
@@ -177,33 +174,45 @@ class Policy(nn.Module):
         check_choice("the suffix of the path", path.suffix, GRAPHS)
         inputs = {"observation": self.loc.repeat(2, 1)}
         part = copy.deepcopy(self)  # a graph keeps all weights, needed or not
-        graph: nn.Module = part
-        part.data_monitor = None
         names: list[str] = [output]
-        if output == "action":
-            part.critics = nn.ModuleList()
-            if self.data_monitor is not None:
-                graph = _Monitored(part, self.data_monitor)
-                names = ["action", "score", "alarm"]
-        else:
+        if output == "value":
             self._check_critics()
             inputs["action"] = self(inputs["observation"])
-            part.actor, graph = nn.Identity(), _Value(part)
+            part.actor, part.data_monitor = nn.Identity(), None
+            part.forward = part.smallest_value  # type: ignore[method-assign,assignment]
+        else:
+            part.critics = nn.ModuleList()
+            if self.data_monitor is not None:
+                part.forward = part._monitored  # type: ignore[method-assign,assignment]
+                names += ["score", "alarm"]
         rows = torch.export.Dim("batch")
         given: dict[str, Any] = {"args": (), "kwargs": inputs}
         given["dynamic_shapes"] = {name: {0: rows} for name in inputs}
         record = json.dumps(self.record)
         if path.suffix == ".onnx":
-            content = _onnx(graph, given, names, record)
+            content = _onnx(part, given, names, record)
         else:
-            file, program = io.BytesIO(), torch.export.export(graph, **given)
+            file, program = io.BytesIO(), torch.export.export(part, **given)
             torch.export.save(program, file, extra_files={RECORD: record})
             content = file.getvalue()
         write_atomically(path, content)
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return deterministic actions, see :meth:`act`; nothing is checked."""
-        return self._in_units(self.mode(self.actor(self._standardized(observation))))
+        action = self.mode(self.actor(self._standardized(observation)))
+        if self.discrete:
+            return action
+        center, half = self._units()
+        # Rounding may lead out of the bounds by one bit.
+        return (action * half + center).clamp(self.low, self.high)
+
+    def _monitored(self, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return finite actions, scores and alarms, see :meth:`export`."""
+        assert self.data_monitor is not None
+        action = Policy.forward(self, observation)  # this method takes its place
+        if not self.discrete:
+            action = torch.where(action.isnan(), self._units()[0], action)
+        return action, *self.data_monitor(observation)
 
     def smallest_value(self, observation: Tensor, action: Tensor) -> Tensor:
         """Return the smallest value, see :meth:`value`; nothing is checked."""
@@ -212,7 +221,7 @@ class Policy(nn.Module):
             index = action.unsqueeze(-1)
             values = [critic(state).gather(-1, index) for critic in self.critics]
         else:
-            center, half = (self.low + self.high) / 2, (self.high - self.low) / 2
+            center, half = self._units()
             unit = (action - center) / half
             values = [critic(state, unit) for critic in self.critics]
         return torch.stack(values).amin(0).squeeze(-1)
@@ -228,27 +237,24 @@ class Policy(nn.Module):
         # Gymnasium's MuJoCo tasks have float64.
         return (observation.to(self.loc.dtype) - self.loc) / self.scale
 
-    def _in_units(self, action: Tensor) -> Tensor:
-        if self.discrete:
-            return action
-        center, half = (self.low + self.high) / 2, (self.high - self.low) / 2
-        # Rounding may lead out of the bounds by one bit.
-        return (action * half + center).clamp(self.low, self.high)
+    def _units(self) -> tuple[Tensor, Tensor]:
+        """Return the middle and the half-width of the bounds."""
+        return (self.low + self.high) / 2, (self.high - self.low) / 2
 
-    def _numbers(self, name: str, value: Any, size: int) -> Tensor:
-        """Return the value as finite float32 rows on the policy's device."""
-        rows = self._rows(name, value, size)
-        if not rows.isfinite().all():
-            raise ValueError(f"the {name} has entries that are NaN or infinite.")
-        return rows
+    def _given(self, observation: Any, *, finite: bool = True) -> tuple[Any, Tensor]:
+        """Return the observation as one vector, and as rows on the policy's device."""
+        given = joined(observation)
+        return given, self._rows("observation", given, self.observation_size, finite)
 
-    def _rows(self, name: str, value: Any, size: int) -> Tensor:
+    def _rows(self, name: str, value: Any, size: int, finite: bool = True) -> Tensor:
         rows = _tensor(value).to(self.loc.device, torch.float32)
         if not rows.ndim or rows.shape[-1] != size:
             raise ValueError(
                 f"the {name} has shape {tuple(rows.shape)}, expected ({size},) or "
                 f"(batch, {size})."
             )
+        if finite and not rows.isfinite().all():
+            raise ValueError(f"the {name} has entries that are NaN or infinite.")
         return rows
 
     def _actions(self, value: Any, observation: Tensor) -> Tensor:
@@ -258,7 +264,7 @@ class Policy(nn.Module):
             shape = observation.shape[:-1]
             least, most = torch.tensor(0), torch.tensor(self.action_size - 1)
         else:
-            action = self._numbers("action", value, self.action_size)
+            action = self._rows("action", value, self.action_size)
             shape = torch.Size([*observation.shape[:-1], self.action_size])
             margin = 5e-6 * (self.high - self.low)  # a caller's own arithmetic rounds
             least, most = self.low - margin, self.high + margin
@@ -311,32 +317,6 @@ def _built(sizes: Mapping[str, Any], inputs: int, outputs: int) -> nn.Module:
     return network
 
 
-class _Value(nn.Module):
-    """Calls a policy's critics: a graph has one ``forward``."""
-
-    def __init__(self, policy: Policy) -> None:
-        super().__init__()
-        self.policy = policy
-
-    def forward(self, observation: Tensor, action: Tensor) -> Tensor:
-        return self.policy.smallest_value(observation, action)
-
-
-class _Monitored(nn.Module):
-    """Returns action, score and alarm; the action is finite."""
-
-    def __init__(self, policy: Policy, monitor: DataMonitor) -> None:
-        super().__init__()
-        self.policy, self.monitor = policy, monitor
-
-    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        policy, action = self.policy, self.policy(observation)
-        if not policy.discrete:
-            center = (policy.low + policy.high) / 2
-            action = torch.where(action.isnan(), center, action)
-        return action, *self.monitor(observation)
-
-
 def _onnx(
     graph: nn.Module, given: dict[str, Any], names: list[str], record: str
 ) -> bytes:
@@ -348,8 +328,7 @@ def _onnx(
     level = log.level
     log.setLevel(logging.ERROR)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             onnx: Any = torch.onnx.export(graph, **given, dynamo=True, verbose=False)
     finally:
         log.setLevel(level)

@@ -96,11 +96,9 @@ def planner(maze: Any) -> Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]]:
         path = shortest_path(free, start, goal)
         return maze.cell_rowcol_to_xy(np.array(path[1])) if len(path) > 2 else None
 
-    def cell_of(position: NDArray[Any]) -> Any:
-        return tuple(maze.cell_xy_to_rowcol(position).tolist())
-
     def waypoint(position: NDArray[Any], goal: NDArray[Any]) -> NDArray[Any]:
-        middle = middle_of_next(cell_of(position), cell_of(goal))
+        cells = (maze.cell_xy_to_rowcol(each).tolist() for each in (position, goal))
+        middle = middle_of_next(*map(tuple, cells))
         return goal if middle is None else np.asarray(middle)
 
     return waypoint
@@ -132,10 +130,8 @@ def ant_sampler(maze: Any) -> ActionSampler:
     The policy was trained to run along x. It sees the ant in a frame whose x axis
     points at the waypoint. Its actions are drawn, which is their noise.
     """
-    waypoint, policy = (
-        planner(maze),
-        load_behavior_policy(*HEADING[:2], folder=HEADING[2]),
-    )
+    waypoint = planner(maze)
+    policy = load_behavior_policy(*HEADING[:2], folder=HEADING[2])
 
     def sample(observation: NDArray[Any], rng: np.random.Generator) -> Any:
         position, goal, ant = observation[:2], observation[2:4], observation[4:]

@@ -109,12 +109,11 @@ def collect_transitions(
     Returns:
         The transitions ``[N]``; returns and lengths ``[E]`` of complete episodes.
     """
-    spaces = env.observation_space, env.action_space
-    state, action = ((num_transitions, flatdim(space)) for space in spaces)
+    size = flatdim(env.observation_space)
     columns: dict[str, NDArray[Any]] = {
-        "observation": np.empty(state, np.float32),
-        "action": np.empty(action, np.float32),
-        "next_observation": np.empty(state, np.float32),
+        "observation": np.empty((num_transitions, size), np.float32),
+        "action": np.empty((num_transitions, flatdim(env.action_space)), np.float32),
+        "next_observation": np.empty((num_transitions, size), np.float32),
         "reward": np.empty(num_transitions, np.float32),
         "terminated": np.zeros(num_transitions, np.bool_),
         "truncated": np.zeros(num_transitions, np.bool_),
@@ -126,39 +125,23 @@ def collect_transitions(
     with tqdm(None, "collect", num_transitions, unit="step", disable=hidden) as bar:
         shares = zip(samplers, seeds, pairwise(bounds), strict=True)
         for sampler, child, (start, stop) in shares:
-            rng = np.random.default_rng(child)
-            while start < stop:
-                rows = {name: column[start:stop] for name, column in columns.items()}
-                length, episode_return = _play_episode(env, sampler, rng, rows)
-                if episode_return is not None:
-                    episodes.append((episode_return, length))
-                start += length
-                bar.update(length)
+            rng, ended = np.random.default_rng(child), True
+            for row in range(start, stop):
+                if ended:
+                    observation, _ = env.reset(seed=int(rng.integers(2**31)))
+                    episode_return, first = 0.0, row
+                columns["observation"][row] = observation
+                action = np.clip(sampler(observation, rng), -ACTION_LIMIT, ACTION_LIMIT)
+                observation, reward, terminated, truncated, _ = env.step(action)
+                columns["action"][row] = action
+                columns["next_observation"][row] = observation
+                columns["reward"][row] = reward
+                columns["terminated"][row] = terminated
+                columns["truncated"][row] = truncated
+                episode_return += float(reward)
+                if ended := terminated or truncated:
+                    episodes.append((episode_return, row + 1 - first))
+                bar.update()
+            columns["truncated"][stop - 1] |= not columns["terminated"][stop - 1]
     returns, lengths = np.array(episodes, np.float64).reshape(-1, 2).T
     return as_transitions(columns), returns, lengths.astype(np.int64)
-
-
-def _play_episode(
-    env: gymnasium.Env[Any, Any],
-    sampler: ActionSampler,
-    rng: np.random.Generator,
-    rows: dict[str, NDArray[Any]],
-) -> tuple[int, float | None]:
-    """Fill ``rows`` from their start; return the length, and the return if complete."""
-    observation, _ = env.reset(seed=int(rng.integers(2**31)))
-    episode_return = 0.0
-    capacity = len(rows["reward"])
-    for step in range(capacity):
-        rows["observation"][step] = observation
-        action = np.clip(sampler(observation, rng), -ACTION_LIMIT, ACTION_LIMIT)
-        observation, reward, terminated, truncated, _ = env.step(action)
-        rows["action"][step] = action
-        rows["next_observation"][step] = observation
-        rows["reward"][step] = reward
-        episode_return += float(reward)
-        if terminated or truncated:
-            rows["terminated"][step] = terminated
-            rows["truncated"][step] = truncated
-            return step + 1, episode_return
-    rows["truncated"][capacity - 1] = True
-    return capacity, None

@@ -5,6 +5,7 @@ Shapes: ``R`` rows, ``A`` action, ``N`` critics.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any
 
@@ -40,8 +41,6 @@ class TD3Loss(ActorCriticLoss):
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
     """
 
-    metric = "cloning_error"
-
     def __init__(
         self,
         actor_network: TensorDictModuleBase,
@@ -67,15 +66,30 @@ class TD3Loss(ActorCriticLoss):
         self.register_bounds(bounds)
         self.register_actor_critic(actor_network, qvalue_network, delay_actor=True)
         self.make_value_estimator()
-        metrics = [self.metric, "pred_value", "target_value"]
+        metrics = ["cloning_error", "pred_value", "target_value"]
         self.declare(["loss_actor", "loss_qvalue"], metrics)
 
-    def policy_values(self, batch: Transitions) -> tuple[Tensor, Tensor]:
-        """Return the policy's actions, ``[R, A]``, and their values, ``[N, R]``."""
+    @abstractmethod
+    def objective(
+        self, batch: Transitions, action: Tensor, qvalues: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return what the policy minimises and its distance from the data, ``[R]``.
+
+        The policy's actions are ``[R, A]``, their values ``[N, R]``.
+        """
+
+    def losses(self, batch: Transitions) -> Losses:
         action = self.act(batch.s, self.actor_network_params)
         self.check_actions(batch, action.shape)
         # Detached: the policy's objective must not train the critics.
-        return action, self.q(batch.s, action, self.qvalue_network_params.detach())
+        qvalues = self.q(batch.s, action, self.qvalue_network_params.detach())
+        objective, distance = self.objective(batch, action, qvalues)
+        with torch.no_grad():
+            target = self.td_target(batch, self.next_value(batch))
+        error, metrics = self.td_error(batch, self.q(batch.s, batch.a), target)
+        metrics["cloning_error"] = self.mean(distance, batch, batch.is_data)
+        terms = {"loss_actor": objective, "loss_qvalue": error}
+        return {name: self.reduce(each, batch) for name, each in terms.items()}, metrics
 
     def magnitude(self, batch: Transitions, value: Tensor) -> Tensor:
         """Return the mean magnitude of values ``[R]``, detached; 1 where it is 0."""
@@ -94,13 +108,6 @@ class TD3Loss(ActorCriticLoss):
     def next_value(self, batch: Transitions) -> Tensor:
         """Return the value of the next state in the TD target, ``[R]``."""
         return self.smoothed(batch)[1]
-
-    def critic_loss(self, batch: Transitions) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return :math:`L_Q`, reduced, and its metrics."""
-        with torch.no_grad():
-            target = self.td_target(batch, self.next_value(batch))
-        error, metrics = self.td_error(batch, self.q(batch.s, batch.a), target)
-        return self.reduce(error, batch), metrics
 
 
 class TD3BCLoss(TD3Loss):
@@ -139,14 +146,12 @@ class TD3BCLoss(TD3Loss):
         super().__init__(actor_network, qvalue_network, **options)
         self.weight_of_values = alpha
 
-    def losses(self, batch: Transitions) -> Losses:
-        action, qvalues = self.policy_values(batch)
+    def objective(
+        self, batch: Transitions, action: Tensor, qvalues: Tensor
+    ) -> tuple[Tensor, Tensor]:
         cloning = batch.of_data((action - batch.a).square().mean(-1))
         weight = self.weight_of_values / self.magnitude(batch, qvalues[0])
-        actor = self.reduce(cloning - weight * qvalues[0], batch)
-        qvalue, metrics = self.critic_loss(batch)
-        metrics["cloning_error"] = self.mean(cloning, batch, batch.is_data)
-        return {"loss_actor": actor, "loss_qvalue": qvalue}, metrics
+        return cloning - weight * qvalues[0], cloning
 
 
 class ReBRACLoss(TD3Loss):
@@ -203,15 +208,13 @@ class ReBRACLoss(TD3Loss):
             keys.append(nested("next", self.tensor_keys.action))
         return keys
 
-    def losses(self, batch: Transitions) -> Losses:
-        action, qvalues = self.policy_values(batch)
+    def objective(
+        self, batch: Transitions, action: Tensor, qvalues: Tensor
+    ) -> tuple[Tensor, Tensor]:
         lowest = qvalues.min(0).values
         distance = batch.of_data(F.action_distance(action, batch.a))
         sought = lowest / self.magnitude(batch, lowest)
-        actor = self.reduce(self.actor_bc_coef * distance - sought, batch)
-        qvalue, metrics = self.critic_loss(batch)
-        metrics["cloning_error"] = self.mean(distance, batch, batch.is_data)
-        return {"loss_actor": actor, "loss_qvalue": qvalue}, metrics
+        return self.actor_bc_coef * distance - sought, distance
 
     def next_value(self, batch: Transitions) -> Tensor:
         """Return the value of the next state less its penalty, ``[R]``."""
