@@ -33,7 +33,7 @@ def test_a_file_is_written_whole_or_stays_as_it_was(tmp_path):
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [(b"\xff{}", "is no text"), (b"[1]", "holds no object"), (b"{", "is no JSON")],
+    [(b"\xff{}", "is no JSON"), (b"[1]", "holds no object"), (b"{", "is no JSON")],
 )
 def test_other_files_are_no_json(tmp_path, content, message):
     (tmp_path / "card.json").write_bytes(content)

@@ -66,19 +66,11 @@ def finite_or_none(value: Any) -> Any:
     return value
 
 
-def read_text(path: Path) -> str:
-    """Return the text of a file; a ValueError names one that is none."""
-    try:
-        return path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path.name} is no text: {error}") from error
-
-
 def read_json(path: Path) -> dict[str, Any]:
     """Return the JSON object of a file; a ValueError names one that holds another."""
     try:
-        value = json.loads(read_text(path))
-    except json.JSONDecodeError as error:
+        value = json.loads(path.read_bytes())
+    except ValueError as error:  # of the encoding, too
         raise ValueError(f"{path.name} is no JSON: {error}") from error
     if not isinstance(value, dict):
         raise ValueError(f"{path.name} holds no object")

@@ -73,7 +73,8 @@ class FusedCritics(Critics):
             torch.get_autocast_dtype("cpu") if autocast else None,
             *(state, action, log_prob),
         )
-        return self.values(states, target, params), soft_maximum(alike, given, layers)
+        soft_maximum = SoftMaximum.apply(alike, given, *sum(layers, ()))
+        return self.values(states, target, params), soft_maximum
 
     def _eps(self) -> list[float] | None:
         """Return the ``eps`` of each normalisation, or ``None`` for other networks.
@@ -162,18 +163,14 @@ def _values(layers: Layers, eps: Sequence[float], rows: Tensor) -> Tensor:
     return hidden.reshape(-1, *batch).to(rows.dtype)
 
 
-def soft_maximum(alike: bool, given: tuple[Any, ...], layers: Layers) -> Tensor:
-    """Return :func:`~torchrl_osr.functional.soft_maximum` of the critics' values.
+class SoftMaximum(torch.autograd.Function):
+    """Compute :func:`~torchrl_osr.functional.soft_maximum` of values, ``[N, B]``.
 
     Differentiable by the critics' parameters, once. If all rows weigh ``alike`` in the
     loss, as in a mean or a sum, the forward pass computes the gradient, too. Otherwise
-    the backward pass computes the chunks once more. The result is ``[N, B]``.
+    the backward pass computes the chunks once more.
     """
-    value: Tensor = _SoftMaximum.apply(alike, given, *sum(layers, ()))
-    return value
 
-
-class _SoftMaximum(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, alike: bool, given: tuple[Any, ...], *flat: Tensor) -> Tensor:
         ctx.alike, ctx.given, ctx.flat = alike, given, flat

@@ -15,6 +15,7 @@ from torchrl.envs import ObservationNorm
 from torchrl.modules import MLP
 from torchrl.objectives import LossModule
 
+from torchrl_osr.objectives.networks import distribution
 from torchrl_osr.policy.policy import DISTRIBUTIONS, Policy
 
 PACKAGES = ("torchrl-osr", "torch", "torchrl", "tensordict")
@@ -59,8 +60,8 @@ def policy_from_loss(
     if isinstance(network, ProbabilisticTensorDictSequential):
         kind = network[-1].distribution_class.__name__
     # A policy acts by the mean of a Gaussian actor, which ends in a tanh.
-    distribution = {"IndependentNormal": "TanhDelta"}.get(kind, kind)
-    if distribution not in DISTRIBUTIONS:
+    head = {"IndependentNormal": "TanhDelta"}.get(kind, kind)
+    if head not in DISTRIBUTIONS:
         raise ValueError(
             f"the actor of a policy ends in one of {DISTRIBUTIONS}, as those of "
             f"torchrl_osr.modules; this one has {kind or 'no distribution'}."
@@ -72,7 +73,7 @@ def policy_from_loss(
         )
     actor, prefix = _mlp(network)
     inputs, size = actor.in_features, actor.out_features
-    if distribution == "TanhNormal":
+    if head == "TanhNormal":
         size //= 2
     tensors = _weights(loss.actor_network_params, prefix, "actor")
     critics = {"number": 0} | _sizes(actor)
@@ -84,7 +85,7 @@ def policy_from_loss(
             tensors |= _weights(params, prefix, f"critics.{number}")
     loc = getattr(observation_norm, "loc", 0.0)
     scale = getattr(observation_norm, "scale", 1.0)
-    bounded = 0 if distribution == "OneHotCategorical" else size
+    bounded = 0 if head == "OneHotCategorical" else size
     for name, given, length in (
         ("loc", loc, inputs),
         ("scale", scale, inputs),
@@ -96,7 +97,7 @@ def policy_from_loss(
     if not (width > 0).all() or width.isinf().any():
         raise ValueError(f"low={low!r} must be below high={high!r}, and both finite.")
     record = {
-        "distribution": distribution,
+        "distribution": head,
         "observation_size": inputs,
         "action_size": size,
         "actor": _sizes(actor),
@@ -148,10 +149,7 @@ def _check_same(policy: Policy, loss: LossModule) -> None:
     place = next(loss.parameters())
     states = TensorDict({}, [len(rows)], device=place.device)
     states.set(loss.actor_network.in_keys[0], rows.to(place))
-    with loss.actor_network_params.to_module(
-        loss.actor_network, preserve_module_state=False
-    ):
-        theirs = loss.actor_network.get_dist(states)
+    theirs = distribution(loss.actor_network, loss.actor_network_params, states)
     raw = policy.actor(rows)
     pairs = [(policy.mode(raw), theirs.deterministic_sample)]
     if policy.discrete:

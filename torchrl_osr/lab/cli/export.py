@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +32,7 @@ from torchrl_osr.lab.run.monitor import MonitorConfig, monitor_of_run
 from torchrl_osr.policy import Policy, load_policy
 from torchrl_osr.policy.policy import GRAPHS, SUFFIX
 
-Outputs = Callable[..., tuple[Tensor, ...]]
+Outputs = tuple[Tensor, ...]
 
 ROWS, TOLERANCE = 256, 1e-5
 """Random observations that a file is checked on, and its largest deviation, relative to
@@ -86,8 +85,8 @@ def check(policy: Policy, path: Path, output: str) -> float:
     if output == "value":
         inputs["action"] = policy.act(observation)
     largest = 0.0
-    wanted, found = outputs_of(policy, output), read(path, output)
-    for one, other in zip(found(**inputs), wanted(**inputs), strict=True):
+    found, wanted = read(path, output, inputs), outputs_of(policy, output, inputs)
+    for one, other in zip(found, wanted, strict=True):
         size = other.float().abs().clamp(1)
         deviation = (one.float() - other.float()).abs() / size  # alarms are bool
         largest = max(largest, deviation.max().item())
@@ -99,36 +98,23 @@ def check(policy: Policy, path: Path, output: str) -> float:
     return largest
 
 
-def outputs_of(policy: Policy, output: str) -> Outputs:
-    """Return what a graph of the policy computes, as a function of named tensors."""
-
-    def run(**inputs: Tensor) -> tuple[Tensor, ...]:
-        if output == "value":
-            return (policy.value(**inputs),)
-        more = policy.monitor(**inputs) if policy.data_monitor is not None else ()
-        return policy.act(**inputs), *more
-
-    return run
+def outputs_of(policy: Policy, output: str, inputs: dict[str, Tensor]) -> Outputs:
+    """Return what a graph of the policy computes."""
+    if output == "value":
+        return (policy.value(**inputs),)
+    more = policy.monitor(**inputs) if policy.data_monitor is not None else ()
+    return policy.act(**inputs), *more
 
 
-def read(path: Path, output: str) -> Outputs:
-    """Return what a written file computes, as a function of named tensors."""
+def read(path: Path, output: str, inputs: dict[str, Tensor]) -> Outputs:
+    """Return what a written file computes."""
     if path.suffix == SUFFIX:
-        return outputs_of(load_policy(path), output)
+        return outputs_of(load_policy(path), output, inputs)
     if path.suffix == ".pt2":
-        graph = torch.export.load(path).module()
-
-        def call(**inputs: Tensor) -> tuple[Tensor, ...]:
-            found = graph(**inputs)
-            return found if isinstance(found, tuple) else (found,)
-
-        return call
+        found = torch.export.load(path).module()(**inputs)
+        return found if isinstance(found, tuple) else (found,)
     with needed_by("a check of the ONNX file needs", "export"):
         import onnxruntime
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-
-    def run(**inputs: Tensor) -> tuple[Tensor, ...]:
-        arrays = {name: each.numpy() for name, each in inputs.items()}
-        return tuple(map(torch.from_numpy, session.run(None, arrays)))
-
-    return run
+    arrays = {name: each.numpy() for name, each in inputs.items()}
+    return tuple(map(torch.from_numpy, session.run(None, arrays)))

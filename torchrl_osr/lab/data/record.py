@@ -45,12 +45,34 @@ def record_episodes(
     rng = np.random.default_rng([seed, 1])  # not the environment's own numbers
     env.action_space.seed(int(rng.integers(2**31)))
     steps: list[dict[str, Any]] = []
+
+    def chosen(observation: NDArray[Any]) -> Any:
+        space: Any = env.action_space
+        if act is None:
+            return space.sample()
+        action = np.asarray(act(observation))
+        if isinstance(space, spaces.Discrete):
+            if rng.random() < noise:
+                return space.sample()
+            action = action[()] if action.ndim == 0 else action
+        else:
+            if action.shape == space.shape and noise:
+                half = (space.high - space.low) / 2
+                noisy = action + noise * half * rng.standard_normal(space.shape)
+                action = np.clip(noisy, space.low, space.high)
+            action = action.astype(space.dtype)
+        if not space.contains(action):
+            raise ValueError(
+                f"the policy's action {np.asarray(action).tolist()} is not in {space}."
+            )
+        return action
+
     hidden = None if progress else True  # None: no bar off a terminal
     for episode in tqdm(range(num_episodes), "collect", unit="episode", disable=hidden):
         # Copies: the environment and the policy may write into their arrays.
         observation, ended = np.array(env.reset(seed=seed + episode)[0]), False
         while not ended:
-            action = _action(env.action_space, act, observation.copy(), noise, rng)
+            action = chosen(observation.copy())
             state, reward, terminated, truncated, _ = env.step(action)
             step = {
                 "observation": observation,
@@ -75,34 +97,6 @@ def record_episodes(
         name: each.astype(np.float32) if each.dtype.kind == "f" else each
         for name, each in columns.items()
     }
-
-
-def _action(
-    space: gymnasium.Space[Any],
-    act: Act | None,
-    observation: NDArray[Any],
-    noise: float,
-    rng: np.random.Generator,
-) -> Any:
-    if act is None:
-        return space.sample()
-    action = np.asarray(act(observation))
-    if isinstance(space, spaces.Discrete):
-        if rng.random() < noise:
-            return space.sample()
-        action = action[()] if action.ndim == 0 else action
-    else:
-        assert isinstance(space, spaces.Box)
-        half = (space.high - space.low) / 2
-        if action.shape == space.shape and noise:
-            noisy = action + noise * half * rng.standard_normal(space.shape)
-            action = np.clip(noisy, space.low, space.high)
-        action = action.astype(space.dtype)
-    if not space.contains(action):
-        raise ValueError(
-            f"the policy's action {np.asarray(action).tolist()} is not in {space}."
-        )
-    return action
 
 
 def check_log_path(path: Path) -> None:

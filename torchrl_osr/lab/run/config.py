@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_osr import objectives
-from torchrl_osr._files import read_text, write_atomically
+from torchrl_osr._files import write_atomically
 from torchrl_osr.lab.run.schema import TrainConfig
 
 CONFIG = "config.yaml"
@@ -129,7 +129,7 @@ def read_columns(given: Any) -> Any:
 def read_yaml(path: Path) -> dict[str, Any]:
     """Read a YAML mapping; a ValueError names a damaged file."""
     try:
-        content = yaml.safe_load(read_text(path))
+        content = yaml.safe_load(path.read_bytes())
         if not isinstance(content, dict):
             raise ValueError("it holds no mapping")
     except (yaml.YAMLError, ValueError) as error:

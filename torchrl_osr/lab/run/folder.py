@@ -7,7 +7,7 @@ import os
 import platform
 import shlex
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, replace
 from glob import glob
 from importlib.metadata import version
@@ -174,20 +174,17 @@ def _check_same(run: TrainConfig, config: TrainConfig, folder: Path) -> None:
         )
 
 
-@contextmanager
-def _lock(folder: Path) -> Iterator[None]:
+def _lock(folder: Path) -> AbstractContextManager[Any]:
     """Keep other processes out of a folder; the lock goes with the process."""
     folder.mkdir(parents=True, exist_ok=True)
     try:
         # A reader of the status has the lock for an instant.
-        held = FileLock(folder / LOCK).acquire(timeout=1)
+        return FileLock(folder / LOCK).acquire(timeout=1)
     except Timeout as error:
         raise ValueError(
             f"another process is training in {folder}: wait for its end or stop it, "
             "or choose another folder."
         ) from error
-    with held:
-        yield
 
 
 @contextmanager
