@@ -23,6 +23,8 @@ from torchrl.modules import MLP, ValueOperator
 
 from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Critics
 
+HOOKS = "_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks"
+
 CHUNK_ROWS = 1024
 """Actions that go through the critics at a time: their activations fit the cache."""
 
@@ -89,7 +91,11 @@ class FusedCritics(Critics):
             or len(network.in_keys) != 2
             or network.in_keys[-1] != keys.action
             or keys.state_action_value not in network.out_keys
-            or any(_has_hook(each) for each in (network, module, *module))
+            or any(
+                vars(each)[kind]
+                for each in (network, module, *module)
+                for kind in HOOKS
+            )
         ):
             return None
         norms = [each for each in module if type(each) is nn.LayerNorm]
@@ -127,15 +133,6 @@ def fuse_critics(loss: nn.Module) -> None:
     for each in loss.modules():
         if isinstance(each, ActorCriticLoss):
             each.critics = FusedCritics(each)
-
-
-def _has_hook(module: nn.Module) -> bool:
-    return bool(
-        module._forward_hooks
-        or module._forward_pre_hooks
-        or module._backward_hooks
-        or module._backward_pre_hooks
-    )
 
 
 def _values(layers: Layers, eps: Sequence[float], rows: Tensor) -> Tensor:

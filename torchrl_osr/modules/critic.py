@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from typing import Any
 
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
-from torch import nn
 from torchrl.modules import ValueOperator
 
 from torchrl_osr.modules.actor import mlp
@@ -17,11 +16,9 @@ def critic_ensemble(
     action_dim: int,
     *,
     num_qvalue_nets: int = 2,
-    num_cells: Sequence[int] = (256, 256),
-    activation_class: type[nn.Module] = nn.ReLU,
-    layer_norm: bool = False,
     observation_key: NestedKey = "observation",
     action_key: NestedKey = "action",
+    **layers: Any,
 ) -> list[ValueOperator]:
     """Return Q networks of one observation and the action.
 
@@ -42,10 +39,9 @@ def critic_ensemble(
         >>> critic(TensorDict(batch, [4]))["state_action_value"].shape
         torch.Size([4, 1])
     """
-    sizes = observation_dim + action_dim, 1
     return [
         ValueOperator(
-            mlp(*sizes, num_cells, activation_class, layer_norm=layer_norm),
+            mlp(observation_dim + action_dim, 1, **layers),
             in_keys=[observation_key, action_key],
             # ValueOperator knows an action by the name "action" alone.
             out_keys=["state_action_value"],
@@ -59,39 +55,28 @@ def discrete_critic_ensemble(
     num_actions: int,
     *,
     num_qvalue_nets: int = 2,
-    num_cells: Sequence[int] = (256, 256),
-    activation_class: type[nn.Module] = nn.ReLU,
     observation_key: NestedKey = "observation",
-    layer_norm: bool = False,
+    **layers: Any,
 ) -> list[TensorDictModule]:
     """Return Q networks that value all ``n`` discrete actions of a state at once.
 
     As :func:`critic_ensemble`; each writes ``"action_value"``, ``[B, n]``.
     """
-    sizes = observation_dim, num_actions
-    return [
-        TensorDictModule(
-            mlp(*sizes, num_cells, activation_class, layer_norm=layer_norm),
-            [observation_key],
-            ["action_value"],
-        )
-        for _ in range(num_qvalue_nets)
-    ]
+    networks = (
+        mlp(observation_dim, num_actions, **layers) for _ in range(num_qvalue_nets)
+    )
+    return [TensorDictModule(n, [observation_key], ["action_value"]) for n in networks]
 
 
 def state_value(
     observation_dim: int,
     *,
-    num_cells: Sequence[int] = (256, 256),
-    activation_class: type[nn.Module] = nn.ReLU,
-    layer_norm: bool = False,
     observation_key: NestedKey = "observation",
+    **layers: Any,
 ) -> ValueOperator:
     """Return a value network of one observation, without an action.
 
     Arguments as of :func:`critic_ensemble`; it writes ``"state_value"``, ``[B, 1]``.
     """
-    network = mlp(
-        observation_dim, 1, num_cells, activation_class, layer_norm=layer_norm
-    )
+    network = mlp(observation_dim, 1, **layers)
     return ValueOperator(network, in_keys=[observation_key])

@@ -131,7 +131,10 @@ class DiscreteOSRLoss(ActorCriticLoss):
         policy = self.policy(batch)
         states = "both" if self.has_recovery else "clean"
         pi = policy[states]
-        qvalue, q_data = self.data_values(batch, pi)
+        qvalue = self.action_values(batch.s, self.qvalue_network_params, pi)
+        index = action_index(batch.a, pi, qvalue.shape[1], self.tensor_keys.action)
+        index = index.expand(qvalue.shape[:-1]).unsqueeze(-1)
+        q_data = qvalue.gather(-1, index).squeeze(-1)
         # Detached: the policy's objective must not train the critics.
         params = self.qvalue_network_params.detach()
         sought = self.action_values(batch.states[SETS[states]], params, pi)
@@ -167,14 +170,6 @@ class DiscreteOSRLoss(ActorCriticLoss):
         qvalue = self.critic_output(rows, params, self.tensor_keys.action_value)
         check_num_actions("qvalue_network", qvalue.shape[-1], pi.logits.shape[-1])
         return qvalue.reshape(-1, *states.batch_size, qvalue.shape[-1])
-
-    def data_values(self, batch: Transitions, pi: Any) -> tuple[Tensor, Tensor]:
-        """Return values at ``s`` of all actions, ``[N, R, n]``, and the data's."""
-        rows = batch.rows.batch_size[0]
-        index = action_index(batch.a, pi, rows, self.tensor_keys.action)
-        qvalue = self.action_values(batch.s, self.qvalue_network_params, pi)
-        index = index.expand(qvalue.shape[:-1]).unsqueeze(-1)
-        return qvalue, qvalue.gather(-1, index).squeeze(-1)
 
     @torch.no_grad()
     def soft_target(self, batch: Transitions, policy: StatePolicy) -> Tensor:

@@ -121,10 +121,8 @@ class DataMonitor(nn.Module):
                 all.
 
         Keyword Args:
-            false_alarms: largest share of episodes with a false alarm. Default 0.05.
-
-        Raises:
-            ValueError: there are too few episodes for this rate.
+            false_alarms: largest share of episodes with a false alarm. Default 0.05. A
+                ValueError says how many episodes it needs.
         """
         score = torch.cat([self(rows)[0] for rows in torch.split(observation, 4096)])
         if counts is not None:
@@ -157,9 +155,6 @@ def fit_monitor(
         false_alarms: see :meth:`DataMonitor.calibrate`. Default 0.05.
         num_states: ``K``, at most. Default 1000.
         seed: of the halves and of the subset. Default 0.
-
-    Raises:
-        ValueError: there are too few episodes for this rate, or no row counts.
 
     Examples:
         >>> rows = torch.randn(1000, 3, generator=torch.Generator().manual_seed(0))

@@ -97,11 +97,14 @@ def evaluate_sweep(config: EvaluateConfig) -> None:
         multiprocessing.get_context("spawn"),
         functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL),
     )
-    jobs = {workers.submit(evaluate_one_of_many, config, run): run for run in runs}
+    jobs = {}
+    for run in runs:
+        one = replace(config, checkpoint=str(run), progress=False)
+        jobs[workers.submit(evaluate_run, one)] = run
     try:
         for number, job in enumerate(as_completed(jobs), start=1):
             try:
-                outcome = job.result()
+                outcome = str(job.result()[0])
             except Exception as error:
                 failed.append(str(jobs[job]))
                 outcome = f"failed: {sentence(error)}"
@@ -113,12 +116,6 @@ def evaluate_sweep(config: EvaluateConfig) -> None:
             f"{len(failed)} of {len(runs)} runs failed: {', '.join(failed)}."
         )
     print(f"  next   torchrl-osr report {config.sweep}")
-
-
-def evaluate_one_of_many(config: EvaluateConfig, folder: Path) -> str:
-    """Evaluate one run of a sweep; return the place of its results."""
-    one = replace(config, checkpoint=str(folder), progress=False)
-    return str(evaluate_run(one)[0])
 
 
 def recoverable_table(results: Mapping[str, Any]) -> str:

@@ -102,12 +102,10 @@ def collect_transitions(
 
     Each policy plays episode after episode until its share is full; the last row of
     a share is then marked truncated. Rows are ordered by policy and time. The stored
-    actions are the executed ones, clipped to ±0.999.
+    actions are the executed ones, clipped to ±0.999. The task is one of
+    :func:`~torchrl_osr.lab.data.make_environment`.
 
-    The task is one of :func:`~torchrl_osr.lab.data.make_environment`.
-
-    Returns:
-        The transitions ``[N]``; returns and lengths ``[E]`` of complete episodes.
+    Also return returns and lengths ``[E]`` of complete episodes.
     """
     size = flatdim(env.observation_space)
     columns: dict[str, NDArray[Any]] = {

@@ -23,11 +23,9 @@ MIN_OBSERVATION_SCALE = 1e-3
 
 
 def observation_statistics(data: TensorDictBase) -> tuple[Tensor, Tensor]:
-    """Return mean and standard deviation of each observation entry, by float64 sums.
+    """Return mean and standard deviation of each observation entry, ``[S]``.
 
-    Returns:
-        ``loc`` ``[S]`` and ``scale`` ``[S]``. The scale is at least 0.001; a logged
-        warning names entries that vary less.
+    The deviation is at least 0.001; a logged warning names entries that vary less.
     """
     observation = data.get("observation")
     variance, loc = torch.var_mean(observation.double(), dim=0, correction=0)

@@ -59,11 +59,7 @@ def evaluate_paired(
 
     Episodes of a pair have the same seed and start state, and the policy is called
     with batches of one size. Until the disturbance acts they are equal, bit for bit.
-    Warns if the environment ignores its seed.
-
-    Args:
-        policy: to be evaluated, on the CPU.
-        distance: to the training data.
+    Warns if the environment ignores its seed. The policy is called on the CPU.
 
     Keyword Args:
         num_episodes, seed: see :class:`~torchrl_osr.lab.evaluation.EpisodeEvaluator`.

@@ -7,7 +7,6 @@ episode, ``R`` resamples, ``N`` seeds, ``M`` states, ``W`` walks.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias
 
@@ -68,15 +67,6 @@ def mean_interval(values: ArrayLike) -> tuple[float, float, float]:
     rng, size = np.random.default_rng(0), sample.size
     rows = rng.integers(size, size=(NUM_RESAMPLES, size))
     return interval(sample.mean(), sample[rows].mean(1))[:3]
-
-
-def wilson_interval(count: int, total: int) -> tuple[float, float]:
-    """Return Wilson's 95 % interval of a share, which is also right near 0 and 1."""
-    square = NORMAL_QUANTILE_975**2
-    centre = (count + square / 2) / (total + square)
-    spread = math.sqrt(count * (total - count) / total + square / 4)
-    half = NORMAL_QUANTILE_975 * spread / (total + square)
-    return centre - half, min(centre + half, 1.0)
 
 
 def nested_resamples(runs: Sequence[ArrayLike], *, seed: int = 0) -> Array:
@@ -183,8 +173,9 @@ def saved_share(
     if baseline is not None:
         theirs = np.asarray(baseline, np.float64) @ member
     elif not ours.any() or (ours == sizes).all():
-        share = float(ours.any())
-        return (share, *wilson_interval(round(share * len(sizes)), len(sizes)))
+        share, square = float(ours.any()), NORMAL_QUANTILE_975**2
+        width = square / (len(sizes) + square)
+        return share, share * (1 - width), max(share, width)
     rng = np.random.default_rng(0)
     # How often each seed and walk is drawn: once, then in each resample.
     by_seed, by_walk = (

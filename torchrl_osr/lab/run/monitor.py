@@ -33,14 +33,7 @@ def monitor_of_run(
     data_path: str | None = None,
     trust: Sequence[str] = (),
 ) -> DataMonitor:
-    """Fit a monitor to a run's data; print what it is made of.
-
-    Args:
-        path: the run's folder, or a checkpoint in it.
-        options: of the monitor.
-        data_path: of a log that has moved since the run.
-        trust: modules of your own that the run's configuration may name.
-    """
+    """Fit a monitor to a run's data, now at ``data_path``; print what it is made of."""
     config = read_run(run_folder_of(path), trust)
     log = replace(config.data, path=data_path or config.data.path)
     env = replace(config.env, id=None)  # its bounds are known: no simulator is made

@@ -306,7 +306,10 @@ def register() -> None:
         "run_dir": _run_dir,
         "method_name": method_name,
         "by_data": by_data,
-        "rolled_out": _rolled_out,
+        # The value of an option that recorded data do not have.
+        "rolled_out": lambda value, *, _root_: (
+            None if _root_.data.source in RECORDED else value
+        ),
         # A part of a folder's name; file systems allow 255 bytes.
         "short": lambda text: re.sub(r"[^\w.-]+", "-", text)[:200],
     }
@@ -327,11 +330,6 @@ def by_data(key: str, *, _root_: DictConfig) -> Any:
     if group != "loss":
         raise ValueError(f"settings have no value of {key} for {env}-{source}.")
     return getattr(schema_of(get_class(_root_.loss._target_))(), option)
-
-
-def _rolled_out(value: Any, *, _root_: DictConfig) -> Any:
-    """The value of an option that recorded data do not have."""
-    return None if _root_.data.source in RECORDED else value
 
 
 def _run_dir(resume: str | None, fresh: str) -> str:
