@@ -189,7 +189,6 @@ class _State:
         self._traits = self._traits_now()
 
     def holds(self) -> bool:
-        """Return whether nothing has changed."""
         try:
             return self._traits == self._traits_now() and all(
                 now == before for now, before in self._attributes

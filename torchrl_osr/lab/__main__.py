@@ -81,7 +81,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _versions() -> str:
-    """Return the versions of Python and of the packages that decide numbers."""
     found = [f"python {sys.version.split()[0]}"]
     for package in ("torch", "torchrl", "tensordict", "gymnasium", "mujoco"):
         with suppress(PackageNotFoundError):

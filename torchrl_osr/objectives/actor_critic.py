@@ -348,13 +348,12 @@ class ActorCriticLoss(LossModule):
     def input_keys(self) -> list[NestedKey]:
         """Return the entries that actor, critics and model read, in order."""
         keys, states = self.tensor_keys, self.observation_keys
-        found = [*states, keys.action, *(nested("next", key) for key in states)]
-        flags = keys.reward, keys.done, keys.terminated
-        found += [nested("next", key) for key in flags]
+        following = [*states, keys.reward, keys.done, keys.terminated]
         model: list[NestedKey] = []
         if "inverse_dynamics_network" in self.__dict__:
             model = list(self.inverse_dynamics_network.in_keys)
-        found += model
+        following = [nested("next", key) for key in following]
+        found = [*states, keys.action, *following, *model]
         if self.reads_perturbed:
             below = [*states, *state_keys(model)]
             found += [nested(keys.perturbed, key) for key in below]

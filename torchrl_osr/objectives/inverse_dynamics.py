@@ -8,13 +8,12 @@ from __future__ import annotations
 from typing import Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey
 from tensordict.nn import (
     InteractionType,
     ProbabilisticTensorDictSequential,
     set_interaction_type,
 )
-from torch import Tensor
 
 from torchrl_osr import functional as F
 from torchrl_osr._checks import check_weight
@@ -112,7 +111,13 @@ class InverseDynamicsLoss(ActorCriticLoss):
         with set_interaction_type(InteractionType.RANDOM):
             params = self.inverse_dynamics_network_params
             output = distribution_params(network, params, inputs)
-        value = self.error(batch, output)
+        model = network.build_dist_from_params(output)
+        if not is_categorical(network):
+            self.check_actions(batch, model.loc.shape[1:])
+        if self.action_error == "mse":
+            value = (model.rsample() - batch.a).square().mean(-1)
+        else:
+            value = cloning_distance(model, batch.a, self.tensor_keys.action)
         if self.has_latent:
             loc, scale = (entry(output, key) for key in LATENT_KEYS)
             prior = torch.zeros_like(loc), torch.ones_like(scale)
@@ -120,13 +125,3 @@ class InverseDynamicsLoss(ActorCriticLoss):
             value = value + self.latent_weight * kl
         loss = self.reduce(value.mean(0), batch, ~batch.done)
         return {"loss_inverse_dynamics": loss}, {}
-
-    def error(self, batch: Transitions, output: TensorDictBase) -> Tensor:
-        """Return the negative log-likelihood or squared error, ``[D, R]``."""
-        model = self.inverse_dynamics_network.build_dist_from_params(output)
-        if not is_categorical(self.inverse_dynamics_network):
-            self.check_actions(batch, model.loc.shape[1:])
-        if self.action_error == "mse":
-            sample: Tensor = model.rsample()
-            return (sample - batch.a).square().mean(-1)
-        return cloning_distance(model, batch.a, self.tensor_keys.action)

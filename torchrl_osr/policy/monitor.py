@@ -93,7 +93,6 @@ class DataMonitor(nn.Module):
             self.register_buffer(name, torch.zeros(shape))
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
-        """Return scores and alarms."""
         rows = (observation.to(self.loc.dtype) - self.loc) / self.scale
         score = distance_to(rows.clamp(-LIMIT, LIMIT), self.states)
         score = torch.where(score.isnan(), math.inf, score)

@@ -69,7 +69,6 @@ class SamplerState:
         self.sampler: Any = getattr(buffer, "sampler", None)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return tensors and numbers."""
         state: dict[str, Any] = {"generator": self.generator.get_state()}
         if isinstance(self.sampler, PrioritizedSampler):
             rows = torch.arange(len(self.buffer))
@@ -80,7 +79,6 @@ class SamplerState:
         return state
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from a saved state."""
         self.generator.set_state(state_dict["generator"].cpu())
         if "priorities" in state_dict:
             priorities = state_dict["priorities"]

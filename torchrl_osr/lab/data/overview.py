@@ -86,7 +86,6 @@ def findings(
             f"all {fell} episodes are terminated after {lengths[0]} steps, like at a "
             "time limit (data.columns.truncated=... data.columns.terminated=false)."
         )
-    yield from _about_jumps(data)
     yield from _about_order(data)
 
 
@@ -95,7 +94,8 @@ def actions_at_bounds(data: TensorDict) -> Any:
     return (data["action"].abs() >= ACTION_LIMIT - 1e-6).double().mean(0)
 
 
-def _about_jumps(data: TensorDict) -> Iterator[str]:
+def _about_order(data: TensorDict) -> Iterator[str]:
+    """Yield findings about states and rows that follow one another."""
     before, after = data["observation"], data["next", "observation"]
     change = (after - before).abs()
     usual = change[:: len(change) // MOST_ROWS + 1].quantile(0.9, dim=0)
@@ -105,10 +105,6 @@ def _about_jumps(data: TensorDict) -> Iterator[str]:
             f"in {len(jumps):,} rows, such as {jumps[0]}, the state jumps by more than "
             f"{JUMP} times its usual change: flags may be missing, or a row late."
         )
-
-
-def _about_order(data: TensorDict) -> Iterator[str]:
-    """Yield findings about rows that follow one another."""
     followed = is_followed(data)
     inside = ~data["next", "done"][:-1, 0]
     share = 1 - followed[:-1][inside].double().mean().item() if inside.any() else 0

@@ -197,7 +197,6 @@ def _recorded(
     log: Mapping[str, Any],
     progress: bool,
 ) -> Dataset:
-    """Read recorded data."""
     bounds = log["action_bounds"]
     if source not in ("file", "lerobot"):
         _refuse({"columns": log["columns"]}, f"data={source}")

@@ -71,27 +71,24 @@ def load_or_write(
         except (OSError, ValueError) as flaw:
             if folder.exists():
                 torchrl_logger.warning(f"Making {folder} anew: {flaw}")
+        names = {path.name for path in folder.iterdir()} if folder.exists() else set()
+        if not names <= {MANIFEST, ROWS}:
+            raise FileExistsError(f"{folder} is not replaced: it holds other files.")
         data, about = make()
-        _write(folder, data, {**wanted, **about})
-        return load()
-
-
-def _write(folder: Path, data: TensorDict, manifest: Mapping[str, Any]) -> None:
-    """Write a data set, or replace it; an interrupted call leaves none."""
-    check_dataset(data)
-    if folder.exists() and not {p.name for p in folder.iterdir()} <= {MANIFEST, ROWS}:
-        raise FileExistsError(f"{folder} is not replaced: it holds other files.")
-    partial = folder.with_name(f".{folder.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    try:
-        data.select(*DATASET_KEYS).memmap(partial / ROWS)
-        about = dict(manifest) | {"format": FORMAT, "num_transitions": len(data)}
-        about["rows_sha256"] = _checksum(partial / ROWS)
-        write_json(partial / MANIFEST, about)
-        shutil.rmtree(folder, ignore_errors=True)
-        os.replace(partial, folder)
-    finally:
+        check_dataset(data)
+        partial = folder.with_name(f".{folder.name}.partial")
         shutil.rmtree(partial, ignore_errors=True)
+        try:
+            data.select(*DATASET_KEYS).memmap(partial / ROWS)
+            manifest = {**wanted, **about, "format": FORMAT}
+            manifest["num_transitions"] = len(data)
+            manifest["rows_sha256"] = _checksum(partial / ROWS)
+            write_json(partial / MANIFEST, manifest)
+            shutil.rmtree(folder, ignore_errors=True)
+            os.replace(partial, folder)
+        finally:  # an interrupted call leaves nothing
+            shutil.rmtree(partial, ignore_errors=True)
+        return load()
 
 
 def _checksum(folder: Path) -> str:

@@ -98,11 +98,9 @@ class ModelAdversary:
         return self.loss.q(batch, action).amin(0)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what a continued run needs."""
         model, optimizer = self.model.state_dict(), self.optimizer.state_dict()
         return {"model": model, "optimizer": optimizer}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from a state."""
         self.model.load_state_dict(state_dict["model"])
         self.optimizer.load_state_dict(state_dict["optimizer"])

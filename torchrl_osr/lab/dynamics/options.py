@@ -84,11 +84,8 @@ class DynamicsOptions:
 
     def check(self, env_id: str | None, *, batch_size: int, gamma: float) -> None:
         """Raise a ValueError if the options contradict each other or the task."""
-        for name, known in (
-            ("terminations", ("auto", "never")),
-            ("unknown", ("refuse", "halt", "take")),
-        ):
-            check_choice(f"dynamics.{name}", getattr(self, name), known)
+        check_choice("dynamics.terminations", self.terminations, ("auto", "never"))
+        check_choice("dynamics.unknown", self.unknown, ("refuse", "halt", "take"))
         rolled_out, real = self.real_ratio != 1, round(self.real_ratio * batch_size)
         if rolled_out:
             self.termination(env_id)

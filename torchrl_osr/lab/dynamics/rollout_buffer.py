@@ -146,7 +146,6 @@ class RolloutReplayBuffer:
         return rows
 
     def _keep(self, rollouts: list[TensorDict]) -> None:
-        """Sample from these rows."""
         self.synthetic = torch.cat(rollouts)
         # Slices: the rows are in memory once.
         self._rollouts = list(self.synthetic.split([len(each) for each in rollouts]))

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from torchrl_osr._files import finite_or_none
 from torchrl_osr.lab.data import ReferenceReturns
 from torchrl_osr.lab.envs import NotPossible
 from torchrl_osr.lab.evaluation.episodes import EpisodeEvaluator, Policy, Wrap
@@ -158,23 +159,20 @@ def summarize_disturbances(
         row = {key: levels[0][key] for key in ("name", "kind", "strength")}
         mean, low, high = mean_interval(values)
         row |= {measure: mean, f"{measure}_low": low, f"{measure}_high": high}
-        row[f"clean_{measure}"] = float(clean.mean())
-        names = ("decrease", "decrease_low", "decrease_high")
-        row |= dict.fromkeys(names)
-        if hit.any():  # an unmet one has no loss
-            row |= zip(names, decrease_interval(clean, values), strict=True)
-        row["disturbed_share"] = float(hit.mean())
-        row["survival"] = _mean(entries["alive_after"].dropna())
-        row["clean_survival"] = _mean(entries["clean_alive_after"].dropna())
-        row["recovered_share"] = row["recovery_median"] = None
-        if levels[0]["recovery_steps"] is not None and hit.any():
-            steps = entries["recovery_steps"][hit].fillna(np.inf)
-            row["recovered_share"] = _mean(np.isfinite(steps))
-            median = float(steps.median())
-            row["recovery_median"] = median if np.isfinite(median) else None
-        rows.append(row)
+        # An unmet one has no loss, and one that does not end no way back.
+        lost = decrease_interval(clean, values) if hit.any() else (None, None, None)
+        ends = levels[0]["recovery_steps"] is not None
+        steps = entries["recovery_steps"][hit & ends].fillna(np.inf)
+        row |= {
+            f"clean_{measure}": clean.mean(),
+            **dict(
+                zip(("decrease", "decrease_low", "decrease_high"), lost, strict=True)
+            ),
+            "disturbed_share": hit.mean(),
+            "survival": entries["alive_after"].mean(),
+            "clean_survival": entries["clean_alive_after"].mean(),
+            "recovered_share": np.isfinite(steps).mean(),
+            "recovery_median": steps.median(),
+        }
+        rows.append({key: finite_or_none(value) for key, value in row.items()})
     return rows
-
-
-def _mean(values: Any) -> float | None:
-    return float(values.mean()) if len(values) else None

@@ -178,6 +178,4 @@ def text(cell: Any) -> str:
 def frame_of(rows: Mapping[Any, Mapping[str, Any]], *names: str) -> pd.DataFrame:
     """Return a table with a row for each key, whose parts have names."""
     frame = pd.DataFrame(list(rows.values()), dtype=object)
-    if not rows or len(names) == 1:
-        return frame.set_axis(pd.Index(list(rows), name=names[0]))
     return frame.set_index(pd.MultiIndex.from_tuples(rows, names=names))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Callable
 from contextlib import closing
 from typing import Any, NamedTuple
 
@@ -66,24 +67,22 @@ def make_learner(config: TrainConfig, device: torch.device | str = "cpu") -> Lea
         layer_norm=layer_norm,
     )
     model = instantiate(config.inverse_dynamics.network, *sizes, num_cells=cells)
-    networks = {
-        "actor_network": actor,
-        "qvalue_network": critics,
-        "inverse_dynamics_network": model.to(device),
+    model.to(device)
+    vae_cells = config.dynamics.vae_num_cells
+    networks: dict[str, Callable[[], Any]] = {
+        "actor_network": lambda: actor,
+        "qvalue_network": lambda: critics,
+        "inverse_dynamics_network": lambda: model,
+        "dynamics_network": lambda: config.dynamics.ensemble(*sizes),
+        "transition_network": lambda: TransitionVAE(sizes[0], num_cells=vae_cells),
+        "value_network": lambda: state_value(
+            sizes[0], num_cells=cells, layer_norm=layer_norm
+        ),
     }
 
     def built(part: dict[str, Any]) -> LossModule:
         wanted = inspect.signature(get_class(part["_target_"])).parameters
-        if "dynamics_network" in wanted:
-            networks["dynamics_network"] = config.dynamics.ensemble(*sizes).to(device)
-        if "transition_network" in wanted:
-            vae_cells = config.dynamics.vae_num_cells
-            vae = TransitionVAE(sizes[0], num_cells=vae_cells)
-            networks["transition_network"] = vae.to(device)
-        if "value_network" in wanted:
-            value = state_value(sizes[0], num_cells=cells, layer_norm=layer_norm)
-            networks["value_network"] = value.to(device)
-        given = {name: each for name, each in networks.items() if name in wanted}
+        given = {name: make() for name, make in networks.items() if name in wanted}
         loss: LossModule = instantiate(part, _partial_=True)(**given).to(device)
         return loss
 

@@ -198,13 +198,11 @@ def _requested(
 ) -> dict[str, Any]:
     """Return all that decides the results: settings, checkpoints' digests, versions."""
     names = [each.absolute().relative_to(folder.absolute()) for each in files]
+    digests = map(sha256_of, files)
     request: dict[str, Any] = {
         "versions": package_versions(),
         "suite": config.suite.name,
-        "checkpoints": {
-            name.as_posix(): sha256_of(file)
-            for name, file in zip(names, files, strict=True)
-        },
+        "checkpoints": dict(zip(map(Path.as_posix, names), digests, strict=True)),
     }
     if config.suite.half is None:  # each recoverable state is played once
         levels = asdict(config.suite)["disturbances"]

@@ -170,13 +170,11 @@ def load_switching_policy(
 
     models = None
     if not critics_only:
-        files = [run_folder_of(run) / FILE for run in runs]
-        parts = [
-            EliteNetworks(
-                load_dynamics(file), each.loc, each.scale, each.low, each.high
-            )
-            for file, each in zip(files, policies, strict=True)
-        ]
+        parts = []
+        for run, each in zip(runs, policies, strict=True):
+            model = load_dynamics(run_folder_of(run) / FILE)
+            units = each.loc, each.scale, each.low, each.high
+            parts.append(EliteNetworks(model, *units))
         models = EliteNetworks.join(parts)
     config = configs[0]
     return SwitchingPolicy(
