@@ -135,7 +135,7 @@ def test_second_derivatives_and_broken_promises_are_refused():
     ]
     rows = torch.randn(6, 3), torch.randn(2, 6, 2), torch.randn(2, 6)
     given = [2, 2], [], 1.0, None, *rows
-    value = critics.SoftMaximum.apply(True, given, *sum(layers, ()))
+    value = critics._SoftMaximum.apply(True, given, *sum(layers, ()))
     with pytest.raises(RuntimeError, match="no second derivatives"):
         torch.autograd.grad(value.sum(), layers[0][0], create_graph=True)
     with pytest.raises(RuntimeError, match="do not weigh alike"):

@@ -75,7 +75,7 @@ class FusedCritics(Critics):
             torch.get_autocast_dtype("cpu") if autocast else None,
             *(state, action, log_prob),
         )
-        soft_maximum = SoftMaximum.apply(alike, given, *sum(layers, ()))
+        soft_maximum = _SoftMaximum.apply(alike, given, *sum(layers, ()))
         return self.values(states, target, params), soft_maximum
 
     def _eps(self) -> list[float] | None:
@@ -160,7 +160,7 @@ def _values(layers: Layers, eps: Sequence[float], rows: Tensor) -> Tensor:
     return hidden.reshape(-1, *batch).to(rows.dtype)
 
 
-class SoftMaximum(torch.autograd.Function):
+class _SoftMaximum(torch.autograd.Function):
     """Compute :func:`~torchrl_osr.functional.soft_maximum` of values, ``[N, B]``.
 
     Differentiable by the critics' parameters, once. If all rows weigh ``alike`` in the

@@ -40,7 +40,7 @@ def test_keys_that_were_added_are_refused(key):
         ("trainer.steps", 0, "trainer.steps must be at least 1, got 0"),
         ("data.held_out", float("nan"), "data.held_out must be between 0 and 1"),
         ("optim.tau", 5.0, "optim.tau must be between 0 and 1, got 5"),
-        ("logger.kind", "tape", "logger.kind must be one of csv, .*, got tape"),
+        ("logger.kind", "tape", "logger.kind must be one of .*'csv', .*, got 'tape'"),
         ("format", 1, r"another version of torchrl-osr \(format 1, this one reads 2"),
     ],
 )

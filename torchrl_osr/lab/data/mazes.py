@@ -55,31 +55,23 @@ ACTION_NOISE = 0.5
 HEADING = "ant", "heading", BEHAVIOR_POLICIES_DIR / "mazes"
 
 
-def maze_sources(env_name: str) -> list[str]:
-    """Return the sources of a maze."""
-    if env_name.endswith("umaze"):
-        return ["diverse"] + ["umaze"] * env_name.startswith("ant")
-    return ["diverse", "play"]
-
-
-def cells_of(env_name: str, source: str) -> list[tuple[Cell, Cell]] | None:
-    """Return the pairs of start and goal; ``None``: any two cells."""
-    size = env_name.split("-")[1]
-    return {"play": PLAY_CELLS.get(size), "umaze": [TEST_CELLS[size]]}.get(source)
+def maze_sources(env_name: str) -> dict[str, list[tuple[Cell, Cell]] | None]:
+    """Return pairs of start and goal by source; ``None``: any two cells."""
+    body, size = env_name.split("-")
+    if size != "umaze":
+        return {"diverse": None, "play": PLAY_CELLS[size]}
+    return {"diverse": None} | (
+        {"umaze": [TEST_CELLS[size]]} if body == "antmaze" else {}
+    )
 
 
 def maze_behavior(env_name: str, source: str) -> dict[str, Any]:
     """Return the manifest's entries that determine the rows."""
-    cells = {"cells": cells_of(env_name, source)}
+    cells = {"cells": maze_sources(env_name)[source]}
     if env_name.startswith("ant"):
         return {"heading_sha256": sha256_of(behavior_policy_path(*HEADING))} | cells
     force = {"stiffness": STIFFNESS, "damping": DAMPING, "action_noise": ACTION_NOISE}
     return force | cells
-
-
-def maze_sampler(env_name: str, maze: Any) -> ActionSampler:
-    """Return the behaviour of a maze's name."""
-    return (ant_sampler if env_name.startswith("ant") else point_sampler)(maze)
 
 
 def planner(maze: Any) -> Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]]:

@@ -25,10 +25,10 @@ from torchrl_osr.lab.data.environment import MAZE_IDS, environment_id, make_envi
 from torchrl_osr.lab.data.mazes import (
     ActionSampler,
     StartsAndGoals,
-    cells_of,
+    ant_sampler,
     maze_behavior,
-    maze_sampler,
     maze_sources,
+    point_sampler,
 )
 from torchrl_osr.lab.data.transitions import ACTION_LIMIT, as_transitions
 
@@ -46,7 +46,7 @@ Collection = tuple[TensorDict, NDArray[np.float64], NDArray[np.int64]]
 
 def behavior_of(env_name: str, source: str) -> dict[str, Any]:
     """Return the manifest's entries that determine the rows, with the seed."""
-    known = maze_sources(env_name) if env_name in MAZE_IDS else [*BEHAVIORS]
+    known = maze_sources(env_name) if env_name in MAZE_IDS else BEHAVIORS
     if source not in known:
         raise ValueError(
             f"unknown data={source} of {env_name}; there are: {', '.join(known)}."
@@ -80,8 +80,9 @@ def collect_source(
 
         samplers: list[ActionSampler] = [uniform]
         if env_name in MAZE_IDS:
-            samplers = [maze_sampler(env_name, env.get_wrapper_attr("maze"))]
-            if cells := cells_of(env_name, source):
+            lead = ant_sampler if env_name.startswith("ant") else point_sampler
+            samplers = [lead(env.get_wrapper_attr("maze"))]
+            if cells := maze_sources(env_name)[source]:
                 env = StartsAndGoals(env, cells)
         elif names := BEHAVIORS[source]:
             samplers = [load_behavior_policy(env_name, name).sample for name in names]

@@ -17,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_osr import objectives
+from torchrl_osr._checks import check_choice, check_positive
 from torchrl_osr._files import write_atomically
 from torchrl_osr.lab.run.schema import TrainConfig
 
@@ -67,26 +68,16 @@ def checked(config: DictConfig, trust: Sequence[str] = ()) -> TrainConfig:
     if missing := sorted(OmegaConf.missing_keys(typed)):
         raise ValueError(f"the configuration lacks {', '.join(missing)}.")
     made = cast(TrainConfig, OmegaConf.to_object(typed))
+    # Others would train nonsense, or fail hours later.
     for key, value in flatten(asdict(made)).items():
-        _check_value(key, value)
+        positive = key.startswith(("trainer.", "dynamics.")) and key not in MAY_BE_0
+        if key in CHOICES:
+            check_choice(key, value, CHOICES[key])
+        elif key in SHARES and not 0 <= value <= 1:
+            raise ValueError(f"{key} must be between 0 and 1, got {value}.")
+        elif positive and type(value) is int:
+            check_positive(key, value, minimum=1)
     return made
-
-
-def _check_value(key: str, value: Any) -> None:
-    """Raise a ValueError for a value that would train nonsense, or fail hours later."""
-    wanted = ""
-    positive = key.startswith(("trainer.", "dynamics.")) and key not in MAY_BE_0
-    if key in CHOICES and value not in CHOICES[key]:
-        wanted = f"one of {', '.join(CHOICES[key])}"
-    elif key in SHARES and not 0 <= value <= 1:
-        wanted = "between 0 and 1"
-    elif positive and type(value) is int and value < 1:
-        wanted = "at least 1"
-    if wanted:
-        raise ValueError(f"{key} must be {wanted}, got {value}.")
-
-
-# -- files ---------------------------------------------------------------------------
 
 
 def read_run(folder: Path, trust: Sequence[str] = ()) -> TrainConfig:
@@ -137,9 +128,6 @@ def read_yaml(path: Path) -> dict[str, Any]:
             f"{path} is damaged: {' '.join(str(error).split())}"
         ) from error
     return content
-
-
-# -- what a configuration may name ---------------------------------------------------
 
 
 def check_targets(config: Mapping[str, Any], trust: Sequence[str] = ()) -> None:

@@ -223,9 +223,6 @@ class Phases:
         return trainer
 
 
-# -- parts, also of examples/offline_osr.py ----------------------------------------
-
-
 def prepare_machine(run: Run) -> tuple[torch.device, torch.dtype | None]:
     """Log what is trained where, and set torch's threads; device and autocast type."""
     config, options = run.config, run.config.trainer
