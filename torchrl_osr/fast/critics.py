@@ -123,9 +123,8 @@ class FusedCritics(Critics):
                     layers[-1] += pair
         return layers
 
-    def _state(self, states: TensorDictBase) -> Tensor:
-        state: Tensor = states.get(self.loss.qvalue_network.in_keys[0])
-        return state
+    def _state(self, states: TensorDictBase) -> Any:
+        return states.get(self.loss.qvalue_network.in_keys[0])
 
 
 def fuse_critics(loss: nn.Module) -> None:

@@ -45,7 +45,7 @@ from torchrl_osr.objectives.networks import (
     distribution_params,
     full_precision,
     squashing_bounds,
-    written_action,
+    written_entry,
 )
 from torchrl_osr.objectives.transitions import (
     SETS,
@@ -410,7 +410,7 @@ class ActorCriticLoss(LossModule):
     def act(self, states: TensorDictBase, params: TensorDictParams) -> Tensor:
         """Return the actions that a deterministic policy writes, ``[..., R, A]``."""
         key = self.tensor_keys.action
-        return written_action(self.actor_network, params, states, key)
+        return written_entry(self.actor_network, params, states, key)
 
     def inverse_dynamics(self, batch: Transitions, states: States) -> Any:
         """Return the frozen model ``I(a | s~, s')``, ``[D, R]``, without gradient.

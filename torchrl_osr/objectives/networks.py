@@ -166,19 +166,19 @@ def distribution(
     return network.build_dist_from_params(found)
 
 
-def written_action(
+def written_entry(
     network: TensorDictModuleBase,
     params: TensorDictParams,
     states: TensorDictBase,
     key: NestedKey,
 ) -> Tensor:
-    """Return the actions that a deterministic network writes, ``[..., R, A]``."""
+    """Return what a deterministic network writes, ``[..., R, A]``."""
     with params.to_module(network, preserve_module_state=False):
         output = full_precision(network(states.copy().reshape(-1)))
-    action: Tensor | None = output.get(key, None)
-    if action is None:
-        raise KeyError(f"The actor writes no {key!r}: call set_keys(action=...).")
-    return action.reshape(*states.batch_size, *action.shape[1:])
+    value: Tensor | None = output.get(key, None)
+    if value is None:
+        raise KeyError(f"The network writes no {key!r}: call set_keys().")
+    return value.reshape(*states.batch_size, *value.shape[1:])
 
 
 def full_precision(output: TensorDictBase) -> TensorDictBase:

@@ -30,7 +30,7 @@ from torchrl_osr.objectives.networks import (
     head_of,
     is_deterministic,
     squashing_bounds,
-    written_action,
+    written_entry,
 )
 from torchrl_osr.objectives.transitions import States, Transitions
 
@@ -262,7 +262,7 @@ def policy_at(
 ) -> Any:
     """Return an actor's distribution at states ``[D, R]``, or the action it writes."""
     if head_of(network)[0] is None:
-        return written_action(network, params, states, key)
+        return written_entry(network, params, states, key)
     return distribution(network, params, states)
 
 

@@ -15,7 +15,7 @@ from torchrl.envs import ObservationNorm
 from torchrl.modules import MLP
 from torchrl.objectives import LossModule
 
-from torchrl_osr.objectives.networks import distribution
+from torchrl_osr.objectives.networks import distribution, written_entry
 from torchrl_osr.policy.policy import DISTRIBUTIONS, Policy
 
 PACKAGES = ("torchrl-osr", "torch", "torchrl", "tensordict")
@@ -157,10 +157,8 @@ def _check_same(policy: Policy, loss: LossModule) -> None:
     states.set(loss.tensor_keys.action, theirs.deterministic_sample)
     given = (rows,) if policy.discrete else (rows, policy.mode(raw))
     for number, critic in enumerate(policy.critics):
-        with loss.qvalue_network_params[number].to_module(
-            loss.qvalue_network, preserve_module_state=False
-        ):
-            value = loss.qvalue_network(states)[loss.qvalue_network.out_keys[-1]]
+        network, params = loss.qvalue_network, loss.qvalue_network_params[number]
+        value = written_entry(network, params, states, network.out_keys[-1])
         pairs.append((critic(*given), value))
     for ours, wanted in pairs:
         if not torch.allclose(ours, wanted.cpu().float(), rtol=1e-4, atol=1e-5):

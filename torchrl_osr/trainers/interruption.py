@@ -31,15 +31,11 @@ class Interrupted(SystemExit):
     """
 
     def __init__(self, reason: str, code: int) -> None:
-        super().__init__(code)
-        self.reason = reason
+        super().__init__(reason, code)  # both: a worker process sends it to its parent
+        self.reason, self.code = reason, code
 
     def __str__(self) -> str:
         return self.reason
-
-    def __reduce__(self) -> tuple[type[Interrupted], tuple[str, int]]:
-        # A worker process sends it to its parent.
-        return type(self), (self.reason, int(self.code or 0))
 
 
 @contextmanager

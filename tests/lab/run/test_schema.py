@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 
 from torchrl_osr.lab.data.behavior import load_behavior_card
 from torchrl_osr.lab.data.environment import MAZE_IDS
-from torchrl_osr.lab.data.mazes import MAZE_SOURCES
+from torchrl_osr.lab.data.mazes import maze_sources
 from torchrl_osr.lab.data.rollout import BEHAVIORS
 from torchrl_osr.lab.data.sources import RECORDED
 from torchrl_osr.lab.run.config import checked
@@ -46,7 +46,8 @@ def test_every_experiment_sweeps_over_values_that_compose(name):
 
 
 def test_groups_name_what_the_package_has():
-    assert options("data") == sorted([*BEHAVIORS, *MAZE_SOURCES, *RECORDED])
+    mazes = {source for name in MAZE_IDS for source in maze_sources(name)}
+    assert options("data") == sorted([*BEHAVIORS, *mazes, *RECORDED])
     assert options("env") == sorted([*load_behavior_card(), *MAZE_IDS, "none"])
     ids = MAZE_IDS | {name: card["env"] for name, card in load_behavior_card().items()}
     for name, env_id in ids.items():

@@ -5,8 +5,7 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from collections.abc import Iterator
-from contextlib import closing, contextmanager, redirect_stderr
+from contextlib import closing, redirect_stderr
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeGuard
@@ -170,10 +169,17 @@ def _registered(env_id: str) -> gymnasium.Env[Any, Any]:
         # Without it an episode never ends at the goal, and the return is no success.
         maze = spec is not None and "maze_map" in spec.kwargs
         options = {"continuing_task": False} if maze else {}
-        with _silent_model_loading(), warnings.catch_warnings():
-            old_ant = r".*AntMaze_\w+-v4 is out of date"  # on purpose, see MAZE_IDS
-            warnings.filterwarnings("ignore", old_ant, DeprecationWarning)
-            return gymnasium.make(env_id, **options)
+        # Without a handler MuJoCo appends its notes on deprecated model attributes to
+        # MUJOCO_LOG.TXT in the working folder. Warnings while stepping are left alone.
+        handler = mujoco.get_mju_user_warning()
+        mujoco.set_mju_user_warning(lambda message: None)
+        try:
+            with warnings.catch_warnings():
+                old_ant = r".*AntMaze_\w+-v4 is out of date"  # on purpose, see MAZE_IDS
+                warnings.filterwarnings("ignore", old_ant, DeprecationWarning)
+                return gymnasium.make(env_id, **options)
+        finally:
+            mujoco.set_mju_user_warning(handler)
 
     try:
         try:
@@ -213,15 +219,3 @@ def _register_ant_tests() -> None:
             max_episode_steps=spec.max_episode_steps,
             kwargs=spec.kwargs | {"maze_map": maze},
         )
-
-
-@contextmanager
-def _silent_model_loading() -> Iterator[None]:
-    # Without a handler MuJoCo appends its notes on deprecated model attributes to
-    # MUJOCO_LOG.TXT in the working folder. Warnings while stepping are left alone.
-    previous = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda message: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(previous)

@@ -27,10 +27,6 @@ from torchrl_osr.lab.data.environment import TEST_CELLS, Cell
 ActionSampler = Callable[[NDArray[Any], np.random.Generator], NDArray[np.float32]]
 """Draws an action ``[A]`` for an observation ``[S]``."""
 
-# Start and goal are two different free cells, as the environment itself draws them, a
-# pair of PLAY_CELLS, or the pair of D4RL's test. They are moved within their cells.
-MAZE_SOURCES = ("diverse", "play", "umaze")
-
 # Row and column of start and goal, picked by hand: long ways, from and to all corners.
 PLAY_CELLS: dict[str, list[tuple[Cell, Cell]]] = {
     "medium": [
@@ -56,7 +52,10 @@ HEADING = "ant", "heading", BEHAVIOR_POLICIES_DIR / "mazes"
 
 
 def maze_sources(env_name: str) -> dict[str, list[tuple[Cell, Cell]] | None]:
-    """Return pairs of start and goal by source; ``None``: any two cells."""
+    """Return pairs of start and goal by source; ``None``: any two free cells.
+
+    Both are moved within their cells.
+    """
     body, size = env_name.split("-")
     if size != "umaze":
         return {"diverse": None, "play": PLAY_CELLS[size]}

@@ -66,10 +66,9 @@ def findings(
         if entry["min"] == entry["max"] and not meant:
             yield f"{name} is {entry['min']:g} in every row: {CONSTANT[part]}"
     if manifest.get("num_actions") is None:
-        names, sizes = entries.loc["action"].index, data["action"].abs().amax(0)
-        for name, share, size in zip(
-            names, actions_at_bounds(data), sizes, strict=True
-        ):
+        shares, sizes = actions_at_bounds(data), data["action"].abs().amax(0)
+        names = entries.loc["action"].index
+        for name, share, size in zip(names, shares, sizes, strict=True):
             if share > MOST:
                 yield (
                     f"{name} is at one of its bounds in {share:.0%} of the rows: they "

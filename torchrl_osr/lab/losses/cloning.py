@@ -23,8 +23,8 @@ from torchrl_osr._entries import state_keys
 from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses
 from torchrl_osr.objectives.networks import (
     distribution,
-    full_precision,
     squashing_bounds,
+    written_entry,
 )
 from torchrl_osr.objectives.state_recovery import cloning_distance, policy_at
 from torchrl_osr.objectives.transitions import Transitions
@@ -149,7 +149,6 @@ class IQLLoss(ActorCriticLoss):
     def state_value(self, states: TensorDictBase) -> Tensor:
         """Return :math:`V`, ``[R]``."""
         network, params = self.value_network, self.value_network_params
-        with params.to_module(network, preserve_module_state=False):
-            output = full_precision(network(states.copy()))
-        value: Tensor = output.get(self.tensor_keys.value)
-        return value.squeeze(-1)
+        return written_entry(network, params, states, self.tensor_keys.value).squeeze(
+            -1
+        )

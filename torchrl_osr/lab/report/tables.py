@@ -77,9 +77,7 @@ def robustness_table(tables: RunTables, suite: str) -> pd.DataFrame:
     for (data, method), group in episodes.groupby(["data", "method"], sort=False):
         names = list(group["disturbance"].unique())
         runs = [
-            run.pivot_table(values="score", index="episode", columns="disturbance")[
-                names
-            ]
+            run.pivot_table("score", "episode", "disturbance")[names]
             for _, run in group.groupby("run", sort=False)
         ]
         scores = scores_and_decreases(runs)
