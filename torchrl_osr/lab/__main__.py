@@ -58,7 +58,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         lines = [f"  {command:18}{does}" for command, does in COMMANDS.items()]
         print(HELP.format(commands="\n".join(lines)), end="")
     elif name == "--version":
-        print(_versions())
+        found = [f"torchrl-osr {version('torchrl-osr')}"]
+        found.append(f"python {sys.version.split()[0]}")
+        for package in ("torch", "torchrl", "tensordict", "gymnasium", "mujoco"):
+            with suppress(PackageNotFoundError):
+                found.append(f"{package} {version(package)}")
+        print(", ".join(found))
     elif name in CONFIGS and {"-h", "--help"} & {*rest}:
         from yaml import safe_load  # quick, unlike Hydra and torch
 
@@ -78,14 +83,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         known = ", ".join(COMMANDS)
         similar = guess(name, COMMANDS)
         sys.exit(f"torchrl-osr has no command {name!r}{similar}; it has {known}.")
-
-
-def _versions() -> str:
-    found = [f"python {sys.version.split()[0]}"]
-    for package in ("torch", "torchrl", "tensordict", "gymnasium", "mujoco"):
-        with suppress(PackageNotFoundError):
-            found.append(f"{package} {version(package)}")
-    return ", ".join([f"torchrl-osr {version('torchrl-osr')}", *found])
 
 
 if __name__ == "__main__":

@@ -104,8 +104,8 @@ class StateRecoveryLoss(ActorCriticLoss):
     ) -> None:
         super().__init__(**options)
         self.recovery_target, self.recovery_states = recovery_target, recovery_states
-        self.recovery_direction: Literal["forward", "reverse"] = recovery_direction
-        self.action_reduction: Literal["sum", "mean"] = action_reduction
+        self.recovery_direction = recovery_direction
+        self.action_reduction = action_reduction
         self.is_normal = head_of(actor_network)[0] is IndependentNormal
         self.is_deterministic = is_deterministic(actor_network)
         if self.is_deterministic or self.is_normal:
@@ -168,18 +168,11 @@ class StateRecoveryLoss(ActorCriticLoss):
             loc = pi.base_dist.param if self.is_deterministic else pi.loc
         sizes = model.loc.shape[-1], loc.shape[-1]
         check_num_actions("inverse_dynamics_network", *sizes)
+        options: dict[str, Any] = {"action_reduction": self.action_reduction}
         if self.is_deterministic or self.is_normal:
-            return F.deterministic_recovery(
-                loc, model.loc, model.scale, action_reduction=self.action_reduction
-            )
-        return F.state_recovery(
-            loc,
-            pi.scale,
-            model.loc,
-            model.scale,
-            direction=self.recovery_direction,
-            action_reduction=self.action_reduction,
-        )
+            return F.deterministic_recovery(loc, model.loc, model.scale, **options)
+        options["direction"] = self.recovery_direction
+        return F.state_recovery(loc, pi.scale, model.loc, model.scale, **options)
 
     def pre_tanh(self, action: Tensor) -> Tensor:
         """Return an action before the tanh, ``[D, R, A]``."""

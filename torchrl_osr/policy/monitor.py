@@ -179,10 +179,6 @@ def fit_monitor(
     monitor.loc.copy_(loc)
     monitor.scale.copy_(variance.sqrt().clamp_min(SMALLEST_SCALE))
     monitor.states.copy_((data[chosen] - monitor.loc) / monitor.scale)
-    monitor.calibrate(
-        observation[held_out],
-        episode[held_out],
-        counts[held_out],
-        false_alarms=false_alarms,
-    )
+    rest = (each[held_out] for each in (observation, episode, counts))
+    monitor.calibrate(*rest, false_alarms=false_alarms)
     return monitor

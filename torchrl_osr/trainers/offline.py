@@ -306,12 +306,11 @@ class OfflineTrainer(Trainer):
             self.checkpoints.write(
                 self.checkpoints.best_path, components=self._model, metadata=metadata
             )
-        self._log_numbers(
-            {
-                name: value for name, value in results.items()
-                if isinstance(value, (int, float)) and name != "step"
-            }
-        )  # fmt: skip
+        numbers = {
+            name: value for name, value in results.items()
+            if isinstance(value, (int, float)) and name != "step"
+        }  # fmt: skip
+        self._log_numbers(numbers)
         if step and step == self._saved["step"]:
             self.checkpoints.save(step)  # once more, with the result
 

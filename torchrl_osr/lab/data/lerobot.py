@@ -55,8 +55,7 @@ def read_lerobot(path: Any, columns: Mapping[str, Any], options: Reading) -> Dat
     about["entry_names"] = {name: _entry_names(each) for name, each in features.items()}
     cameras = [n for n, each in features.items() if each["dtype"] in ("video", "image")]
     if cameras:
-        text = f"images and videos are left out: {', '.join(cameras)}."
-        about["warnings"] = [text]
+        about["warnings"] = [f"images and videos are left out: {', '.join(cameras)}."]
     files = log_files(escape(str(folder)) + "/data/chunk-*/file-*.parquet")
 
     def parts() -> Iterator[Columns]:

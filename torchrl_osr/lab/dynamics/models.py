@@ -14,10 +14,10 @@ import torch
 from tensordict import NestedKey, TensorDictBase, TensorDictParams
 from torch import Tensor, nn
 from torch.nn.functional import softplus
-from torchrl.modules import MLP
 
 from torchrl_osr._entries import column, entry, nested
 from torchrl_osr.functional import gaussian_kl
+from torchrl_osr.modules.actor import mlp
 from torchrl_osr.modules.inverse_dynamics import LATENT_LOG_SCALE_BOUNDS
 from torchrl_osr.objectives import ActorCriticLoss
 from torchrl_osr.objectives.actor_critic import Losses
@@ -283,10 +283,9 @@ class TransitionVAE(nn.Module):
         super().__init__()
         self.observation_key = observation_key
         self.latent_dim = 2 * observation_dim
-        options = {"num_cells": list(num_cells), "activation_class": nn.ReLU}
-        self.encoder = MLP(2 * observation_dim, 2 * self.latent_dim, **options)
+        self.encoder = mlp(2 * observation_dim, 2 * self.latent_dim, num_cells)
         inputs = observation_dim + self.latent_dim
-        self.decoder = MLP(inputs, observation_dim, **options)
+        self.decoder = mlp(inputs, observation_dim, num_cells)
         self.register_buffer("target_loc", torch.zeros(observation_dim))
         self.register_buffer("target_scale", torch.ones(observation_dim))
 

@@ -97,7 +97,16 @@ class ActionKnock(TimedDisturbance):
         number = self.count()
         self.due = self.mode == "official" and number == -1
         self.acted = self.mode != "official" and 0 <= number < self.steps
-        return self.random_action() if self.acted else action
+        if not self.acted:
+            return action
+        actions = self.actions
+        if isinstance(actions, gymnasium.spaces.Discrete):
+            return np.asarray(actions.start + self.generator.integers(actions.n))
+        if self.mode == "paper":
+            action = SMALL * self.generator.standard_normal(actions.shape)
+            return action.astype(actions.dtype)
+        upper = self.generator.random(actions.shape) < 0.5
+        return np.where(upper, actions.high, actions.low)
 
     def step(self, action: Vector) -> Step:
         observation, reward, terminated, truncated, info = super().step(action)
@@ -111,17 +120,6 @@ class ActionKnock(TimedDisturbance):
                 observation = np.asarray(gymnasium.spaces.flatten(space, observation))
             flag(info, True)
         return observation, reward, terminated, truncated, info
-
-    def random_action(self) -> Vector:
-        """Draw an action that replaces the agent's."""
-        actions = self.actions
-        if isinstance(actions, gymnasium.spaces.Discrete):
-            return np.asarray(actions.start + self.generator.integers(actions.n))
-        if self.mode == "paper":
-            action = SMALL * self.generator.standard_normal(actions.shape)
-            return action.astype(actions.dtype)
-        upper = self.generator.random(actions.shape) < 0.5
-        return np.where(upper, actions.high, actions.low)
 
 
 class ExternalPush(TimedDisturbance):

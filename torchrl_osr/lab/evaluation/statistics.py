@@ -34,12 +34,13 @@ class Estimate(NamedTuple):
     over: str = "seeds"
 
     def __str__(self) -> str:
-        return f"{decimal(self.mean)} {self.interval()}"
+        return format(self)
 
-    def interval(self, sign: str = "") -> str:
-        """Format the interval, with a mark if it is not over seeds."""
+    def __format__(self, sign: str) -> str:
+        """Format mean and interval, with a mark if it is not over seeds."""
+        mean, low, high = (decimal(each, sign) for each in self[:3])
         mark = {"seeds": "", "two seeds": " ²"}.get(self.over, " ᵉ")
-        return f"[{decimal(self.low, sign)}, {decimal(self.high, sign)}]{mark}"
+        return f"{mean} [{low}, {high}]{mark}"
 
 
 def decimal(value: float, sign: str = "") -> str:

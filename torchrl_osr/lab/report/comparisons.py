@@ -11,12 +11,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from torchrl_osr.lab.evaluation.statistics import (
-    Array,
-    Estimate,
-    decimal,
-    mean_difference,
-)
+from torchrl_osr.lab.evaluation.statistics import Array, Estimate, mean_difference
 from torchrl_osr.lab.report.runs import RunTables
 from torchrl_osr.lab.report.tables import frame_of, recent
 
@@ -166,7 +161,7 @@ def verdict(differences: Sequence[Difference], reference: str) -> list[str]:
             sentences.append(
                 f"{each.method} is {each.verdict} than {reference} in "
                 f"{each.quantity.name} on {each.data}: "
-                f"{decimal(each.estimate.mean, '+')} {each.estimate.interval('+')}, "
+                f"{each.estimate:+}, "
                 f"{each.seeds} pairs of runs a data set."
             )
         else:
@@ -184,8 +179,7 @@ def difference_table(differences: Sequence[Difference]) -> pd.DataFrame:
     for each in differences:
         text = "not compared"
         if each.estimate is not None:
-            text = MARKS.get(each.verdict, "") + decimal(each.estimate.mean, "+")
-            text += f" {each.estimate.interval('+')}"
+            text = f"{MARKS.get(each.verdict, '')}{each.estimate:+}"
         key = each.data, each.method
         rows.setdefault(key, {})[each.quantity.name] = text
         notes.setdefault(key, []).append(each.note)

@@ -15,7 +15,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torchrl.objectives import LossModule
 
 from torchrl_osr import OSRVLoss
-from torchrl_osr.lab.data import EnvironmentSpec, environment_spec, make_environment
+from torchrl_osr.lab.data import environment_spec, make_environment
 from torchrl_osr.lab.data.record import record_episodes
 from torchrl_osr.lab.dynamics import TransitionVAE
 from torchrl_osr.lab.losses import IQLLoss
@@ -23,9 +23,6 @@ from torchrl_osr.lab.run.schema import EnvConfig, TrainConfig
 from torchrl_osr.modules import state_value
 from torchrl_osr.objectives import ActorCriticLoss, WithRecovery
 from torchrl_osr.objectives.networks import is_categorical
-
-SIZES = ("action_low", "action_high", "observation_size", "action_size")
-"""Settings that are read from the environment or the log."""
 
 
 class Learner(NamedTuple):
@@ -51,7 +48,7 @@ def make_learner(config: TrainConfig, device: torch.device | str = "cpu") -> Lea
     assert env.observation_size is not None
     assert env.action_size is not None
     sizes = env.observation_size, env.action_size
-    layer_norm = config.network.layer_norm
+    layers = {"num_cells": cells, "layer_norm": config.network.layer_norm}
     actor = instantiate(config.network.actor, *sizes, num_cells=cells).to(device)
     kind, other = ("discrete", "discrete_osr") if env.discrete else ("real", "osr")
     if is_categorical(actor) != env.discrete:
@@ -59,12 +56,9 @@ def make_learner(config: TrainConfig, device: torch.device | str = "cpu") -> Lea
             f"{env.id or env.name} has {kind} actions, and {config.loss['_target_']} "
             f"is for others: choose loss={other}, for example."
         )
+    number = config.loss.get("num_qvalue_nets", 2)
     critics = instantiate(
-        config.network.critic,
-        *sizes,
-        num_qvalue_nets=config.loss.get("num_qvalue_nets", 2),
-        num_cells=cells,
-        layer_norm=layer_norm,
+        config.network.critic, *sizes, num_qvalue_nets=number, **layers
     )
     model = instantiate(config.inverse_dynamics.network, *sizes, num_cells=cells)
     model.to(device)
@@ -75,9 +69,7 @@ def make_learner(config: TrainConfig, device: torch.device | str = "cpu") -> Lea
         "inverse_dynamics_network": lambda: model,
         "dynamics_network": lambda: config.dynamics.ensemble(*sizes),
         "transition_network": lambda: TransitionVAE(sizes[0], num_cells=vae_cells),
-        "value_network": lambda: state_value(
-            sizes[0], num_cells=cells, layer_norm=layer_norm
-        ),
+        "value_network": lambda: state_value(sizes[0], **layers),
     }
 
     def built(part: dict[str, Any]) -> LossModule:
@@ -128,7 +120,7 @@ def _check_combination(config: TrainConfig, learner: Learner) -> None:
         dynamics.check(config.env.id, batch_size=batch_size, gamma=gamma)
 
 
-def read_environment(env: EnvConfig) -> EnvironmentSpec:
+def read_environment(env: EnvConfig) -> None:
     """Set sizes and action bounds of a configuration from its environment.
 
     A ValueError names those that have changed since the training.
@@ -138,16 +130,14 @@ def read_environment(env: EnvConfig) -> EnvironmentSpec:
             f"{env.name} has no simulator (env=none): nothing can be played there. "
             "torchrl-osr evaluate-offline estimates the policy's value."
         )
-    spec = environment_spec(env.id)
-    for name in SIZES:
-        given, found = getattr(env, name), getattr(spec, name)
+    for name, found in environment_spec(env.id)._asdict().items():
+        given = getattr(env, name)
         if given is not None and given != found:
             raise ValueError(
                 f"the run has env.{name}={given}, but {env.id} has {found}: use the "
                 "environment that it was trained for."
             )
         setattr(env, name, found)
-    return spec
 
 
 def try_out(env_id: str) -> None:

@@ -137,14 +137,26 @@ def check_targets(config: Mapping[str, Any], trust: Sequence[str] = ()) -> None:
     """
     allowed = {f"torchrl_osr.{name}" for name in objectives.__all__}
     for name in (*TARGET_PACKAGES, *trust):
-        allowed |= _public_names(name)
+        try:
+            module = import_module(name)
+        except ImportError as error:
+            raise ValueError(
+                f"trust=[{name}] cannot be imported ({error}): give the name of a "
+                "module that is installed or in the current folder."
+            ) from error
+        names = getattr(module, "__all__", None) or [
+            name
+            for name, value in vars(module).items()
+            if name[0] != "_" and getattr(value, "__module__", None) == module.__name__
+        ]
+        allowed |= {f"{module.__name__}.{name}" for name in names}
     for target in _targets(config):
         if target not in allowed:
-            module = str(target).rpartition(".")[0]
+            owner = str(target).rpartition(".")[0]
             raise ValueError(
                 f"the configuration names _target_={target}, which is no public name "
                 f"of {', '.join([*TARGET_PACKAGES, *trust])}: allow it with "
-                f"trust=[{module}] if you know that module."
+                f"trust=[{owner}] if you know that module."
             )
 
 
@@ -156,23 +168,6 @@ def check_environment(env_id: str | None, trust: Sequence[str] = ()) -> None:
             f"env.id={env_id} imports a module: allow it with trust=[{module}] if you "
             "know it."
         )
-
-
-def _public_names(name: str) -> set[str]:
-    """Return the full names that a module defines, without its imports."""
-    try:
-        module = import_module(name)
-    except ImportError as error:
-        raise ValueError(
-            f"trust=[{name}] cannot be imported ({error}): give the name of a module "
-            "that is installed or in the current folder."
-        ) from error
-    names = getattr(module, "__all__", None) or [
-        name
-        for name, value in vars(module).items()
-        if name[0] != "_" and getattr(value, "__module__", None) == module.__name__
-    ]
-    return {f"{module.__name__}.{name}" for name in names}
 
 
 def _targets(value: Any) -> Iterator[Any]:

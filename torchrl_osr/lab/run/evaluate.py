@@ -132,17 +132,15 @@ def play_suite(config: EvaluateConfig, players: list[Player]) -> dict[str, Any]:
     shown = progress_bar(config.suite.name, plays, unit="play", bar=config.progress)
     evaluations = []
     with shown as bar:
+        options: dict[str, Any] = {
+            "num_episodes": config.episodes,
+            "references": references_of(run.env),
+            "advance": bar.update,
+        }
         for number, (trained, policy) in enumerate(players):
             seed = config.seed + SEED_STRIDE * number
             paired = evaluate_paired(
-                policy,
-                str(run.env.id),
-                suite,
-                distance,
-                num_episodes=config.episodes,
-                seed=seed,
-                references=references_of(run.env),
-                advance=bar.update,
+                policy, str(run.env.id), suite, distance, seed=seed, **options
             )
             evaluations.append({"step": trained.step} | paired)
     return {

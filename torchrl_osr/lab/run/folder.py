@@ -21,7 +21,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import Container, DictConfig, ListConfig, OmegaConf
 
 from torchrl_osr._files import read_json, write_atomically, write_json
-from torchrl_osr.lab.run.build import SIZES, read_environment
+from torchrl_osr.lab.data import EnvironmentSpec
+from torchrl_osr.lab.run.build import read_environment
 from torchrl_osr.lab.run.config import (
     CONFIG,
     check_environment,
@@ -96,7 +97,7 @@ def open_run(
         else:
             known = (run := read_run(folder, trust)).data
             if config.env.id is None and not config.force:
-                for name in SIZES:
+                for name in EnvironmentSpec._fields:
                     setattr(config.env, name, getattr(run.env, name))
             config.data.checksum = None if config.force else known.checksum
             _check_same(run, config, folder)

@@ -177,11 +177,5 @@ def load_switching_policy(
             parts.append(EliteNetworks(model, *units))
         models = EliteNetworks.join(parts)
     config = configs[0]
-    return SwitchingPolicy(
-        policies,
-        models,
-        value,
-        terminated=config.dynamics.termination(config.env.id),
-        gamma=config.optim.gamma,
-        **options,
-    )
+    options["terminated"] = config.dynamics.termination(config.env.id)
+    return SwitchingPolicy(policies, models, value, gamma=config.optim.gamma, **options)
