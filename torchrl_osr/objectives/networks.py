@@ -20,7 +20,6 @@ from torch import Tensor, nn
 from torch.distributions import Categorical
 from torch.distributions import OneHotCategorical as TorchOneHotCategorical
 from torchrl.modules import (
-    Delta,
     MaskedOneHotCategorical,
     OneHotCategorical,
     TanhDelta,
@@ -48,11 +47,6 @@ def is_categorical(network: TensorDictModuleBase) -> bool:
     """Return whether a network chooses among finitely many actions."""
     head, _ = head_of(network)
     return isinstance(head, type) and issubclass(head, CATEGORICAL)
-
-
-def is_deterministic(network: TensorDictModuleBase) -> bool:
-    """Return whether an actor has no density: a delta, or an action it writes."""
-    return head_of(network)[0] in (None, Delta, TanhDelta)
 
 
 def squashing_bounds(network: TensorDictModuleBase) -> tuple[Tensor, ...]:

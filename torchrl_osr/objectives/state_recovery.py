@@ -28,7 +28,6 @@ from torchrl_osr.objectives.networks import (
     check_same_bounds,
     distribution,
     head_of,
-    is_deterministic,
     squashing_bounds,
     written_entry,
 )
@@ -106,8 +105,9 @@ class StateRecoveryLoss(ActorCriticLoss):
         self.recovery_target, self.recovery_states = recovery_target, recovery_states
         self.recovery_direction = recovery_direction
         self.action_reduction = action_reduction
-        self.is_normal = head_of(actor_network)[0] is IndependentNormal
-        self.is_deterministic = is_deterministic(actor_network)
+        head, _ = head_of(actor_network)
+        self.is_normal = head is IndependentNormal
+        self.is_deterministic = head in (None, Delta, TanhDelta)  # without a density
         if self.is_deterministic or self.is_normal:
             own = squashing_bounds(actor_network)
         else:

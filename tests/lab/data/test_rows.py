@@ -13,6 +13,7 @@ from torchrl_osr.lab.data.rows import (
     check_order,
     mix_datasets,
     multi_step,
+    next_action,
     split_held_out,
     take_multi_step,
 )
@@ -79,13 +80,13 @@ def test_rows_in_no_order_are_refused_by_number() -> None:
 @given(LENGTHS, st.integers(1, 8))
 def test_it_is_what_the_steps_add_up_to(lengths, n_steps) -> None:
     data = episodes(lengths)
-    scaled = {"reward_scale": 2.0, "reward_shift": -1.0, "with_next_action": True}
-    found = multi_step(data, n_steps=n_steps, gamma=0.9, **scaled)
+    data["next", "action"] = next_action(data)
+    found = multi_step(data, n_steps=n_steps, gamma=0.9)
     ends = torch.tensor(lengths).cumsum(0).tolist()
     for row in range(len(data)):
         end = min(each for each in ends if each > row)
         steps = range(row, min(row + n_steps, end))
-        rewards = [2.0 * data["next", "reward"][step].item() - 1.0 for step in steps]
+        rewards = [data["next", "reward"][step].item() for step in steps]
         total = sum(0.9**k * reward for k, reward in enumerate(rewards))
         last = data[steps[-1]]
         assert found["reward"][row].item() == pytest.approx(total, abs=1e-5)

@@ -54,11 +54,11 @@ def is_followed(data: TensorDictBase) -> Tensor:
     return followed
 
 
-def next_action(data: TensorDictBase, rows: Tensor | None = None) -> Tensor:
-    """Return the action ``[B, A]`` of the following row, 0 at an episode's end."""
-    rows = torch.arange(len(data)) if rows is None else rows
-    following: Tensor = data["action"][(rows + 1).clamp(max=len(data) - 1)]
-    return following.masked_fill(data["next", "done"][rows], 0.0)
+def next_action(data: TensorDictBase) -> Tensor:
+    """Return the action ``[N, A]`` of the following row, 0 at an episode's end."""
+    following = torch.arange(1, len(data) + 1).clamp(max=len(data) - 1)
+    action: Tensor = data["action"][following]
+    return action.masked_fill(data["next", "done"], 0.0)
 
 
 def check_order(data: TensorDictBase) -> None:
@@ -79,27 +79,17 @@ def episode_of(data: TensorDictBase) -> Tensor:
     return done.cumsum(0) - done.long()
 
 
-def multi_step(
-    data: TensorDictBase,
-    *,
-    n_steps: int,
-    gamma: float,
-    reward_scale: float = 1.0,
-    reward_shift: float = 0.0,
-    with_next_action: bool = False,
-) -> TensorDict:
+def multi_step(data: TensorDictBase, *, n_steps: int, gamma: float) -> TensorDict:
     r"""Return the entries of ``"next"`` after at most ``n_steps`` steps of the data.
 
-    The reward is :math:`\sum_{k<m} \gamma^k (a\,r_k + b)`, with ``reward_scale`` a and
-    ``reward_shift`` b. State and flags are those after the last of the m steps. The
-    number m, ``"steps"`` ``[B, 1]``, is less than ``n_steps`` where an episode ends or
-    the next row is not next in time. ``with_next_action`` adds the data's ``"action"``
-    at the state after the steps, see :func:`next_action`.
+    The reward is :math:`\sum_{k<m} \gamma^k r_k`. State, flags and action, if there is
+    one, are those after the last of the m steps. The number m, ``"steps"`` ``[B, 1]``,
+    is less than ``n_steps`` where an episode ends or the next row is not next in time.
 
     TorchRL 0.14.1's ``MultiStep`` keeps the flags of the first step: it bootstraps
     returns that have reached a terminal state.
     """
-    single = reward_scale * data["next", "reward"] + reward_shift
+    single = data["next", "reward"]
     followed, last = is_followed(data), torch.arange(len(data))
     steps, reward = torch.ones_like(last), single.clone()
     for step in range(1, n_steps):
@@ -107,9 +97,7 @@ def multi_step(
         last = last + goes_on
         reward += goes_on.unsqueeze(-1) * gamma**step * single[last]
         steps += goes_on
-    found: TensorDict = data["next"].exclude("action")[last].set("reward", reward)
-    if with_next_action:
-        found["action"] = next_action(data, last)
+    found: TensorDict = data["next"][last].set("reward", reward)
     return found.set("steps", steps.unsqueeze(-1))
 
 

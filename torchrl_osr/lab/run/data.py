@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from tensordict import NestedKey, TensorDict
 from torchrl.data import ReplayBuffer
-from torchrl.envs import Compose, ObservationNorm, RewardScaling
+from torchrl.envs import ObservationNorm
 
 from torchrl_osr.lab.data import (
     ReferenceReturns,
@@ -119,40 +119,28 @@ def load_training_data(
             f"dynamics.terminations=never, and {ends:,} rows are terminated: leave it "
             "out, or read a time limit as data.columns.truncated."
         )
-    if with_next_action := ("next", "action") in in_keys:
-        check_order(data)
     loc, scale = observation_statistics(data) if options.standardize else (0.0, 1.0)
-    factor, addend = options.reward_scale, options.reward_shift
-    extremes = torch.stack(data["next", "reward"].aminmax())
-    largest = (factor * extremes + addend).abs().max().item()
+    reward = options.reward_scale * data["next", "reward"] + options.reward_shift
 
-    def norm(*keys: NestedKey) -> ObservationNorm:  # one belongs to one Compose
+    def norm(*keys: NestedKey) -> ObservationNorm:
         return ObservationNorm(loc, scale, in_keys=list(keys), standard_normal=True)
 
     states = "observation", ("next", "observation")
-    prepare = Compose(norm(*states))
-    if (factor, addend) != (1.0, 0.0):
-        prepare.append(RewardScaling(addend, factor, in_keys=[("next", "reward")]))
-    rows = data.copy()
-    if with_next_action:
+    rows = data.copy().set(("next", "reward"), reward)
+    if ("next", "action") in in_keys:
+        check_order(data)
         rows["next", "action"] = next_action(data)
-    rows = prepare(rows)
     if optim.n_steps > 1:  # what follows a row, before some are held out
-        steps = multi_step(
-            data,
-            n_steps=optim.n_steps,
-            gamma=optim.gamma,
-            reward_scale=factor,
-            reward_shift=addend,
-            with_next_action=with_next_action,
-        )
+        steps = multi_step(rows, n_steps=optim.n_steps, gamma=optim.gamma)
         rows["multi_step"] = norm("observation")(steps)
+    rows = norm(*states)(rows)
     rows, held_out = split_held_out(rows, options.held_out, seed=options.seed)
     size = config.trainer.batch_size
     buffer = make_replay_buffer(rows, batch_size=size, seed=0, device=device)
     mean = manifest["normalized_score"]
     if references_of(env) is None:
         mean = manifest["mean_return"]
+    largest = reward.abs().max().item()
     return TrainingData(
         buffer, held_out.to(device), norm(*states).to(device), largest, mean
     )
