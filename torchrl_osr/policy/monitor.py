@@ -120,8 +120,8 @@ class DataMonitor(nn.Module):
                 all.
 
         Keyword Args:
-            false_alarms: largest share of episodes with a false alarm. Default 0.05. A
-                ValueError says how many episodes it needs.
+            false_alarms: largest share of episodes with a false alarm. Default 0.05.
+                A ValueError if there are too few episodes for it.
         """
         score = torch.cat([self(rows)[0] for rows in torch.split(observation, 4096)])
         if counts is not None:
