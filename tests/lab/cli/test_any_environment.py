@@ -9,6 +9,7 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
+import pandas as pd
 import pytest
 from composed import composed
 from composed import trained as trained_on
@@ -215,8 +216,14 @@ def test_policies_are_ranked_on_their_log_alone(tmp_path, capsys, monkeypatch):
     assert "from the first states of 3 episodes" in table
     log.unlink()
     evaluate_offline.main()  # the results are there already
-    with pytest.raises(ValueError, match=r"never played: .*; estimated discounted ret"):
-        read_runs([tmp_path])
+    page = write_report(read_runs([tmp_path]), tmp_path / "page").read_text()
+    name = "estimated return (discount 0.9) of log-log"
+    assert f"Undisturbed {name}" in page
+    assert "No run was played." in page
+    scores = pd.read_csv(tmp_path / "page" / "scores.csv", index_col="method")
+    for loss, each in zip(("bc", "iql"), found, strict=True):
+        assert scores.loc[loss, "last"] == pytest.approx(each["value"])
+    assert scores["data mean"].tolist() == pytest.approx([own, own], rel=1e-5)
 
 
 def test_without_a_simulator_bounds_and_discrete_actions_may_be_given(

@@ -2,6 +2,7 @@
 
     torchrl-osr evaluate-offline outputs/log-pump-file/*
     torchrl-osr evaluate-offline <run's folder> --discount 0.995 --steps 20000
+    torchrl-osr evaluate-offline <run's folder> --checkpoints
 
 Fitted Q evaluation: critics learn the discounted return of each policy, which is then
 averaged over the first state of every episode of the data. A run's folder gets
@@ -19,6 +20,7 @@ from typing import Any
 
 from torchrl_osr.lab.evaluation.tables import aligned_columns
 from torchrl_osr.lab.run.evaluate_offline import evaluate_offline
+from torchrl_osr.lab.run.load import checkpoints_of
 
 
 def main() -> None:
@@ -27,6 +29,7 @@ def main() -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     add = parser.add_argument
     add("runs", nargs="+", type=Path, help="folders of runs, or checkpoints in them")
+    add("--checkpoints", action="store_true", help="evaluate all that each run kept")
     add("--discount", type=float, help="default: that of each run")
     add("--steps", type=int, default=4000, help="updates of the critics")
     add("--seed", type=int, default=0, help="of the critics")
@@ -34,6 +37,8 @@ def main() -> None:
     add("--trust", action="append", default=[], metavar="MODULE", help="yours")
     options = vars(parser.parse_args())
     runs, tables = options.pop("runs"), defaultdict[Any, dict[str, Any]](dict)
+    if options.pop("checkpoints"):
+        runs = [each for run in runs for each in checkpoints_of(run)]
     for run in runs:
         found = evaluate_offline(run, **options)
         tables[found["env"], found["data"], found["discount"]][str(run)] = found
@@ -54,6 +59,7 @@ def ranking(results: Mapping[str, Mapping[str, Any]]) -> str:
         "{env} {source}: estimated discounted return, discount {discount:g}, from the "
         "first states of {episodes:,} episodes".format(**first),
         *aligned_columns(rows),
+        f"  To use the first: torchrl-osr export {best} policy.onnx",
     ]
     if others and results[others[0]]["value_high"] > first["value_low"]:
         lines.append("  The intervals of the first two overlap: their order is unsure.")

@@ -69,7 +69,7 @@ class Difference(NamedTuple):
 
 def quantities(tables: RunTables) -> list[Quantity]:
     """Return the undisturbed score or return, and two quantities of each suite."""
-    measure = "score" if tables.measure == "normalised score" else "return"
+    measure = tables.measure.partition(" of ")[0].removeprefix("normalised ")
     rows = recent(tables.episodes).rename(columns={"score": "value"}).assign(met=True)
     found = [Quantity(f"undisturbed {measure}", rows)]
     for suite in tables.suites:

@@ -121,7 +121,8 @@ def learning_curves(tables: RunTables) -> Figure:
         number = tables.methods.index(method)
         color = COLORS[number % len(COLORS)]
         line = LINES[number // len(COLORS) % len(LINES)]
-        (lines[method],) = panels[data].plot(x, mean, line, color=color, linewidth=1.6)
+        style = f"{line}{'' if len(x) > 1 else 'o'}"
+        (lines[method],) = panels[data].plot(x, mean, style, color=color, linewidth=1.6)
         if played["run"].nunique() > 1:
             panels[data].fill_between(
                 x, low, high, color=color, alpha=0.15, linewidth=0

@@ -36,6 +36,9 @@ METHOD = (
 NUM_NAMED, NAMED_WIDTH = 3, 40
 """At most so many differences are in a name, with so many characters of each value."""
 
+ESTIMATED = "estimated return"
+"""Measure of runs that were never played; a critic stands for an episode."""
+
 SAVED = ["states", "group", "disturbance", "walk", "back"]
 
 
@@ -183,17 +186,21 @@ def _read(folder: Path) -> _Run:
         env, config.get("env.random_return"), config.get("env.expert_return")
     )
     measure = "return" if references is None else "score"
+    measured = "normalised score" if references else f"return of {env}"
     evaluations = returns["evaluations"]
+    if not evaluations and (folder / OFFLINE).exists():  # judged by the data alone
+        offline = read_json(folder / OFFLINE)
+        values = offline["value_of_critics"]
+        each = {"step": steps, "seeds": [*range(len(values))], "returns": values}
+        evaluations, references, measure = [each], None, "return"
+        returns["data_return"] = offline["data_value"]
+        measured = f"{ESTIMATED} (discount {offline['discount']:g}) of {env}"
     if not evaluations or evaluations[-1]["step"] != steps:
         at = evaluations[-1]["step"] if evaluations else "none"
-        reason = f"not finished, or never played: last evaluation at step {at}"
-        if (folder / OFFLINE).exists():
-            each = read_json(folder / OFFLINE)
-            reason += (
-                "; estimated discounted return {value:.4g} [{value_low:.4g}, "
-                "{value_high:.4g}], of the data {data_value:.4g}".format(**each)
-            )
-        raise ValueError(reason)
+        raise ValueError(
+            f"not finished, or never played: last evaluation at step {at}; "
+            "'evaluate-offline' estimates a run that was never played"
+        )
     rows, protocols, versions = [], [], [returns["versions"]]
     for each in evaluations:
         values = np.array(each["returns"], dtype=float)
@@ -228,7 +235,7 @@ def _read(folder: Path) -> _Run:
         "data": data + (f", {100 * share:g} % random" if share else ""),
         "seed": int(config["seed"]),
         "steps": int(steps),
-        "measure": "normalised score" if references else f"return of {env}",
+        "measure": measured,
         "data_score": np.nan if mean is None else float(mean),
         "overrides": " ".join(map(str, hydra["overrides"]["task"] or ())),
         "versions": sorted(packages),
@@ -303,6 +310,11 @@ def tell_apart(
 def comparison_notes(tables: RunTables) -> list[str]:
     """Write a sentence for each thing that makes a comparison unfair."""
     runs, notes = tables.runs, []
+    if tables.measure.startswith(ESTIMATED):
+        notes.append(
+            "No run was played. The returns are estimates from the data alone: they "
+            "find policies that fail, and do not order those that are close."
+        )
     versions = pd.Series(runs["versions"].explode().dropna().unique()).sort_values()
     for _, each in versions.groupby(versions.str.rpartition(" ")[0]):
         if len(each) > 1:
