@@ -2,11 +2,13 @@
 
     torchrl-osr evaluate-offline outputs/log-pump-file/*
     torchrl-osr evaluate-offline <run's folder> --discount 0.995 --steps 20000
-    torchrl-osr evaluate-offline <run's folder> --checkpoints
+    torchrl-osr evaluate-offline <run's folder> --checkpoints --estimator model
 
-Fitted Q evaluation: critics learn the discounted return of each policy, which is then
-averaged over the first state of every episode of the data. A run's folder gets
-offline_evaluation.json. See docs/any_environment.md for how far to trust the order.
+The discounted return, averaged over the first state of every episode of the data. By
+fitted Q evaluation (fqe): critics learn the values of each policy. By a model: the
+policy is rolled out in a model of the task, which is learned once from the data. A
+run's folder gets offline_evaluation.json. See docs/any_environment.md for how far to
+trust the order.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_osr.lab.evaluation.tables import aligned_columns
-from torchrl_osr.lab.run.evaluate_offline import evaluate_offline
+from torchrl_osr.lab.run.evaluate_offline import STEPS, OfflineEvaluator
 from torchrl_osr.lab.run.load import checkpoints_of
 
 
@@ -31,16 +33,18 @@ def main() -> None:
     add("runs", nargs="+", type=Path, help="folders of runs, or checkpoints in them")
     add("--checkpoints", action="store_true", help="evaluate all that each run kept")
     add("--discount", type=float, help="default: that of each run")
-    add("--steps", type=int, default=4000, help="updates of the critics")
-    add("--seed", type=int, default=0, help="of the critics")
+    add("--estimator", choices=STEPS, default="fqe", help="default: fqe")
+    add("--steps", type=int, help="updates of critics (4,000) or model (10,000)")
+    add("--seed", type=int, default=0, help="of critics or model")
     add("--data", metavar="PATH", help="place of the log, if it was moved")
     add("--trust", action="append", default=[], metavar="MODULE", help="yours")
     options = vars(parser.parse_args())
     runs, tables = options.pop("runs"), defaultdict[Any, dict[str, Any]](dict)
     if options.pop("checkpoints"):
         runs = [each for run in runs for each in checkpoints_of(run)]
+    evaluate = OfflineEvaluator(**options)
     for run in runs:
-        found = evaluate_offline(run, **options)
+        found = evaluate(run)
         tables[found["env"], found["data"], found["discount"]][str(run)] = found
     for table in tables.values():
         print("\n" + ranking(table))

@@ -11,6 +11,7 @@ from torchrl_osr.lab.evaluation.inverse_dynamics_fit import (
     describe_inverse_dynamics,
     inverse_dynamics_report,
 )
+from torchrl_osr.lab.evaluation.model_rollouts import fitted_task, rolled_out_values
 from torchrl_osr.lab.evaluation.offline import fitted_values
 from torchrl_osr.lab.evaluation.recoverable import load_recoverable_states, recovers
 from torchrl_osr.lab.evaluation.recovery import DataDistance
@@ -29,12 +30,14 @@ __all__ = [
     "describe_inverse_dynamics",
     "deterministic_policy",
     "evaluate_paired",
+    "fitted_task",
     "fitted_values",
     "inverse_dynamics_report",
     "load_recoverable_states",
     "mean_interval",
     "measure_of",
     "recovers",
+    "rolled_out_values",
     "summarize",
     "summarize_disturbances",
 ]

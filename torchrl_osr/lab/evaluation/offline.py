@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 from torch.nn.functional import one_hot
-from torchrl.objectives import SoftUpdate
+from torchrl.objectives import LossModule, SoftUpdate
 
 from torchrl_osr.fast import FastUpdate
 from torchrl_osr.lab.data import make_replay_buffer, observation_statistics
@@ -70,15 +70,8 @@ def fitted_values(
     """
     if not 0 <= gamma < 1:
         raise ValueError(f"The discount is {gamma}; expected at least 0 and below 1.")
-    episode = episode_of(data)
-    starts = data["observation"][episode.diff(prepend=episode.new_tensor([-1])) > 0]
+    episode, starts = episode_of(data), first_states(data)
     number, size = len(starts), data["action"].shape[-1]
-
-    def act(states: Tensor) -> Tensor:
-        parts = torch.split(states, 2**20)
-        action = torch.cat([policy(rows) for rows in parts])
-        return action if action.ndim > 1 else one_hot(action, size).float()
-
     generator = torch.Generator().manual_seed(seed)
     drawn = torch.randint(number, (num_critics, number), generator=generator)
     weight = torch.stack([each.bincount(minlength=number) for each in drawn]).float()
@@ -91,9 +84,8 @@ def fitted_values(
     for key in ("observation", ("next", "observation")):
         rows[key] = (data[key] - loc) / scale
     rows["next", "reward"] = reward / unit
-    rows["next", "action"] = act(data["next", "observation"])
+    rows["next", "action"] = act(policy, data["next", "observation"], size)
     rows["bootstrap"] = weight[:, episode].T
-    buffer = make_replay_buffer(rows, batch_size=batch_size, seed=0)
     least, most = (each.item() / unit / (1 - gamma) for each in reward.aminmax())
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -108,22 +100,58 @@ def fitted_values(
     loss = FQELoss(critics, value_bounds=bounds, deactivate_vmap=True)
     loss.make_value_estimator(gamma=gamma)
     optimizer = torch.optim.Adam(loss.parameters(), lr=lr, fused=True)
+    options = {"batch_size": batch_size, "steps": steps, "seed": seed}
+    targets = SoftUpdate(loss, tau=tau)
+    description = "fitted Q evaluation"
+    fit(loss, optimizer, targets, rows, description, progress=progress, **options)
+    states = TensorDict({"observation": (starts - loc) / scale}, [number])
+    with torch.no_grad():
+        value = loss.q(
+            states, act(policy, starts, size), loss.target_qvalue_network_params
+        )
+    found: Array = (unit * value).double().numpy()
+    return found
+
+
+def first_states(data: TensorDict) -> Tensor:
+    """Return the first state of each episode, ``[E, S]``."""
+    episode = episode_of(data)
+    starts: Tensor = data["observation"][
+        episode.diff(prepend=episode.new_tensor([-1])) > 0
+    ]
+    return starts
+
+
+def act(policy: Policy, states: Tensor, size: int) -> Tensor:
+    """Return a policy's actions ``[B, size]`` at states ``[B, S]``."""
+    action = torch.cat([policy(rows) for rows in torch.split(states, 2**20)])
+    return action if action.ndim > 1 else one_hot(action, size).float()
+
+
+def fit(
+    loss: LossModule,
+    optimizer: torch.optim.Optimizer,
+    targets: SoftUpdate | None,
+    rows: TensorDict,
+    description: str,
+    *,
+    batch_size: int,
+    steps: int,
+    seed: int,
+    progress: bool,
+) -> None:
+    """Train a loss on rows ``[N]``, without checkpoints that stay."""
     with TemporaryDirectory() as folder:
         OfflineTrainer(
-            FastUpdate(loss, optimizer, SoftUpdate(loss, tau=tau)),
-            buffer,
+            FastUpdate(loss, optimizer, targets),
+            make_replay_buffer(rows, batch_size=batch_size, seed=0),
             steps,
             folder,
             seed=seed,
             checkpoint_interval=steps,
-            description="fitted Q evaluation",
+            description=description,
             progress=progress,
         ).train()
-    states = TensorDict({"observation": (starts - loc) / scale}, [number])
-    with torch.no_grad():
-        value = loss.q(states, act(starts), loss.target_qvalue_network_params)
-    found: Array = (unit * value).double().numpy()
-    return found
 
 
 def episode_values(data: TensorDict, gamma: float) -> Array:

@@ -190,7 +190,7 @@ def _read(folder: Path) -> _Run:
     evaluations = returns["evaluations"]
     if not evaluations and (folder / OFFLINE).exists():  # judged by the data alone
         offline = read_json(folder / OFFLINE)
-        values = offline["value_of_critics"]
+        values = offline["value_of_networks"]
         each = {"step": steps, "seeds": [*range(len(values))], "returns": values}
         evaluations, references, measure = [each], None, "return"
         returns["data_return"] = offline["data_value"]

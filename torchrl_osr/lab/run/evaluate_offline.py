@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torchrl import torchrl_logger
@@ -13,6 +13,7 @@ from torchrl import torchrl_logger
 from torchrl_osr._files import read_json, sha256_of, write_json
 from torchrl_osr.lab.data.recording import NO_REWARDS, has_rewards
 from torchrl_osr.lab.evaluation import deterministic_policy
+from torchrl_osr.lab.evaluation.model_rollouts import fitted_task, rolled_out_values
 from torchrl_osr.lab.evaluation.offline import episode_values, fitted_values
 from torchrl_osr.lab.evaluation.statistics import interval, nested_resamples
 from torchrl_osr.lab.run.data import load_data
@@ -20,67 +21,84 @@ from torchrl_osr.lab.run.folder import package_versions
 from torchrl_osr.lab.run.load import load_trained, run_folder_of
 
 FILE = "offline_evaluation.json"
-"""Result of a run's last checkpoint, in its folder; others have the name in front."""
+"""Result of a run's last checkpoint, in its folder; others have a name in front."""
+
+STEPS = {"fqe": 4000, "model": 10_000}
+"""Estimators, and the updates of the critics or of the model."""
 
 
-def evaluate_offline(
-    path: Path,
-    *,
-    steps: int,
-    discount: float | None = None,
-    seed: int = 0,
-    data: str | None = None,
-    trust: Sequence[str] = (),
-) -> dict[str, Any]:
-    """Estimate the value of a run's policy by fitted Q evaluation on the run's data.
+@dataclass
+class OfflineEvaluator:
+    """Estimate the values of runs' policies on the runs' data.
 
-    The run's folder keeps the result, which the same call then returns at once.
+    A run's folder keeps the result, which the same call then returns at once. Runs on
+    the same data share them, and a model of the task.
 
     Args:
-        path: a run's folder, which stands for its last checkpoint, or a checkpoint.
-
-    Keyword Args:
-        steps, seed: of the training of the critics.
+        estimator: ``"fqe"``, fitted Q evaluation, or ``"model"``, rollouts in a model
+            that is learned from the data.
+        steps, seed: of the training of critics or model.
         discount: default: that of the run.
         data: place of the data, if they have been moved.
         trust: modules of yours that the run may name.
     """
-    torchrl_logger.setLevel("WARNING")
-    trained = load_trained(path, trust=trust)
-    # Without its simulator: the run knows sizes and bounds.
-    env, options = replace(trained.config.env, id=None), trained.config.data
-    options.path = data or options.path
-    gamma = trained.config.optim.gamma if discount is None else discount
-    request = {
-        "versions": package_versions(),
-        "checkpoint": sha256_of(trained.path),
-        "data": options.checksum,
-        "discount": gamma,
-        "steps": steps,
-        "seed": seed,
-    }
-    name = FILE if path.is_dir() else f"{path.stem}-{FILE}"
-    file = run_folder_of(path) / name
-    if file.exists() and request.items() <= (known := read_json(file)).items():
-        return known
-    rows, manifest = load_data(env, options)
-    if not has_rewards(manifest):
-        raise ValueError(f"{path} cannot be evaluated on its data. {NO_REWARDS}")
-    policy = deterministic_policy(trained.actor, trained.observation_norm)
-    torch.set_num_threads(trained.config.trainer.num_threads)
-    values = fitted_values(rows, policy, gamma=gamma, steps=steps, seed=seed)
-    recorded = episode_values(rows, gamma)
-    found = interval(values.mean(), nested_resamples([*values[..., None]])[:, 0])
-    results = request | {
-        "env": env.name,
-        "source": options.source,
-        "step": trained.step,
-        "episodes": len(recorded),
-        "value": found.mean,
-        "value_low": found.low,
-        "value_high": found.high,
-        "value_of_critics": values.mean(1).tolist(),
-        "data_value": recorded.mean(),
-    }
-    write_json(file, results)
-    return results
+
+    estimator: Literal["fqe", "model"] = "fqe"
+    steps: int | None = None
+    discount: float | None = None
+    seed: int = 0
+    data: str | None = None
+    trust: Sequence[str] = ()
+    _known: dict[str, Any] = field(default_factory=dict, init=False)
+
+    def __call__(self, path: Path) -> dict[str, Any]:
+        """Return the estimate of a run, a folder, or of a checkpoint."""
+        torchrl_logger.setLevel("WARNING")
+        trained = load_trained(path, trust=self.trust)
+        # Without its simulator: the run knows sizes and bounds.
+        env, options = replace(trained.config.env, id=None), trained.config.data
+        options.path = self.data or options.path
+        gamma = trained.config.optim.gamma if self.discount is None else self.discount
+        request: dict[str, Any] = {
+            "versions": package_versions(),
+            "checkpoint": sha256_of(trained.path),
+            "data": options.checksum,
+            "estimator": self.estimator,
+            "discount": gamma,
+            "steps": self.steps or STEPS[self.estimator],
+            "seed": self.seed,
+        }
+        parts = [] if path.is_dir() else [path.stem]
+        parts += ["model"] if self.estimator == "model" else []
+        file = run_folder_of(path) / "-".join([*parts, FILE])
+        if file.exists() and request.items() <= (known := read_json(file)).items():
+            return known
+        if options.checksum not in self._known:
+            self._known = {options.checksum: load_data(env, options)}
+        rows, manifest = self._known[options.checksum]
+        if not has_rewards(manifest):
+            raise ValueError(f"{path} cannot be evaluated on its data. {NO_REWARDS}")
+        policy = deterministic_policy(trained.actor, trained.observation_norm)
+        torch.set_num_threads(trained.config.trainer.num_threads)
+        training: dict[str, Any] = {"steps": request["steps"], "seed": self.seed}
+        if self.estimator == "fqe":
+            values = fitted_values(rows, policy, gamma=gamma, **training)
+        else:
+            if "task" not in self._known:
+                self._known["task"] = fitted_task(rows, **training)
+            values = rolled_out_values(self._known["task"], rows, policy, gamma=gamma)
+        recorded = episode_values(rows, gamma)
+        found = interval(values.mean(), nested_resamples([*values[..., None]])[:, 0])
+        results = request | {
+            "env": env.name,
+            "source": options.source,
+            "step": trained.step,
+            "episodes": len(recorded),
+            "value": found.mean,
+            "value_low": found.low,
+            "value_high": found.high,
+            "value_of_networks": values.mean(1).tolist(),
+            "data_value": recorded.mean(),
+        }
+        write_json(file, results)
+        return results
