@@ -49,7 +49,7 @@ class OfflineEvaluator:
     seed: int = 0
     data: str | None = None
     trust: Sequence[str] = ()
-    _known: dict[str, Any] = field(default_factory=dict, init=False)
+    _known: dict[str | None, Any] = field(default_factory=dict, init=False)
 
     def __call__(self, path: Path) -> dict[str, Any]:
         """Return the estimate of a run, a folder, or of a checkpoint."""
