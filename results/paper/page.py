@@ -13,7 +13,7 @@ import contextlib
 import io
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import matplotlib as mpl
@@ -43,6 +43,7 @@ from torchrl_osr.lab.evaluation.statistics import (
     decimal,
     scores_and_decreases,
 )
+from torchrl_osr.lab.report.page import COLORS
 
 mpl.use("agg")
 import matplotlib.pyplot as plt
@@ -295,16 +296,14 @@ def settings() -> str:
     return markdown(["method", *(f"`{key.partition('.')[2]}`" for key in keys)], rows)
 
 
-def draw_curves() -> None:
+def draw_curves(to: Path, methods: Sequence[str]) -> None:
     """Draw score over minutes of updates, every seed and the mean."""
     runs = pd.read_csv(HERE / "runs.csv.xz")
     episodes = pd.read_csv(HERE / "episodes.csv.xz").merge(runs, on="run")
     episodes = episodes[episodes["suite"].isna()]
     minutes = TABLES["table1"].seconds / 60 * episodes["step"] / episodes["updates"]
     episodes = episodes.assign(minutes=minutes.round(3))
-    colors = dict(zip(("osr", "cql_noisy_bc", "cql", "td3_bc", "iql"),
-                      ("#0072B2", "#56B4E9", "#D55E00", "#009E73", "#E69F00"),
-                      strict=True))  # fmt: skip
+    colors = dict(zip(methods, COLORS, strict=False))
     figure, grid = plt.subplots(
         2, 3, figsize=(11, 6), layout="constrained", sharex=True
     )
@@ -319,7 +318,7 @@ def draw_curves() -> None:
     grid[0, 0].legend(frameon=False, fontsize=8)
     figure.supxlabel("minutes of updates on one core", fontsize=10)
     figure.supylabel("normalised score", fontsize=10)
-    figure.savefig(ROOT / "docs" / "figures" / "curves.png", dpi=110)
+    figure.savefig(to, dpi=110)
     plt.close(figure)
 
 
@@ -446,7 +445,9 @@ def main() -> None:
     for page in (HERE / "README.md", ROOT / "docs" / "results.md"):
         fill(page, blocks)
     fill_readme(means)
-    draw_curves()
+    shown = ("osr", "cql", "cql_noisy_bc", "td3_bc", "iql")
+    draw_curves(ROOT / "docs" / "figures" / "curves.png", shown)
+    draw_curves(RESULTS / "osr_v" / "scores.png", ("osr", "cql", "osr_v"))
     with contextlib.redirect_stdout(io.StringIO()) as text:
         tables.main(HERE, "osr", SOURCES)
     fill(HERE / "tables.md", {"tables": text.getvalue().strip()})
