@@ -34,7 +34,7 @@ def main() -> None:
     add("--checkpoints", action="store_true", help="evaluate all that each run kept")
     add("--discount", type=float, help="default: that of each run")
     add("--estimator", choices=STEPS, default="fqe", help="default: fqe")
-    add("--steps", type=int, help="updates of critics (4,000) or model (10,000)")
+    add("--steps", type=int, help="updates of critics (8,000) or model (10,000)")
     add("--seed", type=int, default=0, help="of critics or model")
     add("--data", metavar="PATH", help="place of the log, if it was moved")
     add("--trust", action="append", default=[], metavar="MODULE", help="yours")

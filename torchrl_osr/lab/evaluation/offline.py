@@ -30,7 +30,7 @@ def fitted_values(
     policy: Policy,
     *,
     gamma: float = 0.99,
-    steps: int = 4000,
+    steps: int = 8000,
     num_critics: int = 3,
     num_cells: Sequence[int] = (128, 128),
     batch_size: int = 128,

@@ -23,7 +23,7 @@ from torchrl_osr.lab.run.load import load_trained, run_folder_of
 FILE = "offline_evaluation.json"
 """Result of a run's last checkpoint, in its folder; others have a name in front."""
 
-STEPS = {"fqe": 4000, "model": 10_000}
+STEPS = {"fqe": 8000, "model": 10_000}
 """Estimators, and the updates of the critics or of the model."""
 
 
