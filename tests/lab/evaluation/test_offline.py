@@ -65,7 +65,7 @@ def test_rows_out_of_order_have_no_first_states():
 @pytest.mark.parametrize("gain", [-1.0, 0.0])
 def test_rollouts_in_a_model_have_the_closed_forms_value(gain):
     data = rolled_out(-0.3, 0.7)
-    task = fitted_task(data, steps=800, num_networks=3, progress=False)
+    task = fitted_task(data, steps=400, num_networks=3, progress=False)
     found = rolled_out_values(task, data, lambda s: gain * s, gamma=GAMMA, steps=30)
     assert found.shape == (3, EPISODES)
     truth = true_value(gain, data["observation"][::STEPS])

@@ -63,8 +63,9 @@ def ranking(results: Mapping[str, Mapping[str, Any]]) -> str:
         "{env} {source}: estimated discounted return, discount {discount:g}, from the "
         "first states of {episodes:,} episodes".format(**first),
         *aligned_columns(rows),
-        f"  To use the first: torchrl-osr export {best} policy.onnx",
     ]
+    if others:
+        lines.append(f"  To use the first: torchrl-osr export {best} policy.onnx")
     if others and results[others[0]]["value_high"] > first["value_low"]:
         lines.append("  The intervals of the first two overlap: their order is unsure.")
     return "\n".join(lines)
