@@ -2,7 +2,8 @@
 
 All take ``observation_dim`` (``S``), ``action_dim`` (``A``) and these keywords:
 
-- ``num_cells``, ``activation_class``, ``layer_norm``: see :func:`mlp`.
+- ``num_cells``: width of each hidden layer. Default 256 and 256.
+- ``activation_class``: activation between the layers. Default ReLU.
 - ``low``, ``high``: action bounds, a number or ``[A]``. Default -1 and 1.
 - ``observation_key``: the state that they read. Default ``"observation"``.
 - ``action_key``: the action that they write. Default ``"action"``.
@@ -37,8 +38,8 @@ variance, and without a floor one confident, wrong state owns the whole gradient
 def mlp(
     inputs: int,
     outputs: int,
-    num_cells: Sequence[int] = (256, 256),
-    activation_class: type[nn.Module] = nn.ReLU,
+    num_cells: Sequence[int],
+    activation_class: type[nn.Module],
     *,
     layer_norm: bool = False,
 ) -> MLP:
@@ -82,11 +83,12 @@ def tanh_gaussian_actor(
     observation_dim: int,
     action_dim: int,
     *,
+    num_cells: Sequence[int] = (256, 256),
+    activation_class: type[nn.Module] = nn.ReLU,
     low: float | Tensor = -1.0,
     high: float | Tensor = 1.0,
     observation_key: NestedKey = "observation",
     action_key: NestedKey = "action",
-    **layers: Any,
 ) -> ProbabilisticActor:
     """Return a tanh-Gaussian actor; see the module for the arguments.
 
@@ -101,7 +103,7 @@ def tanh_gaussian_actor(
         torch.Size([4, 3])
     """
     network = nn.Sequential(
-        mlp(observation_dim, 2 * action_dim, **layers),
+        mlp(observation_dim, 2 * action_dim, num_cells, activation_class),
         NormalParamExtractor(SCALE_MAPPING),
     )
     module = TensorDictModule(network, [observation_key], ["loc", "scale"])
@@ -112,18 +114,19 @@ def deterministic_actor(
     observation_dim: int,
     action_dim: int,
     *,
+    num_cells: Sequence[int] = (256, 256),
+    activation_class: type[nn.Module] = nn.ReLU,
     low: float | Tensor = -1.0,
     high: float | Tensor = 1.0,
     observation_key: NestedKey = "observation",
     action_key: NestedKey = "action",
-    **layers: Any,
 ) -> ProbabilisticActor:
     """Return a deterministic actor, whose action ends in a tanh.
 
     It writes ``"param"`` (before the tanh, which :class:`~torchrl.modules.TanhDelta`
     takes of its sum with the center of the bounds) and the action, each ``[B, A]``.
     """
-    network = mlp(observation_dim, action_dim, **layers)
+    network = mlp(observation_dim, action_dim, num_cells, activation_class)
     return ProbabilisticActor(
         TensorDictModule(network, [observation_key], ["param"]),
         in_keys=["param"],
@@ -137,9 +140,10 @@ def gaussian_actor(
     observation_dim: int,
     action_dim: int,
     *,
+    num_cells: Sequence[int] = (256, 256),
+    activation_class: type[nn.Module] = nn.ReLU,
     observation_key: NestedKey = "observation",
     action_key: NestedKey = "action",
-    **layers: Any,
 ) -> ProbabilisticActor:
     """Return a Gaussian actor: IQL's.
 
@@ -149,7 +153,7 @@ def gaussian_actor(
     ``"scale"`` and the action, each ``[B, A]``.
     """
     network = nn.Sequential(
-        mlp(observation_dim, action_dim, **layers),
+        mlp(observation_dim, action_dim, num_cells, activation_class),
         nn.Tanh(),
         AddStateIndependentNormalScale(action_dim),
     )
@@ -165,14 +169,15 @@ def categorical_actor(
     observation_dim: int,
     num_actions: int,
     *,
+    num_cells: Sequence[int] = (256, 256),
+    activation_class: type[nn.Module] = nn.ReLU,
     observation_key: NestedKey = "observation",
     action_key: NestedKey = "action",
-    **layers: Any,
 ) -> ProbabilisticActor:
     """Return an actor that chooses one of ``n`` discrete actions.
 
     It writes ``"logits"`` and the action, one-hot as :class:`~torchrl.envs.GymEnv`
     takes it by default, each ``[B, n]``, and ``"action_log_prob"``, ``[B]``.
     """
-    network = mlp(observation_dim, num_actions, **layers)
+    network = mlp(observation_dim, num_actions, num_cells, activation_class)
     return one_hot(network, [observation_key], action_key)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
 
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
+from torch import nn
 from torchrl.modules import ValueOperator
 
 from torchrl_osr.modules.actor import mlp
@@ -16,9 +17,11 @@ def critic_ensemble(
     action_dim: int,
     *,
     num_qvalue_nets: int = 2,
+    num_cells: Sequence[int] = (256, 256),
+    activation_class: type[nn.Module] = nn.ReLU,
+    layer_norm: bool = False,
     observation_key: NestedKey = "observation",
     action_key: NestedKey = "action",
-    **layers: Any,
 ) -> list[ValueOperator]:
     """Return Q networks of one observation and the action.
 
@@ -39,9 +42,10 @@ def critic_ensemble(
         >>> critic(TensorDict(batch, [4]))["state_action_value"].shape
         torch.Size([4, 1])
     """
+    sizes = observation_dim + action_dim, 1
     return [
         ValueOperator(
-            mlp(observation_dim + action_dim, 1, **layers),
+            mlp(*sizes, num_cells, activation_class, layer_norm=layer_norm),
             in_keys=[observation_key, action_key],
             # ValueOperator knows an action by the name "action" alone.
             out_keys=["state_action_value"],
@@ -55,28 +59,39 @@ def discrete_critic_ensemble(
     num_actions: int,
     *,
     num_qvalue_nets: int = 2,
+    num_cells: Sequence[int] = (256, 256),
+    activation_class: type[nn.Module] = nn.ReLU,
     observation_key: NestedKey = "observation",
-    **layers: Any,
+    layer_norm: bool = False,
 ) -> list[TensorDictModule]:
     """Return Q networks that value all ``n`` discrete actions of a state at once.
 
     As :func:`critic_ensemble`; each writes ``"action_value"``, ``[B, n]``.
     """
-    networks = (
-        mlp(observation_dim, num_actions, **layers) for _ in range(num_qvalue_nets)
-    )
-    return [TensorDictModule(n, [observation_key], ["action_value"]) for n in networks]
+    sizes = observation_dim, num_actions
+    return [
+        TensorDictModule(
+            mlp(*sizes, num_cells, activation_class, layer_norm=layer_norm),
+            [observation_key],
+            ["action_value"],
+        )
+        for _ in range(num_qvalue_nets)
+    ]
 
 
 def state_value(
     observation_dim: int,
     *,
+    num_cells: Sequence[int] = (256, 256),
+    activation_class: type[nn.Module] = nn.ReLU,
+    layer_norm: bool = False,
     observation_key: NestedKey = "observation",
-    **layers: Any,
 ) -> ValueOperator:
     """Return a value network of one observation, without an action.
 
     Arguments as of :func:`critic_ensemble`; it writes ``"state_value"``, ``[B, 1]``.
     """
-    network = mlp(observation_dim, 1, **layers)
+    network = mlp(
+        observation_dim, 1, num_cells, activation_class, layer_norm=layer_norm
+    )
     return ValueOperator(network, in_keys=[observation_key])

@@ -9,7 +9,6 @@ Shapes: ``B`` batch (any dimensions), ``S`` observation, ``A`` action, ``Z`` lat
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from tensordict import NestedKey
@@ -33,11 +32,12 @@ def tanh_gaussian_inverse_dynamics(
     observation_dim: int,
     action_dim: int,
     *,
+    num_cells: Sequence[int] = (256, 256),
+    activation_class: type[nn.Module] = nn.ReLU,
     low: float | Tensor = -1.0,
     high: float | Tensor = 1.0,
     observation_key: NestedKey = "observation",
     action_key: NestedKey = "action",
-    **layers: Any,
 ) -> ProbabilisticActor:
     r"""Return a tanh-Gaussian model of :math:`I(a \mid s, s')`, section 4.2.
 
@@ -56,7 +56,7 @@ def tanh_gaussian_inverse_dynamics(
     """
     # MLP joins its two inputs; nn.Sequential, as the actor uses it, takes one only.
     joint_mlp = TensorDictModule(
-        mlp(2 * observation_dim, 2 * action_dim, **layers),
+        mlp(2 * observation_dim, 2 * action_dim, num_cells, activation_class),
         [observation_key, nested("next", observation_key)],
         ["param"],
     )
@@ -71,12 +71,13 @@ def categorical_inverse_dynamics(
     observation_dim: int,
     num_actions: int,
     *,
+    num_cells: Sequence[int] = (256, 256),
+    activation_class: type[nn.Module] = nn.ReLU,
     observation_key: NestedKey = "observation",
     action_key: NestedKey = "action",
-    **layers: Any,
 ) -> ProbabilisticActor:
     """Return a model over ``n`` discrete actions, which writes what an actor does."""
-    network = mlp(2 * observation_dim, num_actions, **layers)
+    network = mlp(2 * observation_dim, num_actions, num_cells, activation_class)
     keys = [observation_key, nested("next", observation_key)]
     return one_hot(network, keys, action_key)
 

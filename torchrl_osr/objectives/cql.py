@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import torch
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
-from torch import nn
+from torch import Tensor, nn
 
 from torchrl_osr import functional as F
 from torchrl_osr._checks import check_positive
@@ -117,13 +117,7 @@ class CQLLoss(ActorCriticLoss):
         )
         losses, metrics = self.soft_actor_losses(batch, objective, log_prob)
         if self.has_cql:
-            alike = self.clip_diff_min == -math.inf and self.rows_weigh_alike(batch)
-            q_data, soft_maximum = self.critics.values_and_soft_maximum(
-                batch.s, batch.a, *self.proposals(batch, policy), alike=alike
-            )
-            gap = F.conservative_gap(soft_maximum, q_data)
-            if self.clip_diff_min > -math.inf:
-                gap = gap.clamp(min=self.clip_diff_min)
+            q_data, gap = self.conservative_gap(batch, policy)
             if self.target_action_gap is not None:
                 gap, multiplier = F.lagrange_terms(
                     gap, self.log_alpha_prime, self.target_action_gap
@@ -137,3 +131,16 @@ class CQLLoss(ActorCriticLoss):
         error, values = self.td_error(batch, q_data, self.soft_target(batch, policy))
         losses["loss_qvalue"] = self.reduce(error, batch)
         return losses, metrics | values
+
+    def conservative_gap(
+        self, batch: Transitions, policy: StatePolicy
+    ) -> tuple[Tensor, Tensor]:
+        """Return :math:`Q_i(s, a)` and CQL(H)'s gap, ``[N, R]`` each."""
+        alike = self.clip_diff_min == -math.inf and self.rows_weigh_alike(batch)
+        q_data, soft_maximum = self.critics.values_and_soft_maximum(
+            batch.s, batch.a, *self.proposals(batch, policy), alike=alike
+        )
+        gap = F.conservative_gap(soft_maximum, q_data)
+        if self.clip_diff_min > -math.inf:
+            gap = gap.clamp(min=self.clip_diff_min)
+        return q_data, gap
