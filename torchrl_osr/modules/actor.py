@@ -38,8 +38,8 @@ variance, and without a floor one confident, wrong state owns the whole gradient
 def mlp(
     inputs: int,
     outputs: int,
-    num_cells: Sequence[int],
-    activation_class: type[nn.Module],
+    num_cells: Sequence[int] = (256, 256),
+    activation_class: type[nn.Module] = nn.ReLU,
     *,
     layer_norm: bool = False,
 ) -> MLP:
