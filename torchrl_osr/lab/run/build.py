@@ -48,7 +48,8 @@ def make_learner(config: TrainConfig, device: torch.device | str = "cpu") -> Lea
     assert env.observation_size is not None
     assert env.action_size is not None
     sizes = env.observation_size, env.action_size
-    layers: dict[str, Any] = {"num_cells": cells, "layer_norm": config.network.layer_norm}
+    layer_norm = config.network.layer_norm
+    layers: dict[str, Any] = {"num_cells": cells, "layer_norm": layer_norm}
     actor = instantiate(config.network.actor, *sizes, num_cells=cells).to(device)
     kind, other = ("discrete", "discrete_osr") if env.discrete else ("real", "osr")
     if is_categorical(actor) != env.discrete:
