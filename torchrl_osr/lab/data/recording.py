@@ -156,7 +156,14 @@ def _vanishing(columns: Columns) -> Iterator[str]:
             )
 
 
-def transitions_from_columns(columns: Columns, **options: Any) -> Dataset:
+def transitions_from_columns(
+    columns: Columns,
+    *,
+    action_bounds: ActionBounds = (-1.0, 1.0),
+    clip_actions: bool = False,
+    num_actions: int | None = None,
+    missing: str = "error",
+) -> Dataset:
     """Turn recorded steps, in order of time, into transitions and their manifest.
 
     A trajectory ends where a row is terminated or truncated, where the episode number
@@ -174,7 +181,7 @@ def transitions_from_columns(columns: Columns, **options: Any) -> Dataset:
 
     Keyword Args:
         action_bounds: lowest and highest action, mapped to -1 and 1. The actions are
-            then clipped to ±0.999. Default: -1 and 1.
+            then clipped to ±0.999.
         clip_actions: clip actions outside their bounds rather than raise.
         num_actions: number of discrete actions: ``action`` then holds their numbers
             from 0, ``[N]``, and becomes one-hot. Default: actions are real.
@@ -198,7 +205,8 @@ def transitions_from_columns(columns: Columns, **options: Any) -> Dataset:
         >>> manifest["dropped_rows"], manifest["episode_returns"]
         (1, [2.0, 2.0])
     """
-    return convert([columns], Reading(**options))
+    options = Reading(action_bounds, clip_actions, num_actions, missing)
+    return convert([columns], options)
 
 
 def trajectories(
