@@ -7,6 +7,7 @@ import sys
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
 from torchrl_osr.lab.data import reference_returns
@@ -37,10 +38,34 @@ for each in checkpoints:
     }
     rows.append(row | {name: each["value"] for name, each in found.items()})
     pd.DataFrame(rows).round(2).to_csv(path, index=False)
-for data, table in pd.read_csv(path).groupby("data"):
-    score, usual = table["score"], table["score"].max() - table["score"].mean()
-    print(f"{data}: {len(table)} policies, {score.min():.0f} to {score.max():.0f},")
-    print(f"  regret of a random choice {usual:.1f}")
+
+
+def spearman(table: pd.DataFrame, name: str) -> float:
+    """Return the rank correlation of an estimate with the score."""
+    return float(table[name].rank().corr(table["score"].rank()))
+
+
+groups = [table for _, table in pd.read_csv(path).groupby("data")]
+for table in groups:
+    score = table["score"]
+    usual = score.max() - score.mean()
+    print(
+        f"{table['data'].iloc[0]}: {len(table)} policies, regret of chance {usual:.0f}"
+    )
+    print(f"  scores {score.min():.0f} to {score.max():.0f}")
     for name in evaluators:
-        rank, best = table[name].rank().corr(score.rank()), table[name].idxmax()
-        print(f"  {name}: Spearman {rank:.2f}, regret {score.max() - score[best]:.1f}")
+        regret = score.max() - score[table[name].idxmax()]
+        print(f"  {name}: Spearman {spearman(table, name):.2f}, regret {regret:.0f}")
+for name in evaluators:
+    draws = [
+        np.mean(
+            [
+                spearman(g.sample(frac=1, replace=True, random_state=seed), name)
+                for g in groups
+            ]
+        )
+        for seed in range(500)
+    ]
+    low, high = np.quantile(draws, [0.025, 0.975])
+    mean = np.mean([spearman(table, name) for table in groups])
+    print(f"{name}: mean Spearman {mean:.2f} [{low:.2f}, {high:.2f}]")
