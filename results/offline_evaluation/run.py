@@ -7,7 +7,6 @@ import sys
 from contextlib import closing
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 
 from torchrl_osr.lab.data import reference_returns
@@ -40,32 +39,22 @@ for each in checkpoints:
     pd.DataFrame(rows).round(2).to_csv(path, index=False)
 
 
-def spearman(table: pd.DataFrame, name: str) -> float:
-    """Return the rank correlation of an estimate with the score."""
-    return float(table[name].rank().corr(table["score"].rank()))
+def ranks(table: pd.DataFrame) -> pd.Series:
+    """Return each estimate's rank correlation with the score."""
+    return table[list(evaluators)].rank().corrwith(table["score"].rank())
 
 
-groups = [table for _, table in pd.read_csv(path).groupby("data")]
-for table in groups:
+groups = dict(list(pd.read_csv(path).groupby("data")))
+for data, table in groups.items():
     score = table["score"]
-    usual = score.max() - score.mean()
-    print(
-        f"{table['data'].iloc[0]}: {len(table)} policies, regret of chance {usual:.0f}"
-    )
-    print(f"  scores {score.min():.0f} to {score.max():.0f}")
-    for name in evaluators:
-        regret = score.max() - score[table[name].idxmax()]
-        print(f"  {name}: Spearman {spearman(table, name):.2f}, regret {regret:.0f}")
-for name in evaluators:
-    draws = [
-        np.mean(
-            [
-                spearman(g.sample(frac=1, replace=True, random_state=seed), name)
-                for g in groups
-            ]
-        )
-        for seed in range(500)
-    ]
-    low, high = np.quantile(draws, [0.025, 0.975])
-    mean = np.mean([spearman(table, name) for table in groups])
-    print(f"{name}: mean Spearman {mean:.2f} [{low:.2f}, {high:.2f}]")
+    found = pd.DataFrame({"Spearman": ranks(table)})
+    found["regret"] = [score.max() - score[table[each].idxmax()] for each in evaluators]
+    found.loc["chance", "regret"] = score.max() - score.mean()
+    print(f"{data}: {len(table)} policies, {score.min():.0f} to {score.max():.0f}")
+    print(found.round(2))
+tables = list(groups.values())
+draws = [
+    sum(ranks(each.sample(frac=1, replace=True, random_state=n)) for each in tables)
+    for n in range(500)
+]
+print((pd.DataFrame(draws) / len(groups)).quantile([0.025, 0.5, 0.975]).round(2))
