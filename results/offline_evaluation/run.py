@@ -1,4 +1,4 @@
-"""Compare estimates from data alone with the scores of 20 fresh episodes.
+"""Compare estimates from data alone with 20 fresh episodes.
 
 python results/offline_evaluation/run.py table.csv CHECKPOINT...
 """
@@ -8,15 +8,32 @@ from contextlib import closing
 from pathlib import Path
 
 import pandas as pd
+from gymnasium.wrappers import TransformReward
 
 from torchrl_osr.lab.data import reference_returns
-from torchrl_osr.lab.evaluation import (
-    EpisodeEvaluator,
-    deterministic_policy,
-    summarize,
-)
+from torchrl_osr.lab.evaluation import EpisodeEvaluator, deterministic_policy
 from torchrl_osr.lab.run.evaluate_offline import STEPS, OfflineEvaluator
 from torchrl_osr.lab.run.load import load_trained, run_folder_of
+
+
+def discounted(env):
+    """Discount rewards from the first step of an episode on."""
+    get, step = env.get_wrapper_attr, "_elapsed_steps"
+    return TransformReward(env, lambda reward: 0.99 ** (get(step) - 1) * reward)
+
+
+def played(trained, wrap=None):
+    """Return the mean return of 20 episodes."""
+    policy = deterministic_policy(trained.actor, trained.observation_norm)
+    options = {"num_episodes": 20, "seed": 50_000, "wrap": wrap}
+    with closing(EpisodeEvaluator(trained.config.env.id, **options)) as episodes:
+        return episodes(policy).returns.mean()
+
+
+def ranks(table):
+    """Return each estimate's rank correlation with the score."""
+    return table[list(evaluators)].rank().corrwith(table["score"].rank())
+
 
 path, *checkpoints = map(Path, sys.argv[1:])
 evaluators = {each: OfflineEvaluator(each) for each in STEPS}
@@ -25,36 +42,28 @@ for each in checkpoints:
     trained, run = load_trained(each), run_folder_of(each).absolute()
     found = {name: evaluate(each) for name, evaluate in evaluators.items()}
     env = trained.config.env
-    policy = deterministic_policy(trained.actor, trained.observation_norm)
-    with closing(EpisodeEvaluator(env.id, num_episodes=20, seed=50_000)) as episodes:
-        played = summarize(episodes(policy), reference_returns(env.name))
     row = {
         "data": f"{env.name}-{trained.config.data.source}",
         "run": "/".join(run.parts[-2:]),
         "step": trained.step,
-        "score": played["score"],
+        "score": reference_returns(env.name).score(played(trained)),
+        "discounted": played(trained, discounted),
         "data_value": found["fqe"]["data_value"],
     }
     rows.append(row | {name: each["value"] for name, each in found.items()})
     pd.DataFrame(rows).round(2).to_csv(path, index=False)
-
-
-def ranks(table: pd.DataFrame) -> pd.Series:
-    """Return each estimate's rank correlation with the score."""
-    return table[list(evaluators)].rank().corrwith(table["score"].rank())
-
-
-groups = dict(list(pd.read_csv(path).groupby("data")))
-for data, table in groups.items():
-    score = table["score"]
+tables = dict(list(pd.read_csv(path).groupby("data")))
+for data, table in tables.items():
+    score, truth = table["score"], table["discounted"]
     found = pd.DataFrame({"Spearman": ranks(table)})
     found["regret"] = [score.max() - score[table[each].idxmax()] for each in evaluators]
+    found["error"] = [(table[each] - truth).abs().mean() for each in evaluators]
     found.loc["chance", "regret"] = score.max() - score.mean()
-    print(f"{data}: {len(table)} policies, {score.min():.0f} to {score.max():.0f}")
+    print(f"{data}: {len(table)} policies, {score.min():.0f} to {score.max():.0f},")
+    print(f"discounted return {truth.mean():.0f} +- {truth.std():.0f}")
     print(found.round(2))
-tables = list(groups.values())
 draws = [
-    sum(ranks(each.sample(frac=1, replace=True, random_state=n)) for each in tables)
+    sum(ranks(t.sample(frac=1, replace=True, random_state=n)) for t in tables.values())
     for n in range(500)
 ]
-print((pd.DataFrame(draws) / len(groups)).quantile([0.025, 0.5, 0.975]).round(2))
+print((pd.DataFrame(draws) / len(tables)).quantile([0.025, 0.5, 0.975]).round(2))
