@@ -48,7 +48,6 @@ for each in checkpoints:
         "step": trained.step,
         "score": reference_returns(env.name).score(played(trained)),
         "discounted": played(trained, discounted),
-        "data_value": found["fqe"]["data_value"],
     }
     rows.append(row | {name: each["value"] for name, each in found.items()})
     pd.DataFrame(rows).round(2).to_csv(path, index=False)

@@ -50,6 +50,7 @@ import matplotlib.pyplot as plt
 
 ROOT = HERE.parents[1]
 NOT_RUN = "not run"
+SEEDS = "\N{NO-BREAK SPACE}\N{MULTIPLICATION SIGN}{}"
 SOURCES = ("medium-replay", "medium-expert")
 TITLES = {
     "cql": "CQL(H)", "iql": "IQL", "mopo": "MOPO", "rambo": "RAMBO", "sdc": "SDC",
@@ -103,7 +104,7 @@ def shown(found: Estimate | None, absent: str, seeds: str, *quoted: str) -> str:
 
 def cell(runs: pd.DataFrame, *quoted: str) -> str:
     """Return the mean score of runs, or say that there are none."""
-    seeds = f"\N{NO-BREAK SPACE}\N{MULTIPLICATION SIGN}{runs['seed'].nunique()}"
+    seeds = SEEDS.format(runs["seed"].nunique())
     return shown(estimate(runs), NOT_RUN, seeds, *quoted)
 
 
@@ -158,7 +159,7 @@ def table2(episodes: pd.DataFrame, printed: pd.DataFrame, protocol: str) -> str:
                 for kind, value in zip(("score", "decrease"), pair, strict=True):
                     absent = "\N{EN DASH}" if runs else NOT_RUN
                     quoted = number(printed.loc[(env, knock), f"{method} {kind}"])
-                    line.append(shown(value, absent, "", quoted))
+                    line.append(shown(value, absent, SEEDS.format(len(runs)), quoted))
         rows += cells
     kinds = ("score", "loss %")
     head = [f"{TITLES[name]} {kind}" for name in methods for kind in kinds]
