@@ -100,7 +100,7 @@ def rolled_out_values(
 ) -> Array:
     """Return a policy's discounted return in a model, from each first state.
 
-    Each network is rolled out by itself, with its noise. States and rewards stay within
+    Each network makes rollouts of its own, with noise. States and rewards stay within
     the range of the data.
 
     Args:
