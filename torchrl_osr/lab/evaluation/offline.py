@@ -105,10 +105,9 @@ def fitted_values(
     description = "fitted Q evaluation"
     fit(loss, optimizer, targets, rows, description, progress=progress, **options)
     states = TensorDict({"observation": (starts - loc) / scale}, [number])
+    params = loss.target_qvalue_network_params
     with torch.no_grad():
-        value = loss.q(
-            states, act(policy, starts, size), loss.target_qvalue_network_params
-        )
+        value = loss.q(states, act(policy, starts, size), params)
     found: Array = (unit * value).double().numpy()
     return found
 
@@ -116,9 +115,8 @@ def fitted_values(
 def first_states(data: TensorDict) -> Tensor:
     """Return the first state of each episode, ``[E, S]``."""
     episode = episode_of(data)
-    starts: Tensor = data["observation"][
-        episode.diff(prepend=episode.new_tensor([-1])) > 0
-    ]
+    first = episode.diff(prepend=episode.new_tensor([-1])) > 0
+    starts: Tensor = data["observation"][first]
     return starts
 
 

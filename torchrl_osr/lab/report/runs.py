@@ -37,7 +37,7 @@ NUM_NAMED, NAMED_WIDTH = 3, 40
 """At most so many differences are in a name, with so many characters of each value."""
 
 ESTIMATED = "estimated return"
-"""Measure of runs that were never played; a critic stands for an episode."""
+"""Measure of runs that were never played; a network stands for an episode."""
 
 SAVED = ["states", "group", "disturbance", "walk", "back"]
 
