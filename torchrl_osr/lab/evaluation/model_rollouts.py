@@ -15,10 +15,11 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from torchrl.modules import MLP
 
 from torchrl_osr.lab.data import observation_statistics
+from torchrl_osr.lab.data.rows import episode_of
 from torchrl_osr.lab.dynamics import DynamicsEnsemble, DynamicsLoss
 from torchrl_osr.lab.dynamics.rollouts import Termination, never
 from torchrl_osr.lab.evaluation.episodes import Policy
-from torchrl_osr.lab.evaluation.offline import act, first_states, fit
+from torchrl_osr.lab.evaluation.offline import act, check_discount, first_states, fit
 from torchrl_osr.lab.evaluation.statistics import Array
 
 
@@ -109,7 +110,7 @@ def rolled_out_values(
         policy: as of :func:`~torchrl_osr.lab.evaluation.fitted_values`.
 
     Keyword Args:
-        gamma: discount factor.
+        gamma: discount factor, below 1.
         steps: length of a rollout; default ``3 / (1 - gamma)``: 5 % are left then.
         seed: of the noise.
 
@@ -124,7 +125,8 @@ def rolled_out_values(
         >>> len(rolled_out_values(task, data, lambda state: state[:, :3].tanh()))
         2
     """
-    model, starts = task.dynamics, first_states(data)
+    check_discount(gamma)
+    model, starts = task.dynamics, first_states(data, episode_of(data))
     generator = torch.Generator().manual_seed(seed)
     low, high = data["observation"].aminmax(dim=0)
     least, most = data["next", "reward"].aminmax()

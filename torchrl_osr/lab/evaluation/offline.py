@@ -68,9 +68,9 @@ def fitted_values(
         >>> len(fitted_values(data, lambda state: state[:, :3].tanh(), **options))
         2
     """
-    if not 0 <= gamma < 1:
-        raise ValueError(f"The discount is {gamma}; expected at least 0 and below 1.")
-    episode, starts = episode_of(data), first_states(data)
+    check_discount(gamma)
+    episode = episode_of(data)
+    starts = first_states(data, episode)
     number, size = len(starts), data["action"].shape[-1]
     generator = torch.Generator().manual_seed(seed)
     drawn = torch.randint(number, (num_critics, number), generator=generator)
@@ -112,9 +112,14 @@ def fitted_values(
     return found
 
 
-def first_states(data: TensorDict) -> Tensor:
-    """Return the first state of each episode, ``[E, S]``."""
-    episode = episode_of(data)
+def check_discount(gamma: float) -> None:
+    """Raise unless the discounted return of an endless episode is finite."""
+    if not 0 <= gamma < 1:
+        raise ValueError(f"The discount is {gamma}; expected at least 0 and below 1.")
+
+
+def first_states(data: TensorDict, episode: Tensor) -> Tensor:
+    """Return the first state of each of the rows' episodes, ``[E, S]``."""
     first = episode.diff(prepend=episode.new_tensor([-1])) > 0
     starts: Tensor = data["observation"][first]
     return starts

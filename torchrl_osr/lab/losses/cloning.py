@@ -149,6 +149,5 @@ class IQLLoss(ActorCriticLoss):
     def state_value(self, states: TensorDictBase) -> Tensor:
         """Return :math:`V`, ``[R]``."""
         network, params = self.value_network, self.value_network_params
-        return written_entry(network, params, states, self.tensor_keys.value).squeeze(
-            -1
-        )
+        value = written_entry(network, params, states, self.tensor_keys.value)
+        return value.squeeze(-1)

@@ -14,7 +14,11 @@ from torchrl_osr._files import read_json, sha256_of, write_json
 from torchrl_osr.lab.data.recording import NO_REWARDS, has_rewards
 from torchrl_osr.lab.evaluation import deterministic_policy
 from torchrl_osr.lab.evaluation.model_rollouts import fitted_task, rolled_out_values
-from torchrl_osr.lab.evaluation.offline import episode_values, fitted_values
+from torchrl_osr.lab.evaluation.offline import (
+    check_discount,
+    episode_values,
+    fitted_values,
+)
 from torchrl_osr.lab.evaluation.statistics import interval, nested_resamples
 from torchrl_osr.lab.run.data import load_data
 from torchrl_osr.lab.run.folder import package_versions
@@ -59,6 +63,7 @@ class OfflineEvaluator:
         env, options = replace(trained.config.env, id=None), trained.config.data
         options.path = self.data or options.path
         gamma = trained.config.optim.gamma if self.discount is None else self.discount
+        check_discount(gamma)  # before a model is trained
         request: dict[str, Any] = {
             "versions": package_versions(),
             "checkpoint": sha256_of(trained.path),
