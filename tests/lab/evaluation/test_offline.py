@@ -83,5 +83,5 @@ def test_a_learned_end_is_where_the_task_ends():
 def test_a_discount_of_1_has_no_finite_value():
     data = rolled_out(-0.3, 0.7)
     task = fitted_task(data, steps=1, num_networks=2, progress=False)
-    with pytest.raises(ValueError, match="The discount is 1; expected at least 0 and b"):
+    with pytest.raises(ValueError, match="The discount is 1; expected at least 0"):
         rolled_out_values(task, data, lambda s: s, gamma=1)
