@@ -1,4 +1,4 @@
-"""Pairs of episodes under disturbances, and their summary."""
+"""Pairs of episodes under disturbances."""
 
 from __future__ import annotations
 
@@ -23,7 +23,6 @@ from torchrl_osr.lab.evaluation import (
     Disturbance,
     deterministic_policy,
     evaluate_paired,
-    summarize_disturbances,
 )
 from torchrl_osr.modules import tanh_gaussian_actor
 
@@ -164,59 +163,3 @@ def test_an_episode_depends_on_its_own_disturbance_alone():
     assert 0 < sum(met) < 8, "the test needs both kinds of episodes"
     pairs = zip(knocked["returns"], results["clean"]["returns"], strict=True)
     assert [one != other for one, other in pairs] == met
-
-
-@pytest.fixture
-def evaluations():
-    """Two checkpoints of three pairs: a knock, a lasting change, a knock too late."""
-
-    def level(name, scores, moments, alive=None, steps=None):
-        entries = {"name": name, "kind": name, "strength": 1.0, "scores": scores}
-        entries |= {"survived_knock": alive, "alive_after": alive}
-        entries |= {"clean_alive_after": alive, "recovery_steps": steps}
-        return entries | {"disturbed_at": moments}
-
-    def evaluation(clean, knocked, heavy, moments, steps, alive):
-        levels = (
-            level("knock", knocked, moments, alive, steps),
-            level("m", heavy, [0] * 3),
-            level("never", knocked, *[[None] * 3] * 3),
-        )
-        return {"clean": {"scores": clean}, "levels": levels}
-
-    return [
-        evaluation(
-            [40, 60, 50], [20, 30, 50], [10, 10, 10],
-            [7, 8, None], [4, None, None], [True, False, None],
-        ),
-        evaluation(
-            [50, 50, 80], [40, 50, 80], [20, 20, 20],
-            [9, None, 6], [0, None, 12], [None, None, True],
-        ),
-    ]  # fmt: skip
-
-
-def test_summary_is_over_all_checkpoints(evaluations):
-    knock, mass, never = summarize_disturbances(evaluations)
-    assert knock["clean_score"] == pytest.approx(55)
-    assert knock["score"] == pytest.approx(45)
-    assert knock["decrease"] == pytest.approx(100 * 10 / 55)
-    assert knock["decrease_low"] < knock["decrease"] < knock["decrease_high"]
-    assert knock["disturbed_share"] == pytest.approx(4 / 6)
-    assert knock["survival"] == pytest.approx(2 / 3)  # one is not known
-    assert knock["recovered_share"] == pytest.approx(3 / 4)
-    assert knock["recovery_median"] == 8  # of 0, 4, 12 and never
-    assert mass["decrease"] == pytest.approx(100 * 40 / 55)
-    for name in ("survival", "recovered_share", "recovery_median"):
-        assert mass[name] is never[name] is None
-    assert (never["disturbed_share"], never["decrease"]) == (0, None)
-
-
-def test_without_scores_it_is_returns(evaluations):
-    for played in evaluations:
-        for each in (played["clean"], *played["levels"]):
-            each["returns"] = [score - 1000 for score in each.pop("scores")]
-    knock, mass, _ = summarize_disturbances(evaluations)
-    assert knock["clean_return"] == pytest.approx(-945)
-    assert knock["return"] == pytest.approx(-955)
-    assert mass["decrease"] is None, "no percentage of what is below 0"

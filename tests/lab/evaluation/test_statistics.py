@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from torchrl_osr.lab.evaluation.statistics import (
-    decrease_interval,
     estimate,
     mean_difference,
     mean_interval,
@@ -61,26 +60,6 @@ def test_decreases_of_several_runs_by_hand():
     assert score.mean == pytest.approx(20)
     assert lost[:3] == pytest.approx((50, 50, 50))
     assert scores_and_decreases([-run])[1][1] is None
-
-
-def test_decrease_by_hand():
-    # Two pairs: a resample is (1, 1), (2, 2) or, half of the time, both.
-    # Decreases: 100 (1 - 10/20) = 50; 100 (1 - 60/80) = 25; 100 (1 - 70/100) = 30.
-    assert decrease_interval([20, 80], [10, 60]) == pytest.approx((30, 25, 50))
-    # An equal factor in every pair leaves no doubt, however the episodes differ.
-    clean = np.array([1.0, 10.0, 100.0, 55.0])
-    assert decrease_interval(clean, 0.8 * clean) == pytest.approx((20, 20, 20))
-    # Unpaired, the same numbers in another order say much less.
-    _, low, high = decrease_interval(clean, 0.8 * clean[::-1])
-    assert low < 0 < high
-
-
-def test_nothing_to_lose_is_no_number():
-    assert decrease_interval([1.0], [1.0]) == (None, None, None)
-    assert decrease_interval([-1, 0.5], [3, 3]) == (None, None, None)
-    decrease, low, high = decrease_interval([-1, 2], [-1, 1])
-    assert decrease == pytest.approx(100)
-    assert low is high is None
 
 
 def test_the_saved_share_of_known_tables():

@@ -1,10 +1,10 @@
-"""Text tables of a training run and of disturbances."""
+"""The text table of a training run."""
 
 from __future__ import annotations
 
 import pytest
 
-from torchrl_osr.lab.evaluation.tables import robustness_table, score_table
+from torchrl_osr.lab.evaluation.tables import score_table
 
 
 @pytest.mark.parametrize(
@@ -25,14 +25,3 @@ def test_scores_are_last_recent_and_best(tmp_path, scores, recent, mean):
         f"policy, mean of last {recent} {mean}",
         "policy, best evaluation 90.0 [89.0, 91.0] at step 10",
     ]
-
-
-def test_a_disturbance_that_came_in_no_episode_is_named():
-    row = dict.fromkeys(("survival", "clean_survival", "recovered_share"))
-    row |= dict.fromkeys(("decrease", "decrease_low", "decrease_high"))
-    row |= {"recovery_median": None, "disturbed_share": 0.0, "name": "knock"}
-    table = robustness_table("t", [row | {"clean_return": -945.04, "return": -955.0}])
-    _, header, line, last = table.splitlines()
-    assert header.split()[:4] == ["disturbance", "clean", "return", "loss"]
-    assert line.split()[:4] == ["knock", "-945.0", "-955.0", "-"]
-    assert last == "  knock: every episode ended before it came."

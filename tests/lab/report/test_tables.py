@@ -68,7 +68,8 @@ def test_robustness_counts_those_that_met_the_disturbance(tmp_path):
     half = fakes.level("half", [each / 2 for each in clean])
     content = fakes.suite_of((5, [1, 2, 3, 4], clean, [met, late, half]))
     fakes.write_run(tmp_path / "a", {5: [1.0]}, suite=content)
-    table = robustness_table(fakes.read_all(tmp_path), "hand").loc[PLACE]
+    rows = fakes.read_all(tmp_path).episodes
+    table = robustness_table(rows[rows["suite"] == "hand"]).loc[PLACE]
     knock, late, half = (table.loc[name, "osr"] for name in ("knock", "late", "half"))
     assert (knock["met %"], late["met %"], half["met %"]) == (75, 0, 100)
     assert late["lost %"] is None, "nothing is known about it"

@@ -27,8 +27,9 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl_osr.lab.cli.console import sentence, single_job
 from torchrl_osr.lab.evaluation.recoverable import GROUPS
 from torchrl_osr.lab.evaluation.statistics import saved_share
-from torchrl_osr.lab.evaluation.tables import aligned_columns, robustness_table
-from torchrl_osr.lab.report.runs import find_runs
+from torchrl_osr.lab.evaluation.tables import aligned_columns
+from torchrl_osr.lab.report.runs import find_runs, suite_episodes
+from torchrl_osr.lab.report.tables import robustness_table, text
 from torchrl_osr.lab.run import CONF
 from torchrl_osr.lab.run.evaluate import evaluate_files, evaluate_run, file_name
 from torchrl_osr.lab.run.folder import read_status
@@ -64,11 +65,7 @@ def main(cfg: DictConfig) -> None:
     else:
         path, results = evaluate_run(config)
     if config.suite.half is None:
-        title = (
-            f"{results['env']} {results['data']}, suite {results['suite']}: "
-            f"{len(results['evaluations'])} x {config.episodes} pairs of episodes"
-        )
-        print("\n" + robustness_table(title, results["summary"]))
+        print("\n" + disturbance_table(results))
     else:
         print("\n" + recoverable_table(results))
     print(f"  files  {path}")
@@ -116,6 +113,25 @@ def evaluate_sweep(config: EvaluateConfig) -> None:
             f"{len(failed)} of {len(runs)} runs failed: {', '.join(failed)}."
         )
     print(f"  next   torchrl-osr report {config.sweep}")
+
+
+def disturbance_table(results: Mapping[str, Any]) -> str:
+    """Return the report's table of a suite as text, of these results alone."""
+    played, evaluations = suite_episodes(results), results["evaluations"]
+    table = robustness_table(played.assign(data="", run=0, method=""))
+    table = table.droplevel(["data", "method"])
+    table = table.drop(columns=["seeds", "stood %"], errors="ignore")
+    for name in ("clean", "disturbed"):  # an interval of each would be too wide
+        table[name] = [estimate.mean for estimate in table[name]]
+    cells = table.map(lambda cell: text(cell).removesuffix(" ᵉ")).reset_index()
+    clean = evaluations[0]["clean"]
+    title = (
+        f"{results['env']} {results['data']}, suite {results['suite']}: "
+        f"{len(evaluations)} x {len(clean['seeds'])} pairs of episodes, mean "
+        f"{'scores' if 'scores' in clean else 'returns'} [95 %]"
+    )
+    rows = [list(cells), *cells.to_numpy().tolist()]
+    return "\n".join([title, *aligned_columns(rows)])
 
 
 def recoverable_table(results: Mapping[str, Any]) -> str:

@@ -18,7 +18,6 @@ from torchrl_osr.lab.evaluation.recovery import DataDistance
 from torchrl_osr.lab.evaluation.robustness import (
     Disturbance,
     evaluate_paired,
-    summarize_disturbances,
 )
 from torchrl_osr.lab.evaluation.statistics import mean_interval
 
@@ -39,5 +38,4 @@ __all__ = [
     "recovers",
     "rolled_out_values",
     "summarize",
-    "summarize_disturbances",
 ]

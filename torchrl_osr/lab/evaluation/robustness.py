@@ -6,15 +6,13 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
-from torchrl_osr._files import finite_or_none
 from torchrl_osr.lab.data import ReferenceReturns
 from torchrl_osr.lab.envs import NotPossible
 from torchrl_osr.lab.evaluation.episodes import EpisodeEvaluator, Policy, Wrap
@@ -23,7 +21,6 @@ from torchrl_osr.lab.evaluation.recovery import (
     Trajectory,
     measure_recovery,
 )
-from torchrl_osr.lab.evaluation.statistics import decrease_interval, mean_interval
 
 TRANSIENT = ("knock", "push", "start")
 """Kinds of disturbance that end, so that there is something to recover from."""
@@ -128,51 +125,3 @@ def impossible_disturbances(
         except NotPossible as error:
             reasons[each.name] = str(error)
     return reasons
-
-
-def summarize_disturbances(
-    evaluations: Sequence[Mapping[str, Any]],
-) -> list[dict[str, Any]]:
-    """Average each disturbance over the episodes of all checkpoints.
-
-    The evaluations are those of :func:`evaluate_paired`, with the same disturbances.
-
-    Returns:
-        A row for each disturbance: ``"clean_score"``, ``"score"``, ``"decrease"`` in
-        percent, and ``"disturbed_share"``, the share that it acted in. Over those
-        alone: the share alive 100 steps after its end (``"survival"``, and
-        ``"clean_survival"`` of the undisturbed ones), ``"recovered_share"`` and
-        ``"recovery_median"``, steps until back in the data. ``None`` where there is
-        nothing to average. Without scores ``"clean_return"``, ``"return"`` and so on.
-    """
-    rows = []
-    measure = "score" if "scores" in evaluations[0]["clean"] else "return"
-    clean = np.concatenate([each["clean"][f"{measure}s"] for each in evaluations])
-    keys = ("disturbed_at", f"{measure}s", *RECOVERY)
-    for levels in zip(*(each["levels"] for each in evaluations), strict=True):
-        entries = pd.concat(
-            pd.DataFrame({key: level[key] for key in keys}, dtype=float)
-            for level in levels
-        )
-        values = entries[f"{measure}s"].to_numpy()
-        hit = entries["disturbed_at"].notna().to_numpy()
-        row = {key: levels[0][key] for key in ("name", "kind", "strength")}
-        mean, low, high = mean_interval(values)
-        row |= {measure: mean, f"{measure}_low": low, f"{measure}_high": high}
-        # An unmet one has no loss, and one that does not end no way back.
-        lost = decrease_interval(clean, values) if hit.any() else (None, None, None)
-        ends = levels[0]["recovery_steps"] is not None
-        steps = entries["recovery_steps"][hit & ends].fillna(np.inf)
-        row |= {
-            f"clean_{measure}": clean.mean(),
-            **dict(
-                zip(("decrease", "decrease_low", "decrease_high"), lost, strict=True)
-            ),
-            "disturbed_share": hit.mean(),
-            "survival": entries["alive_after"].mean(),
-            "clean_survival": entries["clean_alive_after"].mean(),
-            "recovered_share": np.isfinite(steps).mean(),
-            "recovery_median": steps.median(),
-        }
-        rows.append({key: finite_or_none(value) for key, value in row.items()})
-    return rows

@@ -110,27 +110,6 @@ def mean_difference(data_sets: Sequence[Sequence[Array]]) -> Estimate:
     return interval(float(point), np.mean(resamples, axis=0).ravel(), over)
 
 
-def decrease_interval(
-    clean: ArrayLike, disturbed: ArrayLike
-) -> tuple[float | None, float | None, float | None]:
-    """Return the decrease of the mean in percent and its paired-bootstrap interval.
-
-    All three are ``None`` for fewer than two pairs, or if the clean mean is not above
-    0; both ends are ``None`` if it is not above 0 in a resample.
-    """
-    pairs = np.stack([np.asarray(clean, float), np.asarray(disturbed, float)])
-    if pairs.shape[1] < 2 or pairs[0].mean() <= 0:
-        return None, None, None
-    clean_mean, disturbed_mean = pairs.mean(1)
-    rng = np.random.default_rng(0)
-    rows = rng.integers(pairs.shape[1], size=(NUM_RESAMPLES, pairs.shape[1]))
-    resampled_clean, resampled = pairs[:, rows].mean(-1)
-    point = float(100 * (1 - disturbed_mean / clean_mean))
-    if (resampled_clean <= 0).any():
-        return point, None, None
-    return interval(point, 100 * (1 - resampled / resampled_clean))[:3]
-
-
 def scores_and_decreases(
     runs: Sequence[ArrayLike],
 ) -> list[tuple[Estimate, Estimate | None]]:

@@ -1,4 +1,4 @@
-"""Text tables of a training run and of its evaluation under disturbances."""
+"""Text tables: aligned columns, and the scores of a training run."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from torchrl_osr.lab.evaluation.episodes import measure_of
-from torchrl_osr.lab.evaluation.recovery import STEPS_AFTER
 
 NUM_RECENT = 5  # neighbouring evaluations swing by tens of points: one says little
 
@@ -44,37 +43,6 @@ def score_table(
     lines = [f"{title}: {scale if measure == 'score' else measure} [95 % interval]"]
     lines += [f"  {label:<25}{value}" for label, value in rows.items()]
     return "\n".join([*lines, f"  {'files':<26}{folder}"])
-
-
-def robustness_table(title: str, summary: Sequence[Mapping[str, Any]]) -> str:
-    """Format a summary, see :func:`summarize_disturbances`, as a text table."""
-
-    def number(value: float | None) -> str:
-        return "-" if value is None else f"{value:.1f}"
-
-    def percent(value: float | None) -> str:
-        return "-" if value is None else f"{100 * value:.0f} %"
-
-    measure = measure_of(summary[0])
-    header = (
-        *("disturbance", "clean", measure, "loss %", "[95 %]", "met it"),
-        *(f"alive +{STEPS_AFTER}", "(clean)", "back", "steps back"),
-    )
-    rows = [
-        (
-            row["name"],
-            *(number(row[key]) for key in (f"clean_{measure}", measure, "decrease")),
-            f"[{number(row['decrease_low'])}, {number(row['decrease_high'])}]",
-            *map(percent, (row["disturbed_share"], row["survival"])),
-            *map(percent, (row["clean_survival"], row["recovered_share"])),
-            number(row["recovery_median"]),
-        )
-        for row in summary
-    ]
-    lines = [title, *aligned_columns([header, *rows])]
-    if unmet := [row["name"] for row in summary if not row["disturbed_share"]]:
-        lines.append(f"  {', '.join(unmet)}: every episode ended before it came.")
-    return "\n".join(lines)
 
 
 def aligned_columns(rows: Sequence[Sequence[str]]) -> list[str]:

@@ -57,7 +57,8 @@ def write_report(
         "recoverable": saved_table(tables, reference),
     }
     for suite in tables.suites:
-        frames[f"robustness-{suite}"] = robustness_table(tables, suite)
+        played = tables.episodes[tables.episodes["suite"] == suite]
+        frames[f"robustness-{suite}"] = robustness_table(played)
     frames["runs"] = runs.assign(versions=runs["versions"].map(", ".join))
     frames = {name: frame for name, frame in frames.items() if not frame.empty}
     folder.mkdir(parents=True, exist_ok=True)

@@ -208,11 +208,7 @@ def _read(folder: Path) -> _Run:
         rows.append(_episodes("", each["step"], each["seeds"], values, {"name": ""}))
     for file in sorted(folder.glob("robustness-*.json")):
         content = read_json(file)
-        for each in content["evaluations"]:
-            seeds = each["clean"]["seeds"]
-            for level in ({"name": "", **each["clean"]}, *each["levels"]):
-                place, values = (content["suite"], each["step"]), level[f"{measure}s"]
-                rows.append(_episodes(*place, seeds, values, level))
+        rows.append(suite_episodes(content))
         protocols.append(_protocol(content, steps))
         versions.append(content["versions"])
     episodes = pd.concat(rows)
@@ -245,6 +241,18 @@ def _read(folder: Path) -> _Run:
     settings = {key: str(value) for key, value in config.items()}
     states = pd.concat(saved, ignore_index=True)
     return _Run(facts, settings, contents, protocols, episodes, states)
+
+
+def suite_episodes(content: Mapping[str, Any]) -> pd.DataFrame:
+    """Return the episodes of a file of results under a suite, disturbed or not."""
+    rows = []
+    for each in content["evaluations"]:
+        clean = {"name": "", **each["clean"]}
+        measure = "scores" if "scores" in clean else "returns"
+        for level in (clean, *each["levels"]):
+            place = content["suite"], each["step"], clean["seeds"]
+            rows.append(_episodes(*place, level[measure], level))
+    return pd.concat(rows)
 
 
 def _episodes(

@@ -66,14 +66,13 @@ def score_table(tables: RunTables) -> pd.DataFrame:
     return frame_of(rows, "data", "method")
 
 
-def robustness_table(tables: RunTables, suite: str) -> pd.DataFrame:
+def robustness_table(episodes: pd.DataFrame) -> pd.DataFrame:
     """Tabulate scores and recovery under a suite, by data, disturbance and method.
 
     Scores are over all episodes. The columns after ``met`` are over the episodes that
     met the disturbance.
     """
     rows: dict[tuple[str, str], dict[str, Any]] = {}
-    episodes = tables.episodes[tables.episodes["suite"] == suite]
     for (data, method), group in episodes.groupby(["data", "method"], sort=False):
         names = list(group["disturbance"].unique())
         runs = [

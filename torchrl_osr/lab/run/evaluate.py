@@ -27,7 +27,6 @@ from torchrl_osr.lab.evaluation import (
     Policy,
     deterministic_policy,
     evaluate_paired,
-    summarize_disturbances,
 )
 from torchrl_osr.lab.evaluation.recoverable import load_recoverable_states, recovers
 from torchrl_osr.lab.evaluation.robustness import impossible_disturbances
@@ -149,7 +148,6 @@ def play_suite(config: EvaluateConfig, players: list[Player]) -> dict[str, Any]:
         "threshold": distance.threshold,
         "left_out": left_out,
         "evaluations": evaluations,
-        "summary": summarize_disturbances(evaluations),
     }
 
 
