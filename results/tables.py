@@ -76,7 +76,7 @@ def differences(
         [run.to_numpy() for _, run in group.groupby("seed")]
         for _, group in less.groupby("data")
     ]
-    return min(map(len, data_sets)), statistics.mean_difference(data_sets)
+    return min(map(len, data_sets)), statistics.nested_mean(data_sets)
 
 
 def recoverable(folder: Path) -> dict[tuple[str, str], tuple[str, float]]:

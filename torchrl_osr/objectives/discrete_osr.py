@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModule,
@@ -26,7 +25,7 @@ from torchrl_osr._entries import state_keys
 from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses, StatePolicy
 from torchrl_osr.objectives.networks import check_num_actions, is_categorical
 from torchrl_osr.objectives.state_recovery import action_index
-from torchrl_osr.objectives.transitions import SETS, TransitionKeys, Transitions
+from torchrl_osr.objectives.transitions import SETS, Transitions
 
 
 class DiscreteOSRLoss(ActorCriticLoss):
@@ -78,15 +77,6 @@ class DiscreteOSRLoss(ActorCriticLoss):
     """
 
     _schedulable_buffers = frozenset({"recovery_weight", "min_q_weight"})
-
-    @dataclass
-    class _AcceptedKeys(TransitionKeys):
-        """Those of every loss, and ``action_value``: what a critic writes."""
-
-        action_value: NestedKey = "action_value"
-
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
 
     def __init__(
         self,

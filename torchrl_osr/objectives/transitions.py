@@ -49,6 +49,7 @@ class TransitionKeys:
     priority_weight: NestedKey = "priority_weight"
     perturbed: NestedKey = "perturbed"
     state_action_value: NestedKey = "state_action_value"
+    action_value: NestedKey = "action_value"
     is_synthetic: NestedKey = "is_synthetic"
     one_step: NestedKey = "one_step"
     steps_to_next_obs: NestedKey = "steps_to_next_obs"

@@ -8,7 +8,6 @@ import pytest
 from torchrl_osr.lab.cli.data import overview
 from torchrl_osr.lab.data import transitions_from_columns
 from torchrl_osr.lab.data.overview import (
-    describe_entries,
     findings,
     recorded_columns,
 )
@@ -30,7 +29,7 @@ def make_log(rows=1200, **changes):
 
 def said(columns, **options):
     data, manifest = transitions_from_columns(columns, **options)
-    entries = describe_entries(recorded_columns(data, manifest))
+    entries = recorded_columns(data, manifest).agg(["min", "max"]).T
     return [*findings(data, manifest, entries)]
 
 

@@ -7,8 +7,8 @@ import pytest
 
 from torchrl_osr.lab.evaluation.statistics import (
     estimate,
-    mean_difference,
     mean_interval,
+    nested_mean,
     nested_resamples,
     saved_share,
     scores_and_decreases,
@@ -46,9 +46,9 @@ def test_nested_resamples_are_those_of_a_loop_over_draws():
 )
 def test_an_interval_says_what_it_is_over(runs, over):
     scores = [np.array([1.0, 3.0]) + run for run in range(runs)]
-    assert estimate(scores).over == mean_difference([scores]).over == over
+    assert estimate(scores).over == nested_mean([scores]).over == over
     assert estimate(scores).mean == pytest.approx(2 + (runs - 1) / 2)
-    assert mean_difference([scores, scores * 2]).mean == estimate(scores).mean
+    assert nested_mean([scores, scores * 2]).mean == estimate(scores).mean
 
 
 def test_decreases_of_several_runs_by_hand():

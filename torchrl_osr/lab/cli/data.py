@@ -24,7 +24,6 @@ from torchrl_osr.lab.cli.console import single_job
 from torchrl_osr.lab.data import make_environment
 from torchrl_osr.lab.data.overview import (
     actions_at_bounds,
-    describe_entries,
     findings,
     out_of_space,
     recorded_columns,
@@ -49,7 +48,8 @@ def main(cfg: DictConfig) -> None:
     if not OmegaConf.is_missing(cfg.env, "id"):
         env = OmegaConf.to_object(cfg.env)
     data, manifest = load_data(env, options, progress=cfg.progress)
-    entries = describe_entries(recorded_columns(data, manifest))
+    columns = recorded_columns(data, manifest)
+    entries = columns.agg(["min", "mean", "max", "std"]).T
     wrong = [*findings(data, manifest, entries)]
     if env is not None and env.id is not None:
         with closing(make_environment(env.id)) as made:

@@ -49,15 +49,13 @@ def recorded_columns(data: TensorDict, manifest: Mapping[str, Any]) -> pd.DataFr
     return pd.concat(frames, axis=1)
 
 
-def describe_entries(columns: pd.DataFrame) -> pd.DataFrame:
-    """Return range, mean and deviation of each of :func:`recorded_columns`."""
-    return columns.agg(["min", "mean", "max", "std"]).T
-
-
 def findings(
     data: TensorDict, manifest: Mapping[str, Any], entries: pd.DataFrame
 ) -> Iterator[str]:
-    """Yield what looks wrong with a data set that can be trained on, and the cure."""
+    """Yield what looks wrong with a data set that can be trained on, and the cure.
+
+    ``entries`` has ``min`` and ``max`` of each of :func:`recorded_columns`.
+    """
     yield from manifest.get("warnings", [])
     # If episodes can terminate, a constant reward still favours long ones.
     falls = bool(data["next", "terminated"].any())

@@ -77,7 +77,6 @@ def load_or_write(
         data, about = make()
         check_dataset(data)
         partial = folder.with_name(f".{folder.name}.partial")
-        shutil.rmtree(partial, ignore_errors=True)
         shutil.rmtree(partial, ignore_errors=True)  # of a killed process
         try:
             data.select(*DATASET_KEYS).memmap(partial / ROWS)

@@ -19,7 +19,6 @@ from torchrl_osr.lab.evaluation.robustness import (
     Disturbance,
     evaluate_paired,
 )
-from torchrl_osr.lab.evaluation.statistics import mean_interval
 
 __all__ = [
     "DataDistance",
@@ -33,7 +32,6 @@ __all__ = [
     "fitted_values",
     "inverse_dynamics_report",
     "load_recoverable_states",
-    "mean_interval",
     "measure_of",
     "recovers",
     "rolled_out_values",

@@ -27,11 +27,6 @@ PANELS = {
 """Logged scalars below the learning curve, and their titles."""
 
 
-def new_figure(width: float, height: float) -> Figure:
-    """Return a figure of ``width`` x ``height`` inches that needs no display."""
-    return Figure(figsize=(width, height), layout="constrained")
-
-
 def save_figure(figure: Figure, path: Path | str, *, dpi: int = 150) -> None:
     """Write a figure as PNG; a file of that name is replaced once it is whole."""
     for axes in figure.axes:
@@ -51,7 +46,7 @@ def learning_curve(
     """Draw the score, or return, of the evaluations, and the losses."""
     panels = [name for name in PANELS if scalars.get(name)]
     ratios = (2, 1) if history else (1,)
-    figure = new_figure(9, 2.1 * sum(ratios))
+    figure = Figure(figsize=(9, 2.1 * sum(ratios)), layout="constrained")
     grid = figure.add_gridspec(len(ratios), max(len(panels), 1), height_ratios=ratios)
     figure.suptitle(title)
     if history:

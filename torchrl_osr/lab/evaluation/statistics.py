@@ -95,8 +95,8 @@ def estimate(runs: Sequence[Array]) -> Estimate:
     return Estimate(*mean_interval(values), over_what(len(runs)))
 
 
-def mean_difference(data_sets: Sequence[Sequence[Array]]) -> Estimate:
-    """Return the mean of the differences ``[E]`` of each data set's seeds.
+def nested_mean(data_sets: Sequence[Sequence[Array]]) -> Estimate:
+    """Return the mean over data sets, their seeds, and the episodes ``[E]`` of these.
 
     Data sets have equal weight, and so have the seeds of each.
     """

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from torchrl_osr.lab.evaluation.statistics import Array, Estimate, mean_difference
+from torchrl_osr.lab.evaluation.statistics import Array, Estimate, nested_mean
 from torchrl_osr.lab.report.runs import RunTables
 from torchrl_osr.lab.report.tables import frame_of, recent
 
@@ -99,14 +99,14 @@ def compare(
         if not {method, reference} <= set(rows["method"]):
             continue
         pairs, note = pair(rows, method, reference)
-        estimate = mean_difference([pairs]) if pairs else None
+        estimate = nested_mean([pairs]) if pairs else None
         found.append(Difference(data, method, quantity, estimate, len(pairs), note))
         if pairs:
             paired.append(pairs)
     if len(found) > 1 and paired:
         note = f"{len(paired)} of {len(tables.data)} data sets"
         note = "" if len(paired) == len(tables.data) else note
-        together, fewest = mean_difference(paired), min(map(len, paired))
+        together, fewest = nested_mean(paired), min(map(len, paired))
         found.append(Difference(ALL_DATA, method, quantity, together, fewest, note))
     return found
 

@@ -14,7 +14,7 @@ from jinja2 import Environment, PackageLoader
 from matplotlib.figure import Figure
 
 from torchrl_osr._files import write_atomically
-from torchrl_osr.lab.evaluation.figures import GREY, new_figure, save_figure
+from torchrl_osr.lab.evaluation.figures import GREY, save_figure
 from torchrl_osr.lab.evaluation.statistics import NUM_RESAMPLES, Estimate, estimate
 from torchrl_osr.lab.report.comparisons import (
     MIN_SEEDS,
@@ -101,7 +101,7 @@ def learning_curves(tables: RunTables) -> Figure:
     """Draw scores over updates, and the mean score of the data's episodes."""
     columns = min(3, len(tables.data))
     rows = -(-len(tables.data) // columns)
-    figure = new_figure(9.6, 2.8 * rows + 1)
+    figure = Figure(figsize=(9.6, 2.8 * rows + 1), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False, sharex="col")
     panels = dict(zip(tables.data, grid.flat, strict=False))
     for data, axes in panels.items():

@@ -19,8 +19,7 @@ from torchrl_osr.lab.evaluation.statistics import (
     Estimate,
     decimal,
     estimate,
-    interval,
-    nested_resamples,
+    nested_mean,
     over_what,
     saved_share,
     scores_and_decreases,
@@ -105,19 +104,14 @@ def _recovery(there: pd.DataFrame) -> dict[str, Any]:
         return {}
     columns = ["survived_knock", "alive_after", "clean_alive_after"]
     shares = there.groupby("run")[columns].mean().mean()  # a run, a vote
-    # A column, whose numbers are percentages.
     back = 100.0 * (there["recovery_steps"] <= STEPS_AFTER)
-    runs = [
-        run.to_numpy()[:, None] for _, run in back.groupby(there["run"], sort=False)
-    ]
-    over = over_what(len(runs))
-    mean = np.mean([run.mean() for run in runs])
+    runs = [run.to_numpy() for _, run in back.groupby(there["run"], sort=False)]
     median = there["recovery_steps"].fillna(np.inf).median()
     return {
         "stood %": 100 * shares["survived_knock"],
         f"stood +{STEPS_AFTER} %": 100 * shares["alive_after"],
         "(undisturbed) %": 100 * shares["clean_alive_after"],
-        "recovered %": interval(mean, nested_resamples(runs), over),
+        "recovered %": nested_mean([runs]),
         "median steps": median if np.isfinite(median) else "most never",
     }
 

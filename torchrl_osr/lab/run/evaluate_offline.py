@@ -19,7 +19,7 @@ from torchrl_osr.lab.evaluation.offline import (
     episode_values,
     fitted_values,
 )
-from torchrl_osr.lab.evaluation.statistics import interval, nested_resamples
+from torchrl_osr.lab.evaluation.statistics import nested_mean
 from torchrl_osr.lab.run.data import load_data
 from torchrl_osr.lab.run.folder import package_versions
 from torchrl_osr.lab.run.load import load_trained, run_folder_of
@@ -93,7 +93,7 @@ class OfflineEvaluator:
                 self._known["task"] = fitted_task(rows, **training)
             values = rolled_out_values(self._known["task"], rows, policy, gamma=gamma)
         recorded = episode_values(rows, gamma)
-        found = interval(values.mean(), nested_resamples([*values[..., None]])[:, 0])
+        found = nested_mean([[*values]])
         results = request | {
             "env": env.name,
             "source": options.source,
