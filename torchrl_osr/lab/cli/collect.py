@@ -1,11 +1,4 @@
-"""Roll out a policy in any Gymnasium environment and keep the steps as a log.
-
-    torchrl-osr collect env.id=Pendulum-v1 path=pendulum.npz
-    torchrl-osr collect env.id=Pendulum-v1 policy=my_package:act path=pendulum.npz
-    torchrl-osr collect policy=outputs/Pendulum-v1-file/osr-seed0-... path=new.npz
-
-``torchrl-osr train data=file`` reads the log. See docs/any_environment.md.
-"""
+"""Record episodes of a policy as a log; ``conf/collect.yaml`` has the help."""
 
 from __future__ import annotations
 

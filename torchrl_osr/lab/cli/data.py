@@ -1,11 +1,4 @@
-"""Check data before training.
-
-    torchrl-osr data data.path=log.csv env.id=Pendulum-v1
-    torchrl-osr data data=minari data.path=mujoco/hopper/medium-v0
-
-Prints rows, episodes, ends and ranges, and what looks wrong with its cure. Takes the
-options of ``torchrl-osr train`` and refuses the same data. See docs/your_data.md.
-"""
+"""Check data before training; ``conf/check_data.yaml`` has the help."""
 
 from __future__ import annotations
 

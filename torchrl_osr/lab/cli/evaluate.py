@@ -1,13 +1,4 @@
-"""Disturb a trained policy: score lost, survival, and time back to the data.
-
-    torchrl-osr evaluate checkpoint=outputs/hopper-medium-replay/osr-seed0-...
-    torchrl-osr evaluate checkpoint=<run's folder> suite=recoverable
-    torchrl-osr evaluate sweep=multirun/20260101-120000 jobs=4
-    torchrl-osr evaluate sweep=<folder above runs> switching=true suite=recoverable
-
-A run's folder gets ``robustness-<suite>.json`` with all raw results, or
-``recoverable-<half>.json``. See docs/robustness.md.
-"""
+"""Disturb a trained policy; ``conf/evaluation/evaluate.yaml`` has the help."""
 
 from __future__ import annotations
 

@@ -1,16 +1,4 @@
-"""Train a policy on offline data, with one command.
-
-    torchrl-osr train env=hopper
-    torchrl-osr train env.id=Pendulum-v1 data=file data.path=log.npz
-    torchrl-osr train env=walker2d data=medium-expert seed=3 preset=paper
-    torchrl-osr train -m env=hopper,walker2d seed=0,1,2 hydra/launcher=pool
-    torchrl-osr train resume=<folder of a run> trainer.steps=40_000
-
-Data of the built-in tasks are rolled out on this machine at the first run and cached;
-docs/any_environment.md is about all others. A run leaves ``curve.png``,
-``returns.json``, ``inverse_dynamics.json``, ``policy.safetensors``, ``config.yaml``,
-``status.json``, CSV files and ``checkpoint/`` in its folder.
-"""
+"""Train a policy on offline data; ``conf/train.yaml`` has the help."""
 
 from __future__ import annotations
 
