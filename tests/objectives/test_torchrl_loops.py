@@ -1,4 +1,4 @@
-"""TorchRL's own training code trains every term of the losses.
+"""TorchRL's own trainer trains every term of the losses.
 
 Its CQLTrainer steps on the entries whose names it knows: a term in an entry of another
 name would be lost without an error.
@@ -16,7 +16,6 @@ from torch.optim import Adam
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import GymEnv
-from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import SoftUpdate
 from torchrl.trainers.algorithms import CQLTrainer
 
@@ -97,46 +96,3 @@ def test_cql_trainer_steps_along_the_gradient_of_all_losses(batch, kind) -> None
     assert_same_bits(stepped, expected)
     assert not any(map(torch.equal, before, loss.parameters()))
     trainer.collector.shutdown()
-
-
-class WarmStart(OSRLoss):
-    """OSR with TorchRL's entry for the first steps, which is not to be added up."""
-
-    def __init__(self, *networks: Any, **options: Any) -> None:
-        super().__init__(*networks, **options)
-        self.out_keys = [*self.out_keys, "loss_actor_bc"]
-
-    def losses(self, batch):
-        losses, metrics = super().losses(batch)
-        pi = self.policy(batch)["clean"]
-        _, log_prob = rsample_and_log_prob(pi)
-        cloned = self.alpha * log_prob - pi.log_prob(batch.a.unsqueeze(0))
-        return losses | {"loss_actor_bc": self.reduce(cloned.mean(0), batch)}, metrics
-
-
-@pytest.mark.parametrize("policy_eval_start", [0, 5])
-def test_update_of_torchrls_offline_script_steps_on_every_term(
-    batch, policy_eval_start
-) -> None:
-    """As in sota-implementations/cql/cql_offline.py, in our words."""
-    options = {"num_random": 3, "target_action_gap": 1.0}
-    loss, plain = make_loss(WarmStart, **options), make_loss(**options)
-    SoftUpdate(plain, tau=0.1)
-    updater, optimizer = SoftUpdate(loss, tau=0.1), Adam(loss.parameters(), lr=1e-2)
-    torch.manual_seed(2)
-    values = loss(batch.clone())
-    actor = "loss_actor" if policy_eval_start <= 3 else "loss_actor_bc"
-    q_loss = values["loss_qvalue"] + values["loss_cql"]
-    alphas = values["loss_alpha"] + values["loss_alpha_prime"]
-    (values[actor] + q_loss + alphas).backward()
-    slopes = [each.grad.clone() for each in loss.parameters()]
-    optimizer.step()
-    updater.step()
-    torch.manual_seed(2)
-    out = plain(batch)
-    total = sum(out[key] for key in plain.out_keys if key.startswith("loss_"))
-    total.backward()
-    # In the first steps the policy alone takes another one.
-    for (name, each), slope in zip(plain.named_parameters(), slopes, strict=True):
-        first_steps = policy_eval_start > 3 and name.startswith("actor_network")
-        assert torch.equal(each.grad, slope) != first_steps, name

@@ -110,15 +110,6 @@ def test_interrupted_it_ends_in_order_and_continues(runs, undisturbed, tmp_path)
     assert_same_results(folder, undisturbed)
 
 
-def test_longer_run_is_one_that_was_that_long_from_the_start(runs, tmp_path):
-    folder = tmp_path / "run"
-    assert runs.train(folder) == 0, runs.output
-    runs.start(f"resume={folder}", "trainer.steps=40")
-    assert runs.server.ended() == 0, runs.output
-    assert runs.train(tmp_path / "long", "trainer.steps=40") == 0, runs.output
-    assert results(folder) == results(tmp_path / "long")
-
-
 def test_second_sweep_continues_what_is_not_done(runs, tiny, tmp_path):
     sizes = tiny(steps=100, eval_interval=100, checkpoint_interval=25, record="false")
     sweep = [*sizes, "loss=cql", "seed=0,1", f"hydra.sweep.dir={tmp_path}", "-m"]
