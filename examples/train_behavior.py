@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 from contextlib import closing, suppress
-from dataclasses import fields
 from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -41,7 +40,6 @@ from torchrl_osr.lab.data import (
 from torchrl_osr.lab.data.behavior import (
     LOG_STD_MAX,
     LOG_STD_MIN,
-    Affine,
     BehaviorPolicy,
     load_behavior_card,
 )
@@ -76,11 +74,8 @@ class Actor(nn.Module):
 
     def as_arrays(self) -> BehaviorPolicy:
         """Return a copy that needs NumPy only."""
-        layers = {
-            name: Affine(*(p.detach().numpy().copy() for p in layer.parameters()))
-            for name, layer in self.named_children()
-        }
-        return BehaviorPolicy(**layers)
+        named = self.named_parameters()
+        return BehaviorPolicy({name: p.detach().numpy().copy() for name, p in named})
 
 
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
@@ -202,11 +197,8 @@ def choose(snapshots: list[Snapshot], medium_share: float) -> dict[str, Snapshot
 
 def save(path: Path, policy: BehaviorPolicy, *, half: bool) -> None:
     """Write a policy as plain arrays, in float16 or float32; whole or not at all."""
-    arrays = {
-        f"{layer.name}.{part}": array.astype(np.float16 if half else np.float32)
-        for layer in fields(policy)
-        for part, array in getattr(policy, layer.name)._asdict().items()
-    }
+    dtype = np.float16 if half else np.float32
+    arrays = {name: array.astype(dtype) for name, array in policy.arrays.items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as file:
         np.savez_compressed(file, **arrays)

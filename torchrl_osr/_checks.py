@@ -1,8 +1,10 @@
-"""Checks of arguments, with the messages that users see."""
+"""Checks of arguments and of optional packages, with the messages that users see."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 
@@ -24,3 +26,17 @@ def check_positive(name: str, value: float, *, minimum: float | None = None) -> 
         raise ValueError(f"{name} must be above 0, got {value}.")
     if minimum is not None and not value >= minimum:
         raise ValueError(f"{name} must be at least {minimum}, got {value}.")
+
+
+@contextmanager
+def needed_by(what: str, extra: str) -> Iterator[None]:
+    """Add to an ImportError who needs the package, with a verb, and which extra has it.
+
+    ``with needed_by("CSV files need", "train"): import pandas``
+    """
+    try:
+        yield
+    except ImportError as error:
+        raise ImportError(
+            f"{what} {error.name!r}: pip install torchrl-osr[{extra}]"
+        ) from error

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrl_osr._extras import needed_by
+from torchrl_osr._checks import needed_by
 
 RECORD = "torchrl_osr"
 """Where a file of tensors, or a graph, has its record."""

@@ -17,15 +17,10 @@ from torchrl_osr.lab.run import CONF
 # Waiting threads do not spin; read once, when torch is imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-COMMANDS = {
-    "data": "check a log before training on it",
-    "train": "train a policy on offline data, or continue a run",
-    "collect": "roll out a policy in any environment and keep the log",
-    "evaluate": "disturb a trained policy: score lost, survival, recovery",
-    "evaluate-offline": "estimate how good policies are from their data alone",
-    "report": "compare any number of runs on one page",
-    "export": "write a trained policy to one file, for use elsewhere",
-}
+COMMANDS = (
+    "data", "train", "collect", "evaluate", "evaluate-offline", "report", "export",
+)  # fmt: skip
+"""``conf/help.txt`` describes them."""
 
 CONFIGS = {
     "data": "check_data", "train": "train", "collect": "collect",
@@ -33,30 +28,12 @@ CONFIGS = {
 }  # fmt: skip
 """Configurations of Hydra's commands; they have the commands' help."""
 
-HELP = """\
-Offline reinforcement learning that recovers from out-of-distribution states (OSR).
-
-  torchrl-osr <command> ...
-
-{commands}
-
-A first run, its evaluation and a page about both:
-
-  torchrl-osr train env=hopper
-  torchrl-osr evaluate sweep=outputs
-  torchrl-osr report outputs
-
-Every command takes --help for its options, and --debug for the traceback of an error.
-"torchrl-osr --version" prints versions, for a bug report.
-"""
-
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Dispatch to the subcommand; ``arguments`` are by default the process's."""
     name, *rest = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if name in ("-h", "--help"):
-        lines = [f"  {command:18}{does}" for command, does in COMMANDS.items()]
-        print(HELP.format(commands="\n".join(lines)), end="")
+        print(Path(CONF, "help.txt").read_text(), end="")
     elif name == "--version":
         found = [f"torchrl-osr {version('torchrl-osr')}"]
         found.append(f"python {sys.version.split()[0]}")

@@ -196,7 +196,7 @@ class ActorCriticLoss(LossModule):
     def register_critics(
         self, qvalue_network: TensorDictModule | Sequence[TensorDictModule]
     ) -> None:
-        """Register critics, with targets: one to be copied, or a list."""
+        """Register critics, with targets: one to be copied, or a list; set TD(0)."""
         check_networks(qvalue_network=qvalue_network)
         if isinstance(qvalue_network, Sequence):
             self.num_qvalue_nets = len(qvalue_network)
@@ -220,6 +220,7 @@ class ActorCriticLoss(LossModule):
             )
             self.qvalue_network_params = TensorDictParams(own, no_convert=True)
         self._make_vmap()
+        self.make_value_estimator()
 
     def convert_to_functional(
         self, module: Any, module_name: str, *args: Any, **options: Any

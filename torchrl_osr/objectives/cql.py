@@ -105,7 +105,6 @@ class CQLLoss(ActorCriticLoss):
         self.max_q_backup = max_q_backup
         self.deterministic_backup = deterministic_backup
         self.declare_soft_actor_critic()
-        self.make_value_estimator()
 
     def losses(self, batch: Transitions) -> Losses:
         return self.cql_losses(batch, self.policy(batch))

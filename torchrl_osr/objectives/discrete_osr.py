@@ -115,7 +115,6 @@ class DiscreteOSRLoss(ActorCriticLoss):
         self.register_coefficient("min_q_weight", min_q_weight)
         self.has_cql, self.temperature = min_q_weight > 0, temperature
         self.declare_soft_actor_critic(*["recovery_kl"] * self.has_recovery)
-        self.make_value_estimator()
 
     def losses(self, batch: Transitions) -> Losses:
         policy = self.policy(batch)

@@ -107,7 +107,6 @@ class OSRVLoss(ActorCriticLoss):
         self.policy_values = policy_values
         self.num_random, self.temperature = num_random, temperature
         self.declare_soft_actor_critic("recovery_gap")
-        self.make_value_estimator()
 
     def losses(self, batch: Transitions) -> Losses:
         policy = self.policy(batch)

@@ -25,7 +25,6 @@ from torchrl_osr.objectives.networks import (
     action_bounds,
     check_action,
     check_num_actions,
-    check_same_bounds,
     distribution,
     head_of,
     squashing_bounds,
@@ -123,10 +122,8 @@ class StateRecoveryLoss(ActorCriticLoss):
             )
         else:
             name = "inverse_dynamics_network"
-            bounds = action_bounds(inverse_dynamics_network, name)
-            self.register_bounds(bounds)
-            check_same_bounds(own or bounds, bounds)
-            self.register_frozen(name, inverse_dynamics_network)
+            self.register_bounds(own or action_bounds(inverse_dynamics_network, name))
+            self.register_model(inverse_dynamics_network)
         self.convert_to_functional(actor_network, "actor_network")
         self.register_coefficient("recovery_weight", recovery_weight)
         self.declare(["loss_recovery"], [self.metric])

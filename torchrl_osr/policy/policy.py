@@ -19,8 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from torchrl_osr._checks import check_choice
-from torchrl_osr._extras import needed_by
+from torchrl_osr._checks import check_choice, needed_by
 from torchrl_osr._files import RECORD, read_tensors, write_atomically, write_tensors
 from torchrl_osr.modules.actor import mlp
 from torchrl_osr.policy.monitor import DataMonitor

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from torchrl_osr._extras import needed_by
+from torchrl_osr._checks import needed_by
 
 with needed_by("the trainer needs", "train"):
     from tqdm import tqdm

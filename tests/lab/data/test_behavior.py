@@ -23,8 +23,11 @@ def test_forward_pass_agrees_with_torch(env_name: str, policy_name: str) -> None
     policy = load_behavior_policy(env_name, policy_name)
     with closing(make_environment(CARD[env_name]["env"])) as env:
         data, *_ = collect_transitions(env, [policy.sample], 64, progress=False)
-    layers = policy.hidden0, policy.hidden1, policy.mean, policy.log_std
-    first, second, *heads = ([*map(torch.from_numpy, layer)] for layer in layers)
+    arrays = {name: torch.from_numpy(each) for name, each in policy.arrays.items()}
+    first, second, *heads = (
+        [arrays[f"{layer}.weight"], arrays[f"{layer}.bias"]]
+        for layer in ("hidden0", "hidden1", "mean", "log_std")
+    )
     hidden = F.linear(F.linear(data["observation"], *first).relu(), *second).relu()
     mean, log_std = (F.linear(hidden, *head) for head in heads)
     noise = np.random.default_rng(1).standard_normal(mean.shape, dtype=np.float32)

@@ -26,7 +26,7 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from torchrl_osr._extras import needed_by
+from torchrl_osr._checks import needed_by
 from torchrl_osr.lab.run.load import load_run_policy
 from torchrl_osr.lab.run.monitor import MonitorConfig, monitor_of_run
 from torchrl_osr.policy import Policy, load_policy

@@ -1,14 +1,15 @@
 """Behaviour policies: small tanh-Gaussian actors in NumPy.
 
 For a single observation NumPy costs a quarter of a torch call.
-Shapes: ``B`` batch, ``S`` observation, ``A`` action, ``H`` hidden width.
+Shapes: ``B`` batch, ``S`` observation, ``A`` action.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,41 +24,35 @@ BEHAVIOR_POLICIES_DIR = Path(__file__).parent / "behavior_policies"
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
 
 
-class Affine(NamedTuple):
-    """Weight ``[out, in]`` and bias ``[out]`` of one linear layer."""
-
-    weight: FloatArray
-    bias: FloatArray
-
-    def __call__(self, inputs: FloatArray) -> FloatArray:
-        return np.asarray(inputs @ self.weight.T + self.bias)
-
-
 @dataclass(frozen=True)
 class BehaviorPolicy:
-    """A tanh-Gaussian actor; weights ``[H, S]``, ``[H, H]`` and twice ``[A, H]``."""
+    """A tanh-Gaussian actor: layers ``hidden0``, ``hidden1``, ``mean``, ``log_std``.
 
-    hidden0: Affine
-    hidden1: Affine
-    mean: Affine
-    log_std: Affine
+    Each layer has a ``.weight`` ``[out, in]`` and a ``.bias`` ``[out]`` in ``arrays``.
+    """
+
+    arrays: Mapping[str, FloatArray]
 
     def sample(self, observation: NDArray[Any], rng: np.random.Generator) -> FloatArray:
         """Draw actions ``[A]`` or ``[B, A]`` for states that are not standardised."""
         features = self._features(observation)
-        loc = self.mean(features)
-        log_std = np.clip(self.log_std(features), LOG_STD_MIN, LOG_STD_MAX)
+        loc = self._layer("mean", features)
+        log_std = np.clip(self._layer("log_std", features), LOG_STD_MIN, LOG_STD_MAX)
         noise = rng.standard_normal(loc.shape, dtype=np.float32)
         return np.asarray(np.tanh(loc + np.exp(log_std) * noise))
 
     def deterministic(self, observation: NDArray[Any]) -> FloatArray:
         """Return squashed mean actions ``[A]`` or ``[B, A]``, see :meth:`sample`."""
-        return np.asarray(np.tanh(self.mean(self._features(observation))))
+        return np.asarray(np.tanh(self._layer("mean", self._features(observation))))
 
     def _features(self, observation: NDArray[Any]) -> FloatArray:
         inputs = np.asarray(observation, dtype=np.float32)
-        hidden = np.maximum(self.hidden0(inputs), np.float32(0))
-        return np.maximum(self.hidden1(hidden), np.float32(0))
+        hidden = np.maximum(self._layer("hidden0", inputs), np.float32(0))
+        return np.maximum(self._layer("hidden1", hidden), np.float32(0))
+
+    def _layer(self, name: str, inputs: FloatArray) -> FloatArray:
+        weight, bias = (self.arrays[f"{name}.{each}"] for each in ("weight", "bias"))
+        return np.asarray(inputs @ weight.T + bias)
 
 
 def load_behavior_card(folder: Path | str | None = None) -> dict[str, Any]:
@@ -87,8 +82,4 @@ def load_behavior_policy(
     ``examples/train_behavior.py`` writes a ``folder`` of your own.
     """
     arrays = read_arrays(behavior_policy_path(env_name, policy_name, folder))
-    arrays = {name: array.astype(np.float32) for name, array in arrays.items()}
-    layers = (each.name for each in fields(BehaviorPolicy))
-    return BehaviorPolicy(
-        *(Affine(arrays[f"{n}.weight"], arrays[f"{n}.bias"]) for n in layers)
-    )
+    return BehaviorPolicy({name: arrays[name].astype(np.float32) for name in arrays})

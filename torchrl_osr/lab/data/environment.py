@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from gymnasium import spaces
 
-from torchrl_osr._extras import needed_by
+from torchrl_osr._checks import needed_by
 from torchrl_osr.lab.data.behavior import load_behavior_card
 
 # v4 of the ant, although there is v5: Minari's sets are of v4, whose observations lack

@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium import spaces
 from tqdm.auto import tqdm
 
-from torchrl_osr._extras import needed_by
+from torchrl_osr._checks import needed_by
 from torchrl_osr._files import read_json
 from torchrl_osr.lab.data.environment import sorted_space
 from torchrl_osr.lab.data.recording import Reading, convert

@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from torchrl import torchrl_logger
 
 from torchrl_osr import __version__
-from torchrl_osr._extras import needed_by
+from torchrl_osr._checks import needed_by
 from torchrl_osr.lab.data.environment import (
     MAZE_IDS,
     EnvironmentSpec,

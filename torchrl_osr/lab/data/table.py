@@ -16,7 +16,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from torchrl_osr._extras import needed_by
+from torchrl_osr._checks import needed_by
 from torchrl_osr._files import read_arrays
 from torchrl_osr.lab.data.recording import NO_REWARDS, Reading, convert, has_rewards
 from torchrl_osr.lab.data.store import Dataset

@@ -119,7 +119,6 @@ class IQLLoss(ActorCriticLoss):
         self.advantage_temperature, self.expectile = temperature, expectile
         losses = ["loss_actor", "loss_qvalue", "loss_value"]
         self.declare(losses, ["nll", "pred_value", "target_value"])
-        self.make_value_estimator()
 
     def losses(self, batch: Transitions) -> Losses:
         if batch.is_data is not None:

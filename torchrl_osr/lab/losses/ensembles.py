@@ -16,6 +16,7 @@ from torch.nn.functional import normalize
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives.utils import _vmap_func
 
+from torchrl_osr import functional as F
 from torchrl_osr._checks import check_positive, check_weight
 from torchrl_osr._entries import state_keys
 from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses, StatePolicy
@@ -77,7 +78,6 @@ class EDACLoss(ActorCriticLoss):
         check_positive("num_qvalue_nets", self.num_qvalue_nets, minimum=2)
         self.register_coefficient("diversity_weight", diversity_weight)
         self.declare_soft_actor_critic("diversity")
-        self.make_value_estimator()
 
     def losses(self, batch: Transitions) -> Losses:
         policy = self.policy(batch)
@@ -110,19 +110,6 @@ class EDACLoss(ActorCriticLoss):
         # differentiated once more.
         gradient: Tensor = torch.func.grad(total)(batch.a.expand(number, -1, -1))
         return gradient
-
-
-def jeffreys_divergence(
-    loc_p: Tensor, scale_p: Tensor, loc_q: Tensor, scale_q: Tensor
-) -> Tensor:
-    r"""Return :math:`KL(p \,\|\, q) + KL(q \,\|\, p)` of Gaussians ``[R, A]``, ``[R]``.
-
-    The logarithms cancel; a sum of squares keeps its digits where ``p`` is near ``q``.
-    """
-    gap = loc_p - loc_q
-    means = (gap / scale_p).square() + (gap / scale_q).square()
-    scales = (scale_p / scale_q - scale_q / scale_p).square()
-    return 0.5 * (means + scales).sum(-1)
 
 
 class RORLLoss(ActorCriticLoss):
@@ -209,7 +196,6 @@ class RORLLoss(ActorCriticLoss):
             "uncertainty_penalty": q_ood_reg,
         }
         self.declare_soft_actor_critic(*(name for name in terms if terms[name]))
-        self.make_value_estimator()
 
     @torch.no_grad()
     def decay_uncertainty(self) -> None:
@@ -248,7 +234,9 @@ class RORLLoss(ActorCriticLoss):
         """Return the largest divergence of the policy around a state, ``[R]``."""
         pi, around = policy["clean"], self.around(batch, self.policy_smooth_eps)
         other = distribution(self.actor_network, self.actor_network_params, around)
-        return jeffreys_divergence(pi.loc, pi.scale, other.loc, other.scale).amax(0)
+        ours, theirs = (pi.loc, pi.scale), (other.loc, other.scale)
+        both = F.gaussian_kl(*ours, *theirs) + F.gaussian_kl(*theirs, *ours)
+        return both.sum(-1).amax(0)
 
     def value_smoothness(self, batch: Transitions, q_data: Tensor) -> Tensor:
         r"""Return the change of the values around a state, ``[R]``.

@@ -50,7 +50,6 @@ class FQELoss(ActorCriticLoss):
         self.register_critics(qvalue_network)
         self.value_bounds = value_bounds
         self.declare(["loss_qvalue"], ["pred_value", "target_value"])
-        self.make_value_estimator()
 
     def input_keys(self) -> list[NestedKey]:
         return [*super().input_keys(), nested("next", self.tensor_keys.action)]

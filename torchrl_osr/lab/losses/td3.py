@@ -65,7 +65,6 @@ class TD3Loss(ActorCriticLoss):
         bounds = own or (torch.as_tensor(low).float(), torch.as_tensor(high).float())
         self.register_bounds(bounds)
         self.register_actor_critic(actor_network, qvalue_network, delay_actor=True)
-        self.make_value_estimator()
         metrics = ["cloning_error", "pred_value", "target_value"]
         self.declare(["loss_actor", "loss_qvalue"], metrics)
 

@@ -28,7 +28,7 @@ from torchrl.record.loggers import CSVLogger, Logger, get_logger
 from torchrl.record.loggers.wandb import WandbLogger
 
 from torchrl_osr import StatePerturbation
-from torchrl_osr._extras import needed_by
+from torchrl_osr._checks import needed_by
 from torchrl_osr._files import write_atomically, write_json
 from torchrl_osr.fast import FastUpdate
 from torchrl_osr.lab.data.rows import take_multi_step
