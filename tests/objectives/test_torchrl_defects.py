@@ -117,20 +117,6 @@ def test_cloning_term_of_torchrl_ignores_masks() -> None:
     assert same == {TD3BCLoss: True, TorchRLsTD3BC: False}
 
 
-# TorchRL is wrong: flags of other types are inverted bit by bit, ~1 = 254.
-def test_flags_that_are_no_booleans_reach_torchrls_targets_as_numbers() -> None:
-    batch, same = make_batch("cql", 10), {}
-    for loss_class in (OurCQL, SACLoss):
-        found = []
-        for dtype in (torch.bool, torch.uint8):
-            batch["next", "terminated"] = batch["next", "terminated"].to(dtype)
-            torch.manual_seed(1)
-            loss = make_loss(loss_class, Networks())
-            found.append(loss(batch.clone())["loss_qvalue"])
-        same[loss_class] = torch.equal(*found)
-    assert same == {OurCQL: True, SACLoss: False}
-
-
 # TorchRL is wrong: the next state moves to where the n steps end, the flags do not. A
 # return that reaches the terminal state is bootstrapped from it, by every loss.
 def test_multi_step_of_torchrl_leaves_the_flags_of_the_first_step() -> None:

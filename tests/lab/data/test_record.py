@@ -52,14 +52,6 @@ def test_what_is_written_is_read_in_the_units_of_the_losses(tmp_path):
         write_log(path, columns)
 
 
-def test_discrete_actions_are_numbers_in_the_log_and_one_hot_in_the_data(tmp_path):
-    columns = record("CartPole-v1")
-    write_log(tmp_path / "log.npz", columns)
-    options = {"env_id": "CartPole-v1", "path": tmp_path / "log.npz"}
-    data, _ = load_dataset(**options)
-    np.testing.assert_array_equal(data["action"], np.eye(2)[columns["action"]])
-
-
 def test_noise_stays_within_the_bounds():
     noisy, again = (record("Pendulum-v1", forwards, noise=0.25) for _ in range(2))
     noisy = noisy["action"]
