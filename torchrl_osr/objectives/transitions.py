@@ -90,7 +90,7 @@ class Transitions:
         for mask in (rows.get(key, None) for key in masks):
             if mask is not None:
                 mask = mask.reshape(-1).bool()
-                rows = _zeros_where_not(rows, mask)
+                rows = rows.where(mask, torch.zeros_like(rows))
                 self.unmasked = self.counted(mask)
         self.rows = self.one_step = rows
         if keys.one_step in rows.keys(include_nested=True):
@@ -223,11 +223,3 @@ def _in_dtype(rows: TensorDictBase, dtype: torch.dtype) -> TensorDictBase:
     if all(each.dtype == dtype for each in floats):
         return rows
     return rows.apply(lambda each: each.to(dtype) if each.is_floating_point() else each)
-
-
-def _zeros_where_not(rows: TensorDictBase, mask: Tensor) -> TensorDictBase:
-    def selected(value: Tensor) -> Tensor:
-        where = mask.reshape(-1, *[1] * (value.ndim - 1))
-        return torch.where(where, value, torch.zeros_like(value))
-
-    return rows.apply(selected)

@@ -250,9 +250,9 @@ def trajectories(
     complete = flagged[stops] & ~broken[stops]
     if "next_observation" in columns and episode is None:
         # Rows that do not follow one another have no sum of rewards.
-        reached, after = columns["next_observation"][:-1], columns["observation"][1:]
-        slack = SAME_STATE * np.maximum(1, np.abs(after))
-        jumps = np.r_[(np.abs(reached - after) > slack).any(1) & ~ends[:-1], False]
+        pair = columns["next_observation"][:-1], columns["observation"][1:]
+        same = np.isclose(*pair, SAME_STATE, SAME_STATE).all(1)
+        jumps = np.r_[~same & ~ends[:-1], False]
         complete &= ~np.logical_or.reduceat(jumps, starts)
     returns = np.add.reduceat(reward, starts)
     keep = np.ones_like(ends)

@@ -46,10 +46,8 @@ def mix_datasets(
 def is_followed(data: TensorDictBase) -> Tensor:
     """Return whether the next row in time follows each row, bool ``[N]``."""
     followed: Tensor = ~data["next", "done"].squeeze(-1)
-    state = data["observation"][1:]
-    slack = SAME_STATE * state.abs().clamp_min(1)
-    apart = ((data["next", "observation"][:-1] - state).abs() > slack).any(-1)
-    followed[:-1] &= ~apart
+    pair = data["next", "observation"][:-1], data["observation"][1:]
+    followed[:-1] &= torch.isclose(*pair, SAME_STATE, SAME_STATE).all(-1)
     followed[-1] = False
     return followed
 

@@ -29,7 +29,6 @@ from torchrl_osr.lab.report.tables import (
     saved_table,
     score_table,
     text,
-    undisturbed,
 )
 
 # Each method has its own combination. The palette is Okabe and Ito's.
@@ -114,8 +113,8 @@ def learning_curves(tables: RunTables) -> Figure:
     for axes in grid.flat[len(panels) :]:
         axes.set_visible(False)
     lines = {}
-    groups = undisturbed(tables.episodes).groupby(["data", "method"], sort=False)
-    for (data, method), played in groups:
+    undisturbed = tables.episodes[tables.episodes["suite"] == ""]
+    for (data, method), played in undisturbed.groupby(["data", "method"], sort=False):
         steps = played.groupby("step")
         found = np.array([estimate(by_run(each))[:3] for _, each in steps])
         x, (mean, low, high) = np.array(list(steps.groups)) / 1000, found.T

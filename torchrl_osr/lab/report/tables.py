@@ -28,15 +28,9 @@ from torchrl_osr.lab.evaluation.tables import NUM_RECENT
 from torchrl_osr.lab.report.runs import RunTables
 
 
-def undisturbed(episodes: pd.DataFrame) -> pd.DataFrame:
-    """Select the episodes of the training's own evaluations."""
-    return episodes[episodes["suite"] == ""]
-
-
 def recent(episodes: pd.DataFrame, number: int = NUM_RECENT) -> pd.DataFrame:
     """Select the undisturbed episodes of the last evaluations, without step 0."""
-    found = undisturbed(episodes)
-    found = found[found["step"] > 0]
+    found = episodes[(episodes["suite"] == "") & (episodes["step"] > 0)]
     rank = found.groupby("run")["step"].rank("dense", ascending=False)
     return found[rank <= number]
 
