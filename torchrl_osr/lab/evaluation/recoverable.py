@@ -28,7 +28,7 @@ GROUPS = ("easy", "contested", "recoverable")
 SPEED_STEPS = 50  # HalfCheetah's speed is the mean over so many
 AT_ONCE = 16  # states are played at once
 STATES = Path(__file__).parent / "states"
-HALVES = ("public", "held-out")
+HALVES = ("public", "held-out", "sealed")
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ def load_recoverable_states(env_name: str, half: str = "public") -> RecoverableS
     """Load the states of one task, ``"walker2d"`` for instance.
 
     Choose methods by the ``"public"`` half. Evaluate a finished method once on the
-    ``"held-out"`` half.
+    ``"held-out"`` half, or on the newer ``"sealed"`` states of Hopper and Walker2d.
 
     Examples:
         >>> states = load_recoverable_states("walker2d")

@@ -227,7 +227,7 @@ class SuiteConfig:
 
     name: str = MISSING  # part of the names of the result files
     disturbances: dict[str, DisturbanceConfig] = field(default_factory=dict)
-    half: str | None = None  # half of the recoverable states: public or held-out
+    half: str | None = None  # of recoverable states: public, held-out or sealed
 
 
 @dataclass
