@@ -17,12 +17,14 @@ from torch.nn.functional import softplus
 
 from torchrl_osr._entries import column, entry, nested
 from torchrl_osr.functional import gaussian_kl
+from torchrl_osr.lab.dynamics.body import Body
 from torchrl_osr.modules.actor import mlp
 from torchrl_osr.modules.inverse_dynamics import LATENT_LOG_SCALE_BOUNDS
 from torchrl_osr.objectives import ActorCriticLoss
 from torchrl_osr.objectives.actor_critic import Losses
 from torchrl_osr.objectives.transitions import Transitions, check_single_steps
 
+LEAST_RESIDUAL = 1e-3  # of a body, in standard deviations of the state
 LOG_VARIANCE_BOUNDS = (-10.0, 0.5)  # at first, as in PETS and MOPO
 
 # Of MOPO's four hidden layers and its last one; further layers use the fourth's.
@@ -41,6 +43,9 @@ class DynamicsEnsemble(nn.Module):
     (https://arxiv.org/abs/2005.13239), which sets the defaults. Inputs and targets are
     standardised. Rollouts use the ``num_elites`` best networks, see
     :meth:`calibrate_`.
+
+    With a :attr:`body`, a grey box, they predict :math:`s' - b(s, a)` instead: what the
+    simulated body leaves over.
 
     Examples:
         >>> model = DynamicsEnsemble(11, 3, num_networks=3, num_elites=2)
@@ -85,6 +90,7 @@ class DynamicsEnsemble(nn.Module):
             self.register_buffer(f"{name}_loc", torch.zeros(size))
             self.register_buffer(f"{name}_scale", torch.ones(size))
         self.register_buffer("elites", torch.arange(num_elites))
+        self.body: Body | None = None
 
     def standardized(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and log-variance ``[E, B, D]`` of the standardised targets.
@@ -111,7 +117,15 @@ class DynamicsEnsemble(nn.Module):
         mean = mean * self.target_scale + self.target_loc
         scale = log_variance.mul(0.5).exp() * self.target_scale
         shape = self.num_networks, *batch, -1
-        return mean.view(shape), scale.view(shape)
+        mean, scale = mean.view(shape), scale.view(shape)
+        if self.body is not None:
+            change = self.body(observation, action) - observation
+            mean = torch.cat([mean[..., :-1] + change, mean[..., -1:]], -1)
+        return mean, scale
+
+    def observed(self, state: Tensor) -> Tensor:
+        """Return what a policy sees of states ``[B, S]``."""
+        return state if self.body is None else self.body.observed(state)
 
     def sample(self, mean: Tensor, scale: Tensor) -> Tensor:
         """Draw an elite for each row, and from its Gaussian, ``[B, D]``."""
@@ -131,30 +145,43 @@ class DynamicsEnsemble(nn.Module):
         return distance.amax(0)
 
     def inputs_and_targets(self, data: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Return ``[B, S + A]`` and ``[B, D]`` of transitions ``[B]``."""
+        """Return ``[B, S + A]`` and ``[B, D]`` of transitions ``[B]``.
+
+        Changes are those since ``"simulated"``, the body's prediction, if it is there.
+        """
         key, action_key = self.in_keys
         observation, action = entry(data, key), entry(data, action_key)
-        change = entry(data, nested("next", key)) - observation
+        before = data.get("simulated", observation)
+        change = entry(data, nested("next", key)) - before
         reward = column(data, ("next", "reward")).unsqueeze(-1)
         inputs = torch.cat([observation, action.to(observation.dtype)], -1)
         return inputs, torch.cat([change, reward.to(change.dtype)], -1)
 
+    def is_whole(self, data: TensorDictBase) -> Tensor:
+        """Return which transitions ``[B]`` can be predicted, bool ``[B]``.
+
+        They have a next state, and no number at a limit of the body's sensors.
+        """
+        whole = has_next_state(data, self.in_keys[0])
+        return whole if self.body is None else whole & self.body.shows(data)
+
     @torch.no_grad()
     def standardize_(self, data: TensorDictBase) -> None:
         """Take mean and standard deviation of inputs and targets from rows ``[N]``."""
-        known = has_next_state(data, self.in_keys[0])
-        inputs, targets = self.inputs_and_targets(data[known])
+        inputs, targets = self.inputs_and_targets(data[self.is_whole(data)])
         copy_statistics(inputs, self.input_loc, self.input_scale)
         copy_statistics(targets, self.target_loc, self.target_scale)
+        if self.body is not None:  # a good body leaves rounding errors
+            least = LEAST_RESIDUAL * self.input_scale[: self.observation_dim]
+            self.target_scale[:-1].clamp_(min=least)
 
     @torch.no_grad()
     def calibrate_(self, held_out: TensorDictBase) -> None:
         """Choose the networks with the smallest error on held-out rows as elites."""
-        known = has_next_state(held_out, self.in_keys[0])
-        inputs, targets = self.inputs_and_targets(held_out[known])
-        mean, _ = self.standardized(inputs)
-        wanted = (targets - self.target_loc) / self.target_scale
-        error = (mean - wanted).square().mean((-2, -1))
+        rows = held_out[self.is_whole(held_out)]
+        _, targets = self.inputs_and_targets(rows)
+        mean, _ = self.predict(*(rows[key] for key in self.in_keys))
+        error = ((mean - targets) / self.target_scale).square().mean((-2, -1))
         self.elites.copy_(error.argsort()[: len(self.elites)].sort().values)
 
     def parameter_groups(self) -> Iterator[dict[str, Any]]:
@@ -233,7 +260,8 @@ class DynamicsLoss(ActorCriticLoss):
     def input_keys(self) -> list[NestedKey]:
         key, action = self.dynamics_network.in_keys
         following = [nested("next", each) for each in (key, "reward", "terminated")]
-        return [key, action, *following]
+        simulated = [] if self.dynamics_network.body is None else ["simulated"]
+        return [key, action, *following, *simulated]
 
     def losses(self, batch: Transitions) -> Losses:
         check_single_steps(batch, "the model of the dynamics")
@@ -253,8 +281,7 @@ class DynamicsLoss(ActorCriticLoss):
             bounds = self.bound_weight * width.sum()
         # Of the mean over E times as many rows as each network has.
         error = number * gaussian_error(mean, log_variance, targets).flatten()
-        valid = has_next_state(rows, model.in_keys[0])
-        loss = self.reduce(error, batch, valid)
+        loss = self.reduce(error, batch, model.is_whole(rows))
         return {"loss_dynamics": loss, "loss_bounds": bounds}, {}
 
 

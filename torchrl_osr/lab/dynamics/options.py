@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, ReplayBuffer, Storage
 
 from torchrl_osr._checks import check_choice
+from torchrl_osr.lab.dynamics.body import Body
 from torchrl_osr.lab.dynamics.models import DynamicsEnsemble
 from torchrl_osr.lab.dynamics.rollouts import Termination, never, termination
 
@@ -25,6 +29,8 @@ class ModelData:
     gamma: float  # discount factor
     env_id: str | None
     seed: int
+    action_low: Sequence[float] | float = -1.0  # of the environment
+    action_high: Sequence[float] | float = 1.0
 
     def buffer(self, batch_size: int | None = None) -> ReplayBuffer:
         """Return a buffer of the rows to train on, without transforms."""
@@ -46,6 +52,8 @@ class DynamicsOptions:
     num_elites: int = 5  # networks used for rollouts, the best on held-out rows
     # width of each hidden layer of the networks
     num_cells: list[int] = field(default_factory=lambda: [200, 200, 200, 200])
+    xml: str | None = None  # file of the robot's body, MJCF, for dynamics=grey_box
+    frame_skip: int = 1  # physics steps of an action in it
     lr: float = 1e-3  # learning rate of the model
     batch_size: int = 256  # rows of a gradient step, for each network
     steps: int = 40_000  # gradient steps of the model; the best evaluation counts
@@ -74,6 +82,10 @@ class DynamicsOptions:
         names = "num_networks", "num_elites", "num_cells"
         options = {name: getattr(self, name) for name in names}
         return DynamicsEnsemble(observation_size, action_size, **options)
+
+    def body(self, **units: Any) -> Body:
+        """Return the body as it is described; ``units`` are options of it."""
+        return Body(str(Path(self.xml or "").absolute()), self.frame_skip, **units)
 
     def termination(
         self, env_id: str | None, loc: Tensor | float = 0.0, scale: Tensor | float = 1.0

@@ -94,7 +94,8 @@ def rollout(
     """
     state, kept = starts, []
     for _ in range(steps):
-        action = policy(state)
+        seen = model.observed(state)
+        action = policy(seen)
         mean, scale = model.predict(state, action)
         sample = model.sample(mean, scale)
         following, reward = state + sample[:, :-1], sample[:, -1:]
@@ -106,10 +107,10 @@ def rollout(
             following = torch.where(unknown, state, following)
             reward = torch.where(unknown, halt_reward, reward)
             ended, known = ended | unknown, finite
-        after = {"observation": following, "reward": reward, "done": ended}
+        after = {"observation": model.observed(following), "reward": reward, "done": ended}
         after |= {"terminated": ended, "truncated": torch.zeros_like(ended)}
         entries = {
-            "observation": state,
+            "observation": seen,
             "action": action,
             "next": after,
             "uncertainty": (scale * units).norm(dim=-1).amax(0).unsqueeze(-1),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import nn
 
 from torchrl_osr._files import read_tensors, write_json, write_tensors
+from torchrl_osr.lab.data import make_replay_buffer
+from torchrl_osr.lab.dynamics.body import Body, identify
 from torchrl_osr.lab.dynamics.model_adversary import ModelAdversary
 from torchrl_osr.lab.dynamics.models import (
     DynamicsEnsemble,
@@ -20,7 +23,6 @@ from torchrl_osr.lab.dynamics.models import (
     TransitionVAE,
     TransitionVAELoss,
     gaussian_error,
-    has_next_state,
 )
 from torchrl_osr.lab.dynamics.options import DynamicsOptions, ModelData
 from torchrl_osr.lab.dynamics.rollout_buffer import RolloutReplayBuffer
@@ -30,6 +32,9 @@ from torchrl_osr.trainers.checkpoints import safe_checkpoint
 
 FILE, REPORT = "dynamics.safetensors", "dynamics.json"
 """The model and its errors, in the folder of a run."""
+
+NUM_ROWS = 1000
+"""Rows by which a body is identified."""
 
 Fit = Callable[..., OfflineTrainer]
 """Trains a phase: ``fit(name, loss, parameters, **options of the trainer)``."""
@@ -94,6 +99,8 @@ def _trained(options: DynamicsOptions, data: ModelData, fit: Fit) -> DynamicsEns
     torch.manual_seed(data.seed)
     sizes = (held_out[key].shape[-1] for key in ("observation", "action"))
     model = options.ensemble(*sizes)
+    if options.xml is not None:
+        model.body, data = identified(options, data)
     _standardize(model, data)
     loss = DynamicsLoss(model)
 
@@ -137,6 +144,30 @@ def _trained_vae(options: DynamicsOptions, data: ModelData, fit: Fit) -> Transit
     return model
 
 
+def identified(options: DynamicsOptions, data: ModelData) -> tuple[Body, ModelData]:
+    """Identify the body; return it, and rows with what it predicts.
+
+    Rows beyond the limits of the sensors are left out.
+    """
+    rows = data.storage[:].select("observation", "action", "next")
+    loc, scale = data.loc.tolist(), data.scale.tolist()
+    low, high = data.action_low, data.action_high
+    body = options.body(loc=loc, scale=scale, low=low, high=high)
+    body = body.limited(rows)
+    rows = rows[body.shows(rows)].cpu()
+    generator = torch.Generator().manual_seed(data.seed)
+    some = rows[torch.randperm(len(rows), generator=generator)[:NUM_ROWS]]
+    found = identify(body, some)
+    for name, each in (("described", body), ("identified", found)):
+        change = each(some["observation"], some["action"]) - some["next", "observation"]
+        error = change.square().mean().sqrt()
+        print(f"body as {name}: error {error:.2g} standard deviations in a step")
+    rows["simulated"] = found(rows["observation"], rows["action"])
+    device = data.held_out.device or "cpu"
+    buffer = make_replay_buffer(rows, batch_size=1, seed=0, device=device)
+    return found, replace(data, storage=buffer.storage)
+
+
 def _standardize(model: DynamicsEnsemble | TransitionVAE, data: ModelData) -> None:
     """Move a model to the data, and standardise by 50,000 of their rows."""
     rows, device = data.buffer(), data.held_out.device or "cpu"
@@ -154,7 +185,7 @@ def dynamics_report(model: DynamicsEnsemble, data: TensorDictBase) -> dict[str, 
         the reward last. The share of errors ``"within_1_sigma"``, 0.683 if calibrated.
         Spearman's correlation of disagreement and error, ``"disagreement_rank"``.
     """
-    rows = data[has_next_state(data, model.in_keys[0])]
+    rows = data[model.is_whole(data)]
     _, targets = model.inputs_and_targets(rows)
     mean, scale = model.predict(*(rows[key] for key in model.in_keys))
     unit = model.target_scale
@@ -182,7 +213,8 @@ def write_dynamics(path: Path, model: DynamicsEnsemble) -> None:
     """Write a model to one file of tensors."""
     names = "observation_dim", "action_dim", "num_networks", "num_elites", "num_cells"
     sizes = {name: getattr(model, name) for name in names}
-    write_tensors(path, model.state_dict(), {"sizes": sizes})
+    body = None if model.body is None else asdict(model.body)
+    write_tensors(path, model.state_dict(), {"sizes": sizes, "body": body})
 
 
 def load_dynamics(path: Path) -> DynamicsEnsemble:
@@ -191,4 +223,5 @@ def load_dynamics(path: Path) -> DynamicsEnsemble:
     with torch.random.fork_rng(devices=[]):
         model = DynamicsEnsemble(**record["sizes"])
     model.load_state_dict(tensors)
+    model.body = record["body"] and Body(**record["body"])
     return model

@@ -114,11 +114,19 @@ def _check_combination(config: TrainConfig, learner: Learner) -> None:
         why += " choose dynamics=none"
     elif dynamics.use and dynamics.adversarial_steps and not (rolled_out and critics):
         why = "dynamics.adversarial_steps needs rollouts and critics: set it to 0"
+    elif dynamics.xml and (
+        dynamics.adversarial_steps or any(hasattr(m, "dynamics_network") for m in modules)
+    ):
+        why = f"{name} needs gradients of the model, and a body has none:"
+        why += " choose dynamics=ensemble"
     if why:
         raise ValueError(f"{why}.")
     if dynamics.use:
         batch_size, gamma = config.trainer.batch_size, config.optim.gamma
         dynamics.check(config.env.id, batch_size=batch_size, gamma=gamma)
+        if dynamics.xml:
+            sizes = config.env.observation_size, config.env.action_size
+            dynamics.body().check(*sizes)
 
 
 def read_environment(env: EnvConfig) -> None:

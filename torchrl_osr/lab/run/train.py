@@ -164,6 +164,8 @@ class Phases:
             config.optim.gamma,
             config.env.id,
             config.seed,
+            config.env.action_low or -1.0,
+            config.env.action_high or 1.0,
         )
         return training.train_dynamics(
             config.dynamics,
