@@ -6,7 +6,12 @@ import torch
 from torch import Tensor
 from uneven_dynamics import linear_dynamics
 
-from torchrl_osr.lab.dynamics import DynamicsEnsemble, EliteNetworks, SwitchingPolicy
+from torchrl_osr.lab.dynamics import (
+    DynamicsEnsemble,
+    EliteNetworks,
+    GreyBox,
+    SwitchingPolicy,
+)
 
 
 def cart(*bias: float, elites: int = 1) -> DynamicsEnsemble:
@@ -98,3 +103,27 @@ def test_elite_networks_predict_means_in_the_environments_units() -> None:
     state, action = torch.randn(3, 5, 3), torch.randn(3, 5, 2)
     wanted = torch.cat([other(state[:1], action[:1]), networks(state[1:], action[1:])])
     torch.testing.assert_close(both(state, action), wanted)
+
+
+class Clipped:
+    """A body that doubles states, and shows them up to 1."""
+
+    def __call__(self, state: Tensor, action: Tensor) -> Tensor:
+        return 2 * state
+
+    def observed(self, state: Tensor) -> Tensor:
+        return state.clamp(max=1.0)
+
+
+def test_a_grey_box_adds_the_body_and_shows_what_sensors_see() -> None:
+    model = ensemble(1, 3)
+    left_over = model.predict(torch.zeros(5, 3), torch.zeros(5, 2))[0][[1, 3]].mean(0)
+    model.body = Clipped()
+    loc, scale = torch.tensor([1.0, -2.0, 300.0]), torch.tensor([2.0, 0.5, 40.0])
+    low, high = torch.tensor([-2.0, 0.5]), torch.tensor([4.0, 1.5])
+    box = GreyBox(model, loc, scale, low, high)
+    middle = torch.tensor([1.0, 1.0]).expand(1, 5, -1)
+    found = box(loc.expand(1, 5, -1), middle)
+    wanted = torch.cat([left_over[:, :3] * scale, left_over[:, 3:]], -1)
+    torch.testing.assert_close(found, wanted[None], rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(box.observed(loc + 3 * scale), loc + scale)

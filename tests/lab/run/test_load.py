@@ -198,7 +198,6 @@ def test_switching_uses_all_runs_policies_models_and_critics(folders) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ([LOSS], "dynamics.safetensors"),
         (["loss=bc"], "needs real actions and critics"),
         ([LOSS, "optim.gamma=0.9"], "differ in .*0.9, "),
         ([LOSS, "data.reward_scale=100"], "differ in .*100.0"),
@@ -207,5 +206,12 @@ def test_switching_uses_all_runs_policies_models_and_critics(folders) -> None:
 )
 def test_runs_that_do_not_fit_together_are_refused(folders, tmp_path, options, message):
     make_run(tmp_path / "run", *options)
-    with pytest.raises((ValueError, FileNotFoundError), match=message):
+    with pytest.raises(ValueError, match=message):
         load_switching_policy([*folders, tmp_path / "run"])
+
+
+def test_one_model_is_enough_and_none_is_refused(folders, tmp_path):
+    make_run(tmp_path / "run", LOSS, *BOUNDS)
+    assert load_switching_policy([folders[0], tmp_path / "run"]).networks.number == 1
+    with pytest.raises(ValueError, match="None of the runs has a model"):
+        load_switching_policy([tmp_path / "run"])

@@ -1,5 +1,6 @@
 """Dynamics models: training, rollouts, and policies and losses that use them."""
 
+from torchrl_osr.lab.dynamics.body import Body, identify
 from torchrl_osr.lab.dynamics.model_adversary import ModelAdversary
 from torchrl_osr.lab.dynamics.models import (
     DynamicsEnsemble,
@@ -10,19 +11,22 @@ from torchrl_osr.lab.dynamics.models import (
 from torchrl_osr.lab.dynamics.options import DynamicsOptions, ModelData
 from torchrl_osr.lab.dynamics.rollout_buffer import RolloutReplayBuffer
 from torchrl_osr.lab.dynamics.rollouts import rollout, termination
-from torchrl_osr.lab.dynamics.switching import EliteNetworks, SwitchingPolicy
+from torchrl_osr.lab.dynamics.switching import EliteNetworks, GreyBox, SwitchingPolicy
 
 __all__ = [
+    "Body",
     "DynamicsEnsemble",
     "DynamicsLoss",
     "DynamicsOptions",
     "EliteNetworks",
+    "GreyBox",
     "ModelAdversary",
     "ModelData",
     "RolloutReplayBuffer",
     "SwitchingPolicy",
     "TransitionVAE",
     "TransitionVAELoss",
+    "identify",
     "rollout",
     "termination",
 ]

@@ -107,8 +107,9 @@ def rollout(
             following = torch.where(unknown, state, following)
             reward = torch.where(unknown, halt_reward, reward)
             ended, known = ended | unknown, finite
-        after = {"observation": model.observed(following), "reward": reward, "done": ended}
-        after |= {"terminated": ended, "truncated": torch.zeros_like(ended)}
+        after = {"observation": model.observed(following), "reward": reward}
+        after |= {"done": ended, "terminated": ended}
+        after["truncated"] = torch.zeros_like(ended)
         entries = {
             "observation": seen,
             "action": action,

@@ -50,6 +50,15 @@ class EliteNetworks:
         self.biases = [each.float() for each in biases]
         self.activation = model.activation
 
+    @property
+    def number(self) -> int:
+        """The number of networks, ``E``."""
+        return len(self.weights[0])
+
+    def observed(self, state: Tensor) -> Tensor:
+        """Return what a policy sees of states: all."""
+        return state
+
     @classmethod
     def join(cls, parts: Sequence[EliteNetworks]) -> EliteNetworks:
         """Return the networks of several models as one; their layers must be alike."""
@@ -68,6 +77,33 @@ class EliteNetworks:
         return torch.baddbmm(last[0], hidden, last[1])
 
 
+class GreyBox:
+    """Predict with a model's body and its elites' mean, as if they were one network.
+
+    Units are those of :class:`EliteNetworks`.
+    """
+
+    number = 1
+
+    def __init__(
+        self, model: DynamicsEnsemble, loc: Tensor, scale: Tensor, *bounds: Tensor
+    ) -> None:
+        self.model, self.loc, self.scale, self.bounds = model, loc, scale, bounds
+
+    def __call__(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Return ``[1, n, S + 1]`` at ``[1, n, S]`` and ``[1, n, A]``."""
+        low, high = self.bounds
+        state = (observation[0] - self.loc) / self.scale
+        unit = 2 * (action[0] - low) / (high - low) - 1
+        mean = self.model.predict(state, unit)[0][self.model.elites].mean(0, True)
+        return torch.cat([mean[..., :-1] * self.scale, mean[..., -1:]], -1)
+
+    def observed(self, state: Tensor) -> Tensor:
+        """Return what the sensors show of states ``[n, S]``."""
+        seen = self.model.observed((state - self.loc) / self.scale)
+        return seen * self.scale + self.loc
+
+
 class SwitchingPolicy:
     r"""Act with the policy that has the largest predicted return.
 
@@ -83,7 +119,8 @@ class SwitchingPolicy:
 
     Args:
         policies: each maps observations ``[n, S]`` to actions ``[n, A]``.
-        networks: of one or several models; ``None``: the values alone choose.
+        networks: of one or several models, or a grey box; ``None``: the values alone
+            choose.
         value: of observations and actions, ``[n]``.
 
     Keyword Args:
@@ -95,7 +132,7 @@ class SwitchingPolicy:
     def __init__(
         self,
         policies: Sequence[Callable[[Tensor], Tensor]],
-        networks: EliteNetworks | None,
+        networks: EliteNetworks | GreyBox | None,
         value: Callable[[Tensor, Tensor], Tensor],
         *,
         terminated: Termination = never,
@@ -131,12 +168,12 @@ class SwitchingPolicy:
         if networks is None:
             value = self.value(starts, self._actions(starts))
             return value.view(-1, len(self.policies))
-        number = len(networks.weights[0])
+        number = networks.number
         rows, state = (number, len(starts), -1), starts.repeat(number, 1)
         going = torch.ones_like(state[:, 0], dtype=torch.bool)
         reward = torch.zeros(self.steps, len(going), device=starts.device)
         for step in range(self.steps):
-            action = self._actions(state).reshape(rows)
+            action = self._actions(networks.observed(state)).reshape(rows)
             change = networks(state.view(rows), action).flatten(0, 1)
             # A prediction that is not finite ends the task without a reward.
             going = going & change.isfinite().all(-1)
@@ -148,7 +185,8 @@ class SwitchingPolicy:
             if not going.any():
                 break
         discount = self.gamma ** torch.arange(self.steps, device=starts.device)
-        value = self.value(state, self._actions(state)).where(going, 0.0)
+        seen = networks.observed(state)
+        value = self.value(seen, self._actions(seen)).where(going, 0.0)
         found = discount @ reward + self.gamma**self.steps * value
         return found.view(number, len(starts)).mean(0).view(-1, len(self.policies))
 

@@ -107,16 +107,15 @@ def _check_combination(config: TrainConfig, learner: Learner) -> None:
     reads_data = ("next", "action") in learner.objective.in_keys
     critics = isinstance(loss, ActorCriticLoss) and hasattr(loss, "qvalue_network")
     why = ""
-    if not dynamics.use and any(hasattr(m, "dynamics_network") for m in modules):
+    differentiated = any(hasattr(each, "dynamics_network") for each in modules)
+    if not dynamics.use and differentiated:
         why = f"{name} needs a model of the dynamics: choose dynamics=ensemble"
     elif rolled_out and (reads_data or isinstance(loss, IQLLoss)):
         why = f"{name} learns from actions of the data alone, which rollouts lack:"
         why += " choose dynamics=none"
     elif dynamics.use and dynamics.adversarial_steps and not (rolled_out and critics):
         why = "dynamics.adversarial_steps needs rollouts and critics: set it to 0"
-    elif dynamics.xml and (
-        dynamics.adversarial_steps or any(hasattr(m, "dynamics_network") for m in modules)
-    ):
+    elif dynamics.xml and (dynamics.adversarial_steps or differentiated):
         why = f"{name} needs gradients of the model, and a body has none:"
         why += " choose dynamics=ensemble"
     if why:
@@ -125,8 +124,10 @@ def _check_combination(config: TrainConfig, learner: Learner) -> None:
         batch_size, gamma = config.trainer.batch_size, config.optim.gamma
         dynamics.check(config.env.id, batch_size=batch_size, gamma=gamma)
         if dynamics.xml:
-            sizes = config.env.observation_size, config.env.action_size
-            dynamics.body().check(*sizes)
+            env = config.env
+            assert env.observation_size
+            assert env.action_size
+            dynamics.body().check(env.observation_size, env.action_size)
 
 
 def read_environment(env: EnvConfig) -> None:

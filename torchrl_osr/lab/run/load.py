@@ -16,7 +16,7 @@ from torchrl.checkpoint import CheckpointError
 from torchrl.envs import ObservationNorm
 from torchrl.objectives import LossModule
 
-from torchrl_osr.lab.dynamics import EliteNetworks, SwitchingPolicy
+from torchrl_osr.lab.dynamics import EliteNetworks, GreyBox, SwitchingPolicy
 from torchrl_osr.lab.dynamics.training import FILE, load_dynamics
 from torchrl_osr.lab.run.build import Learner, make_learner
 from torchrl_osr.lab.run.config import CONFIG, read_run
@@ -143,8 +143,9 @@ def load_switching_policy(
 ) -> SwitchingPolicy:
     """Combine runs of a task to one policy, in the environment's units, on the CPU.
 
-    Each run's policy is rolled out in the models of all runs, and the mean of all runs'
-    critics values its last state. Several seeds of ``loss=rim`` have all parts.
+    Each run's policy is rolled out in the models of all runs that have one, or in the
+    first grey box among them. The mean of all runs' critics values its last state.
+    Several seeds of ``loss=rim`` have all parts.
 
     They are folders, or checkpoints in them. With ``critics_only`` no model is used.
     ``options`` are those of :class:`~torchrl_osr.lab.dynamics.SwitchingPolicy`.
@@ -168,14 +169,19 @@ def load_switching_policy(
         values = [each.smallest_value(state, action) for each in policies]
         return torch.stack(values).mean(0)
 
-    models = None
+    models: EliteNetworks | GreyBox | None = None
     if not critics_only:
-        parts = []
-        for run, each in zip(runs, policies, strict=True):
-            model = load_dynamics(run_folder_of(run) / FILE)
-            units = each.loc, each.scale, each.low, each.high
-            parts.append(EliteNetworks(model, *units))
-        models = EliteNetworks.join(parts)
+        files = [run_folder_of(each) / FILE for each in runs]
+        parts = [
+            (load_dynamics(file), each.loc, each.scale, each.low, each.high)
+            for file, each in zip(files, policies, strict=True)
+            if file.exists()
+        ]
+        if not parts:
+            raise ValueError(f"None of the runs has a model, {FILE}: train loss=rim.")
+        grey = [GreyBox(*part) for part in parts if part[0].body]
+        networks = [EliteNetworks(*part) for part in parts]
+        models = grey[0] if grey else EliteNetworks.join(networks)
     config = configs[0]
     options["terminated"] = config.dynamics.termination(config.env.id)
     return SwitchingPolicy(policies, models, value, gamma=config.optim.gamma, **options)
