@@ -35,6 +35,8 @@ def main() -> None:
     add("--discount", type=float, help="default: that of each run")
     add("--estimator", choices=STEPS, default="fqe", help="default: fqe")
     add("--steps", type=int, help="updates of critics (8,000) or model (10,000)")
+    add("--xml", help="the robot's body, MJCF, for a model that is a grey box")
+    add("--frame-skip", type=int, default=1, help="physics steps of an action in it")
     add("--seed", type=int, default=0, help="of critics or model")
     add("--data", metavar="PATH", help="place of the log, if it was moved")
     add("--trust", action="append", default=[], metavar="MODULE", help="yours")

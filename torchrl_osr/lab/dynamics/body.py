@@ -17,7 +17,7 @@ import torch
 from mujoco.minimize import least_squares
 from mujoco.rollout import rollout as simulate
 from numpy.typing import NDArray
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 Numbers = Sequence[float]
@@ -167,3 +167,26 @@ def identify(body: Body, rows: TensorDictBase, *, prior: float = 1e-3) -> Body:
         start, residual, bounds, eps=1e-4, xtol=1e-4, max_iter=40, verbose=0
     )
     return replace(body, factors=np.exp(logs).tolist())
+
+
+def fitted_body(body: Body, rows: TensorDict, *, seed: int) -> tuple[Body, TensorDict]:
+    """Identify a body by 1,000 rows of a log ``[N]``, and print the errors.
+
+    Returns:
+        The body, and the rows within its limits, with ``"simulated"``: what it predicts
+        instead of the next observation.
+    """
+    body = body.limited(rows)
+    rows = rows[body.shows(rows)].cpu()
+    generator = torch.Generator().manual_seed(seed)
+    some = rows[torch.randperm(len(rows), generator=generator)[:1000]]
+    found = identify(body, some)
+    state, action, following = (
+        some[key] for key in ("observation", "action", ("next", "observation"))
+    )
+    for name, each in (("described", body), ("identified", found)):
+        change = (each(state, action) - following) / state.std(0)
+        error = change.square().mean().sqrt()
+        print(f"body as {name}: error {error:.2g} standard deviations in a step")
+    rows["simulated"] = found(rows["observation"], rows["action"])
+    return found, rows

@@ -15,7 +15,7 @@ from torch import nn
 
 from torchrl_osr._files import read_tensors, write_json, write_tensors
 from torchrl_osr.lab.data import make_replay_buffer
-from torchrl_osr.lab.dynamics.body import Body, identify
+from torchrl_osr.lab.dynamics.body import Body, fitted_body
 from torchrl_osr.lab.dynamics.model_adversary import ModelAdversary
 from torchrl_osr.lab.dynamics.models import (
     DynamicsEnsemble,
@@ -32,9 +32,6 @@ from torchrl_osr.trainers.checkpoints import safe_checkpoint
 
 FILE, REPORT = "dynamics.safetensors", "dynamics.json"
 """The model and its errors, in the folder of a run."""
-
-NUM_ROWS = 1000
-"""Rows by which a body is identified."""
 
 Fit = Callable[..., OfflineTrainer]
 """Trains a phase: ``fit(name, loss, parameters, **options of the trainer)``."""
@@ -100,7 +97,7 @@ def _trained(options: DynamicsOptions, data: ModelData, fit: Fit) -> DynamicsEns
     sizes = (held_out[key].shape[-1] for key in ("observation", "action"))
     model = options.ensemble(*sizes)
     if options.xml is not None:
-        model.body, data = identified(options, data)
+        data = _with_body(model, options, data)
     _standardize(model, data)
     loss = DynamicsLoss(model)
 
@@ -144,28 +141,18 @@ def _trained_vae(options: DynamicsOptions, data: ModelData, fit: Fit) -> Transit
     return model
 
 
-def identified(options: DynamicsOptions, data: ModelData) -> tuple[Body, ModelData]:
-    """Identify the body; return it, and rows with what it predicts.
-
-    Rows beyond the limits of the sensors are left out.
-    """
-    rows = data.storage[:].select("observation", "action", "next")
+def _with_body(
+    model: DynamicsEnsemble, options: DynamicsOptions, data: ModelData
+) -> ModelData:
+    """Give a model its body; return rows with what the body predicts."""
     loc, scale = data.loc.tolist(), data.scale.tolist()
     low, high = data.action_low, data.action_high
     body = options.body(loc=loc, scale=scale, low=low, high=high)
-    body = body.limited(rows)
-    rows = rows[body.shows(rows)].cpu()
-    generator = torch.Generator().manual_seed(data.seed)
-    some = rows[torch.randperm(len(rows), generator=generator)[:NUM_ROWS]]
-    found = identify(body, some)
-    for name, each in (("described", body), ("identified", found)):
-        change = each(some["observation"], some["action"]) - some["next", "observation"]
-        error = change.square().mean().sqrt()
-        print(f"body as {name}: error {error:.2g} standard deviations in a step")
-    rows["simulated"] = found(rows["observation"], rows["action"])
+    rows = data.storage[:].select("observation", "action", "next")
+    model.body, rows = fitted_body(body, rows, seed=data.seed)
     device = data.held_out.device or "cpu"
     buffer = make_replay_buffer(rows, batch_size=1, seed=0, device=device)
-    return found, replace(data, storage=buffer.storage)
+    return replace(data, storage=buffer.storage)
 
 
 def _standardize(model: DynamicsEnsemble | TransitionVAE, data: ModelData) -> None:

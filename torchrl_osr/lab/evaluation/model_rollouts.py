@@ -17,6 +17,7 @@ from torchrl.modules import MLP
 from torchrl_osr.lab.data import observation_statistics
 from torchrl_osr.lab.data.rows import episode_of
 from torchrl_osr.lab.dynamics import DynamicsEnsemble, DynamicsLoss
+from torchrl_osr.lab.dynamics.body import Body, fitted_body
 from torchrl_osr.lab.dynamics.rollouts import Termination, never
 from torchrl_osr.lab.evaluation.episodes import Policy
 from torchrl_osr.lab.evaluation.offline import act, check_discount, first_states, fit
@@ -38,8 +39,12 @@ def fitted_task(
     batch_size: int = 128,
     seed: int = 0,
     progress: bool = True,
+    body: Body | None = None,
 ) -> TaskModel:
-    """Learn a model of the task from transitions ``[N]``, its end from their flags."""
+    """Learn a model of the task from transitions ``[N]``, its end from their flags.
+
+    With a ``body``, in the units of the data, the model is a grey box.
+    """
     sizes = (data[key].shape[-1] for key in ("observation", "action"))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -50,6 +55,8 @@ def fitted_task(
             num_cells=(128, 128, 128),
         )
         ended = fitted_end(data)
+    if body is not None:
+        dynamics.body, data = fitted_body(body, data, seed=seed)
     dynamics.standardize_(data)
     optimizer = torch.optim.Adam(dynamics.parameter_groups(), lr=1e-3, fused=True)
     fit(
@@ -101,8 +108,8 @@ def rolled_out_values(
 ) -> Array:
     """Return a policy's discounted return in a model, from each first state.
 
-    Each network makes rollouts of its own, with noise. States and rewards stay within
-    the range of the data.
+    Each network makes rollouts of its own, with noise. Rewards stay within the range
+    of the data, and states too, unless a body moves them.
 
     Args:
         task: of :func:`fitted_task`.
@@ -134,13 +141,18 @@ def rolled_out_values(
     going = torch.ones_like(state[..., 0])
     value, size = torch.zeros_like(going), data["action"].shape[-1]
     for step in range(round(3 / (1 - gamma)) if steps is None else steps):
-        action = act(policy, state.flatten(0, 1), size).view(*going.shape, size)
+        seen = model.observed(state.flatten(0, 1))
+        action = act(policy, seen, size).view(*going.shape, size)
         mean, log_variance = model.standardized(torch.cat([state, action], -1))
         noise = torch.randn(mean.shape, generator=generator)
         change = mean + noise * (log_variance / 2).exp()
         change = change * model.target_scale + model.target_loc
         value += going * gamma**step * change[..., -1].clamp(least, most)
-        state = (state + change[..., :-1]).clamp(low, high)
+        if model.body is None:
+            state = (state + change[..., :-1]).clamp(low, high)
+        else:
+            moved = model.body(state.flatten(0, 1), action.flatten(0, 1))
+            state = moved.view_as(state) + change[..., :-1]
         going = going * ~task.ended(state)
         if not going.any():
             break

@@ -12,6 +12,7 @@ from torchrl import torchrl_logger
 
 from torchrl_osr._files import read_json, sha256_of, write_json
 from torchrl_osr.lab.data.recording import NO_REWARDS, has_rewards
+from torchrl_osr.lab.dynamics import Body
 from torchrl_osr.lab.evaluation import deterministic_policy
 from torchrl_osr.lab.evaluation.model_rollouts import fitted_task, rolled_out_values
 from torchrl_osr.lab.evaluation.offline import (
@@ -44,6 +45,8 @@ class OfflineEvaluator:
         steps, seed: of the training of critics or model.
         discount: default: that of the run.
         data: place of the data, if they have been moved.
+        xml, frame_skip: of the robot's :class:`~torchrl_osr.lab.dynamics.Body`. The
+            estimator is then the model, as a grey box.
         trust: modules of yours that the run may name.
     """
 
@@ -52,8 +55,14 @@ class OfflineEvaluator:
     discount: float | None = None
     seed: int = 0
     data: str | None = None
+    xml: str | None = None
+    frame_skip: int = 1
     trust: Sequence[str] = ()
     _known: dict[str | None, Any] = field(default_factory=dict, init=False)
+
+    def __post_init__(self) -> None:
+        if self.xml is not None:
+            self.estimator = "model"
 
     def __call__(self, path: Path) -> dict[str, Any]:
         """Return the estimate of a run, a folder, or of a checkpoint."""
@@ -73,6 +82,8 @@ class OfflineEvaluator:
             "steps": self.steps or STEPS[self.estimator],
             "seed": self.seed,
         }
+        if self.xml is not None:
+            request |= {"xml": sha256_of(Path(self.xml)), "frame_skip": self.frame_skip}
         parts = [] if path.is_dir() else [path.stem]
         parts += ["model"] if self.estimator == "model" else []
         file = run_folder_of(path) / "-".join([*parts, FILE])
@@ -90,7 +101,13 @@ class OfflineEvaluator:
             values = fitted_values(rows, policy, gamma=gamma, **training)
         else:
             if "task" not in self._known:
-                self._known["task"] = fitted_task(rows, **training)
+                body = None
+                if self.xml is not None:
+                    low, high = env.action_low or -1.0, env.action_high or 1.0
+                    body = Body(self.xml, self.frame_skip, (), 0.0, 1.0, low, high)
+                    states, actions = rows["observation"], rows["action"]
+                    body.check(states.shape[-1], actions.shape[-1])
+                self._known["task"] = fitted_task(rows, body=body, **training)
             values = rolled_out_values(self._known["task"], rows, policy, gamma=gamma)
         recorded = episode_values(rows, gamma)
         found = nested_mean([[*values]])
