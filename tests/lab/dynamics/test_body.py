@@ -45,7 +45,11 @@ def test_the_body_moves_as_gymnasiums_does() -> None:
     body = Body(env.fullpath, env.frame_skip, **units)
     action = 2 * (rows["action"] + 2) / 3 - 1
     found = body((state - loc) / scale, action) * scale + loc
-    torch.testing.assert_close(found, following, rtol=1e-3, atol=1e-3)
+    close = {"rtol": 1e-3, "atol": 1e-3}
+    torch.testing.assert_close(found, following, **close)
+    control = -2 + 3 * (action + 1) / 2
+    found = body.in_own_units()(state, control)
+    torch.testing.assert_close(found, following, **close)
 
 
 def test_factors_are_identified_from_a_log() -> None:

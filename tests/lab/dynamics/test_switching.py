@@ -6,12 +6,7 @@ import torch
 from torch import Tensor
 from uneven_dynamics import linear_dynamics
 
-from torchrl_osr.lab.dynamics import (
-    DynamicsEnsemble,
-    EliteNetworks,
-    GreyBox,
-    SwitchingPolicy,
-)
+from torchrl_osr.lab.dynamics import DynamicsEnsemble, EliteNetworks, SwitchingPolicy
 
 
 def cart(*bias: float, elites: int = 1) -> DynamicsEnsemble:
@@ -105,8 +100,11 @@ def test_elite_networks_predict_means_in_the_environments_units() -> None:
     torch.testing.assert_close(both(state, action), wanted)
 
 
-class Clipped:
+class Doubling:
     """A body that doubles states, and shows them up to 1."""
+
+    def in_own_units(self) -> Doubling:
+        return self
 
     def __call__(self, state: Tensor, action: Tensor) -> Tensor:
         return 2 * state
@@ -115,15 +113,13 @@ class Clipped:
         return state.clamp(max=1.0)
 
 
-def test_a_grey_box_adds_the_body_and_shows_what_sensors_see() -> None:
+def test_of_a_grey_box_one_network_adds_to_the_body() -> None:
     model = ensemble(1, 3)
-    left_over = model.predict(torch.zeros(5, 3), torch.zeros(5, 2))[0][[1, 3]].mean(0)
-    model.body = Clipped()
-    loc, scale = torch.tensor([1.0, -2.0, 300.0]), torch.tensor([2.0, 0.5, 40.0])
-    low, high = torch.tensor([-2.0, 0.5]), torch.tensor([4.0, 1.5])
-    box = GreyBox(model, loc, scale, low, high)
-    middle = torch.tensor([1.0, 1.0]).expand(1, 5, -1)
-    found = box(loc.expand(1, 5, -1), middle)
-    wanted = torch.cat([left_over[:, :3] * scale, left_over[:, 3:]], -1)
+    state, action = torch.randn(1, 5, 3), torch.randn(1, 5, 2)
+    left_over = model.predict(state[0], action[0])[0][1]
+    model.body = Doubling()
+    networks = EliteNetworks(model)
+    found = networks(state, action)
+    wanted = left_over + torch.cat([state[0], torch.zeros(5, 1)], -1)
     torch.testing.assert_close(found, wanted[None], rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(box.observed(loc + 3 * scale), loc + scale)
+    assert networks.observed(2 * torch.ones(1, 3)).tolist() == [[1.0] * 3]

@@ -11,7 +11,7 @@ from torchrl_osr.lab.dynamics.models import (
 from torchrl_osr.lab.dynamics.options import DynamicsOptions, ModelData
 from torchrl_osr.lab.dynamics.rollout_buffer import RolloutReplayBuffer
 from torchrl_osr.lab.dynamics.rollouts import rollout, termination
-from torchrl_osr.lab.dynamics.switching import EliteNetworks, GreyBox, SwitchingPolicy
+from torchrl_osr.lab.dynamics.switching import EliteNetworks, SwitchingPolicy
 
 __all__ = [
     "Body",
@@ -19,7 +19,6 @@ __all__ = [
     "DynamicsLoss",
     "DynamicsOptions",
     "EliteNetworks",
-    "GreyBox",
     "ModelAdversary",
     "ModelData",
     "RolloutReplayBuffer",

@@ -115,6 +115,15 @@ class Body:
         """Return what the sensors show of states."""
         return state.clamp(state.new_tensor(self.least), state.new_tensor(self.most))
 
+    def in_own_units(self) -> Body:
+        """Return the body for observations and controls as they are."""
+        least, most = (
+            (np.asarray(each) * self.scale + self.loc).tolist()
+            for each in (self.least, self.most)
+        )
+        units: Any = {"loc": 0.0, "scale": 1.0, "low": -1.0, "high": 1.0}
+        return replace(self, least=least, most=most, **units)
+
     def shows(self, rows: TensorDictBase) -> Tensor:
         """Return which transitions ``[N]`` are within the limits, bool ``[N]``."""
         states = torch.stack([rows["observation"], rows["next", "observation"]])

@@ -20,7 +20,8 @@ class EliteNetworks:
 
     States and actions are in the environment's units: the model's states are
     ``(s - loc) / scale``, its actions -1 and 1 are ``low`` and ``high``. All scaling is
-    folded into two layers, for speed at action time.
+    folded into two layers, for speed at action time. Of a grey box, the best network
+    alone adds to what the body does.
     """
 
     @torch.no_grad()
@@ -36,8 +37,9 @@ class EliteNetworks:
         states, actions = ones(model.observation_dim), ones(model.action_dim)
         center = torch.cat([loc * states, (low + high) / 2 * actions]).double()
         unit = torch.cat([scale * states, (high - low) / 2 * actions]).double()
-        weights = [each.weight[model.elites].double() for each in model.layers]
-        biases = [each.bias[model.elites].double() for each in model.layers]
+        elites = model.elites if model.body is None else model.elites[:1]
+        weights = [each.weight[elites].double() for each in model.layers]
+        biases = [each.bias[elites].double() for each in model.layers]
         weights[0] /= (unit * model.input_scale).unsqueeze(-1)
         shift = (center + unit * model.input_loc) @ weights[0]
         biases[0] -= shift.unsqueeze(1)
@@ -49,6 +51,7 @@ class EliteNetworks:
         self.weights = [each.float() for each in weights]
         self.biases = [each.float() for each in biases]
         self.activation = model.activation
+        self.body = model.body and model.body.in_own_units()
 
     @property
     def number(self) -> int:
@@ -56,8 +59,8 @@ class EliteNetworks:
         return len(self.weights[0])
 
     def observed(self, state: Tensor) -> Tensor:
-        """Return what a policy sees of states: all."""
-        return state
+        """Return what a policy sees of states ``[n, S]``."""
+        return state if self.body is None else self.body.observed(state)
 
     @classmethod
     def join(cls, parts: Sequence[EliteNetworks]) -> EliteNetworks:
@@ -74,34 +77,10 @@ class EliteNetworks:
         *layers, last = zip(self.biases, self.weights, strict=True)
         for bias, weight in layers:
             hidden = self.activation(torch.baddbmm(bias, hidden, weight))
-        return torch.baddbmm(last[0], hidden, last[1])
-
-
-class GreyBox:
-    """Predict with a model's body and its elites' mean, as if they were one network.
-
-    Units are those of :class:`EliteNetworks`.
-    """
-
-    number = 1
-
-    def __init__(
-        self, model: DynamicsEnsemble, loc: Tensor, scale: Tensor, *bounds: Tensor
-    ) -> None:
-        self.model, self.loc, self.scale, self.bounds = model, loc, scale, bounds
-
-    def __call__(self, observation: Tensor, action: Tensor) -> Tensor:
-        """Return ``[1, n, S + 1]`` at ``[1, n, S]`` and ``[1, n, A]``."""
-        low, high = self.bounds
-        state = (observation[0] - self.loc) / self.scale
-        unit = 2 * (action[0] - low) / (high - low) - 1
-        mean = self.model.predict(state, unit)[0][self.model.elites].mean(0, True)
-        return torch.cat([mean[..., :-1] * self.scale, mean[..., -1:]], -1)
-
-    def observed(self, state: Tensor) -> Tensor:
-        """Return what the sensors show of states ``[n, S]``."""
-        seen = self.model.observed((state - self.loc) / self.scale)
-        return seen * self.scale + self.loc
+        found = torch.baddbmm(last[0], hidden, last[1])
+        if self.body is not None:
+            found[0, :, :-1] += self.body(observation[0], action[0]) - observation[0]
+        return found
 
 
 class SwitchingPolicy:
@@ -119,8 +98,7 @@ class SwitchingPolicy:
 
     Args:
         policies: each maps observations ``[n, S]`` to actions ``[n, A]``.
-        networks: of one or several models, or a grey box; ``None``: the values alone
-            choose.
+        networks: of one or several models; ``None``: the values alone choose.
         value: of observations and actions, ``[n]``.
 
     Keyword Args:
@@ -132,7 +110,7 @@ class SwitchingPolicy:
     def __init__(
         self,
         policies: Sequence[Callable[[Tensor], Tensor]],
-        networks: EliteNetworks | GreyBox | None,
+        networks: EliteNetworks | None,
         value: Callable[[Tensor, Tensor], Tensor],
         *,
         terminated: Termination = never,

@@ -16,7 +16,7 @@ from torchrl.checkpoint import CheckpointError
 from torchrl.envs import ObservationNorm
 from torchrl.objectives import LossModule
 
-from torchrl_osr.lab.dynamics import EliteNetworks, GreyBox, SwitchingPolicy
+from torchrl_osr.lab.dynamics import EliteNetworks, SwitchingPolicy
 from torchrl_osr.lab.dynamics.training import FILE, load_dynamics
 from torchrl_osr.lab.run.build import Learner, make_learner
 from torchrl_osr.lab.run.config import CONFIG, read_run
@@ -169,19 +169,17 @@ def load_switching_policy(
         values = [each.smallest_value(state, action) for each in policies]
         return torch.stack(values).mean(0)
 
-    models: EliteNetworks | GreyBox | None = None
+    models = None
     if not critics_only:
-        files = [run_folder_of(each) / FILE for each in runs]
-        parts = [
-            (load_dynamics(file), each.loc, each.scale, each.low, each.high)
-            for file, each in zip(files, policies, strict=True)
-            if file.exists()
-        ]
+        parts = []
+        for run, each in zip(runs, policies, strict=True):
+            if (file := run_folder_of(run) / FILE).exists():
+                units = each.loc, each.scale, each.low, each.high
+                parts.append(EliteNetworks(load_dynamics(file), *units))
         if not parts:
             raise ValueError(f"None of the runs has a model, {FILE}: train loss=rim.")
-        grey = [GreyBox(*part) for part in parts if part[0].body]
-        networks = [EliteNetworks(*part) for part in parts]
-        models = grey[0] if grey else EliteNetworks.join(networks)
+        grey = [each for each in parts if each.body is not None]
+        models = grey[0] if grey else EliteNetworks.join(parts)
     config = configs[0]
     options["terminated"] = config.dynamics.termination(config.env.id)
     return SwitchingPolicy(policies, models, value, gamma=config.optim.gamma, **options)
