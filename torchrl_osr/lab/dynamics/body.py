@@ -73,16 +73,6 @@ class Body:
             mujoco.mj_setConst(model, mujoco.MjData(model))
         return model
 
-    @cached_property
-    def _data(self) -> Any:
-        return mujoco.MjData(self.model)
-
-    @property
-    def num_factors(self) -> int:
-        """The number of factors, ``F``."""
-        number: int = self.model.nbody - 1 + self.model.nu + 2
-        return number
-
     def check(self, observation_size: int, action_size: int) -> None:
         """Raise a ValueError if the description is of another robot."""
         positions, velocities = self.model.nq, self.model.nv
@@ -107,7 +97,7 @@ class Body:
         share = (action.detach().cpu().double().numpy() + 1) / 2
         low, high = np.asarray(self.low), np.asarray(self.high)
         control = (low + share * (high - low))[:, None].repeat(self.frame_skip, 1)
-        states, _ = simulate(model, self._data, state, control)
+        states, _ = simulate(model, mujoco.MjData(model), state, control)
         found = (states[:, -1, observed] - self.loc) / self.scale
         return torch.from_numpy(found).to(observation)
 
@@ -170,7 +160,8 @@ def identify(body: Body, rows: TensorDictBase, *, prior: float = 1e-3) -> Body:
         errors = torch.stack(found, -1).clamp(-1, 1).flatten(0, -2).double().numpy()
         return np.concatenate([errors, weight * logs])
 
-    start, largest = np.zeros(body.num_factors), np.log(4)
+    start = np.zeros(len(body.model.body_mass) - 1 + body.model.nu + 2)
+    largest = np.log(4)
     bounds = [np.full_like(start, -largest), np.full_like(start, largest)]
     logs, _ = least_squares(
         start, residual, bounds, eps=1e-4, xtol=1e-4, max_iter=40, verbose=0
