@@ -274,13 +274,7 @@ def lagrange_terms(
     return multiplier.detach() * excess, -multiplier * excess.detach()
 
 
-def value_constraint(
-    policy_qvalue: Tensor,
-    inverse_dynamics_qvalue: Tensor,
-    *,
-    log_prob: Tensor | None = None,
-    temperature: float = 1.0,
-) -> Tensor:
+def value_constraint(policy_qvalue: Tensor, inverse_dynamics_qvalue: Tensor) -> Tensor:
     r"""Return OSR-v's constraint on the values, equation (8).
 
     .. math::
@@ -288,20 +282,10 @@ def value_constraint(
         - \mathbb E_{a \sim I(\tilde s, s')} Q(\tilde s, a)
 
     Minimised over Q, it lowers actions with unknown consequences and raises those that
-    lead to ``s'``. With ``log_prob`` the first expectation is a log-sum-exp over
-    importance-weighted actions instead (:func:`soft_maximum`): our addition, which
-    puts the weight on the actions that Q overrates. The paper's difference is linear
-    in Q and has no minimum. Ours estimates, up to the constant :math:`\log M`,
-    :math:`\log\int e^{Q} da - \mathbb E_I Q`, which is never below the model's entropy.
+    lead to ``s'``. It is linear in Q and has no minimum.
 
     Args:
-        policy_qvalue: values of the sampled actions at ``s~``, ``[B, M]``.
+        policy_qvalue: values of the policy's actions at ``s~``, ``[B, K]``.
         inverse_dynamics_qvalue: values of the model's actions at ``s~``, ``[B, K]``.
-        log_prob: log-density of each sampled action under what drew it, ``[B, M]``.
-            Default ``None``, the paper's plain mean.
-        temperature: of the log-sum-exp, in units of the value.
     """
-    target = inverse_dynamics_qvalue.mean(-1)
-    if log_prob is None:
-        return policy_qvalue.mean(-1) - target
-    return soft_maximum(policy_qvalue, log_prob, temperature=temperature) - target
+    return policy_qvalue.mean(-1) - inverse_dynamics_qvalue.mean(-1)

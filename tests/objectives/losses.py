@@ -164,7 +164,6 @@ SMALL = {"alpha_init": 0.5, "num_random": 3}
 SAC_N = {"alpha_init": 0.5, "min_q_weight": 0.0, "deterministic_backup": False}
 EVERY_OPTION = SMALL | {"target_action_gap": 1.0, "max_q_backup": True}
 EVERY_OPTION |= {"temperature": 1.5}
-LSE = SMALL | {"policy_values": "logsumexp", "recovery_weight": 0.5}
 RELEASED = {"recovery_direction": "reverse", "action_reduction": "mean"}
 RELEASED |= {"recovery_states": "perturbed"}
 PAIR, TRIPLE, BOX = "actor critics", "actor critics model", {"low": -1.0, "high": 1.0}
@@ -178,7 +177,6 @@ LOSSES: dict[str, Case] = {
     "sac-n": Case(of(CQLLoss, PAIR, **SAC_N), SAC),
     "osr": Case(of(OSRLoss, TRIPLE, **SMALL), CQL),
     "osr-v": Case(of(OSRVLoss, TRIPLE, **SMALL), SAC),
-    "osr-v-logsumexp": Case(of(OSRVLoss, TRIPLE, **LSE), SAC),
     "osr-v-cql": Case(of(OSRVLoss, TRIPLE, **SMALL, policy_values="cql"), SAC),
     "discrete": Case(of(DiscreteOSRLoss, DISCRETE), CQL, "one_hot"),
     "discrete-cql": Case(

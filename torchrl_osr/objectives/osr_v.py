@@ -51,12 +51,11 @@ class OSRVLoss(ActorCriticLoss):
             ``"inverse_dynamics"`` (default), the model's, or ``"data"``, the data's
             own, at clean and at perturbed states: OSR-v without its model.
         policy_values: how the first expectation is taken. ``"mean"`` (default) is the
-            paper's, over ``K`` actions of the policy. ``"logsumexp"`` is over ``K`` of
-            the policy and ``K`` uniform ones, weighted by their densities. ``"cql"``
-            takes CQL(H)'s samples, as the authors' code does for (3): ``K`` uniform
-            actions, ``K`` at the state and ``K`` at ``s'``. It compares them with the
-            data's action at clean states, and with one of the model's at perturbed
-            states. At clean states it is CQL(H)'s term.
+            paper's, over ``K`` actions of the policy. ``"cql"`` takes CQL(H)'s samples,
+            as the authors' code does for (3): ``K`` uniform actions, ``K`` at the state
+            and ``K`` at ``s'``. It compares them with the data's action at clean
+            states, and with one of the model's at perturbed states. At clean states it
+            is CQL(H)'s term.
         num_random: ``K``, actions drawn of each kind. Default 1.
         temperature: of the log-sum-exp. Default 1.0.
         alpha_init, target_entropy: see :class:`~torchrl_osr.CQLLoss`.
@@ -83,7 +82,7 @@ class OSRVLoss(ActorCriticLoss):
         *,
         recovery_weight: float = 5.0,
         recovery_target: Literal["inverse_dynamics", "data"] = "inverse_dynamics",
-        policy_values: Literal["mean", "logsumexp", "cql"] = "mean",
+        policy_values: Literal["mean", "cql"] = "mean",
         num_random: int = 1,
         temperature: float = 1.0,
         alpha_init: float = 1.0,
@@ -130,7 +129,7 @@ class OSRVLoss(ActorCriticLoss):
         """
         if self.policy_values == "cql":
             return self.data_values_and_cql_gap(batch, policy)
-        target, action, log_prob = self.candidates(batch, policy)
+        target, action = self.candidates(batch, policy)
         candidates = torch.cat([action, target])
         mixed = batch.states[SETS["both"]].expand(candidates.shape[:-1])
         # One pass of the critics for the data's action and all candidates.
@@ -140,10 +139,7 @@ class OSRVLoss(ActorCriticLoss):
         )
         compared = qvalue[:, 1:].reshape(-1, *candidates.shape[:-1]).movedim(1, -1)
         gap = F.value_constraint(
-            compared[..., : len(action)],
-            compared[..., len(action) :],
-            log_prob=None if log_prob is None else log_prob.movedim(0, -1),
-            temperature=self.temperature,
+            compared[..., : len(action)], compared[..., len(action) :]
         )
         return qvalue[:, 0], gap.mean(1).sum(0)
 
@@ -171,20 +167,13 @@ class OSRVLoss(ActorCriticLoss):
     @torch.no_grad()
     def candidates(
         self, batch: Transitions, policy: StatePolicy
-    ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Return the actions whose values are compared, all on D_tot.
+    ) -> tuple[Tensor, Tensor]:
+        """Return the actions to recover with and the policy's, on D_tot.
 
-        Returns:
-            Those to recover with, ``[K, 2, R, A]`` (the data's: ``K = 1``); the others,
-            ``[M, 2, R, A]``; their log-densities ``[M, 2, R]`` where they are needed.
+        Both are ``[K, 2, R, A]``; the data's own have ``K = 1``.
         """
-        action, log_prob = rsample_and_log_prob(policy["both"], (self.num_random,))
-        target = self.recovery_actions(batch, "both", self.num_random)
-        if self.policy_values == "mean":
-            return target, action, None
-        uniform, log_density = self.uniform_actions(action[0])
-        action = torch.cat([uniform, action])
-        return target, action, torch.cat([log_density, log_prob])
+        action, _ = rsample_and_log_prob(policy["both"], (self.num_random,))
+        return self.recovery_actions(batch, "both", self.num_random), action
 
     @torch.no_grad()
     def recovery_actions(

@@ -24,6 +24,9 @@ from torchrl_osr.lab.evaluation.offline import act, check_discount, first_states
 from torchrl_osr.lab.evaluation.statistics import Array
 
 
+MAX_STARTS = 200
+
+
 class TaskModel(NamedTuple):
     """Networks that predict the next state and the reward, and where the task ends."""
 
@@ -43,8 +46,9 @@ def fitted_task(
 ) -> TaskModel:
     """Learn a model of the task from transitions ``[N]``, its end from their flags.
 
-    With a ``body``, in the units of the data, the model is a grey box.
+    With a ``body``, in the units of the data, the model is a grey box of one network.
     """
+    num_networks = 1 if body is not None else num_networks
     sizes = (data[key].shape[-1] for key in ("observation", "action"))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -122,7 +126,7 @@ def rolled_out_values(
         seed: of the noise.
 
     Returns:
-        Values ``[K, E]``, one for each network and episode.
+        Values ``[K, E]``, one for each network and episode, of at most 200 episodes.
 
     Examples:
         >>> from torchrl_osr.lab.data import load_dataset
@@ -135,6 +139,7 @@ def rolled_out_values(
     check_discount(gamma)
     model, starts = task.dynamics, first_states(data, episode_of(data))
     generator = torch.Generator().manual_seed(seed)
+    starts = starts[torch.randperm(len(starts), generator=generator)[:MAX_STARTS]]
     low, high = data["observation"].aminmax(dim=0)
     least, most = data["next", "reward"].aminmax()
     state = starts.expand(model.num_networks, *starts.shape)
