@@ -32,7 +32,7 @@ def main() -> None:
     add = parser.add_argument
     add("runs", nargs="+", type=Path, help="folders of runs, or checkpoints in them")
     add("--checkpoints", action="store_true", help="evaluate all that each run kept")
-    add("--discount", type=float, help="default: that of each run")
+    add("--discount", type=float, help="default: the run's; with --xml 0.999")
     add("--estimator", choices=STEPS, default="fqe", help="default: fqe")
     add("--steps", type=int, help="updates of critics (8,000) or model (10,000)")
     add("--xml", help="the robot's body, MJCF, for a model that is a grey box")

@@ -24,7 +24,7 @@ from torchrl_osr.lab.evaluation.offline import act, check_discount, first_states
 from torchrl_osr.lab.evaluation.statistics import Array
 
 
-MAX_STARTS = 200
+MAX_STARTS = 100
 
 
 class TaskModel(NamedTuple):
@@ -126,7 +126,7 @@ def rolled_out_values(
         seed: of the noise.
 
     Returns:
-        Values ``[K, E]``, one for each network and episode, of at most 200 episodes.
+        Values ``[K, E]``, one for each network and episode, of at most 100 episodes.
 
     Examples:
         >>> from torchrl_osr.lab.data import load_dataset

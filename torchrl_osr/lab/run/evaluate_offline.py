@@ -43,7 +43,7 @@ class OfflineEvaluator:
         estimator: ``"fqe"``, fitted Q evaluation, or ``"model"``, rollouts in a model
             that is learned from the data.
         steps, seed: of the training of critics or model.
-        discount: default: that of the run.
+        discount: default: that of the run; of a body, which bears longer rollouts, 0.999.
         data: place of the data, if they have been moved.
         xml, frame_skip: of the robot's :class:`~torchrl_osr.lab.dynamics.Body`. The
             estimator is then the model, as a grey box.
@@ -71,7 +71,8 @@ class OfflineEvaluator:
         # Without its simulator: the run knows sizes and bounds.
         env, options = replace(trained.config.env, id=None), trained.config.data
         options.path = self.data or options.path
-        gamma = trained.config.optim.gamma if self.discount is None else self.discount
+        gamma = trained.config.optim.gamma if self.xml is None else 0.999
+        gamma = gamma if self.discount is None else self.discount
         check_discount(gamma)  # before a model is trained
         request: dict[str, Any] = {
             "versions": package_versions(),
