@@ -23,7 +23,6 @@ from torchrl_osr.lab.evaluation.episodes import Policy
 from torchrl_osr.lab.evaluation.offline import act, check_discount, first_states, fit
 from torchrl_osr.lab.evaluation.statistics import Array
 
-
 MAX_STARTS = 100
 
 

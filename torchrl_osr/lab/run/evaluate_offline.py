@@ -43,7 +43,7 @@ class OfflineEvaluator:
         estimator: ``"fqe"``, fitted Q evaluation, or ``"model"``, rollouts in a model
             that is learned from the data.
         steps, seed: of the training of critics or model.
-        discount: default: that of the run; of a body, which bears longer rollouts, 0.999.
+        discount: default: that of the run. A body bears longer rollouts: 0.999.
         data: place of the data, if they have been moved.
         xml, frame_skip: of the robot's :class:`~torchrl_osr.lab.dynamics.Body`. The
             estimator is then the model, as a grey box.
