@@ -70,7 +70,7 @@ class DynamicsOptions:
     generations: int = 5  # number of newest rollouts that batches are drawn from
     terminations: str = "auto"  # "auto", or "never" where only a time limit ends a task
     penalty: float = 0.0  # weight of the model's uncertainty in rewards
-    unknown: str = "refuse"  # unknown rows: "refuse", "halt" (end there) or "take"
+    unknown: str = "halt"  # rows the model does not know: "halt" (end there) or "take"
     known_share: float = 1.0  # share of held-out rows that count as known
     # RAMBO's training of the model against the policy, before each further rollout.
     adversarial_steps: int = 0  # gradient steps against the policy
@@ -97,7 +97,7 @@ class DynamicsOptions:
     def check(self, env_id: str | None, *, batch_size: int, gamma: float) -> None:
         """Raise a ValueError if the options contradict each other or the task."""
         check_choice("dynamics.terminations", self.terminations, ("auto", "never"))
-        check_choice("dynamics.unknown", self.unknown, ("refuse", "halt", "take"))
+        check_choice("dynamics.unknown", self.unknown, ("halt", "take"))
         rolled_out, real = self.real_ratio != 1, round(self.real_ratio * batch_size)
         if rolled_out:
             self.termination(env_id)

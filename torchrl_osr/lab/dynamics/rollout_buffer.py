@@ -68,10 +68,9 @@ class RolloutReplayBuffer:
         mean, _ = self.model.predict(held_out["observation"], held_out["action"])
         known = self.model.disagreement(mean).quantile(options.known_share)
         bounds["max_disagreement"] = known.item()
-        if options.unknown == "halt":
-            # An end must not be better than the data's worst rewards for ever.
-            worst = held_out["next", "reward"].quantile(0.01).clamp(max=0)
-            bounds["halt_reward"] = worst.item() / (1 - data.gamma)
+        # An end must not be better than the data's worst rewards for ever.
+        worst = held_out["next", "reward"].quantile(0.01).clamp(max=0)
+        bounds["halt_reward"] = worst.item() / (1 - data.gamma)
         return bounds
 
     def set_rng(self, generator: torch.Generator) -> None:
@@ -137,13 +136,7 @@ class RolloutReplayBuffer:
         device = next(self._copy.parameters()).device
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
             torch.manual_seed(self.data.seed + number)
-            rows = self.roll_out(self._copy)
-        if not len(rows):
-            raise ValueError(
-                "The model rejects all rows of a rollout: train it longer "
-                "(dynamics.steps), or keep them (dynamics.unknown=take)."
-            )
-        return rows
+            return self.roll_out(self._copy)
 
     def _keep(self, rollouts: list[TensorDict]) -> None:
         self.synthetic = torch.cat(rollouts)

@@ -72,7 +72,7 @@ def rollout(
     steps: int,
     terminated: Termination = never,
     max_disagreement: float = math.inf,
-    halt_reward: float | None = None,
+    halt_reward: float = 0.0,
     units: Tensor | float = 1.0,
 ) -> TensorDict:
     r"""Sample transitions of a policy in a model, with torch's global generator.
@@ -86,9 +86,9 @@ def rollout(
     Keyword Args:
         steps: largest length of a rollout.
         terminated: of next states.
-        max_disagreement: of the elites; rows above it or not finite are rejected.
-        halt_reward: keep rows with more disagreement, as ends of the task with this
-            reward in their own state, as in MOReL (https://arxiv.org/abs/2005.05951).
+        max_disagreement: of the elites; rows above it end the task in their own state,
+            as in MOReL (https://arxiv.org/abs/2005.05951).
+        halt_reward: of such rows.
         units: factors ``[S + 1]`` of predictions in ``"uncertainty"``,
             :math:`\max_i \lVert \sigma_i \rVert_2` of all networks, MOPO's penalty.
     """
@@ -99,14 +99,11 @@ def rollout(
         mean, scale = model.predict(state, action)
         sample = model.sample(mean, scale)
         following, reward = state + sample[:, :-1], sample[:, -1:]
+        unknown = (model.disagreement(mean) > max_disagreement).unsqueeze(-1)
+        ended = terminated(following).unsqueeze(-1) | unknown
+        following = torch.where(unknown, state, following)
+        reward = torch.where(unknown, halt_reward, reward)
         finite = sample.isfinite().all(-1)
-        known = finite & (model.disagreement(mean) <= max_disagreement)
-        ended = terminated(following).unsqueeze(-1)
-        if halt_reward is not None:
-            unknown = ~known.unsqueeze(-1)
-            following = torch.where(unknown, state, following)
-            reward = torch.where(unknown, halt_reward, reward)
-            ended, known = ended | unknown, finite
         after = {"observation": model.observed(following), "reward": reward}
         after |= {"done": ended, "terminated": ended}
         after["truncated"] = torch.zeros_like(ended)
@@ -116,8 +113,8 @@ def rollout(
             "next": after,
             "uncertainty": (scale * units).norm(dim=-1).amax(0).unsqueeze(-1),
         }
-        kept.append(TensorDict(entries, [len(state)])[known])
-        state = following[known & ~ended.squeeze(-1)]
+        kept.append(TensorDict(entries, [len(state)])[finite])
+        state = following[finite & ~ended.squeeze(-1)]
         if not len(state):
             break
     return torch.cat(kept)
