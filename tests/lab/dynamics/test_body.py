@@ -11,7 +11,7 @@ import torch
 from composed import trained
 from tensordict import TensorDict
 
-from torchrl_osr.lab.dynamics import Body, identify
+from torchrl_osr.lab.dynamics import Body
 from torchrl_osr.lab.dynamics.training import FILE, REPORT, load_dynamics
 
 HOPPER = gymnasium.make("Hopper-v5").unwrapped
@@ -50,21 +50,6 @@ def test_the_body_moves_as_gymnasiums_does() -> None:
     control = -2 + 3 * (action + 1) / 2
     found = body.in_own_units()(state, control)
     torch.testing.assert_close(found, following, **close)
-
-
-def test_factors_are_identified_from_a_log() -> None:
-    """The log is that of a heavier, weaker robot than the description says."""
-    env = gymnasium.make("Hopper-v5").unwrapped
-    body = Body(env.fullpath, env.frame_skip)
-    wanted = np.ones(4 + 3 + 2)  # masses, gears, damping, friction
-    wanted[[1, 4, -2, -1]] = 1.3, 0.8, 1.2, 0.7
-    env.model.body_mass[2] *= 1.3
-    env.model.body_inertia[2] *= 1.3
-    env.model.actuator_gear[0] *= 0.8
-    env.model.dof_damping[:] *= 1.2
-    env.model.geom_friction[:, 0] *= 0.7
-    found = identify(body, played(env, 300))
-    np.testing.assert_allclose(found.factors, wanted, atol=0.02)
 
 
 def test_limits_of_sensors_are_numbers_that_many_rows_share() -> None:

@@ -7,7 +7,6 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_osr.lab.evaluation import fitted_task, rolled_out_values
 from torchrl_osr.lab.evaluation.offline import episode_values, fitted_values
 
 GAMMA, STEPS, EPISODES = 0.8, 20, 150
@@ -60,28 +59,3 @@ def test_rows_out_of_order_have_no_first_states():
     data = rolled_out(-0.3, 0.7)[torch.randperm(EPISODES * STEPS)]
     with pytest.raises(ValueError, match="Give the rows in order"):
         fitted_values(data, lambda s: s, progress=False)
-
-
-@pytest.mark.parametrize("gain", [-1.0, 0.0])
-def test_rollouts_in_a_model_have_the_closed_forms_value(gain):
-    data = rolled_out(-0.3, 0.7)
-    task = fitted_task(data, steps=400, num_networks=3, progress=False)
-    found = rolled_out_values(task, data, lambda s: gain * s, gamma=GAMMA, steps=30)
-    assert found.shape == (3, EPISODES)
-    truth = true_value(gain, data["observation"][::STEPS])
-    assert found.mean() == pytest.approx(truth, rel=0.1)
-
-
-def test_a_learned_end_is_where_the_task_ends():
-    data = rolled_out(-0.3, 0.7)
-    data["next", "terminated"] = data["next", "observation"].abs() > 0.8
-    ended = fitted_task(data, steps=1, num_networks=2, progress=False).ended
-    states = torch.tensor([[-0.9], [-0.5], [0.0], [0.5], [0.9]])
-    assert ended(states).tolist() == [True, False, False, False, True]
-
-
-def test_a_discount_of_1_has_no_finite_value():
-    data = rolled_out(-0.3, 0.7)
-    task = fitted_task(data, steps=1, num_networks=2, progress=False)
-    with pytest.raises(ValueError, match="The discount is 1; expected at least 0"):
-        rolled_out_values(task, data, lambda s: s, gamma=1)

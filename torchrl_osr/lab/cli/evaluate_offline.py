@@ -2,12 +2,12 @@
 
     torchrl-osr evaluate-offline outputs/log-pump-file/*
     torchrl-osr evaluate-offline <run's folder> --discount 0.995 --steps 20000
-    torchrl-osr evaluate-offline <run's folder> --checkpoints --estimator model
+    torchrl-osr evaluate-offline <run's folder> --xml robot.xml --frame-skip 4
 
-The discounted return, averaged over the first state of every episode of the data. By
-fitted Q evaluation (fqe): critics learn the values of each policy. By a model: the
-policy is rolled out in a model of the task, which is learned once from the data. A
-run's folder gets offline_evaluation.json. See docs/any_environment.md for how far to
+The discounted return, averaged over first states of the data. By fitted Q evaluation:
+critics learn the values of each policy. With --xml by rollouts in the robot's body,
+whose masses, gears, damping and friction are identified from the data. A run's folder
+gets offline_evaluation.json. See docs/any_environment.md for how far to
 trust the order.
 """
 
@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_osr.lab.evaluation.tables import aligned_columns
-from torchrl_osr.lab.run.evaluate_offline import STEPS, OfflineEvaluator
+from torchrl_osr.lab.run.evaluate_offline import OfflineEvaluator
 from torchrl_osr.lab.run.load import checkpoints_of
 
 
@@ -33,11 +33,10 @@ def main() -> None:
     add("runs", nargs="+", type=Path, help="folders of runs, or checkpoints in them")
     add("--checkpoints", action="store_true", help="evaluate all that each run kept")
     add("--discount", type=float, help="default: the run's; with --xml 0.999")
-    add("--estimator", choices=STEPS, default="fqe", help="default: fqe")
-    add("--steps", type=int, help="updates of critics (8,000) or model (10,000)")
-    add("--xml", help="the robot's body, MJCF, for a model that is a grey box")
+    add("--steps", type=int, help="updates of critics (8,000) or with --xml (3,000)")
+    add("--xml", help="description of the robot's body, MJCF")
     add("--frame-skip", type=int, default=1, help="physics steps of an action in it")
-    add("--seed", type=int, default=0, help="of critics or model")
+    add("--seed", type=int, default=0, help="of the training")
     add("--data", metavar="PATH", help="place of the log, if it was moved")
     add("--trust", action="append", default=[], metavar="MODULE", help="yours")
     options = vars(parser.parse_args())

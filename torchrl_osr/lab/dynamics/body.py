@@ -141,7 +141,7 @@ def identify(body: Body, rows: TensorDictBase, *, prior: float = 1e-3) -> Body:
             \rVert_2^2 + N S\, w^2 \lVert \log f \rVert_2^2, \quad
             0.25 \le f \le 4
 
-    by MuJoCo's least squares, with errors clipped to -1 and 1. The prior decides
+    by MuJoCo's least squares, with errors in standard deviations. The prior decides
     between factors that explain the rows alike: a robot with twice all masses, gears
     and damping moves the same.
 
@@ -150,13 +150,15 @@ def identify(body: Body, rows: TensorDictBase, *, prior: float = 1e-3) -> Body:
         rows: transitions ``[N]`` within the limits of the sensors; 1,000 take seconds.
         prior: the weight :math:`w`.
     """
-    states, actions = rows["observation"], rows["action"]
-    weight = prior * states.numel() ** 0.5
+    states, actions, following = (
+        rows[key] for key in ("observation", "action", ("next", "observation"))
+    )
+    weight, unit = prior * states.numel() ** 0.5, states.std(0)
 
     def residual(logs: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return ``[N S + F, n]`` of the logarithms of the factors ``[F, n]``."""
         bodies = [replace(body, factors=column) for column in np.exp(logs.T)]
-        found = [each(states, actions) - rows["next", "observation"] for each in bodies]
+        found = [(each(states, actions) - following) / unit for each in bodies]
         errors = torch.stack(found, -1).clamp(-1, 1).flatten(0, -2).double().numpy()
         return np.concatenate([errors, weight * logs])
 

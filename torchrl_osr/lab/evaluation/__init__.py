@@ -7,11 +7,11 @@ from torchrl_osr.lab.evaluation.episodes import (
     measure_of,
     summarize,
 )
+from torchrl_osr.lab.evaluation.grey_box import fitted_grey_box, rolled_out_values
 from torchrl_osr.lab.evaluation.inverse_dynamics_fit import (
     describe_inverse_dynamics,
     inverse_dynamics_report,
 )
-from torchrl_osr.lab.evaluation.model_rollouts import fitted_task, rolled_out_values
 from torchrl_osr.lab.evaluation.offline import fitted_values
 from torchrl_osr.lab.evaluation.recoverable import load_recoverable_states, recovers
 from torchrl_osr.lab.evaluation.recovery import DataDistance
@@ -28,7 +28,7 @@ __all__ = [
     "describe_inverse_dynamics",
     "deterministic_policy",
     "evaluate_paired",
-    "fitted_task",
+    "fitted_grey_box",
     "fitted_values",
     "inverse_dynamics_report",
     "load_recoverable_states",

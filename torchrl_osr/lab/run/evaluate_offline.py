@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torchrl import torchrl_logger
@@ -14,7 +14,7 @@ from torchrl_osr._files import read_json, sha256_of, write_json
 from torchrl_osr.lab.data.recording import NO_REWARDS, has_rewards
 from torchrl_osr.lab.dynamics import Body
 from torchrl_osr.lab.evaluation import deterministic_policy
-from torchrl_osr.lab.evaluation.model_rollouts import fitted_task, rolled_out_values
+from torchrl_osr.lab.evaluation.grey_box import fitted_grey_box, rolled_out_values
 from torchrl_osr.lab.evaluation.offline import (
     check_discount,
     episode_values,
@@ -28,9 +28,6 @@ from torchrl_osr.lab.run.load import load_trained, run_folder_of
 FILE = "offline_evaluation.json"
 """Result of a run's last checkpoint, in its folder; others have a name in front."""
 
-STEPS = {"fqe": 8000, "model": 10_000}
-"""Estimators, and the updates of the critics or of the model."""
-
 
 @dataclass
 class OfflineEvaluator:
@@ -40,17 +37,14 @@ class OfflineEvaluator:
     the same data share them, and a model of the task.
 
     Args:
-        estimator: ``"fqe"``, fitted Q evaluation, or ``"model"``, rollouts in a model
-            that is learned from the data.
-        steps, seed: of the training of critics or model.
+        steps, seed: of the training.
         discount: default: that of the run. A body bears longer rollouts: 0.999.
         data: place of the data, if they have been moved.
-        xml, frame_skip: of the robot's :class:`~torchrl_osr.lab.dynamics.Body`. The
-            estimator is then the model, as a grey box.
+        xml, frame_skip: of the robot's :class:`~torchrl_osr.lab.dynamics.Body`, for
+            rollouts in it instead of fitted Q evaluation.
         trust: modules of yours that the run may name.
     """
 
-    estimator: Literal["fqe", "model"] = "fqe"
     steps: int | None = None
     discount: float | None = None
     seed: int = 0
@@ -59,10 +53,6 @@ class OfflineEvaluator:
     frame_skip: int = 1
     trust: Sequence[str] = ()
     _known: dict[str | None, Any] = field(default_factory=dict, init=False)
-
-    def __post_init__(self) -> None:
-        if self.xml is not None:
-            self.estimator = "model"
 
     def __call__(self, path: Path) -> dict[str, Any]:
         """Return the estimate of a run, a folder, or of a checkpoint."""
@@ -78,15 +68,14 @@ class OfflineEvaluator:
             "versions": package_versions(),
             "checkpoint": sha256_of(trained.path),
             "data": options.checksum,
-            "estimator": self.estimator,
             "discount": gamma,
-            "steps": self.steps or STEPS[self.estimator],
+            "steps": self.steps or (8000 if self.xml is None else 3000),
             "seed": self.seed,
         }
         if self.xml is not None:
             request |= {"xml": sha256_of(Path(self.xml)), "frame_skip": self.frame_skip}
         parts = [] if path.is_dir() else [path.stem]
-        parts += ["model"] if self.estimator == "model" else []
+        parts += [] if self.xml is None else ["body"]
         file = run_folder_of(path) / "-".join([*parts, FILE])
         if file.exists() and request.items() <= (known := read_json(file)).items():
             return known
@@ -98,18 +87,15 @@ class OfflineEvaluator:
         policy = deterministic_policy(trained.actor, trained.observation_norm)
         torch.set_num_threads(trained.config.trainer.num_threads)
         training: dict[str, Any] = {"steps": request["steps"], "seed": self.seed}
-        if self.estimator == "fqe":
+        if self.xml is None:
             values = fitted_values(rows, policy, gamma=gamma, **training)
         else:
-            if "task" not in self._known:
-                body = None
-                if self.xml is not None:
-                    low, high = env.action_low or -1.0, env.action_high or 1.0
-                    body = Body(self.xml, self.frame_skip, (), 0.0, 1.0, low, high)
-                    states, actions = rows["observation"], rows["action"]
-                    body.check(states.shape[-1], actions.shape[-1])
-                self._known["task"] = fitted_task(rows, body=body, **training)
-            values = rolled_out_values(self._known["task"], rows, policy, gamma=gamma)
+            if "box" not in self._known:
+                low, high = env.action_low or -1.0, env.action_high or 1.0
+                body = Body(self.xml, self.frame_skip, low=low, high=high)
+                self._known["box"] = fitted_grey_box(rows, body, **training)
+            box = self._known["box"]
+            values = rolled_out_values(box, rows, policy, gamma=gamma)[None]
         recorded = episode_values(rows, gamma)
         found = nested_mean([[*values]])
         results = request | {
