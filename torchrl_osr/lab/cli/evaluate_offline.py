@@ -67,6 +67,7 @@ def ranking(results: Mapping[str, Mapping[str, Any]]) -> str:
     ]
     if others:
         lines.append(f"  To use the first: torchrl-osr export {best} policy.onnx")
+    if others and "xml" not in first:
         lines.append("  In our tests, such an order of trained policies was no better")
         lines.append("  than chance on walking robots: results/offline_evaluation.")
     return "\n".join(lines)
