@@ -69,7 +69,7 @@ GREY = [
     "loss=rim", "dynamics=grey_box", f"dynamics.xml={HOPPER.fullpath}",
     "dynamics.frame_skip=4", "dynamics.num_networks=2", "dynamics.num_elites=1",
     "dynamics.num_cells=[8]", "dynamics.batch_size=8", "dynamics.steps=20",
-    "dynamics.rollout_starts=20", "dynamics.unknown=take",
+    "dynamics.rollout_starts=20",
 ]  # fmt: skip
 
 
