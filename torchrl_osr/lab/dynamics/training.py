@@ -146,8 +146,8 @@ def _with_body(
 ) -> ModelData:
     """Give a model its body; return rows with what the body predicts."""
     loc, scale = data.loc.tolist(), data.scale.tolist()
-    low, high = data.action_low, data.action_high
-    body = options.body(loc=loc, scale=scale, low=low, high=high)
+    bounds = {"low": data.action_low, "high": data.action_high}
+    body = options.body(loc=loc, scale=scale, **bounds)
     rows = data.storage[:].select("observation", "action", "next")
     model.body, rows = fitted_body(body, rows, seed=data.seed)
     device = data.held_out.device or "cpu"

@@ -48,6 +48,8 @@ def make_learner(config: TrainConfig, device: torch.device | str = "cpu") -> Lea
     assert env.observation_size is not None
     assert env.action_size is not None
     sizes = env.observation_size, env.action_size
+    if config.dynamics.xml:
+        config.dynamics.body().check(*sizes)
     layer_norm = config.network.layer_norm
     layers: dict[str, Any] = {"num_cells": cells, "layer_norm": layer_norm}
     actor = instantiate(config.network.actor, *sizes, num_cells=cells).to(device)
@@ -123,11 +125,6 @@ def _check_combination(config: TrainConfig, learner: Learner) -> None:
     if dynamics.use:
         batch_size, gamma = config.trainer.batch_size, config.optim.gamma
         dynamics.check(config.env.id, batch_size=batch_size, gamma=gamma)
-        if dynamics.xml:
-            env = config.env
-            assert env.observation_size
-            assert env.action_size
-            dynamics.body().check(env.observation_size, env.action_size)
 
 
 def read_environment(env: EnvConfig) -> None:
