@@ -11,6 +11,7 @@ says what it would do (DAgger, Ross et al. 2011, https://arxiv.org/abs/1011.0686
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +48,7 @@ def imagined(states, switching, networks, steps, student=None):
     return [torch.cat(column) for column in zip(*rows, strict=True)]
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Roll out, imitate, and do so once more with the network acting."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     add = parser.add_argument
@@ -59,7 +60,7 @@ def main() -> None:
     add("--hold", type=int, default=10, help="steps between choices")
     add("--rounds", type=int, default=2)
     add("--updates", type=int, default=20_000, help="gradient steps of a round")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     torch.manual_seed(0)
     torch.set_num_threads(1)
     chosen = {"steps": options.horizon, "hold": options.hold}
