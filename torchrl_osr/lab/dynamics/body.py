@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import mujoco
@@ -21,6 +22,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 Numbers = Sequence[float]
+compiled = cache(mujoco.MjModel.from_xml_path)
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ class Body:
     @cached_property
     def model(self) -> Any:
         """The compiled description, times the factors."""
-        model = mujoco.MjModel.from_xml_path(self.xml)
+        model: Any = deepcopy(compiled(self.xml))
         if len(self.factors):
             masses, gears, others = np.split(self.factors, [model.nbody - 1, -2])
             model.body_mass[1:] *= masses

@@ -97,7 +97,7 @@ def rolled_out_values(
     data: TensorDict,
     policy: Policy,
     *,
-    gamma: float = 0.999,
+    gamma: float = 0.997,
     steps: int | None = None,
 ) -> Array:
     """Return a policy's discounted return in a grey box, from first states.

@@ -38,7 +38,7 @@ class OfflineEvaluator:
 
     Args:
         steps, seed: of the training.
-        discount: default: that of the run. A body bears longer rollouts: 0.999.
+        discount: default: that of the run. A body bears longer rollouts: 0.997.
         data: place of the data, if they have been moved.
         xml, frame_skip: of the robot's :class:`~torchrl_osr.lab.dynamics.Body`, for
             rollouts in it instead of fitted Q evaluation.
@@ -61,7 +61,7 @@ class OfflineEvaluator:
         # Without its simulator: the run knows sizes and bounds.
         env, options = replace(trained.config.env, id=None), trained.config.data
         options.path = self.data or options.path
-        gamma = trained.config.optim.gamma if self.xml is None else 0.999
+        gamma = trained.config.optim.gamma if self.xml is None else 0.997
         gamma = gamma if self.discount is None else self.discount
         check_discount(gamma)  # before a model is trained
         request: dict[str, Any] = {
