@@ -144,8 +144,8 @@ def load_switching_policy(
     """Combine runs of a task to one policy, in the environment's units, on the CPU.
 
     Each run's policy is rolled out in the models of all runs that have one, or in the
-    first grey box among them. The mean of all runs' critics values its last state.
-    Several seeds of ``loss=rim`` have all parts.
+    first grey box among them, for 40 steps every 10. The mean of all runs' critics
+    values its last state. Several seeds of ``loss=rim`` have all parts.
 
     They are folders, or checkpoints in them. With ``critics_only`` no model is used.
     ``options`` are those of :class:`~torchrl_osr.lab.dynamics.SwitchingPolicy`.
@@ -180,6 +180,7 @@ def load_switching_policy(
             raise ValueError(f"None of the runs has a model, {FILE}: train loss=rim.")
         grey = [each for each in parts if each.body is not None]
         models = grey[0] if grey else EliteNetworks.join(parts)
+        options = ({"steps": 40, "hold": 10} if grey else {}) | options
     config = configs[0]
     options["terminated"] = config.dynamics.termination(config.env.id)
     return SwitchingPolicy(policies, models, value, gamma=config.optim.gamma, **options)
