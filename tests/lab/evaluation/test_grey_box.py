@@ -66,12 +66,15 @@ def test_a_policys_value_is_that_of_the_recursion(log, tmp_path):
     assert found.mean() == pytest.approx(wanted.mean(), rel=0.05)
 
 
-def test_a_learned_end_is_where_the_task_ends(log):
-    log = log.clone()
-    log["next", "terminated"] = log["next", "observation"][:, :1].abs() > 0.8
+def test_the_task_ends_beyond_the_range_of_states_that_go_on(log):
+    log, where = log.clone(), log["next", "observation"][:, :1]
+    log["next", "terminated"] = where.abs() > 0.8
     ended = fitted_end(log)
-    states = torch.tensor([[-0.95, 0], [-0.5, 0], [0.0, 0], [0.5, 0], [0.95, 0]])
+    states = torch.tensor([[-0.95, 0], [-0.5, 0], [0.0, 99], [0.5, 0], [0.95, 0]])
     assert ended(states).tolist() == [True, False, False, False, True]
+    log["next", "terminated"] = where.abs() < 0.1  # a goal
+    with pytest.raises(ValueError, match="0% of the log's ends .* expected 90 %"):
+        fitted_end(log)
 
 
 def test_a_discount_of_1_has_no_finite_value(log):
