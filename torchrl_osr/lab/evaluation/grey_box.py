@@ -68,7 +68,7 @@ def fitted_grey_box(
 def fitted_end(data: TensorDict) -> Termination:
     """Return where the task ends: beyond the range of states from which it went on.
 
-    The range has the limits which a twentieth of the ends are beyond. Raise a
+    The range has the limits which a fiftieth of the ends are beyond. Raise a
     ValueError if this does not explain nine ends of ten.
     """
     ended = data["next", "terminated"].squeeze(-1)
@@ -77,7 +77,7 @@ def fitted_end(data: TensorDict) -> Termination:
     states = data["next", "observation"]
     low, high = states[~ended].aminmax(dim=0)
     beyond = torch.stack([states[ended] < low, states[ended] > high])
-    below, above = used = beyond.float().mean(1) >= 0.05
+    below, above = used = beyond.float().mean(1) >= 0.02
     explained = (beyond & used[:, None]).any(0).any(-1).float().mean()
     if explained < 0.9:
         raise ValueError(
