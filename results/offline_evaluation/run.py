@@ -1,6 +1,6 @@
-"""Compare estimates from data alone with 20 fresh episodes.
+"""Compare estimates of policies with 20 fresh episodes.
 
-python results/offline_evaluation/run.py table.csv CHECKPOINT...
+python results/offline_evaluation/run.py table.csv walker.xml 4 CHECKPOINT...
 """
 
 import sys
@@ -12,7 +12,7 @@ from gymnasium.wrappers import TransformReward
 
 from torchrl_osr.lab.data import reference_returns
 from torchrl_osr.lab.evaluation import EpisodeEvaluator, deterministic_policy
-from torchrl_osr.lab.run.evaluate_offline import STEPS, OfflineEvaluator
+from torchrl_osr.lab.run.evaluate_offline import OfflineEvaluator
 from torchrl_osr.lab.run.load import load_trained, run_folder_of
 
 
@@ -35,10 +35,11 @@ def ranks(table):
     return table[list(evaluators)].rank().corrwith(table["score"].rank())
 
 
-path, *checkpoints = map(Path, sys.argv[1:])
-evaluators = {each: OfflineEvaluator(each) for each in STEPS}
+path, xml, skip, *checkpoints = sys.argv[1:]
+body = OfflineEvaluator(xml=xml, frame_skip=int(skip))
+evaluators = {"fqe": OfflineEvaluator(), "body": body}
 rows = []
-for each in checkpoints:
+for each in map(Path, checkpoints):
     trained, run = load_trained(each), run_folder_of(each).absolute()
     found = {name: evaluate(each) for name, evaluate in evaluators.items()}
     env = trained.config.env
@@ -56,7 +57,6 @@ for data, table in tables.items():
     score, truth = table["score"], table["discounted"]
     found = pd.DataFrame({"Spearman": ranks(table)})
     found["regret"] = [score.max() - score[table[each].idxmax()] for each in evaluators]
-    found["error"] = [(table[each] - truth).abs().mean() for each in evaluators]
     found.loc["chance", "regret"] = score.max() - score.mean()
     print(f"{data}: {len(table)} policies, {score.min():.0f} to {score.max():.0f},")
     print(f"discounted return {truth.mean():.0f} +- {truth.std():.0f}")
