@@ -102,7 +102,7 @@ class OfflineEvaluator:
             "env": env.name,
             "source": options.source,
             "step": trained.step,
-            "episodes": len(recorded),
+            "episodes": values.shape[1],
             "value": found.mean,
             "value_low": found.low,
             "value_high": found.high,
