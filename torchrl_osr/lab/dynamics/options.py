@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from tensordict import TensorDict
@@ -85,7 +84,7 @@ class DynamicsOptions:
 
     def body(self, **units: Any) -> Body:
         """Return the body as it is described; ``units`` are options of it."""
-        return Body(str(Path(self.xml or "").absolute()), self.frame_skip, **units)
+        return Body(self.xml or "", self.frame_skip, **units)
 
     def termination(
         self, env_id: str | None, loc: Tensor | float = 0.0, scale: Tensor | float = 1.0

@@ -48,8 +48,6 @@ def make_learner(config: TrainConfig, device: torch.device | str = "cpu") -> Lea
     assert env.observation_size is not None
     assert env.action_size is not None
     sizes = env.observation_size, env.action_size
-    if config.dynamics.xml:
-        config.dynamics.body().check(*sizes)
     layer_norm = config.network.layer_norm
     layers: dict[str, Any] = {"num_cells": cells, "layer_norm": layer_norm}
     actor = instantiate(config.network.actor, *sizes, num_cells=cells).to(device)

@@ -85,6 +85,7 @@ def open_run(
             cfg = _resumed(folder, cfg, job.overrides.task)
             check_environment(cfg.env.id, trust)
         cfg.data.path = _absolute(cfg.data.path)
+        cfg.dynamics.xml = _absolute(cfg.dynamics.xml)
         config = checked(cfg, trust)
         new, known = not (folder / CONFIG).exists(), config.data
         if config.env.id is not None:

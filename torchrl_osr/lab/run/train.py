@@ -59,6 +59,10 @@ EVALUATION_SEED = 10_000  # far from the seeds of the data's episodes
 def train(run: Run) -> float:
     """Train a run, or continue it; return its last score or return, for a sweeper."""
     phases = Phases(run)
+    if run.config.dynamics.xml:
+        rows = phases.data.held_out
+        sizes = (rows[key].shape[-1] for key in ("observation", "action"))
+        run.config.dynamics.body().check(*sizes)
     if phases.learner.model is not None:
         phases.train_inverse_dynamics()
     rollouts = phases.train_dynamics() if run.config.dynamics.use else None
