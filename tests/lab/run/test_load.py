@@ -212,6 +212,7 @@ def test_runs_that_do_not_fit_together_are_refused(folders, tmp_path, options, m
 
 def test_one_model_is_enough_and_none_is_refused(folders, tmp_path):
     make_run(tmp_path / "run", LOSS, *BOUNDS)
-    assert load_switching_policy([folders[0], tmp_path / "run"]).networks.number == 1
+    switching = load_switching_policy([folders[0], tmp_path / "run"])
+    assert len(switching.networks.weights[0]) == 1
     with pytest.raises(ValueError, match="None of the runs has a model"):
         load_switching_policy([tmp_path / "run"])

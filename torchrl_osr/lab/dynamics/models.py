@@ -168,7 +168,8 @@ class DynamicsEnsemble(nn.Module):
     @torch.no_grad()
     def standardize_(self, data: TensorDictBase) -> None:
         """Take mean and standard deviation of inputs and targets from rows ``[N]``."""
-        inputs, targets = self.inputs_and_targets(data[self.is_whole(data)])
+        known = has_next_state(data, self.in_keys[0])
+        inputs, targets = self.inputs_and_targets(data[known])
         copy_statistics(inputs, self.input_loc, self.input_scale)
         copy_statistics(targets, self.target_loc, self.target_scale)
         if self.body is not None:  # a good body leaves rounding errors
@@ -281,7 +282,8 @@ class DynamicsLoss(ActorCriticLoss):
             bounds = self.bound_weight * width.sum()
         # Of the mean over E times as many rows as each network has.
         error = number * gaussian_error(mean, log_variance, targets).flatten()
-        loss = self.reduce(error, batch, model.is_whole(rows))
+        valid = has_next_state(rows, model.in_keys[0])
+        loss = self.reduce(error, batch, valid)
         return {"loss_dynamics": loss, "loss_bounds": bounds}, {}
 
 

@@ -53,11 +53,6 @@ class EliteNetworks:
         self.activation = model.activation
         self.body = model.body and model.body.in_own_units()
 
-    @property
-    def number(self) -> int:
-        """The number of networks, ``E``."""
-        return len(self.weights[0])
-
     def observed(self, state: Tensor) -> Tensor:
         """Return what a policy sees of states ``[n, S]``."""
         return state if self.body is None else self.body.observed(state)
@@ -146,7 +141,7 @@ class SwitchingPolicy:
         if networks is None:
             value = self.value(starts, self._actions(starts))
             return value.view(-1, len(self.policies))
-        number = networks.number
+        number = len(networks.weights[0])
         rows, state = (number, len(starts), -1), starts.repeat(number, 1)
         going = torch.ones_like(state[:, 0], dtype=torch.bool)
         reward = torch.zeros(self.steps, len(going), device=starts.device)

@@ -130,14 +130,15 @@ def rolled_out_values(
     generator = torch.Generator().manual_seed(0)
     state = state[torch.randperm(len(state), generator=generator)[:MAX_STARTS]]
     least, most = data["next", "reward"].aminmax()
-    going = torch.ones_like(state[:, 0])
-    value, size = torch.zeros_like(going), data["action"].shape[-1]
+    value, size = torch.zeros_like(state[:, 0]), data["action"].shape[-1]
+    going = torch.arange(len(state))
     for step in range(round(3 / (1 - gamma)) if steps is None else steps):
         change = model.predict(state, act(policy, model.observed(state), size))[0][0]
-        value += going * gamma**step * change[:, -1].clamp(least, most)
+        value[going] += gamma**step * change[:, -1].clamp(least, most)
         state = state + change[:, :-1]
-        going = going * ~box.ended(state)
-        if not going.any():
+        goes_on = ~box.ended(state)
+        state, going = state[goes_on], going[goes_on]
+        if not len(going):
             break
     found: Array = value.double().numpy()
     return found

@@ -34,7 +34,7 @@ class OfflineEvaluator:
     """Estimate the values of runs' policies on the runs' data.
 
     A run's folder keeps the result, which the same call then returns at once. Runs on
-    the same data share them, and a model of the task.
+    the same data share them, and a grey box.
 
     Args:
         steps, seed: of the training.
