@@ -96,10 +96,8 @@ def test_synthetic_rows_are_marked_and_may_have_noise(data, noise, n_steps) -> N
 @pytest.mark.parametrize("shift", [100.0, -100.0])
 def test_the_task_ends_where_the_model_is_unsure(data, shift) -> None:
     data.held_out["next", "reward"] += shift
-    options = replace(
-        TINY, unknown="halt", known_share=0.5, rollout_starts=400, terminations="never"
-    )
-    buffer, *_ = buffer_of(data, options)
+    options = replace(TINY, unknown="halt", known_share=0.5, rollout_starts=400)
+    buffer, *_ = buffer_of(replace(data, env_id=None), options)
     first = buffer.synthetic[:400]["next"]
     ended = first["terminated"].squeeze(-1)
     assert 0.3 < ended.float().mean() < 0.7

@@ -7,12 +7,13 @@ import math
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 from uneven_dynamics import linear_dynamics
 
 from torchrl_osr.lab.data import make_environment
 from torchrl_osr.lab.dynamics import DynamicsEnsemble, rollout, termination
-from torchrl_osr.lab.dynamics.rollouts import perturbed_starts
+from torchrl_osr.lab.dynamics.rollouts import perturbed_starts, task_limits
 
 
 def linear_world(change=1.0, spread=0.0, log_variance=-40.0) -> DynamicsEnsemble:
@@ -95,12 +96,35 @@ def test_terminations_are_the_simulators(env_id) -> None:
         states.append(state)
         ended.append(terminated)
     env.close()
-    found = termination(env_id)(torch.tensor(np.array(states)))
+    limits = torch.zeros(2, env.observation_space.shape[0])  # not used
+    found = termination(env_id, limits)(torch.tensor(np.array(states)))
     assert found.tolist() == ended
     assert (0 < sum(ended) < 300) == (env_id != "HalfCheetah-v5")
 
 
-def test_a_task_without_a_rule_is_named() -> None:
-    assert termination("Hopper-v5")(torch.full([2, 11], float("nan"))).all()
-    with pytest.raises(ValueError, match=r"mine:Hop-v0.*terminations=never"):
-        termination("mine:Hop-v0")
+def test_a_hopper_that_is_not_a_number_has_fallen() -> None:
+    state = torch.full([2, 11], float("nan"))
+    assert termination("Hopper-v5", torch.zeros(2, 11))(state).all()
+
+
+def walks(ended) -> TensorDict:
+    """1,000 states in a square, and where ``ended`` of the first entry."""
+    states = torch.rand(1000, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    after = {"observation": states, "terminated": ended(states[:, :1])}
+    return TensorDict({"next": after}, [1000])
+
+
+def test_other_tasks_end_beyond_the_states_from_which_they_go_on(capsys) -> None:
+    limits = task_limits(walks(lambda where: where > 0.8), loc=1.0, scale=10.0)
+    found = termination("mine:Hop-v0", limits)
+    states = torch.tensor([[-99, 0], [0.5, 99], [0.95, 0]])
+    assert found(states).tolist() == [False, False, True]
+    said = capsys.readouterr().out
+    assert "the task ends where observation[0] > 8.9" in said  # 10 s + 1
+    assert task_limits(walks(lambda where: where > 2)).isinf().all()
+    assert "the task ends never" in capsys.readouterr().out
+
+
+def test_ends_inside_the_range_are_no_limits() -> None:
+    with pytest.raises(ValueError, match="0% of the log's ends .* expected 90 %"):
+        task_limits(walks(lambda where: where.abs() < 0.1))  # a goal

@@ -94,7 +94,9 @@ def test_elite_networks_predict_means_in_the_environments_units() -> None:
     found = networks(state.expand(2, -1, -1), action.expand(2, -1, -1))
     torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-4)
     other = EliteNetworks(ensemble(0))
+    other.limits[1, 0] = 2.0
     both = EliteNetworks.join([other, networks])
+    assert both.limits.isfinite().sum() == 1
     state, action = torch.randn(3, 5, 3), torch.randn(3, 5, 2)
     wanted = torch.cat([other(state[:1], action[:1]), networks(state[1:], action[1:])])
     torch.testing.assert_close(both(state, action), wanted)

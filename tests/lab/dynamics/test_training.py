@@ -53,6 +53,17 @@ def test_the_best_model_is_kept_and_trained_once(data, tmp_path) -> None:
     assert all(map(torch.equal, first.parameters(), again.parameters()))
 
 
+def test_a_model_learns_where_a_task_without_a_known_rule_ends(data, tmp_path) -> None:
+    rows = data.storage[:].clone()
+    fallen = rows["next", "observation"][:, :1] < -1
+    data.storage.set(range(len(rows)), rows.set(("next", "terminated"), fallen))
+    model, _ = modelled(tmp_path / "a", replace(data, env_id=None), TINY)
+    assert -1 <= model.limits[0, 0] < -0.9
+    assert model.limits.isfinite().sum() == 1
+    rolled_out = modelled(tmp_path / "b", data, TINY)[0]  # a Hopper
+    assert rolled_out.limits.isinf().all()
+
+
 SMALL = [
     "trainer.log_interval=1", "trainer.eval_interval=100", "dynamics.num_networks=3",
     "dynamics.num_elites=2", "dynamics.num_cells=[8]", "dynamics.batch_size=8",

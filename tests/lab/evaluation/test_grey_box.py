@@ -9,7 +9,6 @@ from tensordict import TensorDict
 
 from torchrl_osr.lab.dynamics import Body
 from torchrl_osr.lab.evaluation import fitted_grey_box, rolled_out_values
-from torchrl_osr.lab.evaluation.grey_box import fitted_end
 
 STEP, GEAR, DAMPING = 0.05, 1.3, 0.8  # the file says 1 and 1
 CART = """<mujoco><option timestep="0.05"/><worldbody><body>
@@ -54,27 +53,16 @@ def log() -> TensorDict:
 
 def test_a_policys_value_is_that_of_the_recursion(log, tmp_path):
     (file := tmp_path / "cart.xml").write_text(CART)
-    box = fitted_grey_box(log, Body(str(file), 1), steps=600, progress=False)
-    mass, gear, damping, _ = box.dynamics.body.factors
+    model = fitted_grey_box(log, Body(str(file), 1), steps=600, progress=False)
+    mass, gear, damping, _ = model.body.factors
     assert gear / mass == pytest.approx(GEAR, rel=0.01)
     assert damping / mass == pytest.approx(DAMPING, rel=0.01)
-    found = rolled_out_values(box, log, policy, gamma=0.95, steps=40)
+    found = rolled_out_values(model, log, policy, gamma=0.95, steps=40)
     state, wanted = log["observation"][::STEPS].double(), 0.0
     for step in range(40):
         wanted += 0.95**step * reward(state.numpy())
         state = torch.from_numpy(moved(state.numpy(), policy(state)[:, 0].numpy()))
     assert found.mean() == pytest.approx(wanted.mean(), rel=0.05)
-
-
-def test_the_task_ends_beyond_the_range_of_states_that_go_on(log):
-    log, where = log.clone(), log["next", "observation"][:, :1]
-    log["next", "terminated"] = where.abs() > 0.8
-    ended = fitted_end(log)
-    states = torch.tensor([[-0.95, 0], [-0.5, 0], [0.0, 99], [0.5, 0], [0.95, 0]])
-    assert ended(states).tolist() == [True, False, False, False, True]
-    log["next", "terminated"] = where.abs() < 0.1  # a goal
-    with pytest.raises(ValueError, match="0% of the log's ends .* expected 90 %"):
-        fitted_end(log)
 
 
 def test_a_discount_of_1_has_no_finite_value(log):

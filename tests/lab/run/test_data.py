@@ -45,11 +45,6 @@ def test_without_an_order_the_next_action_is_refused():
         load(*mixed, in_keys=[("next", "action")])
 
 
-def test_a_rule_without_ends_is_refused_if_the_data_have_ends():
-    with pytest.raises(ValueError, match="never, and .* rows are terminated"):
-        load("dynamics.use=true", "dynamics.terminations=never")
-
-
 def test_rewards_are_scaled_then_shifted():
     maze = ["env=pointmaze-umaze", "data=diverse"]
     bare = load(*maze)

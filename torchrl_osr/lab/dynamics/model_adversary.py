@@ -17,7 +17,7 @@ from torch.distributions import Normal
 
 from torchrl_osr.lab.dynamics.models import DynamicsEnsemble, DynamicsLoss
 from torchrl_osr.lab.dynamics.options import DynamicsOptions, ModelData
-from torchrl_osr.lab.dynamics.rollouts import action_of
+from torchrl_osr.lab.dynamics.rollouts import action_of, termination
 from torchrl_osr.objectives import ActorCriticLoss
 
 SEED = 2**40
@@ -53,7 +53,8 @@ class ModelAdversary:
         self.model = model.requires_grad_(True)
         groups, rate = model.parameter_groups(), options.adversarial_lr
         self.optimizer = torch.optim.Adam(groups, lr=rate, fused=True)
-        self.terminated = options.termination(data.env_id, data.loc, data.scale)
+        units = data.loc, data.scale
+        self.terminated = termination(data.env_id, model.limits, *units)
         self.real, self.likelihood = data.buffer(), DynamicsLoss(model)
 
     def __call__(self, number: int) -> None:

@@ -45,7 +45,7 @@ class DynamicsEnsemble(nn.Module):
     :meth:`calibrate_`.
 
     With a :attr:`body`, a grey box, they predict :math:`s' - b(s, a)` instead: what the
-    simulated body leaves over.
+    simulated body leaves over. Beyond :attr:`limits` ``[2, S]`` the task ends.
 
     Examples:
         >>> model = DynamicsEnsemble(11, 3, num_networks=3, num_elites=2)
@@ -59,6 +59,7 @@ class DynamicsEnsemble(nn.Module):
     target_loc: Tensor
     target_scale: Tensor
     elites: Tensor
+    limits: Tensor
     layers: Any
 
     def __init__(
@@ -90,6 +91,8 @@ class DynamicsEnsemble(nn.Module):
             self.register_buffer(f"{name}_loc", torch.zeros(size))
             self.register_buffer(f"{name}_scale", torch.ones(size))
         self.register_buffer("elites", torch.arange(num_elites))
+        infinite = torch.full([observation_dim], torch.inf)
+        self.register_buffer("limits", torch.stack([-infinite, infinite]))
         self.body: Body | None = None
 
     def standardized(self, inputs: Tensor) -> tuple[Tensor, Tensor]:

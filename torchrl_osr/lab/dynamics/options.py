@@ -13,7 +13,6 @@ from torchrl.data import ImmutableDatasetWriter, ReplayBuffer, Storage
 from torchrl_osr._checks import check_choice
 from torchrl_osr.lab.dynamics.body import Body
 from torchrl_osr.lab.dynamics.models import DynamicsEnsemble
-from torchrl_osr.lab.dynamics.rollouts import Termination, never, termination
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,6 @@ class DynamicsOptions:
     action_noise: float = 0.0  # largest noise on a deterministic policy's actions
     rollout_interval: int = 1000  # gradient steps between rollouts
     generations: int = 5  # number of newest rollouts that batches are drawn from
-    terminations: str = "auto"  # "auto", or "never" where only a time limit ends a task
     penalty: float = 0.0  # weight of the model's uncertainty in rewards
     unknown: str = "halt"  # rows the model does not know: "halt" (end there) or "take"
     known_share: float = 1.0  # share of held-out rows that count as known
@@ -86,20 +84,10 @@ class DynamicsOptions:
         """Return the body as it is described; ``units`` are options of it."""
         return Body(self.xml or "", self.frame_skip, **units)
 
-    def termination(
-        self, env_id: str | None, loc: Tensor | float = 0.0, scale: Tensor | float = 1.0
-    ) -> Termination:
-        """Return the rule that ends rollouts, for states ``(s - loc) / scale``."""
-        rule = never if self.terminations == "never" else termination(env_id)
-        return lambda state: rule(state * scale + loc)
-
-    def check(self, env_id: str | None, *, batch_size: int, gamma: float) -> None:
+    def check(self, *, batch_size: int, gamma: float) -> None:
         """Raise a ValueError if the options contradict each other or the task."""
-        check_choice("dynamics.terminations", self.terminations, ("auto", "never"))
         check_choice("dynamics.unknown", self.unknown, ("halt", "take"))
         rolled_out, real = self.real_ratio != 1, round(self.real_ratio * batch_size)
-        if rolled_out:
-            self.termination(env_id)
         if not 1 <= self.num_elites <= self.num_networks:
             why = f"num_elites={self.num_elites} must be between 1 and num_networks"
         elif rolled_out and not 0 < real < batch_size:

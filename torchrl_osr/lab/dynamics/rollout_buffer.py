@@ -16,7 +16,12 @@ from torchrl_osr.lab.data.transitions import DATASET_KEYS
 from torchrl_osr.lab.dynamics.model_adversary import ModelAdversary
 from torchrl_osr.lab.dynamics.models import DynamicsEnsemble
 from torchrl_osr.lab.dynamics.options import DynamicsOptions, ModelData
-from torchrl_osr.lab.dynamics.rollouts import action_of, perturbed_starts, rollout
+from torchrl_osr.lab.dynamics.rollouts import (
+    action_of,
+    perturbed_starts,
+    rollout,
+    termination,
+)
 
 
 class RolloutReplayBuffer:
@@ -61,7 +66,8 @@ class RolloutReplayBuffer:
     def _bounds(self) -> dict[str, Any]:
         """Return options of :func:`rollout` for ends and for unknown rows."""
         options, data, held_out = self.options, self.data, self.data.held_out
-        terminated = options.termination(data.env_id, data.loc, data.scale)
+        limits = self.model.limits
+        terminated = termination(data.env_id, limits, data.loc, data.scale)
         bounds: dict[str, Any] = {"terminated": terminated}
         if options.unknown == "take":
             return bounds

@@ -51,6 +51,7 @@ class EliteNetworks:
         self.weights = [each.float() for each in weights]
         self.biases = [each.float() for each in biases]
         self.activation = model.activation
+        self.limits = model.limits * scale + loc
         self.body = model.body and model.body.in_own_units()
 
     def observed(self, state: Tensor) -> Tensor:
@@ -64,6 +65,8 @@ class EliteNetworks:
         weights, biases = zip(*((p.weights, p.biases) for p in parts), strict=True)
         joined.weights = [torch.cat(layer) for layer in zip(*weights, strict=True)]
         joined.biases = [torch.cat(layer) for layer in zip(*biases, strict=True)]
+        low, high = torch.stack([each.limits for each in parts], 1)
+        joined.limits = torch.stack([low.amax(0), high.amin(0)])  # the narrowest
         return joined
 
     def __call__(self, observation: Tensor, action: Tensor) -> Tensor:

@@ -26,6 +26,7 @@ from torchrl_osr.lab.dynamics.models import (
 )
 from torchrl_osr.lab.dynamics.options import DynamicsOptions, ModelData
 from torchrl_osr.lab.dynamics.rollout_buffer import RolloutReplayBuffer
+from torchrl_osr.lab.dynamics.rollouts import known_rule, task_limits
 from torchrl_osr.objectives import ActorCriticLoss
 from torchrl_osr.trainers import Evaluation, OfflineTrainer
 from torchrl_osr.trainers.checkpoints import safe_checkpoint
@@ -96,6 +97,8 @@ def _trained(options: DynamicsOptions, data: ModelData, fit: Fit) -> DynamicsEns
     torch.manual_seed(data.seed)
     sizes = (held_out[key].shape[-1] for key in ("observation", "action"))
     model = options.ensemble(*sizes)
+    if options.real_ratio != 1 and known_rule(data.env_id) is None:
+        model.limits.copy_(task_limits(data.storage[:], data.loc, data.scale))
     if options.xml is not None:
         data = _with_body(model, options, data)
     _standardize(model, data)

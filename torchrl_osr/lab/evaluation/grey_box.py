@@ -5,28 +5,18 @@ Shapes: ``N`` transitions, ``B`` states, ``S`` observation, ``E`` episodes.
 
 from __future__ import annotations
 
-import math
-from typing import NamedTuple
-
 import torch
 from tensordict import TensorDict
 
 from torchrl_osr.lab.data.rows import episode_of
 from torchrl_osr.lab.dynamics import Body, DynamicsEnsemble, DynamicsLoss
 from torchrl_osr.lab.dynamics.body import fitted_body
-from torchrl_osr.lab.dynamics.rollouts import Termination, never
+from torchrl_osr.lab.dynamics.rollouts import task_limits, termination
 from torchrl_osr.lab.evaluation.episodes import Policy
 from torchrl_osr.lab.evaluation.offline import act, check_discount, first_states, fit
 from torchrl_osr.lab.evaluation.statistics import Array
 
 MAX_STARTS = 100
-
-
-class GreyBox(NamedTuple):
-    """A body, a network of what it leaves over, and where the task ends."""
-
-    dynamics: DynamicsEnsemble
-    ended: Termination
 
 
 def fitted_grey_box(
@@ -37,7 +27,7 @@ def fitted_grey_box(
     batch_size: int = 128,
     seed: int = 0,
     progress: bool = True,
-) -> GreyBox:
+) -> DynamicsEnsemble:
     """Identify the body, and learn rewards and ends, from transitions ``[N]``."""
     sizes = [data[key].shape[-1] for key in ("observation", "action")]
     body.check(*sizes)
@@ -47,7 +37,7 @@ def fitted_grey_box(
         dynamics = DynamicsEnsemble(
             *sizes, num_networks=1, num_elites=1, num_cells=cells
         )
-    ended = fitted_end(data)
+    dynamics.limits.copy_(task_limits(data))
     dynamics.body, rows = fitted_body(body, data, seed=seed)
     dynamics.standardize_(rows)
     optimizer = torch.optim.Adam(dynamics.parameter_groups(), lr=1e-3, fused=True)
@@ -62,35 +52,12 @@ def fitted_grey_box(
         seed=seed,
         progress=progress,
     )
-    return GreyBox(dynamics.requires_grad_(False), ended)
-
-
-def fitted_end(data: TensorDict) -> Termination:
-    """Return where the task ends: beyond the range of states from which it went on.
-
-    The range has the limits which a fiftieth of the ends are beyond. Raise a
-    ValueError if this does not explain nine ends of ten.
-    """
-    ended = data["next", "terminated"].squeeze(-1)
-    if not ended.any():
-        return never
-    states = data["next", "observation"]
-    low, high = states[~ended].aminmax(dim=0)
-    beyond = torch.stack([states[ended] < low, states[ended] > high])
-    below, above = used = beyond.float().mean(1) >= 0.02
-    explained = (beyond & used[:, None]).any(0).any(-1).float().mean()
-    if explained < 0.9:
-        raise ValueError(
-            f"{explained:.0%} of the log's ends are where an observed number leaves "
-            "its range; expected 90 %. Without --xml, values contain the ends."
-        )
-    low, high = low.where(below, -math.inf), high.where(above, math.inf)
-    return lambda state: ((state < low) | (state > high)).any(-1)
+    return dynamics.requires_grad_(False)
 
 
 @torch.no_grad()
 def rolled_out_values(
-    box: GreyBox,
+    model: DynamicsEnsemble,
     data: TensorDict,
     policy: Policy,
     *,
@@ -102,7 +69,7 @@ def rolled_out_values(
     Rewards stay within the range of the data.
 
     Args:
-        box: of :func:`fitted_grey_box`.
+        model: of :func:`fitted_grey_box`.
         data: transitions ``[N]`` in order of time.
         policy: as of :func:`~torchrl_osr.lab.evaluation.fitted_values`.
 
@@ -120,13 +87,13 @@ def rolled_out_values(
         >>> from torchrl_osr.lab.evaluation import fitted_grey_box, rolled_out_values
         >>> data, _ = load_dataset("hopper", "random", num_transitions=300)
         >>> hopper = Body(gymnasium.make("Hopper-v5").unwrapped.fullpath, 4)
-        >>> box = fitted_grey_box(data, hopper, steps=10, progress=False)
+        >>> model = fitted_grey_box(data, hopper, steps=10, progress=False)
         body as described: error ... standard deviations in a step
         body as identified: error ... standard deviations in a step
-        >>> values = rolled_out_values(box, data, lambda s: s[:, :3].tanh(), steps=9)
+        >>> values = rolled_out_values(model, data, lambda s: s[:, :3].tanh(), steps=9)
     """
     check_discount(gamma)
-    model, state = box.dynamics, first_states(data, episode_of(data))
+    state, ended = first_states(data, episode_of(data)), termination(None, model.limits)
     generator = torch.Generator().manual_seed(0)
     state = state[torch.randperm(len(state), generator=generator)[:MAX_STARTS]]
     least, most = data["next", "reward"].aminmax()
@@ -136,7 +103,7 @@ def rolled_out_values(
         change = model.predict(state, act(policy, model.observed(state), size))[0][0]
         value[going] += gamma**step * change[:, -1].clamp(least, most)
         state = state + change[:, :-1]
-        goes_on = ~box.ended(state)
+        goes_on = ~ended(state)
         state, going = state[goes_on], going[goes_on]
         if not len(going):
             break

@@ -122,7 +122,7 @@ def _check_combination(config: TrainConfig, learner: Learner) -> None:
         raise ValueError(f"{why}.")
     if dynamics.use:
         batch_size, gamma = config.trainer.batch_size, config.optim.gamma
-        dynamics.check(config.env.id, batch_size=batch_size, gamma=gamma)
+        dynamics.check(batch_size=batch_size, gamma=gamma)
 
 
 def read_environment(env: EnvConfig) -> None:

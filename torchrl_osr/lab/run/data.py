@@ -113,12 +113,6 @@ def load_training_data(
     rewarded = not in_keys or ("next", "reward") in in_keys or config.dynamics.use
     if rewarded and not has_rewards(manifest):
         raise ValueError(NO_REWARDS)
-    never = config.dynamics.use and config.dynamics.terminations == "never"
-    if never and (ends := int(data["next", "terminated"].sum())):
-        raise ValueError(
-            f"dynamics.terminations=never, and {ends:,} rows are terminated: leave it "
-            "out, or read a time limit as data.columns.truncated."
-        )
     loc, scale = observation_statistics(data) if options.standardize else (0.0, 1.0)
     reward = options.reward_scale * data["next", "reward"] + options.reward_shift
 

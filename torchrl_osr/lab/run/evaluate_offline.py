@@ -94,8 +94,8 @@ class OfflineEvaluator:
                 low, high = env.action_low or -1.0, env.action_high or 1.0
                 body = Body(self.xml, self.frame_skip, low=low, high=high)
                 self._known["box"] = fitted_grey_box(rows, body, **training)
-            box = self._known["box"]
-            values = rolled_out_values(box, rows, policy, gamma=gamma)[None]
+            model = self._known["box"]
+            values = rolled_out_values(model, rows, policy, gamma=gamma)[None]
         recorded = episode_values(rows, gamma)
         found = nested_mean([[*values]])
         results = request | {

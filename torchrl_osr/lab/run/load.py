@@ -17,6 +17,7 @@ from torchrl.envs import ObservationNorm
 from torchrl.objectives import LossModule
 
 from torchrl_osr.lab.dynamics import EliteNetworks, SwitchingPolicy
+from torchrl_osr.lab.dynamics.rollouts import termination
 from torchrl_osr.lab.dynamics.training import FILE, load_dynamics
 from torchrl_osr.lab.run.build import Learner, make_learner
 from torchrl_osr.lab.run.config import CONFIG, read_run
@@ -181,6 +182,6 @@ def load_switching_policy(
         grey = [each for each in parts if each.body is not None]
         models = grey[0] if grey else EliteNetworks.join(parts)
         options = ({"steps": 40, "hold": 10} if grey else {}) | options
-    config = configs[0]
-    options["terminated"] = config.dynamics.termination(config.env.id)
-    return SwitchingPolicy(policies, models, value, gamma=config.optim.gamma, **options)
+        options["terminated"] = termination(configs[0].env.id, models.limits)
+    gamma = configs[0].optim.gamma
+    return SwitchingPolicy(policies, models, value, gamma=gamma, **options)
