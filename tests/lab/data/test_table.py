@@ -81,6 +81,7 @@ def test_comments_blank_lines_and_spaces_are_skipped(tmp_path):
     expected, _ = load_dataset(path=csv(tmp_path, robot()), columns=WANTED)
     lines = robot(fell=robot()["fell"] == 1).to_csv(index=False).splitlines()
     lines = ["# robot 7", f"# {lines[0].replace(',', ', ')},", "", *lines[1:]]
+    lines.append(9 * ",")  # as Excel writes them
     text = "\n".join(lines).replace("True", " true").replace("monday 2", " monday 2")
     (tmp_path / "log.csv").write_text(text.replace("\n\n", "\n"))
     assert (
@@ -108,7 +109,10 @@ def stamps(ticks):
     return [time.isoformat() for time in times]
 
 
-@pytest.mark.parametrize("clock", [lambda ticks: ticks, lambda t: t / 50, stamps])
+@pytest.mark.parametrize(
+    "clock",
+    [lambda ticks: ticks, lambda t: t / 50, lambda t: 20 * t + t % 2, stamps],
+)
 def test_steps_bring_the_rows_of_an_episode_into_order(write, clock):
     expected, _ = load_dataset(path=write(robot()), columns=WANTED)
     ordered = robot().assign(tick=clock(robot()["tick"]))
@@ -154,6 +158,19 @@ def test_several_files_are_one_log(tmp_path):
         load_dataset(path=[*paths, str(tmp_path / "2.npz")], columns=names)
     # Episodes are numbered anew in each file.
     assert manifest["incomplete_lengths"] == [40, 20, 40, 20]
+    paths = [csv(tmp_path, robot()), tmp_path / "other.csv"]
+    robot().drop(columns="cost").to_csv(paths[1], index=False)
+    with pytest.raises(ValueError, match=r"other.csv: it lacks \['cost'\]"):
+        load_dataset(path=[*map(str, paths)], columns=WANTED)
+
+
+def test_row_names_of_pandas_are_columns_if_they_have_a_name(tmp_path):
+    expected, _ = load_dataset(path=csv(tmp_path, robot()), columns=WANTED)
+    for frame in (robot().set_index("run"), robot().set_index(2 * np.arange(120))):
+        frame.to_parquet(tmp_path / "log.parquet")
+        data, about = load_dataset(path=tmp_path / "log.parquet", columns=WANTED)
+        assert (data == expected).all()
+        assert about["unused_columns"] == ["tick"]
 
 
 def test_rows_without_ends_and_values(write):

@@ -48,6 +48,10 @@ def test_recorded_next_observation_keeps_every_row():
     assert (len(data), manifest["dropped_rows"]) == (6, 0)
     # These rows do not follow one another, so that no sum of rewards is a return.
     assert manifest["episode_returns"] == []
+    # Nothing reads the next state of a fall.
+    following[2] = np.nan
+    data, _ = transitions_from_columns(log(next_observation=following))
+    assert data[NEXT][2].tolist() == log()["observation"][2].tolist()
 
 
 def test_episode_numbers_are_ends_and_cuts_become_truncated():
@@ -80,7 +84,7 @@ def test_actions_out_of_bounds_are_refused_or_clipped():
     data, manifest = transitions_from_columns(log(action=action), clip_actions=True)
     assert data["action"][3].item() == np.float32(-0.999)
     assert manifest["warnings"][0].startswith("1 rows had actions outside")
-    for bounds in ((1, -1), 2, (1, 2, 3)):
+    for bounds in ((1, -1), 2, (1, 2, 3), ((-1, -2), (1, 2))):
         with pytest.raises(ValueError, match=r"action.bounds=.* expected"):
             transitions_from_columns(log(), action_bounds=bounds)
 

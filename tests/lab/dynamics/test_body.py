@@ -12,6 +12,7 @@ from composed import trained
 from tensordict import TensorDict
 
 from torchrl_osr.lab.dynamics import Body
+from torchrl_osr.lab.dynamics.body import fitted_body
 from torchrl_osr.lab.dynamics.training import FILE, REPORT, load_dynamics
 
 HOPPER = gymnasium.make("Hopper-v5").unwrapped
@@ -58,11 +59,14 @@ def test_limits_of_sensors_are_numbers_that_many_rows_share() -> None:
     after = {"observation": state.roll(1, 0)}
     rows = TensorDict({"observation": state, "next": after}, [1000])
     body = Body(HOPPER.fullpath, 4).limited(rows)
-    # The lowest number of 1,000 different ones is one row's: a thousandth.
     assert body.most[10] == 0.5
+    assert np.isfinite(body.least + body.most).sum() == 1
     assert body.observed(torch.ones(1, 11))[0, 10] == 0.5
     shown = (state[:, 10] < 0.5) & (state.roll(1, 0)[:, 10] < 0.5)
-    assert body.shows(rows).sum() <= shown.sum()
+    assert torch.equal(body.shows(rows), shown)
+    state[:, 10] = 0.0
+    with pytest.raises(ValueError, match="an observed number is at its limit or never"):
+        fitted_body(body, rows, seed=0)
 
 
 GREY = [

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from torchrl_osr.lab.evaluation.statistics import (
+    crossed_mean,
     estimate,
     mean_interval,
     nested_mean,
@@ -49,6 +50,15 @@ def test_an_interval_says_what_it_is_over(runs, over):
     assert estimate(scores).over == nested_mean([scores]).over == over
     assert estimate(scores).mean == pytest.approx(2 + (runs - 1) / 2)
     assert nested_mean([scores, scores * 2]).mean == estimate(scores).mean
+
+
+def test_networks_that_value_the_same_episodes_share_them():
+    rng = np.random.default_rng(1)
+    networks, episodes = rng.normal(size=(9, 1)), 2 * rng.normal(size=(1, 50))
+    found = crossed_mean(networks + episodes)
+    assert found.mean == pytest.approx(networks.mean() + episodes.mean())
+    error = (networks.var() / 9 + episodes.var() / 50) ** 0.5
+    assert found.high - found.low == pytest.approx(2 * 1.96 * error, rel=0.08)
 
 
 def test_decreases_of_several_runs_by_hand():

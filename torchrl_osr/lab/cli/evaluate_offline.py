@@ -59,7 +59,7 @@ def ranking(results: Mapping[str, Mapping[str, Any]]) -> str:
     for run in order:
         interval = "[{value_low:.4g}, {value_high:.4g}]".format(**results[run])
         rows.append((run, f"{results[run]['value']:.4g}", interval))
-    rows.append(("the data", f"{first['data_value']:.4g}", ""))
+    rows.append(("the data, until its episodes end", f"{first['data_value']:.4g}", ""))
     lines = [
         "{env} {source}: estimated discounted return, discount {discount:g}, from the "
         "first states of {episodes:,} episodes".format(**first),

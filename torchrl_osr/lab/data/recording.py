@@ -218,6 +218,10 @@ def trajectories(
     and whether it is complete.
     """
     columns = _arrays(rows, options.num_actions)
+    if "next_observation" in columns:  # that of a terminated row may be missing
+        after, ended = columns["next_observation"], columns["terminated"] == 1
+        unknown = (ended & (after != after).all(1))[:, None]
+        columns["next_observation"] = np.where(unknown, columns["observation"], after)
     lost = _missing(columns, options.missing)
     flagged, ends = _ends(columns)
     trajectory = np.cumsum(np.r_[False, ends[:-1]])
@@ -389,12 +393,15 @@ def _unit_actions(action: Array, options: Reading) -> tuple[Array, int]:
     if options.num_actions is not None:
         return action, 0
     size = action.shape[1]
-    low, high = (np.broadcast_to(np.float64(b), size) for b in options.action_bounds)
-    if not (np.isfinite([low, high]).all() and (low < high).all()):
+    low, high = (np.float64(bound) for bound in options.action_bounds)
+    fits = {low.size, high.size} <= {1, size} and np.isfinite([low.sum(), high.sum()])
+    if not (np.all(fits) and (low < high).all()):
         raise ValueError(
             f"action_bounds={options.action_bounds}; expected the lowest and the "
-            "highest action, finite numbers, low < high (data.action_bounds)."
+            f"highest action, finite numbers, one or {size} each, low < high "
+            "(data.action_bounds)."
         )
+    low, high = (np.broadcast_to(bound, size) for bound in (low, high))
     whole = ((action >= 0) & (action == np.round(action))).all()
     alone = size == 1 or (action.sum(1) == 1).all()
     if whole and alone and (low < 0).all() and np.ptp(action) > 0:

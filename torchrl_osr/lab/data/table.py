@@ -88,7 +88,10 @@ def log_parts(
             about["unused_columns"] = [name for name in names if name not in used]
             if not has_rewards(about):
                 about.setdefault("warnings", []).append(NO_REWARDS)
-        return [*chain(*about["columns"].values())]
+        needed = [*chain(*about["columns"].values())]
+        if lacking := {*needed} - {*names}:
+            raise ValueError(f"it lacks {sorted(lacking)}, which other files have.")
+        return needed
 
     for file in files:
         try:
@@ -96,7 +99,7 @@ def log_parts(
             rows = assemble(about["columns"], arrays)
             if step := about["columns"].get("step"):
                 rows = _sorted(rows, step[0], about)
-        except (KeyError, OSError, ValueError) as error:
+        except (OSError, ValueError) as error:
             raise ValueError(f"{file}: {error}") from error
         yield rows
 
@@ -116,8 +119,10 @@ def _read(path: Path, chosen: Callable[..., list[str]]) -> Arrays:
         with needed_by("Parquet files need", "minari"):
             from pyarrow import ArrowException, parquet
         try:
-            names = chosen(parquet.read_schema(path).names)
-            frame = pd.read_parquet(path, columns=names)
+            there = parquet.read_schema(path).names  # and pandas' row numbers
+            names = chosen([n for n in there if not n.startswith("__index_level_")])
+            table = parquet.read_table(path, columns=names)
+            frame = table.to_pandas(ignore_metadata=True)
         except ArrowException as error:
             raise ValueError(
                 f"the file is damaged or cut short ({error}): copy it again, or have "
@@ -178,7 +183,7 @@ def _parsed(file: IO[str]) -> tuple[pd.DataFrame, str]:
             "lines have more values than the header has names, or end with a separator."
         )
     named = [name for name in frame if not name.startswith("Unnamed: ")]
-    frame = frame[named].rename(columns=lambda name: name.strip(" #"))
+    frame = frame[named].dropna(how="all").rename(columns=lambda name: name.strip(" #"))
     return frame, f"separator {separator!r}, decimal {decimal!r}"
 
 
@@ -317,15 +322,14 @@ def _sorted(columns: Arrays, name: str, about: dict[str, Any]) -> Arrays:
         raise ValueError(f"{name!r} has no value in row {row} of {len(step)}.")
     order = np.lexsort((step, episode))
     rows = {key: each[order] for key, each in columns.items()}
-    same, gaps = np.diff(episode[order]) == 0, np.diff(step[order])
+    same, gaps = np.diff(episode[order]) == 0, np.diff(step[order]).astype(float)
     if not same.any():
         return rows
     usual = np.sort(gaps[same])[same.sum() // 2]
-    counted = step.dtype.kind in "iu"
-    uneven = gaps != usual if counted else abs(gaps - usual) > usual / 2
-    steps = f"{name}, {usual:.3g}{unit} apart"
+    uneven = abs(gaps - usual) > usual / 2
+    steps = f"{name}, {usual:.2g}{unit} apart"  # clocks jitter
     if unit and usual:
-        steps += f" ({1 / usual:.3g} a second)"
+        steps += f" ({1 / usual:.2g} a second)"
     wrong, warnings = same & ((gaps == 0) | uneven), about.setdefault("warnings", [])
     if wrong.any():
         row = int(wrong.argmax())

@@ -130,7 +130,8 @@ class Body:
         """
         states = rows["observation"]
         low, high = states.aminmax(dim=0)
-        shared = [(states == each).float().mean(0) >= 1e-3 for each in (low, high)]
+        few = max(10, len(states) // 1000)
+        shared = [(states == each).sum(0) >= few for each in (low, high)]
         least, most = low.where(shared[0], -math.inf), high.where(shared[1], math.inf)
         return replace(self, least=least.tolist(), most=most.tolist())
 
@@ -182,6 +183,11 @@ def fitted_body(body: Body, rows: TensorDict, *, seed: int) -> tuple[Body, Tenso
     """
     body = body.limited(rows)
     rows = rows[body.shows(rows)].cpu()
+    if not len(rows):
+        raise ValueError(
+            "In every row, an observed number is at its limit or never changes: the "
+            "body needs all positions and velocities."
+        )
     generator = torch.Generator().manual_seed(seed)
     some = rows[torch.randperm(len(rows), generator=generator)[:1000]]
     found = identify(body, some)

@@ -185,13 +185,14 @@ def dynamics_report(model: DynamicsEnsemble, data: TensorDictBase) -> dict[str, 
     deviation = (mean - targets).abs() / scale
     error = mean.mean(0) - targets
     r2 = 1 - error.square().sum(0) / (targets - targets.mean(0)).square().sum(0)
+    varied = targets.amax(0) > targets.amin(0)
     twice_nll = gaussian_error(mean, 2 * scale.log(), targets) + math.log(2 * math.pi)
     both = torch.stack([disagreement, (error / unit).norm(dim=-1)])
     ranks = both.argsort().argsort().double()
     return {
         "nll": targets.shape[-1] * twice_nll.mean().item() / 2,
         "mse": mse,
-        "r2_mean": r2.mean().item(),
+        "r2_mean": r2[varied].mean().item(),
         "r2": r2.tolist(),
         "within_1_sigma": (deviation < 1).float().mean().item(),
         "disagreement_rank": torch.corrcoef(ranks)[0, 1].item(),

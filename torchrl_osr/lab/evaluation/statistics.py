@@ -110,6 +110,17 @@ def nested_mean(data_sets: Sequence[Sequence[Array]]) -> Estimate:
     return interval(float(point), np.mean(resamples, axis=0).ravel(), over)
 
 
+def crossed_mean(values: ArrayLike) -> Estimate:
+    """Return the mean of ``[N, E]`` values; networks and episodes are drawn again."""
+    table, rng = np.asarray(values, np.float64), np.random.default_rng(0)
+    rows, columns = (
+        rng.multinomial(size, np.full(size, 1 / size), NUM_RESAMPLES) / size
+        for size in table.shape
+    )
+    resamples = ((rows @ table) * columns).sum(1)
+    return interval(float(table.mean()), resamples, over_what(len(table)))
+
+
 def scores_and_decreases(
     runs: Sequence[ArrayLike],
 ) -> list[tuple[Estimate, Estimate | None]]:

@@ -20,7 +20,7 @@ from torchrl_osr.lab.evaluation.offline import (
     episode_values,
     fitted_values,
 )
-from torchrl_osr.lab.evaluation.statistics import nested_mean
+from torchrl_osr.lab.evaluation.statistics import crossed_mean
 from torchrl_osr.lab.run.data import load_data
 from torchrl_osr.lab.run.folder import package_versions
 from torchrl_osr.lab.run.load import load_trained, run_folder_of
@@ -97,7 +97,7 @@ class OfflineEvaluator:
             model = self._known["box"]
             values = rolled_out_values(model, rows, policy, gamma=gamma)[None]
         recorded = episode_values(rows, gamma)
-        found = nested_mean([[*values]])
+        found = crossed_mean(values)
         results = request | {
             "env": env.name,
             "source": options.source,
