@@ -188,8 +188,9 @@ def _read(folder: Path) -> _Run:
     measure = "return" if references is None else "score"
     measured = "normalised score" if references else f"return of {env}"
     evaluations = returns["evaluations"]
-    if not evaluations and (folder / OFFLINE).exists():  # judged by the data alone
-        offline = read_json(folder / OFFLINE)
+    judged = [f for f in (folder / f"body-{OFFLINE}", folder / OFFLINE) if f.exists()]
+    if judged and not evaluations:  # judged by the data alone
+        offline = read_json(judged[0])
         values = offline["value_of_networks"]
         each = {"step": steps, "seeds": [*range(len(values))], "returns": values}
         evaluations, references, measure = [each], None, "return"
