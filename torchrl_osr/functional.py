@@ -195,11 +195,6 @@ def temperature_objective(
     return -log_alpha * (log_prob.detach() + target_entropy)
 
 
-def action_distance(action: Tensor, data_action: Tensor) -> Tensor:
-    r"""Return the squared distance :math:`\|a - a_D\|^2` from the data's ``[B, A]``."""
-    return (action - data_action).square().sum(-1)
-
-
 def soft_maximum(
     qvalue: Tensor, log_prob: Tensor, *, temperature: float = 1.0
 ) -> Tensor:

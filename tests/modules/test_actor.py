@@ -38,6 +38,12 @@ def test_actions_fill_their_bounds_and_never_leave_them(build, low, high) -> Non
     assert (action.amax(0) > high - 0.1 * width).all()
 
 
+@pytest.mark.parametrize("build", [*BOUNDED, deterministic_actor])
+def test_an_untrained_actor_acts_near_the_center(build) -> None:
+    action = build(5, 2, num_cells=[8], low=0.0, high=100.0)(states(500))["action"]
+    assert 35 < action.mean() < 65
+
+
 @pytest.mark.parametrize("build", BOUNDED)
 def test_scale_has_a_floor(build) -> None:
     # The KL divides by the variance: 1e-2 is as sure as a network can get.

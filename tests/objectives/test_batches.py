@@ -171,12 +171,6 @@ def test_actions_of_synthetic_rows_are_not_imitated(name, key) -> None:
     assert not torch.equal(call(loss, other)[key], call(loss, batch)[key])
 
 
-def test_iql_refuses_synthetic_rows() -> None:
-    batch = make_batch("iql", 4).set("is_synthetic", torch.zeros(4, 1).bool())
-    with pytest.raises(ValueError, match="learns from the data's actions"):
-        make_loss("iql")(batch)
-
-
 UNBOUNDED = ["discrete", "discrete-cql", "choice-model", "iql", "fqe"]
 READS_NONE = ["recovery", "recovery-delta", "recovery-module"]
 WITH_BOUNDS = [name for name in LOSSES if name not in (*UNBOUNDED, *READS_NONE)]

@@ -21,6 +21,9 @@ def test_networks_that_a_policy_would_not_copy_whole():
         actor.module[0].module = network
         return actor
 
+    def activated(activation: type[nn.Module]):
+        return tanh_gaussian_actor(3, 2, activation_class=activation)
+
     critics = critic_ensemble(3, 2)
     policy_from_loss(CQLLoss(actor(), critics))
     swapped = ValueOperator(MLP(5, 1), in_keys=["action", "observation"])
@@ -29,6 +32,7 @@ def test_networks_that_a_policy_would_not_copy_whole():
         ((actor(low=-2.0, high=2.0), critics), "compute something else"),
         ((actor(), swapped), "compute something else"),
         ((actor(MLP(3, 3)), critics), "one torchrl.modules.MLP.* has 2"),
+        ((activated(nn.Mish), critics), "layers that no policy has: 'Mish'"),
     ]:
         loss = CQLLoss(*networks)
         with pytest.raises(ValueError, match=message):

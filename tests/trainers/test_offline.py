@@ -19,7 +19,7 @@ from torchrl.data import (
     SamplerWithoutReplacement,
     TensorDictReplayBuffer,
 )
-from torchrl.objectives import SACLoss, SoftUpdate
+from torchrl.objectives import SACLoss, SoftUpdate, TD3BCLoss
 from torchrl.record.loggers import CSVLogger
 
 from torchrl_osr import StatePerturbation
@@ -107,8 +107,18 @@ def torchrls_loss():
     )
 
 
+def metrics_of_rows():
+    networks = Networks()
+    loss = TD3BCLoss(networks.delta, networks.critics, bounds=(-1.0, 1.0))
+    return update_targets(loss.float())
+
+
+def torchrl_osrs_loss():
+    return make_loss("model", states="clean").float()
+
+
 @pytest.mark.parametrize(
-    "make_loss", [torchrls_loss, lambda: make_loss("model", states="clean").float()]
+    "make_loss", [torchrls_loss, metrics_of_rows, torchrl_osrs_loss]
 )
 def test_a_sampler_without_replacement_goes_on_in_its_epoch(
     tmp_path, state, transitions, make_loss

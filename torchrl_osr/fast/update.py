@@ -142,7 +142,8 @@ class FastUpdate:
         # An eighth of the time of the largest magnitudes. A square that overflows is as
         # bad: it would be one of Adam's second moments.
         norms = torch._foreach_norm([each.grad for each in trained])
-        values = torch.stack([*losses.values(), *norms]).tolist()
+        means = [each.float().mean() for each in losses.values()]  # metrics may be [B]
+        values = torch.stack([*means, *norms]).tolist()
         if all(map(math.isfinite, values)):
             return
         names = {each: name for name, each in self.loss_module.named_parameters()}

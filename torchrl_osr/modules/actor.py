@@ -4,7 +4,8 @@ All take ``observation_dim`` (``S``), ``action_dim`` (``A``) and these keywords:
 
 - ``num_cells``: width of each hidden layer. Default 256 and 256.
 - ``activation_class``: activation between the layers. Default ReLU.
-- ``low``, ``high``: action bounds, a number or ``[A]``. Default -1 and 1.
+- ``low``, ``high``: action bounds, a number or ``[A]``. Default -1 and 1. Of the
+  first two alone.
 - ``observation_key``: the state that they read. Default ``"observation"``.
 - ``action_key``: the action that they write. Default ``"action"``.
 """
@@ -14,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import torch
 from tensordict import NestedKey
 from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
 from torch import Tensor, nn
@@ -127,6 +129,8 @@ def deterministic_actor(
     takes of its sum with the center of the bounds) and the action, each ``[B, A]``.
     """
     network = mlp(observation_dim, action_dim, num_cells, activation_class)
+    with torch.no_grad():  # actions begin at the center
+        network[-1].bias -= (torch.as_tensor(low) + torch.as_tensor(high)) / 2
     return ProbabilisticActor(
         TensorDictModule(network, [observation_key], ["param"]),
         in_keys=["param"],

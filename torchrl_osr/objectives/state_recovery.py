@@ -182,8 +182,9 @@ class StateRecoveryLoss(ActorCriticLoss):
 class WithRecovery(LossModule):
     """Join a loss and a term of its actor to one loss.
 
-    Trainers, checkpoints and loggers treat the two as one. Shared parameters count
-    once. Each part has its own reduction, masks and weights.
+    Optimizers, checkpoints and loggers treat the two as one. Give ``SoftUpdate`` and
+    ``policy_from_loss`` the part ``loss``. Shared parameters count once. Each part has
+    its own reduction, masks and weights.
 
     Args:
         loss: trains an actor, such as TorchRL's ``IQLLoss``.
@@ -265,7 +266,7 @@ def cloning_distance(policy: Any, data_action: Tensor, key: NestedKey) -> Tensor
     if isinstance(policy, (Tensor, TanhDelta, Delta)):
         action = policy if isinstance(policy, Tensor) else policy.deterministic_sample
         check_action(data_action, action.shape[1:], key)
-        return F.action_distance(action, data_action)
+        return (action - data_action).square().sum(-1)
     if isinstance(policy, CATEGORICAL):
         sets, rows = policy.logits.shape[:2]
         index = action_index(data_action, policy, rows, key)

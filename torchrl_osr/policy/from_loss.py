@@ -105,7 +105,10 @@ def policy_from_loss(
         "source": {"loss": type(loss).__name__} | dict(source or {}),
         "versions": {name.replace("-", "_"): version(name) for name in PACKAGES},
     }
-    policy = Policy(record, tensors)
+    try:
+        policy = Policy(record, tensors)
+    except (KeyError, RuntimeError) as error:  # an activation; names of parameters
+        raise ValueError(f"a network has layers that no policy has: {error}") from error
     _check_same(policy, loss)
     return policy
 

@@ -45,7 +45,9 @@ class Policy(nn.Module):
     :func:`~torchrl_osr.load_policy` and :func:`~torchrl_osr.policy.policy_from_loss`
     make one. Standardisation of observations and scaling of actions are inside. As a
     module it maps observations ``[B, S]`` to deterministic actions and checks nothing:
-    ``TensorDictModule(policy, ["observation"], ["action"])`` is a TorchRL policy.
+    ``TensorDictModule(policy, ["observation"], ["action"])`` is a TorchRL policy. Of
+    discrete actions it writes the number: ``GymEnv(..., categorical_action_encoding=
+    True)`` takes it.
 
     Attributes:
         record: sizes of the networks, and what is known of the run in ``"source"``.

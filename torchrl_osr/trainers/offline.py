@@ -59,7 +59,7 @@ class OfflineTrainer(Trainer):
     One step is a batch and one ``update`` on it. A killed run continues from its newest
     whole checkpoint: networks, optimizer, targets, random generators, the sampler's
     order or priorities, and ``components``. On a CPU with the same libraries it ends
-    with the same bits as one that was never killed.
+    with the same bits as one that was never killed, if the buffer does not prefetch.
 
     Args:
         update: one gradient step; :class:`~torchrl_osr.fast.FastUpdate` makes it of
@@ -127,7 +127,9 @@ class OfflineTrainer(Trainer):
             progress_bar=False,
             auto_log_optim_steps=False,
         )
-        device = next(update.loss_module.parameters()).device
+        storage = getattr(replay_buffer, "storage", None)  # is sampled where it is
+        device = getattr(storage, "device", None)
+        device = device or next(update.loss_module.parameters()).device
         generator = torch.Generator(device).manual_seed(seed)
         replay_buffer.set_rng(generator)
         # The buffer is not handed to TorchRL's trainer, which would put the whole data
@@ -266,7 +268,7 @@ class OfflineTrainer(Trainer):
 
     def _log_losses(self, _: int, losses: TensorDictBase) -> None:
         """Log the means over a log interval; one copy to the host for all of them."""
-        values = torch.stack([each.float() for each in losses.values()]).tolist()
+        values = torch.stack([each.float().mean() for each in losses.values()]).tolist()
         self._log_numbers(dict(zip(losses.keys(), values, strict=True)))
         self._bar.update(self.collected_frames - self._bar.n)
 

@@ -54,11 +54,11 @@ def make_model(num_cells=(6, 5)) -> DynamicsEnsemble:
     return model.double()
 
 
-def plain_loss(model: DynamicsEnsemble, batch, weight: float) -> torch.Tensor:
+def plain_loss(model: DynamicsEnsemble, batch) -> torch.Tensor:
     """Gaussian by Gaussian: (y - m)^2 / v + log v, each network on its own rows."""
     low, high = model.lowest_log_variance, model.highest_log_variance
     half = len(batch) // 2
-    total = weight * (high.sum() - low.sum())
+    total = 0.01 * (high.sum() - low.sum())
     for number in range(2):
         rows = batch[number * half : (number + 1) * half]
         counted, value = 0, 0.0
@@ -77,18 +77,17 @@ def plain_loss(model: DynamicsEnsemble, batch, weight: float) -> torch.Tensor:
     return total
 
 
-@pytest.mark.parametrize("weight", [0.0, 2.0])
 @pytest.mark.parametrize("num_cells", [(), (6, 5)])
-def test_loss_equals_the_plain_likelihood(check, weight, num_cells) -> None:
+def test_loss_equals_the_plain_likelihood(check, num_cells) -> None:
     batch = make_batch("osr", 10)
     ended = batch["next", "terminated"].squeeze(-1)  # a row of each network
     batch["next", "observation"][ended] = batch["observation"][ended]
     model, plain = make_model(num_cells), make_model(num_cells)
     for each in (model, plain):
         each.standardize_(batch)
-    loss = DynamicsLoss(model, bound_weight=weight)
+    loss = DynamicsLoss(model)
     value = sum(loss(batch).values())
-    wanted = plain_loss(plain, batch, weight)
+    wanted = plain_loss(plain, batch)
     check(
         "Dynamics ensemble",
         [value.detach(), *torch.autograd.grad(value, list(model.parameters()))],
@@ -113,7 +112,7 @@ def test_loss_of_the_autoencoder_equals_the_plain_objective(transitions, check) 
     batch["next", "observation"][1] = batch["observation"][1]  # terminated: no next
     model, plain = Networks().vae, Networks().vae
     model.standardize_(batch)
-    loss = TransitionVAELoss(model, latent_weight=0.3)
+    loss = TransitionVAELoss(model)
     torch.manual_seed(3)
     value = loss(batch)["loss_vae"]
     torch.manual_seed(3)
@@ -132,7 +131,7 @@ def test_loss_of_the_autoencoder_equals_the_plain_objective(transitions, check) 
         out = last.weight @ hidden + last.bias
         variance = (2 * log_scale).exp()
         divergence = (variance + mean**2 - 1 - 2 * log_scale).sum() / 2
-        total = total + ((out - target) ** 2).mean() + 0.3 * divergence / 6
+        total = total + ((out - target) ** 2).mean() + 0.5 * divergence / 6
     wanted = total / len(kept)
     check(
         "Transition VAE",

@@ -393,7 +393,7 @@ def _unit_actions(action: Array, options: Reading) -> tuple[Array, int]:
     if options.num_actions is not None:
         return action, 0
     size = action.shape[1]
-    low, high = (np.float64(bound) for bound in options.action_bounds)
+    low, high = (np.asarray(b, np.float64) for b in options.action_bounds)
     fits = {low.size, high.size} <= {1, size} and np.isfinite([low.sum(), high.sum()])
     if not (np.all(fits) and (low < high).all()):
         raise ValueError(

@@ -136,7 +136,7 @@ class Body:
         return replace(self, least=least.tolist(), most=most.tolist())
 
 
-def identify(body: Body, rows: TensorDictBase, *, prior: float = 1e-3) -> Body:
+def identify(body: Body, rows: TensorDictBase) -> Body:
     r"""Return the body with the factors that explain a log best.
 
     .. math::
@@ -144,19 +144,18 @@ def identify(body: Body, rows: TensorDictBase, *, prior: float = 1e-3) -> Body:
             \rVert_2^2 + N S\, w^2 \lVert \log f \rVert_2^2, \quad
             0.25 \le f \le 4
 
-    by MuJoCo's least squares, with errors in standard deviations. The prior decides
-    between factors that explain the rows alike: a robot with twice all masses, gears
-    and damping moves the same.
+    by MuJoCo's least squares, with errors in standard deviations. The second term, with
+    :math:`w = 10^{-3}`, decides between factors that explain the rows alike: a robot
+    with twice all masses, gears and damping moves the same.
 
     Args:
         body: as described.
         rows: transitions ``[N]`` within the limits of the sensors; 1,000 take seconds.
-        prior: the weight :math:`w`.
     """
     states, actions, following = (
         rows[key] for key in ("observation", "action", ("next", "observation"))
     )
-    weight, unit = prior * states.numel() ** 0.5, states.std(0)
+    weight, unit = 1e-3 * states.numel() ** 0.5, states.std(0)
 
     def residual(logs: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return ``[N S + F, n]`` of the logarithms of the factors ``[F, n]``."""

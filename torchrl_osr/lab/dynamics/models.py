@@ -26,6 +26,7 @@ from torchrl_osr.objectives.transitions import Transitions, check_single_steps
 
 LEAST_RESIDUAL = 1e-3  # of a body, in standard deviations of the state
 LOG_VARIANCE_BOUNDS = (-10.0, 0.5)  # at first, as in PETS and MOPO
+BOUND_WEIGHT, LATENT_WEIGHT = 0.01, 0.5  # as in MOPO's and BCQ's code
 
 # Of MOPO's four hidden layers and its last one; further layers use the fourth's.
 WEIGHT_DECAY, OUTPUT_WEIGHT_DECAY = (2.5e-5, 5e-5, 7.5e-5, 7.5e-5), 1e-4
@@ -244,8 +245,8 @@ class DynamicsLoss(ActorCriticLoss):
             + w \sum_d \big( v^{max}_d - v^{min}_d \big)
 
     with the standardised targets :math:`y = (s' - s, r)` and the learned bounds
-    :math:`v` of the log-variance, as in MOPO's code (tianheyu927/mopo), whose
-    ``bound_weight`` :math:`w` is 0.01. The batch is divided among the networks, where
+    :math:`v` of the log-variance, and :math:`w = 0.01`, as in MOPO's code
+    (tianheyu927/mopo). The batch is divided among the networks, where
     MOPO draws bootstrap samples. Rows without a next state do not count.
     """
 
@@ -253,12 +254,9 @@ class DynamicsLoss(ActorCriticLoss):
     dynamics_network_params: TensorDictParams
     target_dynamics_network_params: TensorDictParams
 
-    def __init__(
-        self, dynamics_network: DynamicsEnsemble, *, bound_weight: float = 0.01
-    ) -> None:
+    def __init__(self, dynamics_network: DynamicsEnsemble) -> None:
         super().__init__(use_prioritized_weights=False)
         self.convert_to_functional(dynamics_network, "dynamics_network")
-        self.bound_weight = bound_weight
         self.declare(["loss_dynamics", "loss_bounds"], [])
 
     def input_keys(self) -> list[NestedKey]:
@@ -282,7 +280,7 @@ class DynamicsLoss(ActorCriticLoss):
             targets = targets.reshape(number, -1, targets.shape[-1])
             mean, log_variance = model.standardized(inputs)
             width = model.highest_log_variance - model.lowest_log_variance
-            bounds = self.bound_weight * width.sum()
+            bounds = BOUND_WEIGHT * width.sum()
         # Of the mean over E times as many rows as each network has.
         error = number * gaussian_error(mean, log_variance, targets).flatten()
         valid = has_next_state(rows, model.in_keys[0])
@@ -345,20 +343,17 @@ class TransitionVAELoss(ActorCriticLoss):
             + w\,\frac1Z \sum_i KL(q_i(z \mid s, s') \,\|\, N(0, 1)) \Big], \quad
             z \sim q
 
-    with the standardised change :math:`y`, as in BCQ's code, whose ``latent_weight``
-    :math:`w` is 0.5. Rows without a next state do not count.
+    with the standardised change :math:`y` and :math:`w = 0.5`, as in BCQ's code. Rows
+    without a next state do not count.
     """
 
     vae_network: TransitionVAE
     vae_network_params: TensorDictParams
     target_vae_network_params: TensorDictParams
 
-    def __init__(
-        self, vae_network: TransitionVAE, *, latent_weight: float = 0.5
-    ) -> None:
+    def __init__(self, vae_network: TransitionVAE) -> None:
         super().__init__(use_prioritized_weights=False)
         self.convert_to_functional(vae_network, "vae_network")
-        self.latent_weight = latent_weight
         self.declare(["loss_vae"], [])
 
     def input_keys(self) -> list[NestedKey]:
@@ -377,6 +372,6 @@ class TransitionVAELoss(ActorCriticLoss):
             output = model.decoder(state, loc + scale * torch.randn_like(scale))
         prior = torch.zeros_like(loc), torch.ones_like(scale)
         divergence = gaussian_kl(loc, scale, *prior).mean(-1)
-        value = (output - target).square().mean(-1) + self.latent_weight * divergence
+        value = (output - target).square().mean(-1) + LATENT_WEIGHT * divergence
         valid = has_next_state(rows, model.observation_key)
         return {"loss_vae": self.reduce(value, batch, valid)}, {}

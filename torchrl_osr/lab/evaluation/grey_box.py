@@ -24,7 +24,6 @@ def fitted_grey_box(
     body: Body,
     *,
     steps: int = 3000,
-    batch_size: int = 128,
     seed: int = 0,
     progress: bool = True,
 ) -> DynamicsEnsemble:
@@ -47,7 +46,7 @@ def fitted_grey_box(
         None,
         rows,
         "grey box",
-        batch_size=batch_size,
+        batch_size=128,
         steps=steps,
         seed=seed,
         progress=progress,

@@ -121,15 +121,11 @@ class IQLLoss(ActorCriticLoss):
         self.declare(losses, ["nll", "pred_value", "target_value"])
 
     def losses(self, batch: Transitions) -> Losses:
-        if batch.is_data is not None:
-            raise ValueError(
-                "The batch has synthetic rows, but IQL learns from the data's actions: "
-                "leave out the rollouts of a model."
-            )
         pi = distribution(
             self.actor_network, self.actor_network_params, batch.states[:1]
         )
         nll = cloning_distance(pi, batch.a, self.tensor_keys.action).squeeze(0)
+        self.check_actions(batch, batch.a.shape)
         with torch.no_grad():
             target_params = self.target_qvalue_network_params
             best = self.q(batch.s, batch.a, target_params).min(0).values

@@ -20,7 +20,7 @@ from torchrl_osr import functional as F
 from torchrl_osr._checks import check_positive, check_weight
 from torchrl_osr._entries import state_keys
 from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses, StatePolicy
-from torchrl_osr.objectives.networks import distribution
+from torchrl_osr.objectives.networks import distribution, full_precision
 from torchrl_osr.objectives.transitions import Transitions
 
 
@@ -83,15 +83,15 @@ class EDACLoss(ActorCriticLoss):
         policy = self.policy(batch)
         objective, log_prob = self.soft_policy_objective(batch, policy, "clean")
         losses, metrics = self.soft_actor_losses(batch, objective, log_prob)
-        q_data = self.q(batch.s, batch.a)
-        diversity = gradient_diversity(self.action_gradients(batch))
+        gradients, q_data = self.gradients_and_values(batch)
+        diversity = gradient_diversity(gradients)
         error, values = self.td_error(batch, q_data, self.soft_target(batch, policy))
         qvalue = self.reduce(error + self.diversity_weight * diversity, batch)
         metrics["diversity"] = self.mean(diversity, batch)
         return losses | {"loss_qvalue": qvalue}, metrics | values
 
-    def action_gradients(self, batch: Transitions) -> Tensor:
-        """Return each critic's gradient by the data's action, ``[N, R, A]``."""
+    def gradients_and_values(self, batch: Transitions) -> tuple[Tensor, Tensor]:
+        """Return each critic's gradient by the data's action, and value, ``[N, R]``."""
         number, keys = self.num_qvalue_nets, self.tensor_keys
         states = batch.s.select(*state_keys(self.qvalue_network.in_keys), strict=False)
         states = states.expand(number, *states.batch_size)
@@ -101,15 +101,16 @@ class EDACLoss(ActorCriticLoss):
             self.qvalue_network, (0, 0), pseudo_vmap=self.deactivate_vmap
         )
 
-        def total(action: Tensor) -> Tensor:
+        def total(action: Tensor) -> tuple[Tensor, Tensor]:
             rows = critics(states.copy().set(keys.action, action), params)
-            value: Tensor = rows.get(keys.state_action_value)
-            return value.sum()
+            value = full_precision(rows).get(keys.state_action_value).squeeze(-1)
+            return value.sum(), value
 
         # torch.func, unlike torch.autograd.grad, can be compiled; both can be
         # differentiated once more.
-        gradient: Tensor = torch.func.grad(total)(batch.a.expand(number, -1, -1))
-        return gradient
+        actions = batch.a.expand(number, -1, -1)
+        found: tuple[Tensor, Tensor] = torch.func.grad(total, has_aux=True)(actions)
+        return found
 
 
 class RORLLoss(ActorCriticLoss):

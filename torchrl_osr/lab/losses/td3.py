@@ -211,7 +211,7 @@ class ReBRACLoss(TD3Loss):
         self, batch: Transitions, action: Tensor, qvalues: Tensor
     ) -> tuple[Tensor, Tensor]:
         lowest = qvalues.min(0).values
-        distance = batch.of_data(F.action_distance(action, batch.a))
+        distance = batch.of_data((action - batch.a).square().sum(-1))
         sought = lowest / self.magnitude(batch, lowest)
         return self.actor_bc_coef * distance - sought, distance
 
@@ -224,5 +224,5 @@ class ReBRACLoss(TD3Loss):
         data_action = entry(batch.rows, key)
         check_action(data_action, action.shape, key)
         done = column(batch.rows, nested("next", self.tensor_keys.done))
-        penalty = F.action_distance(action, data_action).masked_fill(done, 0.0)
+        penalty = (action - data_action).square().sum(-1).masked_fill(done, 0.0)
         return value - self.critic_bc_coef * penalty

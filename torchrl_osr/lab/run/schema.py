@@ -273,9 +273,7 @@ def schema_of(target: type) -> type:
         parameters = inspect.signature(each).parameters
         hints = get_type_hints(vars(each)["__init__"])
         for name, parameter in parameters.items():
-            # Not a Python object, nor what every loss refuses.
-            keyword = parameter.kind is parameter.KEYWORD_ONLY
-            if keyword and name not in ("action_spec", "gamma"):
+            if parameter.kind is parameter.KEYWORD_ONLY:
                 option = name, _config_type(hints[name]), parameter.default
                 options.setdefault(name, option)
         if not any(each.kind is each.VAR_KEYWORD for each in parameters.values()):
