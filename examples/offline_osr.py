@@ -26,7 +26,7 @@ from torchrl.objectives import SoftUpdate
 from torchrl_osr import InverseDynamicsLoss, OSRLoss, OSRVLoss, StatePerturbation
 from torchrl_osr._files import write_json
 from torchrl_osr.fast import FastUpdate
-from torchrl_osr.lab.cli.console import single_job
+from torchrl_osr.lab.cli.console import errors_as_sentences, single_job
 from torchrl_osr.lab.data.rows import take_multi_step
 from torchrl_osr.lab.evaluation import inverse_dynamics_report
 from torchrl_osr.lab.run import CONF
@@ -178,4 +178,5 @@ def check_scope(config: TrainConfig) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with errors_as_sentences():
+        main()

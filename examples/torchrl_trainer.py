@@ -1,8 +1,9 @@
 """OSR trained by TorchRL's CQLTrainer, configured by TorchRL's own Hydra options.
 
-    python examples/torchrl_trainer.py env=walker2d loss.recovery_weight=1.0
+    python examples/torchrl_trainer.py data=medium loss.recovery_weight=1.0
 
-The configuration is ``torchrl_trainer.yaml`` beside this file. Data are collected on
+The configuration is ``torchrl_trainer.yaml`` beside this file. Its networks have the
+sizes of a Hopper. Data are collected on
 this machine and standardised. The inverse dynamics model is trained first, then the
 policy, which finally plays its task. Writes ``result.json`` to Hydra's folder.
 """

@@ -102,6 +102,8 @@ def _configuration_error(error: Any) -> str:
     from omegaconf.errors import ConfigAttributeError, ConfigKeyError
 
     cause = error.__cause__
+    if "schema@recovery" in str(error):
+        return "this loss has a recovery term of its own: leave out recovery=..."
     if isinstance(error, MissingConfigException) and error.options:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
         options, similar = ", ".join(error.options), guess(name, error.options)

@@ -54,6 +54,7 @@ def main() -> None:
         parser.error(f"the path must end in {SUFFIX}, {' or '.join(GRAPHS)}.")
     if options.settings and options.output == "value":
         parser.error("the monitor belongs to the action: leave out --output value.")
+    options.path.parent.mkdir(parents=True, exist_ok=True)
     policy = load_run_policy(options.source, options.trust)
     if options.settings:
         known = OmegaConf.create({"monitor": MonitorConfig, "data": {"path": None}})

@@ -105,7 +105,12 @@ def load_dataset(
         data, manifest = _recorded(source, path, spec, num_actions, log, progress)
         checksum = manifest.get("checksum")
     else:
-        _refuse(log | {"path": path}, f"data={source}, which is rolled out")
+        if path is not None or (env_id is None and env_name not in known_ids()):
+            raise ValueError(
+                f"data={source} is rolled out in a simulator: for a log, give "
+                "data=file data.path=<its place>."
+            )
+        _refuse(log, f"data={source}, which is rolled out")
         if random_share and source == "random":
             raise ValueError(
                 f"data.random_share={random_share} mixes a source with random rows: "

@@ -29,7 +29,7 @@ IGNORED = (
 
 METHOD = (
     *("loss.", "recovery", "network.actor.", "optim.policy_delay", "perturbation."),
-    *("inverse_dynamics.", "dynamics."),
+    *("inverse_dynamics.", "dynamics.", "optim.actor_schedule"),
 )
 """Settings in which methods differ by intent; all others should be equal."""
 

@@ -69,6 +69,8 @@ def load_data(
         elif env.id is None and options.source in ("file", "lerobot"):
             known = env.action_low and (env.action_low, env.action_high)
             reading["action_bounds"] = options.action_bounds or known or "log"
+    elif options.source in ("file", "lerobot"):
+        reading["action_bounds"] = options.action_bounds or "log"
     data, manifest = load_dataset(**reading, progress=progress)
     if options.checksum not in (None, manifest["checksum"]):
         place = "" if options.path is None else f" data.path={options.path}"

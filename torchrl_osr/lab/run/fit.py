@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from torchrl_osr._files import write_atomically
 from torchrl_osr.lab.run import CONF
 from torchrl_osr.lab.run.folder import open_run
 from torchrl_osr.lab.run.load import load_run_policy
@@ -50,7 +52,15 @@ def fit(
     if isinstance(log, Mapping) or hasattr(log, "items"):
         folder.mkdir(parents=True, exist_ok=True)
         columns: Any = {str(name): np.asarray(column) for name, column in log.items()}
-        np.savez(log := folder / f"{folder.name}.npz", **columns)
+        np.savez(content := BytesIO(), **columns)
+        log = folder / f"{folder.name}.npz"
+        same = not log.exists() or log.read_bytes() == content.getvalue()
+        if not same and "force=true" not in overrides:
+            raise ValueError(
+                f"{log} has other columns: choose another folder, or continue on these "
+                "with 'force=true'."
+            )
+        write_atomically(log, content.getvalue())
     given = ["env=none", "data=file", f"data.path='{log}'", *overrides]
     with initialize_config_dir(str(CONF), version_base="1.3"):
         cfg = compose("train", given, return_hydra_config=True)

@@ -121,8 +121,8 @@ def _absolute(path: Any) -> Any:
     """Return the absolute paths of a file, a list or a pattern."""
     if isinstance(path, ListConfig):
         return [_absolute(each) for each in path]
-    if path is None:
-        return None
+    if not path:
+        return path
     full = str(Path(path).expanduser().absolute())
     return full if Path(full).exists() or glob(full) else path
 
