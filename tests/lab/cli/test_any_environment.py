@@ -232,7 +232,12 @@ def test_policies_are_ranked_on_their_log_alone(tmp_path, capsys, monkeypatch):
     name = "estimated return (discount 0.9) of log-log"
     assert f"Undisturbed {name}" in page
     assert "No run was played." in page
+    bodys = json.loads((runs[0] / "offline_evaluation.json").read_text())
+    bodys |= {"value": 0.0, "value_of_networks": [3 * bodys["value"]]}
+    (runs[0] / "body-offline_evaluation.json").write_text(json.dumps(bodys))
     scores = pd.read_csv(tmp_path / "page" / "scores.csv", index_col="method")
+    by_body = read_runs([tmp_path]).episodes.groupby("method")["score"].mean()
+    assert by_body["bc"] == pytest.approx(3 * found[0]["value"])
     for loss, each in zip(("bc", "iql"), found, strict=True):
         assert scores.loc[loss, "last"] == pytest.approx(each["value"])
     assert scores["data mean"].tolist() == pytest.approx([own, own], rel=1e-5)

@@ -65,11 +65,15 @@ QUOTED = "cannot be read: quote a value with blanks, brackets or quotes, as in "
         ("data.path=log (1).csv", f".*{QUOTED}'data.path=\"log \\(1\\).csv\"'"),
         ("data.path=it's.csv", f".*{QUOTED}'data.path=\"it'\"'\"'s.csv\"'"),
         ("seed", "'seed' is no key=value"),
+        (
+            "loss=sdc,recovery=osr",
+            "this loss has a recovery term of its own: leave",
+        ),
     ],
 )
 def test_wrong_override_is_one_sentence(override, message):
     with pytest.raises(Exception, match=r".") as error:
-        composed("train", override)
+        composed("train", *re.split(",(?=recovery)", override))
     assert re.match(message, sentence(error.value)), sentence(error.value)
     assert "\n" not in sentence(error.value)
 

@@ -54,6 +54,7 @@ def test_a_log_is_described(look, tmp_path):
     assert "not read  note" in output
     assert re.search(r"(?m)^action +torque +-1.99\d? ", output)
     assert [path.name for path in tmp_path.iterdir()] == ["log.csv"]
+    assert look(*NAMED) == look(*NAMED, "env=none")
 
 
 def test_what_looks_wrong_is_numbered(look):

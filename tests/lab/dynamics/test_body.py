@@ -103,6 +103,7 @@ def test_a_run_identifies_the_body_and_keeps_it(tmp_path, capsys) -> None:
         (["loss=sdc"], "needs gradients of the model"),
         (["dynamics.adversarial_steps=5"], "needs gradients of the model"),
         (["dynamics.xml=none.xml"], "none.xml"),
+        (["dynamics.xml="], "xml is not given: a grey box needs"),
     ],
 )
 def test_a_body_that_cannot_be_used_is_refused(tmp_path, options, message) -> None:

@@ -25,5 +25,6 @@ def test_columns_become_a_run_that_the_same_call_continues(tmp_path):
     assert read_run(folder).env.name == "log-my-arm"
     again = fit(frame, folder, *small, *given)
     assert again.act(np.zeros(2)) == policy.act(np.zeros(2))
-    with pytest.raises(ValueError, match=r"other contents"):
+    with pytest.raises(ValueError, match=r"my arm.npz has other columns: choose anot"):
         fit(frame.assign(reward=0.5), folder, *small, *given)
+    fit(frame, folder, *small, *given)  # its columns are still there

@@ -88,8 +88,8 @@ class DynamicsOptions:
         """Raise a ValueError if the options contradict each other or the task."""
         check_choice("dynamics.unknown", self.unknown, ("halt", "take"))
         rolled_out, real = self.real_ratio != 1, round(self.real_ratio * batch_size)
-        if self.xml == "" or self.frame_skip < 1:
-            why = "xml=<MJCF file> and dynamics.frame_skip=<steps> describe a grey box: give both"
+        if self.xml == "":
+            why = "xml is not given: a grey box needs the robot's MJCF file"
         elif not 1 <= self.num_elites <= self.num_networks:
             why = f"num_elites={self.num_elites} must be between 1 and num_networks"
         elif rolled_out and not 0 < real < batch_size:
