@@ -71,8 +71,8 @@ BUILDERS: dict[str, tuple[Callable[..., Any], tuple[int, ...], dict, tuple]] = {
         modules.discrete_critic_ensemble, (S, ACTIONS), MLPS, STATE + COUNT
     ),
     "choice_model": (modules.categorical_inverse_dynamics, (S, ACTIONS), MLPS, BOTH),
-    "dynamics": (DynamicsEnsemble, (S, A), ENSEMBLE, BOTH),
-    "vae": (TransitionVAE, (S,), CELLS, STATE),
+    "dynamics": (DynamicsEnsemble, (S, A), ENSEMBLE, ()),
+    "vae": (TransitionVAE, (S,), CELLS, ()),
 }  # fmt: skip
 
 

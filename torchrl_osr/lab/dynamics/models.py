@@ -15,7 +15,7 @@ from tensordict import NestedKey, TensorDictBase, TensorDictParams
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from torchrl_osr._entries import column, entry, nested
+from torchrl_osr._entries import column, entry
 from torchrl_osr.functional import gaussian_kl
 from torchrl_osr.lab.dynamics.body import Body
 from torchrl_osr.modules.actor import mlp
@@ -71,14 +71,11 @@ class DynamicsEnsemble(nn.Module):
         num_networks: int = 7,
         num_elites: int = 5,
         num_cells: Sequence[int] = (200, 200, 200, 200),
-        observation_key: NestedKey = "observation",
-        action_key: NestedKey = "action",
     ) -> None:
         super().__init__()
         self.observation_dim, self.action_dim = observation_dim, action_dim
         self.num_networks, self.num_elites = num_networks, num_elites
         self.num_cells = list(num_cells)
-        self.in_keys = [observation_key, action_key]
         inputs, outputs = observation_dim + action_dim, observation_dim + 1
         widths = [inputs, *num_cells, 2 * outputs]
         self.layers = nn.ModuleList(
@@ -153,10 +150,9 @@ class DynamicsEnsemble(nn.Module):
 
         Changes are those since ``"simulated"``, the body's prediction, if it is there.
         """
-        key, action_key = self.in_keys
-        observation, action = entry(data, key), entry(data, action_key)
+        observation, action = entry(data, "observation"), entry(data, "action")
         before = data.get("simulated", observation)
-        change = entry(data, nested("next", key)) - before
+        change = entry(data, ("next", "observation")) - before
         reward = column(data, ("next", "reward")).unsqueeze(-1)
         inputs = torch.cat([observation, action.to(observation.dtype)], -1)
         return inputs, torch.cat([change, reward.to(change.dtype)], -1)
@@ -166,14 +162,13 @@ class DynamicsEnsemble(nn.Module):
 
         They have a next state, and no number at a limit of the body's sensors.
         """
-        whole = has_next_state(data, self.in_keys[0])
+        whole = has_next_state(data)
         return whole if self.body is None else whole & self.body.shows(data)
 
     @torch.no_grad()
     def standardize_(self, data: TensorDictBase) -> None:
         """Take mean and standard deviation of inputs and targets from rows ``[N]``."""
-        known = has_next_state(data, self.in_keys[0])
-        inputs, targets = self.inputs_and_targets(data[known])
+        inputs, targets = self.inputs_and_targets(data[has_next_state(data)])
         copy_statistics(inputs, self.input_loc, self.input_scale)
         copy_statistics(targets, self.target_loc, self.target_scale)
         if self.body is not None:  # a good body leaves rounding errors
@@ -185,7 +180,7 @@ class DynamicsEnsemble(nn.Module):
         """Choose the networks with the smallest error on held-out rows as elites."""
         rows = held_out[self.is_whole(held_out)]
         _, targets = self.inputs_and_targets(rows)
-        mean, _ = self.predict(*(rows[key] for key in self.in_keys))
+        mean, _ = self.predict(rows["observation"], rows["action"])
         error = ((mean - targets) / self.target_scale).square().mean((-2, -1))
         self.elites.copy_(error.argsort()[: len(self.elites)].sort().values)
 
@@ -222,12 +217,13 @@ def copy_statistics(values: Tensor, loc: Tensor, scale: Tensor) -> None:
     scale.copy_(torch.where(std > 1e-8, std, torch.ones_like(std)))
 
 
-def has_next_state(data: TensorDictBase, key: NestedKey = "observation") -> Tensor:
+def has_next_state(data: TensorDictBase) -> Tensor:
     """Return which of the transitions ``[B]`` have a next state, bool ``[B]``.
 
     Readers repeat the state where a recording lacks the next one of a terminated row.
     """
-    same = (entry(data, nested("next", key)) == entry(data, key)).all(-1)
+    after = entry(data, ("next", "observation"))
+    same = (after == entry(data, "observation")).all(-1)
     return ~(same & column(data, ("next", "terminated")).bool())
 
 
@@ -260,10 +256,9 @@ class DynamicsLoss(ActorCriticLoss):
         self.declare(["loss_dynamics", "loss_bounds"], [])
 
     def input_keys(self) -> list[NestedKey]:
-        key, action = self.dynamics_network.in_keys
-        following = [nested("next", each) for each in (key, "reward", "terminated")]
+        following = [("next", key) for key in ("observation", "reward", "terminated")]
         simulated = [] if self.dynamics_network.body is None else ["simulated"]
-        return [key, action, *following, *simulated]
+        return ["observation", "action", *following, *simulated]
 
     def losses(self, batch: Transitions) -> Losses:
         check_single_steps(batch, "the model of the dynamics")
@@ -283,8 +278,7 @@ class DynamicsLoss(ActorCriticLoss):
             bounds = BOUND_WEIGHT * width.sum()
         # Of the mean over E times as many rows as each network has.
         error = number * gaussian_error(mean, log_variance, targets).flatten()
-        valid = has_next_state(rows, model.in_keys[0])
-        loss = self.reduce(error, batch, valid)
+        loss = self.reduce(error, batch, has_next_state(rows))
         return {"loss_dynamics": loss, "loss_bounds": bounds}, {}
 
 
@@ -304,14 +298,9 @@ class TransitionVAE(nn.Module):
     target_scale: Tensor
 
     def __init__(
-        self,
-        observation_dim: int,
-        *,
-        num_cells: Sequence[int] = (750, 750),
-        observation_key: NestedKey = "observation",
+        self, observation_dim: int, *, num_cells: Sequence[int] = (750, 750)
     ) -> None:
         super().__init__()
-        self.observation_key = observation_key
         self.latent_dim = 2 * observation_dim
         self.encoder = mlp(2 * observation_dim, 2 * self.latent_dim, num_cells)
         inputs = observation_dim + self.latent_dim
@@ -329,9 +318,8 @@ class TransitionVAE(nn.Module):
     @torch.no_grad()
     def standardize_(self, data: TensorDictBase) -> None:
         """Take mean and standard deviation of the change from rows ``[N]``."""
-        key = self.observation_key
-        rows = data[has_next_state(data, key)]
-        change = entry(rows, nested("next", key)) - entry(rows, key)
+        rows = data[has_next_state(data)]
+        change = entry(rows, ("next", "observation")) - entry(rows, "observation")
         copy_statistics(change, self.target_loc, self.target_scale)
 
 
@@ -357,14 +345,13 @@ class TransitionVAELoss(ActorCriticLoss):
         self.declare(["loss_vae"], [])
 
     def input_keys(self) -> list[NestedKey]:
-        key = self.vae_network.observation_key
-        return [key, nested("next", key), ("next", "terminated")]
+        return ["observation", ("next", "observation"), ("next", "terminated")]
 
     def losses(self, batch: Transitions) -> Losses:
         check_single_steps(batch, "the autoencoder")
         rows, model = batch.one_step, self.vae_network
-        state = entry(rows, model.observation_key)
-        target = entry(rows, nested("next", model.observation_key))
+        state = entry(rows, "observation")
+        target = entry(rows, ("next", "observation"))
         with self.vae_network_params.to_module(model):
             target = (target - state - model.target_loc) / model.target_scale
             loc, log_scale = model.encoder(state, target).chunk(2, -1)
@@ -373,5 +360,4 @@ class TransitionVAELoss(ActorCriticLoss):
         prior = torch.zeros_like(loc), torch.ones_like(scale)
         divergence = gaussian_kl(loc, scale, *prior).mean(-1)
         value = (output - target).square().mean(-1) + LATENT_WEIGHT * divergence
-        valid = has_next_state(rows, model.observation_key)
-        return {"loss_vae": self.reduce(value, batch, valid)}, {}
+        return {"loss_vae": self.reduce(value, batch, has_next_state(rows))}, {}

@@ -177,7 +177,7 @@ def dynamics_report(model: DynamicsEnsemble, data: TensorDictBase) -> dict[str, 
     """
     rows = data[model.is_whole(data)]
     _, targets = model.inputs_and_targets(rows)
-    mean, scale = model.predict(*(rows[key] for key in model.in_keys))
+    mean, scale = model.predict(rows["observation"], rows["action"])
     unit = model.target_scale
     mse = ((mean - targets) / unit).square().mean().item()
     disagreement = model.disagreement(mean)

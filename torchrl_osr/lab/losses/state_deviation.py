@@ -15,7 +15,7 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 
 from torchrl_osr import functional as F
 from torchrl_osr._checks import check_positive, check_weight
-from torchrl_osr._entries import entry, nested, state_keys
+from torchrl_osr._entries import nested, state_keys
 from torchrl_osr.lab.dynamics.models import DynamicsEnsemble, TransitionVAE
 from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses
 from torchrl_osr.objectives.networks import distribution
@@ -104,8 +104,7 @@ class StateDeviationLoss(ActorCriticLoss):
         self.declare(losses, ["deviation", "multiplier"])
 
     def input_keys(self) -> list[NestedKey]:
-        keys = [*self.actor_network.in_keys, *self.dynamics_network.in_keys]
-        states = state_keys(keys, self.tensor_keys.action)
+        states = state_keys([*self.actor_network.in_keys, "observation"])
         perturbed = [nested(self.tensor_keys.perturbed, key) for key in states]
         return [*states, *perturbed]
 
@@ -128,9 +127,8 @@ class StateDeviationLoss(ActorCriticLoss):
         pi = distribution(self.actor_network, self.actor_network_params, states)
         action, _ = rsample_and_log_prob(pi, (number,))
         action = action.squeeze(1)  # of the one set of states
-        key = model.in_keys[0]
-        clean = entry(batch.rows, aims.observation_key).expand(number, -1, -1)
-        start = batch.states_of([key], "perturbed")[0].get(key).expand(number, -1, -1)
+        observed = batch.states_of(["observation"], "both").get("observation")
+        clean, start = observed.unsqueeze(1).expand(-1, number, -1, -1)
         with self.dynamics_network_params.to_module(model, preserve_module_state=False):
             change = model.sample(*model.predict(start, action))[..., :-1]
         held = self.transition_network_params
