@@ -42,7 +42,7 @@ def true_value(gain: float, start: torch.Tensor) -> float:
 @pytest.mark.parametrize("gain", [-1.0, 0.0])
 def test_the_value_of_a_linear_policy_is_the_closed_forms(gain):
     data = rolled_out(-0.3, 0.7)
-    options = {"gamma": GAMMA, "steps": 800, "num_cells": [32, 32]}
+    options = {"gamma": GAMMA, "steps": 800}
     found = fitted_values(data, lambda s: gain * s, progress=False, **options)
     assert found.shape == (3, EPISODES)
     truth = true_value(gain, data["observation"][::STEPS])

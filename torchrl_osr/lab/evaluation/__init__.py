@@ -15,10 +15,7 @@ from torchrl_osr.lab.evaluation.inverse_dynamics_fit import (
 from torchrl_osr.lab.evaluation.offline import fitted_values
 from torchrl_osr.lab.evaluation.recoverable import load_recoverable_states, recovers
 from torchrl_osr.lab.evaluation.recovery import DataDistance
-from torchrl_osr.lab.evaluation.robustness import (
-    Disturbance,
-    evaluate_paired,
-)
+from torchrl_osr.lab.evaluation.robustness import Disturbance, evaluate_paired
 
 __all__ = [
     "DataDistance",

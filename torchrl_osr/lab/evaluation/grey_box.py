@@ -46,7 +46,6 @@ def fitted_grey_box(
         None,
         rows,
         "grey box",
-        batch_size=128,
         steps=steps,
         seed=seed,
         progress=progress,
@@ -61,11 +60,11 @@ def rolled_out_values(
     policy: Policy,
     *,
     gamma: float = 0.997,
-    steps: int | None = None,
 ) -> Array:
     """Return a policy's discounted return in a grey box, from first states.
 
-    Rewards stay within the range of the data.
+    Rollouts have ``3 / (1 - gamma)`` steps: 5 % of the return are left then. Rewards
+    stay within the range of the data.
 
     Args:
         model: of :func:`fitted_grey_box`.
@@ -74,7 +73,6 @@ def rolled_out_values(
 
     Keyword Args:
         gamma: discount factor, below 1.
-        steps: length of a rollout; default ``3 / (1 - gamma)``: 5 % are left then.
 
     Returns:
         Values ``[E]``, one for each episode, at most 100.
@@ -87,9 +85,10 @@ def rolled_out_values(
         >>> data, _ = load_dataset("hopper", "random", num_transitions=300)
         >>> hopper = Body(gymnasium.make("Hopper-v5").unwrapped.fullpath, 4)
         >>> model = fitted_grey_box(data, hopper, steps=10, progress=False)
+        in rollouts, the task ends where observation[1] < -...
         body as described: error ... standard deviations in a step
         body as identified: error ... standard deviations in a step
-        >>> values = rolled_out_values(model, data, lambda s: s[:, :3].tanh(), steps=9)
+        >>> values = rolled_out_values(model, data, lambda s: s[:, :3], gamma=0.9)
     """
     check_discount(gamma)
     state, ended = first_states(data, episode_of(data)), termination(None, model.limits)
@@ -98,7 +97,7 @@ def rolled_out_values(
     least, most = data["next", "reward"].aminmax()
     value, size = torch.zeros_like(state[:, 0]), data["action"].shape[-1]
     going = torch.arange(len(state))
-    for step in range(round(3 / (1 - gamma)) if steps is None else steps):
+    for step in range(round(3 / (1 - gamma))):
         change = model.predict(state, act(policy, model.observed(state), size))[0][0]
         value[going] += gamma**step * change[:, -1].clamp(least, most)
         state = state + change[:, :-1]

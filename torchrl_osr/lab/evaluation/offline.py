@@ -5,7 +5,6 @@ Shapes: ``N`` transitions, ``K`` critics, ``E`` episodes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from tempfile import TemporaryDirectory
 
 import numpy as np
@@ -32,10 +31,6 @@ def fitted_values(
     gamma: float = 0.99,
     steps: int = 8000,
     num_critics: int = 3,
-    num_cells: Sequence[int] = (128, 128),
-    batch_size: int = 128,
-    lr: float = 1e-3,
-    tau: float = 0.05,
     seed: int = 0,
     progress: bool = True,
 ) -> Array:
@@ -48,9 +43,8 @@ def fitted_values(
 
     Keyword Args:
         gamma: discount factor, below 1.
-        steps, batch_size, lr, tau: of the training of the critics.
-        num_critics, num_cells: number and sizes of critics. Each learns from episodes
-            drawn with replacement.
+        steps: of the training of the critics.
+        num_critics: each learns from episodes drawn with replacement.
         seed: of networks, batches and drawn episodes.
         progress: show a progress bar.
 
@@ -93,17 +87,15 @@ def fitted_values(
             starts.shape[-1],
             size,
             num_qvalue_nets=num_critics,
-            num_cells=num_cells,
+            num_cells=(128, 128),
             layer_norm=True,
         )
     bounds = min(0.0, least), max(0.0, most)
     loss = FQELoss(critics, value_bounds=bounds, deactivate_vmap=True)
     loss.make_value_estimator(gamma=gamma)
-    optimizer = torch.optim.Adam(loss.parameters(), lr=lr, fused=True)
-    options = {"batch_size": batch_size, "steps": steps, "seed": seed}
-    targets = SoftUpdate(loss, tau=tau)
-    description = "fitted Q evaluation"
-    fit(loss, optimizer, targets, rows, description, progress=progress, **options)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3, fused=True)
+    targets, what = SoftUpdate(loss, tau=0.05), "fitted Q evaluation"
+    fit(loss, optimizer, targets, rows, what, steps=steps, seed=seed, progress=progress)
     states = TensorDict({"observation": (starts - loc) / scale}, [number])
     params = loss.target_qvalue_network_params
     with torch.no_grad():
@@ -138,7 +130,6 @@ def fit(
     rows: TensorDict,
     description: str,
     *,
-    batch_size: int,
     steps: int,
     seed: int,
     progress: bool,
@@ -147,7 +138,7 @@ def fit(
     with TemporaryDirectory() as folder:
         OfflineTrainer(
             FastUpdate(loss, optimizer, targets),
-            make_replay_buffer(rows, batch_size=batch_size, seed=0),
+            make_replay_buffer(rows, batch_size=128, seed=0),
             steps,
             folder,
             seed=seed,
