@@ -7,19 +7,20 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_osr.lab.evaluation import DataDistance
+from torchrl_osr.lab.evaluation import DataDistance, recovery
 from torchrl_osr.lab.evaluation.recovery import Trajectory, measure_recovery
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e3])
-def test_small_distances_keep_their_digits(offset):
+def test_small_distances_keep_their_digits(offset, monkeypatch):
     """Far from zero and close together, a float32 product would lose them."""
+    monkeypatch.setattr(recovery, "MAX_REFERENCE", 3000)
     generator = torch.Generator().manual_seed(0)
     centres = 30 * torch.randn(40, 11, generator=generator)
     rows = centres.repeat(100, 1) + 1e-3 * torch.randn(4000, 11, generator=generator)
     rows = rows + offset
     data = TensorDict({"observation": rows}, [4000])
-    distance = DataDistance(data, max_reference=3000)
+    distance = DataDistance(data)
     assert len(distance._states) == 3000
     scale = rows.double().std(0, correction=0).float().double()
     far = rows[:300] + 5 * torch.randn(300, 11, generator=generator)

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrl_osr.lab.data import observation_statistics
 from torchrl_osr.policy.monitor import distance_to
 
-NUM_NEIGHBORS = 10
+NUM_NEIGHBORS, MAX_REFERENCE = 10, 20_000
 MAX_HELD_OUT = 2_000  # and at most a fifth of the data
 ROWS_AT_A_TIME = 64  # more do not fit into the processor's cache and are slower
 
@@ -28,21 +28,18 @@ STEPS_AFTER = 100
 class DataDistance:
     """Measure the mean distance to the 10 nearest states of the data.
 
-    They are the nearest of a random subset, in standard deviations of the data. A state
-    counts as in the data up to :attr:`threshold`, which 95 % of held-out states are
-    within.
+    They are the nearest of a random subset of 20,000, in standard deviations of the
+    data. A state counts as in the data up to :attr:`threshold`, which 95 % of held-out
+    states are within.
 
     Args:
         data: transitions ``[N]`` with raw ``observation`` ``[N, S]``.
 
     Keyword Args:
-        max_reference: size of the subset, at most. Default 20,000.
         seed: of the random subset and of the held-out states. Default 0.
     """
 
-    def __init__(
-        self, data: TensorDictBase, *, max_reference: int = 20_000, seed: int = 0
-    ) -> None:
+    def __init__(self, data: TensorDictBase, *, seed: int = 0) -> None:
         held_out = min(MAX_HELD_OUT, len(data) // 5)
         if len(data) - held_out < NUM_NEIGHBORS or not held_out:
             raise ValueError(f"distances need at least 12 rows, got {len(data)}.")
@@ -52,7 +49,7 @@ class DataDistance:
         order = torch.randperm(len(data), generator=generator)
         states, others = (
             data[rows]["observation"].cpu()
-            for rows in (order[held_out:][:max_reference], order[:held_out])
+            for rows in (order[held_out:][:MAX_REFERENCE], order[:held_out])
         )
         self._states = self._standard(states)
         self.threshold = float(torch.quantile(self(others).double(), 0.95))
