@@ -57,13 +57,7 @@ def read_minari(
         bounds = actions.low.ravel(), actions.high.ravel()
         options = replace(options, action_bounds=bounds)
     space = sorted_space(opened.observation_space)
-    about = {
-        "source": "minari",
-        "path": str(path),
-        "dataset_id": opened.id,
-        "env_id": opened.env_spec and opened.env_spec.id,
-        "minari_version": opened.minari_version,
-    }
+    about = {"source": "minari", "path": str(path)}
     episodes = [*_read(opened, space, progress)]
     columns = {n: np.concatenate([e[n] for e in episodes]) for n in episodes[0]}
     files = sorted(path for path in here.rglob("*") if path.is_file())
