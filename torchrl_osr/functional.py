@@ -21,7 +21,10 @@ from torch import Tensor
 
 
 def gaussian_kl(
-    loc_p: Tensor, scale_p: Tensor, loc_q: Tensor, scale_q: Tensor
+    loc_p: Tensor,
+    scale_p: Tensor,
+    loc_q: Tensor | float = 0.0,
+    scale_q: Tensor | float = 1.0,
 ) -> Tensor:
     r"""Return :math:`KL(p \,\|\, q)` of diagonal Gaussians, one number a dimension.
 
@@ -31,7 +34,7 @@ def gaussian_kl(
 
     It is also the divergence of the two *tanh*-Gaussians with these pre-tanh
     parameters and equal bounds, because a bijection leaves the KL unchanged. Means,
-    standard deviations and the result are ``[B, A]``.
+    standard deviations and the result are ``[B, A]``. Default ``q``: ``N(0, 1)``.
 
     Examples:
         >>> p, q = torch.tensor([0.4]), torch.tensor([-0.2])

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from typing import Literal
 
-import torch
 from tensordict import NestedKey
 from tensordict.nn import (
     InteractionType,
@@ -120,8 +119,6 @@ class InverseDynamicsLoss(ActorCriticLoss):
             value = cloning_distance(model, batch.a, self.tensor_keys.action)
         if self.has_latent:
             loc, scale = (entry(output, key) for key in LATENT_KEYS)
-            prior = torch.zeros_like(loc), torch.ones_like(scale)
-            kl = F.gaussian_kl(loc, scale, *prior).mean(-1)
-            value = value + self.latent_weight * kl
+            value = value + self.latent_weight * F.gaussian_kl(loc, scale).mean(-1)
         loss = self.reduce(value.mean(0), batch, ~batch.done)
         return {"loss_inverse_dynamics": loss}, {}

@@ -222,8 +222,7 @@ def has_next_state(data: TensorDictBase) -> Tensor:
 
     Readers repeat the state where a recording lacks the next one of a terminated row.
     """
-    after = entry(data, ("next", "observation"))
-    same = (after == entry(data, "observation")).all(-1)
+    same = (entry(data, ("next", "observation")) == entry(data, "observation")).all(-1)
     return ~(same & column(data, ("next", "terminated")).bool())
 
 
@@ -357,7 +356,6 @@ class TransitionVAELoss(ActorCriticLoss):
             loc, log_scale = model.encoder(state, target).chunk(2, -1)
             scale = log_scale.clamp(*LATENT_LOG_SCALE_BOUNDS).exp()
             output = model.decoder(state, loc + scale * torch.randn_like(scale))
-        prior = torch.zeros_like(loc), torch.ones_like(scale)
-        divergence = gaussian_kl(loc, scale, *prior).mean(-1)
+        divergence = gaussian_kl(loc, scale).mean(-1)
         value = (output - target).square().mean(-1) + LATENT_WEIGHT * divergence
         return {"loss_vae": self.reduce(value, batch, has_next_state(rows))}, {}
