@@ -519,15 +519,6 @@ class ActorCriticLoss(LossModule):
         entropy = -self.mean(log_prob, batch)
         return losses, {"alpha": self.alpha, "entropy": entropy}
 
-    def uniform_actions(self, like: Tensor) -> tuple[Tensor, Tensor]:
-        """Draw ``K`` uniform actions ``[K, ..., A]``, with their log-densities."""
-        low, high = self.action_low, self.action_high
-        width = (high - low).expand(like.shape[-1])
-        shape = (self.num_random, *like.shape)
-        action = torch.rand(shape, dtype=like.dtype, device=like.device)
-        log_density = -width.log().sum().expand(action.shape[:-1])
-        return action * width + low, log_density
-
     @torch.no_grad()
     def proposals(
         self, batch: Transitions, policy: StatePolicy, states: str = "recorded"
@@ -536,10 +527,13 @@ class ActorCriticLoss(LossModule):
 
         The default sets are those of CQL(H). Also return log-densities, ``[3K, R]``.
         """
-        uniform, log_density = self.uniform_actions(batch.a)
+        number, width = (self.num_random,), self.action_high - self.action_low
+        shape = *number, *batch.a.shape
+        uniform = torch.rand(shape, dtype=batch.a.dtype, device=batch.a.device)
+        uniform = uniform * width + self.action_low
+        log_density = -width.expand(shape[-1]).log().sum().expand(shape[:-1])
         # rsample also without gradient: torch's sample reads the scale back to the host
         # to check its sign.
-        number = (self.num_random,)
         action, log_prob = rsample_and_log_prob(policy[states], number)
         action = torch.cat([uniform, action.flatten(0, 1)])
         return action, torch.cat([log_density, log_prob.flatten(0, 1)])

@@ -12,11 +12,7 @@ from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import (
-    ProbabilisticTensorDictSequential,
-    TensorDictModule,
-    TensorDictParams,
-)
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor
 
 from torchrl_osr import functional as F
@@ -134,8 +130,7 @@ class DiscreteOSRLoss(ActorCriticLoss):
         )
         if self.has_recovery:
             model = self.inverse_dynamics(batch, "both").logits
-            sizes = model.shape[-1], pi.logits.shape[-1]
-            check_num_actions("inverse_dynamics_network", *sizes)
+            check_num_actions("inverse_dynamics_network", model, pi.logits)
             recovery = F.categorical_kl(model, pi.logits).mean(0)
             term = self.reduce(recovery, batch, batch.has_next)
             losses["loss_actor"] = losses["loss_actor"] + self.recovery_weight * term
@@ -151,13 +146,13 @@ class DiscreteOSRLoss(ActorCriticLoss):
         return losses, metrics | values
 
     def action_values(
-        self, states: TensorDictBase, params: TensorDictParams, pi: Any
+        self, states: TensorDictBase, params: TensorDictBase, pi: Any
     ) -> Tensor:
         """Return the values of all actions, ``[N, ..., n]``; ``pi`` gives ``n``."""
         keys = state_keys(self.qvalue_network.in_keys)
         rows = states.select(*keys, strict=False).reshape(-1)
         qvalue = self.critic_output(rows, params, self.tensor_keys.action_value)
-        check_num_actions("qvalue_network", qvalue.shape[-1], pi.logits.shape[-1])
+        check_num_actions("qvalue_network", qvalue, pi.logits)
         return qvalue.reshape(-1, *states.batch_size, qvalue.shape[-1])
 
     @torch.no_grad()

@@ -100,11 +100,12 @@ def check_action(action: Tensor, shape: torch.Size, key: NestedKey) -> None:
         )
 
 
-def check_num_actions(name: str, number: int, policy: int) -> None:
+def check_num_actions(name: str, actions: Tensor, policy: Tensor) -> None:
     """Raise a ValueError unless a network's actions have the policy's size."""
-    if number != policy:
+    number, wanted = actions.shape[-1], policy.shape[-1]
+    if number != wanted:
         raise ValueError(
-            f"{name} has {number} actions, but actor_network has {policy}: build both "
+            f"{name} has {number} actions, but actor_network has {wanted}: build both "
             "with the same number (of action dimensions, if actions are continuous)."
         )
 

@@ -101,7 +101,6 @@ class OSRLoss(CQLLoss):
     def recovery(self, batch: Transitions, policy: StatePolicy) -> Tensor:
         """Return the state-recovery term (11), the mean over D_tot, ``[R]``."""
         pi, model = policy["both"], self.inverse_dynamics(batch, "both")
-        sizes = model.loc.shape[-1], pi.loc.shape[-1]
-        check_num_actions("inverse_dynamics_network", *sizes)
+        check_num_actions("inverse_dynamics_network", model.loc, pi.loc)
         divergence = F.state_recovery(pi.loc, pi.scale, model.loc, model.scale)
         return divergence.mean(0)

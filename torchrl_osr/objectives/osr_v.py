@@ -129,7 +129,9 @@ class OSRVLoss(ActorCriticLoss):
         """
         if self.policy_values == "cql":
             return self.data_values_and_cql_gap(batch, policy)
-        target, action = self.candidates(batch, policy)
+        with torch.no_grad():
+            action, _ = rsample_and_log_prob(policy["both"], (self.num_random,))
+        target = self.recovery_actions(batch, "both", self.num_random)
         candidates = torch.cat([action, target])
         mixed = batch.states[SETS["both"]].expand(candidates.shape[:-1])
         # One pass of the critics for the data's action and all candidates.
@@ -165,17 +167,6 @@ class OSRVLoss(ActorCriticLoss):
         return qvalue[:, : len(batch.a)], gap.mean(1).sum(0)
 
     @torch.no_grad()
-    def candidates(
-        self, batch: Transitions, policy: StatePolicy
-    ) -> tuple[Tensor, Tensor]:
-        """Return the actions to recover with and the policy's, on D_tot.
-
-        Both are ``[K, 2, R, A]``; the data's own have ``K = 1``.
-        """
-        action, _ = rsample_and_log_prob(policy["both"], (self.num_random,))
-        return self.recovery_actions(batch, "both", self.num_random), action
-
-    @torch.no_grad()
     def recovery_actions(
         self, batch: Transitions, states: States, number: int
     ) -> Tensor:
@@ -183,7 +174,6 @@ class OSRVLoss(ActorCriticLoss):
         if self.recovery_target == "data":
             return batch.a.expand(1, 1 + (states == "both"), *batch.a.shape)
         model = self.inverse_dynamics(batch, states)
-        sizes = model.loc.shape[-1], batch.a.shape[-1]
-        check_num_actions("inverse_dynamics_network", *sizes)
+        check_num_actions("inverse_dynamics_network", model.loc, batch.a)
         action: Tensor = rsample_and_log_prob(model, (number,))[0]
         return action

@@ -163,8 +163,7 @@ class StateRecoveryLoss(ActorCriticLoss):
         else:
             # Not TanhDelta's action, which may have saturated.
             loc = pi.base_dist.param if self.is_deterministic else pi.loc
-        sizes = model.loc.shape[-1], loc.shape[-1]
-        check_num_actions("inverse_dynamics_network", *sizes)
+        check_num_actions("inverse_dynamics_network", model.loc, loc)
         options: dict[str, Any] = {"action_reduction": self.action_reduction}
         if self.is_deterministic or self.is_normal:
             return F.deterministic_recovery(loc, model.loc, model.scale, **options)
