@@ -174,21 +174,16 @@ class RORLLoss(ActorCriticLoss):
         target_entropy: float | Literal["auto"] = "auto",
         **options: Any,
     ) -> None:
-        given = {
-            name: value
-            for name, value in locals().items()
-            if name.endswith(("_reg", "_eps", "_min", "_decay"))
-        }
-        for name, value in given.items():
-            check_weight(name, value)
+        for name, value in list(locals().items()):
+            if name.endswith(("_reg", "_eps", "_min", "_decay")):
+                check_weight(name, value)
+                setattr(self, name, value)
         check_positive("num_samples", num_samples, minimum=1)
         super().__init__(**options)
         networks = actor_network, qvalue_network
         self.register_soft_actor_critic(*networks, alpha_init, target_entropy)
         if q_ood_reg:  # one critic has no deviation
             check_positive("num_qvalue_nets", self.num_qvalue_nets, minimum=2)
-        for name, value in given.items():
-            setattr(self, name, value)
         self.num_samples, self.q_smooth_tau = num_samples, q_smooth_tau
         self.register_buffer("num_updates", torch.tensor(0.0))
         terms = {

@@ -71,7 +71,6 @@ class StateDeviationLoss(ActorCriticLoss):
         ['loss_deviation', 'loss_multiplier', 'deviation', 'multiplier']
     """
 
-    reads_perturbed = True
     dynamics_network: DynamicsEnsemble
     dynamics_network_params: TensorDictParams
     target_dynamics_network_params: TensorDictParams
