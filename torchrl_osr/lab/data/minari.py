@@ -57,11 +57,10 @@ def read_minari(
         bounds = actions.low.ravel(), actions.high.ravel()
         options = replace(options, action_bounds=bounds)
     space = sorted_space(opened.observation_space)
-    about = {"source": "minari", "path": str(path)}
     episodes = [*_read(opened, space, progress)]
     columns = {n: np.concatenate([e[n] for e in episodes]) for n in episodes[0]}
     files = sorted(path for path in here.rglob("*") if path.is_file())
-    return convert([columns], options, about, files)
+    return convert([columns], options, {"source": "minari", "path": str(path)}, files)
 
 
 def _read(

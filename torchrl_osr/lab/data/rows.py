@@ -26,7 +26,6 @@ def split_held_out(
     order = torch.randperm(rows, generator=torch.Generator().manual_seed(seed))
     mask = torch.zeros(rows, dtype=torch.bool)
     mask[order[:count]] = True
-    mask = mask.to(data.device or "cpu")
     return data[~mask], data[mask]
 
 
@@ -54,8 +53,7 @@ def is_followed(data: TensorDictBase) -> Tensor:
 
 def next_action(data: TensorDictBase) -> Tensor:
     """Return the action ``[N, A]`` of the following row, 0 at an episode's end."""
-    following = torch.arange(1, len(data) + 1).clamp(max=len(data) - 1)
-    action: Tensor = data["action"][following]
+    action: Tensor = data["action"].roll(-1, 0)
     return action.masked_fill(data["next", "done"], 0.0)
 
 

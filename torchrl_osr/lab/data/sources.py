@@ -95,7 +95,6 @@ def load_dataset(
         "missing": missing,
         "download": download,
     }
-    spec = None
     if source in RECORDED:
         useless = {"random_share": random_share, "num_transitions": num_transitions}
         _refuse(useless, f"data={source}, which is recorded")
@@ -103,6 +102,8 @@ def load_dataset(
         if path is None:
             raise ValueError(f"data={source} needs data.path=...")
         data, manifest = _recorded(source, path, spec, num_actions, log, progress)
+        if spec is not None:
+            _check_fit(data, manifest, str(env_id), spec)
         checksum = manifest.get("checksum")
     else:
         if path is not None or (env_id is None and env_name not in known_ids()):
@@ -128,8 +129,6 @@ def load_dataset(
         recipe = {"num_transitions": rows, "seed": seed}
         data, manifest = rolled_out(name, source, recipe, progress=progress)
         checksum = manifest["rows_sha256"]
-    if spec is not None:
-        _check_fit(data, manifest, str(env_id), spec)
     references = references or REFERENCE_RETURNS.get(str(env_name))
     mean, score = _mean_and_score(manifest, references)
     if random_share:
