@@ -53,8 +53,7 @@ class ModelAdversary:
         self.model = model.requires_grad_(True)
         groups, rate = model.parameter_groups(), options.adversarial_lr
         self.optimizer = torch.optim.Adam(groups, lr=rate, fused=True)
-        units = data.loc, data.scale
-        self.terminated = termination(data.env_id, model.limits, *units)
+        self.terminated = termination(data.env_id, model.limits, data.loc, data.scale)
         self.real, self.likelihood = data.buffer(), DynamicsLoss(model)
 
     def __call__(self, number: int) -> None:

@@ -66,9 +66,8 @@ class RolloutReplayBuffer:
     def _bounds(self) -> dict[str, Any]:
         """Return options of :func:`rollout` for ends and for unknown rows."""
         options, data, held_out = self.options, self.data, self.data.held_out
-        limits = self.model.limits
-        terminated = termination(data.env_id, limits, data.loc, data.scale)
-        bounds: dict[str, Any] = {"terminated": terminated}
+        rule = termination(data.env_id, self.model.limits, data.loc, data.scale)
+        bounds: dict[str, Any] = {"terminated": rule}
         if options.unknown == "take":
             return bounds
         mean, _ = self.model.predict(held_out["observation"], held_out["action"])
