@@ -40,16 +40,8 @@ def fitted_grey_box(
     dynamics.body, rows = fitted_body(body, data, seed=seed)
     dynamics.standardize_(rows)
     optimizer = torch.optim.Adam(dynamics.parameter_groups(), lr=1e-3, fused=True)
-    fit(
-        DynamicsLoss(dynamics),
-        optimizer,
-        None,
-        rows,
-        "grey box",
-        steps=steps,
-        seed=seed,
-        progress=progress,
-    )
+    loss, options = DynamicsLoss(dynamics), {"steps": steps, "seed": seed}
+    fit(loss, optimizer, None, rows, "grey box", progress=progress, **options)
     return dynamics.requires_grad_(False)
 
 

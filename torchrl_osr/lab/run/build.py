@@ -45,9 +45,7 @@ def make_learner(config: TrainConfig, device: torch.device | str = "cpu") -> Lea
     names options that do not fit each other or the environment.
     """
     env, cells = config.env, list(config.network.num_cells)
-    assert env.observation_size is not None
-    assert env.action_size is not None
-    sizes = env.observation_size, env.action_size
+    sizes: Any = env.observation_size, env.action_size
     layer_norm = config.network.layer_norm
     layers: dict[str, Any] = {"num_cells": cells, "layer_norm": layer_norm}
     actor = instantiate(config.network.actor, *sizes, num_cells=cells).to(device)

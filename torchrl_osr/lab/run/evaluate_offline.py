@@ -13,13 +13,9 @@ from torchrl import torchrl_logger
 from torchrl_osr._files import read_json, sha256_of, write_json
 from torchrl_osr.lab.data.recording import NO_REWARDS, has_rewards
 from torchrl_osr.lab.dynamics import Body
-from torchrl_osr.lab.evaluation import deterministic_policy
+from torchrl_osr.lab.evaluation import deterministic_policy, fitted_values
 from torchrl_osr.lab.evaluation.grey_box import fitted_grey_box, rolled_out_values
-from torchrl_osr.lab.evaluation.offline import (
-    check_discount,
-    episode_values,
-    fitted_values,
-)
+from torchrl_osr.lab.evaluation.offline import check_discount, episode_values
 from torchrl_osr.lab.evaluation.statistics import crossed_mean
 from torchrl_osr.lab.run.data import load_data
 from torchrl_osr.lab.run.folder import package_versions
