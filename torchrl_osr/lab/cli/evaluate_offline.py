@@ -6,9 +6,8 @@
 
 The discounted return, averaged over first states of the data. By fitted Q evaluation:
 critics learn the values of each policy. With --xml by rollouts in the robot's body,
-whose masses, gears, damping and friction are identified from the data. A run's folder
-gets offline_evaluation.json. See docs/any_environment.md for how far to
-trust the order.
+whose masses, gears, damping and friction are identified from the data. Results are in
+a run's folder. See docs/no_simulator.md for how far to trust the order.
 """
 
 from __future__ import annotations
