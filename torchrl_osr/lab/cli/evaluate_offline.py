@@ -43,7 +43,8 @@ def main() -> None:
     if options.pop("checkpoints"):
         runs = [each for run in runs for each in checkpoints_of(run)]
     evaluate = OfflineEvaluator(**options)
-    for run in runs:
+    for number, run in enumerate(runs, 1):
+        print(f"{number} of {len(runs)}: {run}", flush=True)
         found = evaluate(run)
         tables[found["env"], found["data"], found["discount"]][str(run)] = found
     for table in tables.values():
