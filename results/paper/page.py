@@ -130,14 +130,14 @@ def table1(clean: pd.DataFrame, printed: pd.DataFrame) -> str:
     both = clean[clean["data"].isin(complete)]
     means = both.groupby(["data", "method", "run"])["score"].mean()
     means = means.groupby(["data", "method"]).mean().groupby("method").mean()
-    own = both.groupby("data")["data_score"].mean().mean()
+    quoted = printed.loc[complete].mean(skipna=False)
     cells = [
         "" if name in SLOW and not parts.keys() >= {(data, name) for data in complete}
-        else decimal(means[name]) + small(number(printed[name][complete].mean()))
+        else decimal(means[name]) + small(number(quoted[name]))
         for name in COLUMNS
     ]  # fmt: skip
-    label = f"**Mean** of the {len(complete)} rows without gaps"
-    rows.append([label, decimal(own), *cells])
+    own = decimal(both.groupby("data")["data_score"].mean().mean())
+    rows.append([f"**Mean** of the {len(complete)} rows without gaps", own, *cells])
     return markdown(["data", "data's mean", *map(TITLES.get, COLUMNS)], rows)
 
 
