@@ -24,9 +24,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from importlib.metadata import version
 from itertools import cycle
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,9 @@ from contenders import COMPILED, CONTENDERS, PLAIN, Size, make_contender
 from torchrl import torchrl_logger
 
 SIZES = "hopper-quick,hopper-2x256,hopper-3x256,halfcheetah-2x256,halfcheetah-3x256"
-FORK = multiprocessing.get_context("fork")  # a fork shares the imports
+SERVER = multiprocessing.get_context("forkserver")
+SERVER.set_forkserver_preload(["contenders"])  # the processes share the imports
+TIMERS: list[Timer] = []
 
 
 class Timer:
@@ -52,6 +54,7 @@ class Timer:
     def __init__(
         self, name: str, size: Size, device: str, threads: int, seconds: float
     ) -> None:
+        torchrl_logger.setLevel("WARNING")
         torch.set_num_threads(threads)
         torch.manual_seed(0)
         self.device = torch.device(device)
@@ -80,53 +83,11 @@ class Timer:
         }
 
 
-def serve(connection: Connection, *arguments: Any) -> None:
-    """Answer each request with a round, or with the error."""
-    timer = None
-    while connection.recv():
-        try:
-            timer = timer or Timer(*arguments)
-            connection.send(timer.round())
-        except Exception as error:
-            # One contender that fails does not end the others.
-            connection.send(f"{type(error).__name__}: {error}")
-
-
-class Contender:
-    """A contender seen from outside its process.
-
-    Args:
-        arguments: of :class:`Timer`.
-
-    Attributes:
-        rounds: times of each round.
-        failure: the error after which it takes part no more.
-    """
-
-    def __init__(self, *arguments: Any) -> None:
-        self.rounds: list[dict[str, float]] = []
-        self.failure: str | None = None
-        self._connection, theirs = FORK.Pipe()
-        self._process = FORK.Process(
-            target=serve, args=(theirs, *arguments), daemon=True
-        )
-        self._process.start()
-        theirs.close()
-
-    def round(self) -> None:
-        """Do a round of updates."""
-        if self.failure is None:
-            self._connection.send(True)
-            answer = self._connection.recv()
-            if isinstance(answer, str):
-                self.failure = answer
-            else:
-                self.rounds.append(answer)
-
-    def close(self) -> None:
-        """End the process."""
-        self._connection.send(False)
-        self._process.join()
+def timed(*arguments: Any) -> dict[str, float]:
+    """Return a round of this process's timer, which the first call makes."""
+    if not TIMERS:
+        TIMERS.append(Timer(*arguments))
+    return TIMERS[0].round()
 
 
 def measure(
@@ -136,22 +97,28 @@ def measure(
     on_gpu = device == "cuda"
     clock = "wall_seconds" if on_gpu else "cpu_seconds"
     size = Size.parse(name)
-    contenders = {
-        who: Contender(who, size, device, threads, seconds)
+    pools = {
+        who: ProcessPoolExecutor(1, SERVER)
         for who in (*CONTENDERS, *[COMPILED] * on_gpu)
+    }
+    results: dict[str, dict[str, Any]] = {
+        who: {"failure": None, "rounds": []} for who in pools
     }
     for number in range(rounds):
         print(f"{name}: round {number + 1} of {rounds}", file=sys.stderr, flush=True)
-        for each in contenders.values():
-            each.round()
-    results = {}
-    for who, each in contenders.items():
-        each.close()
-        pairs = zip(contenders[PLAIN].rounds, each.rounds, strict=False)
-        ratios = [plain[clock] / ours[clock] for plain, ours in pairs]
-        results[who] = {"failure": each.failure, "rounds": each.rounds}
-        if ratios:
-            rates = [1 / done[clock] for done in each.rounds]
+        for who, pool in pools.items():
+            result = pool.submit(timed, who, size, device, threads, seconds)
+            # One contender that fails does not end the others.
+            if error := result.exception():
+                results[who]["failure"] = f"{type(error).__name__}: {error}"
+            else:
+                results[who]["rounds"].append(result.result())
+    for who, pool in pools.items():
+        pool.shutdown()
+        done = results[who]["rounds"]
+        pairs = zip(results[PLAIN]["rounds"], done, strict=False)
+        if ratios := [plain[clock] / ours[clock] for plain, ours in pairs]:
+            rates = [1 / each[clock] for each in done]
             results[who] |= {
                 "updates_per_second": statistics.median(rates),
                 "ratio": statistics.median(ratios),
@@ -213,7 +180,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
     parser.add_argument("--output", type=Path, default=Path("results/speed"))
     options = parser.parse_args(arguments)
-    torchrl_logger.setLevel("WARNING")
     settings = {
         name: getattr(options, name)
         for name in ("rounds", "seconds", "threads", "device")
@@ -229,7 +195,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         results["sizes"][name] = measure(name, **settings)
         text = json.dumps(results, indent=1) + "\n"
         (options.output / "speed.json").write_text(text)
-    if options.device == "cuda":  # last: a process that has touched a GPU cannot fork
+    if options.device == "cuda":
         results["machine"]["gpu"] = torch.cuda.get_device_name()
     print(table(results))
 

@@ -79,23 +79,33 @@ def differences(
     return min(map(len, data_sets)), statistics.nested_mean(data_sets)
 
 
-def recoverable(folder: Path) -> dict[tuple[str, str], tuple[str, float]]:
-    """Return the recovery rate in percent of each data set and method."""
+def recovered(folder: Path) -> Iterator[tuple[str, str, pd.DataFrame, np.ndarray]]:
+    """Yield data set, method, rates of seeds and states, and the states' walks.
+
+    The held-out half of the recoverable states comes first.
+    """
     if not (folder / "recoverable.csv.xz").exists():
-        return {}
+        return
     runs = pd.read_csv(folder / "runs.csv.xz")
     back = pd.read_csv(folder / "recoverable.csv.xz", dtype={"back": str})
     states = pd.read_csv(folder / "states.csv.xz").groupby("states")
-    found = {}
     keys = ["data", "method", "half", "states"]
     for (data, method, _, mark), rows in back.merge(runs, on="run").groupby(keys):
         of_each = states.get_group(mark)
         hard = (of_each["group"] == "recoverable").to_numpy()
         table = np.array([[int(digit) for digit in text] for text in rows["back"]])
         table = table[:, hard] / rows["checkpoints"].to_numpy()[:, None]
-        share = [100 * x for x in saved_share(table, of_each["walk"].to_numpy()[hard])]
-        # The held-out half comes first, and wins over the public one.
-        shown = str(Estimate(*share, over_what(len(table))))
+        rates = pd.DataFrame(table, index=rows["seed"])
+        yield data, method, rates, of_each["walk"].to_numpy()[hard]
+
+
+def recoverable(folder: Path) -> dict[tuple[str, str], tuple[str, float]]:
+    """Return the recovery rate in percent of each data set and method."""
+    found = {}
+    for data, method, rates, walks in recovered(folder):
+        share = [100 * x for x in saved_share(rates, walks)]
+        # The held-out half wins over the public one.
+        shown = str(Estimate(*share, over_what(len(rates))))
         found.setdefault((data, method), (shown, share[0]))
     return found
 

@@ -41,7 +41,9 @@ from tables import differences, estimate, markdown
 from torchrl_osr.lab.evaluation.statistics import (
     Estimate,
     decimal,
+    saved_share,
     scores_and_decreases,
+    wilson,
 )
 from torchrl_osr.lab.report.page import COLORS
 
@@ -61,6 +63,7 @@ TITLES = {
 IN_DOCS = {"rim": "RIM", "noisy_bc": "noisy BC"} | {
     name: TITLES[name] for name in ("osr", "cql_noisy_bc", "td3_bc", "cql", "osr_v")
 }
+ABLATION = ("osr", "cql_both", "noisy_bc", "td3_bc")
 SLOW = ("mopo", "rambo")  # rows may lack them
 COLUMNS = [name for name in TITLES if name in TABLES["table1"].methods]
 KNOCKS = {
@@ -104,9 +107,16 @@ def shown(found: Estimate | None, absent: str, seeds: str, *quoted: str) -> str:
 
 
 def cell(runs: pd.DataFrame, *quoted: str) -> str:
-    """Return the mean score of runs, or say that there are none."""
+    """Return the mean score of runs, or say that there are none.
+
+    In a maze it is the share of successes, with the interval of a share.
+    """
     seeds = SEEDS.format(runs["seed"].nunique())
-    return shown(estimate(runs), NOT_RUN, seeds, *quoted)
+    found = estimate(runs)
+    if len(runs) and runs["data"].isin(MAZES).all():
+        ends = wilson(int((runs["score"] > 0).sum()), len(runs))
+        found = Estimate(found.mean, *(100 * end for end in ends))
+    return shown(found, NOT_RUN, seeds, *quoted)
 
 
 def number(value: float) -> str:
@@ -151,16 +161,22 @@ def table2(episodes: pd.DataFrame, printed: pd.DataFrame, protocol: str) -> str:
         cells = [[f"{name_of(env)}, {knock}"] for knock in KNOCK_SIZES]
         for method in methods:
             mine = played[played.index == (f"{env} medium-expert", method)]
+            met = mine["disturbed_at"].notna().groupby(mine["disturbance"]).mean()
             runs = [
                 run.pivot_table("score", "episode", "disturbance")[["", *names]]
                 for _, run in mine.groupby("run")
             ]
             found = scores_and_decreases(runs)[1:] if runs else [(None, None)] * 3
-            for line, knock, pair in zip(cells, KNOCK_SIZES, found, strict=True):
+            for line, knock, name, pair in zip(
+                cells, KNOCK_SIZES, names, found, strict=True
+            ):
+                share = f"met: {100 * met.get(name, 1):.0f} %"
                 for kind, value in zip(("score", "decrease"), pair, strict=True):
                     absent = "\N{EN DASH}" if runs else NOT_RUN
                     quoted = number(printed.loc[(env, knock), f"{method} {kind}"])
-                    line.append(shown(value, absent, SEEDS.format(len(runs)), quoted))
+                    note = share if kind == "score" and met.get(name, 1) < 1 else ""
+                    seeds = SEEDS.format(len(runs))
+                    line.append(shown(value, absent, seeds, note, quoted))
         rows += cells
     kinds = ("score", "loss %")
     head = [f"{TITLES[name]} {kind}" for name in methods for kind in kinds]
@@ -334,6 +350,22 @@ def methods_table(means: pd.DataFrame, titles: Mapping[str, str]) -> str:
     return markdown(["method", "score", "disturbed", "recovery rate %"], rows)
 
 
+def ablation() -> str:
+    """Return the R of methods relative to OSR's twin, on the seeds that both have."""
+    found = {(data, name): at for data, name, *at in tables.recovered(HERE)}
+    rows = []
+    for data in SIX:
+        twin, walks = found[data, "cql_noisy_bc"]
+        cells = []
+        for name in ABLATION:
+            ours, _ = found[data, name]
+            seeds = twin.index.intersection(ours.index)
+            share = saved_share(ours.loc[seeds], walks, twin.loc[seeds])
+            cells.append(str(Estimate(*(100 * end for end in share))))
+        rows.append([name_of(data), *cells])
+    return markdown(["R %", *(f"`{name}`" for name in ABLATION)], rows)
+
+
 def tuning() -> str:
     """Return each method's best trial by its tuning seed, and its mean on others."""
     place = RESULTS / TABLES["tune"].place
@@ -400,9 +432,6 @@ def main() -> None:
     """Fill the pages and draw the figures."""
     episodes = tables.read(HERE)
     clean = episodes[episodes["suite"] == ""]
-    mazes = tables.read(RESULTS / TABLES["mazes"].place)
-    whole = mazes["step"] == updates("", TABLES["mazes"].seconds)
-    clean = pd.concat([clean, mazes[whole & mazes["data"].isin(MAZES)]])
     printed = pd.read_csv(HERE / "printed_table1.csv", index_col="data")
     quoted = pd.read_csv(HERE / "published.csv", index_col=0)
     for name in ("td3_bc", "rebrac", "cql_noisy_bc"):
@@ -451,7 +480,8 @@ def main() -> None:
     draw_curves(RESULTS / "osr_v" / "scores.png", ("osr", "cql", "osr_v"))
     with contextlib.redirect_stdout(io.StringIO()) as text:
         tables.main(HERE, "osr", SOURCES)
-    fill(HERE / "tables.md", {"tables": text.getvalue().strip()})
+    blocks = {"tables": text.getvalue().strip(), "ablation": ablation()}
+    fill(HERE / "tables.md", blocks)
 
 
 if __name__ == "__main__":

@@ -28,7 +28,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pandas as pd
-from omegaconf import OmegaConf
 
 from torchrl_osr.lab.report import read_runs
 
@@ -83,7 +82,7 @@ LIMITED = {
 MAZES = {
     f"antmaze-{maze} {source}": [
         f"env=antmaze-{maze}", f"data={source}", "preset=antmaze_quick",
-        "data.num_transitions=100_000",
+        "trainer.eval_episodes=10",
     ]
     for maze, *sources in (
         ("umaze", "umaze", "diverse"),
@@ -107,10 +106,7 @@ file of each. ``official`` is for ``medium-expert`` alone, as in the paper."""
 
 
 class Table(NamedTuple):
-    """Runs of a table; ``seconds`` of a core go to the updates of each policy.
-
-    0 stands for the updates and evaluations of ``preset=antmaze_quick``.
-    """
+    """Runs of a table; ``seconds`` of a core go to the updates of each policy."""
 
     methods: Sequence[str]
     data: Sequence[str]
@@ -125,7 +121,7 @@ TEN = (*PAPER, "td3_bc", "rebrac", "cql_noisy_bc")
 EXPERTS = [f"{env} medium-expert" for env in ENVS]
 TABLES = {
     "table1": Table(TEN, list(MUJOCO)),
-    "mazes": Table(TEN, list(MAZES), seconds=0, place="mazes"),
+    "mazes": Table(TEN, list(MAZES)),
     "table2": Table(("osr", "osr_v", "cql", "sdc"), EXPERTS, ("oos", "official")),
     "figure4": Table(("osr", "cql", "sdc"), list(LIMITED)),
     "d4": Table(
@@ -158,9 +154,6 @@ def command(log: Path, *arguments: str) -> None:
 
 def updates(method: str, seconds: int) -> int:
     """Return how many updates fit into the time."""
-    if not seconds:
-        preset = HERE.parents[1] / "conf" / "preset" / "antmaze_quick.yaml"
-        return int(OmegaConf.load(preset).trainer.steps)
     ms = json.loads((HERE / "update_ms.json").read_text())["quick"]
     ms = ms[method.partition("-")[0]]
     return round(seconds / ms) * 1000
@@ -176,8 +169,8 @@ def run(folder: Path, data: str, method: str, seed: int, table: Table) -> None:
         length = [f"trainer.steps={steps}", f"trainer.eval_interval={tenth}"]
         length += [f"trainer.checkpoint_interval={tenth}", "trainer.eval_episodes=5"]
         command(
-            folder / "train.txt", "train", *DATA[data], f"seed={seed}",
-            *(METHODS | TRIALS)[method], *(length if table.seconds else []),
+            folder / "train.txt", "train", *length, *DATA[data],
+            *(METHODS | TRIALS)[method], f"seed={seed}",
             "trainer.progress=false", f"hydra.run.dir={folder}",
         )  # fmt: skip
     for suite, file in SUITES.items():

@@ -13,6 +13,7 @@ from torchrl_osr.lab.evaluation.statistics import (
     nested_resamples,
     saved_share,
     scores_and_decreases,
+    wilson,
 )
 
 
@@ -70,6 +71,15 @@ def test_decreases_of_several_runs_by_hand():
     assert score.mean == pytest.approx(20)
     assert lost[:3] == pytest.approx((50, 50, 50))
     assert scores_and_decreases([-run])[1][1] is None
+
+
+@pytest.mark.parametrize(
+    ("successes", "trials", "low", "high"),
+    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0, 0.1611)],
+)
+def test_wilsons_interval_is_newcombes(successes, trials, low, high):
+    # Newcombe 1998, Statistics in Medicine 17:857, Table I.
+    assert wilson(successes, trials) == pytest.approx((low, high), abs=5e-5)
 
 
 def test_the_saved_share_of_known_tables():

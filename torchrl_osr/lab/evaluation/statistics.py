@@ -8,6 +8,7 @@ episode, ``R`` resamples, ``N`` seeds, ``M`` states, ``W`` walks.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import sqrt
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -142,6 +143,14 @@ def scores_and_decreases(
     return found
 
 
+def wilson(successes: int, trials: int) -> tuple[float, float]:
+    """Return Wilson's 95 % interval of a share."""
+    share, square = successes / trials, NORMAL_QUANTILE_975**2 / trials
+    half = sqrt(square * (share * (1 - share) + square / 4))
+    low, high = (share + square / 2 + sign * half for sign in (-1, 1))
+    return max(0.0, low / (1 + square)), min(1.0, high / (1 + square))
+
+
 def saved_share(
     back: ArrayLike, walk: ArrayLike, baseline: ArrayLike | None = None
 ) -> tuple[float, float, float]:
@@ -164,9 +173,8 @@ def saved_share(
     if baseline is not None:
         theirs = np.asarray(baseline, np.float64) @ member
     elif not ours.any() or (ours == sizes).all():
-        share, square = float(ours.any()), NORMAL_QUANTILE_975**2
-        width = square / (len(sizes) + square)
-        return share, share * (1 - width), max(share, width)
+        share = int(ours.any())
+        return share, *wilson(share * len(walks), len(walks))
     rng = np.random.default_rng(0)
     # How often each seed and walk is drawn: once, then in each resample.
     by_seed, by_walk = (
