@@ -6,6 +6,7 @@ import copy
 import itertools
 import pickle
 
+import numpy as np
 import pytest
 import torch
 from objectives.losses import make_batch
@@ -29,7 +30,7 @@ def noise(transform: StatePerturbation, *size: int) -> torch.Tensor:
 
 
 def test_noise_has_the_standard_deviation_given_for_all_or_for_each_entry() -> None:
-    for std in (1e-3, [1e-3] * 10 + [3.0]):
+    for std in (np.float32(1e-3), [1e-3] * 10 + [3.0]):
         drawn = noise(StatePerturbation(std, seed=0), 100_000) / torch.tensor(std)
         # Var(x^2) is 2 for the Gaussian.
         assert (drawn.square().mean(0) - 1).abs().max() < 4 * (2 / 100_000) ** 0.5

@@ -70,12 +70,13 @@ class StatePerturbation(Transform):
         perturbed: NestedKey = "perturbed",
         seed: int | None = None,
     ) -> None:
-        for each in [std] if isinstance(std, (int, float)) else std:
+        numbers = torch.as_tensor(std, dtype=torch.float64)
+        for each in numbers.flatten().tolist():
             check_weight("std", each)
         keys = [in_keys] if isinstance(in_keys, str) else list(in_keys)
         perturbed_keys = [nested(perturbed, key) for key in keys]
         super().__init__(in_keys=keys, out_keys=perturbed_keys)
-        self.register_buffer("std", torch.as_tensor(std, dtype=torch.float64))
+        self.register_buffer("std", numbers)
         self.seed = _derived("new", next(_number)) if seed is None else seed
         self._copies, self._process = 0, _process[0]
         self._generator: torch.Generator | None = None

@@ -189,6 +189,11 @@ def test_actions_beyond_the_bounds_are_warned_about_once(name) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         loss(batch)
+        networks, batch = Networks(low=0.1), make_batch(name, 10)
+        options = {"low": [0.1] * 2, "high": [1.0] * 2} if options else {}
+        batch["action"][:] = 0.2
+        batch[MASK] = torch.arange(10) > 0  # this row becomes zeros
+        make_loss(name, networks, **options)(batch)
 
 
 @every_loss

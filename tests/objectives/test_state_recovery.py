@@ -15,8 +15,10 @@ from objectives.losses import (
     update_targets,
 )
 from objectives.plain import BOX, UNIT
+from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torch.distributions import kl_divergence
+from torchrl.modules import Delta, ProbabilisticActor
 from torchrl.objectives import IQLLoss, SACLoss, TD3BCLoss
 
 from torchrl_osr import StateRecoveryLoss
@@ -94,6 +96,14 @@ def test_value_and_gradients_equal_the_divergence(
     batch = batch.select(*loss.in_keys)
     actor = getattr(plain, kind)
     check_term(check, "State recovery alone", loss.double(), batch, expected, actor)
+
+
+def test_a_delta_actor_is_read_as_the_module_in_it() -> None:
+    networks, batch = Networks(), make_batch("recovery", 10)
+    inner = TensorDictModule(networks.module.module, ["observation"], ["param"])
+    delta = ProbabilisticActor(inner, ["param"], distribution_class=Delta)
+    losses = (StateRecoveryLoss(x, networks.model) for x in (delta, networks.module))
+    assert torch.equal(*(loss(batch)[KEY] for loss in losses))
 
 
 @pytest.mark.parametrize("states", STATES)

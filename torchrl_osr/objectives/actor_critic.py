@@ -592,7 +592,9 @@ class ActorCriticLoss(LossModule):
         self._bounds_are_checked = True
         low, high = self.action_low, self.action_high
         margin = 1e-4 * (high - low)
-        if bool(((batch.a < low - margin) | (batch.a > high + margin)).any()):
+        outside = ((batch.a < low - margin) | (batch.a > high + margin)).any(-1)
+        found = batch.counted(outside)  # masked rows are zeros
+        if found is not None and bool(found.any()):
             warnings.warn(
                 f"The data's actions leave the bounds of the networks, {low.tolist()} "
                 f"and {high.tolist()}, where the policy has no density: build actor "

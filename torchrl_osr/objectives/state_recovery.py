@@ -156,13 +156,12 @@ class StateRecoveryLoss(ActorCriticLoss):
 
     def divergence(self, pi: Any, model: Any) -> Tensor:
         """Return the recovery term (11) of a policy and a model, ``[D, R]``."""
-        if isinstance(pi, Tensor):
-            loc = self.pre_tanh(pi)
-        elif self.is_normal:
-            loc = self.pre_tanh(pi.mean)
+        if isinstance(pi, TanhDelta):
+            loc = pi.base_dist.param  # not its action, which may have saturated
+        elif self.is_deterministic or self.is_normal:
+            loc = self.pre_tanh(pi if isinstance(pi, Tensor) else pi.mean)
         else:
-            # Not TanhDelta's action, which may have saturated.
-            loc = pi.base_dist.param if self.is_deterministic else pi.loc
+            loc = pi.loc
         check_num_actions("inverse_dynamics_network", model.loc, loc)
         options: dict[str, Any] = {"action_reduction": self.action_reduction}
         if self.is_deterministic or self.is_normal:

@@ -127,7 +127,7 @@ class DataMonitor(nn.Module):
         if counts is not None:
             score = score.masked_fill(~counts, -math.inf)
         numbers, index = torch.unique(episode, return_inverse=True)
-        largest = torch.full([len(numbers)], -math.inf)
+        largest = score.new_full([len(numbers)], -math.inf)
         largest = largest.scatter_reduce(0, index, score, "amax")
         self.threshold.fill_(conformal_threshold(largest, false_alarms))
         self.record |= {"false_alarms": false_alarms, "episodes": len(numbers)}

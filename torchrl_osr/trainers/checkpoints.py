@@ -166,7 +166,7 @@ class Checkpoints:
             path for path in found
             if int(path.stem.rpartition("-")[2]) % self.interval == 0
         ]  # fmt: skip
-        for path in set(found) - {*regular[-self.kept :], *found[-1:]}:
+        for path in set(found) - {*regular[::-1][: self.kept], *found[-1:]}:
             path.unlink()
 
     def restore(self) -> Path | None:

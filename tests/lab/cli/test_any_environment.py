@@ -20,6 +20,7 @@ from torchrl_osr.lab.data import environment_spec
 from torchrl_osr.lab.report import read_runs, write_report
 from torchrl_osr.lab.report.runs import find_runs
 from torchrl_osr.lab.run.config import read_run
+from torchrl_osr.lab.run.evaluate_offline import OfflineEvaluator
 from torchrl_osr.lab.run.load import load_run_policy
 
 
@@ -241,6 +242,20 @@ def test_policies_are_ranked_on_their_log_alone(tmp_path, capsys, monkeypatch):
     for loss, each in zip(("bc", "iql"), found, strict=True):
         assert scores.loc[loss, "last"] == pytest.approx(each["value"])
     assert scores["data mean"].tolist() == pytest.approx([own, own], rel=1e-5)
+
+
+def test_runs_that_read_one_log_in_two_ways_have_their_own_rows(tmp_path):
+    record(log := tmp_path / "log.npz", "env.id=Pendulum-v1", "episodes=3")
+    with np.load(log) as columns:
+        np.savez(log, **columns, profit=-columns["reward"])
+    given = "env=none", f"data.path={log}", "data.columns.observation=observation"
+    runs = [
+        trained(tmp_path / name, "loss=bc", *given, f"data.columns.reward={name}")
+        for name in ("reward", "profit")
+    ]
+    evaluate = OfflineEvaluator(steps=5)
+    cost, profit = (evaluate(run)["data_value"] for run in runs)
+    assert cost == -profit < 0
 
 
 def test_without_a_simulator_bounds_and_discrete_actions_may_be_given(

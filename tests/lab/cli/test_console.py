@@ -38,8 +38,7 @@ def test_help_is_quick_and_has_no_raw_configuration():
 
 def test_version_begins_with_the_package(capsys):
     main(["--version"])
-    start = f"torchrl-osr {__version__}, python 3."
-    assert capsys.readouterr().out.startswith(start)
+    assert capsys.readouterr().out.startswith(f"torchrl-osr {__version__}, python 3.")
 
 
 def test_unknown_command_lists_commands():

@@ -71,8 +71,9 @@ def test_a_mixture_has_exact_shares():
     for rows, source in ((data[:200], valuable), (data[200:], random)):
         known = {tuple(row.tolist()) for row in source["observation"]}
         assert all(tuple(row.tolist()) in known for row in rows["observation"])
-    expected = 0.1 * about["normalized_score"] + 0.9 * other["normalized_score"]
-    assert manifest["normalized_score"] == pytest.approx(expected)
+    for name in ("mean_return", "normalized_score"):
+        expected = 0.1 * about[name] + 0.9 * other[name]
+        assert manifest[name] == pytest.approx(expected)
 
 
 def d4rl_columns(data):

@@ -109,6 +109,9 @@ def test_missing_rows_cut_their_trajectory():
     data, manifest = transitions_from_columns(rows, missing="episode")
     assert data["observation"][:, 0].tolist() == [1, 3, 5]
     assert manifest["missing_rows"] == 3
+    rows = log(episode=np.array([0, np.nan, 0, 1, 1, 1]))
+    data, _ = transitions_from_columns(rows, missing="row")
+    assert data["observation"][:, 0].tolist() == [5, 7, 9]
 
 
 def test_resets_of_a_vector_environment_are_left_out():

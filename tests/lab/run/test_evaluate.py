@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from composed import CONF, evaluating, trained
 
+from torchrl_osr.lab.dynamics import SwitchingPolicy
 from torchrl_osr.lab.evaluation import deterministic_policy
 from torchrl_osr.lab.evaluation.recoverable import load_recoverable_states, recovers
 from torchrl_osr.lab.run.config import read_run, write_config
-from torchrl_osr.lab.run.evaluate import evaluate_run, make_disturbances
+from torchrl_osr.lab.run.evaluate import InUnits, evaluate_run, make_disturbances
 from torchrl_osr.lab.run.load import CHECKPOINTS, load_trained
 
 SUITES = sorted(path.stem for path in (CONF / "evaluation" / "suite").glob("*.yaml"))
@@ -32,6 +34,12 @@ def play(checkpoint: Path, *overrides: str) -> dict:
     path, results = evaluate_run(config)
     assert json.loads(path.read_text()) == json.loads(json.dumps(results))
     return results
+
+
+def test_a_switching_policy_is_played_from_minus_1_to_1():
+    forces = SwitchingPolicy([lambda s: 8 * s - 2], None, lambda s, a: a[:, 0])
+    policy = InUnits(forces, torch.tensor([[-2.0], [6.0]]))
+    assert policy(torch.tensor([[0.0], [0.5]])).tolist() == [[-1], [0]]
 
 
 def test_results_are_kept_with_what_decides_them(folder, capsys):

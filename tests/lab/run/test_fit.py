@@ -12,7 +12,7 @@ from torchrl_osr.lab.run.config import read_run
 
 
 def test_columns_become_a_run_that_the_same_call_continues(tmp_path):
-    rng, folder = np.random.default_rng(0), tmp_path / "my arm"
+    rng, folder = np.random.default_rng(0), tmp_path / "o'neil" / "my arm"
     frame = pd.DataFrame(
         rng.random((60, 4)), columns=["obs_0", "obs_1", "act", "reward"]
     )

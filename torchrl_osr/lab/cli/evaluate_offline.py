@@ -46,7 +46,8 @@ def main() -> None:
     for number, run in enumerate(runs, 1):
         print(f"{number} of {len(runs)}: {run}", flush=True)
         found = evaluate(run)
-        tables[found["env"], found["data"], found["discount"]][str(run)] = found
+        same = (found[key] for key in ("env", "data", "discount", "data_value"))
+        tables[tuple(same)][str(run)] = found
     for table in tables.values():
         print("\n" + ranking(table))
 

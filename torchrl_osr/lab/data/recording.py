@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from numpy.typing import ArrayLike
 from tensordict import TensorDict
@@ -338,7 +339,10 @@ def _ends(columns: Mapping[str, Array]) -> tuple[Array, Array]:
     ends = flagged.copy()
     ends[-1] = True
     if "episode" in columns:
-        same = np.r_[np.diff(columns["episode"]) == 0, False]
+        given = pd.Series(columns["episode"])
+        before = given.ffill()  # a number that is missing between two equal ones
+        episode = before.where(before == given.bfill(), given).to_numpy()
+        same = np.r_[np.diff(episode) == 0, False]
         if (wrong := flagged & same).any():
             row = int(wrong.argmax())
             raise ValueError(
@@ -347,7 +351,7 @@ def _ends(columns: Mapping[str, Array]) -> tuple[Array, Array]:
                 "flags may be late, or the rows in another order."
             )
         ends |= ~same
-        numbers, times = np.unique(columns["episode"][ends], return_counts=True)
+        numbers, times = np.unique(episode[ends], return_counts=True, equal_nan=False)
         if (times > 1).any():
             raise ValueError(
                 f"'episode' {numbers[times > 1][0]:g} comes back; expected its rows "

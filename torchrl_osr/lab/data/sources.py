@@ -129,17 +129,17 @@ def load_dataset(
         recipe = {"num_transitions": rows, "seed": seed}
         data, manifest = rolled_out(name, source, recipe, progress=progress)
         checksum = manifest["rows_sha256"]
-    references = references or REFERENCE_RETURNS.get(str(env_name))
-    mean, score = _mean_and_score(manifest, references)
+    mean = _mean_return(manifest)
     if random_share:
         random, about = rolled_out(str(name), "random", recipe, progress=progress)
         data = mix_datasets(data, random, random_share=random_share, seed=seed)
         number = round(random_share * len(data))
-        scores: Any = [score, _mean_and_score(about, references)[1]]
-        known = None not in scores
-        weights = [len(data) - number, number]
-        score = float(np.average(scores, weights=weights)) if known else None
+        means: Any = mean, _mean_return(about)
+        weights = len(data) - number, number
+        mean = None if None in means else float(np.average(means, weights=weights))
         manifest = recipe | {"random_share": random_share, "env_id": about["env_id"]}
+    references = references or REFERENCE_RETURNS.get(str(env_name))
+    score = None if mean is None or references is None else references.score(mean)
     facts = {"mean_return": mean, "normalized_score": score, "checksum": checksum}
     return data, manifest | {"env_name": env_name, "source": source} | facts
 
@@ -151,14 +151,10 @@ def _refuse(options: Mapping[str, Any], source: str) -> None:
             raise ValueError(f"data.{name}={value} has no effect with {source}.")
 
 
-def _mean_and_score(
-    manifest: Mapping[str, Any], references: ReferenceReturns | None
-) -> tuple[float | None, float | None]:
-    """Return the complete episodes' mean return and its score, where known."""
-    if not (manifest.get("episode_returns") and has_rewards(manifest)):
-        return None, None
-    mean = float(np.mean(manifest["episode_returns"]))
-    return mean, None if references is None else references.score(mean)
+def _mean_return(manifest: Mapping[str, Any]) -> float | None:
+    """Return the complete episodes' mean return, where known."""
+    returns = manifest.get("episode_returns") if has_rewards(manifest) else None
+    return float(np.mean(returns)) if returns else None
 
 
 def rolled_out(

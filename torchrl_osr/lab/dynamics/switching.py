@@ -20,8 +20,8 @@ class EliteNetworks:
 
     States and actions are in the environment's units: the model's states are
     ``(s - loc) / scale``, its actions -1 and 1 are ``low`` and ``high``. All scaling is
-    folded into two layers, for speed at action time. Of a grey box, the best network
-    alone adds to what the body does.
+    folded into two layers, for speed at action time. Of a grey box, one elite alone
+    adds to what the body does.
     """
 
     @torch.no_grad()

@@ -76,7 +76,7 @@ class DisturbanceWrapper(gymnasium.Wrapper[Vector, Vector, Vector, Vector]):
         observation, info = super().reset(seed=seed, options=options)
         if seed is not None:
             key = zlib.crc32(type(self).__name__.encode())
-            self.generator = np.random.default_rng([seed, key, 0])
+            self.generator = np.random.default_rng([seed, key])
         self.begin()
         return self.observe(observation), flag(info, self.always)
 

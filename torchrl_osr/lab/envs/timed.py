@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 
 from torchrl_osr._checks import check_choice, check_positive, check_weight
+from torchrl_osr.lab.data.environment import sorted_space
 from torchrl_osr.lab.envs.disturbance import (
     DisturbanceWrapper,
     Env,
@@ -115,9 +116,8 @@ class ActionKnock(TimedDisturbance):
             for _ in range(self.steps):
                 extra = self.generator.random(bare.action_space.shape) * SMALL
                 observation, *_ = bare.step(extra)
-            space = bare.observation_space
-            if not isinstance(space, gymnasium.spaces.Box):  # so does make_environment
-                observation = np.asarray(gymnasium.spaces.flatten(space, observation))
+            space = sorted_space(bare.observation_space)  # as make_environment does
+            observation = np.asarray(gymnasium.spaces.flatten(space, observation))
             flag(info, True)
         return observation, reward, terminated, truncated, info
 

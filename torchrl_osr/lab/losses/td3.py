@@ -56,14 +56,13 @@ class TD3Loss(ActorCriticLoss):
         check_weight("noise_clip", noise_clip)
         super().__init__(**options)
         self.policy_noise, self.noise_clip = policy_noise, noise_clip
-        own = squashing_bounds(actor_network)
-        if not own and (low is None or high is None):
-            raise ValueError(
-                "The actor's module has no action bounds: pass low= and high= of the "
-                "environment's actions."
-            )
-        bounds = own or (torch.as_tensor(low).float(), torch.as_tensor(high).float())
-        self.register_bounds(bounds)
+        if not squashing_bounds(actor_network):  # else registered with the actor
+            if low is None or high is None:
+                raise ValueError(
+                    "The actor's module has no action bounds: pass low= and high= of "
+                    "the environment's actions."
+                )
+            self.register_bounds(torch.as_tensor(each).float() for each in (low, high))
         self.register_actor_critic(actor_network, qvalue_network, delay_actor=True)
         metrics = ["cloning_error", "pred_value", "target_value"]
         self.declare(["loss_actor", "loss_qvalue"], metrics)

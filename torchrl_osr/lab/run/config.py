@@ -70,7 +70,9 @@ def checked(config: DictConfig, trust: Sequence[str] = ()) -> TrainConfig:
     made = cast(TrainConfig, OmegaConf.to_object(typed))
     # Others would train nonsense, or fail hours later.
     for key, value in flatten(asdict(made)).items():
-        positive = key.startswith(("trainer.", "dynamics.")) and key not in MAY_BE_0
+        positive = (
+            key.startswith(("trainer.", "dynamics.", "optim.")) and key not in MAY_BE_0
+        )
         if key in CHOICES:
             check_choice(key, value, CHOICES[key])
         elif key in SHARES and not 0 <= value <= 1:

@@ -16,11 +16,13 @@ import numpy as np
 import torch
 from hydra.utils import instantiate
 from numpy.typing import NDArray
+from torch import Tensor
 from torchrl import torchrl_logger
 
 from torchrl_osr._files import read_json, sha256_of, write_json
 from torchrl_osr.lab.data import observation_statistics
 from torchrl_osr.lab.data.environment import environment_id
+from torchrl_osr.lab.dynamics import SwitchingPolicy
 from torchrl_osr.lab.evaluation import (
     DataDistance,
     Disturbance,
@@ -104,11 +106,24 @@ def players_of(config: EvaluateConfig, files: list[Path]) -> list[Player]:
     check_environment(env.id, config.trust)
     read_environment(env)
     if config.switching:
-        return [(trained[0], load_switching_policy(files, trust=config.trust))]
+        policy = load_switching_policy(files, trust=config.trust)
+        bounds = torch.tensor([env.action_low, env.action_high])
+        return [(trained[0], InUnits(policy, bounds))]
     return [
         (each, deterministic_policy(each.actor, each.observation_norm))
         for each in trained
     ]
+
+
+class InUnits:
+    """A switching policy with actions from -1 to 1, which an evaluator expects."""
+
+    def __init__(self, policy: SwitchingPolicy, bounds: Tensor) -> None:
+        self.policy, self.reset = policy, policy.reset
+        self.center, self.half = bounds.mean(0), bounds.diff(dim=0)[0] / 2
+
+    def __call__(self, observation: Tensor) -> Tensor:
+        return (self.policy(observation) - self.center) / self.half
 
 
 def play_suite(config: EvaluateConfig, players: list[Player]) -> dict[str, Any]:

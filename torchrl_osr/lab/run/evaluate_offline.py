@@ -48,7 +48,7 @@ class OfflineEvaluator:
     xml: str | None = None
     frame_skip: int = 1
     trust: Sequence[str] = ()
-    _known: dict[str | None, Any] = field(default_factory=dict, init=False)
+    _known: dict[str, Any] = field(default_factory=dict, init=False)
 
     def __call__(self, path: Path) -> dict[str, Any]:
         """Return the estimate of a run, a folder, or of a checkpoint."""
@@ -75,9 +75,10 @@ class OfflineEvaluator:
         file = run_folder_of(path) / "-".join([*parts, FILE])
         if file.exists() and request.items() <= (known := read_json(file)).items():
             return known
-        if options.checksum not in self._known:
-            self._known = {options.checksum: load_data(env, options)}
-        rows, manifest = self._known[options.checksum]
+        key = repr((env, options))  # one file may be read in several ways
+        if key not in self._known:
+            self._known = {key: load_data(env, options)}
+        rows, manifest = self._known[key]
         if not has_rewards(manifest):
             raise ValueError(f"{path} cannot be evaluated on its data. {NO_REWARDS}")
         policy = deterministic_policy(trained.actor, trained.observation_norm)

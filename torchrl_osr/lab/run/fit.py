@@ -49,7 +49,7 @@ def fit(
     """
     register()
     folder = Path(folder)
-    if isinstance(log, Mapping) or hasattr(log, "items"):
+    if hasattr(log, "items"):  # a mapping or a data frame
         folder.mkdir(parents=True, exist_ok=True)
         columns: Any = {str(name): np.asarray(column) for name, column in log.items()}
         np.savez(content := BytesIO(), **columns)
@@ -61,7 +61,8 @@ def fit(
                 "with 'force=true'."
             )
         write_atomically(log, content.getvalue())
-    given = ["env=none", "data=file", f"data.path='{log}'", *overrides]
+    place = str(log).replace("'", "\\'")
+    given = ["env=none", "data=file", f"data.path='{place}'", *overrides]
     with initialize_config_dir(str(CONF), version_base="1.3"):
         cfg = compose("train", given, return_hydra_config=True)
     settings = OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"])

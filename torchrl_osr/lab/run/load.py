@@ -23,6 +23,7 @@ from torchrl_osr.lab.run.build import Learner, make_learner
 from torchrl_osr.lab.run.config import CONFIG, read_run
 from torchrl_osr.lab.run.schema import TrainConfig
 from torchrl_osr.policy import Policy, load_policy, policy_from_loss
+from torchrl_osr.policy.policy import SUFFIX
 from torchrl_osr.trainers.checkpoints import find_damage, safe_checkpoint
 
 CHECKPOINTS = Path("checkpoint") / "policy"
@@ -107,9 +108,7 @@ def load_run_policy(path: Path | str, trust: Sequence[str] = ()) -> Policy:
     A finished run has exported its policy: nothing is built from its configuration.
     """
     path = Path(path)
-    if path.is_dir() and (path / POLICY).exists():
-        path = path / POLICY
-    if path.suffix == Path(POLICY).suffix:
+    if path.suffix == SUFFIX or (path / POLICY).exists():
         return load_policy(path)
     return policy_of(load_trained(path, trust=trust))
 
