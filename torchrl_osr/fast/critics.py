@@ -51,7 +51,7 @@ class FusedCritics(Critics):
         return _values(self._layers(params), eps, rows)
 
     def values_and_soft_maximum(
-        self, states: TensorDictBase, target: Tensor, *sampled: Tensor, alike: bool
+        self, states: TensorDictBase, compared: Tensor, *sampled: Tensor, alike: bool
     ) -> tuple[Tensor, Tensor]:
         action, log_prob = sampled
         loss, eps = self.loss, self._eps()
@@ -63,7 +63,7 @@ class FusedCritics(Critics):
             or any(value.requires_grad for value in states.values(True, True))
         ):
             return super().values_and_soft_maximum(
-                states, target, *sampled, alike=alike
+                states, compared, *sampled, alike=alike
             )
         params, state = loss.qvalue_network_params, self._state(states)
         layers = self._layers(params)
@@ -76,7 +76,7 @@ class FusedCritics(Critics):
             *(state, action, log_prob),
         )
         soft_maximum = _SoftMaximum.apply(alike, given, *sum(layers, ()))
-        return self.values(states, target, params), soft_maximum
+        return self.values(states, compared, params), soft_maximum
 
     def _eps(self) -> list[float] | None:
         """Return the ``eps`` of each normalisation, or ``None`` for other networks.

@@ -95,16 +95,16 @@ class Critics:
         return value.reshape(-1, *action.shape[:-1])
 
     def values_and_soft_maximum(
-        self, states: TensorDictBase, target: Tensor, *sampled: Tensor, alike: bool
+        self, states: TensorDictBase, compared: Tensor, *sampled: Tensor, alike: bool
     ) -> tuple[Tensor, Tensor]:
         """Return both terms of CQL(H) at states ``[R]``, ``[N, R]`` each.
 
-        They are the value of the target's action, ``[R, A]``, and the log-sum-exp over
-        actions ``[M, R, A]`` with log-densities ``[M, R]``. ``alike``: every row has
-        the same weight in the loss.
+        They are the values of the actions ``compared``, ``[R, A]``, and the log-sum-exp
+        over actions ``[M, R, A]`` with log-densities ``[M, R]``. ``alike``: every row
+        has the same weight in the loss.
         """
         action, log_prob = sampled
-        action = torch.cat([target.unsqueeze(0), action])
+        action = torch.cat([compared.unsqueeze(0), action])
         params = self.loss.qvalue_network_params
         qvalue = self.values(states.expand(action.shape[:-1]), action, params)
         return qvalue[:, 0], F.soft_maximum(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from torchrl_osr.lab.evaluation.tables import score_table
+from torchrl_osr.lab.evaluation.tables import run_summary
 
 
 @pytest.mark.parametrize(
@@ -17,7 +17,7 @@ def test_scores_are_last_recent_and_best(tmp_path, scores, recent, mean):
         {"step": 10 * i, "score": s, "score_low": s - 1, "score_high": s + 1}
         for i, s in enumerate(scores)
     ]
-    table = score_table("hopper", history, history[1], 15.6, tmp_path)
+    table = run_summary("hopper", history, history[1], 15.6, tmp_path)
     lines = [" ".join(line.split()) for line in table.splitlines()]
     assert lines[1:5] == [
         "data, mean episode 15.6",

@@ -13,7 +13,7 @@ from torchrl_osr.lab.evaluation.episodes import measure_of
 NUM_RECENT = 5  # neighbouring evaluations swing by tens of points: one says little
 
 
-def score_table(
+def run_summary(
     title: str,
     history: Sequence[Mapping[str, Any]],
     best: Mapping[str, Any],

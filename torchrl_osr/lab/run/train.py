@@ -41,7 +41,7 @@ from torchrl_osr.lab.evaluation import (
     summarize,
 )
 from torchrl_osr.lab.evaluation.figures import learning_curve, read_scalars
-from torchrl_osr.lab.evaluation.tables import score_table
+from torchrl_osr.lab.evaluation.tables import run_summary
 from torchrl_osr.lab.run.build import Learner, make_learner, try_out
 from torchrl_osr.lab.run.config import write_config
 from torchrl_osr.lab.run.data import load_training_data, references_of
@@ -389,7 +389,7 @@ def report(run: Run, data_mean: float | None, trainer: OfflineTrainer) -> float:
     if not history:
         print(f"\n{name}, in {folder}: the policy is trained, and was never played")
         return math.nan
-    print("\n" + score_table(name, history, rows["best"], data_mean, folder))
+    print("\n" + run_summary(name, history, rows["best"], data_mean, folder))
     if failed := [f"step {n}: {e}" for n, e in trainer.failed_evaluations.items()]:
         raise RuntimeError(
             "The training is complete and the policy is saved, but evaluations in "
