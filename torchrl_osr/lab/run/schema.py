@@ -180,7 +180,7 @@ class TrainConfig:
     optim: OptimConfig = field(default_factory=OptimConfig)
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
     logger: LoggerConfig = field(default_factory=LoggerConfig)
-    # Values by data set: rows <env>-<source>, <env> or any, read with ${by_data:key}.
+    # By data set: rows <env>-<source>[-mixed], <env> or any, for ${by_data:key}.
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
     seed: int = MISSING  # random seed of networks, sampling and noise
     resume: str | None = None  # folder of a run to continue, or to extend
@@ -320,7 +320,8 @@ def by_data(key: str, *, _root_: DictConfig) -> Any:
 
     Without a row it is, of an option of the loss, the default of the constructor.
     """
-    rows, env, source = _root_.settings, _root_.env.name, _root_.data.source
+    rows, env, data = _root_.settings, _root_.env.name, _root_.data
+    source = f"{data.source}-mixed" if data.random_share else data.source
     for name in (f"{env}-{source}", env, "any"):
         if name in rows and key in rows[name]:
             return rows[name][key]
