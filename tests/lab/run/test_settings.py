@@ -25,11 +25,8 @@ KEYS = (
 """Columns of the table. Those of ``dynamics`` are blank without a model."""
 
 METHODS = sorted(path.stem for path in (CONF / "loss").glob("*.yaml"))
-DATA = [
-    (env, source)
-    for source in ("medium-expert", "medium-replay")
-    for env in ("hopper", "walker2d", "halfcheetah")
-]
+ENVS = ("hopper", "walker2d", "halfcheetah")
+DATA = [(env, f"medium-{kind}") for kind in ("expert", "replay") for env in ENVS]
 
 
 def table() -> dict[tuple[str, str, str], dict[str, str]]:
@@ -56,6 +53,9 @@ def test_every_method_has_the_settings_of_the_table(method):
         cfg.env.id, cfg.data.source = environment_id(env), source
         row = rows[method, env, source]
         assert settings_of(cfg) == {key: row[key] for key in KEYS}, (env, source)
+    cfg.data.source, cfg.data.random_share = "expert", 0.5
+    # Half of the actions are nobody's.
+    assert cfg.optim.actor_lr == 1e-3
 
 
 def test_settings_are_those_of_the_task_not_of_the_group():

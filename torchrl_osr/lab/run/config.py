@@ -70,14 +70,12 @@ def checked(config: DictConfig, trust: Sequence[str] = ()) -> TrainConfig:
     made = cast(TrainConfig, OmegaConf.to_object(typed))
     # Others would train nonsense, or fail hours later.
     for key, value in flatten(asdict(made)).items():
-        positive = (
-            key.startswith(("trainer.", "dynamics.", "optim.")) and key not in MAY_BE_0
-        )
+        positive = key.startswith(("trainer.", "dynamics.", "optim."))
         if key in CHOICES:
             check_choice(key, value, CHOICES[key])
         elif key in SHARES and not 0 <= value <= 1:
             raise ValueError(f"{key} must be between 0 and 1, got {value}.")
-        elif positive and type(value) is int:
+        elif positive and key not in MAY_BE_0 and type(value) is int:
             check_positive(key, value, minimum=1)
     return made
 
