@@ -195,8 +195,8 @@ def _status(folder: Path) -> Iterator[None]:
     end: dict[str, Any]
     running = {"status": "running", "pid": os.getpid(), "host": platform.node()}
     with signals_raised():
-        write_json(folder / STATUS, running)
         try:
+            write_json(folder / STATUS, running)
             with interrupts_kept():
                 yield
             with signals_noted():
