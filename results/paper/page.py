@@ -3,8 +3,8 @@
     python results/paper/page.py
 
 A page marks the place of a table or number with ``<!-- name -->`` and
-``<!-- /name -->``. The pages are this folder's README.md and tables.md, the
-repository's README.md and docs/results.md. Also draws the figures.
+``<!-- /name -->``. The pages are this folder's README.md and tables.md, that of
+results/mazes, the repository's README.md and docs/results.md. Also draws the figures.
 """
 
 from __future__ import annotations
@@ -472,8 +472,8 @@ def main() -> None:
     blocks["cql/printed"] = number(printed["cql"][SIX].mean())
     blocks["cql/published"] = number(others)
     blocks["osr-less-cql/published"] = number(lead - others)
-    for page in (HERE / "README.md", ROOT / "docs" / "results.md"):
-        fill(page, blocks)
+    for page in (HERE, RESULTS / "mazes", ROOT / "docs" / "results.md"):
+        fill(page / "README.md" if page.is_dir() else page, blocks)
     fill_readme(means)
     shown = ("osr", "cql", "cql_noisy_bc", "td3_bc", "iql")
     draw_curves(ROOT / "docs" / "figures" / "curves.png", shown)
