@@ -360,8 +360,8 @@ def ablation() -> str:
         for name in ABLATION:
             ours, _ = found[data, name]
             seeds = twin.index.intersection(ours.index)
-            share = saved_share(ours.loc[seeds], walks, twin.loc[seeds])
-            cells.append(str(Estimate(*(100 * end for end in share))))
+            ends = 100 * np.array(saved_share(ours.loc[seeds], walks, twin.loc[seeds]))
+            cells.append(str(Estimate(*ends, tables.over_what(len(seeds)))))
         rows.append([name_of(data), *cells])
     return markdown(["R %", *(f"`{name}`" for name in ABLATION)], rows)
 
@@ -472,8 +472,9 @@ def main() -> None:
     blocks["cql/printed"] = number(printed["cql"][SIX].mean())
     blocks["cql/published"] = number(others)
     blocks["osr-less-cql/published"] = number(lead - others)
-    for page in (HERE, RESULTS / "mazes", ROOT / "docs" / "results.md"):
-        fill(page / "README.md" if page.is_dir() else page, blocks)
+    readmes = (place / "README.md" for place in (HERE, RESULTS / "mazes"))
+    for page in (*readmes, ROOT / "docs" / "results.md"):
+        fill(page, blocks)
     fill_readme(means)
     shown = ("osr", "cql", "cql_noisy_bc", "td3_bc", "iql")
     draw_curves(ROOT / "docs" / "figures" / "curves.png", shown)
