@@ -106,9 +106,9 @@ def measure(
     }
     for number in range(rounds):
         print(f"{name}: round {number + 1} of {rounds}", file=sys.stderr, flush=True)
-        for who, pool in pools.items():
-            result = pool.submit(timed, who, size, device, threads, seconds)
-            # One contender that fails does not end the others.
+        for who in (each for each in pools if not results[each]["failure"]):
+            result = pools[who].submit(timed, who, size, device, threads, seconds)
+            # A contender that fails takes part no more, and the others go on.
             if error := result.exception():
                 results[who]["failure"] = f"{type(error).__name__}: {error}"
             else:

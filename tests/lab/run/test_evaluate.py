@@ -14,7 +14,7 @@ from torchrl_osr.lab.dynamics import SwitchingPolicy
 from torchrl_osr.lab.evaluation import deterministic_policy
 from torchrl_osr.lab.evaluation.recoverable import load_recoverable_states, recovers
 from torchrl_osr.lab.run.config import read_run, write_config
-from torchrl_osr.lab.run.evaluate import InUnits, evaluate_run, make_disturbances
+from torchrl_osr.lab.run.evaluate import UnitActions, evaluate_run, make_disturbances
 from torchrl_osr.lab.run.load import CHECKPOINTS, load_trained
 
 SUITES = sorted(path.stem for path in (CONF / "evaluation" / "suite").glob("*.yaml"))
@@ -38,7 +38,7 @@ def play(checkpoint: Path, *overrides: str) -> dict:
 
 def test_a_switching_policy_is_played_from_minus_1_to_1():
     forces = SwitchingPolicy([lambda s: 8 * s - 2], None, lambda s, a: a[:, 0])
-    policy = InUnits(forces, torch.tensor([[-2.0], [6.0]]))
+    policy = UnitActions(forces, torch.tensor([[-2.0], [6.0]]))
     assert policy(torch.tensor([[0.0], [0.5]])).tolist() == [[-1], [0]]
 
 

@@ -108,14 +108,14 @@ def players_of(config: EvaluateConfig, files: list[Path]) -> list[Player]:
     if config.switching:
         policy = load_switching_policy(files, trust=config.trust)
         bounds = torch.tensor([env.action_low, env.action_high])
-        return [(trained[0], InUnits(policy, bounds))]
+        return [(trained[0], UnitActions(policy, bounds))]
     return [
         (each, deterministic_policy(each.actor, each.observation_norm))
         for each in trained
     ]
 
 
-class InUnits:
+class UnitActions:
     """A switching policy with actions from -1 to 1, which an evaluator expects."""
 
     def __init__(self, policy: SwitchingPolicy, bounds: Tensor) -> None:
