@@ -130,19 +130,18 @@ def our_loss(name: str, size: Size, device: torch.device) -> LossModule:
     return loss.to(device)
 
 
-def our_update(loss: LossModule, *, traced: bool) -> Update:
+def our_update(loss: LossModule, *, traced: bool, fused: bool | None) -> Update:
     """Return the trainer's update: one backward, one optimizer, traced on a CPU."""
     updater = SoftUpdate(loss, tau=TAU)
-    optimizer = torch.optim.Adam(loss.parameters(), lr=RATE, fused=True)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=RATE, fused=fused)
     update = FastUpdate(loss, optimizer, updater, trace=traced, warm_up=2)
     return lambda batch: update(batch.copy())
 
 
-def loop_update(loss: LossModule, *, fast: bool) -> Update:
+def loop_update(loss: LossModule) -> Update:
     """Return the update of a plain TorchRL loop, with PyTorch's default Adam."""
     updater = SoftUpdate(loss, tau=TAU)
     optimizer = torch.optim.Adam(loss.parameters(), lr=RATE)
-    fast_step = FastUpdate(loss, optimizer, updater, trace=fast, warm_up=2)
 
     def step(batch: TensorDictBase) -> None:
         losses = loss(batch)
@@ -151,7 +150,7 @@ def loop_update(loss: LossModule, *, fast: bool) -> Update:
         optimizer.zero_grad()
         updater.step()
 
-    return lambda batch: (fast_step if fast else step)(batch.copy())
+    return lambda batch: step(batch.copy())
 
 
 def tight_update(plain: PlainOSR) -> Update:
@@ -252,6 +251,7 @@ def make_contender(
         loss.compile()
     if ("perturbed", "observation") not in loss.in_keys:
         batches = [batch.exclude("perturbed") for batch in batches]
-    if name in (LOOP, FAST_LOOP):
-        return loop_update(loss, fast=name == FAST_LOOP), batches
-    return our_update(loss, traced=name not in (EAGER, COMPILED)), batches
+    if name == LOOP:
+        return loop_update(loss), batches
+    fused = None if name == FAST_LOOP else True  # None: PyTorch's default
+    return our_update(loss, traced=name not in (EAGER, COMPILED), fused=fused), batches

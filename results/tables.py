@@ -5,7 +5,8 @@
 
 Reads ``runs.csv.xz``, ``episodes.csv.xz`` and, where they exist, ``recoverable.csv.xz``
 with ``states.csv.xz`` and ``published.csv``. Intervals at 95 % resample seeds, then
-episodes (of recoverable states: walks). A mark ² means two seeds, ᵉ one seed.
+those of differences episodes, those of recoverable states walks. A mark ² means two
+seeds, ᵉ one seed.
 """
 
 from __future__ import annotations
@@ -133,8 +134,8 @@ def means_over_data(episodes: pd.DataFrame, folder: Path) -> pd.DataFrame:
     return means.sort_values("undisturbed", ascending=False)
 
 
-def main(folder: Path, reference: str, sources: Sequence[str] = ()) -> None:
-    """Print a table for each data set, means over all, and differences."""
+def main(folder: Path, reference: str, sources: Sequence[str] = ()) -> Iterator[str]:
+    """Yield a table for each data set, means over all, and differences."""
     episodes, saved = read(folder, sources), recoverable(folder)
     there = episodes.groupby("suite")["data"].nunique()
     everywhere = there.index[there == episodes["data"].nunique()]
@@ -156,14 +157,14 @@ def main(folder: Path, reference: str, sources: Sequence[str] = ()) -> None:
             mean = of[of["suite"] == ""].groupby("run")["score"].mean().mean()
             rows.append((mean, [f"`{method}`", *cells]))
         rows.sort(key=lambda row: -row[0])
-        print(f"## {data}\n\n{markdown(head, [cells for _, cells in rows])}\n")
+        yield f"## {data}\n\n{markdown(head, [cells for _, cells in rows])}\n"
 
     if episodes["data"].nunique() == 1:
         return
     means = means_over_data(episodes, folder)
     rows = [[f"`{each[0]}`", *(f"{x:.1f}" for x in each[1:])]
             for each in means.itertuples()]  # fmt: skip
-    print(f"## Means over all data sets\n\n{markdown(['method', *means], rows)}\n")
+    yield f"## Means over all data sets\n\n{markdown(['method', *means], rows)}\n"
 
     rows = []
     for method in sorted(set(episodes["method"]) - {reference}):
@@ -173,8 +174,8 @@ def main(folder: Path, reference: str, sources: Sequence[str] = ()) -> None:
         if all(found):
             cells = [str(each[1]) for each in found if each]
             rows.append([f"`{method}`", str(found[0][0] if found[0] else ""), *cells])
-    print(f"## `{reference}` less each other method, over all data sets\n")
-    print(markdown(["less", "seeds", *suites], rows))
+    yield f"## `{reference}` less each other method, over all data sets\n"
+    yield markdown(["less", "seeds", *suites], rows)
 
 
 if __name__ == "__main__":
@@ -183,4 +184,4 @@ if __name__ == "__main__":
     parser.add_argument("--reference", default="osr")
     parser.add_argument("--data", nargs="+", default=(), metavar="SOURCE")
     given = parser.parse_args()
-    main(given.folder, given.reference, given.data)
+    print(*main(given.folder, given.reference, given.data), sep="\n")

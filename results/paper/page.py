@@ -9,11 +9,9 @@ results/mazes, the repository's README.md and docs/results.md. Also draws the fi
 
 from __future__ import annotations
 
-import contextlib
-import io
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import matplotlib as mpl
@@ -25,6 +23,7 @@ from run import (
     HERE,
     LIMITED,
     MAZES,
+    OWN,
     RESULTS,
     SIX,
     TABLES,
@@ -65,6 +64,8 @@ IN_DOCS = {"rim": "RIM", "noisy_bc": "noisy BC"} | {
 }
 ABLATION = ("osr", "cql_both", "noisy_bc", "td3_bc")
 SLOW = ("mopo", "rambo")  # rows may lack them
+TOO_SHORT = (*SLOW, "sdc", "osr_10", "sac_10", "edac_10", "rorl")
+"""Methods that learn little in two minutes; a dagger marks them."""
 COLUMNS = [name for name in TITLES if name in TABLES["table1"].methods]
 KNOCKS = {
     "corrected": ("oos", ["torque-5", "torque-10", "torque-20"]),
@@ -148,7 +149,8 @@ def table1(clean: pd.DataFrame, printed: pd.DataFrame) -> str:
     ]  # fmt: skip
     own = decimal(both.groupby("data")["data_score"].mean().mean())
     rows.append([f"**Mean** of the {len(complete)} rows without gaps", own, *cells])
-    return markdown(["data", "data's mean", *map(TITLES.get, COLUMNS)], rows)
+    titles = (TITLES[name] + "\N{DAGGER}" * (name in TOO_SHORT) for name in COLUMNS)
+    return markdown(["data", "data's mean", *titles], rows)
 
 
 def table2(episodes: pd.DataFrame, printed: pd.DataFrame, protocol: str) -> str:
@@ -184,7 +186,7 @@ def table2(episodes: pd.DataFrame, printed: pd.DataFrame, protocol: str) -> str:
 
 
 def figure4(clean: pd.DataFrame) -> str:
-    """Return the scores of Figure 4 in a table; draw them if there are any."""
+    """Draw Figure 4, and return its scores in a table."""
     shares = [0, 50, 70, 90]
     methods = [name for name in COLUMNS if name in TABLES["figure4"].methods]
     figure, grid = plt.subplots(1, len(ENVS), figsize=(11, 3.2), layout="constrained")
@@ -204,13 +206,10 @@ def figure4(clean: pd.DataFrame) -> str:
                 axes.fill_between(share, low, high, alpha=0.2)
     figure.supxlabel("random rows, %", fontsize=10)
     figure.supylabel("normalised score", fontsize=10)
-    text = markdown(["robot", "method", *(f"{share} %" for share in shares)], rows)
-    if clean["data"].isin(LIMITED).any():
-        grid[0].legend(frameon=False, fontsize=8)
-        figure.savefig(HERE / "figure4.png", dpi=110)
-        text += "\n\n![Score against the share of random rows](figure4.png)"
+    grid[0].legend(frameon=False, fontsize=8)
+    figure.savefig(HERE / "figure4.png", dpi=110)
     plt.close(figure)
-    return text
+    return markdown(["robot", "method", *(f"{share} %" for share in shares)], rows)
 
 
 def d4(clean: pd.DataFrame, quoted: pd.DataFrame) -> str:
@@ -233,27 +232,21 @@ def d4(clean: pd.DataFrame, quoted: pd.DataFrame) -> str:
     return markdown(["data", *(TITLES[name] for name in grid.methods)], rows)
 
 
-SHORT = "two minutes are too short"
 CLAIMS = [
-    ("OSR scores higher than CQL", "osr", "cql", "score", ""),
-    ("OSR scores higher than IQL", "osr", "iql", "score", ""),
-    ("OSR scores higher than SDC", "osr", "sdc", "score", f"{SHORT} for SDC"),
-    ("OSR scores higher than MOPO", "osr", "mopo", "score", f"{SHORT} for MOPO"),
-    ("OSR scores higher than RAMBO", "osr", "rambo", "score", f"{SHORT} for RAMBO"),
-    ("OSR-v scores higher than OSR", "osr_v", "osr", "score", ""),
-    ("OSR scores higher than its twin without a model", "osr", "cql_noisy_bc", "score",
-     "not a claim of the paper"),
-    ("Knocked, OSR scores higher than CQL", "osr", "cql", "knocked", ""),
-    ("Knocked, OSR scores higher than SDC", "osr", "sdc", "knocked",
-     f"{SHORT} for SDC"),
-    ("OSR loses fewer points to knocks than CQL", "cql", "osr", "lost",
-     "a low score has less to lose"),
-    ("OSR loses fewer points to knocks than SDC", "sdc", "osr", "lost",
-     "a low score has less to lose"),
-    ("OSR-v loses fewer points to knocks than CQL", "cql", "osr_v", "lost",
-     "a low score has less to lose"),
-]  # fmt: skip
-"""A claim, whose number is larger than whose, the kind of number, and a note."""
+    ("OSR scores higher than CQL", "osr", "cql", "score"),
+    ("OSR scores higher than IQL", "osr", "iql", "score"),
+    ("OSR scores higher than SDC", "osr", "sdc", "score"),
+    ("OSR scores higher than MOPO", "osr", "mopo", "score"),
+    ("OSR scores higher than RAMBO", "osr", "rambo", "score"),
+    ("OSR-v scores higher than OSR", "osr_v", "osr", "score"),
+    ("(ours) OSR scores higher than CQL + noisy BC", "osr", "cql_noisy_bc", "score"),
+    ("Knocked, OSR scores higher than CQL", "osr", "cql", "knocked"),
+    ("Knocked, OSR scores higher than SDC", "osr", "sdc", "knocked"),
+    ("OSR loses fewer points to knocks than CQL", "cql", "osr", "lost"),
+    ("OSR loses fewer points to knocks than SDC", "sdc", "osr", "lost"),
+    ("OSR-v loses fewer points to knocks than CQL", "cql", "osr_v", "lost"),
+]
+"""A claim, whose number is larger than whose, and the kind of number."""
 
 
 def claims(episodes: pd.DataFrame, printed: pd.DataFrame, knocked: pd.DataFrame) -> str:
@@ -278,7 +271,7 @@ def claims(episodes: pd.DataFrame, printed: pd.DataFrame, knocked: pd.DataFrame)
         ),
     }
     rows = []
-    for claim, more, less, kind, note in CLAIMS:
+    for claim, more, less, kind in CLAIMS:
         part, theirs = sources[kind]
         part = part[part["method"].isin((more, less))]
         seeds = part.groupby(["data", "method"])["seed"].nunique().unstack()
@@ -289,8 +282,9 @@ def claims(episodes: pd.DataFrame, printed: pd.DataFrame, knocked: pd.DataFrame)
         seen = "not resolved"
         if ours and not ours.low <= 0 <= ours.high:
             seen = "yes" if ours.low > 0 else "no, the reverse"
-        if note.startswith(SHORT):
-            seen = "cannot judge"
+        note = "a low score has less to lose" if kind == "lost" else ""
+        if less in TOO_SHORT:
+            seen, note = "cannot judge", f"two minutes are too short for {TITLES[less]}"
         cells = (number(quoted), str(ours or NOT_RUN), str(len(both)), seen, note)
         rows.append([claim, *cells])
     head = ["claim", "paper", "here [95 %]", "data sets", "seen here", "note"]
@@ -314,18 +308,28 @@ def settings() -> str:
     return markdown(["method", *(f"`{key.partition('.')[2]}`" for key in keys)], rows)
 
 
-def draw_curves(to: Path, methods: Sequence[str]) -> None:
-    """Draw score over minutes of updates, every seed and the mean."""
-    runs = pd.read_csv(HERE / "runs.csv.xz")
-    episodes = pd.read_csv(HERE / "episodes.csv.xz").merge(runs, on="run")
+def draw_curves(
+    to: Path, methods: Iterable[str], place: Path = HERE, chosen: Sequence[int] = ()
+) -> None:
+    """Draw score over minutes of updates, every seed and the mean.
+
+    ``chosen`` are runs of the tables in ``place``; default all.
+    """
+    runs = pd.read_csv(place / "runs.csv.xz")
+    runs = runs[runs["run"].isin(chosen or runs["run"])]
+    runs["method"] = runs["method"].str.partition("-")[0]  # of a trial's name
+    sets = [data for data in SIX if data in set(runs["data"])]
+    episodes = pd.read_csv(place / "episodes.csv.xz").merge(runs, on="run")
     episodes = episodes[episodes["suite"].isna()]
     minutes = TABLES["table1"].seconds / 60 * episodes["step"] / episodes["updates"]
     episodes = episodes.assign(minutes=minutes.round(3))
     colors = dict(zip(methods, COLORS, strict=False))
+    down, across = -(-len(sets) // 3), min(3, len(sets))
     figure, grid = plt.subplots(
-        2, 3, figsize=(11, 6), layout="constrained", sharex=True
-    )
-    for axes, data in zip(grid.flat, SIX, strict=True):
+        down, across, figsize=(3.7 * across, 3 * down),
+        layout="constrained", sharex=True, squeeze=False,
+    )  # fmt: skip
+    for axes, data in zip(grid.flat, sets, strict=True):
         for method, color in colors.items():
             mine = episodes[(episodes["data"] == data) & (episodes["method"] == method)]
             by_seed = mine.groupby(["minutes", "seed"])["score"].mean().unstack()
@@ -343,7 +347,7 @@ def draw_curves(to: Path, methods: Sequence[str]) -> None:
 def methods_table(means: pd.DataFrame, titles: Mapping[str, str]) -> str:
     """Return the means of methods over the six data sets, best first."""
     rows = [
-        [titles[name], *map(decimal, line)]
+        [titles[name] + "\N{DAGGER}" * (name in TOO_SHORT), *map(decimal, line)]
         for name, line in means.iterrows()
         if name in titles
     ]
@@ -369,18 +373,18 @@ def ablation() -> str:
 def tuning() -> str:
     """Return each method's best trial by its tuning seed, and its mean on others."""
     place = RESULTS / TABLES["tune"].place
-    if not place.exists():
-        return NOT_RUN
     runs = tables.read(place)
     runs["trial"] = runs["method"]
     runs["method"] = runs["method"].str.partition("-")[0]
-    rows = []
+    rows, chosen = [], []
     for (data, method), mine in runs.groupby(["data", "method"]):
         trials = mine[mine["seed"] == 100].groupby("trial")["score"].mean()
         fresh = mine[(mine["trial"] == trials.idxmax()) & (mine["seed"] != 100)]
+        chosen += fresh["run"].unique().tolist()
         best = " ".join(f"`{text}`" for text in TRIALS[trials.idxmax()][1:])
         cells = (str(len(trials)), best, decimal(trials.max()), cell(fresh))
         rows.append([name_of(data), TITLES[method], *cells])
+    draw_curves(HERE / "tuned.png", OWN, place, chosen)
     head = ["data", "method", "trials", "best", "tuning seed", "fresh seeds"]
     return markdown(head, rows)
 
@@ -479,9 +483,8 @@ def main() -> None:
     shown = ("osr", "cql", "cql_noisy_bc", "td3_bc", "iql")
     draw_curves(ROOT / "docs" / "figures" / "curves.png", shown)
     draw_curves(RESULTS / "osr_v" / "scores.png", ("osr", "cql", "osr_v"))
-    with contextlib.redirect_stdout(io.StringIO()) as text:
-        tables.main(HERE, "osr", SOURCES)
-    blocks = {"tables": text.getvalue().strip(), "ablation": ablation()}
+    text = "\n".join(tables.main(HERE, "osr", SOURCES))
+    blocks = {"tables": text, "ablation": ablation()}
     fill(HERE / "tables.md", blocks)
 
 

@@ -201,15 +201,9 @@ def pack(folders: Sequence[Path], to: Path) -> None:
     for folder, reason in tables.left_out:
         print(f"{folder}: {reason}", file=sys.stderr)
     to.mkdir(parents=True, exist_ok=True)
-    new = {"runs": tables.runs.rename(columns={"steps": "updates"})}
-    new["runs"] = (
-        new["runs"]
-        .rename_axis("run")
-        .reset_index()[
-            ["run", "data", "method", "seed", "updates", "data_score", "overrides"]
-        ]
-        .round({"data_score": 2})
-    )
+    runs = tables.runs.rename(columns={"steps": "updates"}).rename_axis("run")
+    columns = ["run", "data", "method", "seed", "updates", "data_score", "overrides"]
+    new = {"runs": runs.reset_index()[columns].round({"data_score": 2})}
     columns = ["run", "suite", "disturbance", "step", "episode", "score"]
     columns += ["disturbed_at", "recovery_steps"]
     new["episodes"] = tables.episodes[columns].round({"score": 2})

@@ -39,7 +39,7 @@ class DiscreteOSRLoss(ActorCriticLoss):
 
     :class:`~torchrl_osr.OSRLoss` with the actor of discrete SAC
     (https://arxiv.org/abs/1910.07207) and the exact CQL(H) term
-    (https://arxiv.org/abs/2006.04779). The paper has continuous actions only. With
+    (https://arxiv.org/abs/2006.04779). The paper has no such equations. With
     ``recovery_weight=0`` it is discrete CQL(H): no model, no perturbed states.
 
     Args:

@@ -46,7 +46,8 @@ class OSRLoss(CQLLoss):
             here: in the state dict, moved by ``.to()``, without gradient.
 
     Keyword Args:
-        recovery_weight: weight :math:`\lambda`. Default 0.5. May be assigned later.
+        recovery_weight: weight :math:`\lambda` of the sum over action entries. Default
+            0.5, which the released code gives their mean. May be assigned later.
         actor_states: states of the sought values, ``"both"`` (default) or ``"clean"``.
         options: of :class:`~torchrl_osr.CQLLoss`.
 

@@ -80,7 +80,7 @@ class IQLLoss(ActorCriticLoss):
 
     "Offline Reinforcement Learning with Implicit Q-Learning",
     https://arxiv.org/abs/2110.06169. The authors' actor is
-    :func:`~torchrl_osr.modules.gaussian_actor`.
+    :func:`~torchrl_osr.modules.gaussian_actor`, and they update :math:`V` first.
 
     Keyword Args:
         temperature: :math:`\beta`. Default 3.0, the authors' for robots; mazes 10.0.
