@@ -20,7 +20,7 @@ from torchrl_osr._checks import check_positive
 from torchrl_osr._entries import state_keys
 from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses, StatePolicy
 from torchrl_osr.objectives.networks import check_num_actions, is_categorical
-from torchrl_osr.objectives.state_recovery import action_index
+from torchrl_osr.objectives.state_recovery import at_actions
 from torchrl_osr.objectives.transitions import SETS, Transitions
 
 
@@ -117,9 +117,7 @@ class DiscreteOSRLoss(ActorCriticLoss):
         states = "both" if self.has_recovery else "clean"
         pi = policy[states]
         qvalue = self.action_values(batch.s, self.qvalue_network_params, pi)
-        index = action_index(batch.a, pi, qvalue.shape[1], self.tensor_keys.action)
-        index = index.expand(qvalue.shape[:-1]).unsqueeze(-1)
-        q_data = qvalue.gather(-1, index).squeeze(-1)
+        q_data = at_actions(qvalue, batch.a, pi, self.tensor_keys.action)
         # Detached: the policy's objective must not train the critics.
         params = self.qvalue_network_params.detach()
         sought = self.action_values(batch.states[SETS[states]], params, pi)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import copy
 from typing import Any, Literal, Self, cast
 
-import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
@@ -266,26 +265,23 @@ def cloning_distance(policy: Any, data_action: Tensor, key: NestedKey) -> Tensor
         check_action(data_action, action.shape[1:], key)
         return (action - data_action).square().sum(-1)
     if isinstance(policy, CATEGORICAL):
-        sets, rows = policy.logits.shape[:2]
-        index = action_index(data_action, policy, rows, key)
-        index = index.expand(sets, rows).unsqueeze(-1)
-        log_prob: Tensor = policy.logits.gather(-1, index).squeeze(-1)
-        return -log_prob
+        return -at_actions(policy.logits, data_action, policy, key)
     shape = policy.batch_shape + policy.event_shape
     check_action(data_action, shape[1:], key)
-    log_prob = policy.log_prob(data_action.expand(shape))
+    log_prob: Tensor = policy.log_prob(data_action.expand(shape))
     # torch's Normal has a density for each dimension.
     return -(log_prob if policy.event_shape else log_prob.sum(-1))
 
 
-def action_index(
-    action: Tensor, distribution: Any, rows: int, key: NestedKey
+def at_actions(
+    values: Tensor, action: Tensor, distribution: Any, key: NestedKey
 ) -> Tensor:
-    """Return a batch's discrete actions as indices, int64 ``[R]``.
+    """Return the values ``[..., R, n]`` of a batch's discrete actions, ``[..., R]``.
 
     They are one-hot ``[R, n]`` of any type if the distribution is of one-hot actions,
     or else integer indices ``[R]`` or ``[R, 1]``; a ValueError names others.
     """
+    rows = values.shape[-2]
     if one_hot := isinstance(distribution, ONE_HOT):
         expected: Any = [(rows, distribution.logits.shape[-1])]
     else:
@@ -296,7 +292,6 @@ def action_index(
             f"actions of a {type(distribution).__name__} have one of {expected}, and "
             "indices are integers."
         )
-    if one_hot:
-        # In floating point: torch has no argmax of booleans.
-        return action.to(torch.float32).argmax(-1)
-    return action.long().reshape(rows)
+    # In floating point: torch has no argmax of booleans.
+    index = action.float().argmax(-1) if one_hot else action.long().reshape(rows)
+    return values.gather(-1, index.expand(values.shape[:-1]).unsqueeze(-1)).squeeze(-1)

@@ -110,7 +110,7 @@ def find_damage(path: Path) -> str | None:
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()
     except Exception as error:  # zipfile raises a dozen kinds
-        return str(error)
+        return str(error) or repr(error)
     return f"wrong checksum of {damaged}" if damaged else None
 
 

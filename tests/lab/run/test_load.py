@@ -201,7 +201,7 @@ def test_switching_uses_all_runs_policies_models_and_critics(folders) -> None:
         (["loss=bc"], "needs real actions and critics"),
         ([LOSS, "optim.gamma=0.9"], "differ in .*0.9, "),
         ([LOSS, "data.reward_scale=100"], "differ in .*100.0"),
-        ([LOSS, "env=walker2d"], "differ in .*Walker2d-v5"),
+        ([LOSS, "env=none", "data=file", "data.path=a.csv"], "differ in .*Hopper-v5"),
     ],
 )
 def test_runs_that_do_not_fit_together_are_refused(folders, tmp_path, options, message):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from contextlib import closing
 from pathlib import Path
 from pkgutil import resolve_name
@@ -53,4 +54,5 @@ def main(cfg: DictConfig) -> None:
         f"{path}: {len(columns['reward']):,} steps, {len(returns)} episodes, "
         f"return {returns.mean():.1f} ({returns.min():.1f} to {returns.max():.1f})"
     )
-    print(f"  torchrl-osr train env.id={env_id} {loss}data=file data.path={path}")
+    source = shlex.quote(f"data.path={path}")
+    print(f"  torchrl-osr train env.id={env_id} {loss}data=file {source}")

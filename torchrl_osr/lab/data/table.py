@@ -27,18 +27,16 @@ with needed_by("tables need", "train"):
 
 Arrays = dict[str, Array]
 
+STATES = "observation", "observations", "obs", "state", "states"
 USUAL_NAMES = {
-    "observation": ("observation", "observations", "obs", "state", "states"),
+    "observation": STATES,
     "action": ("action", "actions", "act"),
     "reward": ("reward", "rewards"),
     "terminated": ("terminated", "terminal", "terminals"),
     "truncated": ("truncated", "timeout", "timeouts"),
     "episode": ("episode", "episode_id"),
     "step": (),
-    "next_observation": (
-        *("next_observation", "next_observations", "next_obs"),
-        *("next_state", "next_states"),
-    ),
+    "next_observation": tuple(f"next_{name}" for name in STATES),
 }
 """Parts of a log, and what their columns are called unless you name them."""
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDict
 
+from torchrl_osr.fast import FastUpdate
 from torchrl_osr.lab.data.rows import episode_of
 from torchrl_osr.lab.dynamics import Body, DynamicsEnsemble, DynamicsLoss
 from torchrl_osr.lab.dynamics.body import fitted_body
@@ -40,8 +41,8 @@ def fitted_grey_box(
     dynamics.body, rows = fitted_body(body, data, seed=seed)
     dynamics.standardize_(rows)
     optimizer = torch.optim.Adam(dynamics.parameter_groups(), lr=1e-3, fused=True)
-    loss, options = DynamicsLoss(dynamics), {"steps": steps, "seed": seed}
-    fit(loss, optimizer, None, rows, "grey box", progress=progress, **options)
+    update = FastUpdate(DynamicsLoss(dynamics), optimizer)
+    fit(update, rows, "grey box", steps, seed=seed, progress=progress)
     return dynamics.requires_grad_(False)
 
 

@@ -6,13 +6,14 @@ Shapes: ``N`` transitions, ``K`` critics, ``E`` episodes.
 from __future__ import annotations
 
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 from torch.nn.functional import one_hot
-from torchrl.objectives import LossModule, SoftUpdate
+from torchrl.objectives import SoftUpdate
 
 from torchrl_osr.fast import FastUpdate
 from torchrl_osr.lab.data import make_replay_buffer, observation_statistics
@@ -94,8 +95,8 @@ def fitted_values(
     loss = FQELoss(critics, value_bounds=bounds, deactivate_vmap=True)
     loss.make_value_estimator(gamma=gamma)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3, fused=True)
-    targets, what = SoftUpdate(loss, tau=0.05), "fitted Q evaluation"
-    fit(loss, optimizer, targets, rows, what, steps=steps, seed=seed, progress=progress)
+    update = FastUpdate(loss, optimizer, SoftUpdate(loss, tau=0.05))
+    fit(update, rows, "fitted Q evaluation", steps, seed=seed, progress=progress)
     states = TensorDict({"observation": (starts - loc) / scale}, [number])
     params = loss.target_qvalue_network_params
     with torch.no_grad():
@@ -124,28 +125,13 @@ def act(policy: Policy, states: Tensor, size: int) -> Tensor:
 
 
 def fit(
-    loss: LossModule,
-    optimizer: torch.optim.Optimizer,
-    targets: SoftUpdate | None,
-    rows: TensorDict,
-    description: str,
-    *,
-    steps: int,
-    seed: int,
-    progress: bool,
+    update: FastUpdate, rows: TensorDict, name: str, steps: int, **options: Any
 ) -> None:
-    """Train a loss on rows ``[N]``, without checkpoints that stay."""
+    """Train on rows ``[N]``, without checkpoints that stay; options of the trainer."""
+    buffer = make_replay_buffer(rows, batch_size=128, seed=0)
     with TemporaryDirectory() as folder:
-        OfflineTrainer(
-            FastUpdate(loss, optimizer, targets),
-            make_replay_buffer(rows, batch_size=128, seed=0),
-            steps,
-            folder,
-            seed=seed,
-            checkpoint_interval=steps,
-            description=description,
-            progress=progress,
-        ).train()
+        fixed: Any = {"checkpoint_interval": steps, "description": name}
+        OfflineTrainer(update, buffer, steps, folder, **fixed, **options).train()
 
 
 def episode_values(data: TensorDict, gamma: float) -> Array:

@@ -173,6 +173,12 @@ def play_states(config: EvaluateConfig, players: list[Player]) -> dict[str, Any]
     states = load_recoverable_states(run.env.name, half)
     if run.env.id != (wanted := environment_id(run.env.name)):
         raise ValueError(f"the states are of {wanted}, the run is of {run.env.id}.")
+    evaluations, name = [], config.suite.name
+    with progress_bar(name, len(players), unit="play", bar=config.progress) as bar:
+        for each, policy in players:
+            back = recovers(states, policy).astype(int).tolist()
+            evaluations.append({"step": each.step, "back": back})
+            bar.update()
     return {
         "env": run.env.name,
         "data": run.data.source,
@@ -180,10 +186,7 @@ def play_states(config: EvaluateConfig, players: list[Player]) -> dict[str, Any]
         "group": states.group.tolist(),
         "disturbance": states.disturbance,
         "walk": states.walk.tolist(),
-        "evaluations": [
-            {"step": each.step, "back": recovers(states, policy).astype(int).tolist()}
-            for each, policy in players
-        ],
+        "evaluations": evaluations,
     }
 
 

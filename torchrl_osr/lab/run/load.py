@@ -162,7 +162,7 @@ def load_switching_policy(
     if len(shared) > 1:
         raise ValueError(
             "The runs differ in task, discount, reward scale or reward shift: "
-            f"{sorted(shared)}. Choose runs in which they are equal."
+            f"{sorted(shared, key=str)}. Choose runs in which they are equal."
         )
 
     def value(state: Tensor, action: Tensor) -> Tensor:
