@@ -39,5 +39,4 @@ def __getattr__(name: str) -> object:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     homes = {"load_policy": "policy", "StatePerturbation": "transforms"}
-    home = import_module(f"{__name__}.{homes.get(name, 'objectives')}")
-    return getattr(home, name)
+    return getattr(import_module(f"{__name__}.{homes.get(name, 'objectives')}"), name)

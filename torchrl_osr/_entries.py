@@ -35,9 +35,7 @@ def entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
         raise KeyError(f"The batch has no entry {key!r}; it has {there}.")
     if isinstance(value, TensorDictBase):
         each = unravel_key((key, next(iter(value.keys(True, True)), "name")))
-        raise ValueError(
-            f"{key!r} is a group, not a tensor. Name a key in it: [{each}]."
-        )
+        raise ValueError(f"{key!r} is a group, no tensor. Name a key in it: [{each}].")
     return value
 
 

@@ -118,9 +118,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             f"{path} is no file of tensors of torchrl-osr, or damaged: {error!r}"
         ) from error
     if damaged:
-        raise ValueError(
-            f"{path} is damaged: its checksum is wrong. Take a whole copy."
-        )
+        raise ValueError(f"{path} is damaged: its checksum is wrong. Copy it again.")
     return tensors, record
 
 

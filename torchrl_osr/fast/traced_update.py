@@ -205,8 +205,7 @@ class _State:
             interaction_type(),
             RemovableHandle.next_id,
         )
-        traits = [(each.data_ptr(), each.requires_grad) for each in self.tensors]
-        return [modes, traits]
+        return [modes, [(each.data_ptr(), each.requires_grad) for each in self.tensors]]
 
 
 def _copied(value: Any) -> Any:

@@ -91,7 +91,5 @@ def state_value(
 
     Arguments as of :func:`critic_ensemble`; it writes ``"state_value"``, ``[B, 1]``.
     """
-    network = mlp(
-        observation_dim, 1, num_cells, activation_class, layer_norm=layer_norm
-    )
-    return ValueOperator(network, in_keys=[observation_key])
+    value = mlp(observation_dim, 1, num_cells, activation_class, layer_norm=layer_norm)
+    return ValueOperator(value, in_keys=[observation_key])

@@ -116,8 +116,7 @@ def cvae_inverse_dynamics(
     layer more than the decoder's ``num_cells``.
     """
     pair = 2 * observation_dim
-    encoder_cells = [*num_cells, *num_cells[-1:]]
-    encoder = mlp(pair, 2 * latent_dim, encoder_cells, activation_class)
+    encoder = mlp(pair, 2 * latent_dim, [*num_cells, *num_cells[-1:]], activation_class)
     decoder = mlp(pair + latent_dim, 2 * action_dim, num_cells, activation_class)
     network = TensorDictModule(
         _ConditionalVAE(encoder, decoder),
@@ -145,6 +144,5 @@ class _ConditionalVAE(nn.Module):
         # Mode, median and mean of a Gaussian are one: no other type draws.
         if interaction_type() is InteractionType.RANDOM:
             latent = latent_loc + latent_scale * torch.randn_like(latent_scale)
-        param = self.decoder(observation, next_observation, latent)
-        loc, scale = self.extractor(param)
+        loc, scale = self.extractor(self.decoder(observation, next_observation, latent))
         return loc, scale, latent_loc, latent_scale

@@ -421,8 +421,7 @@ class ActorCriticLoss(LossModule):
         network = self.inverse_dynamics_network
         inputs = self.model_inputs(batch, network.in_keys, states)
         with torch.no_grad(), set_interaction_type(InteractionType.DETERMINISTIC):
-            params = self.inverse_dynamics_network_params
-            return distribution(network, params, inputs)
+            return distribution(network, self.inverse_dynamics_network_params, inputs)
 
     def model_inputs(
         self, batch: Transitions, in_keys: Sequence[NestedKey], states: States
@@ -493,8 +492,7 @@ class ActorCriticLoss(LossModule):
         # Detached: the policy's objective must not train the critics.
         params = self.qvalue_network_params.detach()
         qvalue = self.q(batch.states[SETS[states]], action, params)
-        objective = F.soft_policy_value(log_prob, qvalue, self.alpha)
-        return objective.mean(0), log_prob
+        return F.soft_policy_value(log_prob, qvalue, self.alpha).mean(0), log_prob
 
     def soft_actor_losses(
         self,

@@ -131,8 +131,7 @@ def check_networks(**networks: nn.Module | Sequence[nn.Module] | None) -> None:
                         "of a list, parameters of its own (copy.deepcopy the encoder)."
                     )
             owners |= dict.fromkeys(parameters, name)
-            trained = tuple(each.requires_grad for each in parameters)
-            kinds.add((repr(module), trained))
+            kinds.add((repr(module), tuple(each.requires_grad for each in parameters)))
         if len(kinds) > 1:
             raise ValueError(
                 f"the networks of {name} differ in layers or frozen parameters, and "
@@ -157,8 +156,7 @@ def distribution(
     states: TensorDictBase,
 ) -> Any:
     """Return a network's distribution at states ``[..., R]``."""
-    found = distribution_params(network, params, states)
-    return network.build_dist_from_params(found)
+    return network.build_dist_from_params(distribution_params(network, params, states))
 
 
 def written_entry(

@@ -103,5 +103,4 @@ class OSRLoss(CQLLoss):
         """Return the state-recovery term (11), the mean over D_tot, ``[R]``."""
         pi, model = policy["both"], self.inverse_dynamics(batch, "both")
         check_num_actions("inverse_dynamics_network", model.loc, pi.loc)
-        divergence = F.state_recovery(pi.loc, pi.scale, model.loc, model.scale)
-        return divergence.mean(0)
+        return F.state_recovery(pi.loc, pi.scale, model.loc, model.scale).mean(0)

@@ -140,9 +140,7 @@ class OSRVLoss(ActorCriticLoss):
             torch.cat([batch.a.unsqueeze(0), candidates.flatten(0, 1)]),
         )
         compared = qvalue[:, 1:].reshape(-1, *candidates.shape[:-1]).movedim(1, -1)
-        gap = F.value_constraint(
-            compared[..., : len(action)], compared[..., len(action) :]
-        )
+        gap = F.value_constraint(*compared.tensor_split([len(action)], -1))
         return qvalue[:, 0], gap.mean(1).sum(0)
 
     def data_values_and_cql_gap(

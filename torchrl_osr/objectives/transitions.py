@@ -106,8 +106,7 @@ class Transitions:
         ended = column(self.rows, nested("next", self.keys.terminated))
         sets = self.states_of(keys, "both" if perturbed else "clean")
         clean, *others = sets.unbind(0)
-        after = next_states(self.rows, keys, ended)
-        self.states = torch.stack([clean, after, *others])
+        self.states = torch.stack([clean, next_states(self.rows, keys, ended), *others])
 
     def states_of(self, keys: Sequence[NestedKey], states: States) -> TensorDictBase:
         """Return the entries ``keys`` of D_tot or a half of it, ``[D, R]``.

@@ -98,8 +98,7 @@ def safe_checkpoint(**components: Any) -> Checkpoint:
     """
     checkpoint = Checkpoint(format="archive")
     for name, component in components.items():
-        stateful = hasattr(component, "state_dict")
-        adapter = WeightsOnlyAdapter() if stateful else None
+        adapter = WeightsOnlyAdapter() if hasattr(component, "state_dict") else None
         checkpoint.register(name, component, adapter=adapter)
     return checkpoint
 
@@ -123,11 +122,7 @@ class Checkpoints:
     """
 
     def __init__(
-        self,
-        folder: Path | str,
-        components: Mapping[str, Any],
-        interval: int,
-        kept: int,
+        self, folder: Path | str, components: dict[str, Any], interval: int, kept: int
     ) -> None:
         self.folder, self.interval, self.kept = Path(folder), interval, kept
         self.best_path = self.folder / "best.torchrl"

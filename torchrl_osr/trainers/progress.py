@@ -32,15 +32,10 @@ class _Lines(tqdm):
 
 @contextmanager
 def progress_bar(
-    description: str,
-    total: int,
-    *,
-    first: int = 0,
-    unit: str = "step",
-    bar: bool = True,
+    what: str, total: int, *, first: int = 0, unit: str = "step", bar: bool = True
 ) -> Iterator[Any]:
     """Open tqdm's bar at a step; without a terminal it logs every half minute."""
-    options: dict[str, Any] = {"desc": description, "total": total, "unit": unit}
+    options: dict[str, Any] = {"desc": what, "total": total, "unit": unit}
     options["initial"] = first
     if bar and sys.stderr.isatty():
         with logging_redirect_tqdm(), tqdm(**options) as shown:

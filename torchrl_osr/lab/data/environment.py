@@ -127,9 +127,7 @@ def open_environment(env_id: str) -> gymnasium.Env[Any, Any]:
     else:
         limited = env.spec is not None and env.spec.max_episode_steps is not None
         return env if limited else gymnasium.wrappers.TimeLimit(env, MAX_EPISODE)
-    raise ValueError(
-        f"{env_id} has {flaw}: register it with a wrapper that changes it."
-    )
+    raise ValueError(f"{env_id} has {flaw}: register it with a wrapper that mends it.")
 
 
 def sorted_space(space: spaces.Space[Any]) -> spaces.Space[Any]:

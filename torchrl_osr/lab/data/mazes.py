@@ -107,8 +107,7 @@ def point_sampler(maze: Any) -> ActionSampler:
 
     def sample(observation: NDArray[Any], rng: np.random.Generator) -> Any:
         position, goal, velocity = observation[:2], observation[2:4], observation[6:8]
-        ahead = waypoint(position, goal) - position
-        force = STIFFNESS * ahead - DAMPING * velocity
+        force = STIFFNESS * (waypoint(position, goal) - position) - DAMPING * velocity
         noise = ACTION_NOISE * rng.standard_normal(2)
         return (np.clip(force, -1, 1) + noise).astype(np.float32)
 

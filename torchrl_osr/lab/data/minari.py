@@ -56,8 +56,7 @@ def read_minari(
     elif options.action_bounds is None:
         bounds = actions.low.ravel(), actions.high.ravel()
         options = replace(options, action_bounds=bounds)
-    space = sorted_space(opened.observation_space)
-    episodes = [*_read(opened, space, progress)]
+    episodes = [*_read(opened, sorted_space(opened.observation_space), progress)]
     columns = {n: np.concatenate([e[n] for e in episodes]) for n in episodes[0]}
     files = sorted(path for path in here.rglob("*") if path.is_file())
     return convert([columns], options, {"source": "minari", "path": str(path)}, files)

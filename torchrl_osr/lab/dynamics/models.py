@@ -107,8 +107,7 @@ class DynamicsEnsemble(nn.Module):
         mean, free = last(hidden).chunk(2, -1)
         # Smoothly between the learned bounds: PETS, appendix A.1.
         lowest, highest = self.lowest_log_variance, self.highest_log_variance
-        below = highest - softplus(highest - free)
-        return mean, lowest + softplus(below - lowest)
+        return mean, lowest + softplus(highest - softplus(highest - free) - lowest)
 
     def predict(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and scale of all networks, in the data's units, ``[E, B, D]``."""

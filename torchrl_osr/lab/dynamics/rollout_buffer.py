@@ -94,8 +94,7 @@ class RolloutReplayBuffer:
             weights = {key: value.cpu().clone() for key, value in state.items()}
             newest = slice(-options.generations, None)
             self._policies = [*self._policies, weights][newest]
-            latest = self._repeatable(weights, number)
-            self._keep([*self._rollouts, latest][newest])
+            self._keep([*self._rollouts, self._repeatable(weights, number)][newest])
         self.num_batches += 1
         num_real = round(options.real_ratio * self.batch_size)
         size, rng = (self.batch_size - num_real,), self._rng

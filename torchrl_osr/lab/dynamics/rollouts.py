@@ -78,6 +78,8 @@ def task_limits(
     """
     ended = data["next", "terminated"].squeeze(-1)
     states = data["next", "observation"]
+    if ended.all():
+        raise ValueError("every row is terminated: give whole episodes, not just ends.")
     low, high = states[~ended].aminmax(dim=0)
     found = torch.stack([low, high]).flatten()
     limits = torch.stack([low - math.inf, high + math.inf]).flatten()

@@ -41,8 +41,7 @@ class EliteNetworks:
         weights = [each.weight[elites].double() for each in model.layers]
         biases = [each.bias[elites].double() for each in model.layers]
         weights[0] /= (unit * model.input_scale).unsqueeze(-1)
-        shift = (center + unit * model.input_loc) @ weights[0]
-        biases[0] -= shift.unsqueeze(1)
+        biases[0] -= ((center + unit * model.input_loc) @ weights[0]).unsqueeze(1)
         size = len(model.target_loc)  # log-variances follow
         out = torch.cat([scale * states, ones(1)]).double()
         weights[-1] = weights[-1][..., :size] * model.target_scale * out

@@ -59,8 +59,7 @@ def train_dynamics(
         if hasattr(each, "dynamics_network"):
             each.load_frozen("dynamics_network", model)
         if hasattr(each, "transition_network"):
-            vae = _trained_vae(options, data, fit)
-            each.load_frozen("transition_network", vae)
+            each.load_frozen("transition_network", _trained_vae(options, data, fit))
     if options.real_ratio == 1:
         return None
     adversary = None

@@ -82,8 +82,7 @@ class DisturbanceWrapper(gymnasium.Wrapper[Vector, Vector, Vector, Vector]):
 
     def step(self, action: Vector) -> Step:
         self.acted = self.always
-        observation, reward, terminated, truncated, info = super().step(
-            self.act(action)
-        )
+        action = self.act(action)
+        observation, reward, terminated, truncated, info = super().step(action)
         flag(info, self.acted)
         return self.observe(observation), reward, terminated, truncated, info

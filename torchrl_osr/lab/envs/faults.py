@@ -67,12 +67,7 @@ class DynamicsChange(DisturbanceWrapper):
     """
 
     def __init__(
-        self,
-        env: Env,
-        *,
-        mass: float = 1.0,
-        friction: float = 1.0,
-        gravity: float = 1.0,
+        self, env: Env, *, mass: float = 1, friction: float = 1, gravity: float = 1
     ) -> None:
         check_positive("mass", mass)
         super().__init__(env, always=(mass, friction, gravity) != (1, 1, 1))

@@ -157,6 +157,5 @@ class ExternalPush(TimedDisturbance):
 
     def act(self, action: Vector) -> Vector:
         self.acted = 0 <= self.count() < self.duration and self.force > 0
-        force = self.acted * self.sign * self.force
-        self.bare.data.xfrc_applied[self.body, 0] = force
+        self.bare.data.xfrc_applied[self.body, 0] = self.acted * self.sign * self.force
         return action

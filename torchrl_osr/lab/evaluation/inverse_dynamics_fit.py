@@ -41,8 +41,7 @@ def inverse_dynamics_report(
     action = data.get("action")
     report = {"nll": -distribution.log_prob(action).mean().item(), "rows": len(data)}
     if isinstance(distribution, ONE_HOT):
-        accuracy = (distribution.mode * action).sum(-1).mean().item()
-        return report | {"accuracy": accuracy}
+        return report | {"accuracy": (distribution.mode * action).sum(-1).mean().item()}
     error = (action - distribution.deterministic_sample).square().sum(0)
     r2 = 1 - error / (action - action.mean(0)).square().sum(0)
     return report | {"r2": r2.tolist()}

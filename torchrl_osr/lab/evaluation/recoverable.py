@@ -58,12 +58,8 @@ class RecoverableStates:
 
 def disturbances_of(names: Iterable[str]) -> list[str]:
     """Return the distinct disturbances, sorted by kind and strength."""
-
-    def order(name: str) -> tuple[str, float]:
-        kind, _, strength = name.rpartition(" ")
-        return kind, float(strength)
-
-    return sorted({*names}, key=order)
+    parts = {name: name.rpartition(" ") for name in names}
+    return sorted(parts, key=lambda name: (parts[name][0], float(parts[name][2])))
 
 
 def load_recoverable_states(env_name: str, half: str = "public") -> RecoverableStates:

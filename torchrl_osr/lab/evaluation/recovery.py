@@ -45,8 +45,7 @@ class DataDistance:
             raise ValueError(f"distances need at least 12 rows, got {len(data)}.")
         loc, scale = observation_statistics(data)
         self._loc, self._scale = loc.cpu().double(), scale.cpu().double()
-        generator = torch.Generator().manual_seed(seed)
-        order = torch.randperm(len(data), generator=generator)
+        order = torch.randperm(len(data), generator=torch.Generator().manual_seed(seed))
         states, others = (
             data[rows]["observation"].cpu()
             for rows in (order[held_out:][:MAX_REFERENCE], order[:held_out])
@@ -88,8 +87,7 @@ class Trajectory:
         if True not in self.disturbed:
             return None
         first = self.disturbed.index(True)
-        rest = [*self.disturbed[first:], False]
-        return first, first + rest.index(False) - 1
+        return first, first + [*self.disturbed[first:], False].index(False) - 1
 
     def alive_after(self, end: int) -> bool | None:
         """Return whether it stands :data:`STEPS_AFTER` entries after ``end``.

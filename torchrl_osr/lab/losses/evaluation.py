@@ -57,8 +57,7 @@ class FQELoss(ActorCriticLoss):
     def losses(self, batch: Transitions) -> Losses:
         action = entry(batch.rows, nested("next", self.tensor_keys.action))
         with torch.no_grad():
-            params = self.target_qvalue_network_params
-            next_value = self.q(batch.s_next, action, params)
+            next_value = self.q(batch.s_next, action, self.target_qvalue_network_params)
             target = torch.stack([self.td_target(batch, each) for each in next_value])
             if self.value_bounds is not None:
                 target = target.clamp(*self.value_bounds)

@@ -99,13 +99,11 @@ class StateDeviationLoss(ActorCriticLoss):
         self.num_samples, self.kernel_width = num_samples, kernel_width
         self.threshold = threshold
         self.log_multiplier = nn.Parameter(torch.zeros(()))
-        losses = ["loss_deviation", "loss_multiplier"]
-        self.declare(losses, ["deviation", "multiplier"])
+        self.declare(["loss_deviation", "loss_multiplier"], ["deviation", "multiplier"])
 
     def input_keys(self) -> list[NestedKey]:
         states = state_keys([*self.actor_network.in_keys, "observation"])
-        perturbed = [nested(self.tensor_keys.perturbed, key) for key in states]
-        return [*states, *perturbed]
+        return [*states, *(nested(self.tensor_keys.perturbed, key) for key in states)]
 
     def losses(self, batch: Transitions) -> Losses:
         value, valid = self.deviation(batch), batch.is_data

@@ -124,9 +124,7 @@ def learning_curves(tables: RunTables) -> Figure:
         style = f"{line}{'' if len(x) > 1 else 'o'}"
         (lines[method],) = panels[data].plot(x, mean, style, color=color, linewidth=1.6)
         if played["run"].nunique() > 1:
-            panels[data].fill_between(
-                x, low, high, color=color, alpha=0.15, linewidth=0
-            )
+            panels[data].fill_between(x, low, high, color=color, alpha=0.15, lw=0)
     figure.legend(
         list(lines.values()), [_wrapped(name, 100) for name in lines],
         loc="outside upper center", frameon=False, fontsize=8,

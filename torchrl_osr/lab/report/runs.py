@@ -223,9 +223,7 @@ def _read(folder: Path) -> _Run:
     in_layout = name == f"seed{config['seed']}"
     mean, share = returns[f"data_{measure}"], config["data.random_share"]
     data = f"{env} {config['data.source']}{f' {path}' if path else ''}"
-    packages = {
-        f"{name} {each}" for of in versions for name, each in (of or {}).items()
-    }
+    packages = {f"{name} {v}" for of in versions for name, v in (of or {}).items()}
     facts = {
         "folder": str(folder),
         "method": above if in_layout else method,

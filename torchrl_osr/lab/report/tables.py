@@ -31,8 +31,7 @@ from torchrl_osr.lab.report.runs import RunTables
 def recent(episodes: pd.DataFrame, number: int = NUM_RECENT) -> pd.DataFrame:
     """Select the undisturbed episodes of the last evaluations, without step 0."""
     found = episodes[(episodes["suite"] == "") & (episodes["step"] > 0)]
-    rank = found.groupby("run")["step"].rank("dense", ascending=False)
-    return found[rank <= number]
+    return found[found.groupby("run")["step"].rank("dense", ascending=False) <= number]
 
 
 def by_run(episodes: pd.DataFrame) -> list[Array]:
@@ -86,9 +85,7 @@ def robustness_table(episodes: pd.DataFrame) -> pd.DataFrame:
             }
             if name:
                 rows.setdefault((data, name), {})[method] = row | _recovery(there)
-    flat = {
-        (*key, method): row for key, of in rows.items() for method, row in of.items()
-    }
+    flat = {(*key, name): row for key, of in rows.items() for name, row in of.items()}
     return frame_of(flat, "data", "disturbance", "method")
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 _PACKAGE = Path(__file__).parents[2]
-_CHECKOUT = _PACKAGE.parent
 
-CONF = str((_PACKAGE if (_PACKAGE / "conf").is_dir() else _CHECKOUT) / "conf")
+CONF = str((_PACKAGE if (_PACKAGE / "conf").is_dir() else _PACKAGE.parent) / "conf")
 """Folder of the configuration: in the installed package, or in the checkout."""

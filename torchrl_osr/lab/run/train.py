@@ -87,9 +87,8 @@ class Phases:
         # every state, which is the paper's mixed data set.
         self.data = load_training_data(config, device, self.learner.objective.in_keys)
         write_config(run.folder, config)  # with the checksum of the data
-        self.perturbation = StatePerturbation(
-            config.perturbation.std, seed=config.seed
-        ).to(device)
+        noise = StatePerturbation(config.perturbation.std, seed=config.seed)
+        self.perturbation = noise.to(device)
         self.data.buffer.append_transform(self.perturbation)
 
     def trainer(
@@ -373,18 +372,14 @@ def report(run: Run, data_mean: float | None, trainer: OfflineTrainer) -> float:
     results = {"versions": package_versions(), f"data_{measure}": data_mean, **rows}
     write_json(folder / "returns.json", results | {"evaluations": history})
     name = f"{config.env.name} {config.data.source}"
-    learning_curve(
-        history,
-        read_scalars(folder / "csv" / "scalars" / "policy"),
-        folder / "curve.png",
-        title=f"{name}, {run.method}, seed {config.seed}",
-        data_mean=data_mean,
-    )
+    scalars = read_scalars(folder / "csv" / "scalars" / "policy")
+    title, curve = f"{name}, {run.method}, seed {config.seed}", folder / "curve.png"
+    learning_curve(history, scalars, curve, title=title, data_mean=data_mean)
     for logger in trainer.loggers:
         if isinstance(logger, WandbLogger):
             import wandb
 
-            logger.experiment.log({"curve": wandb.Image(str(folder / "curve.png"))})
+            logger.experiment.log({"curve": wandb.Image(str(curve))})
             logger.experiment.finish()
     if not history:
         print(f"\n{name}, in {folder}: the policy is trained, and was never played")
