@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -47,9 +46,7 @@ class ReferenceReturns(NamedTuple):
 
     def score(self, episode_return: Any) -> Any:
         """Return normalised scores in percent for one return or an array."""
-        above = np.asarray(episode_return, dtype=np.float64) - self.random
-        score = 100.0 * above / (self.expert - self.random)
-        return float(score) if np.ndim(episode_return) == 0 else score
+        return 100.0 * (episode_return - self.random) / (self.expert - self.random)
 
 
 REFERENCE_RETURNS: dict[str, ReferenceReturns] = {
