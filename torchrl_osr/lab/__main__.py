@@ -22,6 +22,8 @@ COMMANDS = (
 )  # fmt: skip
 """``conf/help.txt`` describes them."""
 
+COLUMNS = "data.columns=", "data.columns."
+
 CONFIGS = {
     "data": "check_data", "train": "train", "collect": "collect",
     "evaluate": "evaluation/evaluate",
@@ -55,6 +57,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         # For modules of the user's; last, where they replace no installed package.
         sys.path.append(os.getcwd())
         with errors_as_sentences():
+            if len({each[:13] for each in rest} & {*COLUMNS}) > 1:
+                raise ValueError(
+                    "data.columns=<file> replaces all data.columns.<part>=...: write "
+                    "these into the file."
+                )
             import_module(f"torchrl_osr.lab.cli.{name.replace('-', '_')}").main()
     else:
         known = ", ".join(COMMANDS)

@@ -52,9 +52,9 @@ def conformal_threshold(scores: Tensor, rate: float) -> float:
     needed = math.ceil(round(1 / rate, 9)) - 1
     if len(scores) < needed:
         raise ValueError(
-            f"false alarms in {rate:.3g} of all episodes need {needed} held-out "
-            f"episodes, and there are {len(scores)}. Record more, or ask for a rate of "
-            f"at least {math.ceil(1000 / (len(scores) + 1)) / 1000}."
+            f"false alarms in {rate:.3g} of all episodes need {needed} episodes to "
+            f"calibrate on, and there are {len(scores)}. Record more, or ask for a "
+            f"rate of at least {math.ceil(1000 / (len(scores) + 1)) / 1000}."
         )
     place = math.ceil(round((len(scores) + 1) * (1 - rate), 9))
     return float(scores.sort().values[place - 1])
@@ -138,7 +138,7 @@ def fit_monitor(
     episode: Tensor,
     counts: Tensor | None = None,
     *,
-    false_alarms: float = 0.05,
+    false_alarms: float | None = 0.05,
     num_states: int = 1000,
     seed: int = 0,
 ) -> DataMonitor:
@@ -151,7 +151,8 @@ def fit_monitor(
             before a fall: falls that the data show would raise no alarm. Default: all.
 
     Keyword Args:
-        false_alarms: see :meth:`DataMonitor.calibrate`. Default 0.05.
+        false_alarms: see :meth:`DataMonitor.calibrate`. Default 0.05. ``None`` leaves
+            the calibration to you.
         num_states: ``K``, at most. Default 1000.
         seed: of the halves and of the subset. Default 0.
 
@@ -169,7 +170,6 @@ def fit_monitor(
     held_out = torch.isin(episode, order[len(order) // 2 :])
     known = (~held_out & counts).nonzero()[:, 0]
     if not len(known):
-        conformal_threshold(torch.zeros(len(order) - len(order) // 2), false_alarms)
         raise ValueError("no row counts as data: all are near a terminal state.")
     data = observation[known].float()
     chosen = torch.randperm(len(data), generator=generator)[:num_states]
@@ -180,5 +180,6 @@ def fit_monitor(
     monitor.scale.copy_(variance.sqrt().clamp_min(SMALLEST_SCALE))
     monitor.states.copy_((data[chosen] - monitor.loc) / monitor.scale)
     rest = (each[held_out] for each in (observation, episode, counts))
-    monitor.calibrate(*rest, false_alarms=false_alarms)
+    if false_alarms is not None:
+        monitor.calibrate(*rest, false_alarms=false_alarms)
     return monitor

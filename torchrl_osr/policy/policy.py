@@ -10,7 +10,7 @@ import io
 import json
 import logging
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -94,7 +94,8 @@ class Policy(nn.Module):
 
         Args:
             observation: as the environment gives it, one ``[S]`` or many ``[B, S]``. A
-                dictionary is joined, like the data, in the alphabetical order of keys.
+                dictionary of the log's columns is joined in their order, another one in
+                the alphabetical order of its keys, like an environment's data.
 
         Returns:
             Actions as the environment takes them: float32, ``[A]`` or ``[B, A]``,
@@ -244,7 +245,9 @@ class Policy(nn.Module):
 
     def _given(self, observation: Any, *, finite: bool = True) -> tuple[Any, Tensor]:
         """Return the observation as one vector, and as rows on the policy's device."""
-        given = joined(observation)
+        data = self.record.get("source", {}).get("data") or {}
+        columns = (data.get("columns") or {}).get("observation") or ()
+        given = joined(observation, columns)
         return given, self._rows("observation", given, self.observation_size, finite)
 
     def _rows(self, name: str, value: Any, size: int, finite: bool = True) -> Tensor:
@@ -338,11 +341,12 @@ def _onnx(
     return content
 
 
-def joined(observation: Any) -> Any:
-    """Return a dictionary's vectors as one, in the alphabetical order of its keys."""
+def joined(observation: Any, columns: Sequence[str] = ()) -> Any:
+    """Return a dictionary's vectors as one, in the order of columns or alphabet."""
     if not isinstance(observation, Mapping):
         return observation
-    parts = [joined(observation[key]) for key in sorted(observation)]
+    keys = columns if {*columns} == {*observation} else sorted(observation)
+    parts = [joined(observation[key]) for key in keys]
     if all(isinstance(part, Tensor) for part in parts):
         return torch.cat(parts, -1)
     return np.concatenate([np.atleast_1d(part) for part in parts], -1)

@@ -22,7 +22,7 @@ def test_from_a_run_to_each_kind_of_file(tmp_path, run):
         code, output = run(tmp_path, "export", *arguments)
         assert code == 0, output
         step = 10 if "best" in arguments[0] else 900
-        assert f"OSRLoss, Hopper-v5, step {step}\n" in output
+        assert f"OSRLoss, Hopper-v5, step {step}, no alarm\n" in output
         assert float(output.rpartition(" ")[2]) <= 1e-6
 
 
@@ -46,7 +46,7 @@ def test_a_monitor_of_the_runs_data(tmp_path, run):
     alarm = load_policy(tmp_path / "m.safetensors").monitor(rows)[1].reshape(100, 40)
     assert alarm[late].all()
     assert np.where(late, False, alarm).any(1).mean() <= 0.1
-    given.append("monitor.episodes=own.npz")
+    given += ["monitor.episodes=own.npz", "monitor.false_alarms=0.01"]
     code, output = run(tmp_path, "export", "run", "m.pt2", *given)
     assert code == 0, output
     assert "100 episodes of own.npz" in output

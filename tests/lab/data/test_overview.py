@@ -37,28 +37,26 @@ def test_a_sound_log_gives_no_reason_to_complain():
     assert said(make_log()) == []
 
 
+LOG = make_log()
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"reward": np.full(1200, 2.0)}, "reward is 2 in every row: all policies"),
-        ({"action": np.sign(make_log()["action"])}, "at one of its bounds in 100%"),
-        ({"action": make_log()["action"] / 100}, "stays within 0.9% of its bounds"),
-        (
-            {n: make_log()[n].repeat(2, 0)[:1200] for n in make_log()},
-            "repeat an earlier",
-        ),
+        ({"action": np.sign(LOG["action"])}, "at one of its bounds in 100%"),
+        ({"action": LOG["action"] / 100}, "stays within 0.9% of its bounds"),
+        ({n: LOG[n].repeat(2, 0)[:1200] for n in LOG}, "repeat an earlier"),
+        ({"observation": LOG["observation"].repeat(5, 0)[:1200]}, "does not change"),
         (
             {"observation": 1.7e9 + np.c_[np.zeros(1200), np.arange(1200)] / 50},
             "1,199 changes of observation[1] from row to row",
         ),
         (
-            {"terminated": make_log()["truncated"], "truncated": np.zeros(1200)},
+            {"terminated": LOG["truncated"], "truncated": np.zeros(1200)},
             "all 30 episodes are terminated after 40 steps, like at a time limit",
         ),
-        (
-            {"next_observation": make_log()["observation"] + 1},
-            "after 100% of the rows the next row",
-        ),
+        ({"next_observation": LOG["observation"] + 1}, "after 100% of the rows the"),
     ],
 )
 def test_findings_name_what_looks_wrong(changes, message):

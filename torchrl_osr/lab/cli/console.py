@@ -81,6 +81,8 @@ def sentence(error: BaseException) -> str:
         return _configuration_error(error)
     if isinstance(error, ModuleNotFoundError):
         return f"{error}. Commands need what 'torchrl-osr[train]' installs."
+    if isinstance(error, FileNotFoundError) and error.filename:
+        return f"there is no file {error.filename}."
     raised = [frame.f_globals["__name__"] for frame, _ in walk_tb(error.__traceback__)]
     # Unknown where it was raised in another process.
     lost = not raised or type(error.__cause__).__name__ == "_RemoteTraceback"
@@ -101,7 +103,7 @@ def _configuration_error(error: Any) -> str:
     from hydra.errors import MissingConfigException, OverrideParseException
     from omegaconf.errors import ConfigAttributeError, ConfigKeyError
 
-    cause = error.__cause__
+    cause = error.__cause__ or error
     if "schema@recovery" in str(error):
         return "this loss has a recovery term of its own: leave out recovery=..."
     if isinstance(error, MissingConfigException) and error.options:
@@ -124,12 +126,14 @@ def _configuration_error(error: Any) -> str:
         escaped = value.replace('"', '\\"')
         quoted = shlex.quote(f'{key}="{escaped}"')
         if several:
-            why = "has several values: add -m to run each, or quote what is one value"
+            why = f"has several values: add -m to run each, write a list, [{value}], "
+            why += "or quote what is one value"
         elif equals:
             why = "cannot be read: quote a value with blanks, brackets or quotes"
         else:
             return f"{given!r} is no key=value: --help shows the options."
         return f"{given} {why}, as in {quoted}."
-    lines = [str(each).strip().split("\n")[0] for each in (error, cause) if each]
+    both = (error, error.__cause__)
+    lines = [str(each).strip().split("\n")[0] for each in both if each]
     lines[0] = lines[0].rpartition("raised while resolving interpolation: ")[2]
     return ": ".join(lines)

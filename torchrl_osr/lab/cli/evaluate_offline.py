@@ -21,7 +21,7 @@ from typing import Any
 
 from torchrl_osr.lab.evaluation.tables import aligned_columns
 from torchrl_osr.lab.run.evaluate_offline import OfflineEvaluator
-from torchrl_osr.lab.run.load import checkpoints_of
+from torchrl_osr.lab.run.load import checkpoints_of, run_folder_of
 
 
 def main() -> None:
@@ -40,6 +40,10 @@ def main() -> None:
     add("--trust", action="append", default=[], metavar="MODULE", help="yours")
     options = vars(parser.parse_args())
     runs, tables = options.pop("runs"), defaultdict[Any, dict[str, Any]](dict)
+    for run in runs:
+        if "=" in run.name and not run.exists():
+            parser.error(f"{run} is no run; options have the form --data PATH.")
+        run_folder_of(run)  # before time is spent
     if options.pop("checkpoints"):
         runs = [each for run in runs for each in checkpoints_of(run)]
     evaluate = OfflineEvaluator(**options)
@@ -68,7 +72,10 @@ def ranking(results: Mapping[str, Mapping[str, Any]]) -> str:
     ]
     if others:
         lines.append(f"  To use the first: torchrl-osr export {best} policy.onnx")
-    if others and "xml" not in first:
-        lines.append("  In our tests, such an order of trained policies was no better")
-        lines.append("  than chance on walking robots: results/offline_evaluation.")
+    if "xml" not in first:
+        lines.append("  This does not see a policy leave its data: it is no permission")
+        lines.append(
+            "  to switch a robot on. In our tests with walking robots, the order"
+        )
+        lines.append("  of policies was not better than chance: docs/no_simulator.md.")
     return "\n".join(lines)

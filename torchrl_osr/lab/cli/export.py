@@ -49,7 +49,7 @@ def main() -> None:
     add("settings", nargs="*", metavar="key=value", help="of the monitor")
     add("--output", choices=("action", "value"), default="action", help="of the graph")
     add("--trust", action="append", default=[], metavar="MODULE", help="yours")
-    options = parser.parse_args()
+    options = parser.parse_intermixed_args()
     if options.path.suffix not in (SUFFIX, *GRAPHS):
         parser.error(f"the path must end in {SUFFIX}, {' or '.join(GRAPHS)}.")
     if options.settings and options.output == "value":
@@ -70,9 +70,11 @@ def main() -> None:
         policy.export(options.path, options.output)
     deviation = check(policy, options.path, options.output)
     origin = {"env_id": "?", "step": "?"} | policy.record["source"]
+    alarm = "an alarm" if policy.data_monitor is not None else "no alarm"
     print(
         f"{options.path}: {options.path.stat().st_size:,} bytes, "
-        "{loss}, {env_id}, step {step}\n".format(**origin)
+        "{loss}, {env_id}, step {step}, ".format(**origin)
+        + f"{alarm}\n"
         + f"largest deviation on {ROWS} observations: {deviation:.1e}"
     )
 

@@ -100,7 +100,13 @@ def _about_order(data: TensorDict) -> Iterator[str]:
     if jumps := large.any(1).nonzero()[:, 0].tolist():
         yield (
             f"in {len(jumps):,} rows, such as {jumps[0]}, the state jumps by more than "
-            f"{JUMP} times its usual change: flags may be missing, or a row late."
+            f"{JUMP} times its usual change: an angle may wrap, or a flag be missing."
+        )
+    still = (change == 0).all(1).double().mean().item()
+    if still > 0.5:
+        yield (
+            f"in {still:.0%} of the rows the state does not change: the sensors may be "
+            "slower than the log."
         )
     followed = is_followed(data)
     inside = ~data["next", "done"][:-1, 0]
@@ -115,7 +121,7 @@ def _about_order(data: TensorDict) -> Iterator[str]:
     if double.mean() > SOME / 10:
         yield (
             f"{double.sum():,} rows, such as {double.idxmax()}, repeat an earlier one: "
-            "rows may be double, or the sensors slower than the log."
+            "rows may be double."
         )
     rows = (followed[:-1] & followed[1:]).nonzero()[:MOST_ROWS, 0] + 1
     if len(rows) >= FEW_ROWS:

@@ -21,7 +21,7 @@ def split_held_out(
     if not 0 < count < rows:
         raise ValueError(
             f"held_out={held_out!r} would hold out {count} of {rows} rows; "
-            "expected at least one row on each side."
+            "expected at least one row on each side, as with data.held_out=0.2."
         )
     order = torch.randperm(rows, generator=torch.Generator().manual_seed(seed))
     mask = torch.zeros(rows, dtype=torch.bool)

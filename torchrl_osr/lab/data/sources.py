@@ -238,7 +238,7 @@ def _check_fit(
         raise ValueError(
             f"the data have {ours[0]} observation and {ours[1]} action entries, "
             f"{env_id} has {spec.observation_size} and {spec.action_size} ({kind}): "
-            "choose the env that the data are of."
+            "choose the env that the data are of, or env=none."
         )
     if manifest.get("source") == "minari" and not spec.discrete:
         bounds: Any = manifest["action_bounds"]

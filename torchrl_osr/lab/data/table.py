@@ -67,7 +67,7 @@ def log_files(path: str | Path | Sequence[str]) -> list[Path]:
         found = [whole] if whole.is_file() else [*map(Path, sorted(glob(str(whole))))]
         files += found
         if not found:
-            cure = "give its place with data.path=..."
+            cure = "give its place (data.path=..., evaluate-offline --data ...)"
             raise FileNotFoundError(f"there is no file {whole}: {cure}")
     return files
 

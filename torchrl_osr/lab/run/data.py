@@ -76,8 +76,8 @@ def load_data(
         place = "" if options.path is None else f" data.path={options.path}"
         raise ValueError(
             f"data={options.source}{place} has other contents than those that the run "
-            "began with: give data.path=<place of these>, or continue the run on the "
-            "new ones with 'train resume=<its folder> force=true'."
+            "began with: give data.path=<place of these>, begin another run with "
+            "hydra.run.dir=<folder>, or continue with 'resume=<its folder> force=true'."
         )
     return data, manifest
 

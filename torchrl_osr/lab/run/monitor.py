@@ -39,10 +39,9 @@ def monitor_of_run(
     env = replace(config.env, id=None)  # its bounds are known: no simulator is made
     data, _ = load_data(env if log.path else config.env, log)
     episode, counts = rows_of(data, options.fall_steps)
-    rate = options.false_alarms
-    monitor = fit_monitor(
-        data["observation"][:], episode, counts, false_alarms=rate, seed=log.seed
-    )
+    rate, states = options.false_alarms, data["observation"][:]
+    wanted = rate if options.episodes is None else None
+    monitor = fit_monitor(states, episode, counts, false_alarms=wanted, seed=log.seed)
     source = "held-out episodes of the log"
     if options.episodes is not None:
         source = f"episodes of {options.episodes}"
