@@ -68,13 +68,13 @@ def test_exact_coverage_of_exchangeable_episodes(number, rate):
 
 def test_too_few_episodes_say_how_many_are_needed(log):
     for rate, needed in [(0.05, 19), (0.1, 9), (0.01, 99), (1 / 3, 2)]:
-        with pytest.raises(ValueError, match=f"need {needed} held-out .* are 1.*0.5"):
+        with pytest.raises(ValueError, match=f"need {needed} episodes .* are 1.*0.5"):
             conformal_threshold(torch.ones(1), rate)
         conformal_threshold(torch.ones(needed), rate)
     with pytest.raises(ValueError, match="within 0 and 1"):
         conformal_threshold(torch.ones(5), 0.0)
     one = log[0], np.zeros(ROWS, int)
-    with pytest.raises(ValueError, match="need 19 held-out .* are 1"):
+    with pytest.raises(ValueError, match="need 19 episodes .* are 1"):
         monitor_of(one)
 
 

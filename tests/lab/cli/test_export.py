@@ -66,7 +66,7 @@ def test_what_cannot_be_exported_is_one_line(tmp_path, run):
     make_run(tmp_path / "run")
     for arguments, message in [
         (["nowhere", "p.onnx"], "there is no run and no checkpoint at nowhere."),
-        (["run", "p.pt2", "monitor.rate=1"], "Key 'rate' not in 'MonitorConfig'"),
+        (["run", "p.pt2", "monitor.rate=1"], "there is no key 'monitor.rate'; its"),
         (
             ["run", "p.pt2", "monitor.fall_steps=1", "--output", "value"],
             "leave out --output value",
