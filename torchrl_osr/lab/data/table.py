@@ -95,6 +95,8 @@ def log_parts(
         try:
             arrays = _read(file, chosen)
             rows = assemble(about["columns"], arrays)
+            if not len(rows["action"]):
+                raise ValueError("it has names of columns, and no rows.")
             if step := about["columns"].get("step"):
                 rows = _sorted(rows, step[0], about)
         except (OSError, ValueError) as error:
@@ -210,6 +212,8 @@ def find_columns(
         cure = f"name it with data.columns.{part}=<name> (data=file or data=lerobot)"
         if missing[0] == "terminated":
             cure += ", or data.columns.terminated=false if nothing ends the task"
+        elif part == "truncated":
+            cure += "; a column with the number of the episode is enough"
         raise ValueError(
             f"the data lack {', '.join(missing)}; there are {', '.join(names)}: {cure}."
         )
@@ -337,7 +341,8 @@ def _sorted(columns: Arrays, name: str, about: dict[str, Any]) -> Arrays:
             f"{wrong.sum()} places: rows are missing or double, or the rate changes."
         )
         if (same & (gaps == 0)).any() or "next_observation" not in columns:
-            raise ValueError(f"{found} Start a new episode, or give next_observation.")
+            cure = "Resample to one rate, start new episodes, or give next_observation."
+            raise ValueError(f"{found} {cure}")
         warnings.append(found)
     if about.setdefault("steps", steps) != steps:
         warnings.append(f"steps are {about['steps']}, and in another file {steps}.")
