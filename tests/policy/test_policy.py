@@ -108,6 +108,7 @@ def test_actions_are_within_their_bounds(observation, low, width):
         ("osr", [np.zeros((4, 3)), np.full((4, 2), 1.6)], r"within \[-2\.0.*4\.0"),
         ("discrete", [np.zeros((2, 3)), np.array([0, 2])], "lie within 0 and 1"),
         ("discrete", [np.zeros((4, 3)), np.array([0, 1])], r"must have shape \(4,\)"),
+        ("discrete", [np.zeros((4, 3)), np.zeros(4)], "its type torch.float64"),
     ],
 )
 def test_what_is_not_valued(make_policy, kind, given, message):

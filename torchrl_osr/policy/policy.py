@@ -272,11 +272,13 @@ class Policy(nn.Module):
             shape = torch.Size([*observation.shape[:-1], self.action_size])
             margin = 5e-6 * (self.high - self.low)  # a caller's own arithmetic rounds
             least, most = self.low - margin, self.high + margin
-        if action.shape != shape or not ((action >= least) & (action <= most)).all():
+        whole = not self.discrete or not action.is_floating_point()
+        inside = ((action >= least) & (action <= most)).all()
+        if action.shape != shape or not (inside and whole):
             raise ValueError(
                 f"the action must have shape {tuple(shape)} and lie within "
                 f"{least.tolist()} and {most.tolist()}; its shape is "
-                f"{tuple(action.shape)}."
+                f"{tuple(action.shape)}, its type {action.dtype}."
             )
         return action.long() if self.discrete else action
 

@@ -40,6 +40,8 @@ def main() -> None:
     add("--trust", action="append", default=[], metavar="MODULE", help="yours")
     options = vars(parser.parse_args())
     runs, tables = options.pop("runs"), defaultdict[Any, dict[str, Any]](dict)
+    if options["steps"] is not None and options["steps"] < 1:
+        parser.error(f"--steps {options['steps']}; expected at least 1.")
     for run in runs:
         if "=" in run.name and not run.exists():
             parser.error(f"{run} is no run; options have the form --data PATH.")

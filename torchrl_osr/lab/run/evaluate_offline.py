@@ -90,6 +90,7 @@ class OfflineEvaluator:
             if "box" not in self._known:
                 low, high = env.action_low or -1.0, env.action_high or 1.0
                 body = Body(self.xml, self.frame_skip, low=low, high=high)
+                print(f"a row is {self.frame_skip} x {body.model.opt.timestep:g} s")
                 self._known["box"] = fitted_grey_box(rows, body, **training)
             model = self._known["box"]
             values = rolled_out_values(model, rows, policy, gamma=gamma)[None]
