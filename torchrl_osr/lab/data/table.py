@@ -95,9 +95,7 @@ def log_parts(
         try:
             arrays = _read(file, chosen)
             rows = assemble(about["columns"], arrays)
-            if not len(rows["action"]):
-                raise ValueError("it has names of columns, and no rows.")
-            if step := about["columns"].get("step"):
+            if (step := about["columns"].get("step")) and len(rows["action"]):
                 rows = _sorted(rows, step[0], about)
         except (OSError, ValueError) as error:
             raise ValueError(f"{file}: {error}") from error
