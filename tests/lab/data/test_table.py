@@ -226,7 +226,7 @@ def test_wrong_columns_are_named(names, wanted, message):
         ("obs_0,action,reward,terminated,episode\n1,a,3,0,0\n", "'action' holds other"),
         ("obs_0,action,reward,terminated,episode\n1,.2,3,0,0,9\n", "more values than"),
         ("obs_0,action,reward,terminated,episode\n1,.2,3\n", "no value in row 0"),
-        ("obs_0,action,reward,terminated,episode\n", "hold no rows"),
+        ("obs_0,action,reward,terminated,episode\n", "holds no rows"),
         ("0.5,.2,3,0,0\n1,.2,3,0,0\n", "the first line holds numbers; .* a header"),
         ("1,1,0\n1,.2,3\n", "the first line holds numbers"),
         ("obs,obs,action\n1,.2,3\n", "two columns are named 'obs'"),

@@ -95,7 +95,9 @@ def log_parts(
         try:
             arrays = _read(file, chosen)
             rows = assemble(about["columns"], arrays)
-            if (step := about["columns"].get("step")) and len(rows["action"]):
+            if not len(rows["action"]):
+                raise ValueError("it holds no rows; expected at least one transition.")
+            if step := about["columns"].get("step"):
                 rows = _sorted(rows, step[0], about)
         except (OSError, ValueError) as error:
             raise ValueError(f"{file}: {error}") from error
