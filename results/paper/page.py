@@ -326,7 +326,7 @@ def draw_curves(
     colors = dict(zip(methods, COLORS, strict=False))
     down, across = -(-len(sets) // 3), min(3, len(sets))
     figure, grid = plt.subplots(
-        down, across, figsize=(3.7 * across, 3 * down),
+        down, across, figsize=(3.4 * across + 1.3, 3 * down),
         layout="constrained", sharex=True, squeeze=False,
     )  # fmt: skip
     for axes, data in zip(grid.flat, sets, strict=True):
@@ -337,7 +337,8 @@ def draw_curves(
             axes.plot(by_seed.mean(axis=1), color=color, lw=2, label=TITLES[method])
         axes.set_title(name_of(data), fontsize=10, loc="left")
         axes.spines[["top", "right"]].set_visible(False)
-    grid[0, 0].legend(frameon=False, fontsize=8)
+    lines = grid[0, 0].get_legend_handles_labels()
+    figure.legend(*lines, loc="outside right upper", frameon=False, fontsize=8)
     figure.supxlabel("minutes of updates on one core", fontsize=10)
     figure.supylabel("normalised score", fontsize=10)
     figure.savefig(to, dpi=110)
