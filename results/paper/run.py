@@ -50,7 +50,7 @@ METHODS = {
 """In the order in which they are trained."""
 
 OWN = {
-    **dict.fromkeys(("osr", "cql_noisy_bc", "cql"), ("loss.min_q_weight", 5, 20)),
+    **dict.fromkeys(("osr", "cql", "cql_noisy_bc"), ("loss.min_q_weight", 5, 20)),
     "td3_bc": ("loss.alpha", 2.5, 10),
     "iql": ("loss.temperature", 3, 10),
 }
