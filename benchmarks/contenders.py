@@ -144,13 +144,13 @@ def loop_update(loss: LossModule) -> Update:
     optimizer = torch.optim.Adam(loss.parameters(), lr=RATE)
 
     def step(batch: TensorDictBase) -> None:
-        losses = loss(batch)
+        losses = loss(batch.copy())
         sum(value for name, value in losses.items() if "loss_" in name).backward()
         optimizer.step()
         optimizer.zero_grad()
         updater.step()
 
-    return lambda batch: step(batch.copy())
+    return step
 
 
 def tight_update(plain: PlainOSR) -> Update:

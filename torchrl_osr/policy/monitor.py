@@ -170,8 +170,8 @@ def fit_monitor(
     held_out = torch.isin(episode, order[len(order) // 2 :])
     known = (~held_out & counts).nonzero()[:, 0]
     if not len(known):
-        half = torch.zeros(len(order) - len(order) // 2)
-        conformal_threshold(half, 0.5 if false_alarms is None else false_alarms)
+        if false_alarms is not None:  # there may be too few episodes
+            conformal_threshold(torch.zeros(len(order) - len(order) // 2), false_alarms)
         raise ValueError("no row counts as data: all are near a terminal state.")
     data = observation[known].float()
     chosen = torch.randperm(len(data), generator=generator)[:num_states]

@@ -75,9 +75,9 @@ def ranking(results: Mapping[str, Mapping[str, Any]]) -> str:
     if others:
         lines.append(f"  To use the first: torchrl-osr export {best} policy.onnx")
     if "xml" not in first:
-        lines.append("  This does not see a policy leave its data: it is no permission")
-        lines.append(
-            "  to switch a robot on. In our tests with walking robots, the order"
-        )
-        lines.append("  of policies was not better than chance: docs/no_simulator.md.")
+        lines += [
+            "  This does not see a policy leave its data: it is no permission",
+            "  to switch a robot on. In our tests with walking robots, the order",
+            "  of policies was not better than chance: docs/no_simulator.md.",
+        ]
     return "\n".join(lines)
