@@ -13,18 +13,18 @@ from torchrl_osr.lab.run.config import read_run
 
 def test_columns_become_a_run_that_the_same_call_continues(tmp_path):
     rng, folder = np.random.default_rng(0), tmp_path / "o'neil" / "my arm"
-    frame = pd.DataFrame(
-        rng.random((60, 4)), columns=["obs_0", "obs_1", "act", "reward"]
-    )
-    frame = frame.assign(terminated=0, episode=np.arange(60) // 20)
+    names = ["obs_0", "obs_1", "act", "reward"]
+    frame = pd.DataFrame(rng.random((60, 4)), columns=names)
+    frame = frame.assign(terminated=0, episode=[f"run{row // 20}" for row in range(60)])
     small = [each for each in SMALL if not each.startswith("data.num")][1:]
     given = "loss=td3_bc", "data.action_bounds=[-1,3]"
+    with pytest.raises(ValueError, match=r"'act' holds other than numbers"):
+        fit(frame.assign(act="left"), folder, *small, *given)
     policy = fit(frame, folder, *small, *given)
     assert policy.act(np.zeros(2)).shape == (1,)
     assert (policy.low, policy.high) == (-1, 3)
     assert read_run(folder).env.name == "log-my-arm"
-    again = fit(frame, folder, *small, *given)
-    assert again.act(np.zeros(2)) == policy.act(np.zeros(2))
-    with pytest.raises(ValueError, match=r"my arm.npz has other columns: choose anot"):
+    with pytest.raises(ValueError, match=r"my arm.npz has other contents than those"):
         fit(frame.assign(reward=0.5), folder, *small, *given)
-    fit(frame, folder, *small, *given)  # its columns are still there
+    again = fit(frame, folder, *small, *given)  # its columns are still there
+    assert again.act(np.zeros(2)) == policy.act(np.zeros(2))

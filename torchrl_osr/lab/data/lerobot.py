@@ -58,14 +58,14 @@ def read_lerobot(path: Any, columns: Mapping[str, Any], options: Reading) -> Dat
         about["warnings"] = [f"images and videos are left out: {', '.join(cameras)}."]
     files = log_files(escape(str(folder)) + "/data/chunk-*/file-*.parquet")
 
-    def parts() -> Iterator[Columns]:
+    def parts() -> Iterator[tuple[str, Columns]]:
         total = 0
-        for rows in log_parts(files, {**known, **columns}, about):
+        for place, rows in log_parts(files, {**known, **columns}, about):
             last = np.r_[np.diff(rows["episode"]) != 0, True]
             flag = np.reshape(rows["truncated" if by_truncated else "terminated"], -1)
             ended = last & (flag.astype(np.bool_) != by_truncated)
             total += len(last)
-            yield {**rows, "terminated": ended, "truncated": last & ~ended}
+            yield place, {**rows, "terminated": ended, "truncated": last & ~ended}
         if total != info["total_frames"]:
             raise ValueError(
                 f"{folder} holds {total:,} rows where meta/info.json says "

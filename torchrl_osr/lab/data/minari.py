@@ -59,7 +59,8 @@ def read_minari(
     episodes = [*_read(opened, sorted_space(opened.observation_space), progress)]
     columns = {n: np.concatenate([e[n] for e in episodes]) for n in episodes[0]}
     files = sorted(path for path in here.rglob("*") if path.is_file())
-    return convert([columns], options, {"source": "minari", "path": str(path)}, files)
+    about = {"source": "minari", "path": str(path)}
+    return convert([("", columns)], options, about, files)
 
 
 def _read(

@@ -77,20 +77,20 @@ class Reading:
 
 
 def convert(
-    parts: Iterable[Columns],
+    parts: Iterable[tuple[str, Columns]],
     options: Reading,
     about: Mapping[str, Any] | None = None,
     files: Iterable[Path] = (),
 ) -> Dataset:
     """Return transitions ``[N]`` and their manifest, with the checksum of ``files``.
 
-    Each part has columns of whole trajectories. ``about`` goes into the manifest; a
-    reader may fill it while it yields its parts.
+    Each part has its place, such as ``"a.csv: "``, and columns of whole trajectories.
+    ``about`` goes into the manifest; a reader may fill it while it yields its parts.
     """
     found: list[str] = []
     if options.action_bounds == "log":
         parts = [*parts]
-        options = replace(options, action_bounds=_range(parts))
+        options = replace(options, action_bounds=_range(dict(parts).values()))
         low, high = (
             "[" + ", ".join(f"{x:.4g}" for x in each) + "]"
             for each in options.action_bounds
@@ -100,8 +100,11 @@ def convert(
             f"{MARGIN:.0%} on either side: data.action_bounds=[low,high] sets others."
         )
     rows, episodes, counts = [], [], Counter[str]()
-    for columns in parts:
-        data, numbers, of_each = trajectories(columns, options)
+    for place, columns in parts:
+        try:
+            data, numbers, of_each = trajectories(columns, options)
+        except ValueError as error:
+            raise ValueError(f"{place}{error}") from error
         found += _vanishing(columns)
         counts.update(numbers)
         rows.append(data)
@@ -207,7 +210,7 @@ def transitions_from_columns(
         (1, [2.0, 2.0])
     """
     options = Reading(action_bounds, clip_actions, num_actions, missing)
-    return convert([columns], options)
+    return convert([("", columns)], options)
 
 
 def trajectories(

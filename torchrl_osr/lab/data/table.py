@@ -74,8 +74,8 @@ def log_files(path: str | Path | Sequence[str]) -> list[Path]:
 
 def log_parts(
     files: Sequence[Path], columns: Mapping[str, Any], about: dict[str, Any]
-) -> Iterator[Arrays]:
-    """Yield the columns of each file; put what was found into ``about``."""
+) -> Iterator[tuple[str, Arrays]]:
+    """Yield the place and columns of each file; put what was found into ``about``."""
 
     def chosen(names: list[str], **known: str) -> list[str]:
         """Return the columns to read by name; all files need those of the first."""
@@ -101,7 +101,7 @@ def log_parts(
                 rows = _sorted(rows, step[0], about)
         except (OSError, ValueError) as error:
             raise ValueError(f"{file}: {error}") from error
-        yield rows
+        yield f"{file}: ", rows
 
 
 def _read(path: Path, chosen: Callable[..., list[str]]) -> Arrays:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
@@ -50,16 +51,14 @@ def fit(
     register()
     folder = Path(folder)
     if hasattr(log, "items"):  # a mapping or a data frame
-        folder.mkdir(parents=True, exist_ok=True)
         columns: Any = {str(name): np.asarray(column) for name, column in log.items()}
+        for name, column in columns.items():
+            if column.dtype.kind == "O":  # text, or lists of one length
+                columns[name] = np.asarray(column.tolist())
         np.savez(content := BytesIO(), **columns)
-        log = folder / f"{folder.name}.npz"
-        same = not log.exists() or log.read_bytes() == content.getvalue()
-        if not same and "force=true" not in overrides:
-            raise ValueError(
-                f"{log} has other columns: choose another folder, or continue on these "
-                "with 'force=true'."
-            )
+        digest = hashlib.sha256(content.getvalue()).hexdigest()
+        log = folder / "columns" / digest[:8] / f"{folder.name}.npz"
+        log.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(log, content.getvalue())
     place = str(log).replace("'", "\\'")
     given = ["env=none", "data=file", f"data.path='{place}'", *overrides]
