@@ -429,7 +429,8 @@ def _unit_actions(action: Array, options: Reading) -> tuple[Array, int]:
         raise ValueError(
             f"'action' leaves its bounds in {outside.sum()} of {len(action)} rows, "
             f"first in row {row}: {action[row].tolist()}, where they are "
-            f"{low.tolist()} and {high.tolist()}. Give data.action_bounds=[low,high], "
-            "or data.clip_actions=true if the environment clipped them."
+            f"{low.tolist()} and {high.tolist()}. Give the env of this log (or "
+            "env=none), data.action_bounds=[low,high], or data.clip_actions=true if "
+            "the environment clipped them."
         )
     return np.clip(unit, -ACTION_LIMIT, ACTION_LIMIT), int(outside.sum())
