@@ -42,8 +42,8 @@ class StatePerturbation(Transform):
             the observation: a number, or one for each entry of the observation.
 
     Keyword Args:
-        in_keys: the states to perturb. Integers become floats. Default
-            ``["observation"]``.
+        in_keys: the states to perturb. Default ``["observation"]``. Integers become
+            floats here alone: convert images before (``ToTensorImage``).
         perturbed: where to write the perturbed states. Default ``"perturbed"``.
         seed: of the generator. Default: derived from torch's initial seed, the process
             and the number of transforms before this one.

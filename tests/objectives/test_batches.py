@@ -22,10 +22,6 @@ from objectives.losses import (
 )
 
 MASK, DONE = ("collector", "mask"), ("next", "done")
-# A model's likelihood is of the data, not of what a sampler finds important.
-WEIGHED = [
-    name for name in LOSSES if "loss_inverse_dynamics" not in LOSSES[name].trains
-]
 
 
 @every_loss
@@ -92,10 +88,9 @@ def test_reductions_are_of_the_same_rows(name, case) -> None:
     if "weights" in case:
         weight = torch.linspace(0.2, 2.0, 10).double().reshape(2, 5)
         batch["priority_weight"] = weight.unsqueeze(-1) if "mask" in case else weight
-        if name in WEIGHED:
-            counts = counts * weight
-            ignoring = call(make_loss(name, use_prioritized_weights=False), batch)
-            assert_same_bits([*ignoring.values()], [*plain.values()])
+        counts = counts * weight
+        ignoring = call(make_loss(name, use_prioritized_weights=False), batch)
+        assert_same_bits([*ignoring.values()], [*plain.values()])
     found = {
         reduction: call(make_loss(name, reduction=reduction), batch)
         for reduction in ("mean", "sum", "none")

@@ -136,10 +136,11 @@ def test_a_list_of_unlike_critics_is_refused(name) -> None:
 
 
 def test_networks_with_common_parameters_are_refused() -> None:
-    networks, other = Networks(), Networks()
+    networks, other, third = Networks(), Networks(), Networks()
     networks.critics = [networks.critics[0]] * 2
     other.critics[0].module[0].bias = next(other.actor.parameters())
-    for each in (networks, other):
+    third.model[0][0].module[0].bias = next(third.actor.parameters())
+    for each in (networks, other, third):
         with pytest.raises(ValueError, match=r"share a parameter of shape .*deepcopy"):
             make_loss("osr", each)
 
@@ -197,6 +198,7 @@ def test_a_frozen_model_is_followed_and_never_trained(name) -> None:
     after = call(loss, batch)
     assert after[metric] != before[metric]
     assert torch.equal(call(make_loss(name, networks), batch)[metric], after[metric])
+    assert model not in vars(loss).values(), "an error in it would empty the model"
 
 
 def test_td3_needs_the_bounds_of_a_plain_actor() -> None:

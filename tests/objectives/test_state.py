@@ -72,6 +72,9 @@ def test_every_tensor_moves_with_the_loss(name) -> None:
     addresses = {tensor.data_ptr() for tensor in there}
     assert all(tensor.data_ptr() in addresses for tensor in tensors(loss))
     assert_same_bits(record(loss, batch), wanted)
+    shift(loss)
+    (fresh := make_loss(name)).load_state_dict(loss.state_dict())
+    assert_same_bits(record(loss, batch), record(fresh, batch))
     kinds = {each.dtype for each in tensors(loss.float()) if each.is_floating_point()}
     assert kinds == {torch.float32}
 

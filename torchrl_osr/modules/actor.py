@@ -4,8 +4,8 @@ All take ``observation_dim`` (``S``), ``action_dim`` (``A``) and these keywords:
 
 - ``num_cells``: width of each hidden layer. Default 256 and 256.
 - ``activation_class``: activation between the layers. Default ReLU.
-- ``low``, ``high``: action bounds, a number or ``[A]``. Default -1 and 1. Of the
-  first two alone.
+- ``low``, ``high``: action bounds, a number or a tensor ``[A]`` of the network's type.
+  Default -1 and 1. Of the first two alone.
 - ``observation_key``: the state that they read. Default ``"observation"``.
 - ``action_key``: the action that they write. Default ``"action"``.
 """

@@ -10,6 +10,7 @@ Networks are called with one batch dimension, as by TorchRL's own losses: ``D`` 
 
 from __future__ import annotations
 
+import copy
 import math
 import warnings
 from abc import abstractmethod
@@ -240,7 +241,10 @@ class ActorCriticLoss(LossModule):
         Its parameters become buffers, which an optimizer of ``loss.parameters()``
         cannot move. They share the network's memory.
         """
+        check_networks(actor_network=self.actor_network, **{name: network})
+        # A copy: tensordict 0.14.3 leaves a network without parameters in an error.
         self.convert_to_functional(network, name)
+        self.__dict__[name] = copy.deepcopy(network)
         frozen = getattr(self, f"{name}_params").apply(
             lambda tensor: tensor.data, filter_empty=False
         )
@@ -302,7 +306,7 @@ class ActorCriticLoss(LossModule):
 
     def make_value_estimator(
         self,
-        value_type: ValueEstimators | str = ValueEstimators.TD0,
+        value_type: ValueEstimators | str | None = None,
         *,
         gamma: float = 0.99,
     ) -> Self:
@@ -310,7 +314,7 @@ class ActorCriticLoss(LossModule):
         names = ("value", "reward", "done", "terminated", "steps_to_next_obs")
         dispatch_value_estimator(
             self,
-            value_type,
+            value_type or ValueEstimators.TD0,
             supported=(ValueEstimators.TD0,),
             tensor_keys={name: getattr(self.tensor_keys, name) for name in names},
             value_network=None,
@@ -476,6 +480,13 @@ class ActorCriticLoss(LossModule):
         return self.target_action_gap is not None
 
     @property
+    def frozen_critics(self) -> TensorDictBase:
+        """The critics' parameters; the policy's objective must not train them."""
+        # detach() keeps what it has returned for a list of critics while they move to
+        # another device or type (tensordict 0.14.3).
+        return self.qvalue_network_params.data
+
+    @property
     def alpha(self) -> Tensor:
         """SAC's entropy temperature, detached."""
         return self.log_alpha.detach().exp()
@@ -489,9 +500,7 @@ class ActorCriticLoss(LossModule):
         """
         action, log_prob = rsample_and_log_prob(policy[states])
         self.check_actions(batch, action.shape[1:])
-        # Detached: the policy's objective must not train the critics.
-        params = self.qvalue_network_params.detach()
-        qvalue = self.q(batch.states[SETS[states]], action, params)
+        qvalue = self.q(batch.states[SETS[states]], action, self.frozen_critics)
         return F.soft_policy_value(log_prob, qvalue, self.alpha).mean(0), log_prob
 
     def soft_actor_losses(

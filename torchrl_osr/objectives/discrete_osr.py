@@ -118,9 +118,7 @@ class DiscreteOSRLoss(ActorCriticLoss):
         pi = policy[states]
         qvalue = self.action_values(batch.s, self.qvalue_network_params, pi)
         q_data = at_actions(qvalue, batch.a, pi, self.tensor_keys.action)
-        # Detached: the policy's objective must not train the critics.
-        params = self.qvalue_network_params.detach()
-        sought = self.action_values(batch.states[SETS[states]], params, pi)
+        sought = self.action_values(batch.states[SETS[states]], self.frozen_critics, pi)
         objective = F.discrete_policy_value(pi.logits, sought, self.alpha)
         log_prob, auto = -pi.entropy(), 0.98 * math.log(pi.logits.shape[-1])
         losses, metrics = self.soft_actor_losses(

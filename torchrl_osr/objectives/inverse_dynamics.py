@@ -64,6 +64,8 @@ class InverseDynamicsLoss(ActorCriticLoss):
             the scale shrinks to its floor.
         latent_weight: weight of a latent's divergence. Default 0.5, the authors'.
         reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
+        use_prioritized_weights: multiply rows by ``"priority_weight"``, if there.
+            Default true.
 
     Examples:
         >>> from torchrl_osr import InverseDynamicsLoss
@@ -81,10 +83,12 @@ class InverseDynamicsLoss(ActorCriticLoss):
         loss_function: Literal["nll", "mse"] = "nll",
         latent_weight: float = 0.5,
         reduction: Literal["none", "mean", "sum"] = "mean",
+        use_prioritized_weights: bool = True,
     ) -> None:
         check_weight("latent_weight", latent_weight)
-        # A likelihood of data, not of what a sampler found important.
-        super().__init__(reduction=reduction, use_prioritized_weights=False)
+        super().__init__(
+            reduction=reduction, use_prioritized_weights=use_prioritized_weights
+        )
         if not is_categorical(inverse_dynamics_network):
             name = "inverse_dynamics_network"
             self.register_bounds(action_bounds(inverse_dynamics_network, name))

@@ -100,6 +100,7 @@ class StateRecoveryLoss(ActorCriticLoss):
         **options: Any,
     ) -> None:
         super().__init__(**options)
+        self.convert_to_functional(actor_network, "actor_network")
         self.recovery_target, self.recovery_states = recovery_target, recovery_states
         self.recovery_direction = recovery_direction
         self.action_reduction = action_reduction
@@ -123,7 +124,6 @@ class StateRecoveryLoss(ActorCriticLoss):
             name = "inverse_dynamics_network"
             self.register_bounds(own or action_bounds(inverse_dynamics_network, name))
             self.register_model(inverse_dynamics_network)
-        self.convert_to_functional(actor_network, "actor_network")
         self.register_coefficient("recovery_weight", recovery_weight)
         self.declare(["loss_recovery"], [self.metric])
 

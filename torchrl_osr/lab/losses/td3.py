@@ -79,8 +79,7 @@ class TD3Loss(ActorCriticLoss):
     def losses(self, batch: Transitions) -> Losses:
         action = self.act(batch.s, self.actor_network_params)
         self.check_actions(batch, action.shape)
-        # Detached: the policy's objective must not train the critics.
-        qvalues = self.q(batch.s, action, self.qvalue_network_params.detach())
+        qvalues = self.q(batch.s, action, self.frozen_critics)
         objective, distance = self.objective(batch, action, qvalues)
         with torch.no_grad():
             target = self.td_target(batch, self.next_value(batch))
