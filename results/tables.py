@@ -19,7 +19,8 @@ import numpy as np
 import pandas as pd
 
 from torchrl_osr.lab.evaluation import statistics
-from torchrl_osr.lab.evaluation.statistics import Estimate, over_what, saved_share
+from torchrl_osr.lab.evaluation.statistics import Estimate, saved_share
+from torchrl_osr.lab.report.tables import by_run
 
 
 def read(folder: Path, sources: Sequence[str] = ()) -> pd.DataFrame:
@@ -49,10 +50,7 @@ def conditions(episodes: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
 
 def estimate(episodes: pd.DataFrame) -> Estimate | None:
     """Return the mean score over runs; episodes of one start state are averaged."""
-    if episodes.empty:
-        return None
-    means = episodes.groupby(["run", "episode"])["score"].mean()
-    return statistics.estimate([run.to_numpy() for _, run in means.groupby("run")])
+    return None if episodes.empty else statistics.estimate(by_run(episodes))
 
 
 def differences(
@@ -104,10 +102,9 @@ def recoverable(folder: Path) -> dict[tuple[str, str], tuple[str, float]]:
     """Return the recovery rate in percent of each data set and method."""
     found = {}
     for data, method, rates, walks in recovered(folder):
-        share = [100 * x for x in saved_share(rates, walks)]
+        share = saved_share(rates, walks)
         # The held-out half wins over the public one.
-        shown = str(Estimate(*share, over_what(len(rates))))
-        found.setdefault((data, method), (shown, share[0]))
+        found.setdefault((data, method), (str(share), share.mean))
     return found
 
 

@@ -283,8 +283,8 @@ def claims(episodes: pd.DataFrame, printed: pd.DataFrame, knocked: pd.DataFrame)
         if ours and not ours.low <= 0 <= ours.high:
             seen = "yes" if ours.low > 0 else "no, the reverse"
         note = "a low score has less to lose" if kind == "lost" else ""
-        if less in TOO_SHORT:
-            seen, note = "cannot judge", f"two minutes are too short for {TITLES[less]}"
+        if short := [TITLES[name] for name in (more, less) if name in TOO_SHORT]:
+            seen, note = "cannot judge", f"two minutes are too short for {short[0]}"
         cells = (number(quoted), str(ours or NOT_RUN), str(len(both)), seen, note)
         rows.append([claim, *cells])
     head = ["claim", "paper", "here [95 %]", "data sets", "seen here", "note"]
@@ -365,8 +365,8 @@ def ablation() -> str:
         for name in ABLATION:
             ours, _ = found[data, name]
             seeds = twin.index.intersection(ours.index)
-            ends = 100 * np.array(saved_share(ours.loc[seeds], walks, twin.loc[seeds]))
-            cells.append(str(Estimate(*ends, tables.over_what(len(seeds)))))
+            share = saved_share(ours.loc[seeds], walks, twin.loc[seeds])
+            cells.append(str(share))
         rows.append([name_of(data), *cells])
     return markdown(["R %", *(f"`{name}`" for name in ABLATION)], rows)
 

@@ -107,10 +107,7 @@ def test_a_run_knows_its_data_by_their_contents(tmp_path):
     with np.load(moved) as columns:
         np.savez(log, **{**columns, "reward": -columns["reward"]})
     refused = r"data.path=.*log\.npz has other contents .* began with: give data.path="
-    for play in (
-        partial(disturbed, run, "force=true"),
-        partial(trained_on, run, *more),
-    ):
+    for play in partial(disturbed, run, "force=true"), partial(trained_on, run, *more):
         with pytest.raises(ValueError, match=refused):
             play()
     trained_on(run, more[0], f"data.path={moved}")

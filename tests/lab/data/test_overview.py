@@ -7,10 +7,7 @@ import pytest
 
 from torchrl_osr.lab.cli.data import overview
 from torchrl_osr.lab.data import transitions_from_columns
-from torchrl_osr.lab.data.overview import (
-    findings,
-    recorded_columns,
-)
+from torchrl_osr.lab.data.overview import findings, recorded_columns
 
 
 def make_log(rows=1200, **changes):

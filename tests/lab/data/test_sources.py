@@ -119,11 +119,7 @@ def test_bounds_come_from_the_environment_unless_given(tmp_path, bounds, high):
         ("minari", {}, r"data=minari needs data\.path="),
         ("file", {"num_transitions": 9}, "num_transitions=9 has no effect with data=f"),
         ("file", {"clip_actions": True, "env_id": "CartPole-v1", "path": "x"}, "discr"),
-        (
-            "medium",
-            {"path": "x"},
-            "rolled out in a simulator: for a log, give data",
-        ),
+        ("medium", {"path": "x"}, "rolled out in a simulator: for a log, give data"),
         ("random", {"random_share": 0.5}, "random rows: choose another source"),
         (
             "d4rl",

@@ -77,6 +77,11 @@ def test_data_sets_have_equal_weight_and_come_last_together(tmp_path):
     overs = [each.estimate.over for each in found]
     assert overs == ["episodes", "seeds", "episodes"], "one has a single seed"
     assert [each.seeds for each in found] == [1, 3, 1]
+    for file in tmp_path.glob("hopper-*/robustness-hand.json"):
+        file.unlink()  # played on one data set
+    tables = fakes.read_all(tmp_path)
+    name = quantities(tables)[1].name.capitalize()
+    assert any(name in each for each in verdict(compare_all(tables, "cql"), "cql"))
 
 
 def test_what_cannot_be_paired_is_refused_or_noted(tmp_path):

@@ -128,7 +128,8 @@ def test_suites_played_differently_are_not_one_suite(tmp_path):
     content = json.loads(path.read_text())
     content["evaluations"] = content["evaluations"][:1]
     fakes.write_json(path, content)
+    fakes.write_json(path.with_name("robustness-renamed.json"), content)
     tables = fakes.read_all(top)
     assert [name.partition(", seeds")[0] for name in tables.suites] == [
-        "hand (checkpoints=last 2", "hand (checkpoints=[7000]"
+        "hand (checkpoints=last 2", "hand (checkpoints=[7000]", "renamed"
     ]  # fmt: skip

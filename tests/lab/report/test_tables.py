@@ -95,7 +95,7 @@ STATES = {
 
 
 def write_states(top, method, seed, *back, **entries):
-    evaluations = [{"step": 1000, "back": each} for each in back]
+    evaluations = [{"step": 8000, "back": each} for each in back]
     states = STATES | {"evaluations": evaluations} | entries
     folder = top / method / f"seed{seed}"
     fakes.write_run(folder, {8000: [50.0]}, seed=seed, states=states)
@@ -109,7 +109,7 @@ def test_shares_of_recoverable_states(tmp_path):
         write_states(tmp_path, "osr", seed, *both)
     other = {"group": [*GROUP[:-1], "easy"]}
     write_states(tmp_path, "cql", 2, [1, 0, 0, 0, 0, 1], **other)
-    table = saved_table(fakes.read_all(tmp_path), "cql")
+    table = saved_table(fakes.read_all(tmp_path).saved, "cql")
     assert table["seeds"].tolist() == [2, 2, 1], "other states have their own rows"
     cql, osr, alone = (row for _, row in table.iterrows())
     assert cql["easy %"].mean == osr["contested %"].mean == 100
@@ -128,5 +128,5 @@ def test_shares_of_recoverable_states(tmp_path):
 def test_nothing_is_recovered_where_the_reference_saves_all(tmp_path):
     write_states(tmp_path, "cql", 0, [1] * 6)
     write_states(tmp_path, "osr", 0, [1] * 6)
-    table = saved_table(read_runs([tmp_path]), "cql")
+    table = saved_table(read_runs([tmp_path]).saved, "cql")
     assert not any(isinstance(cell, Estimate) for cell in table["R %"])

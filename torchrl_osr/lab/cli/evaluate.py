@@ -12,15 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_osr.lab.cli.console import sentence, single_job
-from torchrl_osr.lab.evaluation.recoverable import GROUPS
-from torchrl_osr.lab.evaluation.statistics import saved_share
 from torchrl_osr.lab.evaluation.tables import aligned_columns
-from torchrl_osr.lab.report.runs import find_runs, suite_episodes
-from torchrl_osr.lab.report.tables import robustness_table, text
+from torchrl_osr.lab.report.runs import find_runs, saved_states, suite_episodes
+from torchrl_osr.lab.report.tables import robustness_table, saved_table, text
 from torchrl_osr.lab.run import CONF
 from torchrl_osr.lab.run.evaluate import evaluate_files, evaluate_run, file_name
 from torchrl_osr.lab.run.folder import read_status
@@ -126,15 +123,10 @@ def disturbance_table(results: Mapping[str, Any]) -> str:
 
 
 def recoverable_table(results: Mapping[str, Any]) -> str:
-    """Return a text table of recovery rates with intervals, by group of states."""
-    group, walk = np.array(results["group"]), np.array(results["walk"])
-    back = np.mean([each["back"] for each in results["evaluations"]], axis=0)
-    rows = [("states", "number", "recovers %", "[95 %]")]
-    for name in GROUPS:
-        if (chosen := group == name).any():
-            rate = 100 * np.array(saved_share(back[None, chosen], walk[chosen]))
-            mean, low, high = (f"{each:.0f}" for each in rate)
-            rows.append((name, str(chosen.sum()), mean, f"[{low}, {high}]"))
+    """Return the report's table of recovery rates as text, of these results alone."""
+    rows = saved_states(results).assign(data="", run=0, method="", seed=0)
+    rates = saved_table(rows).drop(columns="seeds").iloc[0].map(text)
+    lines = [(name, cell.removesuffix(" ᵉ")) for name, cell in rates.items()]
     number = len(results["evaluations"])
     title = f"{results['env']} {results['data']}, {results['half']} recoverable states"
-    return "\n".join([f"{title}: {number} x each", *aligned_columns(rows)])
+    return "\n".join([f"{title}: {number} x each", *aligned_columns(lines)])

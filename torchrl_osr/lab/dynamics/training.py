@@ -126,19 +126,12 @@ def _trained_vae(options: DynamicsOptions, data: ModelData, fit: Fit) -> Transit
     size = data.held_out["observation"].shape[-1]
     model = TransitionVAE(size, num_cells=options.vae_num_cells)
     _standardize(model, data)
-    loss = TransitionVAELoss(model)
-
-    @torch.no_grad()
-    def evaluate() -> dict[str, float]:
-        return {"vae_error": loss(data.held_out)["loss_vae"].item()}
-
     fit(
         "vae",
-        loss,
+        TransitionVAELoss(model),
         model.parameters(),
         replay_buffer=data.buffer(options.batch_size),
         total_steps=options.vae_steps,
-        evaluation=Evaluation(evaluate, options.vae_steps, "vae_error", "min"),
     )
     return model
 

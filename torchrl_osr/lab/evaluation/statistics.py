@@ -153,8 +153,8 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
 
 def saved_share(
     back: ArrayLike, walk: ArrayLike, baseline: ArrayLike | None = None
-) -> tuple[float, float, float]:
-    """Return the recovery rate over states, with its 95 % interval.
+) -> Estimate:
+    """Return the recovery rate over states, in percent.
 
     ``back`` ``[N, M]`` has the rate of each seed and state. Seeds are resampled, and
     walks with all of their states. If the rate is 0 or 1 everywhere, the interval is
@@ -169,12 +169,13 @@ def saved_share(
     walks, number = np.unique(np.asarray(walk), return_inverse=True)
     member = np.eye(len(walks))[number]
     sizes, ours = member.sum(0), np.asarray(back, np.float64) @ member
-    theirs = 0 * ours
+    theirs, over = 0 * ours, over_what(len(ours), alone="walks")
     if baseline is not None:
         theirs = np.asarray(baseline, np.float64) @ member
     elif not ours.any() or (ours == sizes).all():
         share = int(ours.any())
-        return share, *wilson(share * len(walks), len(walks))
+        low, high = wilson(share * len(walks), len(walks))
+        return Estimate(100 * share, 100 * low, 100 * high, over)
     rng = np.random.default_rng(0)
     # How often each seed and walk is drawn: once, then in each resample.
     by_seed, by_walk = (
@@ -187,5 +188,5 @@ def saved_share(
     lost = by_walk @ sizes - before
     if (lost <= 0).any():
         raise ValueError("The baseline saves all states: R is not defined.")
-    shares = (saved - before) / lost
-    return interval(shares[0], shares[1:])[:3]
+    shares = 100 * (saved - before) / lost
+    return interval(shares[0], shares[1:], over)

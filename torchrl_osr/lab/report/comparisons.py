@@ -152,10 +152,11 @@ def verdict(differences: Sequence[Difference], reference: str) -> list[str]:
 
     A method with several data sets is judged over all of them.
     """
-    everywhere = {each.method for each in differences if each.data == ALL_DATA}
+    everywhere = {x.method + x.quantity.name for x in differences if x.data == ALL_DATA}
     sentences, rest = [], dict[tuple[str, str], list[str]]()
     for each in differences:
-        if each.data != ALL_DATA and each.method in everywhere:
+        judged = each.method + each.quantity.name in everywhere
+        if judged and each.data != ALL_DATA:
             continue
         if each.estimate and each.verdict in ("better", "worse"):
             sentences.append(

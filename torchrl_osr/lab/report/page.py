@@ -53,7 +53,7 @@ def write_report(
     frames = {
         "scores": score_table(tables),
         "differences": difference_table(found),
-        "recoverable": saved_table(tables, reference),
+        "recoverable": saved_table(tables.saved, reference),
     }
     for suite in tables.suites:
         played = tables.episodes[tables.episodes["suite"] == suite]

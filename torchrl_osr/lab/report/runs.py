@@ -192,7 +192,8 @@ def _read(folder: Path) -> _Run:
     if judged and not evaluations:  # judged by the data alone
         offline = read_json(judged[0])
         values = offline["value_of_networks"]
-        each = {"step": steps, "seeds": [*range(len(values))], "returns": values}
+        seeds = [*range(len(values))]
+        each = {"step": offline["step"], "seeds": seeds, "returns": values}
         evaluations, references, measure = [each], None, "return"
         returns["data_return"] = offline["data_value"]
         measured = f"{ESTIMATED} (discount {offline['discount']:g}) of {env}"
@@ -208,7 +209,8 @@ def _read(folder: Path) -> _Run:
         values = values if references is None else references.score(values)
         rows.append(_episodes("", each["step"], each["seeds"], values, {"name": ""}))
     for file in sorted(folder.glob("robustness-*.json")):
-        content = read_json(file)
+        # Named by the file: a renamed one holds other episodes.
+        content = read_json(file) | {"suite": file.stem.removeprefix("robustness-")}
         rows.append(suite_episodes(content))
         protocols.append(_protocol(content, steps))
         versions.append(content["versions"])
@@ -217,7 +219,10 @@ def _read(folder: Path) -> _Run:
         raise ValueError("not all of its returns are finite numbers")
     saved = [pd.DataFrame(columns=SAVED)]
     for file in sorted(folder.glob("recoverable-*.json")):
-        saved.append(_saved_states(content := read_json(file)))
+        content = read_json(file) | {"half": file.stem.removeprefix("recoverable-")}
+        if (at := content["evaluations"][-1]["step"]) != steps:
+            content["half"] += f" at {at}"
+        saved.append(saved_states(content))
         versions.append(content["versions"])
     above, name = folder.resolve().parts[-2:]
     in_layout = name == f"seed{config['seed']}"
@@ -277,7 +282,7 @@ def _protocol(content: Mapping[str, Any], steps: int) -> dict[str, str]:
     return {name: str(value) for name, value in facts.items()}
 
 
-def _saved_states(content: Mapping[str, Any]) -> pd.DataFrame:
+def saved_states(content: Mapping[str, Any]) -> pd.DataFrame:
     """Return the states of a file, and the share of checkpoints that recover."""
     columns = {key: content[key] for key in SAVED[1:-1]}
     back = np.mean([each["back"] for each in content["evaluations"]], axis=0)

@@ -16,11 +16,9 @@ from torchrl_osr.lab.evaluation.recoverable import GROUPS, disturbances_of
 from torchrl_osr.lab.evaluation.recovery import STEPS_AFTER
 from torchrl_osr.lab.evaluation.statistics import (
     Array,
-    Estimate,
     decimal,
     estimate,
     nested_mean,
-    over_what,
     saved_share,
     scores_and_decreases,
 )
@@ -107,13 +105,13 @@ def _recovery(there: pd.DataFrame) -> dict[str, Any]:
     }
 
 
-def saved_table(tables: RunTables, reference: str) -> pd.DataFrame:
+def saved_table(saved: pd.DataFrame, reference: str = "") -> pd.DataFrame:
     """Tabulate recovery rates by group of states and, if recoverable, by disturbance.
 
     R compares with the reference, with the seeds of both.
     """
     cells = {}
-    for (data, states), rows in tables.saved.groupby(["data", "states"], sort=False):
+    for (data, states), rows in saved.groupby(["data", "states"], sort=False):
         rows = rows.assign(state=rows.groupby("run").cumcount())
         of_each = rows.drop_duplicates("state")  # they have the same order in each run
         group, disturbance, walk = (
@@ -138,16 +136,11 @@ def saved_table(tables: RunTables, reference: str) -> pd.DataFrame:
                 row["R %"] = None
                 if len(both):
                     with contextlib.suppress(ValueError):  # the reference saves all
-                        row["R %"] = _percent(ours, walk[hard], theirs)
+                        row["R %"] = saved_share(ours, walk[hard], theirs)
             for name, which in chosen.items():
-                row[name] = _percent(table.loc[:, which], walk[which])
+                row[name] = saved_share(table.loc[:, which], walk[which])
             cells[f"{data}, {states}", method] = row
     return frame_of(cells, "data", "method")
-
-
-def _percent(back: Any, walk: Any, baseline: Any = None) -> Estimate:
-    mean, low, high = (100 * each for each in saved_share(back, walk, baseline))
-    return Estimate(mean, low, high, over_what(len(back), alone="walks"))
 
 
 def text(cell: Any) -> str:

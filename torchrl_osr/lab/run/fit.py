@@ -52,6 +52,7 @@ def fit(
     folder = Path(folder)
     if hasattr(log, "items"):  # a mapping or a data frame
         columns: Any = {str(name): np.asarray(column) for name, column in log.items()}
+        columns.pop("file", None)  # no part of a log; np.savez has an argument "file"
         for name, column in columns.items():
             if column.dtype.kind == "O":  # text, or lists of one length
                 columns[name] = np.asarray(column.tolist())

@@ -156,6 +156,8 @@ def _check_same(run: TrainConfig, config: TrainConfig, folder: Path) -> None:
             f"{config.trainer.steps} are fewer: give more, or choose another folder."
         )
     of_one_start = {"resume", "trust", "force", "settings", "data.checksum", *RESUMABLE}
+    if config.optim.actor_schedule == "cosine":  # a longer run decays more slowly
+        of_one_start.remove("trainer.steps")
     if config.data.checksum:  # the log may have been moved
         of_one_start.add("data.path")
     there, now = flatten(asdict(run)), flatten(asdict(config))
