@@ -150,7 +150,8 @@ def test_a_batch_of_ends_alone_gives_zeros(name) -> None:
 LOSS_ACTOR = ["osr", "discrete", "bc", "td3-bc", "rebrac"]
 RECOVERY = ["official", "recovery", "recovery-module", "noisy-cloning"]
 OF_DATA = dict.fromkeys(LOSS_ACTOR, "loss_actor") | {"osr-v": "recovery_gap"}
-OF_DATA |= dict.fromkeys(RECOVERY, "loss_recovery")
+OF_DATA |= dict.fromkeys(RECOVERY, "loss_recovery") | {"osr-v-cql": "recovery_gap"}
+OF_DATA |= dict.fromkeys(["discrete-cql", "cql"], "loss_cql")
 
 
 @pytest.mark.parametrize(("name", "key"), OF_DATA.items())

@@ -666,7 +666,7 @@ class ActorCriticLoss(LossModule):
 
     def rows_weigh_alike(self, batch: Transitions) -> bool:
         """Return whether every row's term has the same weight in a reduced loss."""
-        alike = batch.unmasked is None and self._weights(batch) is None
+        alike = batch.counted(batch.is_data) is None and self._weights(batch) is None
         return self.reduction != "none" and alike
 
 

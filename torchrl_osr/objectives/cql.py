@@ -121,10 +121,12 @@ class CQLLoss(ActorCriticLoss):
                 gap, multiplier = F.lagrange_terms(
                     gap, self.log_alpha_prime, self.target_action_gap
                 )
-                reduced = self.reduce(multiplier.mean(0), batch)
+                reduced = self.reduce(multiplier.mean(0), batch, batch.is_data)
                 losses["loss_alpha_prime"] = self.min_q_weight * reduced
                 metrics["alpha_prime"] = self.log_alpha_prime.detach().exp()
-            losses["loss_cql"] = self.min_q_weight * self.reduce(gap.sum(0), batch)
+            # The action of a rollout is the policy's own, and is not to be preferred.
+            reduced = self.reduce(gap.sum(0), batch, batch.is_data)
+            losses["loss_cql"] = self.min_q_weight * reduced
         else:
             q_data = self.q(batch.s, batch.a)
         error, values = self.td_error(batch, q_data, self.soft_target(batch, policy))

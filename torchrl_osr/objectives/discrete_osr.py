@@ -138,7 +138,8 @@ class DiscreteOSRLoss(ActorCriticLoss):
             certain, tau = torch.zeros_like(qvalue), self.temperature
             soft_maximum = F.soft_maximum(qvalue, certain, temperature=tau)
             gap = F.conservative_gap(soft_maximum, q_data).sum(0)
-            losses["loss_cql"] = self.min_q_weight * self.reduce(gap, batch)
+            reduced = self.reduce(gap, batch, batch.is_data)
+            losses["loss_cql"] = self.min_q_weight * reduced
         return losses, metrics | values
 
     def action_values(

@@ -114,7 +114,7 @@ class OSRVLoss(ActorCriticLoss):
         q_data, gap = self.data_values_and_gap(batch, policy)
         # The paper prints OSR-v's TD error without the square; (2) has it.
         error, values = self.td_error(batch, q_data, self.soft_target(batch, policy))
-        valid = None if self.policy_values == "cql" else batch.has_next
+        valid = batch.is_data if self.policy_values == "cql" else batch.has_next
         constraint = self.reduce(gap, batch, valid)
         qvalue = self.reduce(error, batch) + self.recovery_weight * constraint
         metrics["recovery_gap"] = self.mean(gap, batch, valid)

@@ -54,7 +54,7 @@ def test_rows_are_drawn_without_replacement_in_exact_shares(rows, share, seed) -
     assert mixed == again
     assert len(mixed) == len(set(mixed)) == rows
     kept = mixed[: rows - round(share * rows)]
-    assert [row for row in mixed if row < 100] == kept
+    assert [row for row in mixed if row < 100] == kept == [*range(len(kept))]
 
 
 @pytest.mark.parametrize(("held_out", "expected"), [(7, 7), (0.2, 10)])

@@ -11,6 +11,9 @@ from torch import Tensor
 
 from torchrl_osr.lab.data.transitions import SAME_STATE
 
+PIECE = 1000
+"""Successive rows that a mixture takes together."""
+
 
 def split_held_out(
     data: TensorDict, held_out: int | float, *, seed: int
@@ -32,14 +35,21 @@ def split_held_out(
 def mix_datasets(
     valuable: TensorDict, random: TensorDict, *, random_share: float, seed: int
 ) -> TensorDict:
-    """Replace a share of the rows by rows of another set, which come last."""
+    """Replace a share of the rows by rows of another set, which come last.
+
+    Rows are kept and taken in pieces of :data:`PIECE`, for returns of several steps.
+    """
     if not 0 <= random_share <= 1:
         raise ValueError(f"random_share={random_share}; expected a share from 0 to 1.")
     number = round(random_share * len(valuable))
     generator = torch.Generator().manual_seed(seed)
-    kept = torch.randperm(len(valuable), generator=generator)[number:].sort().values
-    taken = torch.randperm(len(random), generator=generator)[:number].sort().values
-    return torch.cat([valuable[kept], random[taken]])
+    chosen = []
+    for data, count in (valuable, len(valuable) - number), (random, number):
+        pieces = torch.arange(len(data)).split(PIECE)
+        order = torch.randperm(len(pieces), generator=generator).tolist()
+        rows = torch.cat([pieces[piece] for piece in order])[:count]
+        chosen.append(data[rows.sort().values])
+    return torch.cat(chosen)
 
 
 def is_followed(data: TensorDictBase) -> Tensor:

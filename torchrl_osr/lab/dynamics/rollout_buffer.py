@@ -139,7 +139,7 @@ class RolloutReplayBuffer:
         self._copy.load_state_dict(weights)
         device = next(self._copy.parameters()).device
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
-            torch.manual_seed(self.data.seed + number)
+            torch.manual_seed((self.data.seed << 20) + number)
             return self.roll_out(self._copy)
 
     def _keep(self, rollouts: list[TensorDict]) -> None:
