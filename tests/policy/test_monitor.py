@@ -88,6 +88,8 @@ def test_rows_before_a_fall_are_no_data(log):
     assert fit_monitor(rows, episode, ~falling)(fallen)[1].all()
     with pytest.raises(ValueError, match="no row"):
         fit_monitor(rows, episode, torch.zeros_like(falling))
+    with pytest.raises(ValueError, match="need 19 episodes"):
+        fit_monitor(rows, episode, episode < 20)  # in the others no row counts
 
 
 def test_calibration_on_other_episodes(log):

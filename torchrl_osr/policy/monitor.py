@@ -123,9 +123,9 @@ class DataMonitor(nn.Module):
             false_alarms: largest share of episodes with a false alarm. Default 0.05.
                 A ValueError if there are too few episodes for it.
         """
+        if counts is not None:  # an episode without such rows promises nothing
+            observation, episode = observation[counts], episode[counts]
         score = torch.cat([self(rows)[0] for rows in torch.split(observation, 4096)])
-        if counts is not None:
-            score = score.masked_fill(~counts, -math.inf)
         numbers, index = torch.unique(episode, return_inverse=True)
         largest = score.new_full([len(numbers)], -math.inf)
         largest = largest.scatter_reduce(0, index, score, "amax")

@@ -231,7 +231,7 @@ def test_policies_are_ranked_on_their_log_alone(tmp_path, capsys, monkeypatch):
     assert f"Undisturbed {name}" in page
     assert "No run was played." in page
     bodys = json.loads((runs[0] / "offline_evaluation.json").read_text())
-    bodys |= {"value": 0.0, "value_of_networks": [3 * bodys["value"]]}
+    bodys |= {"value": 0.0, "values": [3 * bodys["value"]]}
     (runs[0] / "body-offline_evaluation.json").write_text(json.dumps(bodys))
     scores = pd.read_csv(tmp_path / "page" / "scores.csv", index_col="method")
     by_body = read_runs([tmp_path]).episodes.groupby("method")["score"].mean()

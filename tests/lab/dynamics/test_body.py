@@ -51,6 +51,8 @@ def test_the_body_moves_as_gymnasiums_does() -> None:
     control = -2 + 3 * (action + 1) / 2
     found = body.in_own_units()(state, control)
     torch.testing.assert_close(found, following, **close)
+    exploding = body.in_own_units()(state + 1e3, control)
+    assert not (exploding.abs() < 100).any(1).all(), "MuJoCo would reset it"
 
 
 def test_limits_of_sensors_are_numbers_that_many_rows_share() -> None:

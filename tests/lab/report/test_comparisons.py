@@ -70,9 +70,8 @@ def test_data_sets_have_equal_weight_and_come_last_together(tmp_path):
     both(tmp_path, 8, seeds=(0, 1, 2), env="walker2d")
     tables = fakes.read_all(tmp_path)
     found = compare(tables, "osr", "cql", quantities(tables)[0])
-    assert [each.data for each in found] == [
-        "hopper medium-replay", "walker2d medium-replay", ALL_DATA,
-    ]  # fmt: skip
+    sets = ["hopper medium-replay", "walker2d medium-replay", ALL_DATA]
+    assert [each.data for each in found] == sets
     assert [each.estimate.mean for each in found] == pytest.approx([2, 8, 5])
     overs = [each.estimate.over for each in found]
     assert overs == ["episodes", "seeds", "episodes"], "one has a single seed"

@@ -32,7 +32,7 @@ def main() -> None:
     add("runs", nargs="+", type=Path, help="folders of runs, or checkpoints in them")
     add("--checkpoints", action="store_true", help="evaluate all that each run kept")
     add("--discount", type=float, help="default: the run's; with --xml 0.997")
-    add("--steps", type=int, help="updates of critics (8,000) or with --xml (3,000)")
+    add("--steps", type=int, help="updates; default: what the discount needs")
     add("--xml", help="description of the robot's body, MJCF")
     add("--frame-skip", type=int, default=1, help="physics steps of an action in it")
     add("--seed", type=int, default=0, help="of the training")

@@ -45,7 +45,7 @@ def mix_datasets(
     generator = torch.Generator().manual_seed(seed)
     chosen = []
     for data, count in (valuable, len(valuable) - number), (random, number):
-        pieces = torch.arange(len(data)).split(PIECE)
+        pieces = torch.split(torch.arange(len(data)), PIECE)
         order = torch.randperm(len(pieces), generator=generator).tolist()
         rows = torch.cat([pieces[piece] for piece in order])[:count]
         chosen.append(data[rows.sort().values])

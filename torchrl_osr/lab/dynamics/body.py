@@ -65,6 +65,8 @@ class Body:
     def model(self) -> Any:
         """The compiled description, times the factors."""
         model: Any = deepcopy(compiled(self.xml))
+        # Or an unstable body would be back in its start pose, upright and healthy.
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         if len(self.factors):
             masses, gears, others = np.split(self.factors, [model.nbody - 1, -2])
             model.body_mass[1:] *= masses
@@ -161,8 +163,8 @@ def identify(body: Body, rows: TensorDictBase) -> Body:
         """Return ``[N S + F, n]`` of the logarithms of the factors ``[F, n]``."""
         bodies = [replace(body, factors=column) for column in np.exp(logs.T)]
         found = [(each(states, actions) - following) / unit for each in bodies]
-        errors = torch.stack(found, -1).clamp(-1, 1).flatten(0, -2).double().numpy()
-        return np.concatenate([errors, weight * logs])
+        errors = torch.stack(found, -1).nan_to_num(1.0).clamp(-1, 1)
+        return np.concatenate([errors.flatten(0, -2).double().numpy(), weight * logs])
 
     start = np.zeros(len(body.model.body_mass) - 1 + body.model.nu + 2)
     largest = np.log(4)
@@ -198,4 +200,4 @@ def fitted_body(body: Body, rows: TensorDict, *, seed: int) -> tuple[Body, Tenso
         error = change.square().mean().sqrt()
         print(f"body as {name}: error {error:.2g} standard deviations in a step")
     rows["simulated"] = found(rows["observation"], rows["action"])
-    return found, rows
+    return found, rows[rows["simulated"].isfinite().all(-1)]

@@ -94,7 +94,9 @@ def rolled_out_values(
         change = model.predict(state, act(policy, model.observed(state), size))[0][0]
         value[going] += gamma**step * change[:, -1].clamp(least, most)
         state = state + change[:, :-1]
-        goes_on = ~ended(state)
+        finite = state.isfinite().all(-1)  # else the body has exploded
+        value[going[~finite]] += gamma ** (step + 1) / (1 - gamma) * least
+        goes_on = finite & ~ended(state)
         state, going = state[goes_on], going[goes_on]
         if not len(going):
             break

@@ -24,13 +24,16 @@ from torchrl_osr.lab.losses import FQELoss
 from torchrl_osr.modules import critic_ensemble
 from torchrl_osr.trainers import OfflineTrainer
 
+TAU = 0.05
+"""Step size of the critics' targets."""
+
 
 def fitted_values(
     data: TensorDict,
     policy: Policy,
     *,
     gamma: float = 0.99,
-    steps: int = 8000,
+    steps: int | None = None,
     num_critics: int = 3,
     seed: int = 0,
     progress: bool = True,
@@ -44,7 +47,7 @@ def fitted_values(
 
     Keyword Args:
         gamma: discount factor, below 1.
-        steps: of the training of the critics.
+        steps: of the training of the critics. Default: :func:`enough_updates`.
         num_critics: each learns from episodes drawn with replacement.
         seed: of networks, batches and drawn episodes.
         progress: show a progress bar.
@@ -95,7 +98,8 @@ def fitted_values(
     loss = FQELoss(critics, value_bounds=bounds, deactivate_vmap=True)
     loss.make_value_estimator(gamma=gamma)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3, fused=True)
-    update = FastUpdate(loss, optimizer, SoftUpdate(loss, tau=0.05))
+    update = FastUpdate(loss, optimizer, SoftUpdate(loss, tau=TAU))
+    steps = steps or enough_updates(gamma)
     fit(update, rows, "fitted Q evaluation", steps, seed=seed, progress=progress)
     states = TensorDict({"observation": (starts - loc) / scale}, [number])
     params = loss.target_qvalue_network_params
@@ -103,6 +107,11 @@ def fitted_values(
         value = loss.q(states, act(policy, starts, size), params)
     found: Array = (unit * value).double().numpy()
     return found
+
+
+def enough_updates(gamma: float) -> int:
+    """Return after how many updates the targets have come 98 % of their way."""
+    return max(8000, round(4 / TAU / (1 - gamma)))
 
 
 def check_discount(gamma: float) -> None:

@@ -8,7 +8,7 @@ episode, ``R`` resamples, ``N`` seeds, ``M`` states, ``W`` walks.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import sqrt
+from math import hypot, sqrt
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -20,6 +20,7 @@ NUM_RESAMPLES = 2000
 """Of bootstraps of means; those of shares of states have 10,000."""
 
 NORMAL_QUANTILE_975 = 1.959963984540054
+STUDENT_QUANTILE_975 = 4.302652729911275  # two degrees of freedom
 
 
 class Estimate(NamedTuple):
@@ -72,22 +73,22 @@ def mean_interval(values: ArrayLike) -> tuple[float, float, float]:
 
 
 def nested_resamples(runs: Sequence[ArrayLike], *, seed: int = 0) -> Array:
-    """Resample runs ``[E, K]`` and then their episodes; return the means ``[R, K]``.
+    """Resample runs ``[E, K]`` and episodes; return the means ``[R, K]``.
 
-    Runs have equal weight. The numbers of an episode stay together.
+    Runs have equal weight. The numbers of an episode stay together. Runs with as many
+    episodes play the same ones, which are drawn alike.
     """
     tables = [np.asarray(run, dtype=np.float64) for run in runs]
     rng = np.random.default_rng(seed)
     drawn = rng.integers(len(tables), size=(NUM_RESAMPLES, len(tables)))
-    total = np.zeros((NUM_RESAMPLES, tables[0].shape[1]))
-    for place in drawn.T:
-        for number, table in enumerate(tables):
-            rows = np.flatnonzero(place == number)
-            size = len(table)
-            # How often each episode is drawn: the same as drawing them, and faster.
-            counts = rng.multinomial(size, np.full(size, 1 / size), size=len(rows))
-            total[rows] += counts @ table / size
-    return total / len(tables)
+    # How often each episode is drawn: the same as drawing them, and faster.
+    share = {
+        size: rng.multinomial(size, np.full(size, 1 / size), NUM_RESAMPLES) / size
+        for size in sorted({*map(len, tables)})
+    }
+    means = np.stack([share[len(table)] @ table for table in tables])
+    found: Array = means[drawn, np.arange(NUM_RESAMPLES)[:, None]].mean(1)
+    return found
 
 
 def estimate(runs: Sequence[Array]) -> Estimate:
@@ -111,15 +112,19 @@ def nested_mean(data_sets: Sequence[Sequence[Array]]) -> Estimate:
     return interval(float(point), np.mean(resamples, axis=0).ravel(), over)
 
 
-def crossed_mean(values: ArrayLike) -> Estimate:
-    """Return the mean of ``[N, E]`` values; networks and episodes are drawn again."""
-    table, rng = np.asarray(values, np.float64), np.random.default_rng(0)
-    rows, columns = (
-        rng.multinomial(size, np.full(size, 1 / size), NUM_RESAMPLES) / size
-        for size in table.shape
-    )
-    resamples = ((rows @ table) * columns).sum(1)
-    return interval(float(table.mean()), resamples, over_what(len(table)))
+def mean_of_networks(values: ArrayLike) -> Estimate:
+    """Return the mean of ``[N, E]`` values, for one or three networks.
+
+    Each network is trained on a bootstrap sample of the data. So it differs from the
+    estimate as that differs from the truth: Student's prediction interval. The interval
+    over episodes adds to it in squares.
+    """
+    table, half = np.asarray(values, np.float64), 0.0
+    if len(table) > 1:
+        half = STUDENT_QUANTILE_975 * table.mean(1).std(ddof=1) * sqrt(1 + 1 / 3)
+    mean, low, high = mean_interval(table.mean(0))
+    ends = mean - hypot(mean - low, half), mean + hypot(high - mean, half)
+    return Estimate(mean, *ends, over_what(len(table)))
 
 
 def scores_and_decreases(

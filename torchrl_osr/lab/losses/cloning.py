@@ -83,7 +83,8 @@ class IQLLoss(ActorCriticLoss):
     :func:`~torchrl_osr.modules.gaussian_actor`, and they update :math:`V` first.
 
     Keyword Args:
-        temperature: :math:`\beta`. Default 3.0, the authors' for robots; mazes 10.0.
+        temperature: :math:`\beta`. Default 3.0, the authors' for robots, whose
+            rewards they scale; mazes 10.0.
         expectile: :math:`\tau`. Default 0.7, the authors' for robots; mazes 0.9.
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 

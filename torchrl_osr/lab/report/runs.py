@@ -191,7 +191,7 @@ def _read(folder: Path) -> _Run:
     judged = [f for f in (folder / f"body-{OFFLINE}", folder / OFFLINE) if f.exists()]
     if judged and not evaluations:  # judged by the data alone
         offline = read_json(judged[0])
-        values = offline["value_of_networks"]
+        values = offline["values"]
         seeds = [*range(len(values))]
         each = {"step": offline["step"], "seeds": seeds, "returns": values}
         evaluations, references, measure = [each], None, "return"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from torchrl_osr.lab.dynamics import Body
 from torchrl_osr.lab.evaluation import deterministic_policy, fitted_values
 from torchrl_osr.lab.evaluation.grey_box import fitted_grey_box, rolled_out_values
 from torchrl_osr.lab.evaluation.offline import check_discount, episode_values
-from torchrl_osr.lab.evaluation.statistics import crossed_mean
+from torchrl_osr.lab.evaluation.statistics import mean_of_networks
 from torchrl_osr.lab.run.data import load_data
 from torchrl_osr.lab.run.folder import package_versions
 from torchrl_osr.lab.run.load import load_trained, run_folder_of
@@ -33,7 +34,7 @@ class OfflineEvaluator:
     the same data share them, and a grey box.
 
     Args:
-        steps, seed: of the training.
+        steps, seed: of the training. Default steps: as many as it needs.
         discount: default: that of the run. A body bears longer rollouts: 0.997.
         data: place of the data, if they have been moved.
         xml, frame_skip: of the robot's :class:`~torchrl_osr.lab.dynamics.Body`, for
@@ -65,7 +66,7 @@ class OfflineEvaluator:
             "checkpoint": sha256_of(trained.path),
             "data": options.checksum,
             "discount": gamma,
-            "steps": self.steps or (8000 if self.xml is None else 3000),
+            "steps": self.steps,
             "seed": self.seed,
         }
         if self.xml is not None:
@@ -83,7 +84,8 @@ class OfflineEvaluator:
             raise ValueError(f"{path} cannot be evaluated on its data. {NO_REWARDS}")
         policy = deterministic_policy(trained.actor, trained.observation_norm)
         torch.set_num_threads(trained.config.trainer.num_threads)
-        training: dict[str, Any] = {"steps": request["steps"], "seed": self.seed}
+        steps = {} if self.steps is None else {"steps": self.steps}
+        training: dict[str, Any] = {"seed": self.seed} | steps
         if self.xml is None:
             values = fitted_values(rows, policy, gamma=gamma, **training)
         else:
@@ -95,7 +97,9 @@ class OfflineEvaluator:
             model = self._known["box"]
             values = rolled_out_values(model, rows, policy, gamma=gamma)[None]
         recorded = episode_values(rows, gamma)
-        found = crossed_mean(values)
+        if not isfinite(values.sum()):
+            raise ValueError(f"{path}: its estimated values are not finite numbers.")
+        found = mean_of_networks(values)
         results = request | {
             "env": env.name,
             "source": options.source,
@@ -104,7 +108,7 @@ class OfflineEvaluator:
             "value": found.mean,
             "value_low": found.low,
             "value_high": found.high,
-            "value_of_networks": values.mean(1).tolist(),
+            "values": values.mean(0).tolist(),
             "data_value": recorded.mean(),
         }
         write_json(file, results)

@@ -63,6 +63,7 @@ def train(run: Run) -> float:
         rows = phases.data.held_out
         sizes = (rows[key].shape[-1] for key in ("observation", "action"))
         run.config.dynamics.body().check(*sizes)
+    (run.folder / POLICY).unlink(missing_ok=True)  # of an earlier, shorter training
     if phases.learner.model is not None:
         phases.train_inverse_dynamics()
     rollouts = phases.train_dynamics() if run.config.dynamics.use else None
