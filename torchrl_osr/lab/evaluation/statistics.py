@@ -132,12 +132,13 @@ def scores_and_decreases(
 ) -> list[tuple[Estimate, Estimate | None]]:
     """Return ``K`` mean scores, and their decreases in percent of the first, clean one.
 
-    Runs are ``[E, K]``. Decreases are ``None`` if a clean mean is not above 0.
+    Runs are ``[E, K]``. Decreases are ``None`` if a clean mean is not
+    well above 0: a resample is below a tenth of it.
     """
     over = over_what(len(runs))
     means = np.mean([np.mean(np.asarray(run, float), axis=0) for run in runs], axis=0)
     resamples = nested_resamples(runs)
-    positive = means[0] > 0 and (resamples[:, 0] > 0).all()
+    positive = means[0] > 0 and (resamples[:, 0] > means[0] / 10).all()
     found: list[tuple[Estimate, Estimate | None]] = []
     for mean, column in zip(means, resamples.T, strict=True):
         lost = None
