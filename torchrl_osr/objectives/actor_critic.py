@@ -241,9 +241,10 @@ class ActorCriticLoss(LossModule):
         Its parameters become buffers, which an optimizer of ``loss.parameters()``
         cannot move. They share the network's memory.
         """
-        check_networks(actor_network=self.actor_network, **{name: network})
-        # A copy: tensordict 0.14.3 leaves a network without parameters in an error.
+        actor = getattr(self, "actor_network", None)
+        check_networks(actor_network=actor, **{name: network})
         self.convert_to_functional(network, name)
+        # A copy: tensordict 0.14.3 leaves a network without parameters in an error.
         self.__dict__[name] = copy.deepcopy(network)
         frozen = getattr(self, f"{name}_params").apply(
             lambda tensor: tensor.data, filter_empty=False

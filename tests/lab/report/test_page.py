@@ -52,8 +52,8 @@ def test_five_seeds_have_a_verdict(tmp_path):
     for shift in range(3):
         for seed in range(5):
             scores = [10.0 * shift + seed, 10.0 * shift + 2 * seed]
-            folder, curve = tmp_path / "runs" / f"{shift}-{seed}", {4: scores, 5: scores}
-            fakes.write_run(folder, curve, seed=seed, choice=f"m{shift}")
+            path = tmp_path / "runs" / f"{shift}-{seed}"
+            fakes.write_run(path, {4: scores, 5: scores}, seed=seed, choice=f"m{shift}")
     tables = read_runs([tmp_path / "runs"])
     first, second = (write_report(tables, tmp_path / name) for name in ("one", "two"))
     assert first.read_bytes() == second.read_bytes()
