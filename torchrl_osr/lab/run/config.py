@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_osr import objectives
-from torchrl_osr._checks import check_choice, check_positive
+from torchrl_osr._checks import check_choice, check_positive, check_weight
 from torchrl_osr._files import write_atomically
 from torchrl_osr.lab.run.schema import TrainConfig
 
@@ -77,6 +77,8 @@ def checked(config: DictConfig, trust: Sequence[str] = ()) -> TrainConfig:
             raise ValueError(f"{key} must be between 0 and 1, got {value}.")
         elif positive and key not in MAY_BE_0 and type(value) is int:
             check_positive(key, value, minimum=1)
+        elif key.endswith("_lr"):
+            check_weight(key, value)
     return made
 
 
@@ -93,8 +95,6 @@ def read_config(folder: Path) -> dict[str, Any]:
     """Read the configuration in the folder of a run; refuse that of another version."""
     content = read_yaml(folder / CONFIG)
     found = content.pop("format", 1)
-    for group, option in (("perturbation", "adversary"), ("data", "storage")):
-        content.get(group, {}).pop(option, None)  # older runs have them
     if found != FORMAT:
         raise ValueError(
             f"{folder} holds a run of another version of torchrl-osr (format {found}, "
