@@ -221,7 +221,7 @@ def _read(folder: Path) -> _Run:
     for file in sorted(folder.glob("recoverable-*.json")):
         content = read_json(file) | {"half": file.stem.removeprefix("recoverable-")}
         if (at := content["evaluations"][-1]["step"]) != steps:
-            content["half"] += f" at {at}"
+            content["half"] += f"-at-{at}"
         saved.append(saved_states(content))
         versions.append(content["versions"])
     above, name = folder.resolve().parts[-2:]
