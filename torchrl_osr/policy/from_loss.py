@@ -167,7 +167,7 @@ def _check_same(policy: Policy, loss: LossModule) -> None:
         if not torch.allclose(ours, wanted.cpu().float(), rtol=1e-4, atol=1e-5):
             raise ValueError(
                 f"the networks of this {type(loss).__name__} compute something else "
-                "than their MLPs and a distribution with bounds -1 and 1: build them "
+                "than their MLPs and a distribution with bounds -1 and 1. Build them "
                 "with low=-1 and high=1, train on actions of that range, and give the "
                 "environment's bounds here."
             )
