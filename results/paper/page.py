@@ -365,8 +365,7 @@ def ablation() -> str:
         for name in ABLATION:
             ours, _ = found[data, name]
             seeds = twin.index.intersection(ours.index)
-            share = saved_share(ours.loc[seeds], walks, twin.loc[seeds])
-            cells.append(str(share))
+            cells.append(str(saved_share(ours.loc[seeds], walks, twin.loc[seeds])))
         rows.append([name_of(data), *cells])
     return markdown(["R %", *(f"`{name}`" for name in ABLATION)], rows)
 

@@ -90,7 +90,7 @@ def convert(
     found: list[str] = []
     if options.action_bounds == "log":
         parts = [*parts]
-        options = replace(options, action_bounds=_range(dict(parts).values()))
+        options = replace(options, action_bounds=_range(part for _, part in parts))
         low, high = (
             "[" + ", ".join(f"{x:.4g}" for x in each) + "]"
             for each in options.action_bounds

@@ -132,8 +132,8 @@ def scores_and_decreases(
 ) -> list[tuple[Estimate, Estimate | None]]:
     """Return ``K`` mean scores, and their decreases in percent of the first, clean one.
 
-    Runs are ``[E, K]``. Decreases are ``None`` if a clean mean is not
-    well above 0: a resample is below a tenth of it.
+    Runs are ``[E, K]``. Decreases are ``None`` if a clean mean is not well above 0: a
+    resample is below a tenth of it.
     """
     over = over_what(len(runs))
     means = np.mean([np.mean(np.asarray(run, float), axis=0) for run in runs], axis=0)

@@ -152,11 +152,11 @@ def verdict(differences: Sequence[Difference], reference: str) -> list[str]:
 
     A method with several data sets is judged over all of them.
     """
-    everywhere = {x.method + x.quantity.name for x in differences if x.data == ALL_DATA}
+    whole = [each for each in differences if each.data == ALL_DATA]
+    everywhere = {(each.method, each.quantity.name) for each in whole}
     sentences, rest = [], dict[tuple[str, str], list[str]]()
     for each in differences:
-        judged = each.method + each.quantity.name in everywhere
-        if judged and each.data != ALL_DATA:
+        if each.data != ALL_DATA and (each.method, each.quantity.name) in everywhere:
             continue
         if each.estimate and each.verdict in ("better", "worse"):
             sentences.append(
