@@ -42,11 +42,9 @@ def gaussian_kl(
         >>> round(kl.item(), 6)
         0.910826
     """
-    variance_ratio = (scale_p / scale_q).square()
+    ratio = (scale_p / scale_q).square()
     # log(x) / 2 of the squared ratio: one logarithm, and exactly 0 for p == q.
-    return 0.5 * (
-        variance_ratio + ((loc_p - loc_q) / scale_q).square() - 1 - variance_ratio.log()
-    )
+    return 0.5 * (ratio + ((loc_p - loc_q) / scale_q).square() - 1 - ratio.log())
 
 
 def categorical_kl(log_prob_p: Tensor, log_prob_q: Tensor) -> Tensor:
@@ -97,30 +95,6 @@ def state_recovery(
     pair = {"forward": (*model, *policy), "reverse": (*policy, *model)}[direction]
     divergence = gaussian_kl(*pair)
     return {"sum": torch.sum, "mean": torch.mean}[action_reduction](divergence, -1)
-
-
-def deterministic_recovery(
-    policy_loc: Tensor,
-    inverse_dynamics_loc: Tensor,
-    inverse_dynamics_scale: Tensor,
-    *,
-    action_reduction: Literal["sum", "mean"] = "sum",
-) -> Tensor:
-    r"""Return the state-recovery term of a policy without a density.
-
-    .. math::
-        \sum_d \frac{(x_d - \mu_{I,d})^2}{2\sigma_{I,d}^2}
-
-    with :math:`x` the policy's action before the tanh, ``policy_loc``. An addition, not
-    in the paper, whose divergence needs two densities: towards a point
-    :math:`KL(I \,\|\, \pi)` is infinite. This is the part of the reverse
-    :math:`KL(\pi \,\|\, I)` that depends on the mean of a Gaussian policy of fixed
-    width. The arguments are those of :func:`state_recovery`.
-    """
-    # Of equal widths, only the means are left in the divergence.
-    scale = inverse_dynamics_scale
-    pair = policy_loc, scale, inverse_dynamics_loc, scale
-    return state_recovery(*pair, action_reduction=action_reduction)
 
 
 def soft_policy_value(

@@ -33,6 +33,8 @@ class StatePerturbation(Transform):
     other draws of a run unchanged. In an environment it adds the same entry to
     observations and specs.
 
+    Append it after transforms that rescale the state (``ObservationNorm``).
+
     Each transform draws its own noise, also without a ``seed``, as a copy, or in a
     worker process of a ``DataLoader``. ``load_state_dict`` continues the noise of the
     saved transform.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from objectives.losses import assert_same_bits, call, make_batch, make_loss
+from objectives.losses import Networks, assert_same_bits, call, make_batch, make_loss
 from torch._dynamo.testing import CompileCounter
 from torchrl.objectives import HardUpdate, SoftUpdate
 
@@ -35,7 +35,8 @@ def hard(loss) -> HardUpdate:
 @pytest.mark.parametrize("delay", [1, 3])
 @pytest.mark.parametrize("updater", [soft, hard])
 def test_it_is_a_loop_with_two_optimizers(trace, delay, updater) -> None:
-    loss, plain = make_loss("osr"), make_loss("osr")
+    networks = Networks(low=-torch.ones(2), high=torch.ones(2))
+    loss, plain = make_loss("osr", networks), make_loss("osr")
     fuse_critics(plain)
     critics, policy = parts(loss)
     update = FastUpdate(
@@ -59,6 +60,7 @@ def test_it_is_a_loop_with_two_optimizers(trace, delay, updater) -> None:
         plain.zero_grad()
         torch.testing.assert_close(returned[step - 1], losses.detach(), rtol=0, atol=0)
     assert_same_bits([*loss.state_dict().values()], [*plain.state_dict().values()])
+    assert all(bool(each.trace) is trace for each in update.gradients)
     assert not any(each.requires_grad for each in returned[-1].values())
     assert all(each.grad is None for each in loss.parameters())
 

@@ -60,7 +60,7 @@ RENAMED = {"perturbed": "noisy", "terminated": "over"} | {
     name: ("agent", f"its_{name}")
     for name in (
         *("action", "state_action_value", "action_value", "value", "reward"),
-        *("done", "priority", "priority_weight", "is_synthetic"),
+        *("done", "priority", "priority_weight", "is_synthetic", "steps_to_next_obs"),
     )
 }
 
@@ -91,6 +91,8 @@ def renamed_loss(name: str):
 def test_nested_and_renamed_keys_change_no_number(name) -> None:
     batch = make_batch(name, 10)
     batch["priority_weight"] = torch.linspace(0.5, 2.0, 10).double()
+    if name in ("cql", "iql"):
+        batch["steps_to_next_obs"] = torch.arange(1, 11).unsqueeze(-1)
     if name != "iql":
         batch["is_synthetic"] = torch.arange(10).unsqueeze(-1) > 6
     other, plain, loss = renamed(batch), make_loss(name), renamed_loss(name)

@@ -158,6 +158,16 @@ def test_a_model_of_other_bounds_or_actions_is_refused(name) -> None:
             make_loss(name, networks)(make_batch(name, 4))
 
 
+CHOICES = [("osr", "reduction"), ("model", "loss_function"), ("osr-v", "policy_values")]
+CHOICES += [("osr-v", "recovery_target"), ("recovery", "recovery_target")]
+
+
+@pytest.mark.parametrize(("name", "option"), CHOICES)
+def test_a_misspelt_choice_is_refused(name, option) -> None:
+    with pytest.raises(ValueError, match=f"{option} must be one of"):
+        make_loss(name, **{option: "l2"})
+
+
 def test_recurrent_actors_are_refused() -> None:
     gru = GRUModule(S, 8, in_key="observation", out_key="hidden")
     layer = TensorDictModule(nn.Linear(8, 2), ["hidden"], ["action"])
@@ -199,6 +209,13 @@ def test_a_frozen_model_is_followed_and_never_trained(name) -> None:
     assert after[metric] != before[metric]
     assert torch.equal(call(make_loss(name, networks), batch)[metric], after[metric])
     assert model not in vars(loss).values(), "an error in it would empty the model"
+
+
+def test_a_frozen_network_has_the_weights_that_a_loss_loads() -> None:
+    loss, other = make_loss("osr"), make_loss("osr", make_networks("osr", seed=9))
+    loss.load_state_dict(other.state_dict())
+    models = (each.inverse_dynamics_network.parameters() for each in (loss, other))
+    assert all(map(torch.equal, *models))
 
 
 def test_td3_needs_the_bounds_of_a_plain_actor() -> None:

@@ -92,9 +92,8 @@ class FastUpdate:
     ) -> None:
         compiled = loss_module._compiled_call_impl is not None
         self._on_gpu = next(loss_module.parameters()).is_cuda
-        if self._on_gpu:
-            hold_bounds(loss_module)
-        elif not compiled:
+        hold_bounds(loss_module)
+        if not self._on_gpu and not compiled:
             fuse_critics(loss_module)
         parameters: list[Sequence[nn.Parameter] | None] = [None]
         if policy_delay > 1:
@@ -154,10 +153,11 @@ class FastUpdate:
 
 
 def hold_bounds(loss_module: LossModule) -> None:
-    """Put the bounds of actions where the networks are.
+    """Put the bounds of actions where the networks are; equal ones become numbers.
 
-    TorchRL 0.14.1 copies them to the GPU at every use, which a CUDA graph cannot. Its
-    TanhDelta also waits for bounds that are tensors, unlike numbers.
+    TorchRL 0.14.1 copies them to the GPU at every use, which a CUDA graph cannot. It
+    also looks at bounds that are tensors, which no trace can: TanhDelta on every
+    device, TanhNormal on the CPU.
     """
     device = next(loss_module.parameters()).device
     parts = [part for each in loss_module.modules() for part in vars(each).values()]
@@ -167,9 +167,8 @@ def hold_bounds(loss_module: LossModule) -> None:
             bounds = {}
             for name in {"low", "high"} & head.distribution_kwargs.keys():
                 bound = torch.as_tensor(head.distribution_kwargs[name], device=device)
-                alike = head.distribution_class is TanhDelta and bool(
-                    (bound == bound.amin()).all()
-                )
+                number = not bound.is_cuda or head.distribution_class is TanhDelta
+                alike = number and bool((bound == bound.amin()).all())
                 bounds[name] = bound.amin().item() if alike else bound
             head.distribution_kwargs = head.distribution_kwargs | bounds
 

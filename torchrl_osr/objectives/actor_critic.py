@@ -35,7 +35,7 @@ from torchrl.objectives import LossModule, ValueEstimators, distance_loss
 from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
 
 from torchrl_osr import functional as F
-from torchrl_osr._checks import check_positive, check_weight
+from torchrl_osr._checks import check_choice, check_positive, check_weight
 from torchrl_osr._entries import column, is_next, nested, state_keys
 from torchrl_osr.objectives.networks import (
     action_bounds,
@@ -150,6 +150,9 @@ class ActorCriticLoss(LossModule):
     inverse_dynamics_network_params: TensorDictParams
     target_inverse_dynamics_network_params: TensorDictParams
 
+    _value_estimator_default_keys = (  # set_keys passes these on
+        *("value", "reward", "done", "terminated", "steps_to_next_obs"),
+    )
     # Losses without CQL's term.
     has_cql = max_q_backup = deterministic_backup = False
     target_action_gap: float | None = None
@@ -165,6 +168,7 @@ class ActorCriticLoss(LossModule):
         use_prioritized_weights: bool = True,
     ) -> None:
         super().__init__()
+        check_choice("reduction", reduction, ("mean", "sum", "none", None))
         self.num_qvalue_nets = num_qvalue_nets
         self.loss_function = loss_function
         self.deactivate_vmap = deactivate_vmap
@@ -244,8 +248,10 @@ class ActorCriticLoss(LossModule):
         actor = getattr(self, "actor_network", None)
         check_networks(actor_network=actor, **{name: network})
         self.convert_to_functional(network, name)
-        # A copy: tensordict 0.14.3 leaves a network without parameters in an error.
-        self.__dict__[name] = copy.deepcopy(network)
+        # tensordict 0.14.3 leaves a network without parameters in an error, so this is
+        # a copy. It has the same tensors.
+        own = {id(each): each for each in (*network.parameters(), *network.buffers())}
+        self.__dict__[name] = copy.deepcopy(network, own)
         frozen = getattr(self, f"{name}_params").apply(
             lambda tensor: tensor.data, filter_empty=False
         )
@@ -312,7 +318,7 @@ class ActorCriticLoss(LossModule):
         gamma: float = 0.99,
     ) -> Self:
         """Set the discount of the TD(0) target."""
-        names = ("value", "reward", "done", "terminated", "steps_to_next_obs")
+        names = self._value_estimator_default_keys
         dispatch_value_estimator(
             self,
             value_type or ValueEstimators.TD0,

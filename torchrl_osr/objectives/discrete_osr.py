@@ -51,7 +51,8 @@ class DiscreteOSRLoss(ActorCriticLoss):
             ``"action_value"``, ``[B, n]``
             (:func:`~torchrl_osr.modules.discrete_critic_ensemble`).
         inverse_dynamics_network: a *trained* categorical model of ``I(a | s, s')``,
-            frozen here. Needed unless ``recovery_weight=0``.
+            frozen here, with the actor's mask, if any. Needed unless
+            ``recovery_weight=0``.
 
     Keyword Args:
         recovery_weight: weight :math:`\lambda`. Default 0.5. May be assigned later.

@@ -15,7 +15,7 @@ from tensordict.nn import (
 )
 
 from torchrl_osr import functional as F
-from torchrl_osr._checks import check_weight
+from torchrl_osr._checks import check_choice, check_weight
 from torchrl_osr._entries import entry, nested, state_keys
 from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses
 from torchrl_osr.objectives.networks import (
@@ -86,6 +86,7 @@ class InverseDynamicsLoss(ActorCriticLoss):
         use_prioritized_weights: bool = True,
     ) -> None:
         check_weight("latent_weight", latent_weight)
+        check_choice("loss_function", loss_function, ("nll", "mse"))
         super().__init__(
             reduction=reduction, use_prioritized_weights=use_prioritized_weights
         )

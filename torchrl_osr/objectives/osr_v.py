@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 
 from torchrl_osr import functional as F
-from torchrl_osr._checks import check_positive
+from torchrl_osr._checks import check_choice, check_positive
 from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses, StatePolicy
 from torchrl_osr.objectives.networks import check_num_actions
 from torchrl_osr.objectives.transitions import SETS, States, Transitions
@@ -91,6 +91,8 @@ class OSRVLoss(ActorCriticLoss):
     ) -> None:
         check_positive("num_random", num_random, minimum=1)
         check_positive("temperature", temperature)
+        check_choice("policy_values", policy_values, ("mean", "cql"))
+        check_choice("recovery_target", recovery_target, ("inverse_dynamics", "data"))
         if recovery_target != "data" and inverse_dynamics_network is None:
             raise ValueError(
                 "OSRVLoss needs an inverse_dynamics_network: pass one, or "

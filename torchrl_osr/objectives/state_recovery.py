@@ -6,7 +6,7 @@ Shapes: ``R`` rows, ``A`` action, ``D`` sets of states (2 for D_tot, 1 for eithe
 from __future__ import annotations
 
 import copy
-from typing import Any, Literal, Self, cast
+from typing import Any, Literal, Self
 
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
@@ -16,6 +16,7 @@ from torchrl.modules.distributions.utils import safeatanh_noeps
 from torchrl.objectives import LossModule
 
 from torchrl_osr import functional as F
+from torchrl_osr._checks import check_choice
 from torchrl_osr._entries import nested, state_keys
 from torchrl_osr.objectives.actor_critic import ActorCriticLoss, Losses
 from torchrl_osr.objectives.networks import (
@@ -46,10 +47,11 @@ class StateRecoveryLoss(ActorCriticLoss):
     and (12) of the paper of :class:`~torchrl_osr.OSRLoss`.
 
     A deterministic actor (a :class:`~torchrl.modules.TanhDelta`, or a module that
-    writes the action) is pulled to the model's mean, by
-    :func:`~torchrl_osr.functional.deterministic_recovery`: an addition, not in the
-    paper. So is the mean of an :class:`~torchrl.modules.IndependentNormal`. A module
-    should end in a tanh; beyond the bounds its gradient is finite, but huge.
+    writes the action) is pulled to the model's mean by
+    :math:`(x - \mu_I)^2 / (2\sigma_I^2)` of its action :math:`x` before the tanh: an
+    addition, not in the paper, that is (11) with equal widths. So is the mean of an
+    :class:`~torchrl.modules.IndependentNormal`. A module should end in a tanh; beyond
+    the bounds its gradient is finite, but huge.
 
     With ``recovery_target="data"`` it is noisy behaviour cloning, which needs no model:
     :math:`-\log\pi(a \mid \tilde s)`, and the squared distance
@@ -99,6 +101,7 @@ class StateRecoveryLoss(ActorCriticLoss):
         action_reduction: Literal["sum", "mean"] = "sum",
         **options: Any,
     ) -> None:
+        check_choice("recovery_target", recovery_target, ("inverse_dynamics", "data"))
         super().__init__(**options)
         self.convert_to_functional(actor_network, "actor_network")
         self.recovery_target, self.recovery_states = recovery_target, recovery_states
@@ -155,25 +158,23 @@ class StateRecoveryLoss(ActorCriticLoss):
 
     def divergence(self, pi: Any, model: Any) -> Tensor:
         """Return the recovery term (11) of a policy and a model, ``[D, R]``."""
+        # Of equal widths, only the means are left in the divergence.
+        scale = model.scale
         if isinstance(pi, TanhDelta):
             loc = pi.base_dist.param  # not its action, which may have saturated
         elif self.is_deterministic or self.is_normal:
-            loc = self.pre_tanh(pi if isinstance(pi, Tensor) else pi.mean)
+            action = pi if isinstance(pi, Tensor) else pi.mean
+            width = self.action_high - self.action_low
+            # Clamped a little inside the bounds, where the slope is finite.
+            loc = safeatanh_noeps(2 * (action - self.action_low) / width - 1)
         else:
-            loc = pi.loc
+            loc, scale = pi.loc, pi.scale
         check_num_actions("inverse_dynamics_network", model.loc, loc)
-        options: dict[str, Any] = {"action_reduction": self.action_reduction}
-        if self.is_deterministic or self.is_normal:
-            return F.deterministic_recovery(loc, model.loc, model.scale, **options)
-        options["direction"] = self.recovery_direction
-        return F.state_recovery(loc, pi.scale, model.loc, model.scale, **options)
-
-    def pre_tanh(self, action: Tensor) -> Tensor:
-        """Return an action before the tanh, ``[D, R, A]``."""
-        width = self.action_high - self.action_low
-        squashed = 2 * (action - self.action_low) / width - 1
-        # Clamped a little inside the bounds, where the slope is finite.
-        return cast(Tensor, safeatanh_noeps(squashed))
+        return F.state_recovery(
+            *(loc, scale, model.loc, model.scale),
+            direction=self.recovery_direction,
+            action_reduction=self.action_reduction,
+        )
 
 
 class WithRecovery(LossModule):

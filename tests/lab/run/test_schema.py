@@ -1,4 +1,4 @@
-"""Every configuration composes, and a mistyped key or value stops by name."""
+"""Every configuration composes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from dataclasses import fields
 
 import pytest
 from composed import CONF, composed
-from hydra.errors import ConfigCompositionException
 from hydra.utils import get_class
 from omegaconf import OmegaConf
 
@@ -80,22 +79,6 @@ def test_schema_has_the_names_and_defaults_of_the_constructor(name):
     # OmegaConf takes every default for a value of its field's type, and keeps it.
     structured = OmegaConf.structured(schema)
     assert {key: structured[key] for key in defaults} == defaults
-
-
-@pytest.mark.parametrize(
-    ("override", "named"),
-    [
-        ("trainer.steps=many", "many"),
-        ("inverse_dynamics.loss.latent_wieght=1", "latent_wieght"),
-        ("loss.recovery_wieght=1", "wieght"),
-        ("loss.num_random=1.5", "1.5"),
-        ("loss.max_q_backup=perhaps", "perhaps"),
-    ],
-)
-def test_mistyped_key_or_type_stops_by_name(override, named):
-    with pytest.raises(ConfigCompositionException) as error:
-        composed("train", override)
-    assert named in f"{error.value} {error.value.__cause__}"
 
 
 def test_official_preset_is_the_released_code():

@@ -47,7 +47,8 @@ def fitted_values(
 
     Keyword Args:
         gamma: discount factor, below 1.
-        steps: of the training of the critics. Default: :func:`enough_updates`.
+        steps: of the critics' training. Default: until the targets have come 98 % of
+            their way.
         num_critics: each learns from episodes drawn with replacement.
         seed: of networks, batches and drawn episodes.
         progress: show a progress bar.
@@ -99,7 +100,7 @@ def fitted_values(
     loss.make_value_estimator(gamma=gamma)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3, fused=True)
     update = FastUpdate(loss, optimizer, SoftUpdate(loss, tau=TAU))
-    steps = steps or enough_updates(gamma)
+    steps = steps or max(8000, round(4 / TAU / (1 - gamma)))
     fit(update, rows, "fitted Q evaluation", steps, seed=seed, progress=progress)
     states = TensorDict({"observation": (starts - loc) / scale}, [number])
     params = loss.target_qvalue_network_params
@@ -107,11 +108,6 @@ def fitted_values(
         value = loss.q(states, act(policy, starts, size), params)
     found: Array = (unit * value).double().numpy()
     return found
-
-
-def enough_updates(gamma: float) -> int:
-    """Return after how many updates the targets have come 98 % of their way."""
-    return max(8000, round(4 / TAU / (1 - gamma)))
 
 
 def check_discount(gamma: float) -> None:

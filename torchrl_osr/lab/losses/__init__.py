@@ -1,4 +1,4 @@
-"""The losses that OSR is compared with."""
+"""The losses that OSR is compared with. They need the extra ``train``."""
 
 from torchrl_osr.lab.losses.cloning import BCLoss, IQLLoss
 from torchrl_osr.lab.losses.ensembles import EDACLoss, RORLLoss

@@ -117,14 +117,13 @@ class IQLLoss(ActorCriticLoss):
         super().__init__(**options)
         self.register_actor_critic(actor_network, qvalue_network)
         self.convert_to_functional(value_network, "value_network")
-        self.advantage_temperature, self.expectile = temperature, expectile
+        self.temperature, self.expectile = temperature, expectile
         losses = ["loss_actor", "loss_qvalue", "loss_value"]
         self.declare(losses, ["nll", "pred_value", "target_value"])
 
     def losses(self, batch: Transitions) -> Losses:
-        pi = distribution(
-            self.actor_network, self.actor_network_params, batch.states[:1]
-        )
+        params = self.actor_network_params
+        pi = distribution(self.actor_network, params, batch.states[:1])
         nll = cloning_distance(pi, batch.a, self.tensor_keys.action).squeeze(0)
         self.check_actions(batch, batch.a.shape)
         with torch.no_grad():
@@ -132,7 +131,7 @@ class IQLLoss(ActorCriticLoss):
             best = self.q(batch.s, batch.a, target_params).min(0).values
             target = self.td_target(batch, self.state_value(batch.s_next))
         advantage = best - self.state_value(batch.s)
-        weight = (self.advantage_temperature * advantage.detach()).exp().clamp(max=100)
+        weight = (self.temperature * advantage.detach()).exp().clamp(max=100)
         error, metrics = self.td_error(batch, self.q(batch.s, batch.a), target)
         tau = torch.where(advantage < 0, 1 - self.expectile, self.expectile)
         losses = {
