@@ -121,9 +121,7 @@ def test_autocast_rounds_products_alone(options):
         half = results(loss, batch)
     assert half[0]["loss_cql"].dtype == torch.float32
     torch.testing.assert_close(dict(half[0]), dict(exact[0]), rtol=5e-2, atol=5e-2)
-    found, wanted = (
-        torch.cat([x.flatten() for x in each[1]]) for each in (half, exact)
-    )
+    found, wanted = (torch.cat([x.flatten() for x in y[1]]) for y in (half, exact))
     assert 0 < (found - wanted).norm() < 0.4 * wanted.norm()
 
 

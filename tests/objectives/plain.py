@@ -21,10 +21,8 @@ GAMMA, ALPHA, TARGET_ENTROPY, TARGET_SCALE = 0.875, 0.3, -1.5, 0.8
 SOFT = {"alpha_init": ALPHA, "target_entropy": TARGET_ENTROPY}
 # Tensors in float64: TorchRL would keep numbers in float32, to 1e-8 only.
 UNIT = {"low": -torch.ones(2).double(), "high": torch.ones(2).double()}
-BOX = {
-    "low": torch.tensor([-1.0, -1.5]).double(),
-    "high": torch.tensor([2.0, 1.0]).double(),
-}
+LOW, HIGH = torch.tensor([[-1.0, -1.5], [2.0, 1.0]]).double()
+BOX = {"low": LOW, "high": HIGH}
 
 
 def prepare(loss: LossModule) -> LossModule:
@@ -219,9 +217,8 @@ def compare(
     expected, part = restated(), parts(loss)[0]
     losses = {key: value for key, value in out.items() if key.startswith("loss_")}
     assert set(losses) == set(expected)
-    check(
-        label, [losses[key] for key in expected], expected.values(), tolerance=tolerance
-    )
+    found = [losses[key] for key in expected]
+    check(label, found, expected.values(), tolerance=tolerance)
     sum(losses.values()).backward()
     ours, wanted = [], []
     for names, network in networks.items():

@@ -42,9 +42,7 @@ def test_flags_of_any_type_are_flags(name) -> None:
 @every_loss
 def test_numbers_of_any_type_are_cast_to_the_networks(name) -> None:
     loss, batch = make_loss(name).float(), make_batch(name, 10)
-    single = batch.apply(
-        lambda each: each.float() if each.is_floating_point() else each
-    )
+    single = batch.apply(lambda x: x.float() if x.is_floating_point() else x)
     wanted = record(loss, single)
     assert_same_bits(record(loss, batch), wanted)
     assert {each.dtype for each in wanted} == {torch.float32}
@@ -152,6 +150,7 @@ RECOVERY = ["official", "recovery", "recovery-module", "noisy-cloning"]
 OF_DATA = dict.fromkeys(LOSS_ACTOR, "loss_actor") | {"osr-v": "recovery_gap"}
 OF_DATA |= dict.fromkeys(RECOVERY, "loss_recovery") | {"osr-v-cql": "recovery_gap"}
 OF_DATA |= dict.fromkeys(["discrete-cql", "cql"], "loss_cql")
+OF_DATA["cql-options"] = "loss_alpha_prime"
 
 
 @pytest.mark.parametrize(("name", "key"), OF_DATA.items())

@@ -53,23 +53,21 @@ VARIANTS = {
     "SAC-N": ENSEMBLE,
     "OSR": {},
     "OSR: temperature 1": {"temperature": 1.0},
+    "OSR: values of clean states": {"actor_states": "clean"},
     "OSR-10": ENSEMBLE,
 }
 
 
 def recovery(plain: PlainCQL, model, batch, *, released: bool = False) -> Tensor:
     """Return the weighted recovery term, over rows with a next state."""
-    pushed, valid = (
-        batch["perturbed", "observation"],
-        ~batch["next", "done"].squeeze(-1),
-    )
+    pushed, done = batch["perturbed", "observation"], batch["next", "done"].squeeze(-1)
     s = torch.stack([pushed] if released else [batch["observation"], pushed])
     with torch.no_grad():
         wanted = density(model, s, batch["next", "observation"].expand_as(s))
     pair = [wanted, plain.policy(s)]
     each = kl_divergence(*(pair[::-1] if released else pair)).sum(-1)
     each = each / 2 if released else each
-    return RECOVERY_WEIGHT * each.mean(0)[valid].mean()
+    return RECOVERY_WEIGHT * each.mean(0)[~done].mean()
 
 
 @pytest.mark.parametrize("number", [1, 3])
@@ -80,7 +78,7 @@ def test_losses_and_gradients_equal_the_restatement(check, variant, number) -> N
     options, recovers = VARIANTS[variant], variant.startswith("OSR")
     plain, model = PlainCQL(networks, **options), copy.deepcopy(networks.model)
     states = torch.stack([batch["observation"], batch["perturbed", "observation"]])
-    if not recovers and "actor_states" not in options:
+    if options.get("actor_states", "both" if recovers else "clean") == "clean":
         states = states[:1]
 
     def restated() -> dict[str, Tensor]:
@@ -120,6 +118,8 @@ def test_released_variant_equals_the_restatement(check) -> None:
 def test_metrics_and_priorities_are_what_they_are_called() -> None:
     networks, batch = Networks(), make_batch("cql", 10)
     loss, plain = make_loss("cql", networks, **SOFT), Plain(networks)
+    assert loss.alpha.item() == pytest.approx(ALPHA), "alpha_init"
+    assert loss.value_estimator.gamma.item() == pytest.approx(0.99)
     out = call(prepare(loss), batch)
     assert out["alpha"].item() == pytest.approx(ALPHA)
     # -log alpha (mean log pi + target): the entropy is what the temperature sees.
@@ -128,8 +128,11 @@ def test_metrics_and_priorities_are_what_they_are_called() -> None:
     values = plain.values(batch["observation"], batch["action"]).detach()
     torch.testing.assert_close(out["pred_value"], values.mean())
     loss.make_value_estimator(gamma=0.0)
+    loss.loss_function = "l1"
     reward = batch["next", "reward"].squeeze(-1)
     out = call(loss, batch)
     torch.testing.assert_close(out["target_value"], reward.mean())
     # The priority is the largest error of the critics.
-    torch.testing.assert_close(batch["td_error"], (values - reward).abs().amax(0))
+    error = (values - reward).abs()
+    torch.testing.assert_close(batch["td_error"], error.amax(0))
+    torch.testing.assert_close(out["loss_qvalue"].detach(), error.mean(1).sum())

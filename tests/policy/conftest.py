@@ -30,9 +30,8 @@ def make_loss() -> Callable[..., torch.nn.Module]:
             return DiscreteOSRLoss(actor, critics, recovery_weight=0)
         critics = modules.critic_ensemble(STATE, ACTION, layer_norm=layer_norm, **many)
         if kind == "td3_bc":
-            return TD3BCLoss(
-                modules.deterministic_actor(STATE, ACTION, **cells), critics
-            )
+            actor = modules.deterministic_actor(STATE, ACTION, **cells)
+            return TD3BCLoss(actor, critics)
         actor = modules.tanh_gaussian_actor(STATE, ACTION, **cells)
         return CQLLoss(actor, critics)
 

@@ -26,7 +26,9 @@ def monitor_of(log, **options):
 
 
 def test_score_is_the_distance_to_the_nearest_kept_row(log):
-    rows, _ = log
+    rows, episode = log
+    drift = rows + np.float32([0.01, 0, 0]) * episode[:, None]
+    assert monitor_of((drift, episode), num_states=300).threshold < 1
     monitor = monitor_of(log, num_states=300)
     kept = monitor.states.numpy() * monitor.scale.numpy() + monitor.loc.numpy()
     apart = np.abs(kept[:, None] - rows).max(-1)

@@ -14,10 +14,9 @@ class Recorder(gymnasium.Env):
     """
 
     def __init__(self, falls=(), *, size=2, low=-1.0, high=1.0, sensors=1) -> None:
-        self.observation_space = gymnasium.spaces.Box(
-            -np.inf, np.inf, (sensors,), np.float64
-        )
-        self.action_space = gymnasium.spaces.Box(low, high, (size,), np.float32)
+        box = gymnasium.spaces.Box
+        self.observation_space = box(-np.inf, np.inf, (sensors,), np.float64)
+        self.action_space = box(low, high, (size,), np.float32)
         self.falls, self.actions = set(falls), []
 
     def reset(self, *, seed=None, options=None):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
+from uneven_dynamics import linear_dynamics
 
 from torchrl_osr.lab.dynamics import Body
 from torchrl_osr.lab.evaluation import fitted_grey_box, rolled_out_values
@@ -68,3 +69,16 @@ def test_a_policys_value_is_that_of_the_recursion(log, tmp_path):
 def test_a_discount_of_1_has_no_finite_value(log):
     with pytest.raises(ValueError, match="The discount is 1; expected at least 0"):
         rolled_out_values(None, log, policy, gamma=1)
+
+
+def test_returns_by_hand() -> None:
+    world = linear_dynamics((1, 1), {(1, 0): 1.0, (0, 1): 1.0}, (1, 1))
+    world.limits[1] = 2.5
+    state, ended = torch.tensor([[0.0], [-20.0], [3e38]]), torch.ones(3, 1).bool()
+    after = {"observation": state, "done": ended, "terminated": ended}
+    after["reward"] = torch.tensor([[-1.0], [1.5], [0.0]])
+    data = TensorDict({"observation": state, "action": state, "next": after}, [3])
+    found = rolled_out_values(
+        world, data, lambda s: torch.where(s > 9, 3e38, 1.0), gamma=0.5
+    )
+    assert sorted(found) == pytest.approx([-63 / 32, 0.5, 0.875])

@@ -7,6 +7,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from torchrl_osr.lab.evaluation import offline
 from torchrl_osr.lab.evaluation.offline import episode_values, fitted_values
 
 GAMMA, STEPS, EPISODES = 0.8, 20, 150
@@ -59,3 +60,18 @@ def test_rows_out_of_order_have_no_first_states():
     data = rolled_out(-0.3, 0.7)[torch.randperm(EPISODES * STEPS)]
     with pytest.raises(ValueError, match="Give the rows in order"):
         fitted_values(data, lambda s: s, progress=False)
+
+
+def test_critics_learn_from_whole_episodes_and_the_policys_choices(monkeypatch):
+    data, given = rolled_out(-0.3, 0.7), []
+    monkeypatch.setattr(offline, "fit", lambda *each, **_: given.extend(each))
+    data["action"] = data["action"].expand(-1, 2)
+    data["next", "reward"] = 1 + data["action"][:, :1] ** 2
+    fitted_values(data, lambda s: (s[:, 0] > 0).long(), gamma=GAMMA)
+    update, rows, *_ = given
+    drawn = rows["bootstrap"].reshape(EPISODES, STEPS, 3)
+    assert (drawn == drawn[:, :1]).all()
+    assert {0, 1, 2} <= {*drawn.flatten().tolist()}
+    assert update.loss_module.value_bounds == (0, 1)
+    choice = data["next", "observation"][:, 0] > 0
+    assert torch.equal(rows["next", "action"].argmax(-1), choice.long())

@@ -49,12 +49,15 @@ def test_an_interval_says_what_it_is_over(runs, over):
     assert estimate(scores).over == nested_mean([scores]).over == over
     assert estimate(scores).mean == pytest.approx(2 + (runs - 1) / 2)
     assert nested_mean([scores, scores * 2]).mean == estimate(scores).mean
+    # Data sets are drawn apart, runs of one data set alike.
+    assert nested_mean([scores] * 4).low > nested_mean([scores]).low
 
 
 def test_the_interval_of_networks_contains_the_truth():
     # 0, 1 and 2 have a deviation of 1: Student's 4.303 times the root of 4 / 3.
-    found = mean_of_networks(np.arange(3.0)[:, None] + np.zeros((1, 50)))
-    assert found[:3] == pytest.approx((1, -3.968, 5.968), abs=1e-3)
+    # Of the 50 episodes, 1.96 times 8 / sqrt(50), at a right angle.
+    found = mean_of_networks(np.arange(3.0)[:, None] + [-8.0, 8.0] * 25)
+    assert found[:3] == pytest.approx((1, -4.44, 6.44), abs=0.15)
     draws = np.random.default_rng(1).normal(size=(2000, 4, 1))
     inside = [(x := mean_of_networks(n)).low <= truth <= x.high for truth, *n in draws]
     assert np.mean(inside) == pytest.approx(0.95, abs=0.02)
@@ -69,6 +72,7 @@ def test_decreases_of_several_runs_by_hand():
     assert score.mean == pytest.approx(20)
     assert lost[:3] == pytest.approx((50, 50, 50))
     assert scores_and_decreases([-run])[1][1] is None
+    assert scores_and_decreases([[[-1, 1], [3, 1]]])[1][1] is None
 
 
 def test_the_saved_share_of_known_tables():

@@ -20,12 +20,11 @@ from torchrl.modules import ProbabilisticActor
 
 from torchrl_osr.lab.losses import BCLoss, IQLLoss
 
-BETA, TAU = 2.0, 0.8
+BETA, TAU = 600.0, 0.8  # weights of advantages meet their limit
 
 
-@pytest.mark.parametrize("loop", [True, False])
 @pytest.mark.parametrize("number", [2, 3])
-def test_iql_equals_the_restatement(check, loop, number) -> None:
+def test_iql_equals_the_restatement(check, number) -> None:
     networks, batch = Networks(number=number), make_batch("iql", 20)
     plain, value = Plain(networks, actor="gaussian"), copy.deepcopy(networks.value)
 
@@ -48,7 +47,7 @@ def test_iql_equals_the_restatement(check, loop, number) -> None:
         "loss_value value": value,
     }
     parts = networks.gaussian, networks.critics, networks.value
-    options = {"temperature": BETA, "expectile": TAU, "deactivate_vmap": loop}
+    options = {"temperature": BETA, "expectile": TAU}
     loss = prepare(update_targets(IQLLoss(*parts, **options).double()))
     compare(check, "IQL", loss, batch, restated, trained, 1e-10)
 
