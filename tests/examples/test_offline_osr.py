@@ -6,8 +6,6 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.usefixtures("own_cache")
-
 
 def files(folder: Path) -> dict[str, bytes]:
     """Results, networks and log entries of a run."""

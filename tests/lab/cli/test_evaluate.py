@@ -45,9 +45,10 @@ def test_bad_input_is_named(tmp_path, monkeypatch, folder, overrides, named):
 
 
 def test_sweep_evaluates_every_finished_run(tmp_path, folder, run):
-    for name in ("0_good", "1_damaged", "2_running"):
+    for name in ("0_good", "1_damaged", "2_running", "3_copied"):
         shutil.copytree(folder, tmp_path / "sweep" / name)
     sweep = tmp_path / "sweep"
+    (sweep / "3_copied" / "status.json").unlink()
     (sweep / "2_running" / "status.json").write_text('{"status": "running"}')
     for path in (sweep / "1_damaged" / "checkpoint" / "policy").glob("checkpoint-*"):
         path.write_bytes(path.read_bytes()[:100])
@@ -56,6 +57,7 @@ def test_sweep_evaluates_every_finished_run(tmp_path, folder, run):
     assert code == 1
     lines = output.splitlines()
     assert lines[0] == "left out: sweep/2_running: not finished, its status is running"
+    assert lines[1] == "left out: sweep/3_copied: not finished, its status is unknown"
     assert lines[-1] == "1 of 2 runs failed: sweep/1_damaged."
     assert re.search(r"of 2: sweep/1_damaged: failed: \S+ is damaged: ", output)
     assert "sweep/0_good: sweep/0_good/robustness-start.json" in output

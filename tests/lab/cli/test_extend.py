@@ -15,9 +15,8 @@ PAGE = (Path(__file__).parents[3] / "docs" / "extend.md").read_text(encoding="ut
 
 def save_files(folder: Path) -> None:
     """Write each block whose text before it names a file."""
-    blocks = re.findall(
-        r"`([\w/.]+\.(?:py|yaml))`[^`]*:\n\n```\w+\n(.*?)```", PAGE, re.S
-    )
+    block = r"(?s)`([\w/.]+\.(?:py|yaml))`[^`]*:\n\n```\w+\n(.*?)```"
+    blocks = re.findall(block, PAGE)
     names = ["my_losses.py", "conf/loss/awac.yaml", "point_mass.py"]
     assert [name for name, _ in blocks] == names
     for name, text in blocks:

@@ -44,6 +44,7 @@ def numbered(rows: int, start: int = 0) -> TensorDict:
     return TensorDict({"row": torch.arange(start, start + rows)}, [rows])
 
 
+@tried(100)
 @given(rows=st.integers(1, 50), share=st.floats(0, 1), seed=st.integers(0, 1000))
 def test_rows_are_drawn_without_replacement_in_exact_shares(rows, share, seed) -> None:
     sets = numbered(rows), numbered(60, 100)

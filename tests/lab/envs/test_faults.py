@@ -7,7 +7,7 @@ import copy
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchrl_osr.lab.data import make_environment
@@ -29,10 +29,8 @@ def executed(env, actions):
     return [float(action[0]) for action in env.unwrapped.actions]
 
 
-@given(
-    st.lists(st.floats(-1, 1, width=32), max_size=12),
-    st.integers(min_value=0, max_value=9),
-)
+@settings(deadline=None)
+@given(st.lists(st.floats(-1, 1, width=32), max_size=12), st.integers(0, 9))
 def test_delay_shifts_the_actions(recorder, sent, steps):
     env = ActionDelay(recorder(), steps)
     for _ in range(2):  # nothing is left over from one episode to the next

@@ -40,9 +40,8 @@ def test_edac_equals_the_restatement(check, number, weight) -> None:
     def restated() -> dict[str, Tensor]:
         found = plain.policy_losses(batch["observation"].unsqueeze(0))
         td = plain.td_loss(batch, plain.soft_value(batch, entropy=True))
-        similarity.append(
-            diversity(plain, batch["observation"], batch["action"]).mean()
-        )
+        pair = batch["observation"], batch["action"]
+        similarity.append(diversity(plain, *pair).mean())
         return found | {"loss_qvalue": td + weight * similarity[0]}
 
     options = SOFT | {"diversity_weight": weight}
@@ -93,9 +92,7 @@ def restated(plain: Plain, batch, options, weight: float) -> dict[str, Tensor]:
             both = kl_divergence(pi, other) + kl_divergence(other, pi)
             found.append(both.sum(-1))
         smoothness = torch.stack([max(row) for row in zip(*found, strict=True)]).mean()
-        losses["loss_actor"] = (
-            losses["loss_actor"] + options["policy_smooth_reg"] * smoothness
-        )
+        losses["loss_actor"] += options["policy_smooth_reg"] * smoothness
     total = plain.td_loss(batch, plain.soft_value(batch, entropy=True))
     if options["q_smooth_reg"]:
         clean, found = plain.values(s, a), []

@@ -61,9 +61,8 @@ def test_robustness_counts_those_that_met_the_disturbance(tmp_path):
         alive_after=[True, None, False, None], clean_alive_after=[None] * 4,
         recovery_steps=[0, 2, None, None],
     )  # fmt: skip
-    none = dict.fromkeys(
-        ("survived_knock", "alive_after", "recovery_steps"), [None] * 4
-    )
+    names = "survived_knock", "alive_after", "recovery_steps"
+    none = dict.fromkeys(names, [None] * 4)
     late = fakes.knock("late", clean, disturbed_at=[None] * 4, **none)
     half = fakes.level("half", [each / 2 for each in clean])
     content = fakes.suite_of((5, [1, 2, 3, 4], clean, [met, late, half]))

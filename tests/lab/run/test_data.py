@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import h5py
+import numpy as np
 import pytest
 import torch
 from composed import SMALL, configured
@@ -62,3 +64,14 @@ def test_rewards_are_scaled_then_shifted():
     for name in ("next", "multi_step"):
         after[name, "reward"] = before[name, "reward"]
     assert (after == before).all(), "nothing else is touched"
+
+
+def test_a_d4rl_file_has_the_bounds_of_its_run(tmp_path):
+    rows = np.linspace(-1, 1, 10, dtype=np.float32)[:, None]
+    with h5py.File(tmp_path / "log.hdf5", "w") as file:
+        file.update(observations=rows, actions=rows, rewards=rows[:, 0])
+        file.update(terminals=rows[:, 0] > 9, timeouts=rows[:, 0] == 1)
+    config = configured("data=d4rl", f"data.path={tmp_path}/log.hdf5")
+    config.env.id, config.env.action_low, config.env.action_high = None, [-2.0], [2.0]
+    data, _ = load_data(config.env, config.data, progress=False)
+    assert torch.equal(data["action"], torch.from_numpy(rows[:9] / 2))

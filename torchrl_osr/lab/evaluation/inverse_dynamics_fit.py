@@ -41,7 +41,8 @@ def inverse_dynamics_report(
     action = data.get("action")
     report = {"nll": -distribution.log_prob(action).mean().item(), "rows": len(data)}
     if isinstance(distribution, ONE_HOT):
-        return report | {"accuracy": (distribution.mode * action).sum(-1).mean().item()}
+        hits = (distribution.mode * action).sum(-1).double()
+        return report | {"accuracy": hits.mean().item()}
     error = (action - distribution.deterministic_sample).square().sum(0)
     r2 = 1 - error / (action - action.mean(0)).square().sum(0)
     return report | {"r2": r2.tolist()}

@@ -66,9 +66,10 @@ def load_data(
         reading["references"] = references_of(env)
         if env.id is None and env.discrete:
             reading["num_actions"] = env.action_size
-        elif env.id is None and options.source in ("file", "lerobot"):
+        elif env.id is None and options.source in ("file", "lerobot", "d4rl"):
             known = env.action_low and (env.action_low, env.action_high)
-            reading["action_bounds"] = options.action_bounds or known or "log"
+            usual = None if options.source == "d4rl" else "log"
+            reading["action_bounds"] = options.action_bounds or known or usual
     elif options.source in ("file", "lerobot"):
         reading["action_bounds"] = options.action_bounds or "log"
     data, manifest = load_dataset(**reading, progress=progress)

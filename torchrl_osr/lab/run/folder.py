@@ -219,7 +219,8 @@ def read_status(folder: Path) -> dict[str, Any]:
 
     A run on another machine stays ``running``: its lock may not be seen from here.
     """
-    found = read_json(folder / STATUS)
+    path = folder / STATUS
+    found = read_json(path) if path.exists() else {"status": "unknown"}
     if found.get("status") != "running" or found.get("host") != platform.node():
         return found
     try:
