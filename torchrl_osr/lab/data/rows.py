@@ -63,6 +63,7 @@ def is_followed(data: TensorDictBase) -> Tensor:
 
 def next_action(data: TensorDictBase) -> Tensor:
     """Return the action ``[N, A]`` of the following row, 0 at an episode's end."""
+    check_order(data)
     action: Tensor = data["action"].roll(-1, 0)
     return action.masked_fill(data["next", "done"], 0.0)
 

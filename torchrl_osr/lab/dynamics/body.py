@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from torchrl_osr.lab.data.transitions import VECTOR_KEYS
+
 Numbers = Sequence[float]
 compiled = cache(mujoco.MjModel.from_xml_path)
 
@@ -154,9 +156,7 @@ def identify(body: Body, rows: TensorDictBase) -> Body:
         body: as described.
         rows: transitions ``[N]`` within the limits of the sensors; 1,000 take seconds.
     """
-    states, actions, following = (
-        rows[key] for key in ("observation", "action", ("next", "observation"))
-    )
+    states, following, actions = map(rows.get, VECTOR_KEYS)
     weight, unit = 1e-3 * states.numel() ** 0.5, states.std(0)
 
     def residual(logs: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -167,8 +167,7 @@ def identify(body: Body, rows: TensorDictBase) -> Body:
         return np.concatenate([errors.flatten(0, -2).double().numpy(), weight * logs])
 
     start = np.zeros(len(body.model.body_mass) - 1 + body.model.nu + 2)
-    largest = np.log(4)
-    bounds = [np.full_like(start, -largest), np.full_like(start, largest)]
+    bounds = [start - np.log(4), start + np.log(4)]
     logs, _ = least_squares(
         start, residual, bounds, eps=1e-4, xtol=1e-4, max_iter=40, verbose=0
     )
@@ -192,9 +191,7 @@ def fitted_body(body: Body, rows: TensorDict, *, seed: int) -> tuple[Body, Tenso
     generator = torch.Generator().manual_seed(seed)
     some = rows[torch.randperm(len(rows), generator=generator)[:1000]]
     found = identify(body, some)
-    state, action, following = (
-        some[key] for key in ("observation", "action", ("next", "observation"))
-    )
+    state, following, action = map(some.get, VECTOR_KEYS)
     for name, each in (("described", body), ("identified", found)):
         change = (each(state, action) - following) / state.std(0)
         error = change.square().mean().sqrt()

@@ -20,12 +20,7 @@ from torchrl_osr.lab.data import (
     reference_returns,
 )
 from torchrl_osr.lab.data.recording import NO_REWARDS, has_rewards
-from torchrl_osr.lab.data.rows import (
-    check_order,
-    multi_step,
-    next_action,
-    split_held_out,
-)
+from torchrl_osr.lab.data.rows import multi_step, next_action, split_held_out
 from torchrl_osr.lab.run.config import read_columns
 from torchrl_osr.lab.run.schema import DataConfig, EnvConfig, TrainConfig
 
@@ -125,7 +120,6 @@ def load_training_data(
     states = "observation", ("next", "observation")
     rows = data.copy().set(("next", "reward"), reward)
     if ("next", "action") in in_keys:
-        check_order(data)
         rows["next", "action"] = next_action(data)
     if optim.n_steps > 1:  # what follows a row, before some are held out
         steps = multi_step(rows, n_steps=optim.n_steps, gamma=optim.gamma)
