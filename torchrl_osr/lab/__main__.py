@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(content["hydra"]["help"]["template"], end="")
     elif name in COMMANDS:
         # Hydra takes no flag behind the first key=value.
-        rest.sort(key=lambda each: each not in ("-m", "--multirun"))
+        rest.sort(key=lambda each: name in CONFIGS and "=" in each and each[0] != "-")
         home = str(Path.home())  # a shell leaves the ~ of data.path=~/log.csv
         rest = [re.sub(r"(?<=[=\[,\"'])~(?=/)", lambda _: home, each) for each in rest]
         sys.argv = [f"torchrl-osr {name}", *rest]

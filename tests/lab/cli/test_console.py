@@ -59,6 +59,10 @@ QUOTED = "cannot be read: quote a value with blanks, brackets or quotes, as in "
             "loss.max_q_backup=perhaps",
             "Error merging override .* 'perhaps' .* valid bool",
         ),
+        (
+            "inverse_dynamics.loss.states=clen",
+            "Error .* 'clen', expected one of .both,",
+        ),
         ("data=medum", r"data has no option 'medum' \(did you mean 'medium'\?\); it"),
         ("seed=a", "Error merging override seed=a: Value 'a' .* to Integer"),
         ("seed=0,1", "seed=0,1 has several values: add -m to run each, write a list"),

@@ -55,7 +55,7 @@ def checked(config: DictConfig, trust: Sequence[str] = ()) -> TrainConfig:
     A ValueError names a key that is unknown, missing, of the wrong type or out of its
     range, or a target that :func:`check_targets` refuses.
     """
-    plain: Any = OmegaConf.to_container(config, resolve=True)
+    plain: Any = OmegaConf.to_container(config, resolve=True, enum_to_str=True)
     plain.pop("settings", None)  # interpolations have read them
     if "columns" in plain.get("data", {}):
         plain["data"]["columns"] = read_columns(plain["data"]["columns"])
@@ -70,7 +70,7 @@ def checked(config: DictConfig, trust: Sequence[str] = ()) -> TrainConfig:
     made = cast(TrainConfig, OmegaConf.to_object(typed))
     # Others would train nonsense, or fail hours later.
     for key, value in flatten(asdict(made)).items():
-        positive = key.startswith(("trainer.", "dynamics.", "optim."))
+        positive = key.startswith(("trainer.", "dynamics.", "optim.", "data.num"))
         if key in CHOICES:
             check_choice(key, value, CHOICES[key])
         elif key in SHARES and not 0 <= value <= 1:

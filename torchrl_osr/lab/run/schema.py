@@ -11,9 +11,10 @@ import inspect
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, make_dataclass
+from enum import StrEnum
 from pathlib import Path
 from types import NoneType
-from typing import Any, get_args, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from hydra.core.config_store import ConfigStore
 from hydra.utils import get_class
@@ -283,6 +284,8 @@ def schema_of(target: type) -> type:
 
 def _config_type(annotation: Any) -> Any:
     """Return an annotation that OmegaConf can check: a plain or optional type."""
+    if get_origin(annotation) is Literal:
+        return StrEnum("choice", [*get_args(annotation)])
     parts = {*get_args(annotation)} - {NoneType} or {annotation}
     return annotation if parts < {bool, int, float, str} else Any
 
