@@ -46,12 +46,12 @@ class StateRecoveryLoss(ActorCriticLoss):
     gradient reaches the actor only. Rows that are ``done`` do not count. Equations (11)
     and (12) of the paper of :class:`~torchrl_osr.OSRLoss`.
 
-    A deterministic actor (a :class:`~torchrl.modules.TanhDelta`, or a module that
-    writes the action) is pulled to the model's mean by
-    :math:`(x - \mu_I)^2 / (2\sigma_I^2)` of its action :math:`x` before the tanh: an
-    addition, not in the paper, that is (11) with equal widths. So is the mean of an
-    :class:`~torchrl.modules.IndependentNormal`. A module should end in a tanh; beyond
-    the bounds its gradient is finite, but huge.
+    Two more actors are pulled to the model's mean: a deterministic one (a
+    :class:`~torchrl.modules.TanhDelta`, or a module that writes the action), and the
+    mean of an :class:`~torchrl.modules.IndependentNormal`. Their term is
+    :math:`(x - \mu_I)^2 / (2\sigma_I^2)`, with :math:`x` the action before the tanh.
+    It is (11) with equal widths, and not in the paper. A module should end in a tanh;
+    beyond the bounds its gradient is finite, but huge.
 
     With ``recovery_target="data"`` it is noisy behaviour cloning, which needs no model:
     :math:`-\log\pi(a \mid \tilde s)`, and the squared distance
