@@ -26,13 +26,15 @@ def tensors(*numbers: float) -> list[torch.Tensor]:
     return [torch.tensor([number], dtype=torch.float64) for number in numbers]
 
 
-@pytest.mark.parametrize(
-    ("direction", "expected"), [("forward", FORWARD), ("reverse", REVERSE)]
-)
-def test_state_recovery_matches_hand_computed_numbers(direction, expected) -> None:
-    value = functional.state_recovery(
-        *tensors(*POLICY, *INVERSE_DYNAMICS), direction=direction
-    )
+PAIR, WIDE, EQUAL = (*POLICY, *INVERSE_DYNAMICS), (0.5, 1e3, 0, 1), (1, 0.5, 0.4, 0.5)
+# WIDE: log(1e3) + 1.25/2e6 - .5, where printed (12) is -6.9. EQUAL: .6^2 / (2 * .5^2).
+HAND = [(PAIR, "forward", FORWARD), (PAIR, "reverse", REVERSE)]
+HAND += [(WIDE, "forward", 6.407756), (EQUAL, "forward", 0.72)]
+
+
+@pytest.mark.parametrize(("numbers", "direction", "expected"), HAND)
+def test_state_recovery_matches_hand_computed_numbers(numbers, direction, expected):
+    value = functional.state_recovery(*tensors(*numbers), direction=direction)
     assert value.item() == pytest.approx(expected, abs=1e-6)
 
 

@@ -158,7 +158,8 @@ def test_nested_and_several_keys_draw_apart() -> None:
     drawn = [transform(batch)["noisy", "states"][key] for key in keys]
     assert not any((each == 1).any() for each in drawn)
     assert torch.cat(drawn).unique().numel() == 24
-    with pytest.raises(ValueError, match=r"'agent' is a group.*\('agent', 'pixels'\)"):
+    named = r"'agent' is a group.*\[\('agent', 'pixels'\)"
+    with pytest.raises(ValueError, match=named):
         StatePerturbation(1.0, in_keys=("agent", "pixels"))(batch)
 
 

@@ -129,7 +129,8 @@ class Transitions:
             value = self.rows.get(name, None)
             if value is not None:
                 perturbed.set(key, _same_shape(clean, key, name, value))
-        return torch.stack([clean, perturbed][states == "perturbed" :])
+        halves = {"both": [clean, perturbed], "perturbed": [perturbed]}
+        return torch.stack(halves[states])
 
     @property
     def s(self) -> TensorDictBase:

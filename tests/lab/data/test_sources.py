@@ -121,7 +121,7 @@ def test_bounds_come_from_the_environment_unless_given(tmp_path, bounds, high):
         ("file", {"clip_actions": True, "env_id": "CartPole-v1", "path": "x"}, "discr"),
         ("medium", {"path": "x"}, "rolled out in a simulator: for a log, give data"),
         ("random", {"random_share": 0.5}, "random rows: choose another source"),
-        ("d4rl", {"path": "x.h5", "columns": {"reward": "x"}}, "columns=.* no effect"),
+        ("d4rl", {"path": "x", "columns": {"reward": "x"}}, "columns=.* has no effect"),
         (
             "medium",
             {"env_id": "Pendulum-v1"},

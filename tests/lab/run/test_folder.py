@@ -58,7 +58,8 @@ def test_some_settings_may_differ_and_steps_may_grow(tmp_path):
     with pytest.raises(ValueError, match="trainer.steps=50000, and 4 are fewer"):
         claim(tmp_path, resume, "trainer.steps=4", "force=true")
     claim(falling := tmp_path / "falling", "loss=iql")
-    with pytest.raises(ValueError, match=r"settings \(trainer.steps: \d+ there, 50000"):
+    named = r"settings \(trainer.steps: \d+ there, 50000 "
+    with pytest.raises(ValueError, match=named):
         claim(falling, "loss=iql", "trainer.steps=50_000")
 
 
