@@ -40,27 +40,24 @@ def episodes(lengths) -> TensorDict:
     return torch.cat(rows)
 
 
-def numbered(rows: int, start: int = 0) -> TensorDict:
-    return TensorDict({"row": torch.arange(start, start + rows)}, [rows])
-
-
 @tried(100)
 @given(rows=st.integers(1, 50), share=st.floats(0, 1), seed=st.integers(0, 1000))
 def test_rows_are_drawn_without_replacement_in_exact_shares(rows, share, seed) -> None:
-    sets = numbered(rows), numbered(60, 100)
-    mixed, again = (
-        mix_datasets(*sets, random_share=share, seed=seed)["row"].tolist()
-        for _ in range(2)
+    valuable, random = episodes([rows, 100]).split([rows, 100])
+    first, second = (
+        mix_datasets(valuable, random, random_share=share, seed=seed) for _ in range(2)
     )
-    assert mixed == again
+    assert (first == second).all()
+    check_order(first)  # what was cut is marked as an end
+    mixed = (first["observation"].squeeze(-1).long() - 1).tolist()
     assert len(mixed) == len(set(mixed)) == rows
     kept = mixed[: rows - round(share * rows)]
-    assert [row for row in mixed if row < 100] == kept == [*range(len(kept))]
+    assert [row for row in mixed if row < rows] == kept == [*range(len(kept))]
 
 
 @pytest.mark.parametrize(("held_out", "expected"), [(7, 7), (0.2, 10)])
 def test_split_keeps_every_row_once(held_out: int | float, expected: int) -> None:
-    data = numbered(50)
+    data = TensorDict({"row": torch.arange(50)}, [50])
     train, rest = split_held_out(data, held_out, seed=1)
     assert len(rest) == expected
     both = torch.cat([train["row"], rest["row"]])

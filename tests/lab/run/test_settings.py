@@ -61,5 +61,7 @@ def test_every_method_has_the_settings_of_the_table(method):
 def test_settings_are_those_of_the_task_not_of_the_group():
     given = ["loss=rebrac", "data=medium-expert", "env.id=Walker2d-v5"]
     assert composed("train", *given).loss.actor_bc_coef == 0.01
+    given = ["loss=rebrac", "env=hopper", "data=d4rl", "data.path=a/hopper_expert-v2"]
+    assert composed("train", *given).loss.actor_bc_coef == 0.1
     # Of data without a row they are the constructor's.
     assert composed("train", "loss=rorl", "env.id=Pendulum-v1").loss.num_samples == 20

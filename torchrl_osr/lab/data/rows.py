@@ -38,6 +38,7 @@ def mix_datasets(
     """Replace a share of the rows by rows of another set, which come last.
 
     Rows are kept and taken in pieces of :data:`PIECE`, for returns of several steps.
+    The row before a cut becomes truncated.
     """
     if not 0 <= random_share <= 1:
         raise ValueError(f"random_share={random_share}; expected a share from 0 to 1.")
@@ -49,7 +50,11 @@ def mix_datasets(
         order = torch.randperm(len(pieces), generator=generator).tolist()
         rows = torch.cat([pieces[piece] for piece in order])[:count]
         chosen.append(data[rows.sort().values])
-    return torch.cat(chosen)
+    mixed: TensorDict = torch.cat(chosen)
+    cut = ~is_followed(mixed) & ~mixed["next", "done"].squeeze(-1)
+    for flag in ("done", "truncated"):
+        mixed["next", flag][cut] = True
+    return mixed
 
 
 def is_followed(data: TensorDictBase) -> Tensor:

@@ -325,12 +325,15 @@ def by_data(key: str, *, _root_: DictConfig) -> Any:
     """
     rows, env, data = _root_.settings, _root_.env.name, _root_.data
     source = f"{data.source}-mixed" if data.random_share else data.source
-    for name in (f"{env}-{source}", env, "any"):
+    row = f"{env}-{source}"
+    if source == "d4rl":  # hopper_medium_replay-v2.hdf5, for instance
+        row = Path(str(data.path)).stem.partition("-v")[0].replace("_", "-")
+    for name in (row, env, "any"):
         if name in rows and key in rows[name]:
             return rows[name][key]
     group, _, option = key.rpartition(".")
     if group != "loss":
-        raise ValueError(f"settings have no value of {key} for {env}-{source}.")
+        raise ValueError(f"settings have no value of {key} for {row}.")
     return getattr(schema_of(get_class(_root_.loss._target_))(), option)
 
 
