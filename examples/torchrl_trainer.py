@@ -103,12 +103,9 @@ def load_buffer(cfg: DictConfig) -> tuple[ReplayBuffer, ObservationNorm]:
     norm = ObservationNorm(
         *observation_statistics(data), in_keys=keys, standard_normal=True
     )
-    buffer = make_replay_buffer(
-        norm(data),
-        batch_size=cfg.batch_size,
-        seed=cfg.seed,
-        transform=instantiate(cfg.transform),
-    )
+    rows, size = norm(data), cfg.batch_size
+    buffer = make_replay_buffer(rows, batch_size=size, seed=cfg.seed)
+    buffer.append_transform(instantiate(cfg.transform))
     return buffer, norm
 
 

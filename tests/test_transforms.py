@@ -57,9 +57,8 @@ def test_a_seed_decides_the_noise() -> None:
     drawn = [noise(StatePerturbation(1.0, seed=seed), 8) for seed in (5, 5, 6)]
     assert torch.equal(drawn[0], drawn[1])
     assert not torch.equal(drawn[0], drawn[2])
-    wanted = torch.randn(
-        8, 11, generator=torch.Generator().manual_seed(5), dtype=torch.float64
-    )
+    generator = torch.Generator().manual_seed(5)
+    wanted = torch.randn(8, 11, generator=generator, dtype=torch.float64)
     assert torch.equal(drawn[0], wanted)
 
 
@@ -101,7 +100,7 @@ def of_copies() -> list[torch.Tensor]:
     noise(first, 2)
     second = copy.deepcopy(first)
     third, fourth = (pickle.loads(pickle.dumps(first)) for _ in range(2))
-    every = first, second, copy.deepcopy(first), copy.deepcopy(second), third, fourth
+    every = first, second, first.clone(), copy.deepcopy(second), third, fourth
     return [noise(each, 8) for each in every]
 
 

@@ -49,10 +49,8 @@ def linear_dynamics(
 
     ``weights`` lead from an input (state, action) to an output (change, reward).
     """
-    number, elites = networks
-    model = DynamicsEnsemble(
-        *sizes, num_networks=number, num_elites=elites, num_cells=[]
-    )
+    counts = dict(zip(("num_networks", "num_elites"), networks, strict=True))
+    model = DynamicsEnsemble(*sizes, **counts, num_cells=[])
     layer = model.layers[0].requires_grad_(False)
     layer.weight.zero_()
     for (start, end), weight in weights.items():

@@ -2,12 +2,13 @@ r"""The noise of equation (5): :math:`\hat s = s + \beta\,\epsilon`."""
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import itertools
 import multiprocessing
 import os
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Self
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -90,6 +91,10 @@ class StatePerturbation(Transform):
         state: dict[str, Any] = super().__getstate__()
         own = {"seed": _derived("copy", self.seed, self._copies), "_copies": 0}
         return state | own | {"_generator": None, "_loaded": None}
+
+    def clone(self) -> Self:
+        """Return a copy, for another environment."""
+        return copy.deepcopy(self)
 
     def _generator_on(self, device: torch.device) -> torch.Generator:
         """Return the noise's generator, made on the device of the first batch."""

@@ -49,6 +49,13 @@ def test_numbers_of_any_type_are_cast_to_the_networks(name) -> None:
     assert all(each.isfinite().all() for each in wanted)
 
 
+def test_a_counter_is_not_the_type_of_a_network() -> None:
+    networks, batch = Networks(), make_batch("osr", 10)
+    wanted = record(make_loss("osr"), batch)
+    networks.actor[0].module.register_buffer("count", torch.tensor(0))
+    assert_same_bits(record(make_loss("osr", networks), batch), wanted)
+
+
 @every_loss
 def test_shape_of_the_batch_changes_no_number(name) -> None:
     loss, flat = make_loss(name), make_batch(name, 10)
@@ -118,6 +125,7 @@ def test_masked_rows_may_hold_anything(name, reduction) -> None:
             elif key != MASK:
                 value[padding] = value[padding].flip(-1) if value.ndim > 2 else 0
         found = record(loss, spoiled)
+        assert not spoiled.get("td_error", torch.zeros(2, 5))[padding].any()
         assert_same(found, wanted)
         assert all(each.isfinite().all() for each in found)
     if reduction == "mean":  # without the mask the garbage shows

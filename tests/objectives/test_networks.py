@@ -214,6 +214,7 @@ def test_a_frozen_model_is_followed_and_never_trained(name) -> None:
 def test_a_frozen_network_has_the_weights_that_a_loss_loads() -> None:
     loss, other = make_loss("osr"), make_loss("osr", make_networks("osr", seed=9))
     loss.load_state_dict(other.state_dict())
+    assert not loss.inverse_dynamics_network.training, "labels would be random"
     models = (each.inverse_dynamics_network.parameters() for each in (loss, other))
     assert all(map(torch.equal, *models))
 

@@ -29,6 +29,7 @@ def test_networks_that_a_policy_would_not_copy_whole():
     swapped = ValueOperator(MLP(5, 1), in_keys=["action", "observation"])
     for networks, message in [
         ((actor(nn.LayerNorm(3)), critics), "compute something else"),
+        ((actor(nn.Hardtanh(-5.0, 5.0)), critics), "compute something else"),
         ((actor(low=-2.0, high=2.0), critics), "compute something else"),
         ((actor(), swapped), "compute something else"),
         ((actor(MLP(3, 3)), critics), "one torchrl.modules.MLP.* has 2"),

@@ -92,6 +92,9 @@ def test_rows_before_a_fall_are_no_data(log):
         fit_monitor(rows, episode, torch.zeros_like(falling))
     with pytest.raises(ValueError, match="need 19 episodes"):
         fit_monitor(rows, episode, episode < 20)  # in the others no row counts
+    rows[7] = torch.nan
+    with pytest.raises(ValueError, match="have NaN"):
+        fit_monitor(rows, episode)
 
 
 def test_calibration_on_other_episodes(log):
@@ -113,6 +116,7 @@ def test_each_file_has_the_monitor(tmp_path, make_policy, log, kind):
     policy.save(tmp_path / "p.safetensors")
     again = load_policy(tmp_path / "p.safetensors")
     assert np.array_equal(again.act(rows), wanted)
+    assert again.record["monitor"] is again.data_monitor.record, "it may be calibrated"
     rows[1, 0], rows[2, 1], rows[3, 2], rows[4] = np.nan, np.inf, -1e30, 1e30
     score, alarm = again.monitor(rows)
     assert score.dtype == np.float32

@@ -64,9 +64,8 @@ def make(transitions):
             "log_interval": 3,
             "progress": False,
         } | options
-        buffer = make_replay_buffer(
-            transitions(64), batch_size=8, seed=0, transform=perturbation
-        )
+        buffer = make_replay_buffer(transitions(64), batch_size=8, seed=0)
+        buffer.append_transform(perturbation)
         optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2, fused=True)
         update = FastUpdate(loss, optimizer, updater if targets else None, **tracing)
         return OfflineTrainer(update, buffer, folder=folder, **options)

@@ -249,9 +249,9 @@ class ActorCriticLoss(LossModule):
         check_networks(actor_network=actor, **{name: network})
         self.convert_to_functional(network, name)
         # tensordict 0.14.3 leaves a network without parameters in an error, so this is
-        # a copy. It has the same tensors.
+        # a copy. It has the same tensors, and neither drops units nor counts batches.
         own = {id(each): each for each in (*network.parameters(), *network.buffers())}
-        self.__dict__[name] = copy.deepcopy(network, own)
+        self.__dict__[name] = copy.deepcopy(network, own).eval()
         frozen = getattr(self, f"{name}_params").apply(
             lambda tensor: tensor.data, filter_empty=False
         )
@@ -401,9 +401,9 @@ class ActorCriticLoss(LossModule):
         """Return the batch as named tensors, see :class:`Transitions`."""
         # To the end: torch.compile cannot leave an iterator of a dictionary halfway.
         name, *_ = (name for name in self._modules if name.endswith("_params"))
-        first, *_ = getattr(self, name).values(True, True)
-        masks = self._loss_mask_keys()
-        keys, dtype = self.tensor_keys, first.dtype
+        tensors = getattr(self, name).values(True, True)
+        dtype, *_ = (each.dtype for each in tensors if each.is_floating_point())
+        keys, masks = self.tensor_keys, self._loss_mask_keys()
         batch = Transitions(tensordict, self.in_keys, keys, masks, dtype)
         action = batch.rows.get(keys.action, None)
         if action is not None and "action_low" in self._buffers:  # real, if integers
@@ -584,9 +584,11 @@ class ActorCriticLoss(LossModule):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the distance of values ``[N, R]`` from a target ``[R]``, and metrics.
 
-        It is summed over critics. The largest absolute error is written as priority.
+        It is summed over critics. The largest absolute error is written as priority, 0
+        for masked rows.
         """
         error = (pred_value.detach() - target).abs().amax(0)
+        error = error if batch.unmasked is None else error * batch.unmasked
         given = batch.tensordict
         given.set(self.tensor_keys.priority, error.reshape(given.batch_size))
         distance: Tensor = distance_loss(

@@ -55,7 +55,8 @@ class DiscreteOSRLoss(ActorCriticLoss):
             ``recovery_weight=0``.
 
     Keyword Args:
-        recovery_weight: weight :math:`\lambda`. Default 0.5. May be assigned later.
+        recovery_weight: weight :math:`\lambda`. Default 0.5. May be assigned later; 0
+            here removes the term permanently.
         min_q_weight, temperature, alpha_init: see :class:`~torchrl_osr.CQLLoss`.
         target_entropy: in nats; ``"auto"`` (default) is 0.98 times ``log(n)``, as in
             TorchRL's ``DiscreteSACLoss``: a policy that is nearly uniform.

@@ -84,7 +84,7 @@ class Policy(nn.Module):
                 self.register_buffer(name, torch.empty(size))
             self.data_monitor: DataMonitor | None = None
             if "monitor" in record:
-                self.data_monitor = DataMonitor(record["monitor"])
+                self.attach(DataMonitor(record["monitor"]))
         self.load_state_dict(dict(tensors), assign=True)
         self.requires_grad_(False).eval()
 

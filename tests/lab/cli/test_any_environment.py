@@ -176,8 +176,6 @@ def test_without_a_simulator_a_log_still_makes_a_policy(tmp_path, capsys):
     assert policy.act(np.zeros((2, 3), np.float32)).shape == (2, 1)
     with pytest.raises(ValueError, match=r"^log-log has no simulator \(env=none\)"):
         disturbed(run)
-    with pytest.raises(ValueError, match=r"env\.id is not given"):
-        record(tmp_path / "x.npz", "env=none")
 
 
 def test_a_log_without_rewards_trains_what_needs_none(tmp_path, capsys):
@@ -187,7 +185,6 @@ def test_a_log_without_rewards_trains_what_needs_none(tmp_path, capsys):
     given = "env=none", f"data.path={log}"
     with pytest.raises(ValueError, match=r"no reward column: .* or loss=bc recovery="):
         trained(tmp_path / "osr", *given, "loss=osr")
-    assert find_runs([tmp_path]) == []
     for loss in (["loss=noisy_bc"], ["loss=bc", "recovery=osr"]):
         run = trained(tmp_path / loss[-1], *given, *loss)
         assert json.loads((run / "returns.json").read_text())["data_return"] is None

@@ -11,6 +11,7 @@ from tensordict import TensorDict
 
 from torchrl_osr.lab.data.rows import (
     check_order,
+    episode_of,
     mix_datasets,
     multi_step,
     next_action,
@@ -43,10 +44,9 @@ def episodes(lengths) -> TensorDict:
 @tried(100)
 @given(rows=st.integers(1, 50), share=st.floats(0, 1), seed=st.integers(0, 1000))
 def test_rows_are_drawn_without_replacement_in_exact_shares(rows, share, seed) -> None:
-    valuable, random = episodes([rows, 100]).split([rows, 100])
-    first, second = (
-        mix_datasets(valuable, random, random_share=share, seed=seed) for _ in range(2)
-    )
+    sets, options = episodes([rows, 100]), {"random_share": share, "seed": seed}
+    sets = sets.split([rows, 100])
+    first, second = (mix_datasets(*sets, **options) for _ in range(2))
     assert (first == second).all()
     check_order(first)  # what was cut is marked as an end
     mixed = (first["observation"].squeeze(-1).long() - 1).tolist()
@@ -68,7 +68,7 @@ def test_rows_in_no_order_are_refused_by_number() -> None:
     data = episodes([4, 5])
     for wrong in (data[[0, 2, 3, 4, 5, 6, 7, 8]], data[[0, 2, 1, 3]]):
         with pytest.raises(ValueError, match="row 0 the first, end no episode"):
-            check_order(wrong)
+            episode_of(wrong)
     with pytest.raises(ValueError, match="1 of the 8 rows, row 7 the first"):
         check_order(data[:-1])
     check_order(data[4:])

@@ -120,6 +120,7 @@ def test_bounds_come_from_the_environment_unless_given(tmp_path, bounds, high):
         ("file", {"num_transitions": 9}, "num_transitions=9 has no effect with data=f"),
         ("file", {"clip_actions": True, "env_id": "CartPole-v1", "path": "x"}, "discr"),
         ("medium", {"path": "x"}, "rolled out in a simulator: for a log, give data"),
+        ("medium", {"env_name": "log-arm"}, "for a log, give data=file"),
         ("random", {"random_share": 0.5}, "random rows: choose another source"),
         ("d4rl", {"path": "x", "columns": {"reward": "x"}}, "columns=.* has no effect"),
         (
@@ -131,12 +132,7 @@ def test_bounds_come_from_the_environment_unless_given(tmp_path, bounds, high):
 )
 def test_useless_options_are_refused(source, options, message):
     with pytest.raises(ValueError, match=message):
-        load_dataset("hopper", source, **options)
-
-
-def test_without_a_simulator_nothing_is_rolled_out():
-    with pytest.raises(ValueError, match="for a log, give data=file"):
-        load_dataset("log-arm", "medium")
+        load_dataset(**{"env_name": "hopper", "source": source} | options)
 
 
 def test_a_d4rl_file_without_ends_names_another_way(tmp_path):

@@ -109,8 +109,7 @@ def stamps(ticks):
 
 
 @pytest.mark.parametrize(
-    "clock",
-    [lambda ticks: ticks, lambda t: t / 50, lambda t: 20 * t + t % 2, stamps],
+    "clock", [lambda ticks: ticks, lambda t: t / 50, lambda t: 20 * t + t % 2, stamps]
 )
 def test_steps_bring_the_rows_of_an_episode_into_order(write, clock):
     expected, _ = load_dataset(path=write(robot()), columns=WANTED)
@@ -162,6 +161,8 @@ def test_several_files_are_one_log(tmp_path):
         frame.to_csv(paths[1], index=False)
         with pytest.raises(ValueError, match=f"other.csv: {flaw}"):
             load_dataset(path=[*map(str, paths)], columns=WANTED)
+    options = {"columns": WANTED, "missing": "episode"}  # the second file has none
+    assert len(load_dataset(path=[*map(str, paths)], **options)[0]) == 119
 
 
 def test_row_names_of_pandas_are_columns_if_they_have_a_name(tmp_path):
@@ -182,6 +183,9 @@ def test_rows_without_ends_and_values(write):
     assert not data["next", "terminated"].any()
     assert (len(data), manifest["missing_rows"]) == (120 - 3 - 1, 1)
     assert manifest["unmarked_ends"] == 3
+    still = {"path": write(robot(w=0.5)), "action_bounds": "log"}
+    (_, low), (_, high) = load_dataset(**still, columns=WANTED)[1]["action_bounds"]
+    assert (low, high) == (-0.5, 1.5)
 
 
 OBS = [f"obs_{number}" for number in range(10, -1, -1)]
@@ -198,17 +202,17 @@ def test_names_are_found_in_the_order_of_their_numbers():
     assert find_columns(USUAL, named)["observation"] == ["obs_3", "obs_1"]
     named["observation"] = [7]
     assert find_columns(["7", *USUAL], named)["observation"] == ["7"]
+    feet = ["foot0x", "foot0y", "foot1x", "foot1y"]
+    after, named["observation"] = [f"next_{name}" for name in feet], "foot*"
+    columns = find_columns([*feet, *after[::-1], *USUAL], named)
+    assert columns["observation"] + columns["next_observation"] == feet + after
 
 
 @pytest.mark.parametrize(
     ("names", "wanted", "message"),
     [
         (USUAL, {"action": "force"}, r"action=force names 0 columns; there are obs_10"),
-        (
-            USUAL,
-            dict.fromkeys(("action", "reward"), "action"),
-            "'action' is read twice",
-        ),
+        (USUAL, {"action": "action", "reward": "action"}, "'action' is read twice"),
         (["obs_0", "obs_2", *USUAL[11:]], {}, "obs_0 to obs_2 lack number 1"),
         (USUAL[:-1], {}, "the data lack truncated or episode; there"),
         (USUAL[:-2], {}, "lack terminated.*terminated=false if noth"),
@@ -226,6 +230,7 @@ def test_wrong_columns_are_named(names, wanted, message):
         ("obs_0,action,reward,terminated,episode\n1,a,3,0,0\n", "'action' holds other"),
         ("obs_0,action,reward,terminated,episode\n1,.2,3,0,0,9\n", "more values than"),
         ("obs_0,action,reward,terminated,episode\n1,.2,3\n", "no value in row 0"),
+        ("obs_0,action,reward,terminated,episode\n,,,,\n1,.2,3,0,0", "in row 0 of 2"),
         ("obs_0,action,reward,terminated,episode\n", "holds no rows"),
         ("0.5,.2,3,0,0\n1,.2,3,0,0\n", "the first line holds numbers; .* a header"),
         ("1,1,0\n1,.2,3\n", "the first line holds numbers"),
@@ -241,6 +246,10 @@ def test_wrong_csv_files_are_refused(tmp_path, rows, message):
 
 def test_rows_of_other_shapes_are_refused(tmp_path):
     columns = {k: list(v) if v.ndim > 1 else v for k, v in make_columns(60).items()}
+    columns["observation"][3] = None
+    parquet.write_table(pyarrow.table(columns), tmp_path / "log.parquet")
+    _, manifest = load_dataset(path=tmp_path / "log.parquet", missing="row")
+    assert manifest["missing_rows"] == 1
     columns["action"] = [[0.1], [0.2, 0.3, 0.1]] * 30
     parquet.write_table(pyarrow.table(columns), tmp_path / "log.parquet")
     with pytest.raises(ValueError, match="must have the same shape"):
@@ -249,5 +258,6 @@ def test_rows_of_other_shapes_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"'observation' has shape \[2, 60, 3\]"):
         load_dataset(path=save(tmp_path / "log.npz", columns))
     columns = make_columns(60) | {"action": make_columns(50)["action"]}
+    columns |= {"time": np.arange(60), "episode": np.arange(60) // 20}
     with pytest.raises(ValueError, match=r"'action' has shape \[50, 2\]"):
-        load_dataset(path=save(tmp_path / "log.npz", columns))
+        load_dataset(path=save(tmp_path / "x.npz", columns), columns={"step": "time"})

@@ -56,12 +56,6 @@ def test_the_datas_own_value_is_that_of_its_episodes():
     assert episode_values(data, GAMMA).mean() == pytest.approx(truth, rel=0.05)
 
 
-def test_rows_out_of_order_have_no_first_states():
-    data = rolled_out(-0.3, 0.7)[torch.randperm(EPISODES * STEPS)]
-    with pytest.raises(ValueError, match="Give the rows in order"):
-        fitted_values(data, lambda s: s, progress=False)
-
-
 def test_critics_learn_from_whole_episodes_and_the_policys_choices(monkeypatch):
     data, given = rolled_out(-0.3, 0.7), []
     monkeypatch.setattr(offline, "fit", lambda *each, **_: given.extend(each))

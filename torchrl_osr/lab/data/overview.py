@@ -33,11 +33,8 @@ def recorded_columns(data: TensorDict, manifest: Mapping[str, Any]) -> pd.DataFr
     action = low + (data["action"] + 1) / 2 * (high - low)
     if manifest.get("num_actions") is not None:
         action = data["action"].argmax(1, keepdim=True)
-    parts = {
-        "observation": data["observation"],
-        "action": action,
-        "reward": data["next", "reward"],
-    }
+    parts = {"observation": data["observation"], "action": action}
+    parts["reward"] = data["next", "reward"]
     frames = {}
     for part, table in parts.items():
         read, entries = manifest.get("columns", {}), manifest.get("entry_names", {})
@@ -146,7 +143,7 @@ def _explained(data: TensorDict, rows: Tensor, shift: int) -> float:
         for x in (known, both)
     )
     left = [(change - fit).square().sum(0) for fit in fits]
-    return float((1 - left[1] / left[0].clamp_min(1e-12)).max())
+    return float(((left[0] - left[1]) / left[0].clamp_min(1e-12)).max())
 
 
 def out_of_space(

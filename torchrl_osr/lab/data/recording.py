@@ -111,7 +111,7 @@ def convert(
         episodes.append(of_each)
     data = torch.cat(rows)
     if not len(data):
-        raise ValueError("no row has a true next state: give next_observation.")
+        raise ValueError("no row has all values and a next state (next_observation).")
     check_dataset(data)
     about = about or {}
     returns, lengths, complete = np.concatenate(episodes).T
@@ -143,7 +143,7 @@ def _range(parts: Iterable[Columns]) -> list[list[float]]:
     actions = [np.asarray(part["action"], np.float64) for part in parts]
     low = np.min([np.nanmin(each, 0) for each in actions], 0)
     high = np.max([np.nanmax(each, 0) for each in actions], 0)
-    slack = MARGIN * (high - low)
+    slack = np.where(low < high, MARGIN * (high - low), 1.0)
     return [(low - slack).tolist(), (high + slack).tolist()]
 
 
@@ -241,12 +241,10 @@ def trajectories(
         resets[1:] = begun & (columns["reward"][1:] == 0) & ~lost[1:]
     ends[:-1] |= lost[1:]
     keep = ~(lost | resets)
-    if not keep.any():
-        raise ValueError("no row has a value in every column.")
     if not keep.all():
         columns = {name: array[keep] for name, array in columns.items()}
         flagged, ends, broken = flagged[keep], ends[keep], broken[keep]
-    ends[-1] = True
+    ends[-1:] = True
     reward = columns["reward"].astype(np.float64)
     columns = _cast(columns, options.num_actions)
     columns["action"], outside = _unit_actions(columns["action"], options)
@@ -254,7 +252,7 @@ def trajectories(
     terminated = columns["terminated"]
     truncated = columns.get("truncated", np.zeros_like(terminated))
     stops = np.flatnonzero(ends)
-    starts = np.r_[0, stops[:-1] + 1]
+    starts = np.r_[0, stops + 1][:-1]
     complete = flagged[stops] & ~broken[stops]
     if "next_observation" in columns and episode is None:
         # Rows that do not follow one another have no sum of rewards.
@@ -411,7 +409,7 @@ def _unit_actions(action: Array, options: Reading) -> tuple[Array, int]:
     low, high = (np.broadcast_to(bound, size) for bound in (low, high))
     whole = ((action >= 0) & (action == np.round(action))).all()
     alone = size == 1 or (action.sum(1) == 1).all()
-    if whole and alone and (low < 0).all() and np.ptp(action) > 0:
+    if whole and alone and (low < 0).all() and (action != action[:1]).any():
         raise ValueError(
             f"'action' holds only the whole numbers {action.min():g} to "
             f"{action.max():g}, which look like discrete actions: name the environment "

@@ -21,7 +21,6 @@ from platformdirs import user_cache_dir
 from tensordict import TensorDict, TensorDictBase
 from torchrl import torchrl_logger
 from torchrl.data import LazyTensorStorage, ReplayBuffer
-from torchrl.envs.transforms import Transform
 
 from torchrl_osr._files import read_json, sha256_of, write_json
 from torchrl_osr.lab.data.transitions import DATASET_KEYS, check_dataset
@@ -107,7 +106,6 @@ def make_replay_buffer(
     *,
     batch_size: int,
     seed: int,
-    transform: Transform | None = None,
     device: torch.device | str | None = None,
 ) -> ReplayBuffer:
     """Return a replay buffer that samples a data set uniformly, with replacement.
@@ -119,7 +117,6 @@ def make_replay_buffer(
     buffer = ReplayBuffer(
         storage=LazyTensorStorage(len(data), device=device),
         batch_size=batch_size,
-        transform=transform,
         generator=torch.Generator(device).manual_seed(seed),
     )
     buffer.extend(data.to(device))

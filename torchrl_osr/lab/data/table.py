@@ -183,7 +183,8 @@ def _parsed(file: IO[str]) -> tuple[pd.DataFrame, str]:
             "lines have more values than the header has names, or end with a separator."
         )
     named = [name for name in frame if not name.startswith("Unnamed: ")]
-    frame = frame[named].dropna(how="all").rename(columns=lambda name: name.strip(" #"))
+    frame = frame[named].rename(columns=lambda name: name.strip(" #"))
+    frame = frame[frame.bfill().notna().any(axis=1)]  # of a spreadsheet's empty end
     return frame, f"separator {separator!r}, decimal {decimal!r}"
 
 
@@ -199,6 +200,9 @@ def find_columns(
     found = {part: _named(part, each, names) for part, each in wanted.items() if each}
     free = [name for name in names if name not in {*chain(*found.values())}]
     found |= {part: _usual(part, free) for part in USUAL_NAMES if part not in wanted}
+    after = [f"next_{name}" for name in found.get("observation", ())]
+    if after and "next_observation" not in wanted and {*after} <= {*free}:
+        found["next_observation"] = after  # in the same order
     columns = {part: found[part] for part in USUAL_NAMES if found.get(part)}
     used = [*chain(*columns.values())]
     if twice := [name for name in used if used.count(name) > 1]:
@@ -261,9 +265,9 @@ def _in_order(names: list[str]) -> list[str]:
     """
     matches = [re.fullmatch(r"(.*?)(\d+)\D?", name) for name in names]
     found = [match for match in matches if match]
-    if len(found) < len(names) or len({match[1] for match in found}) != 1:
-        return names
     numbered = {int(match[2]): match[0] for match in found}
+    if len(numbered) < len(names) or len({match[1] for match in found}) != 1:
+        return names
     first, last = min(numbered), max(numbered)
     if gaps := sorted({*range(1 if first else 0, last)} - numbered.keys()):
         raise ValueError(
@@ -298,8 +302,10 @@ def _numbers(name: str, array: Array) -> Array:
     if array.dtype.kind in "biuf":
         return array
     try:
-        if len(array) and isinstance(array[0], np.ndarray):
-            return np.stack([*array])  # lists of one length
+        lists = [each for each in array if isinstance(each, np.ndarray)]
+        if lists:  # of one length
+            none = np.full(lists[0].shape, np.nan)
+            return np.stack([none if each is None else each for each in array])
         numbers = pd.to_numeric(pd.Series([*array], dtype=object))
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name!r} holds other than numbers: {error}.") from error
@@ -310,6 +316,8 @@ def _sorted(columns: Arrays, name: str, about: dict[str, Any]) -> Arrays:
     """Sort the rows of each episode by its steps or time stamps."""
     given, episode = columns.pop("step"), columns["episode"]
     step, unit = given, ""
+    if {*map(len, columns.values())} != {len(given)}:
+        return columns  # which is refused
     if given.dtype.kind not in "biuf":
         try:
             times = pd.to_datetime(given, format="ISO8601", utc=True)

@@ -54,21 +54,12 @@ def rolled_out_values(
     *,
     gamma: float = 0.997,
 ) -> Array:
-    """Return a policy's discounted return in a grey box, from first states.
+    """Return a policy's discounted returns in a grey box, from first states, ``[E]``.
 
-    Rollouts have ``3 / (1 - gamma)`` steps: 5 % of the return are left then. Rewards
-    stay within the range of the data.
-
-    Args:
-        model: of :func:`fitted_grey_box`.
-        data: transitions ``[N]`` in order of time.
-        policy: as of :func:`~torchrl_osr.lab.evaluation.fitted_values`.
-
-    Keyword Args:
-        gamma: discount factor, below 1.
-
-    Returns:
-        Values ``[E]``, one for each episode, at most 100.
+    The model is one of :func:`fitted_grey_box`. The other arguments are those of
+    :func:`~torchrl_osr.lab.evaluation.fitted_values`. Rollouts have ``3 / (1 - gamma)``
+    steps: 5 % of the return are left then. Rewards stay within the range of the data.
+    Of more than 100 episodes, 100 are drawn.
 
     Examples:
         >>> import gymnasium

@@ -115,23 +115,13 @@ def load_run_policy(path: Path | str, trust: Sequence[str] = ()) -> Policy:
 
 def policy_of(run: TrainedRun) -> Policy:
     """Copy the policy of a run, in the units of its environment."""
-    config = run.config
-    low, high = config.env.action_low, config.env.action_high
-    return policy_from_loss(
-        run.loss,
-        run.observation_norm,
-        low=-1.0 if low is None else low,
-        high=1.0 if high is None else high,
-        source={
-            "env_id": config.env.id or config.env.name,
-            "step": run.step,
-            "checkpoint": run.path.name,
-            "seed": config.seed,
-            "discount": config.optim.gamma,
-            # Without the place of a log on this machine.
-            "data": asdict(config.data) | {"path": None},
-        },
-    )
+    config, env = run.config, run.config.env
+    source = {"env_id": env.id or env.name, "seed": config.seed, "step": run.step}
+    source |= {"checkpoint": run.path.name, "discount": config.optim.gamma}
+    # Without the place of a log on this machine.
+    source |= {"data": asdict(config.data) | {"path": None}}
+    bounds: Any = {"low": env.action_low or -1.0, "high": env.action_high or 1.0}
+    return policy_from_loss(run.loss, run.observation_norm, source=source, **bounds)
 
 
 def load_switching_policy(
