@@ -34,7 +34,7 @@ from torchrl_osr.lab.run.build import Learner
 from torchrl_osr.lab.run.config import write_config
 from torchrl_osr.lab.run.data import load_training_data
 from torchrl_osr.lab.run.folder import Run, open_run
-from torchrl_osr.lab.run.load import CHECKPOINTS
+from torchrl_osr.lab.run.load import CHECKPOINTS, POLICY
 from torchrl_osr.lab.run.schema import TrainConfig, register
 from torchrl_osr.lab.run.train import (
     adam,
@@ -94,6 +94,7 @@ def train(run: Run) -> float:
     # state. Both together are the paper's mixed data set D_tot.
     data = load_training_data(config, device)
     write_config(folder, config)  # with the checksum of the data
+    (folder / POLICY).unlink(missing_ok=True)  # of an earlier, shorter training
     perturbation = StatePerturbation(config.perturbation.std, seed=config.seed)
     data.buffer.append_transform(perturbation)
 

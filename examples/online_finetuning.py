@@ -81,7 +81,7 @@ def make_trainer(run: TrainedRun, frames: int, seed: int) -> OfflineToOnlineTrai
     )
     groups = [
         {"params": list(loss.actor_network_params.parameters())},
-        {"params": [loss.log_alpha]},
+        {"params": list(loss.parameters(recurse=False))},  # log_alpha, for instance
         {
             "params": list(loss.qvalue_network_params.parameters()),
             "lr": cfg.optim.qvalue_lr,
@@ -134,6 +134,11 @@ def main(arguments: Sequence[str]) -> None:
     )
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(arguments)
+    if options.interval % FRAMES_PER_BATCH or options.frames % options.interval:
+        parser.error(
+            f"--interval must be a multiple of {FRAMES_PER_BATCH}, --frames one of "
+            "--interval."
+        )
 
     torch.manual_seed(options.seed)
     torch.set_num_threads(1)

@@ -19,7 +19,8 @@ from torchrl.data import (
     SamplerWithoutReplacement,
     TensorDictReplayBuffer,
 )
-from torchrl.objectives import SACLoss, SoftUpdate, TD3BCLoss
+from torchrl.data.replay_buffers.scheduler import LinearScheduler
+from torchrl.objectives import HardUpdate, SACLoss, TD3BCLoss
 from torchrl.record.loggers import CSVLogger
 
 from torchrl_osr import StatePerturbation
@@ -57,11 +58,9 @@ def test_updates_evaluations_and_checkpoints_come_when_due(make, undisturbed):
     assert steps == {STEPS}
     assert steps_of(undisturbed) == [0, 5, 10, 15, 20]
     checkpoints = undisturbed.checkpoints
-    assert sorted(path.name for path in checkpoints.folder.iterdir()) == [
-        "best.torchrl",
-        "checkpoint-000000000015.torchrl",
-        "checkpoint-000000000020.torchrl",
-    ]
+    names = [f"checkpoint-0000000000{step}.torchrl" for step in (15, 20)]
+    there = sorted(path.name for path in checkpoints.folder.iterdir())
+    assert there == ["best.torchrl", *names]
     # Not the data set.
     assert set(manifest_of(checkpoints.latest())["components"]) == {
         "global_rng", "history", "loss_module", "optimizer", "perturbation",
@@ -117,14 +116,12 @@ def torchrl_osrs_loss():
     return make_loss("model", states="clean").float()
 
 
-@pytest.mark.parametrize(
-    "make_loss", [torchrls_loss, metrics_of_rows, torchrl_osrs_loss]
-)
+@pytest.mark.parametrize("made", [torchrls_loss, metrics_of_rows, torchrl_osrs_loss])
 def test_a_sampler_without_replacement_goes_on_in_its_epoch(
-    tmp_path, state, transitions, make_loss
+    tmp_path, state, transitions, made
 ):
     def make_run(folder):
-        loss = make_loss()
+        loss = made()
         buffer = make_replay_buffer(transitions(64), batch_size=8, seed=0)
         buffer.set_sampler(SamplerWithoutReplacement())
         update = FastUpdate(loss, torch.optim.Adam(loss.parameters()))
@@ -139,8 +136,8 @@ def test_a_sampler_without_replacement_goes_on_in_its_epoch(
 def test_priorities_follow_the_errors_and_are_restored(
     tmp_path, state, transitions, trace
 ):
-    def make_run(folder):
-        loss = make_loss("osr").float()
+    def make_run(folder, name="osr"):
+        loss = make_loss(name).float()
         buffer = TensorDictReplayBuffer(
             storage=LazyTensorStorage(64), batch_size=8,
             sampler=PrioritizedSampler(64, alpha=0.7, beta=0.5),
@@ -148,17 +145,24 @@ def test_priorities_follow_the_errors_and_are_restored(
         )  # fmt: skip
         buffer.extend(transitions(64))
         optimizer = torch.optim.Adam(loss.parameters())
-        updater = SoftUpdate(loss, tau=0.1)
+        every = {"value_network_update_interval": 4}
+        updater = HardUpdate(loss, **every) if name == "osr" else None
         update = FastUpdate(loss, optimizer, updater, trace=trace, warm_up=2)
+        beta = LinearScheduler(buffer, "beta", final_value=1.0, num_steps=STEPS)
         return OfflineTrainer(
             update, buffer, STEPS, folder, checkpoint_interval=5, progress=False,
-            components={"perturbation": buffer.transform[-1]},
+            components={"perturbation": buffer.transform[-1], "beta": beta},
+            hooks=[("post_optim", beta.step)],
         )  # fmt: skip
 
-    before = make_run(tmp_path).buffer.sampler._sum_tree[torch.arange(64)]
-    whole = assert_resumes(make_run, state, tmp_path)
-    after = whole.buffer.sampler._sum_tree[torch.arange(64)]
-    assert (before != after).sum() > 32
+    rows, before = torch.arange(64), make_run(tmp_path).buffer.sampler._sum_tree
+    after = assert_resumes(make_run, state, tmp_path).buffer.sampler._sum_tree
+    assert (before[rows] != after[rows]).sum() > 32
+    cloning = make_run(tmp_path / "bc", "bc")  # which computes no priorities
+    cloning.buffer.update_priority(rows, rows + 1.0)
+    given = cloning.buffer.sampler._sum_tree[rows].clone()
+    cloning.train()
+    assert torch.equal(cloning.buffer.sampler._sum_tree[rows], given)
 
 
 @pytest.mark.parametrize("step", [7, 20])
@@ -300,13 +304,9 @@ def test_killed_run_logs_no_step_twice(tmp_path, make, interval, evaluated):
     """
 
     def make_logged(folder):
-        return make(
-            tmp_path / folder,
-            checkpoint_interval=interval,
-            log_interval=1,
-            loggers=[CSVLogger("csv", log_dir=str(tmp_path / folder))],
-            evaluate=lambda: {"score": 1},
-        )
+        csv = CSVLogger("csv", log_dir=str(tmp_path / folder))
+        options = {"checkpoint_interval": interval, "log_interval": 1, "loggers": [csv]}
+        return make(tmp_path / folder, **options, evaluate=lambda: {"score": 1})
 
     def files(folder):
         return (tmp_path / folder / "csv" / "scalars" / "train").glob("*.csv")
@@ -333,16 +333,11 @@ def test_killed_run_logs_no_step_twice(tmp_path, make, interval, evaluated):
 
 
 def test_hooks_run_before_checkpoint_and_evaluation(tmp_path, make):
-    order = []
-
-    def note(name):
-        return lambda *_: order.append(name)
-
-    places = (
+    order, places = [], (
         "process_optim_batch", "post_optim", "post_optim_log",
         "post_optim_complete_log", "post_steps", "post_steps_log",
     )  # fmt: skip
-    hooks = [(place, note(place)) for place in places]
+    hooks = [(name, lambda *_, name=name: order.append(name)) for name in places]
     evaluate = {"evaluate": lambda: order.append("evaluated") or {"score": 0}}
     trainer = make(tmp_path, total_steps=1, hooks=hooks, **evaluate)
     original = trainer.checkpoints.save
@@ -376,6 +371,9 @@ def test_run_stops_before_a_step_that_is_not_finite(tmp_path, make, state, step,
     match = f"train: step {step}: not finite: losses .*loss_qvalue.*; gradients qvalue"
     with pytest.raises(FloatingPointError, match=match):
         trainer.train()
+    if step == 1:
+        with pytest.raises(RuntimeError, match="nothing was saved: build networks"):
+            trainer.train()
     # The networks are those of the updates before.
     before = make(tmp_path / "before", total_steps=max(step - 1, 1))
     if step > 1:

@@ -104,7 +104,7 @@ class LossGradients:
         try:
             trace = _Trace(self._losses, self.loss_module, batch, self.parameters)
             if all(map(torch.equal, tensors, before)) and self._state.holds():
-                self.trace = trace
+                self.trace, self._replays = trace, 0
             else:
                 self._give_up("it writes into its own tensors")
         except Exception as error:  # whatever a loss does that cannot be traced

@@ -111,7 +111,8 @@ class FastUpdate:
             for each in parameters
         ]
         self.loss_module, self.optimizer, self.count = loss_module, optimizer, 0
-        self._move_targets, self._delay = _mover(target_updater), policy_delay
+        self.target_updater, self._delay = target_updater, policy_delay
+        self._move_targets = _mover(target_updater)
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
         """Do one step on a batch; return the detached losses and metrics.

@@ -74,6 +74,7 @@ class SamplerState:
             rows = torch.arange(len(self.buffer))
             state["priorities"] = torch.as_tensor(self.sampler._sum_tree[rows])
             state["max_priority"] = self.sampler._max_priority
+            state["beta"] = float(self.sampler.beta)  # a scheduler may move it
         elif self.sampler is not None:
             state["sampler"] = dict(self.sampler.state_dict())
         return state
@@ -86,6 +87,7 @@ class SamplerState:
             self.sampler._sum_tree[rows] = priorities
             self.sampler._min_tree[rows] = priorities
             self.sampler._max_priority = state_dict["max_priority"]
+            self.sampler.beta = state_dict["beta"]
         elif state_dict.get("sampler"):
             self.sampler.load_state_dict(state_dict["sampler"])
 

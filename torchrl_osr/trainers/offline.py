@@ -154,6 +154,8 @@ class OfflineTrainer(Trainer):
             history=self.history,
             progress=self._saved,
         )
+        if hasattr(update.target_updater, "counter"):  # of a HardUpdate
+            parts["target_updater"] = update.target_updater
         self.checkpoints = Checkpoints(
             folder, parts, checkpoint_interval, checkpoints_kept
         )
@@ -162,7 +164,7 @@ class OfflineTrainer(Trainer):
         for place, hook in hooks:
             self.register_op(place, hook)
         if isinstance(getattr(replay_buffer, "sampler", None), PrioritizedSampler):
-            self.register_op("post_optim_log", replay_buffer.update_tensordict_priority)
+            self.register_op("post_optim_log", self._update_priority)
         # The checkpoint is first: if the evaluation ends the process, no step is lost.
         self.register_op("post_steps", self._save_if_due)
         self.register_op("post_steps_log", self._evaluate_if_due)
@@ -212,6 +214,8 @@ class OfflineTrainer(Trainer):
         its step whose result it lacks: these are repeated.
         """
         path = self.checkpoints.restore()
+        if path is None and self.step:
+            raise RuntimeError("nothing was saved: build networks and trainer anew.")
         step = self._saved["step"]
         if step > self.total_frames:
             raise ValueError(
@@ -249,6 +253,11 @@ class OfflineTrainer(Trainer):
             raise self._interrupted(self.step - 1)
         batch: TensorDictBase = self.buffer.sample()
         return batch
+
+    def _update_priority(self, batch: TensorDictBase) -> None:
+        # TorchRL 0.14.1 gives rows without a new priority the largest there is.
+        if batch.get(self.buffer.priority_key, None) is not None:
+            self.buffer.update_tensordict_priority(batch)
 
     def _interrupted(self, step: int) -> Interrupted:
         """Save a run that was asked to end after a step; return what to raise.

@@ -174,7 +174,7 @@ def _check_same(run: TrainConfig, config: TrainConfig, folder: Path) -> None:
     if different:
         log.warning(
             f"Continues with other settings, by force=true: {different}. What the "
-            "checkpoint restores stays, such as learning rates and loss weights."
+            "checkpoint restores stays, such as learning rates."
         )
 
 
