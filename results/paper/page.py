@@ -262,8 +262,9 @@ def claims(episodes: pd.DataFrame, printed: pd.DataFrame, knocked: pd.DataFrame)
     after = after.rename(
         index=lambda env: f"{env} medium-expert", columns=lambda name: name.split()[0]
     )
+    clean = episodes[episodes["suite"] == ""]
     sources = {
-        "score": (episodes[episodes["suite"] == ""], printed),
+        "score": (clean[clean["data"].isin(printed.index)], printed),  # not Figure 4's
         "knocked": (pairs, after),
         "lost": (
             pairs.assign(score=pairs["score_clean"] - pairs["score"]),
