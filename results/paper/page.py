@@ -23,6 +23,7 @@ from run import (
     HERE,
     LIMITED,
     MAZES,
+    MUJOCO,
     OWN,
     RESULTS,
     SIX,
@@ -465,8 +466,10 @@ def main() -> None:
     # Single numbers in the text.
     for name, line in means.iterrows():
         blocks |= {f"{name}/{kind}": decimal(value) for kind, value in line.items()}
-        found = differences(clean[clean["data"].isin(SIX)], "osr", name)
-        blocks[f"osr-less-{name}"] = str(found and found[1])
+        for mark, sets in (("", SIX), ("/15", MUJOCO)):
+            found = differences(clean[clean["data"].isin(sets)], "osr", name)
+            text = str(found and found[1]).removesuffix(" ²")
+            blocks[f"osr-less-{name}{mark}"] = text
     for (data, name), score in clean.groupby(["data", "method"])["score"]:
         blocks[f"{folder_name(data)}/{name}"] = decimal(score.mean())
     for (data, name), (_, share) in tables.recoverable(HERE).items():
