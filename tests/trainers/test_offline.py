@@ -372,7 +372,7 @@ def test_run_stops_before_a_step_that_is_not_finite(tmp_path, make, state, step,
     with pytest.raises(FloatingPointError, match=match):
         trainer.train()
     if step == 1:
-        with pytest.raises(RuntimeError, match="nothing was saved: build networks"):
+        with pytest.raises(RuntimeError, match="no checkpoint yet: build networks"):
             trainer.train()
     # The networks are those of the updates before.
     before = make(tmp_path / "before", total_steps=max(step - 1, 1))

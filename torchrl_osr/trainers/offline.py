@@ -215,7 +215,7 @@ class OfflineTrainer(Trainer):
         """
         path = self.checkpoints.restore()
         if path is None and self.step:
-            raise RuntimeError("nothing was saved: build networks and trainer anew.")
+            raise RuntimeError("no checkpoint yet: build networks and trainer again.")
         step = self._saved["step"]
         if step > self.total_frames:
             raise ValueError(
