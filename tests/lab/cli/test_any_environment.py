@@ -185,6 +185,7 @@ def test_a_log_without_rewards_trains_what_needs_none(tmp_path, capsys):
     given = "env=none", f"data.path={log}"
     with pytest.raises(ValueError, match=r"no reward column: .* or loss=bc recovery="):
         trained(tmp_path / "osr", *given, "loss=osr")
+    assert find_runs([tmp_path]) == []
     for loss in (["loss=noisy_bc"], ["loss=bc", "recovery=osr"]):
         run = trained(tmp_path / loss[-1], *given, *loss)
         assert json.loads((run / "returns.json").read_text())["data_return"] is None

@@ -70,7 +70,7 @@ def test_rows_in_no_order_are_refused_by_number() -> None:
         with pytest.raises(ValueError, match="row 0 the first, end no episode"):
             episode_of(wrong)
     with pytest.raises(ValueError, match="1 of the 8 rows, row 7 the first"):
-        check_order(data[:-1])
+        next_action(data[:-1])
     check_order(data[4:])
 
 

@@ -202,10 +202,10 @@ def test_names_are_found_in_the_order_of_their_numbers():
     assert find_columns(USUAL, named)["observation"] == ["obs_3", "obs_1"]
     named["observation"] = [7]
     assert find_columns(["7", *USUAL], named)["observation"] == ["7"]
-    feet = ["foot0x", "foot0y", "foot1x", "foot1y"]
-    after, named["observation"] = [f"next_{name}" for name in feet], "foot*"
-    columns = find_columns([*feet, *after[::-1], *USUAL], named)
-    assert columns["observation"] + columns["next_observation"] == feet + after
+    named["observation"], feet = "foot*", ["foot0x", "foot0y", "foot1x", "foot1y"]
+    assert find_columns([*feet, *USUAL], named)["observation"] == feet
+    named["observation"], after = ["obs_3", "obs_1"], ["next_obs_3", "next_obs_1"]
+    assert find_columns([*after[::-1], *USUAL], named)["next_observation"] == after
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import torch
 from torchrl_osr.lab.data import check_dataset, transitions_from_columns
 
 NEXT = ("next", "observation")
+DISCRETE = "only the whole numbers 0 to 1, which look like discrete"
 
 
 def log(**changes):
@@ -144,8 +145,8 @@ def with_value(name, row, value):
         ({"truncated": None}, "neither truncated nor episode"),
         ({"episode": [0, 0, 0, 1, 1, 0], "terminated": [0] * 6}, "'episode' 0 comes b"),
         ({"episode": [0, 0, 0, 0, 1, 1]}, r"row 2 ends its episode, and row 3 .*late"),
-        ({"action": np.eye(6)[:, :1]}, "whole numbers 0 to 1, which look like disc"),
-        ({"terminated": [0] * 6, "truncated": [1] * 6}, "no row has .* a next state"),
+        ({"action": np.eye(6)[:, :1]}, DISCRETE),
+        ({"terminated": [0] * 6, "truncated": [1] * 6}, "all values and a next state"),
     ],
 )
 def test_bad_columns_are_named(changes, message):

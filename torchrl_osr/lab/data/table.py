@@ -199,10 +199,10 @@ def find_columns(
     endless = wanted.get("terminated") is False
     found = {part: _named(part, each, names) for part, each in wanted.items() if each}
     free = [name for name in names if name not in {*chain(*found.values())}]
-    found |= {part: _usual(part, free) for part in USUAL_NAMES if part not in wanted}
-    after = [f"next_{name}" for name in found.get("observation", ())]
-    if after and "next_observation" not in wanted and {*after} <= {*free}:
-        found["next_observation"] = after  # in the same order
+    for part in (part for part in USUAL_NAMES if part not in wanted):
+        after = [f"next_{name}" for name in found.get("observation", ())]
+        paired = part == "next_observation" and after and {*after} <= {*free}
+        found[part] = after if paired else _usual(part, free)
     columns = {part: found[part] for part in USUAL_NAMES if found.get(part)}
     used = [*chain(*columns.values())]
     if twice := [name for name in used if used.count(name) > 1]:
