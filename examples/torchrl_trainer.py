@@ -36,7 +36,7 @@ from torchrl_osr.lab.data import (
     observation_statistics,
     reference_returns,
 )
-from torchrl_osr.lab.data.environment import environment_id
+from torchrl_osr.lab.data.environment import known_ids
 from torchrl_osr.lab.evaluation import EpisodeEvaluator, deterministic_policy, summarize
 
 OmegaConf.register_new_resolver("frames", lambda steps, rows: steps * rows)
@@ -147,7 +147,7 @@ def main(cfg: DictConfig) -> None:
         target_net_updater=instantiate(cfg.target_net_updater),
     )
     trainer.train()
-    evaluator = EpisodeEvaluator(environment_id(cfg.env), num_episodes=cfg.episodes)
+    evaluator = EpisodeEvaluator(known_ids()[cfg.env], num_episodes=cfg.episodes)
     result = summarize(
         evaluator(deterministic_policy(actor, norm)), reference_returns(cfg.env)
     )

@@ -112,7 +112,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             # Copies: what is mapped changes with the file.
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
             record = json.loads((file.metadata() or {})[RECORD])
-        damaged = record.pop("checksum") != _digest(tensors)
+        damaged = record["checksum"] != _digest(tensors)
     except (SafetensorError, KeyError, ValueError, AttributeError) as error:
         raise ValueError(
             f"{path} is no file of tensors of torchrl-osr, or damaged: {error!r}"

@@ -310,6 +310,7 @@ def load_policy(path: Path | str) -> Policy:
     if (path := Path(path)).is_dir():
         path /= f"policy{SUFFIX}"
     tensors, record = read_tensors(path)
+    del record["checksum"]  # of the file
     try:
         return Policy(record, tensors)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:

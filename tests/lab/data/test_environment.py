@@ -11,7 +11,7 @@ import pytest
 from gymnasium import spaces
 
 from torchrl_osr.lab.data import environment, make_environment
-from torchrl_osr.lab.data.environment import MAZE_IDS, environment_id
+from torchrl_osr.lab.data.environment import MAZE_IDS, known_ids
 
 PLANE = spaces.Box(-1, 1, (2,), np.float32)
 STATE = spaces.Dict([("speed", spaces.Box(2, 3, (1,))), ("angle", PLANE)])
@@ -54,7 +54,7 @@ WIDTHS = {"pointmaze": 8, "antmaze": 31}  # goal reached, goal wanted, point or 
 @pytest.mark.parametrize("name", MAZE_IDS)
 def test_mazes_observe_a_vector_with_the_goal_in_front(name, tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    with closing(make_environment(environment_id(name))) as env:
+    with closing(make_environment(known_ids()[name])) as env:
         observation, info = env.reset(seed=3)
         bare = env.unwrapped
         parts = bare.observation_space.spaces

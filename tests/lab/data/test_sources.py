@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from concurrent.futures import ThreadPoolExecutor
 from unittest import mock
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 from recorded_logs import make_columns, save
 
+from torchrl_osr._files import read_tensors
 from torchrl_osr.lab.data import load_dataset, sources, transitions_from_columns
 from torchrl_osr.lab.data.statistics import REFERENCE_RETURNS
 
@@ -50,8 +50,7 @@ def test_other_versions_make_the_set_anew(collections, monkeypatch):
 
 def test_manifest_describes_the_set(cache):
     _, manifest = roll_out(seed=3)
-    folder = cache / "collected" / "hopper-random-300-seed3"
-    stored = json.loads((folder / "manifest.json").read_text())
+    _, stored = read_tensors(cache / "collected/hopper-random-300-seed3.safetensors")
     assert stored.items() <= manifest.items()
     returns = np.array(manifest["episode_returns"])
     assert manifest["env_id"] == "Hopper-v5"

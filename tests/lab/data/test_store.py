@@ -26,7 +26,7 @@ def load(tmp_path, data, monkeypatch):
         return data, {"a": 1}
 
     def load(**request):
-        return load_or_write(tmp_path / "set", request, make)
+        return load_or_write(tmp_path / "set.safetensors", request, make)
 
     load.made, load.warnings = 0, []
     monkeypatch.setattr(torchrl_logger, "warning", load.warnings.append)
@@ -34,41 +34,29 @@ def load(tmp_path, data, monkeypatch):
 
 
 def test_a_cached_set_is_made_once_for_a_request(load, data, tmp_path):
-    (tmp_path / ".set.partial" / "rows").mkdir(parents=True)  # of a killed process
+    (tmp_path / ".set.safetensors.new").write_bytes(b"0")  # of a killed process
     for _ in range(2):
         found, manifest = load(seed=(1, 2))
         assert (found == data).all()
         assert (manifest["num_transitions"], manifest["a"]) == (60, 1)
     assert (load.made, load.warnings) == (1, [])
-    found["reward"] = torch.zeros(60)  # in memory: the files stay as they are
     load(seed=3)
     assert load.made == 2
     assert "its seed is [1, 2], wanted 3" in load.warnings[0]
-    assert {path.name for path in tmp_path.iterdir()} == {"set", "set.lock"}
-
-
-def test_a_folder_with_other_files_is_not_replaced(load, tmp_path):
-    load(seed=1)
-    (tmp_path / "set" / "notes.txt").write_text("mine")
-    with pytest.raises(FileExistsError, match="is not replaced"):
-        load(seed=2)
-    assert (tmp_path / "set" / "notes.txt").exists()
-    load(seed=1)
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"set.safetensors", "set.safetensors.lock"}
 
 
 def test_what_fails_leaves_no_set(load, data, tmp_path):
     data["observation"][37] = torch.nan
     with pytest.raises(ValueError, match="'observation'.* holds NaN"):
         load()
-    assert [path.name for path in tmp_path.iterdir()] == ["set.lock"]
+    assert [path.name for path in tmp_path.iterdir()] == ["set.safetensors.lock"]
 
 
-@pytest.mark.parametrize(
-    "name", ["rows/action.memmap", "rows/meta.json", "manifest.json"]
-)
-def test_a_damaged_set_is_made_anew(load, tmp_path, name):
+def test_a_damaged_set_is_made_anew(load, tmp_path):
     load()
-    path = tmp_path / "set" / name
+    path = tmp_path / "set.safetensors"
     content = path.read_bytes()
     path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
     load()

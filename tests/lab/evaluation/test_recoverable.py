@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrl_osr._files import sha256_of
 from torchrl_osr.lab.data import load_behavior_policy, make_environment
-from torchrl_osr.lab.data.environment import environment_id
+from torchrl_osr.lab.data.environment import known_ids
 from torchrl_osr.lab.evaluation.recoverable import (
     GROUPS,
     HALVES,
@@ -81,7 +81,7 @@ def test_halfcheetah_has_to_regain_its_speed() -> None:
 
 def test_in_a_maze_the_goal_of_each_state_counts() -> None:
     pytest.importorskip("gymnasium_robotics")
-    env = make_environment(environment_id("pointmaze-umaze"))
+    env = make_environment(known_ids()["pointmaze-umaze"])
     start, _ = env.reset(seed=0)
     here = start[:2]
     # It rolls towards the first goal, stands at the second, and away from the third.

@@ -13,7 +13,7 @@ import pytest
 from composed import CONF, composed
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_osr.lab.data.environment import environment_id
+from torchrl_osr.lab.data.environment import known_ids
 
 TABLE = Path(__file__).with_name("settings.csv")
 KEYS = (
@@ -50,7 +50,7 @@ def test_every_method_has_the_settings_of_the_table(method):
     cfg, rows = composed("train", f"loss={method}"), table()
     assert {name for name, *_ in rows} == set(METHODS)
     for env, source in DATA:
-        cfg.env.id, cfg.data.source = environment_id(env), source
+        cfg.env.id, cfg.data.source = known_ids()[env], source
         row = rows[method, env, source]
         assert settings_of(cfg) == {key: row[key] for key in KEYS}, (env, source)
     cfg.data.source, cfg.data.random_share = "expert", 0.5

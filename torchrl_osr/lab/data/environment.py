@@ -49,11 +49,6 @@ def known_ids() -> dict[str, str]:
     return {name: str(e["env"]) for name, e in load_behavior_card().items()} | MAZE_IDS
 
 
-def environment_id(env_name: str) -> str:
-    """Return the Gymnasium id of a known task by its short name."""
-    return known_ids()[env_name]
-
-
 def environment_name(env_id: str) -> str:
     """Return a known task's short name; for others their id as a folder's name.
 

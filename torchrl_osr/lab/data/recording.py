@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,8 @@ from tensordict import TensorDict
 from torchrl import torchrl_logger
 
 from torchrl_osr._checks import check_choice
-from torchrl_osr.lab.data.store import Dataset, checksum_of
+from torchrl_osr._files import sha256_of
+from torchrl_osr.lab.data.store import Dataset
 from torchrl_osr.lab.data.transitions import (
     ACTION_LIMIT,
     SAME_STATE,
@@ -79,7 +81,7 @@ class Reading:
 def convert(
     parts: Iterable[tuple[str, Columns]],
     options: Reading,
-    about: Mapping[str, Any] | None = None,
+    about: Mapping[str, Any],
     files: Iterable[Path] = (),
 ) -> Dataset:
     """Return transitions ``[N]`` and their manifest, with the checksum of ``files``.
@@ -113,7 +115,6 @@ def convert(
     if not len(data):
         raise ValueError("no row has all values and a next state (next_observation).")
     check_dataset(data)
-    about = about or {}
     returns, lengths, complete = np.concatenate(episodes).T
     whole, lengths = complete == 1, lengths.astype(int)
     warnings = [*about.get("warnings", []), *dict.fromkeys(found)]
@@ -122,14 +123,14 @@ def convert(
     for warning in warnings:
         torchrl_logger.warning(warning)
     bounds = [np.asarray(b, np.float64).tolist() for b in options.action_bounds]
-    files = [*files]
+    digests = "".join(map(sha256_of, files))
     return data, {
         **asdict(options),
         "action_bounds": bounds,
         "num_transitions": len(data),
         **about,
         **counts,
-        **({"checksum": checksum_of(files)} if files else {}),
+        **({"checksum": sha256(digests.encode()).hexdigest()} if digests else {}),
         "episode_returns": returns[whole].tolist(),
         "episode_lengths": lengths[whole].tolist(),
         "incomplete_returns": returns[~whole].tolist(),
@@ -210,7 +211,7 @@ def transitions_from_columns(
         (1, [2.0, 2.0])
     """
     options = Reading(action_bounds, clip_actions, num_actions, missing)
-    return convert([("", columns)], options)
+    return convert([("", columns)], options, {})
 
 
 def trajectories(

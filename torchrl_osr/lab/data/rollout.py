@@ -21,7 +21,7 @@ from tqdm.auto import tqdm
 
 from torchrl_osr._files import sha256_of
 from torchrl_osr.lab.data.behavior import behavior_policy_path, load_behavior_policy
-from torchrl_osr.lab.data.environment import MAZE_IDS, environment_id, make_environment
+from torchrl_osr.lab.data.environment import MAZE_IDS, known_ids, make_environment
 from torchrl_osr.lab.data.mazes import (
     ActionSampler,
     StartsAndGoals,
@@ -71,7 +71,7 @@ def collect_source(
     """
     entropy = (seed, zlib.crc32(f"{env_name}-{source}".encode()))
     # Data have any start and goal, where D4RL's test has one of each.
-    env_id = environment_id(env_name).replace("_Test", "")
+    env_id = known_ids()[env_name].replace("_Test", "")
     with closing(make_environment(env_id)) as env:
         size = flatdim(env.action_space)
 

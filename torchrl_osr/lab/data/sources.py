@@ -16,7 +16,6 @@ from torchrl_osr._checks import needed_by
 from torchrl_osr.lab.data.environment import (
     MAZE_IDS,
     EnvironmentSpec,
-    environment_id,
     environment_name,
     environment_spec,
     known_ids,
@@ -104,7 +103,6 @@ def load_dataset(
         data, manifest = _recorded(source, path, spec, num_actions, log, progress)
         if spec is not None:
             _check_fit(data, manifest, str(env_id), spec)
-        checksum = manifest.get("checksum")
     else:
         if path is not None or (env_id is None and env_name not in known_ids()):
             raise ValueError(
@@ -128,8 +126,7 @@ def load_dataset(
         rows = 200_000 if num_transitions is None else num_transitions
         recipe = {"num_transitions": rows, "seed": seed}
         data, manifest = rolled_out(name, source, recipe, progress=progress)
-        checksum = manifest["rows_sha256"]
-    mean = _mean_return(manifest)
+    mean, checksum = _mean_return(manifest), manifest.get("checksum")
     if random_share:
         random, about = rolled_out(str(name), "random", recipe, progress=progress)
         data = mix_datasets(data, random, random_share=random_share, seed=seed)
@@ -170,7 +167,7 @@ def rolled_out(
     request = {
         "recipe_version": RECIPE_VERSION,
         "env_name": env_name,
-        "env_id": environment_id(env_name),
+        "env_id": known_ids()[env_name],
         "source": source,
         **recipe,
         **behavior_of(env_name, source),
@@ -185,8 +182,8 @@ def rolled_out(
         about |= {"episode_returns": returns.tolist()}
         return data, about | {"episode_lengths": lengths.tolist()}
 
-    folder = cache_root() / "collected" / f"{env_name}-{source}-{rows}-seed{seed}"
-    return load_or_write(folder, request, collect)
+    name = f"{env_name}-{source}-{rows}-seed{seed}.safetensors"
+    return load_or_write(cache_root() / "collected" / name, request, collect)
 
 
 def _recorded(

@@ -1,16 +1,10 @@
-"""The cache of rolled-out transitions, and replay buffers of any data.
-
-A cached set is a folder with ``rows``, files of ``TensorDict.memmap``, and
-``manifest.json``, which describes them and holds their checksum.
-"""
+"""The cache of rolled-out transitions, and replay buffers of any data."""
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
-import shutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -22,16 +16,14 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl import torchrl_logger
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
-from torchrl_osr._files import read_json, sha256_of, write_json
+from torchrl_osr._files import read_tensors, write_tensors
 from torchrl_osr.lab.data.transitions import DATASET_KEYS, check_dataset
 
 Dataset = tuple[TensorDict, dict[str, Any]]
 """Transitions ``[N]`` and their manifest."""
 
-MANIFEST, ROWS = "manifest.json", "rows"
-
 # Raise the number whenever the files or the required entries of the manifest change.
-FORMAT = "torchrl-osr transitions 2"
+FORMAT = "torchrl-osr transitions 3"
 
 
 def cache_root() -> Path:
@@ -41,64 +33,39 @@ def cache_root() -> Path:
 
 
 def load_or_write(
-    folder: Path, request: Mapping[str, Any], make: Callable[[], Dataset]
+    path: Path, request: Mapping[str, Any], make: Callable[[], Dataset]
 ) -> Dataset:
     """Read a cached data set; make it first if its manifest differs from ``request``.
 
-    ``make`` returns transitions, and entries of the manifest besides ``request``.
-    Processes that ask for the same data set at once wait for one of them to write it.
+    The file holds the rows as tensors, and the manifest as their record. ``make``
+    returns transitions, and entries of the manifest besides ``request``. Processes that
+    ask for the same data set at once wait for one of them to write it.
     """
     wanted = json.loads(json.dumps(request))  # like the manifest's: without tuples
 
     def load() -> Dataset:
-        manifest = read_json(folder / MANIFEST)
+        rows, manifest = read_tensors(path)
         for key, value in {**wanted, "format": FORMAT}.items():
             if (was := manifest.get(key)) != value:
                 raise ValueError(f"its {key} is {was!r}, wanted {value!r}.")
-        if manifest.get("rows_sha256") != _checksum(folder / ROWS):
-            raise ValueError("its checksum is wrong: the files are damaged.")
-        data = TensorDict.load_memmap(folder / ROWS, allow_pickle=False)
-        return data.clone(), manifest
+        data = TensorDict(rows, [manifest["num_transitions"]])
+        return data.unflatten_keys(), manifest
 
     # Without the lock first: a data set can be read from a read-only folder.
     with suppress(OSError, ValueError):
         return load()
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with FileLock(f"{folder}.lock"):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(f"{path}.lock"):
         try:
             return load()  # another process may have written it in the meantime
         except (OSError, ValueError) as flaw:
-            if folder.exists():
-                torchrl_logger.warning(f"Making {folder} anew: {flaw}")
-        names = {path.name for path in folder.iterdir()} if folder.exists() else set()
-        if not names <= {MANIFEST, ROWS}:
-            raise FileExistsError(f"{folder} is not replaced: it holds other files.")
+            if path.exists():
+                torchrl_logger.warning(f"Making {path} anew: {flaw}")
         data, about = make()
         check_dataset(data)
-        partial = folder.with_name(f".{folder.name}.partial")
-        shutil.rmtree(partial, ignore_errors=True)  # of a killed process
-        try:
-            data.select(*DATASET_KEYS).memmap(partial / ROWS)
-            manifest = {**wanted, **about, "format": FORMAT}
-            manifest["num_transitions"] = len(data)
-            manifest["rows_sha256"] = _checksum(partial / ROWS)
-            write_json(partial / MANIFEST, manifest)
-            shutil.rmtree(folder, ignore_errors=True)
-            os.replace(partial, folder)
-        finally:  # an interrupted call leaves nothing
-            shutil.rmtree(partial, ignore_errors=True)
+        manifest = {**wanted, **about, "format": FORMAT, "num_transitions": len(data)}
+        write_tensors(path, data.select(*DATASET_KEYS).flatten_keys(), manifest)
         return load()
-
-
-def _checksum(folder: Path) -> str:
-    """Return the SHA-256 of the files of the rows."""
-    return checksum_of(sorted(path for path in folder.rglob("*") if path.is_file()))
-
-
-def checksum_of(files: Iterable[Path]) -> str:
-    """Return the SHA-256 of the contents of files, wherever they are."""
-    digests = [sha256_of(path) for path in files]
-    return hashlib.sha256("".join(digests).encode()).hexdigest()
 
 
 def make_replay_buffer(

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from torchrl_osr._checks import check_choice
 from torchrl_osr._files import read_arrays
-from torchrl_osr.lab.data.environment import MAZE_IDS, environment_id
+from torchrl_osr.lab.data.environment import MAZE_IDS, known_ids
 from torchrl_osr.lab.evaluation.episodes import EpisodeEvaluator, Policy
 
 GROUPS = ("easy", "contested", "recoverable")
@@ -93,7 +93,7 @@ def recovers(states: RecoverableStates, policy: Policy) -> NDArray[np.bool_]:
     back = np.zeros(len(states), dtype=np.bool_)
     waiting = iter(range(len(states)))
     evaluator = EpisodeEvaluator(
-        environment_id(states.env_name),
+        known_ids()[states.env_name],
         num_episodes=max(1, min(AT_ONCE, len(states))),
         fixed_batch=True,  # falls are chaotic: rounding decides some of them
         wrap=lambda env: TimeLimit(_Start(env, states, waiting), states.steps),

@@ -21,7 +21,7 @@ from torchrl import torchrl_logger
 
 from torchrl_osr._files import read_json, sha256_of, write_json
 from torchrl_osr.lab.data import observation_statistics
-from torchrl_osr.lab.data.environment import environment_id
+from torchrl_osr.lab.data.environment import known_ids
 from torchrl_osr.lab.dynamics import SwitchingPolicy
 from torchrl_osr.lab.evaluation import (
     DataDistance,
@@ -171,7 +171,7 @@ def play_states(config: EvaluateConfig, players: list[Player]) -> dict[str, Any]
     run, half = players[0][0].config, config.suite.half
     assert half is not None
     states = load_recoverable_states(run.env.name, half)
-    if run.env.id != (wanted := environment_id(run.env.name)):
+    if run.env.id != (wanted := known_ids()[run.env.name]):
         raise ValueError(f"the states are of {wanted}, the run is of {run.env.id}.")
     evaluations, name = [], config.suite.name
     with progress_bar(name, len(players), unit="play", bar=config.progress) as bar:
