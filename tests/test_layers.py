@@ -28,7 +28,7 @@ def test_plug_in_loads_torch_tensordict_and_torchrl_alone() -> None:
 import sys
 import torchrl.envs, torchrl.trainers  # TorchRL 0.14.1 loads mujoco by itself
 before = set(sys.modules)
-import torchrl_osr
+from torchrl_osr import *
 print(sorted({"gymnasium", "mujoco", "hydra", "pandas"} & (set(sys.modules) - before)))
 """
     command = [sys.executable, "-W", "ignore", "-c", code]

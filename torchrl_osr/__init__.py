@@ -40,3 +40,8 @@ def __getattr__(name: str) -> object:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     homes = {"load_policy": "policy", "StatePerturbation": "transforms"}
     return getattr(import_module(f"{__name__}.{homes.get(name, 'objectives')}"), name)
+
+
+def __dir__() -> list[str]:
+    """List the names that wait for their first use, too."""
+    return __all__

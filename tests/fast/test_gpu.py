@@ -48,6 +48,13 @@ def test_a_gpu_has_the_numbers_of_a_cpu(name):
     torch.testing.assert_close(*found, rtol=1e-10, atol=1e-10)
 
 
+def test_networks_on_a_gpu_are_enough():
+    networks, batch = make_networks("osr"), make_batch("osr", 6).to("cuda")
+    for each in (networks.actor, *networks.critics, networks.model):
+        each.to("cuda")
+    assert make_loss("osr", networks)(batch)["loss_cql"].is_cuda
+
+
 def test_infinity_is_found_within_a_hundred_updates():
     loss, batch = make_loss("osr").to("cuda"), make_batch("osr", 5).to("cuda")
     optimizer = torch.optim.Adam(loss.parameters(), fused=True)

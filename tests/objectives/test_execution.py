@@ -29,7 +29,7 @@ def test_a_loop_over_critics_equals_vmap(name) -> None:
 
 
 # One loss for each path that is traced, for tracing takes seconds.
-TRACED = ["osr", "iql"]
+TRACED = ["osr", "iql", "discrete"]
 
 
 # torch 2.13, tensordict 0.14.3 and TorchRL 0.14.1 warn of each other while they are

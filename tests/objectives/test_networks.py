@@ -215,8 +215,23 @@ def test_a_frozen_network_has_the_weights_that_a_loss_loads() -> None:
     loss, other = make_loss("osr"), make_loss("osr", make_networks("osr", seed=9))
     loss.load_state_dict(other.state_dict())
     assert not loss.inverse_dynamics_network.training, "labels would be random"
-    models = (each.inverse_dynamics_network.parameters() for each in (loss, other))
-    assert all(map(torch.equal, *models))
+    held = loss.inverse_dynamics_network.parameters()
+    assert all(map(torch.equal, held, other.inverse_dynamics_network.parameters()))
+    model = make_networks("osr", seed=4).model
+    loss.load_frozen("inverse_dynamics_network", model)
+    held = loss.inverse_dynamics_network.parameters()
+    assert all(map(torch.equal, held, model.parameters()))
+
+
+def test_a_loss_is_where_its_networks_are(monkeypatch) -> None:
+    monkeypatch.setattr(Tensor, "is_set_to", lambda *_: False)  # no meta kernel
+    networks = make_networks("cql-options")
+    for each in (networks.actor, *networks.critics):
+        each.to("meta")
+    loss = make_loss("cql-options", networks)
+    numbers = [*loss.parameters(), *loss.buffers(recurse=False)]
+    assert len(numbers) > 5
+    assert all(each.is_meta for each in numbers)
 
 
 def test_td3_needs_the_bounds_of_a_plain_actor() -> None:

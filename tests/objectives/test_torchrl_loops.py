@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 import torch
 from objectives.losses import assert_same_bits
-from tensordict import TensorDict
 from torch.optim import Adam
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
@@ -71,13 +70,9 @@ def make_trainer(loss, optimizer) -> CQLTrainer:
     )
 
 
-@pytest.fixture
-def batch(transitions) -> TensorDict:
-    return StatePerturbation(std=0.1)(transitions(16, observation=3, action=1))
-
-
 @pytest.mark.parametrize("kind", LOSSES)
-def test_cql_trainer_steps_along_the_gradient_of_all_losses(batch, kind) -> None:
+def test_cql_trainer_steps_along_the_gradient_of_all_losses(transitions, kind) -> None:
+    batch = StatePerturbation(std=0.1)(transitions(16, action=1))
     loss_class, options = LOSSES[kind]
     loss = make_loss(loss_class, **options)
     SoftUpdate(reference := make_loss(loss_class, **options), tau=0.1)

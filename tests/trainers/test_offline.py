@@ -124,7 +124,8 @@ def test_a_sampler_without_replacement_goes_on_in_its_epoch(
         loss = made()
         buffer = make_replay_buffer(transitions(64), batch_size=8, seed=0)
         buffer.set_sampler(SamplerWithoutReplacement())
-        update = FastUpdate(loss, torch.optim.Adam(loss.parameters()))
+        adam, (first, *_) = torch.optim.Adam(loss.parameters()), loss.parameters()
+        update = FastUpdate(loss, adam, policy_delay=2, policy_params=[first])
         return OfflineTrainer(
             update, buffer, STEPS, folder, checkpoint_interval=5, progress=False
         )

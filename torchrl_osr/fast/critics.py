@@ -38,8 +38,8 @@ class FusedCritics(Critics):
 
     Plain is a :class:`~torchrl.modules.MLP` with one output that reads an observation
     and then the action, of linear layers and ReLUs in between; before the ReLUs there
-    may be layer normalisations. Other critics, those with hooks, and those on a GPU are
-    evaluated as usual.
+    may be layer normalisations. Other critics and those with hooks are evaluated as
+    usual. The chunks are for a CPU alone.
     """
 
     def values(

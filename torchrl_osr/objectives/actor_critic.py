@@ -170,7 +170,7 @@ class ActorCriticLoss(LossModule):
         super().__init__()
         check_choice("reduction", reduction, ("mean", "sum", "none", None))
         self.num_qvalue_nets = num_qvalue_nets
-        self.loss_function = loss_function
+        self.loss_function: str = loss_function
         self.deactivate_vmap = deactivate_vmap
         self.use_prioritized_weights = use_prioritized_weights
         self.reduction = reduction
@@ -292,10 +292,14 @@ class ActorCriticLoss(LossModule):
         for name, bound in zip(("action_low", "action_high"), bounds, strict=False):
             self.register_buffer(name, bound, persistent=False)
 
+    def scalar(self, value: float) -> Tensor:
+        """Return a number as a tensor on the networks' device."""
+        return torch.tensor(float(value), device=next(self.parameters()).device)
+
     def register_coefficient(self, name: str, value: float) -> None:
         """Register the weight of a term, which may be assigned later."""
         check_weight(name, value)
-        self.register_buffer(name, torch.tensor(float(value)), persistent=False)
+        self.register_buffer(name, self.scalar(value), persistent=False)
 
     def register_temperature(
         self, alpha_init: float, target_entropy: float | Literal["auto"]
@@ -303,7 +307,7 @@ class ActorCriticLoss(LossModule):
         """Register the logarithm of SAC's entropy temperature, ``log_alpha``."""
         check_positive("alpha_init", alpha_init)
         self.target_entropy = target_entropy
-        self.log_alpha = nn.Parameter(torch.tensor(math.log(alpha_init)))
+        self.log_alpha = nn.Parameter(self.scalar(math.log(alpha_init)))
 
     def _make_vmap(self) -> None:
         if "qvalue_network" in self.__dict__:
@@ -552,19 +556,19 @@ class ActorCriticLoss(LossModule):
         action = torch.cat([uniform, action.flatten(0, 1)])
         return action, torch.cat([log_density, log_prob.flatten(0, 1)])
 
+    @torch.no_grad()
     def soft_target(self, batch: Transitions, policy: StatePolicy) -> Tensor:
         """Return the TD target of an action of the policy at ``s'``, ``[R]``."""
-        with torch.no_grad():  # as a decorator here, torch.compile cannot trace it
-            states, pi = batch.states[SETS["next"]], policy["next"]
-            number = (self.num_random,) if self.max_q_backup else ()
-            action, log_prob = rsample_and_log_prob(pi, number)
-            params = self.target_qvalue_network_params
-            qvalue = self.q(states.expand(action.shape[:-1]), action, params)
-            entropy = () if self.deterministic_backup else (log_prob, self.alpha)
-            next_value = F.bootstrap_value(qvalue, *entropy)
-            if self.max_q_backup:
-                next_value = next_value.amax(0)
-            return self.td_target(batch, next_value.squeeze(0))
+        states, pi = batch.states[SETS["next"]], policy["next"]
+        number = (self.num_random,) if self.max_q_backup else ()
+        action, log_prob = rsample_and_log_prob(pi, number)
+        params = self.target_qvalue_network_params
+        qvalue = self.q(states.expand(action.shape[:-1]), action, params)
+        entropy = () if self.deterministic_backup else (log_prob, self.alpha)
+        next_value = F.bootstrap_value(qvalue, *entropy)
+        if self.max_q_backup:
+            next_value = next_value.amax(0)
+        return self.td_target(batch, next_value.squeeze(0))
 
     def td_target(self, batch: Transitions, next_value: Tensor) -> Tensor:
         r"""Return :math:`r + \gamma (1 - \text{terminated}) V(s')`, ``[R]``.

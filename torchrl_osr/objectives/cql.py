@@ -10,7 +10,6 @@ import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
-import torch
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor, nn
 
@@ -99,7 +98,7 @@ class CQLLoss(ActorCriticLoss):
         if target_action_gap is not None and not self.has_cql:
             raise ValueError("target_action_gap needs min_q_weight above 0.")
         if target_action_gap is not None:
-            self.log_alpha_prime = nn.Parameter(torch.zeros(()))
+            self.log_alpha_prime = nn.Parameter(self.scalar(0))
         self.num_random, self.temperature = num_random, temperature
         self.target_action_gap, self.clip_diff_min = target_action_gap, clip_diff_min
         self.max_q_backup = max_q_backup

@@ -97,7 +97,7 @@ class InverseDynamicsLoss(ActorCriticLoss):
             raise ValueError("loss_function='mse' needs real actions: choose 'nll'.")
         self.convert_to_functional(inverse_dynamics_network, "inverse_dynamics_network")
         self.states: Literal["both", "clean"] = states
-        self.action_error, self.latent_weight = loss_function, latent_weight
+        self.loss_function, self.latent_weight = loss_function, latent_weight
         self.has_latent = set(LATENT_KEYS) <= set(inverse_dynamics_network.out_keys)
         self.declare(["loss_inverse_dynamics"], [])
 
@@ -118,7 +118,7 @@ class InverseDynamicsLoss(ActorCriticLoss):
         model = network.build_dist_from_params(output)
         if not is_categorical(network):
             self.check_actions(batch, model.loc.shape[1:])
-        if self.action_error == "mse":
+        if self.loss_function == "mse":
             value = (model.rsample() - batch.a).square().mean(-1)
         else:
             value = cloning_distance(model, batch.a, self.tensor_keys.action)

@@ -57,9 +57,9 @@ def squashing_bounds(network: TensorDictModuleBase) -> tuple[Tensor, ...]:
         options = dict(zip(("low", "high"), tanh[-1].buffers(), strict=False))
     elif head not in (TanhNormal, TanhDelta):
         return ()
-    dtype = torch.get_default_dtype()
-    low = torch.as_tensor(options.get("low", -1.0), dtype=dtype)
-    return low, torch.as_tensor(options.get("high", 1.0), dtype=dtype)
+    device, dtype = next(network.parameters()).device, torch.get_default_dtype()
+    low = torch.as_tensor(options.get("low", -1.0), dtype=dtype, device=device)
+    return low, torch.as_tensor(options.get("high", 1.0), dtype=dtype, device=device)
 
 
 def action_bounds(network: TensorDictModuleBase, name: str) -> tuple[Tensor, ...]:

@@ -43,8 +43,8 @@ class StateRecoveryLoss(ActorCriticLoss):
     Give it the actor of an IQLLoss, SACLoss, TD3BCLoss or another TorchRL loss and add
     ``"loss_recovery"`` to that loss's entries, or join both by :class:`WithRecovery`.
     The two share the actor's tensors, and the optimizer of that loss is enough. The
-    gradient reaches the actor only. Rows that are ``done`` do not count. Equations (11)
-    and (12) of the paper of :class:`~torchrl_osr.OSRLoss`.
+    gradient reaches the actor only. Rows that are ``done`` or synthetic do not count.
+    Equations (11) and (12) of the paper of :class:`~torchrl_osr.OSRLoss`.
 
     Two more actors are pulled to the model's mean: a deterministic one (a
     :class:`~torchrl.modules.TanhDelta`, or a module that writes the action), and the

@@ -71,10 +71,10 @@ def task_limits(
 ) -> Tensor:
     """Return limits ``[2, S]`` beyond which transitions ``[N]`` show that a task ends.
 
-    They are limits of the states from which it went on, the one first that most ends
-    are beyond, while each explains another fiftieth of the ends. Others are infinite.
-    Print them in the units of ``s``: the rows hold ``(s - loc) / scale``. Raise a
-    ValueError if they miss more than one end of ten.
+    They bound the states from which the task went on. The limit that explains most
+    ends comes first; one that explains less than 2 % of them stays infinite. Print them
+    in the units of ``s``: rows hold ``(s - loc) / scale``. Raise a ValueError if they
+    miss more than one end of ten.
     """
     ended = data["next", "terminated"].squeeze(-1)
     states = data["next", "observation"]

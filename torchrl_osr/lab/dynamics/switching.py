@@ -100,8 +100,8 @@ class SwitchingPolicy:
 
     Keyword Args:
         terminated: of next observations.
-        steps: :math:`T`.
-        hold: number of calls until the next choice.
+        steps, gamma: :math:`T` and :math:`\gamma`, default 20 and 0.99.
+        hold: number of calls until the next choice, default 4.
     """
 
     def __init__(

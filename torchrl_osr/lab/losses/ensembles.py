@@ -185,7 +185,7 @@ class RORLLoss(ActorCriticLoss):
         if q_ood_reg:  # one critic has no deviation
             check_positive("num_qvalue_nets", self.num_qvalue_nets, minimum=2)
         self.num_samples, self.q_smooth_tau = num_samples, q_smooth_tau
-        self.register_buffer("num_updates", torch.tensor(0.0))
+        self.register_buffer("num_updates", self.scalar(0))
         terms = {
             "policy_smoothness": policy_smooth_reg,
             "value_smoothness": q_smooth_reg,
@@ -193,7 +193,6 @@ class RORLLoss(ActorCriticLoss):
         }
         self.declare_soft_actor_critic(*(name for name in terms if terms[name]))
 
-    @torch.no_grad()
     def decay_uncertainty(self) -> None:
         """Lower the weight of the uncertainty by one update's decay."""
         self.num_updates += 1

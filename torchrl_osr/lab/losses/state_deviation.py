@@ -98,7 +98,7 @@ class StateDeviationLoss(ActorCriticLoss):
         self.register_frozen("transition_network", transition_network)
         self.num_samples, self.kernel_width = num_samples, kernel_width
         self.threshold = threshold
-        self.log_multiplier = nn.Parameter(torch.zeros(()))
+        self.log_multiplier = nn.Parameter(self.scalar(0))
         self.declare(["loss_deviation", "loss_multiplier"], ["deviation", "multiplier"])
 
     def input_keys(self) -> list[NestedKey]:
