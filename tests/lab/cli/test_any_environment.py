@@ -225,7 +225,7 @@ def test_policies_are_ranked_on_their_log_alone(tmp_path, capsys, monkeypatch):
     log.unlink()
     evaluate_offline.main()  # the results are there already
     page = write_report(read_runs([tmp_path]), tmp_path / "page").read_text()
-    name = "estimated return (discount 0.9) of log-log"
+    name = "estimated return by FQE (discount 0.9) of log-log"
     assert f"Undisturbed {name}" in page
     assert "No run was played." in page
     bodys = json.loads((runs[0] / "offline_evaluation.json").read_text())
@@ -278,7 +278,7 @@ def test_without_a_simulator_bounds_and_discrete_actions_may_be_given(
         (["env.id=Pendulum-v1", "path=there.npz"], "there.npz exists"),
         (["path=log.npz"], "env.id is not given"),
         (["env=hopper", "path=a.npz", "policy=good"], "no run .* at good"),
-        (["env=hopper", "path=a.npz", "policy=no:act"], "No module named 'no'"),
+        (["env=hopper", "path=a.npz", "policy=no:act"], "policy=no:act: No mod"),
     ],
 )
 def test_collect_refuses_in_a_sentence(overrides, message, tmp_path, monkeypatch):

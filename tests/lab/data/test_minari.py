@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from minari.data_collector import EpisodeBuffer
+from recorded_logs import make_columns, save
 from torchrl import torchrl_logger
+from untrained_run import make_run
 
 from torchrl_osr.lab.data import check_dataset, load_dataset
+from torchrl_osr.lab.run.monitor import MonitorConfig, monitor_of_run
 
 # Minari asks for an author's address, and more, whenever a set is made.
 pytestmark = [
@@ -109,7 +112,7 @@ def test_actions_are_mapped_to_the_unit_box_or_become_one_hot():
     assert manifest["num_actions"] == 3
 
 
-def test_nothing_is_fetched_unless_asked_for(monkeypatch):
+def test_nothing_is_fetched_unless_asked_for(tmp_path, monkeypatch):
     asked = []
 
     def fetch(name):
@@ -123,6 +126,11 @@ def test_nothing_is_fetched_unless_asked_for(monkeypatch):
     data, _ = load("test/far-v0", download=True)
     load("test/far-v0", download=True)
     assert (asked, len(data)) == (["test/far-v0"], sum(LENGTHS))
+    given = "data=minari", "data.path=test/far-v0", "data.download=true"
+    make_run(tmp_path / "run", *given, sizes=(3, 2))
+    own = save(tmp_path / "own.npz", make_columns())
+    options = MonitorConfig(false_alarms=0.3, episodes=str(own))
+    assert monitor_of_run(tmp_path / "run", options).record["episodes"] == 4
 
 
 def test_other_action_bounds_than_the_tasks_are_a_warning(monkeypatch):

@@ -34,7 +34,10 @@ def main(cfg: DictConfig) -> None:
     env_id = None if OmegaConf.is_missing(cfg.env, "id") else cfg.env.id
     act: Act | None = None
     if ":" in cfg.policy:
-        act = resolve_name(cfg.policy)
+        try:
+            act = resolve_name(cfg.policy)
+        except (ImportError, AttributeError) as error:
+            raise ValueError(f"cannot import policy={cfg.policy}: {error}.") from error
     elif cfg.policy != "random":
         policy = load_run_policy(cfg.policy, cfg.trust)
         known = policy.record["source"].get("env_id")

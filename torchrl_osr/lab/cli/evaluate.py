@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import multiprocessing
+import shlex
 import signal
 from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -100,7 +101,7 @@ def evaluate_sweep(config: EvaluateConfig) -> None:
         raise ValueError(
             f"{len(failed)} of {len(runs)} runs failed: {', '.join(failed)}."
         )
-    print(f"  next   torchrl-osr report {config.sweep}")
+    print(f"  next   torchrl-osr report {shlex.quote(str(config.sweep))}")
 
 
 def disturbance_table(results: Mapping[str, Any]) -> str:

@@ -13,6 +13,7 @@ a run's folder. See docs/no_simulator.md for how far to trust the order.
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from collections import defaultdict
 from collections.abc import Mapping
@@ -73,7 +74,9 @@ def ranking(results: Mapping[str, Mapping[str, Any]]) -> str:
         *aligned_columns(rows),
     ]
     if others:
-        lines.append(f"  To use the first: torchrl-osr export {best} policy.onnx")
+        lines.append(
+            f"  To use the first: torchrl-osr export {shlex.quote(best)} policy.onnx"
+        )
     if "xml" not in first:
         lines += [
             "  This does not see a policy leave its data: it is no permission",

@@ -8,10 +8,7 @@ from torchrl_osr.lab.evaluation.episodes import (
     summarize,
 )
 from torchrl_osr.lab.evaluation.grey_box import fitted_grey_box, rolled_out_values
-from torchrl_osr.lab.evaluation.inverse_dynamics_fit import (
-    describe_inverse_dynamics,
-    inverse_dynamics_report,
-)
+from torchrl_osr.lab.evaluation.inverse_dynamics_fit import inverse_dynamics_report
 from torchrl_osr.lab.evaluation.offline import fitted_values
 from torchrl_osr.lab.evaluation.recoverable import load_recoverable_states, recovers
 from torchrl_osr.lab.evaluation.recovery import DataDistance
@@ -22,7 +19,6 @@ __all__ = [
     "Disturbance",
     "EpisodeEvaluator",
     "Policy",
-    "describe_inverse_dynamics",
     "deterministic_policy",
     "evaluate_paired",
     "fitted_grey_box",

@@ -163,9 +163,9 @@ def summarize(
     """Summarise episodes, JSON-compatible.
 
     Returns:
-        Means ``"return"``, ``"length"`` and, with references, ``"score"``; the 95 %
-        bootstrap interval of the latter, or of the return, as ``"score_low"`` and
-        ``"score_high"``; the lists ``"returns"``, ``"lengths"`` and ``"seeds"``.
+        Means ``"return"``, ``"length"`` and, with references, ``"score"``. The 95 %
+        bootstrap interval: ``"score_low"`` and ``"score_high"``, or ``"return_low"``
+        and ``"return_high"``. The lists ``"returns"``, ``"lengths"``, ``"seeds"``.
     """
     measure, values = "return", results.returns
     if references is not None:

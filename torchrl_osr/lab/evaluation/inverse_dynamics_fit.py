@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -46,12 +45,3 @@ def inverse_dynamics_report(
     error = (action - distribution.deterministic_sample).square().sum(0)
     r2 = 1 - error / (action - action.mean(0)).square().sum(0)
     return report | {"r2": r2.tolist()}
-
-
-def describe_inverse_dynamics(report: Mapping[str, Any]) -> str:
-    """Format the numbers of a report as one line."""
-    head = f"inverse dynamics, {report['rows']} held-out rows: NLL {report['nll']:.2f}"
-    if "accuracy" in report:
-        return f"{head}, {100 * report['accuracy']:.0f} % of the actions"
-    r2 = ", ".join("-" if each is None else f"{each:.2f}" for each in report["r2"])
-    return f"{head}, R2 {r2}"

@@ -37,7 +37,7 @@ NUM_NAMED, NAMED_WIDTH = 3, 40
 """At most so many differences are in a name, with so many characters of each value."""
 
 ESTIMATED = "estimated return"
-"""Measure of runs that were never played; a network stands for an episode."""
+"""Measure of runs that were never played; a first state stands for an episode."""
 
 SAVED = ["states", "group", "disturbance", "walk", "back"]
 
@@ -196,7 +196,8 @@ def _read(folder: Path) -> _Run:
         each = {"step": offline["step"], "seeds": seeds, "returns": values}
         evaluations, references, measure = [each], None, "return"
         returns["data_return"] = offline["data_value"]
-        measured = f"{ESTIMATED} (discount {offline['discount']:g}) of {env}"
+        kind = "in a body" if "xml" in offline else "by FQE"
+        measured = f"{ESTIMATED} {kind} (discount {offline['discount']:g}) of {env}"
     if not evaluations or evaluations[-1]["step"] != steps:
         at = evaluations[-1]["step"] if evaluations else "none"
         raise ValueError(

@@ -47,7 +47,7 @@ def monitor_of_run(
         source = f"episodes of {options.episodes}"
         log = replace(
             log, source="file", path=options.episodes, num_transitions=None,
-            checksum=None, random_share=0.0,
+            checksum=None, random_share=0.0, download=False,
         )  # fmt: skip
         own, _ = load_data(env, log)
         about = rows_of(own, options.fall_steps)

@@ -107,7 +107,7 @@ class NetworkConfig:
 class PerturbationConfig:
     """Noise of the mixed data set, see StatePerturbation."""
 
-    std: float = MISSING  # width of the noise, in deviations of the data
+    std: float = MISSING  # beta, in standard deviations; raw units if not standardised
 
 
 @dataclass

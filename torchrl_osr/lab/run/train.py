@@ -35,7 +35,6 @@ from torchrl_osr.lab.data.rows import take_multi_step
 from torchrl_osr.lab.dynamics import ModelData, RolloutReplayBuffer, training
 from torchrl_osr.lab.evaluation import (
     EpisodeEvaluator,
-    describe_inverse_dynamics,
     deterministic_policy,
     inverse_dynamics_report,
     summarize,
@@ -60,9 +59,8 @@ def train(run: Run) -> float:
     """Train a run, or continue it; return its last score or return, for a sweeper."""
     phases = Phases(run)
     if run.config.dynamics.xml:
-        rows = phases.data.held_out
-        sizes = (rows[key].shape[-1] for key in ("observation", "action"))
-        run.config.dynamics.body().check(*sizes)
+        env: Any = run.config.env  # the data fit it
+        run.config.dynamics.body().check(env.observation_size, env.action_size)
     (run.folder / POLICY).unlink(missing_ok=True)  # of an earlier, shorter training
     if phases.learner.model is not None:
         phases.train_inverse_dynamics()
@@ -153,8 +151,13 @@ class Phases:
                 lambda: inverse_dynamics_report(model, rows), steps, "nll", "min"
             ),
         )
-        write_json(self.run.folder / "inverse_dynamics.json", trainer.history[-1])
-        print(describe_inverse_dynamics(trainer.history[-1]))
+        found = trainer.history[-1]
+        write_json(self.run.folder / "inverse_dynamics.json", found)
+        fit = f"{100 * found.get('accuracy', 0):.0f} % of the actions"
+        if r2 := found.get("r2"):
+            fit = "R2 " + ", ".join("-" if r is None else f"{r:.2f}" for r in r2)
+        rows, nll = found["rows"], found["nll"]
+        print(f"inverse dynamics, {rows} held-out rows: NLL {nll:.2f}, {fit}")
 
     def train_dynamics(self) -> RolloutReplayBuffer | None:
         """Train models of the dynamics, see ``lab/dynamics/training.py``."""
