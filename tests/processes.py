@@ -11,7 +11,7 @@ from warm import Server
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="module", autouse=True)
 def own_cache(tmp_path_factory):
     """One cache for the tests of a file, and one thread; processes inherit both."""
     with pytest.MonkeyPatch.context() as patch:

@@ -15,12 +15,12 @@ PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
 PAGES += ROOT.glob("torchrl_osr/**/MODEL_CARD.md")
 
 
-# This page's commands run between its blocks: tests/lab/cli/test_no_simulator_page.py.
-WITH_COMMANDS = ROOT / "docs" / "no_simulator.md"
+# The commands of these pages run with their blocks: tests/lab/cli/test_*_page.py.
+WITH_COMMANDS = {ROOT / "docs" / f"{name}.md" for name in ("no_simulator", "your_data")}
 
 
 @pytest.mark.parametrize(
-    "page", sorted({*PAGES} - {WITH_COMMANDS}), ids=lambda page: page.name
+    "page", sorted({*PAGES} - WITH_COMMANDS), ids=lambda page: page.name
 )
 def test_python_blocks_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import subprocess
 import sys
@@ -15,7 +14,6 @@ ROW = re.compile(r"(.+?) +from the data's state (\d\.\d\d), pushed off it (\d\.\
 def test_recovery_brings_the_pushed_policy_closer_to_the_data():
     process = subprocess.run(
         [sys.executable, "-W", "error", str(SCRIPT), "60"],
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
         timeout=240,

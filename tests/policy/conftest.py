@@ -39,16 +39,12 @@ def make_loss() -> Callable[..., torch.nn.Module]:
 
 
 @pytest.fixture(scope="session")
-def norm() -> ObservationNorm:
-    return ObservationNorm(
+def make_policy(make_loss) -> Callable[..., Policy]:
+    """Return a factory of policies of those losses, with bounds of their own."""
+    norm = ObservationNorm(
         torch.tensor([1.0, -2.0, 0.0]), torch.tensor([2.0, 0.5, 1.0]),
         in_keys=["observation"], standard_normal=True,
     )  # fmt: skip
-
-
-@pytest.fixture(scope="session")
-def make_policy(make_loss, norm) -> Callable[..., Policy]:
-    """Return a factory of policies of those losses, with bounds of their own."""
 
     def make(kind: str, **options) -> Policy:
         bounds = {} if kind == "discrete" else {"low": LOW, "high": HIGH}

@@ -19,7 +19,7 @@ from torchrl_osr.lab.run.load import load_switching_policy
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory, own_cache) -> Path:
+def folder(tmp_path_factory) -> Path:
     """A run with two checkpoints."""
     more = "trainer.steps=20", "trainer.eval_interval=20"
     return trained(tmp_path_factory.mktemp("evaluate") / "run", *more)

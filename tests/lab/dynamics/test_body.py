@@ -79,7 +79,6 @@ GREY = [
 ]  # fmt: skip
 
 
-@pytest.mark.usefixtures("own_cache")
 def test_a_run_identifies_the_body_and_keeps_it(tmp_path, capsys) -> None:
     trained(tmp_path / "run", *GREY, "trainer.steps=2")
     errors = [line.split()[4] for line in capsys.readouterr().out.splitlines()

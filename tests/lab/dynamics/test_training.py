@@ -22,8 +22,6 @@ TINY = DynamicsOptions(
     num_networks=3, num_elites=2, num_cells=[8], batch_size=8, steps=20
 )
 
-pytestmark = pytest.mark.usefixtures("own_cache")
-
 
 def modelled(folder: Path, data: ModelData, options: DynamicsOptions):
     """Return the model, and its trainer if one was needed."""

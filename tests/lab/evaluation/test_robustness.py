@@ -64,8 +64,7 @@ def shove(name: str, size: float, at: int) -> Disturbance:
     return Disturbance(name, "push", size, wrap)
 
 
-@pytest.fixture(scope="module")
-def line_results():
+def test_known_returns_and_recovery():
     gymnasium.register(LINE, Line, max_episode_steps=LIMIT)
     rows = torch.linspace(-1, 1, 1000)[:, None]
     distance = DataDistance(TensorDict({"observation": rows}, [1000]))
@@ -84,12 +83,8 @@ def line_results():
     gymnasium.registry.pop(LINE)
     assert len(calls) == 1 + len(disturbances)
     assert json.loads(json.dumps(results, allow_nan=False)) == results
-    return results
-
-
-def test_known_returns_and_recovery(line_results):
-    clean = line_results["clean"]
-    six, deadly, late, never, always = line_results["levels"]
+    clean = results["clean"]
+    six, deadly, late, never, always = results["levels"]
     assert clean["returns"] == six["returns"] == [LIMIT] * 3
     assert clean["seeds"] == [4, 5, 6]
     # At 0.5, action 0: shoved to 6.5, then 5.5 ... 0.5, the sixth step is back.

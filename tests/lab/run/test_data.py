@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import h5py
 import numpy as np
-import pytest
 import torch
 from composed import SMALL, configured
 
 from torchrl_osr.lab.run.data import TrainingData, load_data, load_training_data
-
-pytestmark = pytest.mark.usefixtures("own_cache")
 
 
 def load(*overrides: str, in_keys=()) -> TrainingData:

@@ -19,11 +19,9 @@ from torchrl_osr.lab.run.load import CHECKPOINTS, load_trained
 
 SUITES = sorted(path.stem for path in (CONF / "evaluation" / "suite").glob("*.yaml"))
 
-pytestmark = pytest.mark.usefixtures("own_cache")
-
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory, own_cache) -> Path:
+def folder(tmp_path_factory) -> Path:
     """A run with three checkpoints."""
     more = "trainer.steps=30", "trainer.eval_interval=30"
     return trained(tmp_path_factory.mktemp("evaluate") / "run", *more)

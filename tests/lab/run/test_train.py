@@ -18,11 +18,9 @@ from torchrl_osr.lab.evaluation import deterministic_policy
 from torchrl_osr.lab.evaluation.figures import read_scalars
 from torchrl_osr.lab.run.load import CHECKPOINTS, load_trained
 
-pytestmark = pytest.mark.usefixtures("own_cache")
-
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory, own_cache):
+def folder(tmp_path_factory):
     top = tmp_path_factory.mktemp("train")
     intervals = "trainer.eval_interval=5", "trainer.checkpoint_interval=5"
     return trained(top / "run", *intervals, "logger=tensorboard")

@@ -1,7 +1,0 @@
-"""Each file has a cache of its own."""
-
-import pytest
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _cache(own_cache) -> None: ...
