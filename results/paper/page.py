@@ -41,7 +41,7 @@ from tables import differences, estimate, markdown
 from torchrl_osr.lab.evaluation.statistics import (
     Estimate,
     decimal,
-    saved_share,
+    recovered_share,
     scores_and_decreases,
     wilson,
 )
@@ -367,7 +367,7 @@ def ablation() -> str:
         for name in ABLATION:
             ours, _ = found[data, name]
             seeds = twin.index.intersection(ours.index)
-            cells.append(str(saved_share(ours.loc[seeds], walks, twin.loc[seeds])))
+            cells.append(str(recovered_share(ours.loc[seeds], walks, twin.loc[seeds])))
         rows.append([name_of(data), *cells])
     return markdown(["R %", *(f"`{name}`" for name in ABLATION)], rows)
 

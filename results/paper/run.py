@@ -228,8 +228,9 @@ def pack(folders: Sequence[Path], to: Path) -> None:
         if name == "states" and name in old:  # a mark stands for a list of states
             rows = rows[~rows["states"].isin(old[name]["states"])]
             rows = pd.concat([old[name], rows])
-        elif name in old:
-            kept = old[name][~old[name]["run"].isin(again)]
+        elif old and name != "states":
+            kept = old.get(name, rows[:0])
+            kept = kept[~kept["run"].isin(again)]
             rows = pd.concat([kept, rows.assign(run=rows["run"] + shift)])
         rows.convert_dtypes().to_csv(to / f"{name}.csv.xz", index=False)
 
