@@ -80,7 +80,6 @@ def test_halfcheetah_has_to_regain_its_speed() -> None:
 
 
 def test_in_a_maze_the_goal_of_each_state_counts() -> None:
-    pytest.importorskip("gymnasium_robotics")
     env = make_environment(known_ids()["pointmaze-umaze"])
     start, _ = env.reset(seed=0)
     here = start[:2]

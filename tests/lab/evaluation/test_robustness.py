@@ -61,7 +61,7 @@ def shove(name: str, size: float, at: int) -> Disturbance:
         env.unwrapped.size, env.unwrapped.at = size, at
         return env
 
-    return Disturbance(name, "push", size, wrap)
+    return Disturbance(name, "push", wrap)
 
 
 def test_known_returns_and_recovery():
@@ -73,7 +73,7 @@ def test_known_returns_and_recovery():
         shove("deadly", 20.0, 5),
         shove("late", 9.0, LIMIT - 3),
         shove("never", 6.0, LIMIT),
-        Disturbance("always", "observation", 0.0, partial(ObservationNoise, std=0.0)),
+        Disturbance("always", "observation", partial(ObservationNoise, std=0.0)),
     ]
     calls = []
     results = evaluate_paired(
@@ -126,17 +126,17 @@ def play(*disturbances: Disturbance, policy, episodes: int = 4):
 def test_strength_zero_is_the_clean_episodes_bit_for_bit():
     actor = tanh_gaussian_actor(11, 3, num_cells=[16])
     results = play(
-        Disturbance("push", "push", 0.0, partial(ExternalPush, force=0.0, duration=5)),
-        Disturbance("noise", "observation", 0.0, partial(ObservationNoise, std=0.0)),
-        Disturbance("heavy", "dynamics", 2.0, partial(DynamicsChange, mass=2.0)),
+        Disturbance("push", "push", partial(ExternalPush, force=0.0, duration=5)),
+        Disturbance("noise", "observation", partial(ObservationNoise, std=0.0)),
+        Disturbance("heavy", "dynamics", partial(DynamicsChange, mass=2.0)),
         # After the heavy one: nothing of it may be left.
-        Disturbance("mass", "dynamics", 1.0, partial(DynamicsChange, mass=1.0)),
+        Disturbance("mass", "dynamics", partial(DynamicsChange, mass=1.0)),
         policy=deterministic_policy(actor),
     )
     levels = {each["name"]: each for each in results["levels"]}
     for name, each in levels.items():
         same = each["returns"] == results["clean"]["returns"]
-        assert same == (each["strength"] in (0.0, 1.0)), name
+        assert same == (name != "heavy"), name
         assert each["seeds"] == results["clean"]["seeds"]
     moments = {name: each["disturbed_at"] for name, each in levels.items()}
     assert moments["heavy"] == [0] * 4
@@ -152,7 +152,7 @@ def test_an_episode_depends_on_its_own_disturbance_alone():
 
     # Who is knocked early falls while the others, some never knocked, walk on.
     wrap = partial(ActionKnock, steps=20, mode="torque", at=(9, 900))
-    results = play(Disturbance("knock", "knock", 20, wrap), policy=policy, episodes=8)
+    results = play(Disturbance("knock", "knock", wrap), policy=policy, episodes=8)
     (knocked,) = results["levels"]
     met = [moment is not None for moment in knocked["disturbed_at"]]
     assert 0 < sum(met) < 8, "the test needs both kinds of episodes"

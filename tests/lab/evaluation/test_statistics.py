@@ -11,7 +11,7 @@ from torchrl_osr.lab.evaluation.statistics import (
     mean_of_networks,
     nested_mean,
     nested_resamples,
-    saved_share,
+    recovered_share,
     scores_and_decreases,
     wilson,
 )
@@ -78,28 +78,28 @@ def test_decreases_of_several_runs_by_hand():
 def test_the_saved_share_of_known_tables():
     back, walk = [[1, 1, 0, 0], [1, 0, 0, 0]], [0, 0, 1, 1]
     # All walks alike: with one of them the seeds alone vary, from 1 / 4 to 2 / 4.
-    assert saved_share(back, [7] * 4)[:3] == pytest.approx((37.5, 25, 50))
+    assert recovered_share(back, [7] * 4)[:3] == pytest.approx((37.5, 25, 50))
     # With one seed the walks alone vary, from none of a walk to all.
-    assert saved_share(back[:1], walk) == (50, 0, 100, "walks")
+    assert recovered_share(back[:1], walk) == (50, 0, 100, "walks")
     # Newcombe 1998, Statistics in Medicine 17:857, Table I.
     assert wilson(81, 263) == pytest.approx((0.2553, 0.3662), abs=5e-5)
     # Nothing varies where all come back: Wilson's interval of two walks, 2 / (2 + z^2).
-    all_of_them = saved_share(np.ones((3, 4)), walk)
+    all_of_them = recovered_share(np.ones((3, 4)), walk)
     assert all_of_them[:3] == pytest.approx((100, 34.2380, 100), abs=1e-4)
-    none = saved_share(np.zeros((3, 4)), walk)
+    none = recovered_share(np.zeros((3, 4)), walk)
     assert none[:3] == pytest.approx((0, 0, 65.7620), abs=1e-4)
     # A walk with more states counts for more.
-    assert saved_share([[1, 1, 1, 0]], [0, 0, 0, 1]).mean == 75
+    assert recovered_share([[1, 1, 1, 0]], [0, 0, 0, 1]).mean == 75
 
 
 def test_the_share_of_a_baselines_failures_of_known_tables():
     baseline = [[1, 0, 0, 0, 0, 0, 0, 0], [0, 0, 1, 0, 0, 0, 0, 0]]
     method = [[1, 1, 0, 0, 0, 0, 0, 0], [1, 1, 1, 0, 0, 0, 0, 0]]
     walk = [0, 0, 1, 1, 2, 2, 3, 3]
-    assert saved_share(np.ones((2, 8)), walk, baseline)[:3] == (100, 100, 100)
-    assert saved_share(baseline, walk, baseline)[:3] == (0, 0, 0)
+    assert recovered_share(np.ones((2, 8)), walk, baseline)[:3] == (100, 100, 100)
+    assert recovered_share(baseline, walk, baseline)[:3] == (0, 0, 0)
     # With one walk the seeds alone vary: (2 - 1) / 7, (3 - 1) / 7, or between.
-    one = saved_share(method, [7] * 8, baseline)
+    one = recovered_share(method, [7] * 8, baseline)
     assert one[:3] == pytest.approx((300 / 14, 100 / 7, 200 / 7))
     with pytest.raises(ValueError, match="saves all states"):
-        saved_share([[1, 0]], [0, 1], [[1, 1]])
+        recovered_share([[1, 0]], [0, 1], [[1, 1]])

@@ -77,7 +77,7 @@ def write_run(
 
 def level(name: str, scores: list[float], **entries) -> dict:
     """Return a disturbance that does not end."""
-    base = {"name": name, "kind": "dynamics", "strength": 1.0, "scores": scores}
+    base = {"name": name, "kind": "dynamics", "scores": scores}
     return base | {"disturbed_at": [0] * len(scores), "recovery_steps": None} | entries
 
 
@@ -96,7 +96,7 @@ def suite_of(*evaluations: tuple) -> dict:
         {"step": step, "clean": {"scores": clean, "seeds": seeds}, "levels": levels}
         for step, seeds, clean, levels in evaluations
     ]
-    return {"versions": VERSIONS, "suite": "hand", "evaluations": rows}
+    return {"versions": VERSIONS, "suite": "hand", "levels": {}, "evaluations": rows}
 
 
 def write_experiment(folder: Path) -> Path:

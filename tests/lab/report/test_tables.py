@@ -10,8 +10,8 @@ from torchrl_osr.lab.evaluation.statistics import Estimate
 from torchrl_osr.lab.report import read_runs
 from torchrl_osr.lab.report.tables import (
     by_run,
+    recovery_table,
     robustness_table,
-    saved_table,
     score_table,
 )
 
@@ -108,7 +108,7 @@ def test_shares_of_recoverable_states(tmp_path):
         write_states(tmp_path, "osr", seed, *both)
     other = {"group": [*GROUP[:-1], "easy"]}
     write_states(tmp_path, "cql", 2, [1, 0, 0, 0, 0, 1], **other)
-    table = saved_table(fakes.read_all(tmp_path).saved, "cql")
+    table = recovery_table(fakes.read_all(tmp_path).saved, "cql")
     assert table["seeds"].tolist() == [2, 2, 1], "other states have their own rows"
     cql, osr, alone = (row for _, row in table.iterrows())
     assert cql["easy %"].mean == osr["contested %"].mean == 100
@@ -127,5 +127,5 @@ def test_shares_of_recoverable_states(tmp_path):
 def test_nothing_is_recovered_where_the_reference_saves_all(tmp_path):
     write_states(tmp_path, "cql", 0, [1] * 6)
     write_states(tmp_path, "osr", 0, [1] * 6)
-    table = saved_table(read_runs([tmp_path]).saved, "cql")
+    table = recovery_table(read_runs([tmp_path]).saved, "cql")
     assert not any(isinstance(cell, Estimate) for cell in table["R %"])

@@ -15,7 +15,7 @@ import numpy as np
 
 from torchrl_osr.lab.data import ReferenceReturns
 from torchrl_osr.lab.envs import NotPossible
-from torchrl_osr.lab.evaluation.episodes import EpisodeEvaluator, Policy, Wrap
+from torchrl_osr.lab.evaluation.episodes import EpisodeEvaluator, UnitPolicy, Wrap
 from torchrl_osr.lab.evaluation.recovery import (
     DataDistance,
     Trajectory,
@@ -31,19 +31,18 @@ RECOVERY = ("survived_knock", "alive_after", "clean_alive_after", "recovery_step
 
 @dataclass(frozen=True)
 class Disturbance:
-    """One kind of disturbance at one strength, with a name unique in its suite.
+    """A disturbance, with a name unique in its suite.
 
     ``wrap`` puts it around an environment. Kinds in :data:`TRANSIENT` end.
     """
 
     name: str
     kind: str
-    strength: float
     wrap: Wrap
 
 
 def evaluate_paired(
-    policy: Policy,
+    policy: UnitPolicy,
     env_id: str,
     disturbances: Sequence[Disturbance],
     distance: DataDistance,
@@ -57,7 +56,7 @@ def evaluate_paired(
 
     Episodes of a pair have the same seed and start state, and the policy is called
     with batches of one size. Until the disturbance acts they are equal, bit for bit.
-    Warns if the environment ignores its seed. The policy is called on the CPU.
+    Warn if the environment ignores its seed. The policy is called on the CPU.
 
     Keyword Args:
         num_episodes, seed: see :class:`~torchrl_osr.lab.evaluation.EpisodeEvaluator`.
@@ -67,7 +66,7 @@ def evaluate_paired(
     Returns:
         JSON-compatible. ``"clean"``: lists ``"returns"``, ``"lengths"``, ``"seeds"``
         and, with references, ``"scores"``, one entry an episode. ``"levels"``: the same
-        for each disturbance, with its ``"name"``, ``"kind"`` and ``"strength"``.
+        for each disturbance, with its ``"name"`` and ``"kind"``.
         ``"disturbed_at"`` is the step of the disturbance (``None``: the episode ended
         before). The entries of
         :func:`~torchrl_osr.lab.evaluation.recovery.measure_recovery` are ``None`` if
@@ -109,7 +108,7 @@ def evaluate_paired(
             pairs = zip(played, undisturbed, strict=True)
             found = [measure_recovery(*pair, distance) for pair in pairs]
             recovery = {key: [row and row[key] for row in found] for key in RECOVERY}
-        level = {"name": each.name, "kind": each.kind, "strength": each.strength}
+        level = {"name": each.name, "kind": each.kind}
         levels.append(level | results | {"disturbed_at": moments} | recovery)
     return {"clean": clean, "levels": levels}
 

@@ -25,8 +25,8 @@ from torchrl_osr.lab.report.comparisons import (
 from torchrl_osr.lab.report.runs import RunTables, comparison_notes
 from torchrl_osr.lab.report.tables import (
     by_run,
+    recovery_table,
     robustness_table,
-    saved_table,
     score_table,
     text,
 )
@@ -53,7 +53,7 @@ def write_report(
     frames = {
         "scores": score_table(tables),
         "differences": difference_table(found),
-        "recoverable": saved_table(tables.saved, reference),
+        "recoverable": recovery_table(tables.saved, reference),
     }
     for suite in tables.suites:
         played = tables.episodes[tables.episodes["suite"] == suite]

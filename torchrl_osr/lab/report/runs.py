@@ -16,7 +16,7 @@ from torchrl_osr._files import read_json
 from torchrl_osr.lab.data import reference_returns
 from torchrl_osr.lab.evaluation.robustness import RECOVERY
 from torchrl_osr.lab.run.config import CONFIG, flatten, read_config, read_yaml
-from torchrl_osr.lab.run.evaluate_offline import FILE as OFFLINE
+from torchrl_osr.lab.run.evaluate_offline import OFFLINE
 from torchrl_osr.lab.run.folder import RESUMABLE, read_status
 from torchrl_osr.lab.run.schema import method_name
 
@@ -169,7 +169,7 @@ class _Run(NamedTuple):
 
 
 def _read(folder: Path) -> _Run:
-    """Read a run; raises if it is not finished, or its numbers make no sense."""
+    """Read a run; raise if it is not finished, or its numbers make no sense."""
     status = read_status(folder)
     if status["status"] != "done":
         why = [f": {status[key]}" for key in ("error", "reason") if key in status]
@@ -273,12 +273,12 @@ def _episodes(
 def _protocol(content: Mapping[str, Any], steps: int) -> dict[str, str]:
     """Return the facts that must be equal in comparable results of a suite."""
     evaluations = content["evaluations"]
-    at, keys = [each["step"] for each in evaluations], ("name", "kind", "strength")
+    at = [each["step"] for each in evaluations]
     facts = {
         "suite": content["suite"],
         "checkpoints": f"last {len(at)}" if at[-1] == steps else at,
         "seeds": [each["clean"]["seeds"] for each in evaluations],
-        "levels": [[level[key] for key in keys] for level in evaluations[0]["levels"]],
+        "levels": content["levels"],
     }
     return {name: str(value) for name, value in facts.items()}
 

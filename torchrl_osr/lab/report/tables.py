@@ -19,7 +19,7 @@ from torchrl_osr.lab.evaluation.statistics import (
     decimal,
     estimate,
     nested_mean,
-    saved_share,
+    recovered_share,
     scores_and_decreases,
 )
 from torchrl_osr.lab.evaluation.tables import NUM_RECENT
@@ -92,7 +92,7 @@ def _recovery(there: pd.DataFrame) -> dict[str, Any]:
     if not there["survived_knock"].notna().any():
         return {}
     columns = ["survived_knock", "alive_after", "clean_alive_after"]
-    shares = there.groupby("run")[columns].mean().mean()  # a run, a vote
+    shares = there.groupby("run")[columns].mean().mean()  # runs have equal weight
     back = 100.0 * (there["recovery_steps"] <= STEPS_AFTER)
     runs = [run.to_numpy() for _, run in back.groupby(there["run"], sort=False)]
     median = there["recovery_steps"].fillna(np.inf).median()
@@ -105,7 +105,7 @@ def _recovery(there: pd.DataFrame) -> dict[str, Any]:
     }
 
 
-def saved_table(saved: pd.DataFrame, reference: str = "") -> pd.DataFrame:
+def recovery_table(saved: pd.DataFrame, reference: str = "") -> pd.DataFrame:
     """Tabulate recovery rates by group of states and, if recoverable, by disturbance.
 
     R compares with the reference, with the seeds of both.
@@ -136,9 +136,9 @@ def saved_table(saved: pd.DataFrame, reference: str = "") -> pd.DataFrame:
                 row["R %"] = None
                 if len(both):
                     with contextlib.suppress(ValueError):  # the reference saves all
-                        row["R %"] = saved_share(ours, walk[hard], theirs)
+                        row["R %"] = recovered_share(ours, walk[hard], theirs)
             for name, which in chosen.items():
-                row[name] = saved_share(table.loc[:, which], walk[which])
+                row[name] = recovered_share(table.loc[:, which], walk[which])
             cells[f"{data}, {states}", method] = row
     return frame_of(cells, "data", "method")
 

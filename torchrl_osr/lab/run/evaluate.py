@@ -26,13 +26,13 @@ from torchrl_osr.lab.dynamics import SwitchingPolicy
 from torchrl_osr.lab.evaluation import (
     DataDistance,
     Disturbance,
-    Policy,
+    UnitPolicy,
     deterministic_policy,
     evaluate_paired,
 )
 from torchrl_osr.lab.evaluation.recoverable import load_recoverable_states, recovers
 from torchrl_osr.lab.evaluation.robustness import impossible_disturbances
-from torchrl_osr.lab.run.build import read_environment
+from torchrl_osr.lab.run.build import set_sizes_from_environment
 from torchrl_osr.lab.run.config import check_environment
 from torchrl_osr.lab.run.data import load_data, references_of
 from torchrl_osr.lab.run.folder import package_versions
@@ -49,7 +49,7 @@ from torchrl_osr.trainers.progress import progress_bar
 SEED_STRIDE = 1000
 """Between checkpoints: no two of them play the same episodes."""
 
-Player = tuple[TrainedRun, Policy]
+Player = tuple[TrainedRun, UnitPolicy]
 """A checkpoint, and the policy that plays."""
 
 
@@ -104,7 +104,7 @@ def players_of(config: EvaluateConfig, files: list[Path]) -> list[Player]:
     trained = [load_trained(file, trust=config.trust) for file in files]
     env = trained[0].config.env
     check_environment(env.id, config.trust)
-    read_environment(env)
+    set_sizes_from_environment(env)
     if config.switching:
         policy = load_switching_policy(files, trust=config.trust)
         bounds = torch.tensor([env.action_low, env.action_high])
@@ -203,7 +203,7 @@ def make_disturbances(
         wrap = instantiate(config.wrap)
         if wrap.keywords.get("unit") == "data":
             wrap = partial(wrap, unit=scale)
-        made.append(Disturbance(name, config.kind, config.strength, wrap))
+        made.append(Disturbance(name, config.kind, wrap))
     return made
 
 

@@ -26,7 +26,7 @@ from torchrl_osr.lab.data.environment import environment_name
 from torchrl_osr.lab.data.sources import RECORDED
 from torchrl_osr.lab.dynamics import DynamicsOptions
 
-CHOSEN = {
+LOSSES = {
     name: getattr(package, name)
     for package in (objectives, losses)
     for name in package.__all__
@@ -80,16 +80,16 @@ class DataConfig:
     path: Any = None  # recorded data: a file, a folder, a list or a pattern
     columns: Any = field(default_factory=ColumnsConfig)  # or a YAML file with them
     action_bounds: Any = None  # bounds in the log's units; null: the task's
-    clip_actions: bool = MISSING  # clip actions outside the bounds; false: refuse them
-    missing: str = MISSING  # missing values: error, or leave out the row or episode
-    download: bool = MISSING  # download the set that path names
+    clip_actions: bool = False  # clip actions outside the bounds; false: refuse them
+    missing: str = "error"  # missing values: error, or leave out the row or episode
+    download: bool = False  # download the set that path names
     num_transitions: int | None = None  # number of collected rows, default 200,000
-    seed: int = MISSING  # random seed of collection and held-out rows
-    random_share: float = MISSING  # share of rows replaced by random data
-    held_out: float = MISSING  # share of rows kept to judge models
-    standardize: bool = MISSING  # standardise observations
-    reward_scale: float = MISSING  # factor of the training rewards
-    reward_shift: float = MISSING  # added to the scaled training rewards
+    seed: int = 0  # random seed of collection and held-out rows
+    random_share: float = 0.0  # share of rows replaced by random data
+    held_out: float = 0.02  # share of rows kept to judge models
+    standardize: bool = True  # standardise observations
+    reward_scale: float = 1.0  # factor of the training rewards
+    reward_shift: float = 0.0  # added to the scaled training rewards
     checksum: str | None = None  # of the data; read from them and kept with the run
 
 
@@ -150,7 +150,7 @@ class TrainerConfig:
     device: str = MISSING  # cpu, cuda or cuda:1
     precision: str = MISSING  # precision of the losses: float32 or bfloat16
     matmul_precision: str = MISSING  # of matrix products: highest, high or medium
-    record: bool = MISSING  # repeat recorded operations: same numbers, faster (CPU)
+    record: bool = MISSING  # repeat recorded operations: same numbers, faster
     compile: bool = MISSING  # compile the losses
     progress: bool = MISSING  # show progress bars
 
@@ -215,10 +215,9 @@ class CollectConfig:
 
 @dataclass
 class DisturbanceConfig:
-    """One kind of disturbance at one strength."""
+    """A disturbance and its kind."""
 
     kind: str = MISSING  # knock, push and start end; others last the whole episode
-    strength: float = MISSING  # a number, in the unit of the suite
     wrap: Any = MISSING  # wrapper of lab.envs, with _target_ and _partial_
 
 
@@ -292,13 +291,13 @@ def _config_type(annotation: Any) -> Any:
 
 @functools.cache
 def register() -> None:
-    """Make the schemas of commands and of :data:`CHOSEN`, and resolvers, known."""
+    """Make the schemas of commands and of :data:`LOSSES`, and resolvers, known."""
     store = ConfigStore.instance()
     store.store(name="train_schema", node=TrainConfig)
     store.store(name="check_data_schema", node=CheckDataConfig)
     store.store(name="collect_schema", node=CollectConfig)
     store.store(name="evaluate_schema", node=EvaluateConfig)
-    for name, chosen in CHOSEN.items():
+    for name, chosen in LOSSES.items():
         store.store(group="schema", name=name, node=schema_of(chosen))
     resolvers: dict[str, Callable[..., Any]] = {
         "environment_name": environment_name,
