@@ -190,13 +190,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "machine": machine() | settings,
         "sizes": {},
     }
+    if options.device == "cuda":
+        results["machine"]["gpu"] = torch.cuda.get_device_name()
     options.output.mkdir(parents=True, exist_ok=True)
     for name in options.sizes.split(","):
         results["sizes"][name] = measure(name, **settings)
         text = json.dumps(results, indent=1) + "\n"
         (options.output / "speed.json").write_text(text)
-    if options.device == "cuda":
-        results["machine"]["gpu"] = torch.cuda.get_device_name()
     print(table(results))
 
 

@@ -113,7 +113,7 @@ def main(arguments=None):
     rows = {each.__name__: episode(each, given.push) for each in controllers}
     path = given.run / "recovery.png"
     draw(rows, f"{task.id}, steps after a push of {given.push:g} body weights", path)
-    print({name: fell or "up" for name, (*_, fell) in rows.items()}, path)
+    print({n: "up" if fell is None else fell for n, (*_, fell) in rows.items()}, path)
 
 
 if __name__ == "__main__":

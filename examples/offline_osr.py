@@ -155,7 +155,7 @@ def train(run: Run) -> float:
 
     # 5. Results: policy.safetensors, returns.json, curve.png and a table.
     save_policies(run, Learner(actor, model, loss, loss), data.norm)
-    return report(run, data.mean, trainer)
+    return report(run, data.data_mean, trainer)
 
 
 def options_in(options: dict) -> dict:

@@ -16,8 +16,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib
 import torch
+from matplotlib.figure import Figure
 from torchrl.collectors import Collector
 from torchrl.data import OfflineToOnlineReplayBuffer
 from torchrl.envs import (
@@ -25,12 +25,13 @@ from torchrl.envs import (
     DoubleToFloat,
     GymWrapper,
     ObservationNorm,
+    RewardScaling,
     TransformedEnv,
 )
 from torchrl.objectives import SoftUpdate
 from torchrl.trainers.algorithms import OfflineToOnlineTrainer
 
-from torchrl_osr import StatePerturbation
+from torchrl_osr import OSRLoss, StatePerturbation
 from torchrl_osr._files import write_json
 from torchrl_osr.lab.data import make_environment
 from torchrl_osr.lab.evaluation import (
@@ -56,6 +57,7 @@ def make_collector(run: TrainedRun, frames: int, seed: int) -> Collector:
             ObservationNorm(
                 norm.loc, norm.scale, in_keys=["observation"], standard_normal=True
             ),
+            RewardScaling(run.config.data.reward_shift, run.config.data.reward_scale),
         ),
     )
     environment.set_seed(seed)
@@ -79,13 +81,11 @@ def make_trainer(run: TrainedRun, frames: int, seed: int) -> OfflineToOnlineTrai
         batch_size=cfg.trainer.batch_size,
         transform=StatePerturbation(cfg.perturbation.std, seed=seed),
     )
+    critics = list(loss.qvalue_network_params.parameters())
     groups = [
         {"params": list(loss.actor_network_params.parameters())},
         {"params": list(loss.parameters(recurse=False))},  # log_alpha, for instance
-        {
-            "params": list(loss.qvalue_network_params.parameters()),
-            "lr": cfg.optim.qvalue_lr,
-        },
+        {"params": critics, "lr": cfg.optim.qvalue_lr},
     ]
     return OfflineToOnlineTrainer(
         collector=make_collector(run, frames, seed),
@@ -103,12 +103,10 @@ def make_trainer(run: TrainedRun, frames: int, seed: int) -> OfflineToOnlineTrai
 
 def draw(record: dict, path: Path) -> None:
     """Draw the score with its interval over the environment's frames."""
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
     curve = record["curve"]
     frames = [point["frames"] for point in curve]
-    figure, axes = pyplot.subplots(figsize=(6, 3.5), layout="constrained")
+    figure = Figure(figsize=(6, 3.5), layout="constrained")
+    axes = figure.subplots()
     measure = measure_of(curve[0])
     low, high = (
         [point[f"{measure}_{end}"] for point in curve] for end in ("low", "high")
@@ -118,7 +116,6 @@ def draw(record: dict, path: Path) -> None:
     axes.set(xlabel="environment frames after training from data")
     axes.set(ylabel=IN_WORDS[measure], title=f"{record['env']}, {record['loss']}")
     figure.savefig(path, dpi=120)
-    pyplot.close(figure)
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -143,6 +140,8 @@ def main(arguments: Sequence[str]) -> None:
     torch.manual_seed(options.seed)
     torch.set_num_threads(1)
     run = load_trained(options.run)
+    if not isinstance(run.loss, OSRLoss):
+        parser.error(f"{options.run} is no run of loss=osr or loss=osr_10.")
     if options.min_q_weight is not None:
         run.loss.min_q_weight = options.min_q_weight
     options.output.mkdir(parents=True, exist_ok=True)

@@ -3,9 +3,9 @@
     python examples/torchrl_trainer.py data=medium loss.recovery_weight=1.0
 
 The configuration is ``torchrl_trainer.yaml`` beside this file. Its networks have the
-sizes of a Hopper. Data are collected on
-this machine and standardised. The inverse dynamics model is trained first, then the
-policy, which finally plays its task. Writes ``result.json`` to Hydra's folder.
+sizes of a Hopper. Unlike the quick preset, it has one-step returns, no average of the
+weights, and other rates and batches. Data are collected here and standardised. The
+model is trained first, then the policy, which plays its task. Writes ``result.json``.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 from torchrl_osr.lab.evaluation import statistics
-from torchrl_osr.lab.evaluation.statistics import Estimate, saved_share
+from torchrl_osr.lab.evaluation.statistics import Estimate, recovered_share
 from torchrl_osr.lab.report.tables import by_run
 
 
@@ -102,7 +102,7 @@ def recoverable(folder: Path) -> dict[tuple[str, str], tuple[str, float]]:
     """Return the recovery rate in percent of each data set and method."""
     found = {}
     for data, method, rates, walks in recovered(folder):
-        share = saved_share(rates, walks)
+        share = recovered_share(rates, walks)
         # The held-out half wins over the public one.
         found.setdefault((data, method), (str(share), share.mean))
     return found
