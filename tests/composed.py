@@ -7,7 +7,7 @@ from pathlib import Path
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_osr.lab.run.build import read_environment
+from torchrl_osr.lab.run.build import set_sizes_from_environment
 from torchrl_osr.lab.run.config import checked
 from torchrl_osr.lab.run.folder import open_run
 from torchrl_osr.lab.run.schema import EvaluateConfig, TrainConfig, register
@@ -39,7 +39,7 @@ def composed(config: str, *overrides: str) -> DictConfig:
 def configured(*overrides: str) -> TrainConfig:
     """The checked configuration of a run, with the sizes of its environment."""
     config = checked(composed("train", *overrides))
-    read_environment(config.env)
+    set_sizes_from_environment(config.env)
     return config
 
 

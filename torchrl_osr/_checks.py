@@ -17,13 +17,13 @@ def check_choice(name: str, value: Any, choices: tuple[Any, ...]) -> None:
 def check_weight(name: str, weight: float) -> None:
     """Raise a ValueError unless the weight of a term is finite and at least 0."""
     if not 0 <= weight < math.inf:
-        raise ValueError(f"{name} must be at least 0, got {weight}.")
+        raise ValueError(f"{name} must be finite and at least 0, got {weight}.")
 
 
 def check_positive(name: str, value: float, *, minimum: float | None = None) -> None:
     """Raise a ValueError unless 0 < ``value`` < inf, or ``value`` >= ``minimum``."""
     if minimum is None and not 0 < value < math.inf:
-        raise ValueError(f"{name} must be above 0, got {value}.")
+        raise ValueError(f"{name} must be finite and above 0, got {value}.")
     if minimum is not None and not value >= minimum:
         raise ValueError(f"{name} must be at least {minimum}, got {value}.")
 

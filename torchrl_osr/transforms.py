@@ -163,7 +163,7 @@ def _floating(dtype: torch.dtype) -> torch.dtype:
 
 
 def _derived(*parts: str | int) -> int:
-    """Seed of a stream that belongs to these parts, in this process."""
+    """Return the seed of a stream that belongs to these parts, in this process."""
     here = torch.initial_seed(), multiprocessing.current_process().name
     digest = hashlib.sha256(repr((*parts, *here)).encode()).digest()
     return int.from_bytes(digest[:7], "big")

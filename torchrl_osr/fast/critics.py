@@ -146,8 +146,8 @@ def _values(layers: Layers, eps: Sequence[float], rows: Tensor) -> Tensor:
             hidden = hidden.to(scale.dtype)
             hidden = layer_norm(hidden, scale.shape, scale, shift, eps[index])
         elif norm:
-            # Its own scale and shift would be those of all critics. It is given ones,
-            # for without any torch 2.13 takes twice as long.
+            # layer_norm takes one scale and shift for all critics. Ones and zeros stand
+            # in: without them torch 2.13 takes twice as long.
             ones = norm[0].new_ones(hidden.shape[-1])
             zeros = torch.zeros_like(ones)
             hidden = layer_norm(hidden, ones.shape, ones, zeros, eps[index])

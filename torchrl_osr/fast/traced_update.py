@@ -203,7 +203,7 @@ class _State:
             *map(torch.get_autocast_dtype, ("cpu", "cuda")),
             torch.get_default_dtype(),
             interaction_type(),
-            RemovableHandle.next_id,
+            RemovableHandle.next_id,  # rises with every hook
         )
         return [modes, [(each.data_ptr(), each.requires_grad) for each in self.tensors]]
 

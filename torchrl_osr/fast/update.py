@@ -139,8 +139,8 @@ class FastUpdate:
             return
         groups = self.optimizer.param_groups
         trained = [p for each in groups for p in each["params"] if p.grad is not None]
-        # An eighth of the time of the largest magnitudes. A square that overflows is as
-        # bad: it would be one of Adam's second moments.
+        # Norms take an eighth of the time of maxima. A square that overflows is an
+        # error, too: Adam stores squared gradients.
         norms = torch._foreach_norm([each.grad for each in trained])
         means = [each.float().mean() for each in losses.values()]  # metrics may be [B]
         values = torch.stack([*means, *norms]).tolist()

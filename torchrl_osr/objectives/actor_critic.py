@@ -410,7 +410,7 @@ class ActorCriticLoss(LossModule):
         keys, masks = self.tensor_keys, self._loss_mask_keys()
         batch = Transitions(tensordict, self.in_keys, keys, masks, dtype)
         action = batch.rows.get(keys.action, None)
-        if action is not None and "action_low" in self._buffers:  # real, if integers
+        if action is not None and "action_low" in self._buffers:  # may be stored as int
             batch.rows.set(keys.action, action.to(dtype))
         if "qvalue_network" in self.__dict__:
             batch.stack_states(self.observation_keys, perturbed=self.reads_perturbed)
@@ -523,7 +523,7 @@ class ActorCriticLoss(LossModule):
     ) -> Losses:
         """Return the losses of SAC's policy and temperature, and their metrics.
 
-        The arguments are those of :meth:`soft_policy_objective`; ``auto`` is the target
+        Arguments: the results of :meth:`soft_policy_objective`; ``auto`` is the target
         entropy of ``"auto"``, by default minus the number of the action's dimensions.
         """
         wanted = self.target_entropy
@@ -588,8 +588,8 @@ class ActorCriticLoss(LossModule):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the distance of values ``[N, R]`` from a target ``[R]``, and metrics.
 
-        It is summed over critics. The largest absolute error is written as priority, 0
-        for masked rows.
+        It is summed over critics, which may have a target each, ``[N, R]``. The largest
+        absolute error is written as priority, 0 for masked rows.
         """
         error = (pred_value.detach() - target).abs().amax(0)
         error = error if batch.unmasked is None else error * batch.unmasked

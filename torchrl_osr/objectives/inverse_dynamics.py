@@ -94,7 +94,7 @@ class InverseDynamicsLoss(ActorCriticLoss):
             name = "inverse_dynamics_network"
             self.register_bounds(action_bounds(inverse_dynamics_network, name))
         elif loss_function == "mse":
-            raise ValueError("loss_function='mse' needs real actions: choose 'nll'.")
+            raise ValueError("loss_function='mse' needs continuous actions: use 'nll'.")
         self.convert_to_functional(inverse_dynamics_network, "inverse_dynamics_network")
         self.states: Literal["both", "clean"] = states
         self.loss_function, self.latent_weight = loss_function, latent_weight

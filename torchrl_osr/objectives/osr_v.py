@@ -149,13 +149,13 @@ class OSRVLoss(ActorCriticLoss):
         self, batch: Transitions, policy: StatePolicy
     ) -> tuple[Tensor, Tensor]:
         """Return the same, with CQL(H)'s term at clean and at perturbed states."""
-        # Not in the paper, which prints (8), as (3), with a mean over pi(s~). For (3)
-        # the authors' code has a log-sum-exp, uniform actions, and those of pi(s').
+        # The paper prints (8), like (3), with a mean over pi(s~). For (3) the authors'
+        # code takes a log-sum-exp, also over uniform actions and those of pi(s').
         sets = "recorded", "perturbed_and_next"
         drawn = [self.proposals(batch, policy, states) for states in sets]
         sampled = (torch.cat(both, 1) for both in zip(*drawn, strict=True))
-        # Not in (8), which has the model's action at clean states, too. It has the
-        # data's in expectation (Proposition 2). A row without s' has it at both.
+        # (8) has the model's action at clean states, too. In expectation it is the
+        # data's (Proposition 2), used here; rows without s' have the data's at both.
         wanted = self.recovery_actions(batch, "perturbed", 1)[0, 0]
         wanted = torch.where(batch.has_next.unsqueeze(-1), wanted, batch.a)
         mixed = batch.states[SETS["both"]].reshape(-1)

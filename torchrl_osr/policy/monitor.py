@@ -174,7 +174,7 @@ def fit_monitor(
     if not len(known):
         if false_alarms is not None:  # there may be too few episodes
             conformal_threshold(torch.zeros(len(order) - len(order) // 2), false_alarms)
-        raise ValueError("no row counts as data: all are near a terminal state.")
+        raise ValueError("no rows to fit: it needs two episodes, and rows that count.")
     data = observation[known].float()
     chosen = torch.randperm(len(data), generator=generator)[:num_states]
     size = {"num_states": len(chosen), "observation_size": data.shape[-1]}

@@ -95,7 +95,7 @@ class Policy(nn.Module):
         Args:
             observation: as the environment gives it, one ``[S]`` or many ``[B, S]``. A
                 dictionary of the log's columns is joined in their order, another one in
-                the alphabetical order of its keys, like an environment's data.
+                the alphabetical order of its keys. NaN or infinity is a ValueError.
 
         Returns:
             Actions as the environment takes them: float32, ``[A]`` or ``[B, A]``,

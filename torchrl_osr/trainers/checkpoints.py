@@ -51,10 +51,9 @@ def _check_fits(here: Mapping[str, Any], there: Mapping[str, Any]) -> None:
         for state in (here, there)
     )
     for key in sorted(shapes.keys() | saved.keys()):
-        if shapes.get(key) != saved.get(key):
-            raise ValueError(
-                f"{key} is {saved.get(key)} in the file, {shapes.get(key)} here."
-            )
+        ours, theirs = (each.get(key, "missing") for each in (shapes, saved))
+        if ours != theirs:
+            raise ValueError(f"{key} is {theirs} in the file, {ours} here.")
 
 
 class SamplerState:

@@ -25,9 +25,9 @@ if hasattr(signal, "SIGHUP"):
 
 
 class Interrupted(SystemExit):
-    """Ends the process after a signal, with everything saved to be continued.
+    """End the process after a signal; the same command continues the run.
 
-    The reason says which signal came, and what was saved where.
+    The reason names the signal and, in training, the last checkpoint.
     """
 
     def __init__(self, reason: str, code: int) -> None:
@@ -65,7 +65,7 @@ def signals_raised() -> Iterator[None]:
     def stop(number: int, frame: FrameType | None) -> None:
         name = signal.Signals(number).name
         raise Interrupted(
-            f"stopped by {name}, not while training. Run again to continue.",
+            f"stopped by {name} before or after training. Run again to continue.",
             EXIT_CODES[signal.Signals(number)],
         )
 

@@ -202,7 +202,7 @@ class OfflineTrainer(Trainer):
             self.description, self.total_frames, first=self.step, bar=self._progress
         )
         with shown as self._bar, signals_noted() as self._signals:
-            self._evaluate_if_due()  # a kill may have come between both
+            self._evaluate_if_due()  # a kill may fall between checkpoint and evaluation
             super().train()
         if self._signals:  # in the last evaluation
             raise self._interrupted(self.step)

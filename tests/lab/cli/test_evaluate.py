@@ -13,7 +13,7 @@ from composed import composed, trained
 
 from torchrl_osr.lab.cli.evaluate import main
 from torchrl_osr.lab.dynamics import DynamicsEnsemble
-from torchrl_osr.lab.dynamics.training import FILE, write_dynamics
+from torchrl_osr.lab.dynamics.training import MODEL, write_dynamics
 from torchrl_osr.lab.evaluation.recoverable import load_recoverable_states, recovers
 from torchrl_osr.lab.run.load import load_switching_policy
 
@@ -76,7 +76,7 @@ def test_runs_of_a_sweep_are_one_policy_that_switches(folder, tmp_path, capsys):
         shutil.copytree(folder, run)
         torch.manual_seed(len(run.parts))
         model = DynamicsEnsemble(11, 3, num_networks=2, num_elites=1, num_cells=[4])
-        write_dynamics(run / FILE, model)
+        write_dynamics(run / MODEL, model)
     for file in (runs[1] / "checkpoint" / "policy").glob("checkpoint-*20.torchrl"):
         file.unlink()  # so that they differ: its last step is 10
     sweep = [f"sweep={tmp_path}", "switching=true"]
@@ -90,7 +90,7 @@ def test_runs_of_a_sweep_are_one_policy_that_switches(folder, tmp_path, capsys):
     back = recovers(states, load_switching_policy(runs))
     assert results["evaluations"][0]["back"] == back.astype(int).tolist()
     printed = capsys.readouterr().out
-    assert "hopper random, public recoverable states: 1 x each\n" in printed
+    assert "hopper random, public recoverable states, each played 1 x\n" in printed
     evaluate(*sweep, "suite=official")
     results = json.loads((tmp_path / "switching-robustness-official.json").read_text())
     assert len(results["evaluations"]) == 1

@@ -22,7 +22,7 @@ def test_from_a_run_to_each_kind_of_file(tmp_path, run):
         code, output = run(tmp_path, "export", *arguments)
         assert code == 0, output
         step = 10 if "best" in arguments[0] else 900
-        assert f"OSRLoss, Hopper-v5, step {step}, no alarm\n" in output
+        assert f"OSRLoss, Hopper-v5, step {step}, without a monitor\n" in output
         assert float(output.rpartition(" ")[2]) <= 1e-6
 
 

@@ -13,7 +13,7 @@ from tensordict import TensorDict
 
 from torchrl_osr.lab.dynamics import Body
 from torchrl_osr.lab.dynamics.body import fitted_body
-from torchrl_osr.lab.dynamics.training import FILE, REPORT, load_dynamics
+from torchrl_osr.lab.dynamics.training import MODEL, REPORT, load_dynamics
 
 HOPPER = gymnasium.make("Hopper-v5").unwrapped
 
@@ -84,7 +84,7 @@ def test_a_run_identifies_the_body_and_keeps_it(tmp_path, capsys) -> None:
     errors = [line.split()[4] for line in capsys.readouterr().out.splitlines()
               if line.startswith("body as")]  # fmt: skip
     assert float(errors[1]) <= float(errors[0]) < 1e-3
-    model = load_dynamics(tmp_path / "run" / FILE)
+    model = load_dynamics(tmp_path / "run" / MODEL)
     assert model.body is not None
     np.testing.assert_allclose(model.body.factors, 1, atol=0.05)
     report = json.loads((tmp_path / "run" / REPORT).read_text())

@@ -89,7 +89,7 @@ def test_recovery_is_added_to_a_loss_without_it(name, recovery, batch) -> None:
         (["loss=rim", "dynamics.unknown=halts"], "dynamics.unknown must be one of"),
         (["loss=mopo", "dynamics.num_elites=9"], "num_elites=9 must be between 1"),
         (["env.id=CartPole-v1"], "discrete actions.*loss=discrete_osr"),
-        (["env.id=Pendulum-v1", "loss=discrete_osr"], "real actions.*loss=osr"),
+        (["env.id=Pendulum-v1", "loss=discrete_osr"], "continuous actions.*loss=osr"),
         (["env.id=Pendulum-v1", "env.action_low=[-1.0]"], "but Pendulum-v1 has"),
     ],
 )

@@ -49,7 +49,7 @@ def test_rewards_are_scaled_then_shifted():
     assert (after["next", "reward"][reached] == 5).all()
     assert (after["next", "reward"][~reached] == -5).all()
     assert (bare.largest_reward, data.largest_reward) == (1, 5)
-    assert data.mean == bare.mean, "the data's own score stays"
+    assert data.data_mean == bare.data_mean, "the data's own score stays"
     never = before["multi_step", "reward"] == 0
     discounts = 2 * (1 - 0.5 ** after["multi_step", "steps"][never])
     torch.testing.assert_close(after["multi_step", "reward"][never], -5 * discounts)

@@ -16,7 +16,7 @@ from torchrl.checkpoint import CheckpointError, CheckpointRotation
 from untrained_run import make_run
 
 from torchrl_osr.lab.dynamics import DynamicsEnsemble
-from torchrl_osr.lab.dynamics.training import FILE, load_dynamics, write_dynamics
+from torchrl_osr.lab.dynamics.training import MODEL, load_dynamics, write_dynamics
 from torchrl_osr.lab.evaluation import deterministic_policy
 from torchrl_osr.lab.run.build import make_learner
 from torchrl_osr.lab.run.config import read_run, write_config
@@ -161,7 +161,7 @@ def folders(tmp_path_factory) -> list[Path]:
         torch.manual_seed(seed)
         make_run(folder := top / f"seed{seed}", LOSS, *BOUNDS)
         model = DynamicsEnsemble(11, 3, num_networks=2, num_elites=1, num_cells=[4])
-        write_dynamics(folder / FILE, model)
+        write_dynamics(folder / MODEL, model)
         found.append(folder)
     return found
 
@@ -178,7 +178,7 @@ def test_switching_uses_all_runs_policies_models_and_critics(folders) -> None:
             # Restated: the run's networks see standardised states and actions in 1.
             seen, half = (state - own.loc) / own.scale, (own.high - own.low) / 2
             unit = (action - (own.low + own.high) / 2) / half
-            plain = load_dynamics(folder / FILE)
+            plain = load_dynamics(folder / MODEL)
             mean = plain.predict(seen, unit)[0][plain.elites[0]]
             after = state + mean[:, :-1] * own.scale
             values = [own.smallest_value(after, policy(after)) for own in policies]
@@ -198,7 +198,7 @@ def test_switching_uses_all_runs_policies_models_and_critics(folders) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["loss=bc"], "needs real actions and critics"),
+        (["loss=bc"], "needs continuous actions and critics"),
         ([LOSS, "optim.gamma=0.9"], "differ in .*0.9, "),
         ([LOSS, "data.reward_scale=100"], "differ in .*100.0"),
         ([LOSS, "env=none", "data=file", "data.path=a.csv"], "differ in .*Hopper-v5"),

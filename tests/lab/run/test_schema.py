@@ -16,7 +16,7 @@ from torchrl_osr.lab.data.mazes import maze_sources
 from torchrl_osr.lab.data.rollout import BEHAVIORS
 from torchrl_osr.lab.data.sources import RECORDED
 from torchrl_osr.lab.run.config import checked
-from torchrl_osr.lab.run.schema import CHOSEN, TrainConfig, schema_of
+from torchrl_osr.lab.run.schema import LOSSES, TrainConfig, schema_of
 
 # Environments are composed below, losses in test_build.py.
 GROUPS = ("data", "inverse_dynamics", "dynamics", "recovery", "logger", "preset")
@@ -63,12 +63,12 @@ def test_an_id_alone_is_enough():
         assert composed("train", f"env.id={env_id}").env.name == name
 
 
-@pytest.mark.parametrize("name", sorted(CHOSEN))
+@pytest.mark.parametrize("name", sorted(LOSSES))
 def test_schema_has_the_names_and_defaults_of_the_constructor(name):
-    schema = schema_of(CHOSEN[name])
+    schema = schema_of(LOSSES[name])
     defaults = {field.name: field.default for field in fields(schema)}
-    assert get_class(defaults.pop("_target_")) is CHOSEN[name]
-    found = inspect.signature(CHOSEN[name]).parameters
+    assert get_class(defaults.pop("_target_")) is LOSSES[name]
+    found = inspect.signature(LOSSES[name]).parameters
     for key, default in defaults.items():
         assert key not in found or found[key].default == default
     keywords = {

@@ -15,13 +15,13 @@ from torchrl import torchrl_logger
 
 from torchrl_osr.lab.cli.console import single_job
 from torchrl_osr.lab.data import make_environment
+from torchrl_osr.lab.data.columns import has_rewards
 from torchrl_osr.lab.data.overview import (
     actions_at_bounds,
     findings,
     out_of_space,
     recorded_columns,
 )
-from torchrl_osr.lab.data.recording import has_rewards
 from torchrl_osr.lab.run import CONF
 from torchrl_osr.lab.run.data import load_data
 from torchrl_osr.lab.run.schema import register

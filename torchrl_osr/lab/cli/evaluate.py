@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl_osr.lab.cli.console import sentence, single_job
 from torchrl_osr.lab.evaluation.tables import aligned_columns
 from torchrl_osr.lab.report.runs import find_runs, saved_states, suite_episodes
-from torchrl_osr.lab.report.tables import robustness_table, saved_table, text
+from torchrl_osr.lab.report.tables import recovery_table, robustness_table, text
 from torchrl_osr.lab.run import CONF
 from torchrl_osr.lab.run.evaluate import evaluate_files, evaluate_run, file_name
 from torchrl_osr.lab.run.folder import read_status
@@ -126,8 +126,8 @@ def disturbance_table(results: Mapping[str, Any]) -> str:
 def recoverable_table(results: Mapping[str, Any]) -> str:
     """Return the report's table of recovery rates as text, of these results alone."""
     rows = saved_states(results).assign(data="", run=0, method="", seed=0)
-    rates = saved_table(rows).drop(columns="seeds").iloc[0].map(text)
+    rates = recovery_table(rows).drop(columns="seeds").iloc[0].map(text)
     lines = [(name, cell.removesuffix(" ᵉ")) for name, cell in rates.items()]
     number = len(results["evaluations"])
     title = f"{results['env']} {results['data']}, {results['half']} recoverable states"
-    return "\n".join([f"{title}: {number} x each", *aligned_columns(lines)])
+    return "\n".join([f"{title}, each played {number} x", *aligned_columns(lines)])

@@ -38,7 +38,7 @@ def main() -> None:
     add("--frame-skip", type=int, default=1, help="physics steps of an action in it")
     add("--seed", type=int, default=0, help="of the training")
     add("--data", metavar="PATH", help="place of the log, if it was moved")
-    add("--trust", action="append", default=[], metavar="MODULE", help="yours")
+    add("--trust", action="append", default=[], help="module that the run may import")
     options = vars(parser.parse_args())
     runs, tables = options.pop("runs"), defaultdict[Any, dict[str, Any]](dict)
     if options["steps"] is not None and options["steps"] < 1:

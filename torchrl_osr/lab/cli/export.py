@@ -48,7 +48,7 @@ def main() -> None:
     add("path", type=Path, help="the file to write")
     add("settings", nargs="*", metavar="key=value", help="of the monitor")
     add("--output", choices=("action", "value"), default="action", help="of the graph")
-    add("--trust", action="append", default=[], metavar="MODULE", help="yours")
+    add("--trust", action="append", default=[], help="module that the run may import")
     options = parser.parse_intermixed_args()
     if options.path.suffix not in (SUFFIX, *GRAPHS):
         parser.error(f"the path must end in {SUFFIX}, {' or '.join(GRAPHS)}.")
@@ -70,7 +70,7 @@ def main() -> None:
         policy.export(options.path, options.output)
     deviation = check(policy, options.path, options.output)
     origin = {"env_id": "?", "step": "?"} | policy.record["source"]
-    alarm = "an alarm" if policy.data_monitor is not None else "no alarm"
+    alarm = "with a monitor" if policy.data_monitor is not None else "without a monitor"
     print(
         f"{options.path}: {options.path.stat().st_size:,} bytes, "
         "{loss}, {env_id}, step {step}, ".format(**origin)

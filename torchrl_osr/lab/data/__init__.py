@@ -4,12 +4,12 @@
 """
 
 from torchrl_osr.lab.data.behavior import load_behavior_policy
+from torchrl_osr.lab.data.columns import transitions_from_columns
 from torchrl_osr.lab.data.environment import (
     EnvironmentSpec,
     environment_spec,
     make_environment,
 )
-from torchrl_osr.lab.data.recording import transitions_from_columns
 from torchrl_osr.lab.data.rollout import collect_transitions
 from torchrl_osr.lab.data.sources import load_dataset
 from torchrl_osr.lab.data.statistics import (

@@ -86,7 +86,7 @@ def environment_spec(env_id: str) -> EnvironmentSpec:
 
 
 def make_environment(env_id: str) -> gymnasium.Env[Any, Any]:
-    """Make a Gymnasium task; real actions are rescaled to -1 and 1."""
+    """Make a Gymnasium task; continuous actions are rescaled to -1 and 1."""
     env = open_environment(env_id)
     actions: Any = env.action_space
     box = isinstance(actions, spaces.Box)
@@ -141,7 +141,7 @@ def sorted_space(space: spaces.Space[Any]) -> spaces.Space[Any]:
 
 
 def _entries(space: Any, name: str = "") -> list[str]:
-    """Names of the entries of the vector that an observation becomes."""
+    """Return the names of the entries of a flattened observation."""
     if isinstance(space, (spaces.Dict, spaces.Tuple)):
         keys: Any = space if isinstance(space, spaces.Dict) else range(len(space))
         parts = [_entries(space[key], f"{name}.{key}") for key in keys]

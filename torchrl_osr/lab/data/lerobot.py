@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_osr._files import read_json
-from torchrl_osr.lab.data.recording import Columns, Reading, convert
+from torchrl_osr.lab.data.columns import Columns, Reading, convert
 from torchrl_osr.lab.data.store import Dataset
 from torchrl_osr.lab.data.table import log_files, log_parts
 

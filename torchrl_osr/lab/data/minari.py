@@ -16,8 +16,8 @@ from tqdm.auto import tqdm
 
 from torchrl_osr._checks import needed_by
 from torchrl_osr._files import read_json
+from torchrl_osr.lab.data.columns import Reading, convert
 from torchrl_osr.lab.data.environment import sorted_space
-from torchrl_osr.lab.data.recording import Reading, convert
 from torchrl_osr.lab.data.store import Dataset
 from torchrl_osr.lab.data.transitions import Array
 

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from torchrl_osr.lab.data.recording import has_rewards
+from torchrl_osr.lab.data.columns import has_rewards
 from torchrl_osr.lab.data.rows import is_followed
 from torchrl_osr.lab.data.transitions import ACTION_LIMIT
 
@@ -72,7 +72,7 @@ def findings(
             if 0 < size < FEW:
                 yield (
                     f"{name} stays within {size:.1%} of its bounds: it may have other "
-                    "units than they (data.action_bounds=[low,high])."
+                    "units than the bounds (data.action_bounds=[low,high])."
                 )
     fell, lengths = manifest.get("terminated_ends"), manifest.get("episode_lengths", [])
     if len(lengths) > 2 and len({*lengths}) == 1 and fell == len(lengths):

@@ -100,16 +100,16 @@ def record_episodes(
 
 
 def check_log_path(path: Path) -> None:
-    """Raise unless a log can be written there."""
+    """Raise unless a log can be written there; make missing folders."""
     if path.suffix != ".npz":
         raise ValueError(f"path={path} must end in .npz.")
     if path.exists():
         raise FileExistsError(f"path={path} exists: choose another.")
+    path.parent.mkdir(parents=True, exist_ok=True)
 
 
 def write_log(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     """Write columns to a file, whole or not at all; missing folders are made."""
     check_log_path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as file:
         np.savez(file, allow_pickle=False, **columns)

@@ -13,6 +13,7 @@ from torchrl import torchrl_logger
 
 from torchrl_osr import __version__
 from torchrl_osr._checks import needed_by
+from torchrl_osr.lab.data.columns import ActionBounds, Reading, has_rewards
 from torchrl_osr.lab.data.environment import (
     MAZE_IDS,
     EnvironmentSpec,
@@ -20,7 +21,6 @@ from torchrl_osr.lab.data.environment import (
     environment_spec,
     known_ids,
 )
-from torchrl_osr.lab.data.recording import ActionBounds, Reading, has_rewards
 from torchrl_osr.lab.data.rollout import behavior_of, collect_source
 from torchrl_osr.lab.data.rows import mix_datasets
 from torchrl_osr.lab.data.statistics import REFERENCE_RETURNS, ReferenceReturns
@@ -231,7 +231,7 @@ def _check_fit(
     numbered = manifest["num_actions"] is not None
     fits = ours == [spec.observation_size, spec.action_size]
     if not fits or numbered != spec.discrete:
-        kind = "discrete" if spec.discrete else "real"
+        kind = "discrete" if spec.discrete else "continuous"
         raise ValueError(
             f"the data have {ours[0]} observation and {ours[1]} action entries, "
             f"{env_id} has {spec.observation_size} and {spec.action_size} ({kind}): "

@@ -18,7 +18,7 @@ import numpy as np
 
 from torchrl_osr._checks import needed_by
 from torchrl_osr._files import read_arrays
-from torchrl_osr.lab.data.recording import NO_REWARDS, Reading, convert, has_rewards
+from torchrl_osr.lab.data.columns import NO_REWARDS, Reading, convert, has_rewards
 from torchrl_osr.lab.data.store import Dataset
 from torchrl_osr.lab.data.transitions import Array
 

@@ -93,7 +93,7 @@ class DynamicsEnsemble(nn.Module):
         self.register_buffer("limits", torch.stack([-infinite, infinite]))
         self.body: Body | None = None
 
-    def standardized(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+    def predict_standardized(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and log-variance ``[E, B, D]`` of the standardised targets.
 
         ``inputs`` are states and actions, ``[B, S + A]`` or ``[E, B, S + A]``.
@@ -113,7 +113,7 @@ class DynamicsEnsemble(nn.Module):
         """Return mean and scale of all networks, in the data's units, ``[E, B, D]``."""
         batch = observation.shape[:-1]
         inputs = torch.cat([observation, action], -1).flatten(0, -2)
-        mean, log_variance = self.standardized(inputs)
+        mean, log_variance = self.predict_standardized(inputs)
         mean = mean * self.target_scale + self.target_loc
         scale = log_variance.mul(0.5).exp() * self.target_scale
         shape = self.num_networks, *batch, -1
@@ -271,10 +271,10 @@ class DynamicsLoss(ActorCriticLoss):
             targets = (targets - model.target_loc) / model.target_scale
             inputs = inputs.reshape(number, -1, inputs.shape[-1])
             targets = targets.reshape(number, -1, targets.shape[-1])
-            mean, log_variance = model.standardized(inputs)
+            mean, log_variance = model.predict_standardized(inputs)
             width = model.highest_log_variance - model.lowest_log_variance
             bounds = BOUND_WEIGHT * width.sum()
-        # Of the mean over E times as many rows as each network has.
+        # Each network has 1/E of the rows over which reduce() takes the mean.
         error = number * gaussian_error(mean, log_variance, targets).flatten()
         loss = self.reduce(error, batch, has_next_state(rows))
         return {"loss_dynamics": loss, "loss_bounds": bounds}, {}

@@ -31,7 +31,7 @@ from torchrl_osr.objectives import ActorCriticLoss
 from torchrl_osr.trainers import Evaluation, OfflineTrainer
 from torchrl_osr.trainers.checkpoints import safe_checkpoint
 
-FILE, REPORT = "dynamics.safetensors", "dynamics.json"
+MODEL, REPORT = "dynamics.safetensors", "dynamics.json"
 """The model and its errors, in the folder of a run."""
 
 Fit = Callable[..., OfflineTrainer]
@@ -72,7 +72,7 @@ def dynamics_model(
     options: DynamicsOptions, data: ModelData, fit: Fit, folder: Path
 ) -> DynamicsEnsemble:
     """Train a run's ensemble or load it; write file and report to the run's folder."""
-    file = folder / FILE
+    file = folder / MODEL
     if not file.exists():
         # The rest of the run draws the same numbers with a model from a file.
         with torch.random.fork_rng(devices=[]):
@@ -84,8 +84,8 @@ def dynamics_model(
     write_json(folder / REPORT, report)
     print(
         "dynamics, {rows} held-out rows: NLL {nll:.2f}, R2 {r2_mean:.2f}, within one "
-        "sigma {within_1_sigma:.0%}, disagreement and error {disagreement_rank:.2f}"
-        "".format(**report)
+        "sigma {within_1_sigma:.0%}, rank correlation of disagreement and error "
+        "{disagreement_rank:.2f}".format(**report)
     )
     return model
 

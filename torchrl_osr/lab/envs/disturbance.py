@@ -20,7 +20,7 @@ Step: TypeAlias = tuple[Vector, Any, bool, bool, dict[str, Any]]
 
 
 class NotPossible(TypeError):
-    """The environment lacks MuJoCo, or real actions, which a disturbance needs."""
+    """The environment lacks MuJoCo, or continuous actions, that a disturbance needs."""
 
 
 def box_of(space: gymnasium.Space[Any], name: str) -> gymnasium.spaces.Box:

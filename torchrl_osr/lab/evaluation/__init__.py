@@ -2,7 +2,7 @@
 
 from torchrl_osr.lab.evaluation.episodes import (
     EpisodeEvaluator,
-    Policy,
+    UnitPolicy,
     deterministic_policy,
     measure_of,
     summarize,
@@ -18,7 +18,7 @@ __all__ = [
     "DataDistance",
     "Disturbance",
     "EpisodeEvaluator",
-    "Policy",
+    "UnitPolicy",
     "deterministic_policy",
     "evaluate_paired",
     "fitted_grey_box",

@@ -24,7 +24,7 @@ from torchrl_osr.lab.data.environment import make_environment
 from torchrl_osr.lab.evaluation.statistics import mean_interval
 from torchrl_osr.objectives.networks import ONE_HOT
 
-Policy = Callable[[Tensor], Tensor]
+UnitPolicy = Callable[[Tensor], Tensor]
 """Maps raw observations ``[E, S]`` to actions ``[E, A]`` within -1 and 1.
 
 Discrete actions are their numbers, ``[E]``.
@@ -53,7 +53,7 @@ class EpisodeResults:
 def deterministic_policy(
     actor_network: ProbabilisticTensorDictSequential,
     observation_norm: ObservationNorm | None = None,
-) -> Policy:
+) -> UnitPolicy:
     """Return the actor's deterministic action as a function of raw observations.
 
     Of discrete actions that is the number of the likeliest. Pass the
@@ -111,7 +111,7 @@ class EpisodeEvaluator:
         self.device, self.fixed_batch = device, fixed_batch
 
     def __call__(
-        self, policy: Policy, watch: Watch = lambda *_: None
+        self, policy: UnitPolicy, watch: Watch = lambda *_: None
     ) -> EpisodeResults:
         """Play an episode for each seed; call the policy's ``reset`` first, if any."""
         getattr(policy, "reset", lambda: None)()

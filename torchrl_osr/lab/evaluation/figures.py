@@ -61,7 +61,7 @@ def learning_curve(
         if data_mean is not None:
             label = "data (mean episode)"
             axes.axhline(data_mean, color=ORANGE, linestyle="--", label=label)
-        axes.set(xlabel="gradient steps", ylabel=IN_WORDS[measure])
+        axes.set(xlabel="updates", ylabel=IN_WORDS[measure])
         # Outside: inside it would cover the curve.
         figure.legend(loc="outside upper right", frameon=False, fontsize=8)
     for column, name in enumerate(panels):
@@ -69,7 +69,7 @@ def learning_curve(
         small.plot(*zip(*scalars[name], strict=True), color=GREY, linewidth=1)
         small.set_title(PANELS[name], fontsize=9)
         small.tick_params(labelsize=8)
-        small.set_xlabel("gradient steps", fontsize=8)
+        small.set_xlabel("updates", fontsize=8)
         small.ticklabel_format(axis="x", style="sci", scilimits=(3, 3))
     save_figure(figure, path)
 

@@ -13,7 +13,7 @@ from torchrl_osr.lab.data.rows import episode_of
 from torchrl_osr.lab.dynamics import Body, DynamicsEnsemble, DynamicsLoss
 from torchrl_osr.lab.dynamics.body import fitted_body
 from torchrl_osr.lab.dynamics.rollouts import task_limits, termination
-from torchrl_osr.lab.evaluation.episodes import Policy
+from torchrl_osr.lab.evaluation.episodes import UnitPolicy
 from torchrl_osr.lab.evaluation.offline import act, check_discount, first_states, fit
 from torchrl_osr.lab.evaluation.statistics import Array
 
@@ -50,7 +50,7 @@ def fitted_grey_box(
 def rolled_out_values(
     model: DynamicsEnsemble,
     data: TensorDict,
-    policy: Policy,
+    policy: UnitPolicy,
     *,
     gamma: float = 0.997,
 ) -> Array:

@@ -24,7 +24,7 @@ def inverse_dynamics_report(
     Returns:
         ``"nll"``, mean negative log-likelihood in nats, and ``"rows"``. Of discrete
         actions also ``"accuracy"``, share of rows whose action is the likeliest. Of
-        real ones ``"r2"``, share of each action dimension's variance that the
+        continuous ones ``"r2"``, share of each action dimension's variance that the
         deterministic action explains.
     """
     data = data[~data.get(("next", "done")).squeeze(-1)]

@@ -18,7 +18,7 @@ from torchrl.objectives import SoftUpdate
 from torchrl_osr.fast import FastUpdate
 from torchrl_osr.lab.data import make_replay_buffer, observation_statistics
 from torchrl_osr.lab.data.rows import episode_of
-from torchrl_osr.lab.evaluation.episodes import Policy
+from torchrl_osr.lab.evaluation.episodes import UnitPolicy
 from torchrl_osr.lab.evaluation.statistics import Array
 from torchrl_osr.lab.losses import FQELoss
 from torchrl_osr.modules import critic_ensemble
@@ -30,7 +30,7 @@ TAU = 0.05
 
 def fitted_values(
     data: TensorDict,
-    policy: Policy,
+    policy: UnitPolicy,
     *,
     gamma: float = 0.99,
     steps: int | None = None,
@@ -123,7 +123,7 @@ def first_states(data: TensorDict, episode: Tensor) -> Tensor:
     return starts
 
 
-def act(policy: Policy, states: Tensor, size: int) -> Tensor:
+def act(policy: UnitPolicy, states: Tensor, size: int) -> Tensor:
     """Return a policy's actions ``[B, size]`` at states ``[B, S]``."""
     action = torch.cat([policy(rows) for rows in torch.split(states, 2**20)])
     return action if action.ndim > 1 else one_hot(action, size).float()

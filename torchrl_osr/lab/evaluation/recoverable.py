@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torchrl_osr._checks import check_choice
 from torchrl_osr._files import read_arrays
 from torchrl_osr.lab.data.environment import MAZE_IDS, known_ids
-from torchrl_osr.lab.evaluation.episodes import EpisodeEvaluator, Policy
+from torchrl_osr.lab.evaluation.episodes import EpisodeEvaluator, UnitPolicy
 
 GROUPS = ("easy", "contested", "recoverable")
 """No reference policy failed; some did; all did, and a planner did not."""
@@ -84,7 +84,7 @@ def load_recoverable_states(env_name: str, half: str = "public") -> RecoverableS
     return RecoverableStates(**kept)
 
 
-def recovers(states: RecoverableStates, policy: Policy) -> NDArray[np.bool_]:
+def recovers(states: RecoverableStates, policy: UnitPolicy) -> NDArray[np.bool_]:
     """Return whether a policy recovers from each state, ``[M]``.
 
     Hopper and Walker2d: no fall within ``steps`` steps. HalfCheetah: a mean speed of

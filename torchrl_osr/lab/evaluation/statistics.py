@@ -66,7 +66,7 @@ def mean_interval(values: ArrayLike) -> tuple[float, float, float]:
     """Return the mean of ``[E]`` values and its 95 % percentile-bootstrap interval."""
     sample = np.asarray(values, np.float64).ravel()
     if not sample.size or not np.isfinite(sample).all():
-        raise ValueError(f"mean_interval needs finite values, got {sample}.")
+        raise ValueError(f"an interval needs finite values, got {sample}.")
     rng, size = np.random.default_rng(0), sample.size
     rows = rng.integers(size, size=(NUM_RESAMPLES, size))
     return interval(sample.mean(), sample[rows].mean(1))[:3]
@@ -157,7 +157,7 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
     return max(0.0, low / (1 + square)), min(1.0, high / (1 + square))
 
 
-def saved_share(
+def recovered_share(
     back: ArrayLike, walk: ArrayLike, baseline: ArrayLike | None = None
 ) -> Estimate:
     """Return the recovery rate over states, in percent.

@@ -134,13 +134,13 @@ class RORLLoss(ActorCriticLoss):
     Call :meth:`decay_uncertainty` after each update.
 
     Keyword Args:
-        num_samples: ``M``.
+        num_samples: ``M``. Default 20.
         policy_smooth_reg, q_smooth_reg, q_ood_reg: the weights :math:`\beta_P`,
-            :math:`\beta_Q` and :math:`\beta_{ood}`.
-        policy_smooth_eps, q_smooth_eps, q_ood_eps: half-widths of boxes around states.
-        q_smooth_tau: weight of values that fall against those that rise.
+            :math:`\beta_Q` and :math:`\beta_{ood}`. Default 0.1, 1e-4 and 0.5.
+        policy_smooth_eps, q_smooth_eps, q_ood_eps: half-widths, 0.005, 0.005 and 0.01.
+        q_smooth_tau: weight of values that fall against those that rise. Default 0.2.
         q_ood_uncertainty_reg, q_ood_uncertainty_reg_min, q_ood_uncertainty_decay:
-            :math:`\lambda` at first, what it falls to, and by how much an update.
+            :math:`\lambda` at first, at last, and its fall an update: 0.1, 0, 1e-6.
         alpha_init, target_entropy: see :class:`~torchrl_osr.CQLLoss`.
         options: of every loss, see :class:`~torchrl_osr.objectives.ActorCriticLoss`.
 

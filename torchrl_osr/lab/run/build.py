@@ -49,11 +49,11 @@ def make_learner(config: TrainConfig, device: torch.device | str = "cpu") -> Lea
     layer_norm = config.network.layer_norm
     layers: dict[str, Any] = {"num_cells": cells, "layer_norm": layer_norm}
     actor = instantiate(config.network.actor, *sizes, num_cells=cells).to(device)
-    kind, other = ("discrete", "discrete_osr") if env.discrete else ("real", "osr")
+    kind, name = ("discrete", "discrete_osr") if env.discrete else ("continuous", "osr")
     if is_categorical(actor) != env.discrete:
         raise ValueError(
             f"{env.id or env.name} has {kind} actions, and {config.loss['_target_']} "
-            f"is for others: choose loss={other}, for example."
+            f"is for others: choose loss={name}, for example."
         )
     number = config.loss.get("num_qvalue_nets", 2)
     critics = instantiate(
@@ -123,7 +123,7 @@ def _check_combination(config: TrainConfig, learner: Learner) -> None:
         dynamics.check(batch_size=batch_size, gamma=gamma)
 
 
-def read_environment(env: EnvConfig) -> None:
+def set_sizes_from_environment(env: EnvConfig) -> None:
     """Set sizes and action bounds of a configuration from its environment.
 
     A ValueError names those that have changed since the training.

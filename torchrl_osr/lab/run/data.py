@@ -19,7 +19,7 @@ from torchrl_osr.lab.data import (
     observation_statistics,
     reference_returns,
 )
-from torchrl_osr.lab.data.recording import NO_REWARDS, has_rewards
+from torchrl_osr.lab.data.columns import NO_REWARDS, has_rewards
 from torchrl_osr.lab.data.rows import multi_step, next_action, split_held_out
 from torchrl_osr.lab.run.config import read_columns
 from torchrl_osr.lab.run.schema import DataConfig, EnvConfig, TrainConfig
@@ -35,7 +35,7 @@ class TrainingData(NamedTuple):
     held_out: TensorDict  # rows that are not in the buffer
     norm: ObservationNorm  # standardises observations
     largest_reward: float  # the largest absolute one, held-out rows included
-    mean: float | None  # score of the behaviour, or return without scores, if known
+    data_mean: float | None  # score of the behaviour, else return, if known
 
 
 def references_of(env: EnvConfig) -> ReferenceReturns | None:
@@ -78,7 +78,7 @@ def load_data(
     return data, manifest
 
 
-def read_log(config: TrainConfig) -> None:
+def set_sizes_from_log(config: TrainConfig) -> None:
     """Set sizes and action bounds of a configuration without a simulator."""
     env = config.env
     data, manifest = load_data(env, config.data, progress=config.trainer.progress)
@@ -101,9 +101,9 @@ def load_training_data(
     Their checksum is kept in the configuration.
 
     Rewards become ``reward_scale * r + reward_shift``; the mean is of the task's own.
-    ``in_keys`` are the keys that the loss reads, by default with rewards; a log without
-    these is then refused. If they have ``("next", "action")``, batches
-    have the data's next action, and the rows must be in order of time.
+    ``in_keys`` are the keys that the loss reads. If rewards are among them, or by
+    default, a log without rewards is refused. With ``("next", "action")``, batches have
+    the data's next action, and the rows must be in order of time.
     """
     env, options, optim = config.env, config.data, config.optim
     data, manifest = load_data(env, options, progress=config.trainer.progress)

@@ -12,7 +12,7 @@ import torch
 from torchrl import torchrl_logger
 
 from torchrl_osr._files import read_json, sha256_of, write_json
-from torchrl_osr.lab.data.recording import NO_REWARDS, has_rewards
+from torchrl_osr.lab.data.columns import NO_REWARDS, has_rewards
 from torchrl_osr.lab.dynamics import Body
 from torchrl_osr.lab.evaluation import deterministic_policy, fitted_values
 from torchrl_osr.lab.evaluation.grey_box import fitted_grey_box, rolled_out_values
@@ -22,7 +22,7 @@ from torchrl_osr.lab.run.data import load_data
 from torchrl_osr.lab.run.folder import package_versions
 from torchrl_osr.lab.run.load import load_trained, run_folder_of
 
-FILE = "offline_evaluation.json"
+OFFLINE = "offline_evaluation.json"
 """Result of a run's last checkpoint, in its folder; others have a name in front."""
 
 
@@ -73,7 +73,7 @@ class OfflineEvaluator:
             request |= {"xml": sha256_of(Path(self.xml)), "frame_skip": self.frame_skip}
         parts = [] if path.is_dir() else [path.stem]
         parts += [] if self.xml is None else ["body"]
-        file = run_folder_of(path) / "-".join([*parts, FILE])
+        file = run_folder_of(path) / "-".join([*parts, OFFLINE])
         if file.exists() and request.items() <= (known := read_json(file)).items():
             return known
         key = repr((env, options))  # one file may be read in several ways
@@ -92,7 +92,7 @@ class OfflineEvaluator:
             if "box" not in self._known:
                 low, high = env.action_low or -1.0, env.action_high or 1.0
                 body = Body(self.xml, self.frame_skip, low=low, high=high)
-                print(f"a row is {self.frame_skip} x {body.model.opt.timestep:g} s")
+                print(f"row spacing: {self.frame_skip} x {body.model.opt.timestep:g} s")
                 self._known["box"] = fitted_grey_box(rows, body, **training)
             model = self._known["box"]
             values = rolled_out_values(model, rows, policy, gamma=gamma)[None]

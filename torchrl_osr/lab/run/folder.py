@@ -22,7 +22,7 @@ from omegaconf import Container, DictConfig, ListConfig, OmegaConf
 
 from torchrl_osr._files import read_json, write_atomically, write_json
 from torchrl_osr.lab.data import EnvironmentSpec
-from torchrl_osr.lab.run.build import read_environment
+from torchrl_osr.lab.run.build import set_sizes_from_environment
 from torchrl_osr.lab.run.config import (
     CONFIG,
     check_environment,
@@ -32,7 +32,7 @@ from torchrl_osr.lab.run.config import (
     read_run,
     write_config,
 )
-from torchrl_osr.lab.run.data import read_log
+from torchrl_osr.lab.run.data import set_sizes_from_log
 from torchrl_osr.lab.run.schema import TrainConfig, method_name
 from torchrl_osr.trainers import Interrupted
 from torchrl_osr.trainers.interruption import (
@@ -89,9 +89,9 @@ def open_run(
         config = checked(cfg, trust)
         new, known = not (folder / CONFIG).exists(), config.data
         if config.env.id is not None:
-            read_environment(config.env)
+            set_sizes_from_environment(config.env)
         elif new or config.force:
-            read_log(config)
+            set_sizes_from_log(config)
         if new:
             (folder / HYDRA).parent.mkdir(exist_ok=True)
             write_atomically(folder / HYDRA, OmegaConf.to_yaml({"hydra": job}))
@@ -102,8 +102,8 @@ def open_run(
                     setattr(config.env, name, getattr(run.env, name))
             config.data.checksum = None if config.force else known.checksum
             _check_same(run, config, folder)
-        # Last: it makes the folder that of a run. A new place of the data is kept once
-        # they have been found to be the same there.
+        # Last: config.yaml makes the folder a run's. A new data.path is stored later,
+        # when the data's checksum has been compared.
         there = replace(config.data, path=known.path)
         write_config(folder, replace(config, data=there))
         choices = OmegaConf.load(folder / HYDRA).hydra.runtime.choices

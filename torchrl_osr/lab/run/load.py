@@ -18,7 +18,7 @@ from torchrl.objectives import LossModule
 
 from torchrl_osr.lab.dynamics import EliteNetworks, SwitchingPolicy
 from torchrl_osr.lab.dynamics.rollouts import termination
-from torchrl_osr.lab.dynamics.training import FILE, load_dynamics
+from torchrl_osr.lab.dynamics.training import MODEL, load_dynamics
 from torchrl_osr.lab.run.build import Learner, make_learner
 from torchrl_osr.lab.run.config import CONFIG, read_run
 from torchrl_osr.lab.run.schema import TrainConfig
@@ -144,7 +144,7 @@ def load_switching_policy(
     policies, configs = [*map(policy_of, trained)], [run.config for run in trained]
     for run, policy in zip(runs, policies, strict=True):
         if policy.discrete or not policy.critics:
-            raise ValueError(f"{run} needs real actions and critics to switch.")
+            raise ValueError(f"{run} needs continuous actions and critics to switch.")
     shared = {
         (each.env.id, each.optim.gamma, each.data.reward_scale, each.data.reward_shift)
         for each in configs
@@ -163,11 +163,11 @@ def load_switching_policy(
     if not critics_only:
         parts = []
         for run, each in zip(runs, policies, strict=True):
-            if (file := run_folder_of(run) / FILE).exists():
+            if (file := run_folder_of(run) / MODEL).exists():
                 units = each.loc, each.scale, each.low, each.high
                 parts.append(EliteNetworks(load_dynamics(file), *units))
         if not parts:
-            raise ValueError(f"None of the runs has a model, {FILE}: train loss=rim.")
+            raise ValueError(f"None of the runs has a model, {MODEL}: train loss=rim.")
         grey = [each for each in parts if each.body is not None]
         models = grey[0] if grey else EliteNetworks.join(parts)
         options = ({"steps": 40, "hold": 10} if grey else {}) | options

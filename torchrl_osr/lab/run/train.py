@@ -67,7 +67,7 @@ def train(run: Run) -> float:
     rollouts = phases.train_dynamics() if run.config.dynamics.use else None
     trainer = phases.train_policy(rollouts)
     save_policies(run, phases.learner, phases.data.norm)
-    return report(run, phases.data.mean, trainer)
+    return report(run, phases.data.data_mean, trainer)
 
 
 class Phases:
@@ -82,12 +82,12 @@ class Phases:
         if config.env.id is not None:
             try_out(config.env.id)
         self.options = trainer_options(run)
+        noise = StatePerturbation(config.perturbation.std, seed=config.seed)
+        self.perturbation = noise.to(device)
         # Transitions with standardised states. Each batch gets a perturbed state for
         # every state, which is the paper's mixed data set.
         self.data = load_training_data(config, device, self.learner.objective.in_keys)
         write_config(run.folder, config)  # with the checksum of the data
-        noise = StatePerturbation(config.perturbation.std, seed=config.seed)
-        self.perturbation = noise.to(device)
         self.data.buffer.append_transform(self.perturbation)
 
     def trainer(
@@ -233,7 +233,7 @@ class Phases:
 
 
 def prepare_machine(run: Run) -> tuple[torch.device, torch.dtype | None]:
-    """Log what is trained where, and set torch's threads; device and autocast type."""
+    """Log versions; set threads and precision; return device and autocast type."""
     config, options = run.config, run.config.trainer
     torchrl_logger.setLevel("WARNING")
     name = f"{config.env.name} {config.data.source}, seed {config.seed}"

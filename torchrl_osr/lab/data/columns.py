@@ -189,7 +189,7 @@ def transitions_from_columns(
             then clipped to ±0.999.
         clip_actions: clip actions outside their bounds rather than raise.
         num_actions: number of discrete actions: ``action`` then holds their numbers
-            from 0, ``[N]``, and becomes one-hot. Default: actions are real.
+            from 0, ``[N]``, and becomes one-hot. Default: continuous actions.
         missing: ``"row"`` leaves out rows with missing values (NaN) and cuts their
             trajectories there, ``"episode"`` leaves out their trajectories,
             ``"error"`` raises. Default: ``"error"``.
