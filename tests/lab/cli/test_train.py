@@ -103,4 +103,5 @@ def test_help_lists_the_options_of_every_group(tmp_path, run):
         *("logger", "preset"),
     )
     files = {path.stem for group in groups for path in CONF.glob(f"{group}/*.yaml")}
-    assert names - {"basic"} == files | {"pool", "cluster"}
+    launchers = {"pool", "cluster", "submitit_slurm", "submitit_local"}
+    assert names - {"basic"} == files | launchers
