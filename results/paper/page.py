@@ -468,8 +468,7 @@ def main() -> None:
         blocks |= {f"{name}/{kind}": decimal(value) for kind, value in line.items()}
         for mark, sets in (("", SIX), ("/15", MUJOCO)):
             found = differences(clean[clean["data"].isin(sets)], "osr", name)
-            text = str(found and found[1]).removesuffix(" ²")
-            blocks[f"osr-less-{name}{mark}"] = text
+            blocks[f"osr-less-{name}{mark}"] = str(found and found[1])
     for (data, name), score in clean.groupby(["data", "method"])["score"]:
         blocks[f"{folder_name(data)}/{name}"] = decimal(score.mean())
     for (data, name), (_, share) in tables.recoverable(HERE).items():

@@ -153,9 +153,11 @@ class Phases:
         )
         found = trainer.history[-1]
         write_json(self.run.folder / "inverse_dynamics.json", found)
-        fit = f"{100 * found.get('accuracy', 0):.0f} % of the actions"
-        if r2 := found.get("r2"):
-            fit = "R2 " + ", ".join("-" if r is None else f"{r:.2f}" for r in r2)
+        if "accuracy" in found:
+            fit = f"{100 * found['accuracy']:.0f} % of the actions"
+        else:
+            r2 = ["-" if each is None else f"{each:.2f}" for each in found["r2"]]
+            fit = f"R2 {', '.join(r2)}"
         rows, nll = found["rows"], found["nll"]
         print(f"inverse dynamics, {rows} held-out rows: NLL {nll:.2f}, {fit}")
 
