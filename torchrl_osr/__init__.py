@@ -44,4 +44,4 @@ def __getattr__(name: str) -> object:
 
 def __dir__() -> list[str]:
     """List the names that wait for their first use, too."""
-    return __all__
+    return sorted({*globals(), *__all__})

@@ -62,8 +62,9 @@ class TD3Loss(ActorCriticLoss):
                     "The actor's module has no action bounds: pass low= and high= of "
                     "the environment's actions."
                 )
-            like = next(actor_network.parameters())
-            self.register_bounds(torch.as_tensor(x).to(like) for x in (low, high))
+            device = next(actor_network.parameters()).device
+            bounds = [torch.as_tensor(each, device=device) for each in (low, high)]
+            self.register_bounds(each.float() for each in bounds)
         self.register_actor_critic(actor_network, qvalue_network, delay_actor=True)
         metrics = ["cloning_error", "pred_value", "target_value"]
         self.declare(["loss_actor", "loss_qvalue"], metrics)
